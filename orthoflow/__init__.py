@@ -1,0 +1,21 @@
+"""Orthoimages from laser scans and free-hand photographs, with methods that can be compared."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from orthoflow.records import open_run as open_run
+
+__all__ = ["__version__", "open_run"]
+
+__version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> object:
+    # Lazy: `orthoflow --help` must not load numpy and h5py for a name it never uses.
+    if name == "open_run":
+        from orthoflow.records import open_run  # noqa: PLC0415
+
+        return open_run
+    raise AttributeError(f"module 'orthoflow' has no attribute {name!r}")

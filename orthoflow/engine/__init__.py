@@ -1,0 +1,1 @@
+"""Plan, store and executors: turns cells into results."""

@@ -1,0 +1,76 @@
+"""Every error that orthoflow raises on purpose, in one page.
+
+A message is one sentence: what was given, what was expected, where, and the way out if there is
+one. The command line turns the class into an exit code (`exit_code`) and never shows a traceback
+unless `--debug` is given.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class OrthoflowError(Exception):
+    """Root of all errors that orthoflow raises on purpose.
+
+    Attributes:
+        exit_code: process exit code when this error ends a command.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+
+class InputError(OrthoflowError, ValueError):
+    """A file or value that the user gave cannot be used: unreadable, empty, of the wrong kind."""
+
+    exit_code = 2
+
+
+class WorkflowError(OrthoflowError, ValueError):
+    """A workflow file is invalid; the message lists every problem found, one per line."""
+
+    exit_code = 2
+
+
+class ArgumentError(OrthoflowError, ValueError):
+    """A command-line argument or a function argument is invalid."""
+
+    exit_code = 2
+
+
+class GeometryError(OrthoflowError, ValueError):
+    """A geometric construction has no solution, e.g. a plane through three points on a line."""
+
+
+class ProductError(OrthoflowError, ValueError):
+    """A product breaks its own rules: shapes that disagree, values out of range, unknown type."""
+
+
+class MethodError(OrthoflowError, RuntimeError):
+    """A method cannot give a result for these inputs, e.g. no plane has enough points."""
+
+
+class StepFailedError(OrthoflowError, RuntimeError):
+    """A step ended without a result: crashed, killed, out of memory, or past its timeout."""
+
+
+class CancelledStepError(OrthoflowError, RuntimeError):
+    """A step was asked to stop and did."""
+
+    exit_code = 130
+
+
+class PluginError(OrthoflowError, ImportError):
+    """A plugin, a method or a library that a plugin needs is missing, broken or claimed twice."""
+
+    exit_code = 4
+
+
+class StoreError(OrthoflowError, OSError):
+    """The store or a run folder cannot be read or written: full disk, no permission, damage."""
+
+
+class RecordError(OrthoflowError, ValueError):
+    """A record is damaged, differs from its seal, or has a format this version cannot read."""
+
+    exit_code = 3

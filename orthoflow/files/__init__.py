@@ -1,0 +1,1 @@
+"""Files of other programs: point files, images, GeoTIFF, and what orthoflow publishes."""

@@ -1,0 +1,152 @@
+"""The wall frame: where the cells of a wall's raster lie in the world, and back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.planes import Plane
+
+# Below this angle between normal and up a plane counts as a floor or ceiling: "right for the
+# viewer" would then hang on a nearly vertical normal's noise.
+LEVEL_LIMIT_DEG: Final = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallFrame:
+    """A raster grid on a plane: u to the viewer's right, v down, n towards the viewer.
+
+    World point of a position (column, row) with a depth:
+    `origin_world + gsd_m * (column * u_world + row * v_world) + depth_m * normal_world`. The centre
+    of cell (row, column) is at (column + 0.5, row + 0.5); `u x v = -n`.
+
+    Attributes:
+        origin_world: (3,) float64 metres, outer corner of the top-left cell, on the plane.
+        u_world: (3,) unit vector.
+        v_world: (3,) unit vector.
+        normal_world: (3,) unit vector.
+        gsd_m: side of a cell in metres.
+        width: number of columns.
+        height: number of rows.
+    """
+
+    origin_world: NDArray[np.float64]
+    u_world: NDArray[np.float64]
+    v_world: NDArray[np.float64]
+    normal_world: NDArray[np.float64]
+    gsd_m: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if not (self.gsd_m > 0.0 and self.width > 0 and self.height > 0):
+            raise GeometryError(
+                f"a wall frame needs a positive cell size and at least one cell, got "
+                f"{self.gsd_m} m and {self.width} x {self.height}"
+            )
+        if not np.allclose(np.cross(self.u_world, self.v_world), -self.normal_world, atol=1e-9):
+            raise GeometryError("a wall frame needs u x v = -n; these axes mirror the image")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, as numpy arrays have them."""
+        return self.height, self.width
+
+    @property
+    def plane(self) -> Plane:
+        """The plane the frame lies on."""
+        return Plane(
+            normal=self.normal_world, offset_m=float(self.normal_world @ self.origin_world)
+        )
+
+    def world_from_wall(
+        self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64] | float = 0.0
+    ) -> NDArray[np.float64]:
+        """World points (n, 3) in metres of wall positions (n, 2) = (column, row) and depths (n,)."""
+        in_plane = self.gsd_m * (
+            pixels_wall[:, :1] * self.u_world + pixels_wall[:, 1:2] * self.v_world
+        )
+        lifted = np.multiply.outer(np.broadcast_to(depths_m, len(pixels_wall)), self.normal_world)
+        points: NDArray[np.float64] = self.origin_world + in_plane + lifted
+        return points
+
+    def wall_from_world(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Wall positions (n, 3) = (column, row, depth in metres) of world points (n, 3)."""
+        relative = points_world - self.origin_world
+        return np.column_stack(
+            [
+                relative @ self.u_world / self.gsd_m,
+                relative @ self.v_world / self.gsd_m,
+                relative @ self.normal_world,
+            ]
+        )
+
+    def corners_world(self) -> NDArray[np.float64]:
+        """Outer corners (4, 3) of the raster on the plane: top-left, then counter-clockwise."""
+        columns = np.array([0, 0, self.width, self.width], dtype=np.float64)
+        rows = np.array([0, self.height, self.height, 0], dtype=np.float64)
+        return self.world_from_wall(np.column_stack([columns, rows]))
+
+
+def wall_axes(normal: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axes u and v of the wall frame on a plane.
+
+    u is horizontal and to the right for a viewer whom the normal points to. For floors and
+    ceilings (normal within 10 deg of up or down) u is the horizontal e1 axis of `basis_from_up`
+    laid into the plane, so that a floor reads like a map: e1 to the right, e2 upwards.
+
+    Args:
+        normal: (3,) unit vector towards the viewer.
+        up: (3,) unit vector.
+
+    Returns:
+        (2, 3) rows u and v.
+    """
+    if abs(float(normal @ up)) > math.cos(math.radians(LEVEL_LIMIT_DEG)):
+        first = basis_from_up(up)[0]
+        u = first - (first @ normal) * normal
+    else:
+        u = np.cross(up, normal)
+    u = u / np.linalg.norm(u)
+    return np.vstack([u, np.cross(u, normal)])
+
+
+def frame_over(
+    corners_world: NDArray[np.float64], normal: NDArray[np.float64], *, gsd_m: float
+) -> WallFrame:
+    """Lay a grid over a rectangle on a plane.
+
+    Args:
+        corners_world: (4, 3) metres, top-left first, counter-clockwise for the viewer.
+        normal: (3,) unit vector of the rectangle, towards the viewer.
+        gsd_m: side of a cell in metres.
+
+    Returns:
+        The grid whose top-left corner is the rectangle's; it covers the rectangle, so right and
+        bottom may reach past it by less than a cell.
+    """
+    top_left, bottom_left, _, top_right = corners_world
+    u = top_right - top_left
+    width_m = float(np.linalg.norm(u))
+    height_m = float(np.linalg.norm(bottom_left - top_left))
+    if not (width_m > 0.0 and height_m > 0.0):
+        raise GeometryError(f"a rectangle needs an area, got corners {corners_world.tolist()}")
+    # Re-orthogonalised against the normal: stored corners carry rounding.
+    u = u - (u @ normal) * normal
+    u = u / np.linalg.norm(u)
+    return WallFrame(
+        origin_world=top_left.copy(),
+        u_world=u,
+        v_world=np.cross(u, normal),
+        normal_world=normal.copy(),
+        gsd_m=gsd_m,
+        # A millionth of a cell of slack: 3.000000001 m at 3 mm must not cost a column.
+        width=max(1, math.ceil(width_m / gsd_m - 1e-6)),
+        height=max(1, math.ceil(height_m / gsd_m - 1e-6)),
+    )

@@ -1,0 +1,110 @@
+"""The point cloud: offsets from an origin, what the scanner measured with them, where it stood."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import ProductError
+from orthoflow.products.product import JsonValue, Product, Tolerance
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointCloud(Product):
+    """Points of one or several scans in one world frame.
+
+    The world point i is `origin + (x[i], y[i], z[i])`. Survey coordinates of 10^6 m lose nothing:
+    float32 holds offsets only.
+
+    Attributes:
+        origin: (3,) float64 metres.
+        x: (n,) float32 metres from the origin; y and z alike. Three contiguous arrays, because
+            hot passes read them at memory speed.
+        up: (3,) float64 unit vector in world axes.
+        intensity: (n,) float32, 0..1, or None.
+        rgb: (n, 3) uint8 sRGB, or None.
+        scan: (n,) uint16 index of the scan the point is from, or None.
+        row: (n,) uint32 position in the scan's grid, or None; column alike.
+        stations: (s, 3) float64 metres, where the scanner (or the viewer) stood, or None.
+        stations_source: `file`, `view_from` (the user said it) or None without stations.
+        source: how the data were read: files, unit, ranges before normalising, counts dropped.
+    """
+
+    type_name: ClassVar[str] = "cloud"
+    mapped: ClassVar[bool] = True
+    embedded: ClassVar[bool] = False
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {
+        "x": Tolerance(limit=1e-6, unit="m"),
+        "y": Tolerance(limit=1e-6, unit="m"),
+        "z": Tolerance(limit=1e-6, unit="m"),
+        "origin": Tolerance(limit=1e-6, unit="m"),
+        "intensity": Tolerance(limit=1e-6, unit="1"),
+        "rgb": Tolerance(limit=1, unit="grey"),
+    }
+
+    origin: NDArray[np.float64]
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+    up: NDArray[np.float64]
+    intensity: NDArray[np.float32] | None = None
+    rgb: NDArray[np.uint8] | None = None
+    scan: NDArray[np.uint16] | None = None
+    row: NDArray[np.uint32] | None = None
+    column: NDArray[np.uint32] | None = None
+    stations: NDArray[np.float64] | None = None
+    stations_source: str | None = None
+    source: dict[str, JsonValue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n_points = len(self.x)
+        wanted: dict[str, tuple[object, tuple[int, ...], str]] = {
+            "origin": (self.origin, (3,), "f8"),
+            "up": (self.up, (3,), "f8"),
+            "x": (self.x, (n_points,), "f4"),
+            "y": (self.y, (n_points,), "f4"),
+            "z": (self.z, (n_points,), "f4"),
+            "intensity": (self.intensity, (n_points,), "f4"),
+            "rgb": (self.rgb, (n_points, 3), "u1"),
+            "scan": (self.scan, (n_points,), "u2"),
+            "row": (self.row, (n_points,), "u4"),
+            "column": (self.column, (n_points,), "u4"),
+        }
+        for name, (value, shape, dtype) in wanted.items():
+            if value is None:
+                continue
+            array = np.asanyarray(value)
+            if array.shape != shape or array.dtype != np.dtype(dtype):
+                raise ProductError(
+                    f"cloud.{name} must be {dtype} of shape {shape}, got {array.dtype} of shape "
+                    f"{array.shape}"
+                )
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def points_world(self, index: NDArray[np.int64] | slice = slice(None)) -> NDArray[np.float64]:
+        """World points (m, 3) float64 of a selection; a copy, so keep selections small."""
+        offsets = np.column_stack([self.x[index], self.y[index], self.z[index]])
+        return self.origin + offsets.astype(np.float64)
+
+    def require_points(self, n_least: int) -> None:
+        """Refuse a cloud that no method can work on.
+
+        Raises:
+            ProductError: fewer than `n_least` points, or coordinates that are not finite.
+        """
+        if len(self) < n_least:
+            raise ProductError(f"the cloud has {len(self)} points, at least {n_least} are needed")
+        for name, values in (("x", self.x), ("y", self.y), ("z", self.z)):
+            # A sum is NaN or infinite exactly when a term is (float64 cannot overflow here), and
+            # needs no mask of scan size.
+            if not np.isfinite(np.sum(values, dtype=np.float64)):
+                raise ProductError(
+                    f"the cloud has coordinates in {name} that are NaN or infinite: read it with "
+                    "read.scan, which drops such points"
+                )

@@ -1,0 +1,103 @@
+"""Judging products: surveyed check points, the truth of a simulated scene, and what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.scenes import Scene
+from orthoflow.products.planes import Planes
+from orthoflow.products.product import JsonValue, Product, Tolerance
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckPoints(Product):
+    """Surveyed points that took no part in anything they check.
+
+    Attributes:
+        names: names of the points.
+        points_world: (n, 3) float64 metres.
+        classes: class of each point, e.g. `flat`, `vertical`; empty strings without one.
+        wall: (n,) int32 wall in whose orthoimage the point was measured, -1 for none.
+        pixels_wall: (n, 2) float64 measured (column, row), NaN where not measured.
+    """
+
+    type_name: ClassVar[str] = "checkpoints"
+
+    names: tuple[str, ...]
+    points_world: NDArray[np.float64]
+    classes: tuple[str, ...]
+    wall: NDArray[np.int32]
+    pixels_wall: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth(Product):
+    """What a simulated scene really is.
+
+    Attributes:
+        scene: the surfaces, with their colours; can be seen from anywhere.
+        planes: the planes a detector should find.
+        labels: (n,) int16 per point of the simulated cloud: index into `planes`, -1 for none.
+        stations: (s, 3) float64 metres, where the scanner stood.
+        details: parameters of the simulation (scan step, noise, relief ...), JSON.
+    """
+
+    type_name: ClassVar[str] = "truth"
+    embedded: ClassVar[bool] = False
+
+    scene: Scene
+    planes: Planes
+    labels: NDArray[np.int16]
+    stations: NDArray[np.float64]
+    details: dict[str, JsonValue] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One number that an inspection gives.
+
+    Attributes:
+        name: metric name, unit in the name where it has one.
+        value: the number.
+        unit: unit, `1` for shares and counts.
+        wall: index of the wall it speaks of, -1 for all together.
+    """
+
+    name: str
+    value: float
+    unit: str
+    wall: int = -1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspection(Product):
+    """Displacements measured in orthoimages, and what they add up to.
+
+    Attributes:
+        wall: (n,) int32 wall of each measured point.
+        points_world: (n, 3) float64 metres.
+        displacement_m: (n, 2) float64 metres along u and v: shown - true.
+        kind: (n,) uint8 class of the point; `kinds` names them.
+        kinds: names of the classes.
+        findings: the numbers.
+        details: what else the method says, JSON.
+    """
+
+    type_name: ClassVar[str] = "inspection"
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {
+        "points_world": Tolerance(limit=1e-3, unit="m"),
+        "displacement_m": Tolerance(limit=1e-4, unit="m"),
+    }
+
+    wall: NDArray[np.int32]
+    points_world: NDArray[np.float64]
+    displacement_m: NDArray[np.float64]
+    kind: NDArray[np.uint8]
+    kinds: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    details: dict[str, JsonValue] = field(default_factory=dict)

@@ -1,0 +1,105 @@
+"""Planes found in a cloud, and which point belongs to which."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import ProductError
+from orthoflow.geometry import Plane
+from orthoflow.products.product import JsonValue, Product, Tolerance
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planes(Product):
+    """Planes of a scene, ordered by support, largest first.
+
+    Attributes:
+        normal: (k, 3) float64 unit vectors towards the viewer, world axes.
+        offset: (k,) float64 metres, `normal . x` of the points on the plane.
+        corners: (k, 4, 3) float64 metres, rectangle on the plane: top-left first,
+            counter-clockwise for the viewer.
+        covariance: (k, 4, 4) float64 of (normal, offset); zero for a plane that was given.
+        n_points: (k,) int64, points that support the plane.
+        rms_m: (k,) float64, root mean square distance of those points.
+        up: (3,) float64 unit vector of the cloud they come from.
+        names: k short labels, e.g. `wall 0`, `floor`.
+        part_corners: (p, 4, 3) float64 rectangles of connected parts, or None.
+        part_plane: (p,) int32 index of the plane a part lies on, or None.
+        viewpoint: how the normals' side was chosen: `stations`, `view_from` or `guess`.
+        details: what else the method says about itself, JSON.
+    """
+
+    type_name: ClassVar[str] = "planes"
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {
+        "normal": Tolerance(limit=1e-6, unit="1"),
+        "offset": Tolerance(limit=1e-5, unit="m"),
+        "corners": Tolerance(limit=1e-3, unit="m"),
+        "part_corners": Tolerance(limit=1e-3, unit="m"),
+        "covariance": Tolerance(limit=1e-6, unit="1"),
+        "n_points": Tolerance(limit=10, unit="1"),
+        "rms_m": Tolerance(limit=1e-5, unit="m"),
+    }
+
+    normal: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    corners: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    n_points: NDArray[np.int64]
+    rms_m: NDArray[np.float64]
+    up: NDArray[np.float64]
+    names: tuple[str, ...]
+    part_corners: NDArray[np.float64] | None = None
+    part_plane: NDArray[np.int32] | None = None
+    viewpoint: str = "guess"
+    details: dict[str, JsonValue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.offset)
+        shapes = {
+            "normal": (self.normal.shape, (count, 3)),
+            "corners": (self.corners.shape, (count, 4, 3)),
+            "covariance": (self.covariance.shape, (count, 4, 4)),
+            "n_points": (self.n_points.shape, (count,)),
+            "rms_m": (self.rms_m.shape, (count,)),
+            "names": ((len(self.names),), (count,)),
+        }
+        for name, (shape, expected) in shapes.items():
+            if shape != expected:
+                raise ProductError(f"planes.{name} must have shape {expected}, got {shape}")
+        lengths = np.linalg.norm(self.normal, axis=1)
+        if not np.allclose(lengths, 1.0, atol=1e-9):
+            raise ProductError(f"planes.normal must be unit vectors, got lengths {lengths}")
+
+    def __len__(self) -> int:
+        return len(self.offset)
+
+    def plane(self, index: int) -> Plane:
+        """Give one of the planes, 0 the one with the largest support."""
+        return Plane(normal=self.normal[index].copy(), offset_m=float(self.offset[index]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointLabels(Product):
+    """For each point of a cloud the plane it belongs to.
+
+    Attributes:
+        plane_index: (n,) int16, position in `Planes`, or -1 for none.
+    """
+
+    type_name: ClassVar[str] = "labels"
+    mapped: ClassVar[bool] = True
+    embedded: ClassVar[bool] = False
+
+    plane_index: NDArray[np.int16]
+
+    def __post_init__(self) -> None:
+        if self.plane_index.ndim != 1 or self.plane_index.dtype != np.int16:
+            raise ProductError(
+                f"labels.plane_index must be a flat int16 array, got {self.plane_index.dtype} of "
+                f"shape {self.plane_index.shape}"
+            )

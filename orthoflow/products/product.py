@@ -1,0 +1,186 @@
+"""What every product is: a frozen dataclass that turns into named arrays plus JSON, and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar, Final, Literal, Self, TypeAlias, Union
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import ProductError
+
+JsonValue: TypeAlias = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
+Array: TypeAlias = NDArray[np.generic]
+Unit = Literal["m", "px", "grey", "deg", "1"]
+
+_ARRAY: Final = "$array"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tolerance:
+    """How far two values of one field may lie apart and still count as equal.
+
+    Attributes:
+        limit: largest absolute difference, in `unit`.
+        unit: metres, pixels, grey levels, degrees, or 1 for plain numbers.
+    """
+
+    limit: float
+    unit: Unit
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload:
+    """A product as it is stored: what store, record and comparison see.
+
+    Attributes:
+        type_name: name of the product type, e.g. `planes`.
+        encoding_version: version of the layout below, raised when it changes.
+        metadata: JSON; holds everything that is not an array.
+        arrays: name -> array; a name may have `/` for nesting, e.g. `walls/0/depth_m`.
+        mapped: stored contiguous and uncompressed, so that readers can memory-map it.
+    """
+
+    type_name: str
+    encoding_version: int
+    metadata: Mapping[str, JsonValue]
+    arrays: Mapping[str, Array]
+    mapped: bool = False
+
+
+class Product:
+    """Base of all product types; subclasses are frozen dataclasses.
+
+    Fields may be numpy arrays, bytes, JSON values, other dataclasses and tuples of dataclasses;
+    each may be None where its annotation says so. `None` means absent.
+
+    Attributes:
+        type_name: identity in workflows, store and record; never changes.
+        encoding_version: raised when the fields change.
+        mapped: store contiguous and memory-map on reading (for products of scan size).
+        embedded: put the arrays into the record, not only their digest.
+        tolerances: field name -> how far replays may differ; fields not named must be equal.
+    """
+
+    type_name: ClassVar[str]
+    encoding_version: ClassVar[int] = 1
+    mapped: ClassVar[bool] = False
+    embedded: ClassVar[bool] = True
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {}
+
+    def to_payload(self) -> Payload:
+        """Give the product as named arrays and JSON; arrays are not copied."""
+        arrays: dict[str, Array] = {}
+        metadata = _encode_fields(self, "", arrays)
+        return Payload(
+            type_name=self.type_name,
+            encoding_version=self.encoding_version,
+            metadata=metadata,
+            arrays=arrays,
+            mapped=self.mapped,
+        )
+
+    @classmethod
+    def from_payload(cls, payload: Payload) -> Self:
+        """Build the product again from `to_payload`'s result; arrays are not copied.
+
+        Raises:
+            ProductError: the payload is of another type, of a newer encoding, or incomplete.
+        """
+        if payload.type_name != cls.type_name:
+            raise ProductError(f"expected a {cls.type_name} product, got {payload.type_name}")
+        if payload.encoding_version != cls.encoding_version:
+            raise ProductError(
+                f"{cls.type_name} has encoding version {payload.encoding_version}, this orthoflow "
+                f"reads version {cls.encoding_version}: use the orthoflow that wrote it"
+            )
+        return typing.cast("Self", _decode_fields(cls, "", payload.metadata, payload.arrays))
+
+
+def _encode_fields(owner: object, prefix: str, arrays: dict[str, Array]) -> dict[str, JsonValue]:
+    encoded: dict[str, JsonValue] = {}
+    for field in dataclasses.fields(typing.cast("typing.Any", owner)):
+        value = getattr(owner, field.name)
+        if value is not None:
+            encoded[field.name] = _encode(value, prefix + field.name, arrays)
+    return encoded
+
+
+def _encode(value: object, name: str, arrays: dict[str, Array]) -> JsonValue:
+    if isinstance(value, np.ndarray):
+        arrays[name] = value
+        return {_ARRAY: "numeric"}
+    if isinstance(value, bytes):
+        arrays[name] = np.frombuffer(value, dtype=np.uint8)
+        return {_ARRAY: "bytes"}
+    if dataclasses.is_dataclass(value):
+        return _encode_fields(value, name + "/", arrays)
+    if isinstance(value, tuple | list):
+        return [_encode(item, f"{name}/{index}", arrays) for index, item in enumerate(value)]
+    if isinstance(value, Mapping):
+        return {str(key): _encode(item, f"{name}/{key}", arrays) for key, item in value.items()}
+    return _json_scalar(value, name)
+
+
+def _json_scalar(value: object, name: str) -> JsonValue:
+    if isinstance(value, np.bool_ | np.integer | np.floating):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ProductError(f"{name} must be finite to be stored as JSON, got {value}")
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise ProductError(f"{name} holds a {type(value).__name__}, which no product can store")
+
+
+def _decode_fields(
+    cls: type, prefix: str, metadata: Mapping[str, JsonValue], arrays: Mapping[str, Array]
+) -> object:
+    hints = _hints(cls)
+    values: dict[str, object] = {}
+    for field in dataclasses.fields(cls):
+        if field.name in metadata:
+            name = prefix + field.name
+            values[field.name] = _decode(hints[field.name], metadata[field.name], name, arrays)
+    try:
+        return cls(**values)
+    except TypeError as error:
+        raise ProductError(f"a stored {cls.__name__} lacks fields: {error}") from error
+
+
+@cache
+def _hints(cls: type) -> dict[str, object]:
+    return typing.get_type_hints(cls)
+
+
+def _decode(hint: object, stored: JsonValue, name: str, arrays: Mapping[str, Array]) -> object:
+    if isinstance(stored, dict) and _ARRAY in stored:
+        if name not in arrays:
+            raise ProductError(f"the stored product lacks the array {name}")
+        array = arrays[name]
+        return array.tobytes() if stored[_ARRAY] == "bytes" else array
+    for candidate in _alternatives(hint):
+        if dataclasses.is_dataclass(candidate) and isinstance(stored, dict):
+            return _decode_fields(typing.cast("type", candidate), name + "/", stored, arrays)
+        if typing.get_origin(candidate) is tuple and isinstance(stored, list):
+            items = typing.get_args(candidate)
+            return tuple(
+                _decode(
+                    items[0] if items[-1] is Ellipsis else items[i], item, f"{name}/{i}", arrays
+                )
+                for i, item in enumerate(stored)
+            )
+    return stored
+
+
+def _alternatives(hint: object) -> Iterator[object]:
+    if typing.get_origin(hint) in (Union, types.UnionType):
+        yield from typing.get_args(hint)
+    else:
+        yield hint

@@ -1,0 +1,235 @@
+"""Rasters in a wall's plane: the surface, photos laid onto it, and the finished orthoimage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import ProductError
+from orthoflow.geometry import WallFrame
+from orthoflow.products.product import Array, JsonValue, Product, Tolerance
+
+
+class SurfaceMask(IntEnum):
+    """Where a wall's depth comes from."""
+
+    VOID = 0
+    MEASURED = 1
+    RECOVERED = 2
+
+
+class LayerMask(IntEnum):
+    """What one source could paint."""
+
+    OUTSIDE = 0
+    PAINTED = 1
+    OCCLUDED = 2
+    NO_SURFACE = 3
+
+
+class OrthoMask(IntEnum):
+    """What became of a cell of an orthoimage."""
+
+    NONE = 0
+    PAINTED = 1
+    FILLED = 2
+    OCCLUDED = 3
+    NO_SURFACE = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wall:
+    """The scanned surface over one plane, a value per cell.
+
+    Attributes:
+        frame: where the cells lie; all rasters have `frame.shape`.
+        plane_index: position of the plane in `Planes`.
+        name: label of the plane.
+        depth_m: float32 metres along the normal, NaN where void.
+        sigma_m: float32 metres, spread of the depths seen in the cell, NaN where unknown.
+        count: uint32 points in the cell.
+        mask: uint8 `SurfaceMask`.
+        intensity: float32 0..1, NaN where void, or None when the scan has neither intensity nor
+            colour.
+        rgb: (rows, cols, 3) uint8, or None.
+        rgb_mask: uint8, 1 where rgb holds a colour; None without rgb.
+    """
+
+    frame: WallFrame
+    plane_index: int
+    name: str
+    depth_m: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+    count: NDArray[np.uint32]
+    mask: NDArray[np.uint8]
+    intensity: NDArray[np.float32] | None = None
+    rgb: NDArray[np.uint8] | None = None
+    rgb_mask: NDArray[np.uint8] | None = None
+
+    def __post_init__(self) -> None:
+        _check_rasters(
+            self.frame,
+            f"wall {self.name}",
+            depth_m=self.depth_m,
+            sigma_m=self.sigma_m,
+            count=self.count,
+            mask=self.mask,
+            intensity=self.intensity,
+            rgb=self.rgb,
+            rgb_mask=self.rgb_mask,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Walls(Product):
+    """One raster per chosen plane.
+
+    Attributes:
+        walls: in the order of the planes; `wall.plane_index` says which plane.
+        up: (3,) float64 unit vector.
+        intensity_source: `laser`, `luminance` (no laser intensity: grey of the colours stands
+            in) or `none`.
+        buffer_front_m: how far in front of the plane points were taken.
+        buffer_behind_m: how far behind.
+        details: what else the method says, JSON.
+    """
+
+    type_name: ClassVar[str] = "walls"
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {
+        "depth_m": Tolerance(limit=1e-4, unit="m"),
+        "sigma_m": Tolerance(limit=1e-4, unit="m"),
+        "intensity": Tolerance(limit=1e-3, unit="1"),
+        "rgb": Tolerance(limit=2, unit="grey"),
+        "origin_world": Tolerance(limit=1e-3, unit="m"),
+        "u_world": Tolerance(limit=1e-6, unit="1"),
+        "v_world": Tolerance(limit=1e-6, unit="1"),
+        "normal_world": Tolerance(limit=1e-6, unit="1"),
+    }
+
+    walls: tuple[Wall, ...]
+    up: NDArray[np.float64]
+    intensity_source: str
+    buffer_front_m: float
+    buffer_behind_m: float
+    details: dict[str, JsonValue] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """One source (a photo, or the cloud itself) laid onto one wall.
+
+    Attributes:
+        frame: where the cells lie.
+        wall: index of the wall in `Walls`.
+        source: what painted it, e.g. a photo's name, or `cloud`.
+        rgb: (rows, cols, 3) uint8, 0 where not painted.
+        mask: uint8 `LayerMask`; cells of value 1 are painted.
+        quality: float32, larger is better, comparable between the layers of one wall; 0 where
+            not painted.
+        filled: uint8, 1 where the colour was inpainted from neighbours, or None.
+    """
+
+    frame: WallFrame
+    wall: int
+    source: str
+    rgb: NDArray[np.uint8]
+    mask: NDArray[np.uint8]
+    quality: NDArray[np.float32]
+    filled: NDArray[np.uint8] | None = None
+
+    def __post_init__(self) -> None:
+        _check_rasters(
+            self.frame,
+            f"layer {self.source}",
+            rgb=self.rgb,
+            mask=self.mask,
+            quality=self.quality,
+            filled=self.filled,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layers(Product):
+    """Layers of all walls.
+
+    Attributes:
+        layers: grouped by wall in the order of `Walls`, then by source.
+        names: name of each wall, by its index.
+        details: what else the method says, JSON.
+    """
+
+    type_name: ClassVar[str] = "layers"
+    embedded: ClassVar[bool] = False
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {
+        "rgb": Tolerance(limit=2, unit="grey"),
+        "quality": Tolerance(limit=1e-3, unit="1"),
+        "origin_world": Tolerance(limit=1e-3, unit="m"),
+    }
+
+    layers: tuple[Layer, ...]
+    names: tuple[str, ...] = ()
+    details: dict[str, JsonValue] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Orthoimage:
+    """The finished image of one wall.
+
+    Attributes:
+        frame: where the cells lie.
+        wall: index of the wall in `Walls`.
+        name: label of the wall.
+        rgb: (rows, cols, 3) uint8 sRGB, 0 where nothing is shown.
+        mask: uint8 `OrthoMask`; painted and filled cells are shown.
+        source: int16 index into `sources`, -1 where nothing painted the cell.
+        sources: what painted it, e.g. photo names, or `cloud`.
+    """
+
+    frame: WallFrame
+    wall: int
+    name: str
+    rgb: NDArray[np.uint8]
+    mask: NDArray[np.uint8]
+    source: NDArray[np.int16]
+    sources: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        _check_rasters(
+            self.frame,
+            f"orthoimage {self.name}",
+            rgb=self.rgb,
+            mask=self.mask,
+            source=self.source,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Orthoimages(Product):
+    """Orthoimages of all walls, in the order of `Walls`.
+
+    Attributes:
+        images: one per wall.
+        details: what else the method says, JSON.
+    """
+
+    type_name: ClassVar[str] = "orthoimages"
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {
+        "rgb": Tolerance(limit=2, unit="grey"),
+        "origin_world": Tolerance(limit=1e-3, unit="m"),
+    }
+
+    images: tuple[Orthoimage, ...]
+    details: dict[str, JsonValue] = field(default_factory=dict)
+
+
+def _check_rasters(frame: WallFrame, owner: str, **rasters: Array | None) -> None:
+    for name, raster in rasters.items():
+        if raster is not None and raster.shape[:2] != frame.shape:
+            raise ProductError(
+                f"{owner}: {name} has {raster.shape[:2]} cells, but its frame has {frame.shape}"
+            )

@@ -1,0 +1,1 @@
+"""The record of a run: writing run.h5 at the end, and reading it back."""

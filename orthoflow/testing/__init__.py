@@ -1,0 +1,1 @@
+"""The conformance suite that every method passes, ours and a stranger's."""

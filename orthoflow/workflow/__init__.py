@@ -1,0 +1,1 @@
+"""The workflow document: reading it, checking it, and expanding it into cells."""

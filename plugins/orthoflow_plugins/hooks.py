@@ -1,0 +1,190 @@
+"""What the built-in plugin announces: kinds, product types and methods, by import string."""
+
+from __future__ import annotations
+
+from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec, hookimpl
+
+
+@hookimpl
+def orthoflow_kinds() -> list[KindSpec]:
+    """Give the built-in kinds, in the order of the road from scan to inspection."""
+    return [
+        KindSpec(name="read", summary="files -> products", is_source=True),
+        KindSpec(name="simulate", summary="scenes with exact truth", is_source=True),
+        KindSpec(
+            name="plane",
+            summary="find the planes of walls, floors and ceilings",
+            inputs={"cloud": "cloud"},
+            outputs={"planes": "planes", "labels": "labels"},
+        ),
+        KindSpec(
+            name="raster",
+            summary="lay the cloud into a raster on each plane",
+            inputs={"cloud": "cloud", "planes": "planes"},
+            outputs={"walls": "walls"},
+        ),
+        KindSpec(
+            name="match",
+            summary="find points of the photos on the walls",
+            inputs={"photos": "photos", "walls": "walls", "cameras": "cameras"},
+            outputs={"ties": "ties"},
+        ),
+        KindSpec(
+            name="orient",
+            summary="orient the photos to the scan",
+            inputs={"ties": "ties", "photos": "photos"},
+            outputs={"cameras": "cameras"},
+        ),
+        KindSpec(
+            name="ortho",
+            summary="lay photos or the coloured cloud onto the walls",
+            inputs={"walls": "walls", "cloud": "cloud", "photos": "photos", "cameras": "cameras"},
+            outputs={"layers": "layers"},
+        ),
+        KindSpec(
+            name="mosaic",
+            summary="join the layers of each wall",
+            inputs={"layers": "layers"},
+            outputs={"orthoimages": "orthoimages"},
+        ),
+        KindSpec(
+            name="inspect",
+            summary="measure how good the orthoimages are",
+            inputs={
+                "orthoimages": "orthoimages",
+                "walls": "walls",
+                "checkpoints": "checkpoints",
+                "truth": "truth",
+                "cloud": "cloud",
+                "planes": "planes",
+                "labels": "labels",
+                "cameras": "cameras",
+            },
+            outputs={"inspection": "inspection"},
+        ),
+    ]
+
+
+@hookimpl
+def orthoflow_products() -> list[ProductSpec]:
+    """Give the built-in product types with what publishes their files."""
+    publish = "orthoflow.files.publishing"
+    return [
+        ProductSpec(
+            type_name="cloud",
+            target="orthoflow.products.cloud:PointCloud",
+            summary="points with intensity and colour",
+        ),
+        ProductSpec(
+            type_name="photos",
+            target="orthoflow.products.photographs:Photos",
+            summary="photographs as they were taken",
+        ),
+        ProductSpec(
+            type_name="calibration",
+            target="orthoflow.products.photographs:Calibration",
+            summary="calibrated cameras",
+        ),
+        ProductSpec(
+            type_name="checkpoints",
+            target="orthoflow.products.inspections:CheckPoints",
+            summary="surveyed check points",
+        ),
+        ProductSpec(
+            type_name="truth",
+            target="orthoflow.products.inspections:Truth",
+            summary="what a simulated scene really is",
+        ),
+        ProductSpec(
+            type_name="planes",
+            target="orthoflow.products.planes:Planes",
+            summary="planes with rectangles and covariances",
+            publisher=f"{publish}:publish_planes",
+        ),
+        ProductSpec(
+            type_name="labels",
+            target="orthoflow.products.planes:PointLabels",
+            summary="the plane of each point",
+        ),
+        ProductSpec(
+            type_name="walls",
+            target="orthoflow.products.walls:Walls",
+            summary="depth, intensity and colour on each plane",
+            publisher=f"{publish}:publish_walls",
+        ),
+        ProductSpec(
+            type_name="ties",
+            target="orthoflow.products.photographs:Ties",
+            summary="points of photos known on walls",
+            publisher=f"{publish}:publish_ties",
+        ),
+        ProductSpec(
+            type_name="cameras",
+            target="orthoflow.products.photographs:Cameras",
+            summary="orientations of photos",
+            publisher=f"{publish}:publish_cameras",
+        ),
+        ProductSpec(
+            type_name="layers",
+            target="orthoflow.products.walls:Layers",
+            summary="each source laid onto each wall",
+        ),
+        ProductSpec(
+            type_name="orthoimages",
+            target="orthoflow.products.walls:Orthoimages",
+            summary="the finished orthoimages",
+            publisher=f"{publish}:publish_orthoimages",
+        ),
+        ProductSpec(
+            type_name="inspection",
+            target="orthoflow.products.inspections:Inspection",
+            summary="measured displacements",
+        ),
+    ]
+
+
+@hookimpl
+def orthoflow_methods() -> list[MethodSpec]:
+    """Give the built-in methods."""
+    return [
+        MethodSpec(
+            id="read.scan",
+            target="orthoflow_plugins.read.scan:ReadScan",
+            summary="E57, LAS/LAZ, PLY, PCD, PTX and text scans -> cloud",
+        ),
+        MethodSpec(
+            id="simulate.room",
+            target="orthoflow_plugins.simulate.room:SimulateRoom",
+            summary="a scanned room with relief, niche and obstacle, and its truth",
+        ),
+        MethodSpec(
+            id="plane.hough2d",
+            target="orthoflow_plugins.plane.hough2d:Hough2d",
+            summary="Hough transform of the plan, cells weighted by their points",
+        ),
+        MethodSpec(
+            id="plane.given",
+            target="orthoflow_plugins.plane.given:GivenPlane",
+            summary="a reference plane that the user gives",
+        ),
+        MethodSpec(
+            id="raster.grid",
+            target="orthoflow_plugins.raster.grid:RasterGrid",
+            summary="depth, intensity and colour per cell of each wall",
+        ),
+        MethodSpec(
+            id="ortho.pointcloud-direct",
+            target="orthoflow_plugins.ortho.pointcloud_direct:PointcloudDirect",
+            summary="the topmost point colours its cell",
+        ),
+        MethodSpec(
+            id="mosaic.seams",
+            target="orthoflow_plugins.mosaic.seams:MosaicSeams",
+            summary="one orthoimage per wall from its layers",
+        ),
+        MethodSpec(
+            id="inspect.truth",
+            target="orthoflow_plugins.inspect.truth:InspectTruth",
+            summary="compare orthoimages, walls and planes with a simulated scene",
+        ),
+    ]

@@ -1,0 +1,1 @@
+"""The record format of orthoflow: h5py and numpy only, readable without the program itself."""
