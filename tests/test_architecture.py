@@ -1,0 +1,82 @@
+"""What linters do not hold: module sizes, forbidden names, what may be loaded when."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("orthoflow", "plugins/orthoflow_plugins", "provenance/orthoflow_provenance")
+MODULES = sorted(
+    path.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py")
+)
+FORBIDDEN_NAMES = {"utils", "util", "helpers", "common", "base", "misc", "core", "manager"}
+HEAVY = ("open3d", "pycolmap", "cv2", "rasterio", "laspy")
+CHILD_PATH = f"import sys; sys.path[:0] = {[str(ROOT / part) for part in ('', 'plugins', 'provenance')]};"
+
+
+def run_python(code: str) -> str:
+    completed = subprocess.run(
+        [sys.executable, "-c", CHILD_PATH + code], capture_output=True, text=True, check=False
+    )
+    assert completed.returncode == 0, completed.stderr
+    return completed.stdout
+
+
+@pytest.mark.parametrize("module", MODULES, ids=str)
+def test_no_module_is_longer_than_four_hundred_lines(module: Path) -> None:
+    assert len((ROOT / module).read_text().splitlines()) <= 400
+
+
+@pytest.mark.parametrize("module", MODULES, ids=str)
+def test_every_module_has_a_noun_for_a_name(module: Path) -> None:
+    assert not FORBIDDEN_NAMES & {module.stem, *module.parts}
+
+
+def test_loading_every_method_loads_no_heavy_library() -> None:
+    loaded = run_python(
+        "from orthoflow.catalog import discover_catalog\n"
+        "catalog = discover_catalog()\n"
+        "[entry.load() for entry in catalog.methods.values()"
+        " if entry.distribution.name == 'orthoflow-tls']\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules])"
+    )
+    assert loaded.strip() == "[]"
+
+
+@pytest.mark.parametrize("command", [["--help"], ["plugins", "list"]], ids=" ".join)
+def test_listing_commands_load_no_numerical_library(command: list[str]) -> None:
+    loaded = run_python(
+        "from orthoflow.cli import main\n"
+        f"sys.argv = ['orthoflow', *{command!r}]\n"
+        "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code, stop.code\n"
+        "print('LOADED', [n for n in ('numpy', 'pydantic', 'networkx', 'h5py') if n in sys.modules])"
+    )
+    assert loaded.splitlines()[-1] == "LOADED []"
+
+
+def test_import_contracts_hold() -> None:
+    linter = Path(sys.executable).with_name("lint-imports")
+    if not linter.exists() and shutil.which("lint-imports") is None:
+        pytest.skip("import-linter is not installed")
+    completed = subprocess.run(
+        [str(linter), "--no-cache"], capture_output=True, text=True, check=False, cwd=ROOT,
+        env={"PYTHONPATH": f"{ROOT}:{ROOT / 'plugins'}:{ROOT / 'provenance'}", "PATH": "/usr/bin:/bin"},
+    )  # fmt: skip
+    assert completed.returncode == 0, completed.stdout + completed.stderr
+
+
+@pytest.mark.parametrize("folder", ["orthoflow", "plugins", "provenance"])
+def test_no_module_carries_doubts_or_leftovers(folder: str) -> None:
+    words = ("TODO", "FIXME", "XXX", "NotImplementedError", "placeholder", "for now")
+    found = [
+        f"{path.relative_to(ROOT)}: {word}"
+        for path in (ROOT / folder).rglob("*.py")
+        for word in words
+        if word in path.read_text()
+    ]
+    assert found == []
