@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -16,7 +17,9 @@ MODULES = sorted(
 )
 FORBIDDEN_NAMES = {"utils", "util", "helpers", "common", "base", "misc", "core", "manager"}
 HEAVY = ("open3d", "pycolmap", "cv2", "rasterio", "laspy")
-CHILD_PATH = f"import sys; sys.path[:0] = {[str(ROOT / part) for part in ('', 'plugins', 'provenance')]};"
+CHILD_PATH = (
+    f"import sys; sys.path[:0] = {[str(ROOT / part) for part in ('', 'plugins', 'provenance')]};"
+)
 
 
 def run_python(code: str) -> str:
@@ -54,7 +57,8 @@ def test_listing_commands_load_no_numerical_library(command: list[str]) -> None:
         "from orthoflow.cli import main\n"
         f"sys.argv = ['orthoflow', *{command!r}]\n"
         "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code, stop.code\n"
-        "print('LOADED', [n for n in ('numpy', 'pydantic', 'networkx', 'h5py') if n in sys.modules])"
+        "slow = ('numpy', 'pydantic', 'networkx', 'h5py')\n"
+        "print('LOADED', [name for name in slow if name in sys.modules])"
     )
     assert loaded.splitlines()[-1] == "LOADED []"
 
@@ -63,10 +67,15 @@ def test_import_contracts_hold() -> None:
     linter = Path(sys.executable).with_name("lint-imports")
     if not linter.exists() and shutil.which("lint-imports") is None:
         pytest.skip("import-linter is not installed")
+    paths = ":".join(str(ROOT / part) for part in ("", "plugins", "provenance"))
     completed = subprocess.run(
-        [str(linter), "--no-cache"], capture_output=True, text=True, check=False, cwd=ROOT,
-        env={"PYTHONPATH": f"{ROOT}:{ROOT / 'plugins'}:{ROOT / 'provenance'}", "PATH": "/usr/bin:/bin"},
-    )  # fmt: skip
+        [str(linter), "--no-cache"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+        env={"PYTHONPATH": paths, "PATH": os.environ["PATH"]},
+    )
     assert completed.returncode == 0, completed.stdout + completed.stderr
 
 

@@ -1,0 +1,206 @@
+"""Products: payload round trips, validation, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import ProductError
+from orthoflow.geometry import WallFrame
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Intrinsics,
+    Payload,
+    Photo,
+    Photos,
+    Planes,
+    PointCloud,
+    PointLabels,
+    Product,
+    Wall,
+    Walls,
+)
+
+
+def frame(width: int = 4, height: int = 3) -> WallFrame:
+    return WallFrame(
+        origin_world=np.array([1.0, 2.0, 3.0]),
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=np.array([0.0, 0.0, -1.0]),
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=0.01,
+        width=width,
+        height=height,
+    )
+
+
+def cloud(n_points: int = 5) -> PointCloud:
+    rng = np.random.default_rng(n_points)
+    x, y, z = rng.normal(size=(3, n_points)).astype(np.float32)
+    return PointCloud(
+        origin=np.array([634512.0, 486215.0, 112.0]),
+        x=x,
+        y=y,
+        z=z,
+        up=np.array([0.0, 0.0, 1.0]),
+        rgb=rng.integers(0, 255, (n_points, 3), dtype=np.uint8),
+        stations=np.zeros((2, 3)),
+        stations_source="file",
+        source={"files": ["a.e57"], "dropped": 3},
+    )
+
+
+def walls() -> Walls:
+    raster = frame()
+    wall = Wall(
+        frame=raster,
+        plane_index=2,
+        name="wall 0",
+        depth_m=np.full(raster.shape, np.nan, np.float32),
+        sigma_m=np.zeros(raster.shape, np.float32),
+        count=np.ones(raster.shape, np.uint32),
+        mask=np.zeros(raster.shape, np.uint8),
+    )
+    return Walls(
+        walls=(wall, dataclasses.replace(wall, name="floor")),
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity_source="none",
+        buffer_front_m=0.15,
+        buffer_behind_m=0.2,
+        details={"n_void": 3, "shares": [0.5, 0.25]},
+    )
+
+
+def photos() -> Photos:
+    lens = Intrinsics(width=30, height=20, fx=25.0, fy=25.5, cx=15.0, cy=10.0)
+    return Photos(
+        photos=(
+            Photo(name="a.jpg", encoded=b"\xff\xd8\x00", width=30, height=20, intrinsics=lens),
+            Photo(name="b.jpg", encoded=b"", width=30, height=20, exif_focal_px=1200.5),
+        )
+    )
+
+
+def cameras() -> Cameras:
+    refused = Camera(photo="b.jpg", status="only 3 ties, 8 are needed")
+    return Cameras(
+        cameras=(
+            Camera(
+                photo="a.jpg",
+                status="ok",
+                rotation_camera_from_world=np.eye(3),
+                translation_camera_from_world=np.zeros(3),
+            ),
+            refused,
+        )
+    )
+
+
+PRODUCTS = [
+    cloud(),
+    cloud(0),
+    walls(),
+    photos(),
+    cameras(),
+    PointLabels(plane_index=np.array([-1, 3], np.int16)),
+]
+
+
+def assert_equal(first: object, second: object) -> None:
+    if isinstance(first, np.ndarray):
+        assert isinstance(second, np.ndarray)
+        assert first.dtype == second.dtype
+        np.testing.assert_array_equal(first, second)
+    elif dataclasses.is_dataclass(first):
+        assert type(first) is type(second)
+        for field in dataclasses.fields(first):
+            assert_equal(getattr(first, field.name), getattr(second, field.name))
+    elif isinstance(first, tuple):
+        assert isinstance(second, tuple)
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            assert_equal(one, other)
+    else:
+        assert first == second
+
+
+@pytest.mark.parametrize("product", PRODUCTS, ids=lambda product: type(product).__name__)
+def test_a_product_comes_back_from_its_payload(product: Product) -> None:
+    assert_equal(type(product).from_payload(product.to_payload()), product)
+
+
+def test_a_cloud_without_points_comes_back_too() -> None:
+    assert_equal(PointCloud.from_payload(cloud(0).to_payload()), cloud(0))
+
+
+def test_arrays_are_named_by_their_place_and_not_copied() -> None:
+    product = walls()
+    arrays = product.to_payload().arrays
+    assert arrays["walls/1/depth_m"] is product.walls[1].depth_m
+
+
+def test_the_world_points_of_a_cloud_keep_survey_coordinates() -> None:
+    points = cloud()
+    expected = points.origin + np.column_stack([points.x, points.y, points.z]).astype(float)
+    np.testing.assert_array_equal(points.points_world(), expected)
+
+
+def test_a_payload_of_another_type_is_refused() -> None:
+    with pytest.raises(ProductError, match="expected a planes product, got walls"):
+        Planes.from_payload(walls().to_payload())
+
+
+def test_a_payload_of_a_newer_encoding_is_refused() -> None:
+    payload = dataclasses.replace(walls().to_payload(), encoding_version=2)
+    with pytest.raises(ProductError, match="encoding version 2, this orthoflow reads version 1"):
+        Walls.from_payload(payload)
+
+
+def test_a_payload_that_lacks_an_array_is_refused() -> None:
+    payload = walls().to_payload()
+    arrays = {name: array for name, array in payload.arrays.items() if name != "walls/0/mask"}
+    with pytest.raises(ProductError, match="lacks the array walls/0/mask"):
+        Walls.from_payload(dataclasses.replace(payload, arrays=arrays))
+
+
+def test_a_payload_that_lacks_a_field_is_refused() -> None:
+    payload = Payload(type_name="walls", encoding_version=1, metadata={}, arrays={})
+    with pytest.raises(ProductError, match="lacks fields"):
+        Walls.from_payload(payload)
+
+
+def test_metadata_that_is_not_finite_is_refused() -> None:
+    product = dataclasses.replace(walls(), details={"share": float("nan")})
+    with pytest.raises(ProductError, match="details/share must be finite"):
+        product.to_payload()
+
+
+def test_a_raster_that_does_not_fit_its_frame_is_refused() -> None:
+    with pytest.raises(
+        ProductError, match=r"depth_m has \(2, 2\) cells, but its frame has \(3, 4\)"
+    ):
+        dataclasses.replace(walls().walls[0], depth_m=np.zeros((2, 2), np.float32))
+
+
+def test_a_cloud_with_arrays_of_another_length_or_type_is_refused() -> None:
+    with pytest.raises(ProductError, match=r"cloud.y must be f4 of shape \(5,\)"):
+        dataclasses.replace(cloud(), y=np.zeros(4, np.float32))
+    with pytest.raises(ProductError, match=r"cloud\.x must be f4"):
+        dataclasses.replace(cloud(), x=np.zeros(5))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_cloud_with_coordinates_that_are_not_finite_is_refused(bad: float) -> None:
+    points = cloud()
+    y = points.y.copy()
+    y[2] = bad
+    with pytest.raises(ProductError, match="coordinates in y that are NaN or infinite"):
+        dataclasses.replace(points, y=y).require_points(3)
+
+
+def test_a_cloud_with_too_few_points_is_refused() -> None:
+    with pytest.raises(ProductError, match="the cloud has 1 points, at least 3 are needed"):
+        cloud(1).require_points(3)

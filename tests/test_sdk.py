@@ -1,0 +1,91 @@
+"""The SDK: ports from annotations, what the context collects and refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import CancelledStepError, PluginError, ProductError
+from orthoflow.products import Planes, PointCloud
+from orthoflow.sdk import Ports, StepContext, StepEvent, port_specs
+
+
+class Inputs(Ports):
+    cloud: PointCloud
+    planes: Planes | None = None
+
+
+class Wrong(Ports):
+    cloud: int
+
+
+def context(folder: Path, **more: object) -> StepContext:
+    return StepContext(rng=np.random.default_rng(1), cores=1, scratch=folder, **more)
+
+
+def test_ports_are_read_from_annotations() -> None:
+    ports = port_specs(Inputs)
+    assert {name: (port.type_name, port.required) for name, port in ports.items()} == {
+        "cloud": ("cloud", True),
+        "planes": ("planes", False),
+    }
+
+
+def test_a_port_that_carries_no_product_is_refused() -> None:
+    with pytest.raises(PluginError, match=r"Wrong.cloud must be annotated with a product class"):
+        port_specs(Wrong)
+
+
+def test_ports_are_frozen_and_take_keywords_only() -> None:
+    with pytest.raises(TypeError):
+        Inputs(None)  # type: ignore[misc, arg-type]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_metric_that_is_not_finite_is_refused(tmp_path: Path, value: float) -> None:
+    with pytest.raises(ProductError, match="metric rms_mm must be finite"):
+        context(tmp_path).metric("rms_mm", value, "mm")
+
+
+def test_a_metric_reported_twice_is_refused(tmp_path: Path) -> None:
+    ctx = context(tmp_path)
+    ctx.metric("rms_mm", 1.0, "mm")
+    with pytest.raises(ProductError, match="reported twice"):
+        ctx.metric("rms_mm", 2.0, "mm")
+
+
+def test_progress_never_goes_back(tmp_path: Path) -> None:
+    heard: list[StepEvent] = []
+    ctx = context(tmp_path, listen=heard.append)
+    for fraction in (0.5, 0.2, 7.0):
+        ctx.progress(fraction)
+    assert [event.fraction for event in heard] == [0.5, 0.5, 1.0]
+
+
+def test_progress_stops_a_cancelled_step(tmp_path: Path) -> None:
+    with pytest.raises(CancelledStepError):
+        context(tmp_path, is_cancelled=lambda: True).progress(0.1)
+
+
+def test_allocated_arrays_lie_in_the_scratch_folder(tmp_path: Path) -> None:
+    array = context(tmp_path).allocate("cloud", "x", (1000,), np.float32)
+    array[:] = 7
+    assert array.dtype == np.float32
+    assert next((tmp_path / "allocated").iterdir()).stat().st_size == 4000
+
+
+def test_warnings_are_collected_and_heard(tmp_path: Path) -> None:
+    heard: list[StepEvent] = []
+    ctx = context(tmp_path, listen=heard.append)
+    ctx.warn("no station known")
+    assert ctx.warnings == ["no station known"]
+    assert heard == [StepEvent(kind="warning", text="no station known")]
+
+
+def test_a_figure_from_bytes_is_kept_as_a_file(tmp_path: Path) -> None:
+    ctx = context(tmp_path)
+    ctx.figure("histogram", b"\x89PNG rest", "deviations")
+    assert ctx.figures[0].path.read_bytes() == b"\x89PNG rest"
+    assert ctx.figures[0].path.name == "histogram.png"
