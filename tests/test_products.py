@@ -101,7 +101,6 @@ def cameras() -> Cameras:
 
 PRODUCTS = [
     cloud(),
-    cloud(0),
     walls(),
     photos(),
     cameras(),
