@@ -1,0 +1,30 @@
+"""What is installed: methods, kinds and product types of all plugins, and what is wrong with them.
+
+Light on purpose: nothing here loads numpy, pydantic or networkx until a method is loaded.
+"""
+
+from __future__ import annotations
+
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.catalog.distributions import DistributionInfo
+from orthoflow.catalog.entries import (
+    BrokenPlugin,
+    EntryState,
+    KindEntry,
+    MethodEntry,
+    ProductEntry,
+)
+from orthoflow.catalog.suggestions import did_you_mean
+
+__all__ = [
+    "BrokenPlugin",
+    "Catalog",
+    "DistributionInfo",
+    "EntryState",
+    "KindEntry",
+    "MethodEntry",
+    "ProductEntry",
+    "did_you_mean",
+    "discover_catalog",
+]

@@ -1,0 +1,246 @@
+"""Finding plugins: a loop over entry points in which no plugin can harm another."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.metadata import EntryPoint
+from typing import Final, Generic, TypeVar
+
+import pluggy
+
+from orthoflow.catalog.catalog import Catalog
+from orthoflow.catalog.distributions import DistributionInfo, describe_distribution
+from orthoflow.catalog.entries import (
+    BrokenPlugin,
+    EntryState,
+    KindEntry,
+    MethodEntry,
+    ProductEntry,
+)
+from orthoflow.errors import PluginError
+from orthoflow.sdk.hooks import (
+    ENTRY_POINT_GROUP,
+    PROJECT,
+    KindSpec,
+    MethodSpec,
+    PluginHooks,
+    ProductSpec,
+)
+
+_NAME: Final = r"[a-z][a-z0-9_-]{0,31}"
+_METHOD_ID: Final = re.compile(rf"{_NAME}\.{_NAME}")
+_KIND: Final = re.compile(_NAME)
+_TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+
+_Spec = TypeVar("_Spec", MethodSpec, KindSpec, ProductSpec)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Claim(Generic[_Spec]):
+    """A spec and who announced it."""
+
+    spec: _Spec
+    distribution: DistributionInfo
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Announcement:
+    """What one plugin brings."""
+
+    distribution: DistributionInfo
+    methods: tuple[MethodSpec, ...]
+    kinds: tuple[KindSpec, ...]
+    products: tuple[ProductSpec, ...]
+
+
+def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalog:
+    """List everything that the installed plugins bring.
+
+    Args:
+        entry_points: plugins to look at; None for all installed ones.
+    """
+    found = metadata.entry_points(group=ENTRY_POINT_GROUP) if entry_points is None else entry_points
+    announcements: list[_Announcement] = []
+    broken: list[BrokenPlugin] = []
+    described = [(entry, describe_distribution(entry)) for entry in found]
+    for entry, distribution in sorted(
+        described, key=lambda item: (item[1].name, item[0].name, item[0].value)
+    ):
+        try:
+            announcements.append(_announce(entry, distribution))
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001 - foreign code may raise anything, even SystemExit
+            broken.append(_describe_failure(entry, distribution, error))
+    products = _collect_products(announcements)
+    kinds = _collect_kinds(announcements, frozenset(products))
+    methods = _collect_methods(announcements, kinds, frozenset(products))
+    return Catalog(methods=methods, kinds=kinds, products=products, broken=tuple(broken))
+
+
+def _announce(entry: EntryPoint, distribution: DistributionInfo) -> _Announcement:
+    # One manager per plugin: with a shared one, the second plugin of a name is dropped in silence.
+    manager = pluggy.PluginManager(PROJECT)
+    manager.add_hookspecs(PluginHooks)
+    manager.register(entry.load(), entry.name)
+    manager.check_pending()
+    announcement = _Announcement(
+        distribution=distribution,
+        methods=_specs(manager.hook.orthoflow_methods(), MethodSpec),
+        kinds=_specs(manager.hook.orthoflow_kinds(), KindSpec),
+        products=_specs(manager.hook.orthoflow_products(), ProductSpec),
+    )
+    _check_spelling(announcement)
+    if not (announcement.methods or announcement.kinds or announcement.products):
+        raise PluginError(
+            f"{entry.value} announces nothing; give it a function orthoflow_methods with @hookimpl"
+        )
+    return announcement
+
+
+def _specs(answers: Iterable[object], spec_class: type[_Spec]) -> tuple[_Spec, ...]:
+    specs: list[_Spec] = []
+    for answer in answers:
+        if not isinstance(answer, list | tuple):
+            raise PluginError(f"expected a list of {spec_class.__name__}, got {answer!r}")
+        for item in answer:
+            if not isinstance(item, spec_class):
+                raise PluginError(f"expected a {spec_class.__name__}, got {item!r}")
+            specs.append(item)
+    return tuple(specs)
+
+
+def _check_spelling(announcement: _Announcement) -> None:
+    for method in announcement.methods:
+        if not _METHOD_ID.fullmatch(method.id):
+            raise PluginError(
+                f"method id must be kind.method in lower case, e.g. plane.mine, got {method.id!r}"
+            )
+    for name in [
+        *(kind.name for kind in announcement.kinds),
+        *(product.type_name for product in announcement.products),
+    ]:
+        if not _KIND.fullmatch(name):
+            raise PluginError(f"kind and product names must match {_NAME}, got {name!r}")
+    for target in [
+        *(method.target for method in announcement.methods),
+        *(product.target for product in announcement.products),
+        *(product.publisher for product in announcement.products if product.publisher),
+    ]:
+        if not _TARGET.fullmatch(target):
+            raise PluginError(f"target must be package.module:Name, got {target!r}")
+
+
+def _describe_failure(
+    entry: EntryPoint, distribution: DistributionInfo, error: BaseException
+) -> BrokenPlugin:
+    text = " ".join(str(error).split())
+    return BrokenPlugin(
+        entry_point=entry.name,
+        module=entry.value,
+        distribution=distribution,
+        error=f"{type(error).__name__}: {text}" if text else type(error).__name__,
+        traceback="".join(traceback.format_exception(error)),
+    )
+
+
+def _by_name(
+    announcements: Iterable[_Announcement], specs_of: Callable[[_Announcement], Iterable[_Spec]]
+) -> dict[str, list[_Claim[_Spec]]]:
+    claims: dict[str, list[_Claim[_Spec]]] = {}
+    for announcement in announcements:
+        for spec in specs_of(announcement):
+            claim = _Claim(spec=spec, distribution=announcement.distribution)
+            claims.setdefault(_name(spec), []).append(claim)
+    return claims
+
+
+def _name(spec: MethodSpec | KindSpec | ProductSpec) -> str:
+    if isinstance(spec, MethodSpec):
+        return spec.id
+    return spec.name if isinstance(spec, KindSpec) else spec.type_name
+
+
+def _clash(what: str, claims: list[_Claim[_Spec]]) -> str:
+    claimants = " and ".join(str(claim.distribution) for claim in claims)
+    return f"{what} is claimed by {claimants}; uninstall all but one of them"
+
+
+def _collect_products(announcements: Iterable[_Announcement]) -> dict[str, ProductEntry]:
+    entries: dict[str, ProductEntry] = {}
+    for name, claims in _by_name(announcements, lambda item: item.products).items():
+        first = claims[0]
+        problem = ""
+        if len({(claim.spec.target, claim.spec.publisher) for claim in claims}) > 1:
+            problem = _clash(f"product type {name}", claims)
+        entries[name] = ProductEntry(
+            spec=first.spec,
+            distribution=first.distribution,
+            state="clash" if problem else "fine",
+            problem=problem,
+        )
+    return entries
+
+
+def _collect_kinds(
+    announcements: Iterable[_Announcement], product_types: frozenset[str]
+) -> dict[str, KindEntry]:
+    entries: dict[str, KindEntry] = {}
+    for name, claims in _by_name(announcements, lambda item: item.kinds).items():
+        first = claims[0]
+        state: EntryState = "fine"
+        problem = ""
+        unknown = sorted(
+            {*first.spec.inputs.values(), *first.spec.outputs.values()} - product_types
+        )
+        # The same ports again do no harm: two strangers may both need a kind of their own.
+        if any(_ports(claim.spec) != _ports(first.spec) for claim in claims):
+            state, problem = "clash", _clash(f"kind {name}", claims)
+        elif unknown:
+            state = "broken"
+            problem = (
+                f"kind {name} of {first.distribution} has ports of product types that no plugin "
+                f"announces: {', '.join(unknown)}"
+            )
+        entries[name] = KindEntry(
+            spec=first.spec, distribution=first.distribution, state=state, problem=problem
+        )
+    return entries
+
+
+def _ports(spec: KindSpec) -> tuple[dict[str, str], dict[str, str], bool]:
+    return dict(spec.inputs), dict(spec.outputs), spec.is_source
+
+
+def _collect_methods(
+    announcements: Iterable[_Announcement],
+    kinds: dict[str, KindEntry],
+    product_types: frozenset[str],
+) -> dict[str, MethodEntry]:
+    entries: dict[str, MethodEntry] = {}
+    for name, claims in _by_name(announcements, lambda item: item.methods).items():
+        first = claims[0]
+        who = f"method {name} of {first.distribution}"
+        kind = kinds.get(first.spec.kind)
+        state: EntryState = "fine"
+        problem = ""
+        if len(claims) > 1:
+            state, problem = "clash", _clash(f"method {name}", claims)
+        elif kind is None:
+            state = "broken"
+            problem = f"{who} is of kind {first.spec.kind}, which no plugin announces"
+        elif kind.state != "fine":
+            state, problem = "broken", f"{who} cannot be used: {kind.problem}"
+        entries[name] = MethodEntry(
+            spec=first.spec,
+            distribution=first.distribution,
+            kind=kind.spec if kind else None,
+            product_types=product_types,
+            state=state,
+            problem=problem,
+        )
+    return entries

@@ -1,0 +1,87 @@
+"""Which distribution brought a plugin, whether it is a released install, and where its code is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import Distribution, EntryPoint
+from importlib.util import find_spec
+from pathlib import Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistributionInfo:
+    """The distribution behind a plugin.
+
+    Attributes:
+        name: name of the distribution.
+        version: its version.
+        is_released: installed from an index, so that name and version stand for the code; False
+            for editable installs, installs from a folder or URL, and code run from a checkout.
+        source_folder: folder of the package that holds the hooks; None for a plugin of a single
+            module, which lies among strangers' code (see `MethodEntry.source_files`).
+    """
+
+    name: str
+    version: str
+    is_released: bool
+    source_folder: Path | None
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.version}"
+
+
+def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
+    """Say where an entry point comes from, without importing it."""
+    code = package_path(entry_point.module)
+    folder = code if code is not None and code.is_dir() else None
+    distribution = entry_point.dist
+    if distribution is None:
+        return DistributionInfo(
+            name=entry_point.name, version="0", is_released=False, source_folder=folder
+        )
+    return DistributionInfo(
+        name=distribution.name,
+        version=distribution.version,
+        is_released=_is_released(distribution, code),
+        source_folder=folder,
+    )
+
+
+def _is_released(distribution: Distribution, code: Path | None) -> bool:
+    # pip writes direct_url.json for everything that does not come from an index; code that lies
+    # elsewhere than its metadata was put in front of a release, e.g. by PYTHONPATH.
+    if code is None or distribution.read_text("direct_url.json") is not None:
+        return False
+    return code.is_relative_to(Path(str(distribution.locate_file(""))).resolve())
+
+
+def package_path(module: str) -> Path | None:
+    """Folder of the outermost regular package of a module, or the file of a single module.
+
+    Nothing is imported except namespace packages, which hold no code. None when there is no such
+    module.
+    """
+    name, _, rest = module.partition(".")
+    while True:
+        try:
+            spec = find_spec(name)
+        except (ImportError, ValueError, AttributeError):
+            return None
+        if spec is None:
+            return None
+        if spec.origin is not None and spec.has_location:
+            origin = Path(spec.origin).resolve()
+            return origin.parent if spec.submodule_search_locations else origin
+        if not rest:
+            return None
+        head, _, rest = rest.partition(".")
+        name = f"{name}.{head}"
+
+
+def source_files(paths: tuple[Path | None, ...]) -> tuple[Path, ...]:
+    """All Python files in packages and single modules, sorted, each once."""
+    files: set[Path] = set()
+    for path in paths:
+        if path is not None:
+            files.update([path] if path.is_file() else path.rglob("*.py"))
+    return tuple(sorted(files))

@@ -1,0 +1,139 @@
+"""Importing what import strings name, and checking that a method's class keeps its promises."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping
+from importlib import import_module
+
+from orthoflow.catalog.distributions import DistributionInfo
+from orthoflow.errors import PluginError
+from orthoflow.sdk.hooks import KindSpec, MethodSpec
+from orthoflow.sdk.methods import (
+    Determinism,
+    Method,
+    MethodParams,
+    Ports,
+    PortSpec,
+    port_specs,
+)
+
+FILES = "files"
+
+
+def import_target(target: str, what: str, distribution: DistributionInfo) -> object:
+    """Import `package.module:Name`.
+
+    Args:
+        target: import string.
+        what: what it is, for the error, e.g. `method plane.hough2d`.
+        distribution: who announced it, for the error.
+
+    Raises:
+        PluginError: the module fails to import or lacks the name.
+    """
+    module_name, _, name = target.partition(":")
+    try:
+        return typing.cast("object", getattr(import_module(module_name), name))
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise PluginError(
+            f"{what} of {distribution} cannot be loaded from {target}: "
+            f"{describe_error(error)}; install what is missing, or another version of "
+            f"{distribution.name}"
+        ) from error
+
+
+def describe_error(error: BaseException) -> str:
+    """Class and message of an error in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def load_method(
+    spec: MethodSpec,
+    kind: KindSpec,
+    distribution: DistributionInfo,
+    product_types: frozenset[str],
+) -> type[Method]:
+    """Import a method's class and check it against its spec and its kind.
+
+    Raises:
+        PluginError: the import fails or the class breaks a rule.
+    """
+    method = import_target(spec.target, f"method {spec.id}", distribution)
+    broken = f"method {spec.id} of {distribution} breaks a rule: "
+    if not (isinstance(method, type) and issubclass(method, Method)):
+        raise PluginError(f"{broken}{spec.target} must be a subclass of Method, got {method!r}")
+    complaint = _class_complaint(method, spec)
+    if not complaint:
+        try:
+            complaint = _port_complaint(method, kind, product_types)
+        except (PluginError, NameError, TypeError) as error:
+            complaint = f"its ports cannot be read: {describe_error(error)}"
+    if complaint:
+        raise PluginError(broken + complaint)
+    return method
+
+
+def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
+    own_id: object = getattr(method, "id", None)
+    version: object = method.result_version
+    citations: object = method.citations
+    rules = {
+        f"its class says id {own_id!r}": own_id == spec.id,
+        "its Params must be a subclass of MethodParams": _is_subclass(
+            getattr(method, "Params", None), MethodParams
+        ),
+        "its In must be a subclass of Ports": _is_subclass(getattr(method, "In", None), Ports),
+        "its Out must be a subclass of Ports": _is_subclass(getattr(method, "Out", None), Ports),
+        f"determinism must be exact, seeded or loose, got {method.determinism!r}": (
+            method.determinism in typing.get_args(Determinism)
+        ),
+        f"result_version must be a whole number from 1 on, got {version!r}": (
+            type(version) is int and version >= 1
+        ),
+        f"citations must be a tuple of texts, got {citations!r}": (
+            isinstance(citations, tuple) and all(isinstance(item, str) for item in citations)
+        ),
+        "it has no run": method.run is not Method.run,
+    }
+    return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
+
+
+def _is_subclass(candidate: object, parent: type) -> bool:
+    return isinstance(candidate, type) and issubclass(candidate, parent)
+
+
+def _port_complaint(method: type[Method], kind: KindSpec, product_types: frozenset[str]) -> str:
+    taken, given = port_specs(method.In), port_specs(method.Out)
+    if kind.is_source:
+        return _unknown_type(taken, product_types | {FILES}) or _unknown_type(given, product_types)
+    for port in taken.values():
+        if port.name not in kind.inputs:
+            return f"kind {kind.name} has no input port {port.name}; it has {_join(kind.inputs)}"
+        if port.type_name != kind.inputs[port.name]:
+            return (
+                f"input port {port.name} carries {kind.inputs[port.name]} in kind {kind.name}, "
+                f"not {port.type_name}"
+            )
+    if {port.name: port.type_name for port in given.values()} != dict(kind.outputs):
+        return (
+            f"its outputs must be {_join(kind.outputs)} as in kind {kind.name}, got {_join(given)}"
+        )
+    return ""
+
+
+def _unknown_type(ports: Mapping[str, PortSpec], known: frozenset[str]) -> str:
+    for port in ports.values():
+        if port.type_name not in known:
+            return (
+                f"port {port.name} carries {port.type_name}, a product type that no plugin "
+                f"announces"
+            )
+    return ""
+
+
+def _join(names: Mapping[str, object]) -> str:
+    return ", ".join(names) or "none"
