@@ -1,0 +1,115 @@
+"""A method and a check become a case; a case that fails says why in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from orthoflow.catalog import discover_catalog
+from orthoflow.errors import ArgumentError
+from orthoflow.products import InputFiles, Product
+from orthoflow.sdk import Method, port_specs
+from orthoflow.testing.checks import CHECKS, Check, Subject
+from orthoflow.testing.examples import example
+
+
+class ConformanceError(AssertionError):
+    """A method does not keep a rule; the message names method, rule and what happened."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConformanceCase:
+    """One check of one method.
+
+    Attributes:
+        method_id: id of the method.
+        check: what is checked.
+        inputs: port -> product, where the suite's own examples do not fit.
+        params: parameters that differ from the defaults.
+        expected_failure: why the check is known to fail; empty when it must pass.
+    """
+
+    method_id: str
+    check: Check
+    inputs: Mapping[str, Product | InputFiles] = field(default_factory=dict)
+    params: Mapping[str, object] = field(default_factory=dict)
+    expected_failure: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.method_id}-{self.check.name}"
+
+    def run(self) -> None:
+        """Run the check.
+
+        Raises:
+            ConformanceError: the method breaks the rule, or a failure that was expected did not
+                happen.
+        """
+        problem = self._problem()
+        if self.expected_failure and not problem:
+            raise ConformanceError(
+                f"{self}: passes, although it was expected to fail ({self.expected_failure}): "
+                "take it out of expected_failures"
+            )
+        if problem and not self.expected_failure:
+            raise ConformanceError(f"{self}: {problem}")
+
+    def _problem(self) -> str:
+        with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
+            try:
+                self.check.run(self._subject(Path(folder)))
+            except AssertionError as error:
+                return str(error)
+        return ""
+
+    def _subject(self, folder: Path) -> Subject:
+        method = discover_catalog().method(self.method_id).load()
+        inputs = {
+            name: self.inputs.get(name) or example(port.type_name)
+            for name, port in port_specs(method.In).items()
+            if name in self.inputs or port.required or port.type_name == "truth"
+        }
+        return Subject(method=method, inputs=inputs, params=self.params, folder=folder)
+
+
+def conformance_cases(
+    method_id: str,
+    *,
+    inputs: Mapping[str, Product | InputFiles] | None = None,
+    params: Mapping[str, object] | None = None,
+    expected_failures: Mapping[str, str] | None = None,
+) -> tuple[ConformanceCase, ...]:
+    """Give every check that applies to an installed method.
+
+    Args:
+        method_id: e.g. `plane.flat`; found through the installed entry points.
+        inputs: port -> product for ports the suite has no fitting example of.
+        params: parameters that differ from the defaults, for a quick run.
+        expected_failures: check name -> why the method cannot pass it.
+
+    Raises:
+        ArgumentError: `expected_failures` names a check that does not exist or gives no reason.
+        WorkflowError: no installed plugin has the method.
+        PluginError: the method cannot be loaded.
+    """
+    expected = dict(expected_failures or {})
+    method: type[Method] = discover_catalog().method(method_id).load()
+    for name, reason in expected.items():
+        if name not in {check.name for check in CHECKS} or not reason.strip():
+            raise ArgumentError(
+                f"expected_failures needs the name of a check and a reason, got {name!r}: "
+                f"{reason!r}; the checks are {', '.join(check.name for check in CHECKS)}"
+            )
+    return tuple(
+        ConformanceCase(
+            method_id=method_id,
+            check=check,
+            inputs=dict(inputs or {}),
+            params=dict(params or {}),
+            expected_failure=expected.get(check.name, ""),
+        )
+        for check in CHECKS
+        if check.applies(method)
+    )

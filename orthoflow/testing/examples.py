@@ -1,0 +1,181 @@
+"""Small inputs to try a method on: an analytic room, and what the built-in road makes of one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.errors import OrthoflowError
+from orthoflow.geometry import up_vector, wall_axes
+from orthoflow.products import InputFiles, Planes, PointCloud, Product
+from orthoflow.sdk import StepContext
+
+# The road of built-in methods that makes an example of each product type, with parameters small
+# enough for a test: product type -> (method, output port, parameters, inputs by port).
+_ROAD: Final[Mapping[str, tuple[str, str, Mapping[str, object], Mapping[str, str]]]] = {
+    "cloud": ("simulate.room", "cloud", {"scan_step_m": 0.03}, {}),
+    "truth": ("simulate.room", "truth", {"scan_step_m": 0.03}, {}),
+    "planes": ("plane.hough2d", "planes", {"n_planes_max": 2}, {"cloud": "cloud"}),
+    "labels": ("plane.hough2d", "labels", {"n_planes_max": 2}, {"cloud": "cloud"}),
+    "walls": ("raster.grid", "walls", {"gsd_m": 0.05}, {"cloud": "cloud", "planes": "planes"}),
+    "layers": ("ortho.pointcloud-direct", "layers", {}, {"cloud": "cloud", "walls": "walls"}),
+    "orthoimages": ("mosaic.seams", "orthoimages", {}, {"layers": "layers"}),
+}
+
+
+class ExampleError(OrthoflowError, LookupError):
+    """There is no example of a product type: the caller has to give one."""
+
+
+def example(type_name: str) -> Product | InputFiles:
+    """Give a small product of a type, the same in every process.
+
+    Raises:
+        ExampleError: the type is a plugin's own, or no built-in method makes it.
+    """
+    if type_name == "files":
+        return _example_files()
+    if type_name not in _ROAD:
+        raise ExampleError(
+            f"there is no example of a {type_name} product: give one in `inputs` of "
+            "conformance_cases"
+        )
+    return _on_the_road(type_name)
+
+
+def example_room(
+    *,
+    seed: int = 1,
+    n_points: int = 40_000,
+    turned_deg: float = 0.0,
+    shift_m: NDArray[np.float64] | None = None,
+) -> tuple[PointCloud, Planes]:
+    """Give a box-shaped room whose planes are known exactly.
+
+    Args:
+        seed: of noise and point positions; turning and shifting do not change them.
+        n_points: on all six sides together.
+        turned_deg: the room is turned about up by this angle, then shifted.
+        shift_m: (3,) metres.
+
+    Returns:
+        The cloud (2 mm noise, grey colours, a station in the middle) and its true planes, in the
+        order two long walls, two short walls, floor, ceiling; normals into the room.
+    """
+    rng = np.random.default_rng(seed)
+    size = np.array([5.0, 3.6, 2.6])
+    normals = np.array(
+        [[0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64
+    )
+    spans = np.array([[0, 2], [0, 2], [1, 2], [1, 2], [0, 1], [0, 1]])
+    areas = size[spans].prod(axis=1)
+    per_side = np.floor(n_points * areas / areas.sum()).astype(int)
+    turn = _turn_about_up(turned_deg)
+    origin = np.zeros(3) if shift_m is None else np.asarray(shift_m, dtype=np.float64)
+    points, offsets, corners = [], [], []
+    for normal, span, count in zip(normals, spans, per_side, strict=True):
+        distance = -0.5 * size[np.argmax(np.abs(normal))]
+        local = (rng.random((count, 3)) - 0.5) * size
+        axis = int(np.argmax(np.abs(normal)))
+        local[:, axis] = normal[axis] * (distance + 0.002 * rng.normal(size=count))
+        points.append(local @ turn.T)
+        offsets.append(distance + float(turn @ normal @ origin))
+        corners.append(_corners(turn @ normal, distance, size[span]) + origin)
+    offsets_m = np.concatenate(points).astype(np.float32)
+    grey = rng.integers(60, 200, (len(offsets_m), 1)).astype(np.uint8)
+    cloud = PointCloud(
+        origin=origin,
+        x=np.ascontiguousarray(offsets_m[:, 0]),
+        y=np.ascontiguousarray(offsets_m[:, 1]),
+        z=np.ascontiguousarray(offsets_m[:, 2]),
+        up=up_vector("z"),
+        intensity=(grey[:, 0] / 255.0).astype(np.float32),
+        rgb=np.repeat(grey, 3, axis=1),
+        stations=origin[None, :].copy(),
+        stations_source="file",
+    )
+    planes = Planes(
+        normal=normals @ turn.T,
+        offset=np.array(offsets),
+        corners=np.array(corners),
+        covariance=np.zeros((6, 4, 4)),
+        n_points=per_side.astype(np.int64),
+        rms_m=np.full(6, 0.002),
+        up=up_vector("z"),
+        names=("wall 0", "wall 1", "wall 2", "wall 3", "floor", "ceiling"),
+        viewpoint="stations",
+    )
+    return cloud, planes
+
+
+def few_points(coordinates: NDArray[np.float64]) -> PointCloud:
+    """Give a cloud of the given offsets (n, 3) with every optional array present."""
+    offsets = coordinates.astype(np.float32).reshape(-1, 3)
+    count = len(offsets)
+    return PointCloud(
+        origin=np.zeros(3),
+        x=np.ascontiguousarray(offsets[:, 0]),
+        y=np.ascontiguousarray(offsets[:, 1]),
+        z=np.ascontiguousarray(offsets[:, 2]),
+        up=up_vector("z"),
+        intensity=np.full(count, 0.5, np.float32),
+        rgb=np.full((count, 3), 128, np.uint8),
+        stations=np.zeros((1, 3)),
+        stations_source="file",
+    )
+
+
+def _turn_about_up(angle_deg: float) -> NDArray[np.float64]:
+    cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _corners(
+    normal: NDArray[np.float64], offset_m: float, sides_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    u, v = wall_axes(normal, up_vector("z"))
+    half_u, half_v = 0.5 * sides_m[0] * u, 0.5 * sides_m[1] * v
+    steps = [-half_u - half_v, -half_u + half_v, half_u + half_v, half_u - half_v]
+    return offset_m * normal + np.array(steps)
+
+
+def _example_files() -> InputFiles:
+    cloud, _ = example_room(n_points=3000)
+    path = Path(mkdtemp(prefix="orthoflow-example-")) / "room.xyz"
+    rows = np.column_stack([cloud.points_world(), np.full((len(cloud), 3), 128)])
+    np.savetxt(path, rows, fmt="%.4f %.4f %.4f %d %d %d", header="x y z r g b", comments="//")
+    return InputFiles(name="scan", paths=(path,))
+
+
+@cache
+def _catalog() -> Catalog:
+    return discover_catalog()
+
+
+@cache
+def _on_the_road(type_name: str) -> Product:
+    method_id, port, params, wired = _ROAD[type_name]
+    outputs = _run_once(method_id, tuple(params.items()), tuple(wired.items()))
+    product: Product = getattr(outputs, port)
+    return product
+
+
+@cache
+def _run_once(
+    method_id: str, params: tuple[tuple[str, object], ...], wired: tuple[tuple[str, str], ...]
+) -> object:
+    method = _catalog().method(method_id).load()
+    inputs: Callable[..., object] = method.In
+    ctx = StepContext(
+        rng=np.random.default_rng(1), cores=1, scratch=Path(mkdtemp(prefix="orthoflow-example-"))
+    )
+    products = {port: _on_the_road(type_name) for port, type_name in wired}
+    return method().run(inputs(**products), method.Params(**dict(params)), ctx)

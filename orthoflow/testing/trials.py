@@ -1,0 +1,82 @@
+"""Running a method outside a workflow, as a check needs it: once, watched, in a known folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from orthoflow.engine.store import digest_of
+from orthoflow.products import InputFiles, Product
+from orthoflow.sdk import Method, Metric, StepContext, StepEvent
+from orthoflow.sdk.context import Figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """What to run.
+
+    Attributes:
+        method: the class.
+        inputs: port -> product.
+        params: parameters that differ from the defaults.
+        seed: of the generator.
+        cores: threads the method may use.
+    """
+
+    method: type[Method]
+    inputs: Mapping[str, Product | InputFiles]
+    params: Mapping[str, object] = field(default_factory=dict)
+    seed: int = 7
+    cores: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialRun:
+    """What came out.
+
+    Attributes:
+        outputs: port -> product.
+        digests: port -> digest of the product.
+        metrics: what the method reported.
+        figures: pictures, still in the scratch folder.
+        events: progress, log lines and warnings, in order.
+    """
+
+    outputs: Mapping[str, Product]
+    digests: Mapping[str, str]
+    metrics: tuple[Metric, ...]
+    figures: tuple[Figure, ...]
+    events: tuple[StepEvent, ...]
+
+
+def run_trial(trial: Trial, scratch: Path) -> TrialRun:
+    """Run a method once in an empty scratch folder.
+
+    Raises:
+        OrthoflowError: what the method raises.
+        AssertionError: the method returned something that is not its `Out`.
+    """
+    scratch.mkdir(parents=True, exist_ok=True)
+    events: list[StepEvent] = []
+    ctx = StepContext(
+        rng=np.random.default_rng(trial.seed),
+        cores=trial.cores,
+        scratch=scratch,
+        listen=events.append,
+    )
+    method = trial.method
+    returned = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
+    if not isinstance(returned, method.Out):
+        got = type(returned).__name__
+        raise AssertionError(f"{method.id} must return an instance of its Out, got {got}")  # noqa: TRY004 - a broken rule, as every other
+    outputs = {name: value for name, value in vars(returned).items() if value is not None}
+    return TrialRun(
+        outputs=outputs,
+        digests={name: digest_of(product) for name, product in outputs.items()},
+        metrics=tuple(ctx.metrics),
+        figures=tuple(ctx.figures),
+        events=tuple(events),
+    )

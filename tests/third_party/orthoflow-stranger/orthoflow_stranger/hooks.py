@@ -1,0 +1,34 @@
+"""What the plugin announces."""
+
+from orthoflow.sdk import KindSpec, MethodSpec, hookimpl
+
+_MISCHIEF = "orthoflow_stranger.mischief"
+
+
+@hookimpl
+def orthoflow_methods() -> list[MethodSpec]:
+    return [
+        MethodSpec(
+            id="plane.median",
+            target="orthoflow_stranger.median:MedianPlanes",
+            summary="one level plane through the median height, one wall through the densest azimuth",
+        ),
+        MethodSpec(id="mischief.crash", target=f"{_MISCHIEF}:Crash", summary="segfaults"),
+        MethodSpec(id="mischief.eat", target=f"{_MISCHIEF}:Eat", summary="takes all memory"),
+        MethodSpec(id="mischief.hang", target=f"{_MISCHIEF}:Hang", summary="never ends"),
+        MethodSpec(id="mischief.raise", target=f"{_MISCHIEF}:Raise", summary="raises"),
+        MethodSpec(id="mischief.exit", target=f"{_MISCHIEF}:Exit", summary="exits the process"),
+        MethodSpec(id="mischief.fill", target=f"{_MISCHIEF}:Fill", summary="fills the disk"),
+    ]
+
+
+@hookimpl
+def orthoflow_kinds() -> list[KindSpec]:
+    return [
+        KindSpec(
+            name="mischief",
+            summary="methods that fail in every way a method can",
+            inputs={"cloud": "cloud"},
+            outputs={"planes": "planes"},
+        )
+    ]
