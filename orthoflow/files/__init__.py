@@ -1,1 +1,1 @@
-"""Files of other programs: point files, images, GeoTIFF, and what orthoflow publishes."""
+"""Files of other programs: images, GeoTIFF, point clouds, and what a run publishes for people."""

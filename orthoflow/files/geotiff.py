@@ -1,0 +1,202 @@
+"""GeoTIFF in the plane of a wall: one-band rasters and cloud-optimised orthoimages.
+
+X = gsd * column and Y = -gsd * row in a local metric coordinate system, pixel-is-area, so that GIS
+and CAD programs measure metres on the wall. Equal rasters give equal bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError, ProductError, StoreError
+
+LOCAL_CRS_WKT: Final = (
+    'LOCAL_CS["plane of the wall, metres",UNIT["metre",1.0],AXIS["X",EAST],AXIS["Y",NORTH]]'
+)
+TILE_PX: Final = 512
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterFile:
+    """What a GeoTIFF holds.
+
+    Attributes:
+        values: (rows, cols) for one band, (rows, cols, bands) for more; stored type.
+        shown: (rows, cols) True where the dataset mask says that there is something.
+        gsd_m: side of a cell in metres.
+        tags: the dataset's tags.
+        crs_wkt: coordinate system, as GDAL gives it.
+        nodata: the value that means nothing, or None.
+        overviews: factors of the overviews.
+        layout: `COG` for a cloud-optimised file, else empty.
+    """
+
+    values: NDArray[np.generic]
+    shown: NDArray[np.bool_]
+    gsd_m: float
+    tags: dict[str, str] = field(default_factory=dict)
+    crs_wkt: str = ""
+    nodata: float | None = None
+    overviews: tuple[int, ...] = ()
+    layout: str = ""
+
+
+def write_raster(
+    path: Path, values: NDArray[np.generic], *, gsd_m: float, tags: Mapping[str, str]
+) -> None:
+    """Write one band: float32 with NaN for nothing, or uint8 classes without a nodata value.
+
+    Args:
+        path: file to write; its folder exists.
+        values: (rows, cols) float32 or uint8.
+        gsd_m: side of a cell in metres.
+        tags: text to keep with the raster.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    if values.ndim != 2 or values.dtype not in (np.dtype(np.float32), np.dtype(np.uint8)):
+        raise ProductError(
+            f"{path.name} takes a flat raster of float32 or uint8, got {values.dtype} of shape "
+            f"{values.shape}"
+        )
+    is_float = values.dtype == np.dtype(np.float32)
+    profile: dict[str, object] = {
+        "driver": "GTiff",
+        "count": 1,
+        "dtype": str(values.dtype),
+        "compress": "DEFLATE",
+        "predictor": 3 if is_float else 2,
+        "tiled": True,
+        "blockxsize": TILE_PX,
+        "blockysize": TILE_PX,
+    }
+    if is_float:
+        profile["nodata"] = math.nan
+    _write(path, values[None], None, profile | _placed(values.shape, gsd_m), tags)
+
+
+def write_orthoimage(
+    path: Path,
+    rgb: NDArray[np.uint8],
+    shown: NDArray[np.bool_],
+    *,
+    gsd_m: float,
+    tags: Mapping[str, str],
+) -> None:
+    """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
+
+    Args:
+        path: file to write; its folder exists.
+        rgb: (rows, cols, 3) sRGB.
+        shown: (rows, cols) True where the image shows something (painted or filled).
+        gsd_m: side of a cell in metres.
+        tags: text to keep with the image.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or rgb.shape[:2] != shown.shape:
+        raise ProductError(
+            f"{path.name} takes uint8 RGB and a mask of one size, got {rgb.dtype} of shape "
+            f"{rgb.shape} and a mask of {shown.shape}"
+        )
+    profile: dict[str, object] = {
+        "driver": "COG",
+        "count": 3,
+        "dtype": "uint8",
+        "compress": "DEFLATE",
+        "predictor": "YES",
+        "blocksize": TILE_PX,
+        # The driver makes overviews itself; odd factors with a mask crashed older builds.
+        "overviews": "AUTO",
+        "resampling": "AVERAGE",
+    }
+    bands = np.moveaxis(rgb, 2, 0)
+    _write(path, bands, shown, profile | _placed(shown.shape, gsd_m), tags)
+
+
+def read_raster(path: Path) -> RasterFile:
+    """Read a GeoTIFF that orthoflow or another program wrote.
+
+    Raises:
+        InputError: the file is no GeoTIFF that GDAL can read.
+    """
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    try:
+        with _quiet(), rasterio.open(path) as dataset:
+            values = dataset.read()
+            return RasterFile(
+                values=values[0] if len(values) == 1 else np.moveaxis(values, 0, 2),
+                shown=dataset.dataset_mask() > 0,
+                gsd_m=float(dataset.transform.a),
+                tags=dict(dataset.tags()),
+                crs_wkt=dataset.crs.to_wkt() if dataset.crs else "",
+                nodata=dataset.nodata,
+                overviews=tuple(dataset.overviews(1)),
+                layout=dataset.tags(ns="IMAGE_STRUCTURE").get("LAYOUT", ""),
+            )
+    except (RasterioError, OSError) as error:
+        raise InputError(
+            f"{path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
+        ) from error
+
+
+def _placed(shape: tuple[int, ...], gsd_m: float) -> dict[str, object]:
+    from rasterio.crs import CRS
+    from rasterio.transform import Affine
+
+    return {
+        "height": shape[0],
+        "width": shape[1],
+        "crs": CRS.from_wkt(LOCAL_CRS_WKT),
+        "transform": Affine(gsd_m, 0.0, 0.0, 0.0, -gsd_m, 0.0),
+    }
+
+
+def _write(
+    path: Path,
+    bands: NDArray[np.generic],
+    shown: NDArray[np.bool_] | None,
+    profile: Mapping[str, object],
+    tags: Mapping[str, str],
+) -> None:
+    from rasterio.enums import ColorInterp
+    from rasterio.errors import RasterioError
+    from rasterio.io import MemoryFile
+
+    try:
+        with _quiet(), MemoryFile(ext=".tif") as memory:
+            with memory.open(**profile) as dataset:
+                if len(bands) == 3:
+                    dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+                dataset.write(bands)
+                if shown is not None:
+                    dataset.write_mask(shown)
+                dataset.update_tags(AREA_OR_POINT="Area", **tags)
+            # Python writes the file: GDAL only logs a disk that gets full at closing.
+            with path.open("wb") as target:
+                target.write(memory.getbuffer())
+    except (RasterioError, OSError) as error:
+        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep GDAL's masks inside the file and rasterio's advice out of the user's terminal."""
+    import rasterio
+
+    with warnings.catch_warnings(), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+        warnings.simplefilter("ignore")
+        yield

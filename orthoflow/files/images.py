@@ -1,0 +1,119 @@
+"""Photos and pictures as bytes: decode, encode, and small previews for the report.
+
+Arrays are RGB at this border; OpenCV's BGR stays inside. Nothing here turns a picture by its EXIF
+orientation: the pixel frame is the stored array.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError, ProductError
+
+PREVIEW_SIDE_PX: Final = 1600
+STRETCH_PERCENTILES: Final = (1.0, 99.0)
+
+
+def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
+    """Decode a JPEG, PNG, TIFF ... file into (rows, cols, 3) RGB.
+
+    Args:
+        encoded: the file's bytes.
+        name: what to call it in an error.
+
+    Raises:
+        InputError: the bytes are no image that OpenCV knows, or it is cut off.
+    """
+    import cv2
+
+    try:
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
+    except cv2.error as error:
+        raise InputError(_not_an_image(encoded, name)) from error
+    if image is None:
+        raise InputError(_not_an_image(encoded, name))
+    return np.ascontiguousarray(image[:, :, ::-1]).astype(np.uint8, copy=False)
+
+
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """Encode (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA as PNG."""
+    return _encode(".png", image, [])
+
+
+def encode_jpeg(image: NDArray[np.uint8], *, quality: int = 90) -> bytes:
+    """Encode (rows, cols) grey or (rows, cols, 3) RGB as JPEG; quality 1..100."""
+    import cv2
+
+    return _encode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def stretch_to_grey(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Grey picture of a raster: the 1st percentile is black, the 99th white, NaN is black."""
+    known = np.isfinite(values)
+    if not known.any():
+        return np.zeros(values.shape, dtype=np.uint8)
+    low, high = np.percentile(values[known], STRETCH_PERCENTILES)
+    span = max(float(high - low), 1e-12)
+    scaled = (np.where(known, values, low) - low) / span
+    grey: NDArray[np.uint8] = np.rint(np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
+    return grey
+
+
+def preview_png(
+    image: NDArray[np.uint8], shown: NDArray[np.bool_], *, longest_side_px: int = PREVIEW_SIDE_PX
+) -> bytes:
+    """Give a small PNG of a raster, transparent where nothing is shown.
+
+    Args:
+        image: (rows, cols) grey or (rows, cols, 3) RGB.
+        shown: (rows, cols), True where the image holds something.
+        longest_side_px: larger images are averaged down to this; smaller ones stay as they are.
+    """
+    colour = np.dstack([image] * 3) if image.ndim == 2 else image
+    weight = shown.astype(np.float32)
+    if max(shown.shape) > longest_side_px:
+        # Averaged under the mask: black void must not darken the rim of what is shown.
+        summed = _shrink(colour * weight[:, :, None], longest_side_px)
+        weight = _shrink(weight, longest_side_px)
+        colour = np.rint(summed / np.maximum(weight, 1e-6)[:, :, None]).astype(np.uint8)
+    alpha = np.rint(weight * 255.0).astype(np.uint8)
+    return encode_png(np.dstack([colour, alpha]))
+
+
+def _shrink(values: NDArray[np.float32], longest_side_px: int) -> NDArray[np.float32]:
+    import cv2
+
+    rows, columns = values.shape[:2]
+    scale = longest_side_px / max(rows, columns)
+    size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _encode(suffix: str, image: NDArray[np.uint8], options: list[int]) -> bytes:
+    import cv2
+
+    if image.dtype != np.uint8 or not (
+        image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (3, 4))
+    ):
+        raise ProductError(
+            f"an image to encode must be uint8 of shape (rows, cols[, 3 or 4]), got {image.dtype} "
+            f"of shape {image.shape}"
+        )
+    if image.ndim == 3:
+        code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
+        image = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), code), dtype=np.uint8)
+    done, encoded = cv2.imencode(suffix, np.ascontiguousarray(image), options)
+    if not done:
+        raise ProductError(f"an image of shape {image.shape} could not be encoded as {suffix}")
+    return encoded.tobytes()
+
+
+def _not_an_image(encoded: bytes, name: str) -> str:
+    return (
+        f"{name} cannot be decoded as an image ({len(encoded)} bytes): expected a whole JPEG, PNG "
+        "or TIFF file; open it in an image viewer, or copy it again from the camera"
+    )

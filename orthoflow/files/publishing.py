@@ -1,0 +1,239 @@
+"""The files of a run that people open in other programs, one function per product type.
+
+Each takes the product, an existing empty folder and the product's digest, and writes the same bytes
+for the same product. The `k` in file names is the wall's position in `Walls`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.files.geotiff import write_orthoimage, write_raster
+from orthoflow.files.images import preview_png, stretch_to_grey
+from orthoflow.files.sidecars import (
+    ORTHO_MASK_MEANINGS,
+    SURFACE_MASK_MEANINGS,
+    frame_json,
+    mask_meanings,
+    number,
+    numbers,
+    raster_tags,
+    write_bytes,
+    write_json,
+    write_text,
+)
+from orthoflow.geometry import omega_phi_deg
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    JsonValue,
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    Planes,
+    TieRole,
+    Ties,
+    Wall,
+    Walls,
+)
+
+# OpenCV puts (0, 0) at the centre of the first pixel, orthoflow (0.5, 0.5).
+OPENCV_SHIFT_PX: Final = -0.5
+PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
+TIE_COLUMNS: Final = (
+    "photo",
+    "wall",
+    "u_px",
+    "v_px",
+    "x",
+    "y",
+    "z",
+    "role",
+    "residual_u_px",
+    "residual_v_px",
+    "sigma_px",
+    # A comment line would break plain CSV readers, so the header says it in a column of its own.
+    "opencv_pixel_convention",
+)
+
+
+def publish_planes(product: Planes, folder: Path, digest: str) -> None:
+    """Write `planes.json`: the planes in order of support, largest first."""
+    planes: list[JsonValue] = []
+    for index in range(len(product)):
+        omega, phi = omega_phi_deg(product.normal[index], product.up)
+        entry: dict[str, JsonValue] = {
+            "normal": numbers(product.normal[index]),
+            "offset_m": float(product.offset[index]),
+            "corners_world": numbers(product.corners[index]),
+            "n_points": int(product.n_points[index]),
+            "rms_mm": number(1000.0 * float(product.rms_m[index])),
+            "label": product.names[index],
+            "omega_deg": omega,
+            "phi_deg": phi,
+            "viewpoint": product.viewpoint,
+        }
+        if product.part_corners is not None and product.part_plane is not None:
+            entry["part_corners_world"] = numbers(product.part_corners[product.part_plane == index])
+        planes.append(entry)
+    write_json(
+        folder / "planes.json",
+        {"planes": planes, "up": numbers(product.up), "product_digest": digest},
+    )
+
+
+def publish_walls(product: Walls, folder: Path, digest: str) -> None:
+    """Write `wall_<k>_depth.tif`, `wall_<k>_intensity.tif` if any, sidecars and previews."""
+    for index, wall in enumerate(product.walls):
+        details: dict[str, JsonValue] = {
+            "plane_index": wall.plane_index,
+            "intensity_source": product.intensity_source,
+            "buffer": {"front_m": product.buffer_front_m, "behind_m": product.buffer_behind_m},
+        }
+        _publish_band(folder / f"wall_{index}_depth", wall.depth_m, wall, digest, details)
+        if wall.intensity is not None:
+            _publish_band(folder / f"wall_{index}_intensity", wall.intensity, wall, digest, details)
+
+
+def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None:
+    """Write `wall_<k>_ortho.tif`, the raster of its mask, sidecars and a preview."""
+    for image in product.images:
+        shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
+        stem = f"wall_{image.wall}_ortho"
+        gsd_m = image.frame.gsd_m
+        tags = raster_tags(
+            image.frame, digest=digest, name=image.name, content="orthoimage, sRGB", extra={}
+        )
+        write_orthoimage(folder / f"{stem}.tif", image.rgb, shown, gsd_m=gsd_m, tags=tags)
+        mask_tags = tags | {"content": "mask of the orthoimage"}
+        write_raster(folder / f"{stem}_mask.tif", image.mask, gsd_m=gsd_m, tags=mask_tags)
+        _write_ortho_sidecars(folder, stem, image, digest)
+        write_bytes(folder / f"{stem}.png", preview_png(image.rgb, shown))
+
+
+def publish_ties(product: Ties, folder: Path, digest: str) -> None:
+    """Write `ties.csv`: pixels in OpenCV's convention, residuals observed - computed."""
+    del digest  # A table of numbers has no place for it; the record names it.
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(TIE_COLUMNS)
+    pixels = product.pixels_photo + OPENCV_SHIFT_PX
+    for index in range(len(product.photo)):
+        table.writerow(
+            [
+                product.photo_names[int(product.photo[index])],
+                int(product.wall[index]),
+                *(_cell(value) for value in pixels[index]),
+                *(_cell(value) for value in product.points_world[index]),
+                TieRole(int(product.role[index])).name.lower(),
+                *(_cell(value) for value in product.residual_px[index]),
+                _cell(product.sigma_px[index]),
+                "first pixel centre at 0 0",
+            ]
+        )
+    write_text(folder / "ties.csv", text.getvalue())
+
+
+def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
+    """Write `cameras.json`, and `ties.csv` with the residuals if the orientation kept its ties."""
+    write_json(
+        folder / "cameras.json",
+        {
+            "pixel_convention": PIXEL_CONVENTION,
+            "camera_axes": "x right, y down, z forward; X_camera = R X_world + t, metres",
+            "cameras": {camera.photo: _camera_json(camera) for camera in product.cameras},
+            "product_digest": digest,
+        },
+    )
+    if product.ties is not None:
+        publish_ties(product.ties, folder, digest)
+
+
+def _publish_band(
+    stem: Path,
+    values: NDArray[np.float32],
+    wall: Wall,
+    digest: str,
+    details: dict[str, JsonValue],
+) -> None:
+    """Write one float raster of a wall with its sidecar and preview."""
+    is_depth = values is wall.depth_m
+    meaning = (
+        "depth in metres along the normal, positive towards the viewer; NaN = nothing"
+        if is_depth
+        else f"intensity 0..1 ({details['intensity_source']}); NaN = nothing"
+    )
+    tags = raster_tags(
+        wall.frame, digest=digest, name=wall.name, content=meaning, extra={"unit": "m"}
+    )
+    if not is_depth:
+        tags |= {"unit": "1", "intensity_source": str(details["intensity_source"])}
+    write_raster(stem.with_suffix(".tif"), values, gsd_m=wall.frame.gsd_m, tags=tags)
+    write_json(
+        stem.with_suffix(".json"),
+        frame_json(wall.frame)
+        | details
+        | {
+            "name": wall.name,
+            "content": meaning,
+            "mask": mask_meanings(SURFACE_MASK_MEANINGS),
+            "mask_counts": _counts(wall.mask),
+            "product_digest": digest,
+        },
+    )
+    picture = preview_png(stretch_to_grey(values), np.isfinite(values))
+    write_bytes(stem.with_suffix(".png"), picture)
+
+
+def _write_ortho_sidecars(folder: Path, stem: str, image: Orthoimage, digest: str) -> None:
+    content = frame_json(image.frame) | {
+        "wall": image.wall,
+        "name": image.name,
+        "sources": list(image.sources),
+        "mask": mask_meanings(ORTHO_MASK_MEANINGS),
+        "mask_counts": _counts(image.mask),
+        "dataset_mask": "255 where the mask is painted (1) or filled (2), else 0",
+        "mask_raster": f"{stem}_mask.tif",
+        "product_digest": digest,
+    }
+    write_json(folder / f"{stem}.json", content | {"content": "orthoimage, sRGB"})
+    write_json(folder / f"{stem}_mask.json", content | {"content": "mask of the orthoimage"})
+
+
+def _counts(mask: NDArray[np.uint8]) -> JsonValue:
+    values, counts = np.unique(mask, return_counts=True)
+    return {str(int(value)): int(count) for value, count in zip(values, counts, strict=True)}
+
+
+def _camera_json(camera: Camera) -> JsonValue:
+    entry: dict[str, JsonValue] = {"status": camera.status}
+    inner = camera.intrinsics
+    if inner is not None:
+        entry["K"] = [
+            [inner.fx, 0.0, inner.cx + OPENCV_SHIFT_PX],
+            [0.0, inner.fy, inner.cy + OPENCV_SHIFT_PX],
+            [0.0, 0.0, 1.0],
+        ]
+        entry["distortion"] = list(inner.distortion)
+        entry["width"] = inner.width
+        entry["height"] = inner.height
+    if camera.rotation_camera_from_world is not None:
+        entry["R_camera_from_world"] = numbers(camera.rotation_camera_from_world)
+    if camera.translation_camera_from_world is not None:
+        entry["t_camera_from_world"] = numbers(camera.translation_camera_from_world)
+    if camera.sigma_wall_m is not None:
+        entry["sigma_wall_mm"] = number(1000.0 * camera.sigma_wall_m)
+    if camera.sigma0_px is not None:
+        entry["sigma0_px"] = number(camera.sigma0_px)
+    return entry
+
+
+def _cell(value: float) -> str:
+    """Shortest text that gives the number back; empty for NaN."""
+    return repr(float(value)) if np.isfinite(value) else ""

@@ -1,0 +1,316 @@
+"""What a run publishes: GeoTIFF, JSON beside it, tables; and what other programs read there."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError, ProductError, StoreError
+from orthoflow.files import geotiff, images, publishing
+from orthoflow.geometry import WallFrame
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Intrinsics,
+    Orthoimage,
+    Orthoimages,
+    Planes,
+    TieRole,
+    Ties,
+    Wall,
+    Walls,
+)
+
+DIGEST = "sha256:" + "ab" * 32
+
+
+@pytest.fixture
+def frame() -> WallFrame:
+    return WallFrame(
+        origin_world=np.array([634512.347, 486215.781, 114.5]),
+        u_world=np.array([0.0, 1.0, 0.0]),
+        v_world=np.array([0.0, 0.0, -1.0]),
+        normal_world=np.array([1.0, 0.0, 0.0]),
+        gsd_m=0.01,
+        width=700,
+        height=40,
+    )
+
+
+def orthoimage(frame: WallFrame, wall: int = 3) -> Orthoimage:
+    rng = np.random.default_rng(5)
+    rgb = rng.integers(0, 256, (*frame.shape, 3), dtype=np.uint8)
+    mask = rng.integers(0, 5, frame.shape, dtype=np.uint8)
+    return Orthoimage(
+        frame=frame,
+        wall=wall,
+        name="wall 3",
+        rgb=rgb,
+        mask=mask,
+        source=np.zeros(frame.shape, np.int16),
+        sources=("cloud",),
+    )
+
+
+def walls(frame: WallFrame, intensity: NDArray[np.float32] | None) -> Walls:
+    depth = np.full(frame.shape, np.nan, dtype=np.float32)
+    depth[5:, 10:] = np.linspace(-0.1, 0.2, 690, dtype=np.float32)
+    wall = Wall(
+        frame=frame,
+        plane_index=2,
+        name="wall 2",
+        depth_m=depth,
+        sigma_m=np.zeros(frame.shape, np.float32),
+        count=np.ones(frame.shape, np.uint32),
+        mask=np.isfinite(depth).astype(np.uint8),
+        intensity=intensity,
+    )
+    return Walls(
+        walls=(wall,),
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity_source="none" if intensity is None else "laser",
+        buffer_front_m=0.3,
+        buffer_behind_m=0.2,
+    )
+
+
+def ties() -> Ties:
+    return Ties(
+        photo_names=("b.jpg", "a.jpg"),
+        photo=np.array([1, 0], np.int32),
+        wall=np.array([0, 2], np.int32),
+        pixels_photo=np.array([[0.5, 0.5], [100.25, 7.125]]),
+        points_world=np.array([[634512.347, 1.0, 2.0], [0.1, 0.2, 0.3]]),
+        sigma_px=np.array([0.5, 1.0]),
+        sigma_m=np.array([0.001, 0.002]),
+        role=np.array([TieRole.CONTROL, TieRole.REJECTED], np.uint8),
+        residual_px=np.array([[0.25, -0.125], [np.nan, np.nan]]),
+    )
+
+
+def test_an_orthoimage_file_gives_back_every_pixel_and_shows_painted_and_filled_cells_only(
+    tmp_path: Path, frame: WallFrame
+) -> None:
+    image = orthoimage(frame)
+    publishing.publish_orthoimages(Orthoimages(images=(image,)), tmp_path, DIGEST)
+
+    read = geotiff.read_raster(tmp_path / "wall_3_ortho.tif")
+    np.testing.assert_array_equal(read.values, image.rgb)
+    np.testing.assert_array_equal(read.shown, (image.mask == 1) | (image.mask == 2))
+    np.testing.assert_array_equal(
+        geotiff.read_raster(tmp_path / "wall_3_ortho_mask.tif").values, image.mask
+    )
+    assert read.gsd_m == 0.01
+    assert read.layout == "COG"
+    assert read.overviews
+    assert "metre" in read.crs_wkt.lower()
+    assert read.tags["product_digest"] == DIGEST
+    assert json.loads(read.tags["plane"])["offset_m"] == pytest.approx(634512.347, abs=1e-9)
+    assert json.loads(read.tags["frame"])["v_world"] == [0.0, 0.0, -1.0]
+
+
+def test_geotiffs_lie_in_metres_with_rows_downwards(tmp_path: Path, frame: WallFrame) -> None:
+    import rasterio
+
+    publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
+    with rasterio.open(tmp_path / "wall_3_ortho.tif") as dataset:
+        assert tuple(dataset.transform)[:6] == (0.01, 0.0, 0.0, 0.0, -0.01, 0.0)
+        assert dataset.tags()["AREA_OR_POINT"] == "Area"
+        assert [item.name for item in dataset.colorinterp] == ["red", "green", "blue"]
+        assert dataset.count == 3
+
+
+def test_the_sidecar_places_the_raster_in_the_world(tmp_path: Path, frame: WallFrame) -> None:
+    publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
+    sidecar = json.loads((tmp_path / "wall_3_ortho.json").read_text())
+    pixel = np.array([[123.5, 20.5]])
+    world = np.array(sidecar["origin_world"]) + sidecar["gsd_m"] * (
+        pixel[0, 0] * np.array(sidecar["u_world"]) + pixel[0, 1] * np.array(sidecar["v_world"])
+    )
+    np.testing.assert_allclose(world, frame.world_from_wall(pixel)[0], atol=1e-9)
+    assert sidecar["normal_world"] == [1.0, 0.0, 0.0]
+    assert (sidecar["width"], sidecar["height"]) == (700, 40)
+    assert set(sidecar["mask"]) == {"0", "1", "2", "3", "4"}
+    assert sum(sidecar["mask_counts"].values()) == 700 * 40
+    assert sidecar["product_digest"] == DIGEST
+
+
+def test_publishing_twice_gives_the_same_bytes(tmp_path: Path, frame: WallFrame) -> None:
+    intensity = np.linspace(0, 1, 28000, dtype=np.float32).reshape(frame.shape)
+    contents = []
+    for name in ("first", "second"):
+        folder = tmp_path / name
+        folder.mkdir()
+        publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), folder, DIGEST)
+        publishing.publish_walls(walls(frame, intensity), folder, DIGEST)
+        contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert contents[0] == contents[1]
+    assert set(contents[0]) == {
+        *(f"wall_3_ortho{suffix}" for suffix in (".tif", ".json", ".png")),
+        *(f"wall_3_ortho_mask{suffix}" for suffix in (".tif", ".json")),
+        *(f"wall_0_depth{suffix}" for suffix in (".tif", ".json", ".png")),
+        *(f"wall_0_intensity{suffix}" for suffix in (".tif", ".json", ".png")),
+    }
+
+
+def test_depth_keeps_its_bits_and_its_nothing(tmp_path: Path, frame: WallFrame) -> None:
+    product = walls(frame, None)
+    publishing.publish_walls(product, tmp_path, DIGEST)
+    read = geotiff.read_raster(tmp_path / "wall_0_depth.tif")
+    np.testing.assert_array_equal(read.values, product.walls[0].depth_m)
+    np.testing.assert_array_equal(read.shown, np.isfinite(product.walls[0].depth_m))
+    assert read.nodata is not None
+    assert np.isnan(read.nodata)
+    sidecar = json.loads((tmp_path / "wall_0_depth.json").read_text())
+    assert sidecar["buffer"] == {"front_m": 0.3, "behind_m": 0.2}
+    assert sidecar["plane"]["normal"] == [1.0, 0.0, 0.0]
+    assert sidecar["name"] == "wall 2"
+    assert sidecar["intensity_source"] == "none"
+    assert not (tmp_path / "wall_0_intensity.tif").exists()
+
+
+def test_planes_are_published_with_the_agreed_keys(tmp_path: Path) -> None:
+    corners = np.array([[[3.0, 0, 2], [3.0, 0, 0], [3.0, 4, 0], [3.0, 4, 2]]])
+    product = Planes(
+        normal=np.array([[1.0, 0.0, 0.0]]),
+        offset=np.array([3.0]),
+        corners=corners,
+        covariance=np.zeros((1, 4, 4)),
+        n_points=np.array([1234], np.int64),
+        rms_m=np.array([np.nan]),
+        up=np.array([0.0, 0.0, 1.0]),
+        names=("wall 0",),
+        part_corners=np.concatenate([corners, corners + 1.0]),
+        part_plane=np.array([0, 0], np.int32),
+    )
+    publishing.publish_planes(product, tmp_path, DIGEST)
+    (plane,) = json.loads((tmp_path / "planes.json").read_text())["planes"]
+    assert plane["normal"] == [1.0, 0.0, 0.0]
+    assert plane["offset_m"] == 3.0
+    assert plane["corners_world"] == corners[0].tolist()
+    assert plane["n_points"] == 1234
+    assert plane["rms_mm"] is None
+    assert plane["label"] == "wall 0"
+    assert len(plane["part_corners_world"]) == 2
+    assert (plane["omega_deg"], plane["phi_deg"]) == (0.0, 0.0)
+
+
+def test_published_cameras_and_ties_agree_in_opencv_pixels(tmp_path: Path) -> None:
+    camera = Camera(
+        photo="a.jpg",
+        status="ok",
+        intrinsics=Intrinsics(width=3000, height=2000, fx=2500.0, fy=2501.0, cx=1500.0, cy=1000.0),
+        rotation_camera_from_world=np.eye(3),
+        translation_camera_from_world=np.array([0.0, 0.0, 5.0]),
+        sigma_wall_m=0.0015,
+    )
+    lost = Camera(photo="b.jpg", status="only 3 ties, 6 are needed")
+    publishing.publish_cameras(Cameras(cameras=(camera, lost), ties=ties()), tmp_path, DIGEST)
+
+    content = json.loads((tmp_path / "cameras.json").read_text())
+    assert "OpenCV" in content["pixel_convention"]
+    first = content["cameras"]["a.jpg"]
+    assert first["K"] == [[2500.0, 0.0, 1499.5], [0.0, 2501.0, 999.5], [0.0, 0.0, 1.0]]
+    assert first["distortion"] == [0.0] * 5
+    assert first["R_camera_from_world"] == np.eye(3).tolist()
+    assert first["t_camera_from_world"] == [0.0, 0.0, 5.0]
+    assert (first["width"], first["height"]) == (3000, 2000)
+    assert first["sigma_wall_mm"] == pytest.approx(1.5, abs=1e-12)
+    assert content["cameras"]["b.jpg"] == {"status": "only 3 ties, 6 are needed"}
+
+    with (tmp_path / "ties.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert (rows[0]["photo"], rows[0]["wall"], rows[0]["role"]) == ("a.jpg", "0", "control")
+    assert (float(rows[0]["u_px"]), float(rows[0]["v_px"])) == (0.0, 0.0)
+    assert float(rows[0]["x"]) == 634512.347
+    assert float(rows[0]["residual_v_px"]) == -0.125
+    assert (rows[1]["photo"], rows[1]["role"], rows[1]["residual_u_px"]) == (
+        "b.jpg",
+        "rejected",
+        "",
+    )
+    assert any("opencv" in name for name in rows[0])
+
+
+def test_a_folder_that_cannot_be_written_is_said_in_one_sentence(
+    tmp_path: Path, frame: WallFrame
+) -> None:
+    with pytest.raises(StoreError, match=r"wall_3_ortho\.tif cannot be written: .*No such file"):
+        publishing.publish_orthoimages(
+            Orthoimages(images=(orthoimage(frame),)), tmp_path / "missing", DIGEST
+        )
+    with pytest.raises(StoreError, match=r"ties\.csv cannot be written"):
+        publishing.publish_ties(ties(), tmp_path / "missing", DIGEST)
+
+
+def test_rasters_of_a_wrong_type_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match=r"a\.tif takes a flat raster of float32 or uint8"):
+        geotiff.write_raster(tmp_path / "a.tif", np.zeros((2, 2)), gsd_m=1.0, tags={})
+    with pytest.raises(ProductError, match=r"a\.tif takes uint8 RGB and a mask of one size"):
+        geotiff.write_orthoimage(
+            tmp_path / "a.tif",
+            np.zeros((2, 2, 3), np.uint8),
+            np.zeros((3, 2), np.bool_),
+            gsd_m=1.0,
+            tags={},
+        )
+
+
+def test_reading_something_else_as_a_geotiff_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "text.tif"
+    path.write_text("no picture")
+    with pytest.raises(InputError, match=r"text\.tif cannot be read as a GeoTIFF"):
+        geotiff.read_raster(path)
+
+
+def test_png_round_trip_keeps_the_order_of_the_channels() -> None:
+    rgb = np.random.default_rng(1).integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(images.decode_image(images.encode_png(rgb)), rgb)
+
+
+def test_jpeg_keeps_red_red() -> None:
+    red = np.zeros((16, 16, 3), np.uint8)
+    red[:, :, 0] = 255
+    decoded = images.decode_image(images.encode_jpeg(red, quality=95))
+    assert decoded[..., 0].min() > 240
+    assert decoded[..., 2].max() < 20
+
+
+def test_what_is_no_image_is_refused() -> None:
+    with pytest.raises(InputError, match=r"photo\.jpg cannot be decoded as an image \(4 bytes\)"):
+        images.decode_image(b"text", "photo.jpg")
+    with pytest.raises(InputError, match="cannot be decoded"):
+        images.decode_image(b"", "photo.jpg")
+    with pytest.raises(ProductError, match="must be uint8"):
+        images.encode_png(np.zeros((2, 2, 5), np.uint8))
+
+
+def test_the_stretch_puts_the_percentiles_at_black_and_white() -> None:
+    values = np.linspace(0.0, 100.0, 1001)
+    values[0] = np.nan
+    grey = images.stretch_to_grey(values)
+    assert grey[0] == 0
+    assert grey[5] == 0
+    assert grey[-5] == 255
+    assert grey[501] == pytest.approx(128, abs=1)
+    assert images.stretch_to_grey(np.full((2, 2), np.nan)).max() == 0
+
+
+def test_previews_are_small_and_do_not_darken_at_the_rim_of_voids() -> None:
+    rgb = np.zeros((100, 5000, 3), np.uint8)
+    shown = np.zeros((100, 5000), np.bool_)
+    rgb[:, :2501] = 200
+    shown[:, :2501] = True
+    import cv2
+
+    preview = cv2.imdecode(
+        np.frombuffer(images.preview_png(rgb, shown), np.uint8), cv2.IMREAD_UNCHANGED
+    )
+    assert preview is not None
+    assert preview.shape == (32, 1600, 4)
+    assert set(np.unique(preview[preview[:, :, 3] > 0][:, :3])) <= {199, 200}
