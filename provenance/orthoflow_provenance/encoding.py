@@ -1,0 +1,210 @@
+"""How text and attributes lie in HDF5, and what becomes of HDF5's own errors."""
+
+from __future__ import annotations
+
+import json
+import math
+import unicodedata
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Final
+
+import h5py
+import numpy as np
+
+from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.model import JsonValue
+
+# Everything that h5py raises for damaged files; which one depends on where the damage is.
+HDF5_ERRORS: Final = (
+    OSError,
+    RuntimeError,
+    KeyError,
+    ValueError,
+    TypeError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+    SystemError,
+)
+
+AttributeValue = str | int | float
+
+
+@contextmanager
+def reading(place: str) -> Iterator[None]:
+    """Turn whatever HDF5 says about a damaged place into one sentence.
+
+    Raises:
+        RecordFormatError: something inside failed.
+    """
+    try:
+        yield
+    except RecordFormatError:
+        raise
+    except HDF5_ERRORS as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RecordFormatError(f"{place} cannot be read, the file is damaged: {reason}") from error
+
+
+def check_name(name: str, what: str) -> str:
+    """Refuse names that cannot be one link in HDF5 or one line in the seal.
+
+    Raises:
+        RecordFormatError: the name is empty, `.` or `..`, or holds `/` or a control character.
+    """
+    if (
+        name in {"", ".", ".."}
+        or "/" in name
+        or any(unicodedata.category(letter) in {"Cc", "Cs", "Zl", "Zp"} for letter in name)
+    ):
+        raise RecordFormatError(
+            f"{what} {name!r} cannot be a name in a record: names are not empty, not `.` or `..`, "
+            "and hold neither `/` nor control characters"
+        )
+    return name
+
+
+def storable_text(text: str) -> str:
+    """Drop NUL characters, which HDF5 text cannot hold, and replace halves of surrogate pairs."""
+    return text.replace("\0", "").encode("utf-8", "replace").decode("utf-8")
+
+
+def set_attributes(group: h5py.Group, values: Mapping[str, AttributeValue]) -> None:
+    """Write scalar attributes: text as UTF-8, whole numbers as int64, others as float64."""
+    for name, value in values.items():
+        if isinstance(value, str):
+            group.attrs[name] = storable_text(value)
+        elif isinstance(value, int):
+            group.attrs[name] = np.int64(value)
+        else:
+            group.attrs[name] = np.float64(value)
+
+
+def text_attribute(group: h5py.Group, name: str) -> str:
+    """Read a text attribute.
+
+    Raises:
+        RecordFormatError: it is missing or not text.
+    """
+    value = _attribute(group, name)
+    if isinstance(value, bytes):
+        value = decoded(bytes(value), f"{group.name}@{name}")
+    if not isinstance(value, str):
+        raise _wrong_attribute(group, name, "text", value)
+    return value
+
+
+def int_attribute(group: h5py.Group, name: str) -> int:
+    """Read a whole-number attribute.
+
+    Raises:
+        RecordFormatError: it is missing or no whole number.
+    """
+    value = _attribute(group, name)
+    if not isinstance(value, np.integer | int):
+        raise _wrong_attribute(group, name, "a whole number", value)
+    return int(value)
+
+
+def float_attribute(group: h5py.Group, name: str) -> float:
+    """Read a number attribute.
+
+    Raises:
+        RecordFormatError: it is missing or no number.
+    """
+    value = _attribute(group, name)
+    if not isinstance(value, np.integer | np.floating | int | float):
+        raise _wrong_attribute(group, name, "a number", value)
+    return float(value)
+
+
+def write_text(group: h5py.Group, name: str, text: str) -> None:
+    """Write a text of any length as a scalar UTF-8 dataset of fixed length."""
+    data = storable_text(text).encode("utf-8")
+    dtype = h5py.string_dtype("utf-8", max(1, len(data)))
+    group.create_dataset(name, data=np.array(data, dtype=dtype), track_times=False)
+
+
+def read_text(group: h5py.Group, name: str) -> str:
+    """Read what `write_text` wrote; text of variable length is read as well.
+
+    Raises:
+        RecordFormatError: the dataset is missing, damaged or not text.
+    """
+    dataset = dataset_of(group, name)
+    with reading(f"{group.name}/{name}"):
+        value = dataset[()]
+    if not isinstance(value, bytes):
+        raise RecordFormatError(f"{group.name}/{name} must be one text, got {dataset.dtype}")
+    return decoded(bytes(value), f"{group.name}/{name}")
+
+
+def read_json(group: h5py.Group, name: str) -> dict[str, JsonValue]:
+    """Read a text that holds a JSON object.
+
+    Raises:
+        RecordFormatError: the text is not one.
+    """
+    value = parse_json(read_text(group, name), f"{group.name}/{name}")
+    if not isinstance(value, dict):
+        raise RecordFormatError(f"{group.name}/{name} must hold a JSON object")
+    return value
+
+
+def parse_json(text: str, place: str) -> JsonValue:
+    """Parse JSON as the format understands it: no NaN, no infinity, no endless nesting.
+
+    Raises:
+        RecordFormatError: the text is not such JSON.
+    """
+
+    def refuse(constant: str) -> JsonValue:
+        raise ValueError(f"{constant} is no JSON")
+
+    try:
+        value: JsonValue = json.loads(text, parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise RecordFormatError(f"{place} must hold JSON: {error}") from error
+    return value
+
+
+def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
+    """Open a dataset.
+
+    Raises:
+        RecordFormatError: there is none of that name.
+    """
+    with reading(f"{group.name}/{name}"):
+        found = group.get(name)
+    if not isinstance(found, h5py.Dataset):
+        raise RecordFormatError(f"{group.name} lacks the dataset {name}")
+    return found
+
+
+def _attribute(group: h5py.Group, name: str) -> object:
+    with reading(f"{group.name}@{name}"):
+        value: object = group.attrs.get(name)
+    if value is None:
+        raise RecordFormatError(f"{group.name} lacks the attribute {name}")
+    return value
+
+
+def decoded(data: bytes, place: str) -> str:
+    """Decode UTF-8.
+
+    Raises:
+        RecordFormatError: the bytes are something else.
+    """
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise RecordFormatError(f"{place} must be UTF-8 text: {error}") from error
+
+
+def _wrong_attribute(
+    group: h5py.Group, name: str, expected: str, value: object
+) -> RecordFormatError:
+    kind = "NaN" if isinstance(value, float) and math.isnan(value) else type(value).__name__
+    return RecordFormatError(f"{group.name}@{name} must be {expected}, got {kind}")

@@ -1,0 +1,11 @@
+"""The one error this package raises on purpose."""
+
+from __future__ import annotations
+
+
+class RecordFormatError(ValueError):
+    """A file or a value does not fit the record format: damaged, forbidden, newer or incomplete.
+
+    The message is one sentence: what was found, what was expected, where, and the way out if there
+    is one.
+    """

@@ -1,0 +1,176 @@
+"""Opening files from strangers: nothing outside the file is read, nothing small becomes huge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import h5py
+
+from orthoflow_provenance.encoding import reading
+from orthoflow_provenance.errors import RecordFormatError
+
+_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+_DEEPEST: Final = 32
+# No honest file comes near: deflate packs at most 1032 to 1.
+_LARGEST_RATIO: Final = 1100
+_ALWAYS_ALLOWED_BYTES: Final = 64 << 20
+_LARGEST_CHUNK_BYTES: Final = 64 << 20
+_LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
+_FILTERS: Final = {
+    h5py.h5z.FILTER_SHUFFLE: "shuffle",
+    h5py.h5z.FILTER_DEFLATE: "gzip",
+    h5py.h5z.FILTER_FLETCHER32: "fletcher32",
+}
+_PLAIN_CLASSES: Final = frozenset({h5py.h5t.INTEGER, h5py.h5t.FLOAT})
+
+
+@contextmanager
+def safe_open(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading after looking at every object in it.
+
+    Raises:
+        RecordFormatError: the file is no HDF5 file or damaged, or holds links other than hard
+            links, an object that is reached twice, external or virtual storage, filters other than
+            shuffle, gzip and fletcher32, types outside the format, or datasets that unpack to far
+            more than the file could hold.
+        OSError: the file cannot be opened.
+    """
+    _check_signature(path)
+    with reading(path.name):
+        file = h5py.File(path, "r", locking=False)
+    try:
+        _Inspection(file, path).run()
+        yield file
+    finally:
+        file.close()
+
+
+def _check_signature(path: Path) -> None:
+    with path.open("rb") as stream:
+        start = stream.read(len(_SIGNATURE))
+    if start != _SIGNATURE:
+        raise RecordFormatError(f"{path.name} must be an HDF5 file, but does not begin like one")
+
+
+class _Inspection:
+    """One walk over all links, objects and attributes of a file."""
+
+    def __init__(self, file: h5py.File, path: Path) -> None:
+        self._file = file
+        self._name = path.name
+        self._size_bytes = path.stat().st_size
+        self._stored_bytes = 0
+        self._seen: set[tuple[int, int]] = set()
+
+    def run(self) -> None:
+        """Look at everything, deepest last.
+
+        Raises:
+            RecordFormatError: something forbidden was found.
+        """
+        pending: list[tuple[h5py.Group, int]] = [(self._file, 0)]
+        self._visit_once(self._file, "/")
+        while pending:
+            group, depth = pending.pop()
+            if depth > _DEEPEST:
+                raise self._refusal(group.name, f"is nested more than {_DEEPEST} groups deep")
+            with reading(f"{self._name}:{group.name}"):
+                self._check_attributes(group, group.name)
+                names = list(group)
+            for name in names:
+                place = f"{group.name.rstrip('/')}/{name}"
+                with reading(f"{self._name}:{place}"):
+                    child = self._open(group, name, place)
+                    if isinstance(child, h5py.Group):
+                        pending.append((child, depth + 1))
+                    else:
+                        self._check_attributes(child, place)
+                        self._check_dataset(child, place)
+
+    def _open(self, group: h5py.Group, name: str, place: str) -> h5py.Group | h5py.Dataset:
+        link = group.get(name, getlink=True)
+        if isinstance(link, h5py.ExternalLink):
+            raise self._refusal(place, "is a link into another file")
+        if not isinstance(link, h5py.HardLink):
+            raise self._refusal(place, "is a soft link, only hard links are allowed")
+        child = group[name]
+        if not isinstance(child, h5py.Group | h5py.Dataset):
+            raise self._refusal(place, "is neither a group nor a dataset")
+        self._visit_once(child, place)
+        return child
+
+    def _visit_once(self, item: h5py.Group | h5py.Dataset, place: str) -> None:
+        # Two ways to one object make loops, and trees that grow without end from a few bytes.
+        info = h5py.h5o.get_info(item.id)
+        identity = (int(info.fileno), int(info.addr))
+        if identity in self._seen:
+            raise self._refusal(place, "leads to an object that has another place as well")
+        self._seen.add(identity)
+
+    def _check_dataset(self, dataset: h5py.Dataset, place: str) -> None:
+        properties = dataset.id.get_create_plist()
+        if properties.get_external_count():
+            raise self._refusal(place, "keeps its data in another file")
+        layout = properties.get_layout()
+        if layout not in {h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED}:
+            raise self._refusal(place, "is a virtual dataset")
+        used = [properties.get_filter(index)[0] for index in range(properties.get_nfilters())]
+        if not set(used) <= set(_FILTERS) or len(set(used)) != len(used):
+            raise self._refusal(
+                place, f"must use each of {', '.join(_FILTERS.values())} at most once and no other"
+            )
+        kind = dataset.id.get_type()
+        if not (_is_allowed(kind) or (dataset.shape == () and _is_text(kind))):
+            raise self._refusal(place, f"has a type outside the format ({dataset.dtype})")
+        if layout == h5py.h5d.CHUNKED and (
+            math.prod(properties.get_chunk()) * kind.get_size() > _LARGEST_CHUNK_BYTES
+        ):
+            raise self._refusal(place, "has chunks of more than 64 MiB")
+        self._check_size(dataset, kind.get_size(), place)
+
+    def _check_size(self, dataset: h5py.Dataset, itemsize: int, place: str) -> None:
+        declared = math.prod(dataset.shape or ()) * itemsize
+        stored = dataset.id.get_storage_size()
+        if declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored):
+            raise self._refusal(
+                place, f"says it has {declared} bytes, but the file holds {stored} for it"
+            )
+        self._stored_bytes += stored
+        if self._stored_bytes > self._size_bytes:
+            raise self._refusal(place, "and the datasets before it say more than the file can hold")
+
+    def _check_attributes(self, item: h5py.Group | h5py.Dataset, place: str) -> None:
+        for name in item.attrs:
+            attribute = item.attrs.get_id(name)
+            kind = attribute.get_type()
+            n_values = math.prod(attribute.shape)
+            if not (_is_allowed(kind) or (n_values == 1 and _is_text(kind))):
+                raise self._refusal(f"{place}@{name}", "has a type outside the format")
+            if n_values * kind.get_size() > _LARGEST_ATTRIBUTE_BYTES:
+                raise self._refusal(f"{place}@{name}", "is larger than 1 MiB")
+
+    def _refusal(self, place: str, reason: str) -> RecordFormatError:
+        return RecordFormatError(f"{self._name}:{place} {reason}: the file is not opened")
+
+
+def _is_text(kind: h5py.h5t.TypeID) -> bool:
+    return bool(kind.get_class() == h5py.h5t.STRING)
+
+
+def _is_allowed(kind: h5py.h5t.TypeID) -> bool:
+    """Say whether values of a type lie in the dataset itself: numbers, bool, fixed text, rows."""
+    type_class = kind.get_class()
+    if type_class == h5py.h5t.COMPOUND:
+        return all(_is_plain(kind.get_member_type(index)) for index in range(kind.get_nmembers()))
+    return _is_plain(kind)
+
+
+def _is_plain(kind: h5py.h5t.TypeID) -> bool:
+    type_class = kind.get_class()
+    if type_class == h5py.h5t.STRING:
+        return not kind.is_variable_str()
+    return type_class in _PLAIN_CLASSES or type_class == h5py.h5t.ENUM
