@@ -1,0 +1,271 @@
+"""What is installed and whether it works: the findings of `orthoflow doctor`."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Final, Literal
+
+_IMPORT_TIMEOUT_S: Final = 120
+_COMFORTABLE_DISK_BYTES: Final = 5 * 1024**3
+_COMFORTABLE_MEMORY_BYTES: Final = 2 * 1024**3
+
+Verdict = Literal["ok", "limited", "missing"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Library:
+    """A distribution that orthoflow uses.
+
+    Attributes:
+        distribution: its name on the package index.
+        module: what is imported.
+        loss: what does not work without it.
+        is_core: nothing works without it.
+    """
+
+    distribution: str
+    module: str
+    loss: str
+    is_core: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """One thing that was looked at.
+
+    Attributes:
+        name: what was looked at.
+        verdict: ok, limited (works, with a restriction) or missing.
+        found: version, size or setting.
+        cost: what does not work because of it, and the way out; empty when ok.
+        is_core: orthoflow cannot work without it.
+    """
+
+    name: str
+    verdict: Verdict
+    found: str
+    cost: str = ""
+    is_core: bool = False
+
+
+_EVERYTHING: Final = "nothing works"
+LIBRARIES: Final = (
+    Library(distribution="click", module="click", loss=_EVERYTHING, is_core=True),
+    Library(distribution="h5py", module="h5py", loss=_EVERYTHING, is_core=True),
+    Library(distribution="jinja2", module="jinja2", loss="no report", is_core=True),
+    Library(distribution="networkx", module="networkx", loss=_EVERYTHING, is_core=True),
+    Library(distribution="numpy", module="numpy", loss=_EVERYTHING, is_core=True),
+    Library(distribution="pluggy", module="pluggy", loss=_EVERYTHING, is_core=True),
+    Library(distribution="pydantic", module="pydantic", loss=_EVERYTHING, is_core=True),
+    Library(distribution="rich", module="rich", loss="no live progress", is_core=True),
+    Library(distribution="ruamel.yaml", module="ruamel.yaml", loss=_EVERYTHING, is_core=True),
+    Library(
+        distribution="numba",
+        module="numba",
+        loss="no simulated room, plane detection, rasters or orthoimages: the methods of "
+        "simulate, plane, raster, ortho",
+    ),
+    Library(distribution="scipy", module="scipy", loss="methods that use scipy fail to load"),
+    Library(
+        distribution="opencv-python-headless",
+        module="cv2",
+        loss="no photographs and no filling of gaps: read.photos, ortho.pointcloud-direct",
+    ),
+    Library(
+        distribution="rasterio",
+        module="rasterio",
+        loss="no GeoTIFF files: the products of raster and mosaic",
+    ),
+    Library(distribution="laspy", module="laspy", loss="no LAS and LAZ files: read.scan"),
+    Library(distribution="lazrs", module="lazrs", loss="no compressed LAZ files: read.scan"),
+    Library(distribution="pye57", module="pye57", loss="no E57 files: read.scan"),
+    Library(distribution="pandas", module="pandas", loss="no text point files: read.scan"),
+    Library(distribution="mahotas", module="mahotas", loss="no inspect.surf"),
+    Library(distribution="matplotlib", module="matplotlib", loss="no figures drawn by methods"),
+    Library(distribution="pycolmap", module="pycolmap", loss="no orient.colmap-bundle"),
+    Library(distribution="pyceres", module="pyceres", loss="no orient.colmap-bundle"),
+    Library(
+        distribution="libusb-package",
+        module="libusb_package",
+        loss="open3d may not load on machines without libusb-1.0",
+    ),
+    Library(
+        distribution="open3d-cpu",
+        module="open3d",
+        loss="no plane.open3d-ransac, no plane.open3d-patches; the default methods work without it",
+    ),
+)
+
+# The wheel of open3d needs libusb-1.0.so.0, which libusb-package carries: loaded globally, it is
+# found when open3d is imported.
+_OPEN3D_PRELUDE: Final = """
+import ctypes
+try:
+    import libusb_package
+    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+except (ImportError, OSError, TypeError):
+    pass
+"""
+
+
+def diagnose_libraries() -> list[Diagnosis]:
+    """Import every library in a process of its own, since a broken one can crash its process."""
+    with ThreadPoolExecutor(max_workers=max(2, os.cpu_count() or 1)) as pool:
+        return list(pool.map(diagnose_library, LIBRARIES))
+
+
+def diagnose_library(library: Library) -> Diagnosis:
+    """Say which version of a library is installed and whether it can be imported."""
+    try:
+        version = metadata.version(library.distribution)
+    except metadata.PackageNotFoundError:
+        version = ""
+    problem = _import_problem(library.module)
+    if not problem:
+        return Diagnosis(
+            name=library.distribution,
+            verdict="ok",
+            found=version or "present",
+            is_core=library.is_core,
+        )
+    found = f"{version}, but {problem}" if version else "not installed"
+    way_out = _way_out(problem) if version else f"pip install {library.distribution}"
+    return Diagnosis(
+        name=library.distribution,
+        verdict="missing",
+        found=found,
+        cost=f"{library.loss} ({way_out})",
+        is_core=library.is_core,
+    )
+
+
+def _import_problem(module: str) -> str:
+    prelude = _OPEN3D_PRELUDE if module == "open3d" else ""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", f"{prelude}\nimport {module}"],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_IMPORT_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"its import takes longer than {_IMPORT_TIMEOUT_S} s"
+    if done.returncode == 0:
+        return ""
+    if done.returncode < 0:
+        return f"its import crashes (signal {-done.returncode})"
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    return f"its import fails: {lines[-1] if lines else 'no message'}"
+
+
+def _way_out(problem: str) -> str:
+    packages = {
+        "libGL.so": "libgl1",
+        "libX11.so": "libx11-6",
+        "libusb": "libusb-1.0-0",
+        "libgomp": "libgomp1",
+    }
+    for library, package in packages.items():
+        if library in problem:
+            return f"install the system package {package}, e.g. apt-get install {package}"
+    return "reinstall it"
+
+
+def diagnose_machine(store: Path) -> Iterator[Diagnosis]:
+    """Look at the platform, the cores, the memory, the disk of the store, and its write access."""
+    yield _diagnose_platform()
+    yield Diagnosis(name="cores", verdict="ok", found=str(usable_cores()))
+    yield _diagnose_memory()
+    yield from _diagnose_store(store)
+
+
+def _diagnose_platform() -> Diagnosis:
+    found = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    is_supported = platform.system() == "Linux" and platform.machine() == "x86_64"
+    return Diagnosis(
+        name="platform",
+        verdict="ok" if is_supported else "limited",
+        found=found,
+        cost="" if is_supported else "only Linux on x86-64 is tested",
+    )
+
+
+def usable_cores() -> int:
+    """Processors this process may use, which can be fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def available_memory() -> int | None:
+    """Bytes of memory still free for use, also under a container's limit; None when unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        candidates = [
+            int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")
+        ]
+    except (OSError, ValueError):
+        return None
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = int((group / "memory.max").read_text(encoding="ascii"))
+        candidates.append(limit - int((group / "memory.current").read_text(encoding="ascii")))
+    except (OSError, ValueError):
+        pass  # no limit, or another version of control groups
+    return min(candidates, default=None)
+
+
+def _diagnose_memory() -> Diagnosis:
+    n_bytes = available_memory()
+    if n_bytes is None:
+        return Diagnosis(name="memory", verdict="limited", found="unknown", cost="cannot be told")
+    is_enough = n_bytes >= _COMFORTABLE_MEMORY_BYTES
+    return Diagnosis(
+        name="memory",
+        verdict="ok" if is_enough else "limited",
+        found=f"{n_bytes / 1024**3:.1f} GiB available",
+        cost="" if is_enough else "scans of many millions of points will not fit",
+    )
+
+
+def _diagnose_store(store: Path) -> Iterator[Diagnosis]:
+    existing = next(
+        folder for folder in (store.absolute(), *store.absolute().parents) if folder.is_dir()
+    )
+    free = shutil.disk_usage(existing).free
+    is_enough = free >= _COMFORTABLE_DISK_BYTES
+    yield Diagnosis(
+        name="disk of the store",
+        verdict="ok" if is_enough else "limited",
+        found=f"{free / 1024**3:.1f} GiB free",
+        cost="" if is_enough else "long runs may fill it (orthoflow cache gc, or --store DIR)",
+    )
+    problem = _write_problem(existing)
+    yield Diagnosis(
+        name="store and numba cache",
+        verdict="missing" if problem else "ok",
+        found=problem or f"{store} is writable",
+        cost="no run can start here (choose another folder with --store DIR)" if problem else "",
+        is_core=True,
+    )
+
+
+def _write_problem(folder: Path) -> str:
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"x")
+    except OSError as error:
+        return f"{folder} cannot be written: {(error.strerror or str(error)).lower()}"
+    return ""

@@ -1,0 +1,87 @@
+"""`orthoflow doctor`: what is installed, what is missing, and what that costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from orthoflow import __version__
+from orthoflow.cli.diagnosis import Diagnosis, diagnose_libraries, diagnose_machine
+from orthoflow.cli.failures import EXIT_GOOD, EXIT_PLUGIN_MISSING
+from orthoflow.cli.options import Command, json_option, store_option
+from orthoflow.cli.tables import counted, echo_json, echo_table
+
+
+@click.command(cls=Command)
+@store_option
+@json_option
+def doctor(store: Path, *, as_json: bool) -> int:
+    """Say what is installed, what is missing, and what that costs.
+
+    Ends with 4 when something is missing without which nothing works.
+    """
+    findings = [*diagnose_machine(store), *diagnose_libraries(), *_diagnose_plugins()]
+    broken_core = any(item.is_core and item.verdict == "missing" for item in findings)
+    if as_json:
+        echo_json(
+            {
+                "version": __version__,
+                "ok": not broken_core,
+                "findings": [
+                    {
+                        "name": item.name,
+                        "verdict": item.verdict,
+                        "found": item.found,
+                        "cost": item.cost,
+                        "core": item.is_core,
+                    }
+                    for item in findings
+                ],
+            }
+        )
+    else:
+        _print(findings, broken_core=broken_core)
+    return EXIT_PLUGIN_MISSING if broken_core else EXIT_GOOD
+
+
+def _print(findings: list[Diagnosis], *, broken_core: bool) -> None:
+    click.echo(f"orthoflow {__version__}\n")
+    echo_table(
+        ("what", "verdict", "found"),
+        [(item.name, item.verdict, item.found) for item in findings],
+    )
+    costs = [item for item in findings if item.cost]
+    if costs:
+        click.echo("\nWhat that costs:")
+    for item in costs:
+        click.echo(f"- {item.name}: {item.cost}")
+    if broken_core:
+        click.echo("\nsomething that everything needs is missing")
+    elif costs:
+        click.echo(f"\northoflow works, with {counted(len(costs), 'restriction')}")
+    else:
+        click.echo("\neverything works")
+
+
+def _diagnose_plugins() -> list[Diagnosis]:
+    from orthoflow.catalog import discover_catalog
+
+    catalog = discover_catalog()
+    findings = [
+        Diagnosis(
+            name="plugins",
+            verdict="ok",
+            found=counted(len(catalog.methods), "method"),
+        )
+    ]
+    findings += [
+        Diagnosis(
+            name=f"plugin {broken.entry_point}",
+            verdict="missing",
+            found=f"{broken.distribution} fails to load",
+            cost=f"its methods are missing: {broken.error}",
+        )
+        for broken in catalog.broken
+    ]
+    return findings

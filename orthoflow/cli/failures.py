@@ -1,0 +1,71 @@
+"""How every error becomes one sentence on standard error and an exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from typing import Final
+
+import click
+
+from orthoflow.cli.sessions import Session
+from orthoflow.errors import OrthoflowError
+
+EXIT_GOOD: Final = 0
+EXIT_CELL_FAILED: Final = 1
+EXIT_INVALID: Final = 2
+EXIT_RECORD_DIFFERS: Final = 3
+EXIT_PLUGIN_MISSING: Final = 4
+EXIT_INTERRUPTED: Final = 130
+
+
+def explain(error: Exception, session: Session) -> int:
+    """Tell the user about an error that ended a command.
+
+    Returns:
+        The exit code of the process.
+    """
+    if session.debug:
+        import traceback
+
+        traceback.print_exception(error)
+    if isinstance(error, click.Abort | KeyboardInterrupt):
+        say_error(session.resume_hint or "interrupted")
+        return EXIT_INTERRUPTED
+    if isinstance(error, OrthoflowError):
+        interrupted = error.exit_code == EXIT_INTERRUPTED
+        say_error((session.resume_hint if interrupted else "") or f"error: {error_text(error)}")
+        return error.exit_code
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename}: " if error.filename else ""
+        say_error(f"error: {where}{error.strerror.lower()}")
+        return EXIT_CELL_FAILED
+    say_error(
+        f"error: orthoflow itself failed ({type(error).__name__}: {_first_line(str(error))}); "
+        "repeat the command with --debug and report what it prints"
+    )
+    return EXIT_CELL_FAILED
+
+
+def error_text(error: Exception) -> str:
+    """Give the sentence of an error; `str` of an OSError without arguments would be empty."""
+    return str(error) or type(error).__name__
+
+
+def say_error(text: str) -> None:
+    """Write to standard error; a closed one is no reason to fail."""
+    with contextlib.suppress(BrokenPipeError):
+        click.echo(text, err=True)
+
+
+def silence_stdout() -> None:
+    """Send what is still to be printed nowhere, so that a closed pipe makes no noise at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+
+
+def _first_line(text: str) -> str:
+    return (text.splitlines() or [""])[0]

@@ -1,0 +1,23 @@
+"""`orthoflow graph`: draw a workflow as a Mermaid graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import click
+
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import Command, workflow_arguments
+
+
+@click.command(cls=Command)
+@workflow_arguments
+def graph(workflow: str, sets: Sequence[str], inputs: Sequence[str]) -> int:
+    """Draw WORKFLOW as a Mermaid graph, which GitHub, GitLab and many editors show."""
+    from orthoflow.catalog import discover_catalog
+    from orthoflow.workflow import load_workflow, mermaid
+
+    catalog = discover_catalog()
+    loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
+    click.echo(mermaid(loaded, catalog).rstrip("\n"))
+    return EXIT_GOOD

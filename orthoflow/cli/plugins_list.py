@@ -1,0 +1,69 @@
+"""`orthoflow plugins list`: every method, and what is wrong with plugins that do not load."""
+
+from __future__ import annotations
+
+import click
+
+from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import Command, json_option
+from orthoflow.cli.tables import echo_json, echo_table
+
+
+@click.command("list", cls=Command)
+@json_option
+def plugins_list(*, as_json: bool) -> int:
+    """List every method, and what is wrong with plugins that do not load."""
+    catalog = discover_catalog()
+    if as_json:
+        echo_json(_as_json(catalog))
+        return EXIT_GOOD
+    echo_table(
+        ("method", "state", "distribution", "summary"),
+        [
+            (
+                entry.spec.id,
+                entry.state,
+                f"{entry.distribution.name} {entry.distribution.version}",
+                entry.spec.summary,
+            )
+            for entry in catalog.methods.values()
+        ],
+    )
+    problems = [
+        *(entry.problem for entry in catalog.methods.values() if entry.problem),
+        *(str(broken) for broken in catalog.broken),
+    ]
+    if problems:
+        click.echo("\nwhat is wrong:")
+    for problem in problems:
+        click.echo(f"- {problem}")
+    return EXIT_GOOD
+
+
+def _as_json(catalog: Catalog) -> dict[str, object]:
+    return {
+        "methods": [
+            {
+                "id": entry.spec.id,
+                "kind": entry.spec.kind,
+                "state": entry.state,
+                "problem": entry.problem,
+                "distribution": entry.distribution.name,
+                "version": entry.distribution.version,
+                "summary": entry.spec.summary,
+            }
+            for entry in catalog.methods.values()
+        ],
+        "broken": [
+            {
+                "plugin": broken.entry_point,
+                "module": broken.module,
+                "distribution": broken.distribution.name,
+                "version": broken.distribution.version,
+                "problem": str(broken),
+                "traceback": broken.traceback,
+            }
+            for broken in catalog.broken
+        ],
+    }

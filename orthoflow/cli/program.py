@@ -1,0 +1,106 @@
+"""The program: its commands by name, and the root that runs them."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, Final, NoReturn
+
+import click
+
+from orthoflow import __version__
+from orthoflow.cli.failures import explain, silence_stdout
+from orthoflow.cli.lazy_groups import LazyCommand, LazyGroup
+from orthoflow.cli.sessions import Session, debug_parameter
+
+_SUMMARIES: Final = {
+    "check": "Say everything that is wrong with a workflow file.",
+    "plan": "Say which steps would run, which are cached, and why.",
+    "graph": "Draw a workflow as a Mermaid graph.",
+    "run": "Run a workflow; makes orthoimages, report and record.",
+    "show": "Summarise a finished run.",
+    "report": "Write the HTML report of one or more runs.",
+    "verify": "Check that a record is whole and unchanged.",
+    "plugins": "List the methods that are installed, or show one.",
+    "schema": "Print the JSON Schema of workflow files.",
+    "cache": "List or clean the store of results.",
+    "doctor": "Say what is installed, what is missing, and what that costs.",
+}
+
+_HELP: Final = """Make orthoimages of walls from laser scans and free-hand photographs, with methods
+that can be compared and repeated.
+
+A first run, on a simulated room: orthoflow run direct.yaml
+
+Exit codes: 0 good; 1 some cell failed; 2 the workflow, an argument or an input is invalid; 3 a
+record is damaged or differs; 4 a plugin or a library is missing; 130 interrupted.
+"""
+
+
+class Program(LazyGroup):
+    """The root group; every error ends in one sentence and one of the exit codes."""
+
+    # Any: the signature is click's.
+    def main(self, *args: Any, **extra: Any) -> NoReturn:
+        """Run the command line and leave the process with an exit code."""
+        session = Session()
+        extra.update(standalone_mode=False, obj=session)
+        code: object
+        try:
+            code = super().main(*args, **extra)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            silence_stdout()
+            code = 0
+        except click.ClickException as error:
+            error.show()
+            code = error.exit_code
+        except Exception as error:  # noqa: BLE001 - the last stop before the user
+            code = explain(error, session)
+        sys.exit(code if isinstance(code, int) else 0)
+
+    def invoke(self, ctx: click.Context) -> object:
+        """Run the chosen command; a reader that closed the pipe early is no error."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            # Caught here because click would turn it into exit code 1, "some cell failed".
+            silence_stdout()
+            return 0
+
+
+def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:  # noqa: FBT001
+    if value:
+        click.echo(f"orthoflow {__version__}")
+        ctx.exit()
+
+
+def _nothing_before_the_command() -> None:
+    """Satisfy click, which wants a callback on the root."""
+
+
+program: Final = Program(
+    name="orthoflow",
+    lazy={
+        name: LazyCommand(target=f"orthoflow.cli.{name}:{name}", summary=summary)
+        for name, summary in _SUMMARIES.items()
+    },
+    help=_HELP,
+    callback=_nothing_before_the_command,
+    params=[
+        click.Option(
+            ["--version"],
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=_print_version,
+            help="Print the version and leave.",
+        ),
+        debug_parameter(),
+    ],
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+
+
+def main() -> NoReturn:
+    """Run the `orthoflow` command."""
+    program.main(prog_name="orthoflow")

@@ -1,0 +1,38 @@
+"""`orthoflow report`: write the HTML report of one or more runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import Command
+from orthoflow.errors import ArgumentError
+
+
+@click.command(cls=Command)
+@click.argument("runs", metavar="RUN [RUN ...]", nargs=-1, required=True, type=click.Path())
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Where to write it; for a single run its own report.html.",
+)
+def report(runs: tuple[str, ...], output: Path | None) -> int:
+    """Write the HTML report of one or more runs, each a run folder or its run.h5."""
+    from orthoflow.records import REPORT_FILE, open_run
+    from orthoflow.report import write_report
+
+    opened = [open_run(run) for run in runs]
+    if output is None and len(opened) > 1:
+        raise ArgumentError(
+            f"{len(opened)} runs were given: say with -o FILE where their common report goes"
+        )
+    target = output if output is not None else opened[0].folder / REPORT_FILE
+    if not target.parent.is_dir():
+        raise ArgumentError(f"{target.parent} does not exist: make the folder, or choose another")
+    write_report(opened, target)
+    click.echo(f"report: {target}")
+    return EXIT_GOOD

@@ -1,0 +1,25 @@
+"""`orthoflow schema`: print the JSON Schema of workflow files."""
+
+from __future__ import annotations
+
+import click
+
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import Command, json_option
+from orthoflow.cli.tables import echo_json
+
+
+@click.command(cls=Command)
+@json_option
+def schema(*, as_json: bool) -> int:
+    """Print the JSON Schema of workflow files, with the parameters of every installed method.
+
+    Save it and name it in an editor to get completion and checks while writing. The output is
+    JSON with or without --json.
+    """
+    from orthoflow.catalog import discover_catalog
+    from orthoflow.workflow import workflow_schema
+
+    del as_json
+    echo_json(workflow_schema(discover_catalog()))
+    return EXIT_GOOD

@@ -1,0 +1,137 @@
+"""`orthoflow show`: summarise a finished run."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import Command, json_option
+from orthoflow.cli.tables import counted, duration, echo_json, echo_table, size
+
+if TYPE_CHECKING:
+    from orthoflow.records import RecordedCell, Run
+
+
+@click.command(cls=Command)
+@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@json_option
+def show(run: Path, *, as_json: bool) -> int:
+    """Summarise RUN, a run folder or its run.h5: inputs, cells, metrics, warnings, environment."""
+    from orthoflow.records import open_run
+
+    opened = open_run(run)
+    if as_json:
+        echo_json(_as_json(opened))
+    else:
+        _print_head(opened)
+        _print_cells(opened)
+        _print_metrics(opened)
+        _print_environments(opened)
+        _print_files(opened)
+    return EXIT_GOOD
+
+
+def _print_head(run: Run) -> None:
+    record = run.record
+    click.echo(f"{record.name}, run {record.run_id}: {_status_text(run)}")
+    click.echo(f"{record.started} to {record.ended}, {record.created_by}, seed {record.seed}")
+    if record.overrides:
+        click.echo(f"overrides: {' '.join(record.overrides)}")
+    for entry in record.inputs:
+        if not entry.files:
+            click.echo(f"input {entry.name}: not given")
+        for file in entry.files:
+            click.echo(
+                f"input {entry.name}: {file.name}, {size(file.size_bytes)}, "
+                f"sha256 {file.sha256[:12]}"
+            )
+
+
+def _status_text(run: Run) -> str:
+    counts = [
+        f"{number} {status}"
+        for status in ("ok", "failed", "skipped")
+        if (number := sum(cell.status == status for cell in run.record.cells))
+    ]
+    return f"{counted(len(run.record.cells), 'cell')}, {', '.join(counts)}"
+
+
+def _print_cells(run: Run) -> None:
+    click.echo()
+    echo_table(
+        ("cell", "method", "status", "time", "memory"),
+        [
+            (
+                cell.address,
+                f"{cell.method} {cell.distribution_version}".rstrip(),
+                _cell_status(cell),
+                duration(cell.wall_s) if cell.started else "",
+                f"{cell.peak_rss_mib:.0f} MiB" if cell.started else "",
+            )
+            for cell in run.record.cells
+        ],
+    )
+    for cell in run.record.cells:
+        if cell.error_message:
+            click.echo(f"{cell.address} {cell.status}: {cell.error_message}")
+    for cell in run.record.cells:
+        for warning in cell.warnings:
+            click.echo(f"warning, {cell.address}: {warning}")
+
+
+def _cell_status(cell: RecordedCell) -> str:
+    return f"{cell.status} (cached from {cell.cached_from})" if cell.cached_from else cell.status
+
+
+def _print_metrics(run: Run) -> None:
+    rows = [
+        (cell.address, metric.name, f"{metric.value:.6g}", metric.unit)
+        for cell in run.record.cells
+        for metric in cell.metrics
+    ]
+    if rows:
+        click.echo()
+        echo_table(("cell", "metric", "value", "unit"), rows)
+
+
+def _print_environments(run: Run) -> None:
+    for environment in run.record.environments:
+        commit = f", commit {environment.git_commit}" if environment.git_commit else ""
+        packages = environment.packages
+        click.echo(
+            f"\nenvironment: Python {environment.python}, {environment.os}, {environment.cpu}, "
+            f"{counted(environment.cores, 'core')}, {counted(environment.threads, 'thread')}"
+            f"{commit}"
+        )
+        if packages:
+            click.echo(", ".join(f"{name} {packages[name]}" for name in sorted(packages)))
+
+
+def _print_files(run: Run) -> None:
+    files = [file for group in run.files.values() for file in group]
+    if files:
+        click.echo("\nfiles:")
+    for file in files:
+        click.echo(f"  {file}")
+
+
+def _as_json(run: Run) -> dict[str, object]:
+    record = run.record
+    values = dataclasses.asdict(dataclasses.replace(record, cells=()))
+    values["cells"] = [_cell_json(cell) for cell in record.cells]
+    values["files"] = [str(file) for group in run.files.values() for file in group]
+    return values
+
+
+def _cell_json(cell: RecordedCell) -> dict[str, object]:
+    values = dataclasses.asdict(dataclasses.replace(cell, figures=()))
+    # The bytes of pictures are in the record and the report; here their names do.
+    values["figures"] = [
+        {"name": figure.name, "caption": figure.caption, "media_type": figure.media_type}
+        for figure in cell.figures
+    ]
+    return values

@@ -1,0 +1,72 @@
+"""Plain text on the terminal: aligned tables, times and sizes in words, JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import click
+
+
+def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows under a header, columns aligned; nothing when there are no rows."""
+    if rows:
+        for line in table_lines(header, rows):
+            click.echo(line)
+
+
+def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lay rows under a header, columns aligned.
+
+    >>> table_lines(("cell", "time"), [("cloud", "1.0 s")])
+    ['cell   time', 'cloud  1.0 s']
+    """
+    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+    return [
+        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in (header, *rows)
+    ]
+
+
+def echo_json(value: object) -> None:
+    """Print a value as JSON, readable and stable."""
+    click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def duration(seconds: float) -> str:
+    """Say a time as people do.
+
+    >>> [duration(seconds) for seconds in (0.042, 3.14159, 75, 3700)]
+    ['0.04 s', '3.1 s', '1 min 15 s', '1 h 02 min']
+    """
+    if seconds < 1:
+        return f"{seconds:.2f} s"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def size(n_bytes: float) -> str:
+    """Say a number of bytes in binary units.
+
+    >>> [size(n) for n in (512, 2048, 5 * 1024**3)]
+    ['512 B', '2.0 KiB', '5.0 GiB']
+    """
+    value = float(n_bytes)
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if value < 1024:
+            return f"{value:.0f} B" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1024
+    return f"{value:.1f} TiB"
+
+
+def counted(number: int, noun: str) -> str:
+    """Say a number with its noun.
+
+    >>> counted(1, "cell"), counted(3, "cell")
+    ('1 cell', '3 cells')
+    """
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
