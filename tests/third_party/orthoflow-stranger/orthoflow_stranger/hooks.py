@@ -11,13 +11,14 @@ def orthoflow_methods() -> list[MethodSpec]:
         MethodSpec(
             id="plane.median",
             target="orthoflow_stranger.median:MedianPlanes",
-            summary="one level plane through the median height, one wall through the densest azimuth",
+            summary="the level surface with the most points",
         ),
         MethodSpec(id="mischief.crash", target=f"{_MISCHIEF}:Crash", summary="segfaults"),
         MethodSpec(id="mischief.eat", target=f"{_MISCHIEF}:Eat", summary="takes all memory"),
         MethodSpec(id="mischief.hang", target=f"{_MISCHIEF}:Hang", summary="never ends"),
         MethodSpec(id="mischief.raise", target=f"{_MISCHIEF}:Raise", summary="raises"),
         MethodSpec(id="mischief.exit", target=f"{_MISCHIEF}:Exit", summary="exits the process"),
+        MethodSpec(id="mischief.good", target=f"{_MISCHIEF}:Good", summary="works"),
         MethodSpec(id="mischief.fill", target=f"{_MISCHIEF}:Fill", summary="fills the disk"),
     ]
 

@@ -86,3 +86,15 @@ class Fill(_Mischief):
         import errno
 
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(ctx.scratch / "big"))
+
+
+class Good(_Mischief):
+    """Does what it should, in bad company."""
+
+    id = "mischief.good"
+
+    def run(self, inputs: object, params: object, ctx: StepContext) -> object:
+        from orthoflow_stranger.median import MedianPlanes
+
+        found = MedianPlanes().run(MedianPlanes.In(cloud=inputs.cloud), MedianPlanes.Params(), ctx)
+        return self.Out(planes=found.planes)

@@ -1,0 +1,198 @@
+"""The road from a scan to orthoimages, walked with the command line on scans with known truth."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import orthoflow
+from orthoflow.files.geotiff import read_raster
+from orthoflow.geometry import angle_between_deg
+from tests.road.conftest import CHECKOUT, Shell
+
+SHIFT_M = (634512.347, 486215.781, 112.193)
+SMALL = ("--set", "room.scan_step_m=0.02", "--set", "wall.gsd_m=0.03")
+
+
+@pytest.fixture(scope="module")
+def road(tmp_path_factory: pytest.TempPathFactory) -> Shell:
+    """A folder in which `direct.yaml` ran once on the small simulated room, as `run`."""
+    shell = Shell(tmp_path_factory.mktemp("road"), CHECKOUT)
+    ended = shell("run", "direct.yaml", *SMALL, "-o", "run")
+    assert ended.code == 0, ended.said
+    assert str(Path("run") / "report.html") in ended.out
+    assert str(Path("run") / "run.h5") in ended.out
+    assert "wall_0_ortho.tif" in ended.out
+    return shell
+
+
+def planes_of(folder: Path) -> list[dict[str, object]]:
+    found: list[dict[str, object]] = json.loads(
+        (folder / "products" / "plane" / "planes.json").read_text()
+    )["planes"]
+    return found
+
+
+def metrics_of(folder: Path) -> Mapping[tuple[str, str], float]:
+    with (folder / "products" / "metrics.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    return {(row["cell"], row["metric"]): float(row["value"]) for row in rows}
+
+
+def test_a_second_run_comes_from_the_cache_and_says_so(road: Shell) -> None:
+    ended = road("run", "direct.yaml", *SMALL, "-o", "again")
+    assert ended.code == 0
+    assert "cached" in ended.out
+    for product in ("planes.json",):
+        first = (road.folder / "run" / "products" / "plane" / product).read_bytes()
+        assert (road.folder / "again" / "products" / "plane" / product).read_bytes() == first
+
+
+def test_the_record_verifies_and_reads_back(road: Shell) -> None:
+    assert road("verify", "run").code == 0
+    run = orthoflow.open_run(road.folder / "run")
+    assert set(run.cells) == {"cloud", "room", "plane", "wall", "ortho", "mosaic", "check"}
+    assert run.cells["cloud"].status == "skipped"
+    assert run.cells["check"].status == "ok"
+
+
+def test_the_main_wall_and_its_orthoimage_agree_with_the_truth(road: Shell) -> None:
+    metrics = metrics_of(road.folder / "run")
+    assert metrics["check", "plane_angle_deg"] <= 0.02
+    assert metrics["check", "plane_offset_mm"] <= 1.0
+    # A third of a 30 mm cell: the scan step is 20 mm, each cell shows one point.
+    assert metrics["check", "rmse_u_mm"] <= 10.0
+    assert metrics["check", "rmse_v_mm"] <= 10.0
+
+
+def test_a_finished_run_folder_is_refused(road: Shell) -> None:
+    ended = road("run", "direct.yaml", *SMALL, "-o", "run")
+    assert ended.code == 2
+    assert "run.h5" in ended.said
+
+
+def test_a_changed_parameter_reruns_only_what_depends_on_it(road: Shell) -> None:
+    ended = road("plan", "direct.yaml", *SMALL, "--set", "ortho.inpaint_radius_px=4", "--json")
+    states = {cell["address"]: cell for cell in json.loads(ended.out)["cells"]}
+    assert {address: cell["status"] for address, cell in states.items()} == {
+        "cloud": "skipped",
+        "room": "cached",
+        "plane": "cached",
+        "wall": "cached",
+        "ortho": "will run",
+        "mosaic": "unknown yet",
+        "check": "unknown yet",
+    }
+    assert "inpaint_radius_px" in states["ortho"]["reason"]
+
+
+def test_survey_coordinates_change_nothing_but_the_origin(road: Shell) -> None:
+    shift = "[" + ", ".join(map(str, SHIFT_M)) + "]"
+    ended = road(
+        "run", "direct.yaml", *SMALL, "--set", f"room.shift_world_m={shift}", "-o", "shifted"
+    )
+    assert ended.code == 0, ended.said
+    here, there = planes_of(road.folder / "run")[0], planes_of(road.folder / "shifted")[0]
+    normal, moved = (np.array(plane["normal"]) for plane in (here, there))
+    assert angle_between_deg(normal, moved) < 1e-6
+    offset_m = there["offset_m"] - moved @ np.array(SHIFT_M)
+    assert offset_m == pytest.approx(here["offset_m"], abs=0.05e-3)
+    images = [
+        read_raster(road.folder / name / "products" / "mosaic" / "wall_0_ortho.tif").values
+        for name in ("run", "shifted")
+    ]
+    assert images[0].shape == images[1].shape
+    assert np.mean(images[0] != images[1]) < 1e-3
+
+
+@pytest.mark.parametrize("dataset", ["plane", "metric", "workflow"])
+def test_one_changed_byte_is_found(road: Shell, tmp_path: Path, dataset: str) -> None:
+    copy = tmp_path / "run.h5"
+    shutil.copy(road.folder / "run" / "run.h5", copy)
+    _change_one_byte(copy, dataset)
+    ended = road("verify", copy)
+    assert ended.code == 3
+    assert "Traceback" not in ended.said
+
+
+def _change_one_byte(record: Path, what: str) -> None:
+    content = bytearray(record.read_bytes())
+    run = orthoflow.open_run(record)
+    needle = {
+        "plane": run.product("plane", "planes").normal[0].tobytes(),
+        "metric": np.float64(run.cells["check"].metrics[0].value).tobytes(),
+        "workflow": b"skarlatos2012",
+    }[what]
+    place = content.find(needle)
+    assert place > 0, f"the {what} is not stored as plain bytes"
+    content[place + 2] ^= 1
+    record.write_bytes(content)
+
+
+@pytest.mark.slow
+def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path) -> None:
+    scan = shared_data / "heritage-hall-west-wall" / "west_wall.laz"
+    options = ("--set", "wall.gsd_m=0.01", "--set", "wall.buffer_m=0.45")
+    ended = shell("run", "direct.yaml", "--input", f"scan={scan}", *options, "-o", "run")
+    assert ended.code == 0, ended.said
+    main = planes_of(shell.folder / "run")[0]
+    normal = np.array(main["normal"])
+    expected = np.array([0.9998, -0.018, 0.0])
+    assert angle_between_deg(normal, expected / np.linalg.norm(expected)) < 0.1
+    # x of the plane at y = -1.1, z = 1.4.
+    x = (main["offset_m"] - normal[1] * -1.1 - normal[2] * 1.4) / normal[0]
+    assert x == pytest.approx(-2.865, abs=0.010)
+    image = read_raster(shell.folder / "run" / "products" / "mosaic" / "wall_0_ortho.tif")
+    assert image.values.shape[-2] > 2300  # 24.6 m at 1 cm
+    assert np.mean(image.mask > 0) > 0.75
+
+
+@pytest.mark.slow
+def test_a_gridded_e57_gives_intensity_and_depth(shell: Shell, shared_data: Path) -> None:
+    scan = shared_data / "pump-e57" / "pumpAVisualReferenceImage.e57"
+    ended = shell("run", "direct.yaml", "--input", f"scan={scan}", "-o", "run")
+    assert ended.code == 0, ended.said
+    floor = planes_of(shell.folder / "run")[0]
+    assert abs(floor["normal"][2]) > 0.999
+    walls = shell.folder / "run" / "products" / "wall"
+    depth = read_raster(walls / "wall_0_depth.tif").values
+    intensity = read_raster(walls / "wall_0_intensity.tif").values
+    assert np.isfinite(depth).any()
+    assert np.nanmin(intensity) >= 0.0
+    assert np.nanmax(intensity) <= 1.0
+
+
+OTHER_SCANS = {
+    "fountain-p11/cloud_from_photos.laz": ("cloud.up=-z",),
+    "ceiling-808/808_db.ply": (),
+    "ceiling-808/808-60.ply": ("cloud.up=y",),
+    "lion-takanawa/lion_takanawa_1mm.laz": (),
+    "lion-takanawa/lion_takanawa.copc.laz": (),
+    "indoor-laz/indoor.laz": ("cloud.up=y",),
+    "tls-targets-sp1/T1.1.txt": ("wall.gsd_m=0.002",),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scan", OTHER_SCANS, ids=str)
+def test_every_other_scan_goes_through_or_ends_with_a_sentence(
+    shell: Shell, shared_data: Path, scan: str
+) -> None:
+    options = [word for setting in OTHER_SCANS[scan] for word in ("--set", setting)]
+    defaults = ("--set", "wall.gsd_m=0.02") if "wall.gsd_m" not in str(options) else ()
+    ended = shell(
+        "run", "direct.yaml", "--input", f"scan={shared_data / scan}", *defaults, *options,
+        "-o", "run",
+    )  # fmt: skip
+    assert "Traceback" not in ended.said
+    if ended.code == 0:
+        assert list((shell.folder / "run" / "products" / "mosaic").glob("wall_0_ortho.tif"))
+    else:
+        assert ended.code in (1, 2)
+        assert "orthoflow" in ended.said or "error" in ended.said

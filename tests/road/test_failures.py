@@ -1,0 +1,159 @@
+"""What goes wrong ends in a sentence: bad workflow files, bad scans, methods that misbehave."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.road.conftest import Shell
+
+Write = Callable[[str, str], Path]
+
+SIX_ERRORS = """\
+orthoflow: 1
+name: wrong
+seeed: 3
+inputs:
+  scan: {files: 7}
+steps:
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+  plane: {use: plane.hough2dd, in: {cloud: cloud.cloud}}
+  wall: {use: raster.grid, in: {cloud: cloud.cloud}}
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+  ortho: {use: ortho.pointcloud-direct, in: {walls: wall.walls, cloud: second.cloud}}
+  first: {use: mosaic.seams, in: {layers: third.layers}}
+  second: {use: mosaic.seams, in: {layers: first.layers}}
+  a: {use: raster.grid, in: {cloud: cloud.cloud, planes: b.planes}}
+  b: {use: plane.hough2d, in: {cloud: a.cloud}}
+"""
+
+MISCHIEF = """\
+orthoflow: 1
+name: mischief
+steps:
+  room: {use: simulate.room, params: {scan_step_m: 0.1}}
+  bad:
+    in: {cloud: room.cloud}
+    timeout: 5s
+    variants:
+      crash: {use: mischief.crash}
+      exit: {use: mischief.exit}
+      raise: {use: mischief.raise}
+      hang: {use: mischief.hang}
+      fill: {use: mischief.fill}
+      good: {use: mischief.good}
+  wall: {use: raster.grid, in: {cloud: room.cloud, planes: bad.planes}, params: {gsd_m: 0.1}}
+compare: {design: product}
+"""
+
+
+def no_traceback(said: str) -> bool:
+    return "Traceback" not in said and "site-packages" not in said
+
+
+def test_all_errors_of_a_workflow_file_come_at_once_with_their_lines(
+    shell: Shell, write: Write
+) -> None:
+    write("wrong.yaml", SIX_ERRORS)
+    ended = shell("check", "wrong.yaml")
+    assert ended.code == 2
+    assert no_traceback(ended.said)
+    for expected in (
+        "wrong.yaml:3:1",  # unknown key
+        "did you mean seed",
+        "wrong.yaml:5:17",  # wrong type
+        "wrong.yaml:8:17",  # unknown method
+        "did you mean plane.hough2d",
+        "wrong.yaml:9:",  # planes not wired
+        "wrong.yaml:10:3",  # duplicate step
+        "cycle",
+    ):
+        assert expected in ended.said
+
+
+def test_the_errors_are_data_for_other_programs(shell: Shell, write: Write) -> None:
+    write("wrong.yaml", SIX_ERRORS)
+    problems = json.loads(shell("check", "wrong.yaml", "--json").out)["problems"]
+    assert {3, 5, 8, 9, 10} <= {problem["line"] for problem in problems}
+
+
+BAD_SCANS: dict[str, bytes] = {
+    "corrupt.laz": b"LASF" + bytes(range(256)) * 8,
+    "text.e57": b"this is not a scan\n" * 50,
+    "empty.las": b"",
+    "empty.xyz": b"",
+    "words.xyz": b"the quick brown fox\njumps over\n",
+    "header.ply": b"ply\nformat ascii 1.0\nelement vertex 5\nproperty float x\n",
+    "photo.jpg": b"\xff\xd8\xff\xe0 not a scan",
+}
+
+
+@pytest.mark.parametrize("name", BAD_SCANS, ids=str)
+def test_a_bad_scan_ends_in_one_sentence_with_exit_code_two(
+    shell: Shell, tmp_path: Path, name: str
+) -> None:
+    (tmp_path / name).write_bytes(BAD_SCANS[name])
+    ended = shell("run", "direct.yaml", "--input", f"scan={name}", "-o", "run")
+    assert ended.code == 2
+    assert no_traceback(ended.said)
+    assert name in ended.said
+
+
+def test_a_truncated_laz_is_named(shell: Shell, tmp_path: Path, shared_data: Path) -> None:
+    whole = (shared_data / "lion-takanawa" / "lion_takanawa_1mm.laz").read_bytes()
+    (tmp_path / "half.laz").write_bytes(whole[: len(whole) // 2])
+    ended = shell("run", "direct.yaml", "--input", "scan=half.laz", "-o", "run")
+    assert ended.code == 2
+    assert no_traceback(ended.said)
+    assert "half.laz" in ended.said
+
+
+def test_a_scan_that_is_not_there_is_named(shell: Shell) -> None:
+    ended = shell("run", "direct.yaml", "--input", "scan=nowhere.laz")
+    assert ended.code == 2
+    assert "nowhere.laz" in ended.said
+    assert no_traceback(ended.said)
+
+
+def test_methods_that_misbehave_fail_alone(with_stranger: Shell, write: Write) -> None:
+    write("mischief.yaml", MISCHIEF)
+    ended = with_stranger("run", "mischief.yaml", "-o", "run")
+    assert ended.code == 1
+    assert no_traceback(ended.said)
+    shown = json.loads(with_stranger("show", "run", "--json").out)
+    cells = {cell["address"]: cell for cell in shown["cells"]}
+    reasons = {
+        "crash": "segmentation fault",
+        "exit": "17",
+        "raise": "KeyError",
+        "hang": "5 s",
+        "fill": "No space left",
+    }
+    for variant, reason in reasons.items():
+        cell = cells[f"bad@bad={variant}"]
+        assert cell["status"] == "failed"
+        assert reason in cell["error_message"]
+        assert cells[f"wall@bad={variant}"]["status"] == "skipped"
+    assert cells["room"]["status"] == "ok"
+    assert cells["bad@bad=good"]["status"] == "ok"
+    assert cells["wall@bad=good"]["status"] == "ok"
+    assert with_stranger("verify", "run").code == 0
+
+
+@pytest.mark.slow
+def test_a_method_that_eats_all_memory_is_stopped_and_the_rest_goes_on(
+    with_stranger: Shell, write: Write
+) -> None:
+    write("eat.yaml", MISCHIEF.replace("crash: {use: mischief.crash}", "eat: {use: mischief.eat}"))
+    ended = with_stranger("run", "eat.yaml", "-o", "run", "--set", "room.scan_step_m=0.1")
+    assert ended.code == 1
+    cells = {
+        cell["address"]: cell
+        for cell in json.loads(with_stranger("show", "run", "--json").out)["cells"]
+    }
+    assert cells["bad@bad=eat"]["status"] == "failed"
+    assert "memory" in cells["bad@bad=eat"]["error_message"]
+    assert cells["wall@bad=good"]["status"] == "ok"

@@ -1,0 +1,92 @@
+"""Killed at any moment, the same command goes on and ends with the digests of a quiet run."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import orthoflow
+from tests.road.conftest import Shell
+
+SMALL = ("--set", "room.scan_step_m=0.05", "--set", "wall.gsd_m=0.05")
+KILLS = 10 if os.environ.get("ORTHOFLOW_LONG_TESTS") == "1" else 3
+
+
+def digests(run_folder: Path) -> dict[str, str]:
+    run = orthoflow.open_run(run_folder)
+    return {
+        f"{address}.{port}": product.digest
+        for address, cell in run.cells.items()
+        for port, product in cell.outputs.items()
+    }
+
+
+def test_killed_runs_resume_with_the_same_digests(shell: Shell) -> None:
+    command = ("run", "direct.yaml", *SMALL)
+    started = time.monotonic()
+    quiet = shell(*command, "-o", "quiet", "--store", "quiet-store")
+    duration_s = time.monotonic() - started
+    assert quiet.code == 0, quiet.said
+    expected = digests(shell.folder / "quiet")
+    rng = random.Random(20150807)
+    for attempt in range(KILLS):
+        arguments = (*command, "-o", f"killed{attempt}", "--store", f"store{attempt}")
+        _kill_after(shell, arguments, rng.uniform(0.5, duration_s))
+        ended = shell(*arguments)
+        finished_before = ended.code == 2 and "run.h5" in ended.said
+        assert ended.code == 0 or finished_before, ended.said
+        assert digests(shell.folder / f"killed{attempt}") == expected
+        assert shell("verify", f"killed{attempt}").code == 0
+
+
+def _kill_after(shell: Shell, arguments: tuple[str, ...], seconds: float) -> None:
+    process = subprocess.Popen(
+        shell.command(*arguments),
+        cwd=shell.folder,
+        env=shell.variables(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        stdin=subprocess.DEVNULL,
+    )
+    try:
+        process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+
+def test_ctrl_c_says_how_to_go_on(shell: Shell) -> None:
+    arguments = ("run", "direct.yaml", *SMALL, "-o", "run")
+    process = subprocess.Popen(
+        shell.command(*arguments),
+        cwd=shell.folder,
+        env=shell.variables(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    said = process.stdout.readline()  # it has begun
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    said += process.communicate(timeout=60)[0]
+    assert process.returncode == 130, said
+    assert "Traceback" not in said
+    assert "-o run" in said
+    assert shell(*arguments).code == 0
+
+
+def test_both_executors_give_the_same_digests(shell: Shell) -> None:
+    found = []
+    for executor in ("inline", "local"):
+        options = ("--store", f"{executor}-store", "-o", executor, "--executor", executor)
+        ended = shell("run", "direct.yaml", *SMALL, *options)
+        assert ended.code == 0, ended.said
+        found.append(digests(shell.folder / executor))
+    assert found[0] == found[1]
