@@ -1,0 +1,154 @@
+"""Pictures for the page: products of the record as small images inside the HTML."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.files.images import preview_png, stretch_to_grey
+from orthoflow.geometry import WallFrame
+from orthoflow.products import Orthoimages, OrthoMask, SurfaceMask, Walls
+from orthoflow.records import Run
+
+LONGEST_SIDE_PX: Final = 1200
+
+# From blue (behind the plane) over white (on it) to red (in front): readable in grey and with
+# red-green blindness. Colours of the classes RdBu, Brewer 2003.
+_DIVERGING: Final = np.array(
+    [[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]],
+    dtype=np.float64,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """One image on the page.
+
+    Attributes:
+        uri: data URI of the image.
+        title: what it shows.
+        caption: size and shares, in words.
+        file: path of the full image relative to the run folder, or empty.
+    """
+
+    uri: str
+    title: str
+    caption: str
+    file: str = ""
+
+
+def data_uri(content: bytes, media_type: str) -> str:
+    """Give the bytes of a file as a URI that carries them."""
+    return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def orthoimage_pictures(run: Run) -> Iterator[Picture]:
+    """Every orthoimage that the record holds."""
+    for address, port in _embedded(run, "orthoimages"):
+        product = Orthoimages.from_payload(run.payload(address, port))
+        for index, image in enumerate(product.images):
+            shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
+            filled = float(np.mean(image.mask == OrthoMask.FILLED))
+            caption = (
+                f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells show "
+                f"something, {_percent(filled)} of them filled from neighbours"
+                if filled
+                else f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells painted"
+            )
+            yield Picture(
+                uri=data_uri(
+                    preview_png(image.rgb, shown, longest_side_px=LONGEST_SIDE_PX), "image/png"
+                ),
+                title=_title(image.name, address),
+                caption=caption,
+                file=_published(run, address, f"wall_{index}_ortho.tif"),
+            )
+
+
+def wall_pictures(run: Run) -> Iterator[Picture]:
+    """Depth and intensity of every wall raster that the record holds."""
+    for address, port in _embedded(run, "walls"):
+        product = Walls.from_payload(run.payload(address, port))
+        for index, wall in enumerate(product.walls):
+            known = wall.mask != SurfaceMask.VOID
+            limit_m = _depth_limit_m(wall.depth_m)
+            yield Picture(
+                uri=data_uri(
+                    preview_png(
+                        depth_colours(wall.depth_m, limit_m), known, longest_side_px=LONGEST_SIDE_PX
+                    ),
+                    "image/png",
+                ),
+                title=_title(f"{wall.name}, depth", address),
+                caption=(
+                    f"blue {1000 * limit_m:.0f} mm behind the plane, white on it, red "
+                    f"{1000 * limit_m:.0f} mm in front; {_percent(known.mean())} of the cells known"
+                ),
+                file=_published(run, address, f"wall_{index}_depth.tif"),
+            )
+            if wall.intensity is not None:
+                grey = stretch_to_grey(wall.intensity)
+                yield Picture(
+                    uri=data_uri(
+                        preview_png(
+                            grey, np.isfinite(wall.intensity), longest_side_px=LONGEST_SIDE_PX
+                        ),
+                        "image/png",
+                    ),
+                    title=_title(f"{wall.name}, intensity", address),
+                    caption={
+                        "laser": "laser intensity",
+                        "luminance": "no laser intensity in the scan: grey of its colours instead",
+                    }.get(product.intensity_source, product.intensity_source),
+                    file=_published(run, address, f"wall_{index}_intensity.tif"),
+                )
+
+
+def depth_colours(depth_m: NDArray[np.float32], limit_m: float) -> NDArray[np.uint8]:
+    """Colour depths from blue (-limit) over white (0) to red (+limit); NaN is white."""
+    place = np.nan_to_num(np.clip(depth_m / limit_m, -1.0, 1.0)) * 2.0 + 2.0
+    low = np.clip(np.floor(place).astype(np.int64), 0, 3)
+    share = (place - low)[..., None]
+    mixed: NDArray[np.float64] = (1.0 - share) * _DIVERGING[low] + share * _DIVERGING[low + 1]
+    return np.rint(mixed).astype(np.uint8)
+
+
+def frame_words(frame: WallFrame) -> str:
+    """Say how large a raster is on the wall, and how fine."""
+    return (
+        f"{frame.width * frame.gsd_m:.2f} x {frame.height * frame.gsd_m:.2f} m at "
+        f"{1000 * frame.gsd_m:g} mm, {frame.width} x {frame.height} cells"
+    )
+
+
+def _embedded(run: Run, type_name: str) -> Iterator[tuple[str, str]]:
+    for address, cell in run.cells.items():
+        for port, product in cell.outputs.items():
+            if product.type_name == type_name and product.embedded:
+                yield address, port
+
+
+def _depth_limit_m(depth_m: NDArray[np.float32]) -> float:
+    known = np.abs(depth_m[np.isfinite(depth_m)])
+    return max(0.001, float(np.percentile(known, 99))) if known.size else 0.001
+
+
+def _title(name: str, address: str) -> str:
+    _, varied, variants = address.partition("@")
+    return f"{name} ({variants})" if varied else name
+
+
+def _published(run: Run, address: str, name: str) -> str:
+    for path in run.files.get(address, ()):
+        if path.name == name:
+            return path.relative_to(run.folder).as_posix()
+    return ""
+
+
+def _percent(share: float) -> str:
+    return f"{100 * float(share):.1f} %"
