@@ -1,0 +1,228 @@
+"""Laying a cloud into the raster of a wall: streams the points, gives arrays per cell.
+
+Loads numba through `raster_kernels`; import it in method modules only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import raster_kernels as kernels
+from orthoflow.geometry.frames import WallFrame
+from orthoflow.geometry.raster_kernels import Entries, Moments, Target, Winners
+
+# 2^19 points: the entries of a chunk (8 MB) stay in the processor's cache between the passes.
+_CHUNK: Final = 1 << 19
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffsetPoints:
+    """Points as a cloud keeps them.
+
+    Attributes:
+        origin: (3,) float64 metres.
+        x: (n,) float32 metres from the origin; y and z alike.
+        y: see x.
+        z: see x.
+    """
+
+    origin: NDArray[np.float64]
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slab:
+    """The raster of a wall and how far in front of and behind its plane points count.
+
+    Attributes:
+        frame: where the cells lie.
+        front_m: reach towards the viewer, measured from the plane.
+        behind_m: reach away from the viewer, positive.
+    """
+
+    frame: WallFrame
+    front_m: float
+    behind_m: float
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return self.frame.width * self.frame.height
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellStatistics:
+    """What all points of a cell say together, flat.
+
+    Attributes:
+        count: uint32.
+        mean_m: float32 metres, NaN where void.
+        sigma_m: float32 metres, sample standard deviation, NaN with fewer than two points.
+    """
+
+    count: NDArray[np.uint32]
+    mean_m: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+
+
+def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Transform (3, 4) from offsets of a cloud in metres to (column, row, depth in metres).
+
+    The difference of the two origins is taken once, in float64: with survey coordinates of 10^6 m
+    nothing is lost.
+    """
+    axes = np.vstack([frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world])
+    return np.column_stack([axes, axes @ (origin - frame.origin_world)])
+
+
+def entries_inside(points: OffsetPoints, slab: Slab) -> Iterator[Entries]:
+    """Give the points inside a slab, chunk by chunk, in their order.
+
+    The yielded arrays are overwritten by the next chunk.
+    """
+    frame = slab.frame
+    target = Target(
+        wall_from_offset=wall_from_offset(frame, points.origin),
+        behind_m=-float(slab.behind_m),
+        front_m=float(slab.front_m),
+        height=frame.height,
+        width=frame.width,
+    )
+    x, y, z = (_read_only(values) for values in (points.x, points.y, points.z))
+    size = min(_CHUNK, max(1, x.size))
+    buffers = _empty_entries(size)
+    for first in range(0, x.size, size):
+        part = slice(first, min(first + size, x.size))
+        n_blocks = -(-(part.stop - part.start) // kernels.BLOCK)
+        entries = buffers._replace(n_inside=buffers.n_inside[:n_blocks])
+        kernels.project_points(x[part], y[part], z[part], first, target, entries)
+        yield entries
+
+
+def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> Winners:
+    """The point nearest to the viewer in each cell: the rule of skarlatos2012.
+
+    Ties go to the point nearer the centre of its cell, then to the lower index.
+    """
+    winners = empty_winners(slab.n_cells)
+    owners = owners_among(threads)
+    for entries in entries_inside(points, slab):
+        kernels.keep_topmost(entries, winners, owners)
+    return winners
+
+
+def empty_winners(n_cells: int) -> Winners:
+    """Give cells that nobody has won yet."""
+    return Winners(
+        depths_m=np.full(n_cells, -np.inf, dtype=np.float32),
+        squares=np.full(n_cells, np.inf, dtype=np.float32),
+        points=np.full(n_cells, kernels.NO_POINT, dtype=np.uint32),
+    )
+
+
+def empty_moments(n_cells: int) -> Moments:
+    """Give sums over no points."""
+    return Moments(
+        n_points=np.zeros(n_cells, dtype=np.uint32),
+        sum_m=np.zeros(n_cells),
+        sum_m2=np.zeros(n_cells),
+    )
+
+
+def statistics_of(moments: Moments) -> CellStatistics:
+    """Mean and spread of each cell; the moments' arrays are used up."""
+    count, mean, squares = moments.n_points, moments.sum_m, moments.sum_m2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        np.divide(mean, count, out=mean)
+        squares -= mean * mean * count
+        np.maximum(squares, 0.0, out=squares)
+        # Unsigned: 0 - 1 would be four thousand million points.
+        np.divide(squares, count - 1.0, out=squares)
+        np.sqrt(squares, out=squares)
+    squares[count < 2] = np.nan
+    return CellStatistics(
+        count=count, mean_m=mean.astype(np.float32), sigma_m=squares.astype(np.float32)
+    )
+
+
+def disc_offsets(radius_cells: int) -> NDArray[np.int64]:
+    """Cells (k, 2) = (row, column) within a radius of a centre cell, nearest first, without it."""
+    steps = np.arange(-radius_cells, radius_cells + 1, dtype=np.int64)
+    rows, columns = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+    squares = rows * rows + columns * columns
+    order = np.argsort(squares, kind="stable")
+    order = order[(squares[order] > 0) & (squares[order] <= radius_cells * radius_cells)]
+    return np.column_stack([rows[order], columns[order]])
+
+
+def lenders_in_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArray[np.int64]:
+    """For each void cell of a narrow gap the measured cell nearest to it.
+
+    A gap is narrow where no disc of the radius fits into it: what stays void is the morphological
+    opening of the void cells, so that windows and outlines keep their shape to the cell. Cells
+    outside the raster count as void. Of cells equally near, the upper and then the left one lends.
+
+    Args:
+        is_measured: (rows, cols).
+        radius_cells: radius of the disc; 0 finds no gap.
+
+    Returns:
+        (k, 2) flat indices: the void cell, and the measured cell that lends its values.
+    """
+    if radius_cells == 0:
+        return np.empty((0, 2), dtype=np.int64)
+    offsets = disc_offsets(radius_cells)
+    frame = 2 * radius_cells
+    padded: NDArray[np.bool_] = np.pad(is_measured, frame)
+    nearest = kernels.nearest_within(padded, offsets, radius_cells)
+    void = np.flatnonzero(kernels.is_narrow_gap(padded, nearest, offsets))
+    width, padded_width = is_measured.shape[1], padded.shape[1]
+
+    def unpadded(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        rows, columns = np.divmod(cells, padded_width)
+        flat: NDArray[np.int64] = (rows - frame) * width + columns - frame
+        return flat
+
+    lenders = nearest.ravel()[void].astype(np.int64)
+    return np.column_stack([unpadded(void), unpadded(lenders)])
+
+
+def use_threads(cores: int) -> int:
+    """Let the passes use so many threads, as far as numba has them; gives their number."""
+    # numba sets the attributes of its config module when it is imported.
+    n_threads = min(cores, int(vars(numba.config)["NUMBA_NUM_THREADS"]))
+    numba.set_num_threads(n_threads)
+    return n_threads
+
+
+def owners_among(threads: int) -> int:
+    """Give the largest power of two that is not above the number of threads."""
+    return 1 << (max(1, threads).bit_length() - 1)
+
+
+def _empty_entries(n_points: int) -> Entries:
+    n_blocks = -(-n_points // kernels.BLOCK)
+    slots = n_blocks * kernels.BLOCK
+    return Entries(
+        cells=np.empty(slots, dtype=np.int32),
+        depths_m=np.empty(slots, dtype=np.float32),
+        squares=np.empty(slots, dtype=np.float32),
+        points=np.empty(slots, dtype=np.uint32),
+        n_inside=np.zeros(n_blocks, dtype=np.int64),
+    )
+
+
+def _read_only(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    # Mapped inputs are read-only, arrays of tests are not: one kernel signature serves both, so
+    # that nothing is compiled twice.
+    view = np.asarray(values).view()
+    view.flags.writeable = False
+    return view

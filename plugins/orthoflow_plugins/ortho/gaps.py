@@ -1,0 +1,86 @@
+"""Which gaps between painted cells may be filled, and with what colour (skarlatos2012, 3)."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Inpainting = Literal["telea", "navier-stokes", "none"]
+VoidLimits = tuple[int, int, int]
+
+_WINDOWS: Final = (3, 5, 7)
+
+
+def fillable_gaps(is_void: NDArray[np.bool_], limits: VoidLimits) -> NDArray[np.bool_]:
+    """Void cells with few void cells around them.
+
+    The void cells in the 3 x 3, 5 x 5 and 7 x 7 windows around a void cell are counted, the cell
+    itself included; all three counts must not exceed their limit. Cells outside the image count
+    as void: nothing is known there, so that the rim of an image is filled more reluctantly than
+    its inside and never extrapolated. The rule is applied once.
+
+    Args:
+        is_void: (rows, cols).
+        limits: largest counts in the three windows.
+
+    Returns:
+        (rows, cols).
+    """
+    is_fillable = is_void.copy()
+    for window, limit in zip(_WINDOWS, limits, strict=True):
+        is_fillable &= void_counts(is_void, window) <= limit
+    return is_fillable
+
+
+def void_counts(is_void: NDArray[np.bool_], window: int) -> NDArray[np.uint8]:
+    """Void cells (rows, cols) in the square window around each cell; outside counts as void."""
+    import cv2
+
+    reach = window // 2
+    padded = cv2.copyMakeBorder(
+        is_void.astype(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=1
+    )
+    counts = cv2.boxFilter(padded, -1, (window, window), normalize=False)
+    return np.asarray(counts[reach:-reach, reach:-reach], dtype=np.uint8)
+
+
+def inpainted(
+    rgb: NDArray[np.uint8],
+    is_void: NDArray[np.bool_],
+    is_fillable: NDArray[np.bool_],
+    *,
+    method: Inpainting,
+    radius_px: float,
+) -> NDArray[np.uint8]:
+    """Paint the fillable cells with colours that come from painted cells only.
+
+    Args:
+        rgb: (rows, cols, 3); values of void cells have no influence.
+        is_void: (rows, cols) cells without a colour.
+        is_fillable: (rows, cols) the void cells to paint.
+        method: of `cv2.inpaint`; `none` paints nothing.
+        radius_px: neighbourhood from which a cell takes its colour.
+
+    Returns:
+        (rows, cols, 3) colours, 0 in void cells that are not filled.
+    """
+    import cv2
+
+    if method == "none" or is_void.all() or not is_fillable.any():
+        return np.where(is_void[..., np.newaxis], np.uint8(0), rgb)
+    # cv2.inpaint takes every cell outside its mask for known, so that the black of large voids
+    # would creep into the gaps beside them. Void cells lend the colour of their nearest painted
+    # cell while it runs.
+    _, labels = cv2.distanceTransformWithLabels(
+        is_void.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    painted = np.flatnonzero(~is_void)
+    painted_of_label = np.zeros(painted.size + 1, dtype=np.int64)
+    painted_of_label[labels.ravel()[painted]] = painted
+    lent = rgb.reshape(-1, 3)[painted_of_label[labels.ravel()]].reshape(rgb.shape)
+    flag = cv2.INPAINT_TELEA if method == "telea" else cv2.INPAINT_NS
+    filled = cv2.inpaint(lent, is_fillable.astype(np.uint8), radius_px, flag)
+    is_shown = ~is_void | is_fillable
+    return np.where(is_shown[..., np.newaxis], filled, np.uint8(0))

@@ -1,0 +1,300 @@
+"""`raster.grid`: the scanned surface over each wall as a regular raster (markiewicz2015, 3.4)."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.rastering import Slab, lenders_in_gaps, use_threads
+from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.raster.previews import depth_preview
+from orthoflow_plugins.raster.selection import Constraint, WallChoice, chosen_planes, frame_of
+from orthoflow_plugins.raster.surfaces import CellSurface, Surface, SurfaceRule, surface_of
+
+# Rec. 601 luma on the sRGB values as they are: the grey of cv2.cvtColor.
+_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+# What the passes hold per cell at their peak, outputs included; measured with a 5 megapixel wall.
+_BYTES_PER_CELL: Final = 110
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Raster:
+    wall: Wall
+    scan_step_m: float
+
+
+class RasterGrid(Method):
+    """Lay the cloud into a raster on each wall: depth, spread, count, intensity, colour.
+
+    Narrow gaps are closed with the nearest measured cell; wider ones, such as windows, stay void.
+    """
+
+    id: ClassVar[str] = "raster.grid"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "exact"
+    citations: ClassVar[tuple[str, ...]] = (
+        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.4, 4.2",
+    )
+
+    class Params(MethodParams):
+        """Cell size, reach of the surface, which planes, and how gaps close."""
+
+        gsd_m: float = Field(
+            default=0.005, gt=0, description="Side of a cell; not finer than the scan's step."
+        )
+        buffer_m: float = Field(
+            default=0.15, gt=0, description="Points so far from the plane, on both sides, count."
+        )
+        buffer_front_m: float | None = Field(
+            default=None, ge=0, description="Reach towards the viewer instead of buffer_m."
+        )
+        buffer_behind_m: float | None = Field(
+            default=None, ge=0, description="Reach behind the plane instead of buffer_m."
+        )
+        surface: Surface = Field(
+            default="median",
+            description="Depth of a cell: median of its points; the point nearest its centre "
+            "(markiewicz2015); the topmost point (skarlatos2012); or the mean.",
+        )
+        layer_m: float = Field(
+            default=0.02,
+            gt=0,
+            description="A depth step beyond which two points of a cell are two surfaces, which "
+            "the median never averages.",
+        )
+        recover_gap_cells: int = Field(
+            default=2,
+            ge=0,
+            le=50,
+            description="Void cells are recovered where no disc of this radius fits into the gap; "
+            "0 recovers nothing.",
+        )
+        constraint: Constraint = Field(
+            default="any", description="Raster only vertical, only horizontal, or any planes."
+        )
+        min_area_m2: float = Field(
+            default=1.0,
+            ge=0,
+            description="Smallest rectangle of a plane; the one with the most support is exempt.",
+        )
+        n_walls_max: int = Field(
+            default=12, ge=1, le=1000, description="At most so many planes, by support."
+        )
+        margin_m: float = Field(
+            default=0.0, ge=0, description="Widens the rectangle of a plane on all sides."
+        )
+
+    class In(Ports):
+        """The cloud and the planes found in it."""
+
+        cloud: PointCloud
+        planes: Planes
+
+    class Out(Ports):
+        """One raster per wall."""
+
+        walls: Walls
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Raster the chosen planes, one pass over the cloud or a few for each."""
+        cloud, planes = inputs.cloud, inputs.planes
+        cloud.require_points(3)
+        threads = use_threads(ctx.cores)
+        slabs = _slabs(planes, params)
+        rasters: list[_Raster] = []
+        for k, (index, slab) in enumerate(slabs.items()):
+            ctx.progress(k / len(slabs), planes.names[index])
+            rasters.append(_raster(cloud, slab, params, threads=threads, plane=(planes, index)))
+        walls = tuple(raster.wall for raster in rasters)
+        _require_points_near(walls, params)
+        source = _intensity_source(cloud)
+        _warn(ctx, params, rasters, source)
+        _report(ctx, params, rasters)
+        slab = next(iter(slabs.values()))
+        return self.Out(
+            walls=Walls(
+                walls=walls,
+                up=planes.up.copy(),
+                intensity_source=source,
+                buffer_front_m=slab.front_m,
+                buffer_behind_m=slab.behind_m,
+                details={
+                    "surface": params.surface,
+                    "scan_step_m": [raster.scan_step_m for raster in rasters],
+                },
+            )
+        )
+
+
+def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
+    """Slab of each chosen plane by its index.
+
+    Raises:
+        MethodError: the rasters would not fit into memory.
+    """
+    choice = WallChoice(
+        constraint=params.constraint,
+        min_area_m2=params.min_area_m2,
+        n_walls_max=params.n_walls_max,
+    )
+    front, behind = params.buffer_front_m, params.buffer_behind_m
+    slabs = {
+        index: Slab(
+            frame=frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m),
+            front_m=params.buffer_m if front is None else front,
+            behind_m=params.buffer_m if behind is None else behind,
+        )
+        for index in chosen_planes(planes, choice)
+    }
+    _require_memory([slab.frame for slab in slabs.values()])
+    return slabs
+
+
+def _require_memory(frames: list[WallFrame]) -> None:
+    n_cells = sum(frame.width * frame.height for frame in frames)
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    limit = min(memory // (2 * _BYTES_PER_CELL), np.iinfo(np.int32).max)
+    if n_cells > limit:
+        largest = max(frames, key=lambda frame: frame.width * frame.height)
+        raise MethodError(
+            f"cells of gsd_m = {largest.gsd_m:g} m give {n_cells:.3g} cells ({largest.width} x "
+            f"{largest.height} on the largest wall), but at most {limit:.3g} fit into this "
+            "machine's memory: raise gsd_m, or lower n_walls_max"
+        )
+
+
+def _raster(
+    cloud: PointCloud,
+    slab: Slab,
+    params: RasterGrid.Params,
+    *,
+    threads: int,
+    plane: tuple[Planes, int],
+) -> _Raster:
+    rule = SurfaceRule(surface=params.surface, layer_m=params.layer_m, threads=threads)
+    surface = surface_of(cloud, slab, rule)
+    mask = np.where(surface.count > 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8)
+    lent = lenders_in_gaps(surface.count.reshape(slab.frame.shape) > 0, params.recover_gap_cells)
+    _recover(surface, mask, lent)
+    planes, index = plane
+    shape = slab.frame.shape
+    intensity = _grey(surface.rgb, mask) if surface.intensity is None else surface.intensity
+    wall = Wall(
+        frame=slab.frame,
+        plane_index=index,
+        name=planes.names[index],
+        depth_m=surface.depth_m.reshape(shape),
+        sigma_m=surface.sigma_m.reshape(shape),
+        count=surface.count.reshape(shape),
+        mask=mask.reshape(shape),
+        intensity=None if intensity is None else intensity.reshape(shape),
+        rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
+        rgb_mask=None if surface.rgb is None else (mask > 0).astype(np.uint8).reshape(shape),
+    )
+    return _Raster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=params.gsd_m))
+
+
+def _recover(surface: CellSurface, mask: NDArray[np.uint8], lent: NDArray[np.int64]) -> None:
+    """Copy values into the cells of narrow gaps; their spread stays unknown, their count 0."""
+    void, lender = lent[:, 0], lent[:, 1]
+    mask[void] = SurfaceMask.RECOVERED
+    for values in (surface.depth_m, surface.intensity, surface.rgb):
+        if values is not None:
+            values[void] = values[lender]
+
+
+def _grey(rgb: NDArray[np.uint8] | None, mask: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    if rgb is None:
+        return None
+    grey = rgb.astype(np.float32) @ _LUMA / np.float32(255.0)
+    grey[mask == SurfaceMask.VOID] = np.nan
+    return grey.astype(np.float32)
+
+
+def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
+    """Distance between neighbouring points on the wall, estimated from the points per cell.
+
+    Cells are joined, 2 x 2, until a block that holds points holds at least four on average: from
+    then on chance hardly leaves a block of scanned surface empty, so that the blocks show the
+    scanned area.
+
+    Args:
+        count: (rows, cols) points per cell.
+        gsd_m: side of a cell in metres.
+
+    Returns:
+        Side of the square that each point has for itself, metres; 0 without points.
+    """
+    blocks, side_m = count.astype(np.int64), gsd_m
+    while blocks.any():
+        per_block = blocks.sum() / np.count_nonzero(blocks)
+        if per_block >= 4.0 or blocks.size == 1:
+            return float(side_m / np.sqrt(per_block))
+        rows, columns = blocks.shape
+        even = np.pad(blocks, ((0, rows % 2), (0, columns % 2)))
+        blocks = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
+        side_m *= 2.0
+    return 0.0
+
+
+def _require_points_near(walls: tuple[Wall, ...], params: RasterGrid.Params) -> None:
+    if not any(wall.count.any() for wall in walls):
+        raise MethodError(
+            f"no point of the cloud lies inside the rectangle and the buffer of a wall "
+            f"(buffer_m = {params.buffer_m:g}): the planes do not belong to this cloud, or the "
+            "buffer is too small"
+        )
+
+
+def _intensity_source(cloud: PointCloud) -> str:
+    if cloud.intensity is not None:
+        return "laser"
+    return "none" if cloud.rgb is None else "luminance"
+
+
+def _warn(ctx: StepContext, params: RasterGrid.Params, rasters: list[_Raster], source: str) -> None:
+    if source == "luminance":
+        ctx.warn("the cloud has no laser intensity; the grey of its colours (Rec. 601) stands in")
+    if source == "none":
+        ctx.warn("the cloud has neither intensity nor colour; only the depth of walls is rastered")
+    for raster in rasters:
+        if not raster.wall.count.any():
+            ctx.warn(f"{raster.wall.name}: no point lies within its buffer")
+        elif raster.scan_step_m > params.gsd_m:
+            measured = np.count_nonzero(raster.wall.count) / raster.wall.count.size
+            ctx.warn(
+                f"{raster.wall.name}: cells of gsd_m = {params.gsd_m:g} m are finer than the scan, "
+                f"whose points lie about {raster.scan_step_m:.2g} m apart; {measured:.0%} of the "
+                "cells have a point"
+            )
+
+
+def _report(ctx: StepContext, params: RasterGrid.Params, rasters: list[_Raster]) -> None:
+    walls = [raster.wall for raster in rasters]
+    n_cells = sum(wall.mask.size for wall in walls)
+    per_cell = np.concatenate([wall.count[wall.count > 0] for wall in walls])
+    spread_m = np.concatenate([wall.sigma_m[wall.count > 1] for wall in walls])
+    ctx.metric("n_walls", len(walls), "1")
+    ctx.metric("n_points_inside", int(per_cell.sum(dtype=np.int64)), "1")
+    ctx.metric("points_per_cell", float(np.median(per_cell)), "1")
+    ctx.metric("scan_step_mm", 1000.0 * rasters[0].scan_step_m, "mm")
+    ctx.metric("gsd_mm", 1000.0 * params.gsd_m, "mm")
+    if spread_m.size:
+        ctx.metric("sigma_median_mm", 1000.0 * float(np.median(spread_m)), "mm")
+    for state in SurfaceMask:
+        share = sum(np.count_nonzero(wall.mask == state) for wall in walls) / n_cells
+        ctx.metric(f"{state.name.lower()}_share", share, "1")
+    ctx.figure(
+        "depth",
+        depth_preview(walls[0]),
+        f"Depth of {walls[0].name}: brighter is nearer to the viewer, grey is void.",
+    )

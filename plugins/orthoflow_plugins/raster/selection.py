@@ -1,0 +1,84 @@
+"""Which planes become walls, and the raster over each."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame, frame_over
+from orthoflow.products import Planes
+
+Constraint = Literal["vertical", "horizontal", "any"]
+
+# How far a plane may lean and still count as vertical or horizontal.
+_LEAN_DEG: Final = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallChoice:
+    """What decides which planes are rastered.
+
+    Attributes:
+        constraint: direction of the planes.
+        min_area_m2: smallest rectangle; the plane with the most support is exempt.
+        n_walls_max: at most so many, by support.
+    """
+
+    constraint: Constraint
+    min_area_m2: float
+    n_walls_max: int
+
+
+def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
+    """Indices of the planes to raster, by support, largest first.
+
+    Raises:
+        MethodError: no plane has the wanted direction, or there is none at all.
+    """
+    if len(planes) == 0:
+        raise MethodError("no plane was found in the cloud, at least one is needed for a wall")
+    fitting = [k for k in range(len(planes)) if _fits(planes, k, choice.constraint)]
+    if not fitting:
+        raise MethodError(
+            f"none of the {len(planes)} planes is {choice.constraint} within {_LEAN_DEG:g} deg: "
+            "set constraint to any, or look for other planes"
+        )
+    large = [k for k in fitting if area_m2(planes.corners[k]) >= choice.min_area_m2]
+    # The best supported plane stays whatever its size: a scan of one small object has a wall too.
+    chosen = sorted({fitting[0], *large})
+    return chosen[: choice.n_walls_max]
+
+
+def area_m2(corners: NDArray[np.float64]) -> float:
+    """Area of a rectangle given by its corners (4, 3), top-left first, counter-clockwise."""
+    down, right = corners[1] - corners[0], corners[3] - corners[0]
+    return float(np.linalg.norm(np.cross(down, right)))
+
+
+def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> WallFrame:
+    """Lay the raster over a plane's rectangle, widened on all sides."""
+    corners = planes.corners[index]
+    right = _unit(corners[3] - corners[0])
+    down = _unit(corners[1] - corners[0])
+    steps = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
+    widened = corners + margin_m * (steps[:, :1] * right + steps[:, 1:] * down)
+    return frame_over(widened, planes.normal[index], gsd_m=gsd_m)
+
+
+def _fits(planes: Planes, index: int, constraint: Constraint) -> bool:
+    upright = abs(float(planes.normal[index] @ planes.up))
+    if constraint == "vertical":
+        return upright <= math.sin(math.radians(_LEAN_DEG))
+    if constraint == "horizontal":
+        return upright >= math.cos(math.radians(_LEAN_DEG))
+    return True
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 0.0 else vector
