@@ -10,6 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.errors import ProductError
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products.product import JsonValue, Product, Tolerance
 
 
@@ -158,6 +160,27 @@ class Camera:
     covariance: NDArray[np.float64] | None = None
     sigma0_px: float | None = None
     sigma_wall_m: float | None = None
+
+    def viewing(self) -> ViewingCamera:
+        """Give the camera that projects.
+
+        Raises:
+            ProductError: the photo is not oriented.
+        """
+        rotation, translation = self.rotation_camera_from_world, self.translation_camera_from_world
+        if self.intrinsics is None or rotation is None or translation is None:
+            raise ProductError(f"photo {self.photo} is not oriented: {self.status}")
+        return ViewingCamera(
+            width=self.intrinsics.width,
+            height=self.intrinsics.height,
+            fx=self.intrinsics.fx,
+            fy=self.intrinsics.fy,
+            cx=self.intrinsics.cx,
+            cy=self.intrinsics.cy,
+            distortion=np.array(self.intrinsics.distortion, dtype=np.float64),
+            rotation=rotation,
+            translation=translation,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,102 @@
+"""The distorted camera against OpenCV and against itself."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def camera(seed: int, *, distorted: bool = True) -> ViewingCamera:
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform(-1.0, 1.0, 3) - [0.0, 4.0, 0.0]
+    rotation = looking_at(centre, rng.uniform(-0.3, 0.3, 3), UP)
+    distortion = np.array([-0.11, 0.04, 1.2e-3, -8e-4, -5e-3]) if distorted else np.zeros(5)
+    return ViewingCamera(
+        width=3000,
+        height=2000,
+        fx=2500.0 + rng.uniform(-100, 100),
+        fy=2510.0,
+        cx=1510.3,
+        cy=992.7,
+        distortion=distortion,
+        rotation=rotation,
+        translation=-rotation @ centre,
+    )
+
+
+def points(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform([-1.5, -0.3, -1.0], [1.5, 0.3, 1.0], (200, 3))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_projection_is_opencvs_half_a_pixel_on(seed: int) -> None:
+    viewer = camera(seed)
+    matrix = np.array([[viewer.fx, 0, viewer.cx - 0.5], [0, viewer.fy, viewer.cy - 0.5], [0, 0, 1]])
+    rotation_vector, _ = cv2.Rodrigues(viewer.rotation)
+    expected, _ = cv2.projectPoints(
+        points(seed), rotation_vector, viewer.translation, matrix, viewer.distortion
+    )
+    found = viewer.project(points(seed))
+    np.testing.assert_allclose(found[:, :2] - 0.5, expected[:, 0], atol=1e-8)  # pixels
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_ray_of_a_points_pixel_leads_back_to_the_point(seed: int) -> None:
+    viewer = camera(seed)
+    scene = points(seed)
+    seen = viewer.project(scene)
+    rays = viewer.rays_world(seen[:, :2])
+    expected = scene - viewer.centre_world
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(rays, expected, atol=1e-10)
+
+
+def test_survey_coordinates_lose_nothing_through_a_shifted_camera() -> None:
+    shift = np.array([634512.347, 486215.781, 112.193])
+    near = camera(1)
+    far = camera(1).shifted(-shift)
+    np.testing.assert_allclose(far.centre_world, near.centre_world + shift, atol=1e-8)
+    np.testing.assert_allclose(
+        far.shifted(shift).project(points(1)), near.project(points(1)), atol=1e-6
+    )
+
+
+def test_points_behind_the_camera_are_not_seen() -> None:
+    viewer = camera(2)
+    behind = 2.0 * viewer.centre_world[None] - points(2)
+    assert np.isnan(viewer.project(behind)[:, :2]).all()
+    assert not viewer.sees(viewer.project(behind)[:, :2]).any()
+
+
+def test_a_point_beyond_the_fold_of_the_lens_does_not_come_back_into_the_image() -> None:
+    rotation = looking_at(np.array([0.0, -4.0, 0.0]), np.zeros(3), UP)
+    viewer = ViewingCamera(
+        width=3000, height=2000, fx=1500.0, fy=1500.0, cx=1500.0, cy=1000.0,
+        distortion=np.array([-0.35, 0.0, 0.0, 0.0, 0.0]),
+        rotation=rotation, translation=-rotation @ np.array([0.0, -4.0, 0.0]),
+    )  # fmt: skip
+    # r (1 - 0.35 r^2) turns back at r = 0.976; r = 1.6 would appear at 0.17, near the centre.
+    seen = viewer.project(np.array([[4.0 * 1.6, 0.0, 0.0], [4.0 * 0.9, 0.0, 0.0]]))
+    assert np.isnan(seen[0, 0])
+    assert np.isfinite(seen[1, 0])
+
+
+def test_a_level_camera_has_level_rows() -> None:
+    rotation = looking_at(np.array([1.0, -4.0, 0.5]), np.zeros(3), UP)
+    assert rotation[0] @ UP == pytest.approx(0.0)
+    assert rotation[1] @ UP < 0.0
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+def test_a_mirroring_rotation_is_refused() -> None:
+    with pytest.raises(GeometryError, match="mirrors the world"):
+        ViewingCamera(
+            width=3, height=2, fx=1, fy=1, cx=1, cy=1, distortion=np.zeros(5),
+            rotation=np.diag([1.0, 1.0, -1.0]), translation=np.zeros(3),
+        )  # fmt: skip
