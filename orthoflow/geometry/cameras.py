@@ -105,13 +105,13 @@ class ViewingCamera:
                 model.
         """
         centre, focal = np.array([self.cx, self.cy]), np.array([self.fx, self.fy])
-        wanted: NDArray[np.float64] = (pixels_photo - centre) / focal
+        wanted = np.asarray((pixels_photo - centre) / focal, dtype=np.float64)
         found = wanted.copy()
         step = np.zeros_like(found)
         for _ in range(_ITERATIONS):
             error, jacobian = self._distortion_error(found, wanted)
-            step = np.linalg.solve(jacobian, error[:, :, None])[:, :, 0]
-            found = found - step
+            step[:] = np.linalg.solve(jacobian, error[:, :, None])[:, :, 0]
+            found = np.asarray(found - step, dtype=np.float64)
             if not step.size or np.abs(step).max() < _CONVERGED:
                 break
         if step.size and not np.abs(step).max() < 1e-9:
