@@ -1,1 +1,52 @@
 """The workflow document: reading it, checking it, and expanding it into cells."""
+
+from __future__ import annotations
+
+from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
+from orthoflow.workflow.document import load_workflow, resolved_json
+from orthoflow.workflow.expansion import derive_seed, expand_cells
+from orthoflow.workflow.inputs import present_inputs, resolve_input_files
+from orthoflow.workflow.model import (
+    Comparison,
+    Reference,
+    StepVariant,
+    Workflow,
+    WorkflowInputSpec,
+    WorkflowStep,
+)
+from orthoflow.workflow.problems import (
+    InvalidArgumentsError,
+    InvalidWorkflowError,
+    Problem,
+    UnusablePluginError,
+)
+from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
+from orthoflow.workflow.selection import Selection, check_step_names
+from orthoflow.workflow.wiring import topological_steps
+
+__all__ = [
+    "Cell",
+    "CellOutput",
+    "Comparison",
+    "InvalidArgumentsError",
+    "InvalidWorkflowError",
+    "Problem",
+    "Reference",
+    "Selection",
+    "StepVariant",
+    "UnusablePluginError",
+    "Workflow",
+    "WorkflowInput",
+    "WorkflowInputSpec",
+    "WorkflowStep",
+    "check_step_names",
+    "derive_seed",
+    "expand_cells",
+    "load_workflow",
+    "present_inputs",
+    "resolve_input_files",
+    "resolved_json",
+    "shipped_workflow",
+    "shipped_workflows",
+    "topological_steps",
+]

@@ -1,0 +1,272 @@
+"""YAML 1.2 text as values that know their line and column, with everything odd refused.
+
+ruamel.yaml composes the nodes; turning nodes into values happens here, so that duplicate keys,
+tags and anchor bombs are problems among others instead of the first exception.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final, TypeAlias
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
+
+from orthoflow.products.product import JsonValue
+from orthoflow.workflow.problems import ProblemLog
+
+MAX_NODES: Final = 10_000
+MAX_DEPTH: Final = 60
+_TAG: Final = "tag:yaml.org,2002:"
+
+Scalar: TypeAlias = bool | int | float | str | None
+
+
+@dataclass(frozen=True, kw_only=True, order=True)
+class Position:
+    """A place in the text; line and column count from 1."""
+
+    line: int
+    column: int
+
+
+_START: Final = Position(line=1, column=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Text:
+    """A single value: text, number, true, false or null."""
+
+    position: Position
+    value: Scalar
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listing:
+    """A list."""
+
+    position: Position
+    items: tuple[Value, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A key with its value."""
+
+    position: Position
+    key: str
+    value: Value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A mapping; every key occurs once."""
+
+    position: Position
+    entries: tuple[Entry, ...]
+
+    def get(self, key: str) -> Entry | None:
+        """The entry of a key."""
+        return next((entry for entry in self.entries if entry.key == key), None)
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter(self.entries)
+
+
+Value: TypeAlias = Text | Listing | Table
+
+
+def plain(value: Value) -> JsonValue:
+    """Give a value without positions."""
+    if isinstance(value, Text):
+        return value.value
+    if isinstance(value, Listing):
+        return [plain(item) for item in value.items]
+    return {entry.key: plain(entry.value) for entry in value}
+
+
+def describe(value: Value) -> str:
+    """Say what a value is, for messages: `the text "a"`, `a list`, `a mapping`, `5`."""
+    if isinstance(value, Listing):
+        return "a list"
+    if isinstance(value, Table):
+        return "a mapping"
+    return describe_scalar(value.value)
+
+
+def describe_scalar(value: object) -> str:
+    """Say what a plain value is, for messages.
+
+    >>> describe_scalar("0.003"), describe_scalar(0.003), describe_scalar(None)
+    ('the text "0.003"', '0.003', 'nothing')
+    """
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'the text "{value}"'
+    return str(value)
+
+
+def read_yaml(text: str, log: ProblemLog) -> Value | None:
+    """Read a document; problems go to the log, None when nothing can be read."""
+    try:
+        return _Converter(log=log).convert(_compose(text), "", 0)
+    except _UnreadableError as error:
+        log.add(error.position, "", str(error))
+        return None
+
+
+class _UnreadableError(Exception):
+    def __init__(self, position: Position, message: str) -> None:
+        super().__init__(message)
+        self.position = position
+
+
+def _compose(text: str) -> Node:
+    if re.search(r"^%YAML +(?!1\.2\s)", text, re.MULTILINE):
+        raise _UnreadableError(
+            _START, "expected YAML 1.2, got a %YAML line that asks for another version"
+        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
+            node: Node | None = YAML(typ="rt", pure=True).compose(text)
+    except MarkedYAMLError as error:
+        raise _UnreadableError(
+            _mark_position(error.problem_mark), f"this is not YAML: {_words(error)}"
+        ) from error
+    except YAMLError as error:
+        raise _UnreadableError(
+            _reader_position(text, error), f"this is not YAML: {_first_line(error)}"
+        ) from error
+    except RecursionError as error:
+        raise _UnreadableError(
+            _START, f"the document is nested deeper than {MAX_DEPTH} levels"
+        ) from error
+    if node is None:
+        raise _UnreadableError(_START, "the document is empty")
+    return node
+
+
+def _mark_position(mark: object) -> Position:
+    line, column = getattr(mark, "line", 0), getattr(mark, "column", 0)
+    return Position(line=int(line) + 1, column=int(column) + 1)
+
+
+def _reader_position(text: str, error: YAMLError) -> Position:
+    before = text[: int(getattr(error, "position", 0) or 0)]
+    return Position(line=before.count("\n") + 1, column=len(before) - before.rfind("\n"))
+
+
+def _words(error: MarkedYAMLError) -> str:
+    parts = [part for part in (error.context, error.problem) if part]
+    return ", ".join(" ".join(str(part).split()) for part in parts)
+
+
+def _first_line(error: YAMLError) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@dataclass
+class _Converter:
+    """Turns composed nodes into values; aliases are expanded and counted."""
+
+    log: ProblemLog
+    n_nodes: int = 0
+    open_nodes: set[int] = field(default_factory=set)
+
+    def convert(self, node: Node, path: str, depth: int) -> Value:
+        position = _mark_position(node.start_mark)
+        self.n_nodes += 1
+        if self.n_nodes > MAX_NODES:
+            raise _UnreadableError(
+                position, f"the document has more than {MAX_NODES} values once aliases are expanded"
+            )
+        if depth > MAX_DEPTH or id(node) in self.open_nodes:
+            raise _UnreadableError(
+                position,
+                f"the document is nested deeper than {MAX_DEPTH} levels or contains itself",
+            )
+        if isinstance(node, ScalarNode):
+            return Text(position=position, value=self._scalar(node, position, path))
+        self.open_nodes.add(id(node))
+        value = self._collection(node, position, path, depth)
+        self.open_nodes.discard(id(node))
+        return value
+
+    def _collection(self, node: Node, position: Position, path: str, depth: int) -> Value:
+        if str(node.tag) not in (_TAG + "map", _TAG + "seq"):
+            self._refuse_tag(node, position, path)
+        if isinstance(node, SequenceNode):
+            items = (
+                self.convert(item, f"{path}[{index}]", depth + 1)
+                for index, item in enumerate(node.value)
+            )
+            return Listing(position=position, items=tuple(items))
+        entries: dict[str, Entry] = {}
+        for key_node, value_node in node.value:
+            key_position = _mark_position(key_node.start_mark)
+            key = self._key(key_node, key_position, path)
+            value = self.convert(value_node, join(path, key), depth + 1)
+            if key in entries:
+                first = entries[key].position.line
+                message = f"the key is there already, in line {first}; remove one of them"
+                self.log.add(key_position, join(path, key), message)
+            else:
+                entries[key] = Entry(position=key_position, key=key, value=value)
+        return Table(position=position, entries=tuple(entries.values()))
+
+    def _key(self, node: Node, position: Position, path: str) -> str:
+        if isinstance(node, ScalarNode) and str(node.tag) in (_TAG + "str", _TAG + "merge"):
+            return str(node.value)
+        if isinstance(node, ScalarNode):
+            self.log.add(position, path, f"a key must be text, got {node.value or 'nothing'}")
+            return str(node.value)
+        self.log.add(position, path, "a key must be text, got a list or mapping")
+        return "?"
+
+    def _scalar(self, node: ScalarNode, position: Position, path: str) -> Scalar:
+        tag, text = str(node.tag), str(node.value)
+        try:
+            return _parse_scalar(tag.removeprefix(_TAG), text)
+        except KeyError:
+            self._refuse_tag(node, position, path)
+        except ValueError:
+            self.log.add(position, path, f"{text!r} is no {tag.removeprefix(_TAG)}")
+        return text
+
+    def _refuse_tag(self, node: Node, position: Position, path: str) -> None:
+        self.log.add(position, path, f"tags are not allowed in a workflow, got {node.tag}")
+
+
+def join(path: str, key: str) -> str:
+    """Append a key to a path."""
+    return f"{path}.{key}" if path else key
+
+
+def _parse_scalar(kind: str, text: str) -> Scalar:
+    match kind:
+        case "str" | "timestamp" | "merge" | "value":
+            return text
+        case "null":
+            return None
+        case "bool":
+            return {"true": True, "false": False}[text.lower()]
+        case "int":
+            digits = text.replace("_", "").lower()
+            base = next((base for mark, base in _BASES.items() if mark in digits), 10)
+            return int(digits, base)
+        case "float":
+            number = text.replace("_", "").lower()
+            return float(number.replace(".inf", "inf").replace(".nan", "nan"))
+        case _:
+            raise KeyError(kind)
+
+
+_BASES: Final = {"0x": 16, "0o": 8, "0b": 2}

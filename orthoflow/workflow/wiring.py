@@ -1,0 +1,206 @@
+"""Checking how steps hang together: references, port types, required ports, cycles."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import networkx as nx
+
+from orthoflow.catalog import did_you_mean
+from orthoflow.catalog.loading import FILES
+from orthoflow.workflow.model import INPUTS, WorkflowStep
+from orthoflow.workflow.positions import join
+from orthoflow.workflow.problems import ProblemLog
+from orthoflow.workflow.steps import DraftPort, DraftReference, DraftStep
+
+
+def step_graph(steps: Mapping[str, WorkflowStep]) -> nx.DiGraph[str]:
+    """Give the graph of steps; an edge runs from the step that makes a product to its user."""
+    graph: nx.DiGraph[str] = nx.DiGraph()
+    graph.add_nodes_from(steps)
+    for step in steps.values():
+        graph.add_edges_from((source, step.name) for source in step.upstream())
+    return graph
+
+
+def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
+    """Order steps so that each stands behind all it needs, else in the order of the file."""
+    rank = {name: index for index, name in enumerate(steps)}
+    ordered = nx.lexicographical_topological_sort(step_graph(steps), key=rank.__getitem__)
+    return tuple(str(name) for name in ordered)
+
+
+def check_wiring(
+    steps: Sequence[DraftStep],
+    step_names: Collection[str],
+    input_names: Collection[str],
+    log: ProblemLog,
+) -> None:
+    """Report everything that is wrong with how steps are wired.
+
+    Args:
+        steps: all steps that could be read.
+        step_names: names of all steps in the file, readable or not.
+        input_names: names of all inputs.
+        log: takes the problems.
+    """
+    checker = _Checker(
+        steps={step.name: step for step in steps},
+        step_names=step_names,
+        input_names=input_names,
+        log=log,
+    )
+    for step in steps:
+        checker.check_step(step)
+    _check_cycles(steps, log)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Checker:
+    steps: Mapping[str, DraftStep]
+    step_names: Collection[str]
+    input_names: Collection[str]
+    log: ProblemLog
+
+    def check_step(self, step: DraftStep) -> None:
+        accepted = _accepted_ports(step)
+        for port in step.ports:
+            if accepted is None:
+                self._check_references(port.references, None)
+            elif port.name in accepted:
+                self._check_references(port.references, accepted[port.name])
+            else:
+                self._report_unknown_port(step, port, accepted)
+                self._check_references(port.references, None)
+        if step.unless is not None:
+            self._check_unless(step.unless)
+        self._check_required(step)
+
+    def _report_unknown_port(
+        self, step: DraftStep, port: DraftPort, accepted: Collection[str]
+    ) -> None:
+        self.log.add(
+            port.position,
+            port.path,
+            f"{step.variants[0].method} has no input port {port.name}"
+            f"{did_you_mean(port.name, accepted)}; it has {', '.join(accepted) or 'none'}",
+        )
+
+    def _check_references(self, drafts: Sequence[DraftReference], wanted: str | None) -> None:
+        for draft in drafts:
+            found = self._type_of(draft)
+            if found is not None and wanted is not None and found != wanted:
+                self.log.add(
+                    draft.position,
+                    draft.path,
+                    f"expected {_article(wanted)}, but {draft.reference} gives {_article(found)}",
+                )
+
+    def _type_of(self, draft: DraftReference) -> str | None:
+        """Product type behind a reference; None when unknown, which is reported."""
+        reference = draft.reference
+        if reference.is_input:
+            if reference.name in self.input_names:
+                return FILES
+            known = ", ".join(self.input_names) or "none"
+            self.log.add(
+                draft.position,
+                draft.path,
+                f"there is no input {reference.name}"
+                f"{did_you_mean(reference.name, self.input_names)}; inputs: {known}",
+            )
+            return None
+        if reference.source not in self.step_names:
+            self.log.add(
+                draft.position,
+                draft.path,
+                f"there is no step {reference.source}"
+                f"{did_you_mean(reference.source, [*self.step_names, INPUTS])}; steps: "
+                f"{', '.join(self.step_names)}",
+            )
+            return None
+        source = self.steps.get(reference.source)
+        given = _given_ports(source) if source else None
+        if given is None:
+            return None
+        if reference.name not in given:
+            self.log.add(
+                draft.position,
+                draft.path,
+                f"step {reference.source} has no output port {reference.name}"
+                f"{did_you_mean(reference.name, given)}; it has {', '.join(given)}",
+            )
+        return given.get(reference.name)
+
+    def _check_unless(self, draft: DraftReference) -> None:
+        if draft.reference.is_input:
+            self._type_of(draft)
+        else:
+            self.log.add(
+                draft.position,
+                draft.path,
+                f"expected an input such as inputs.scan, got {draft.reference}",
+            )
+
+    def _check_required(self, step: DraftStep) -> None:
+        wired = {port.name for port in step.ports}
+        for variant in step.variants:
+            if variant.info is None:
+                continue
+            for port in variant.info.takes.values():
+                if port.required and port.name not in wired:
+                    self.log.add(
+                        variant.position,
+                        join(step.path, "in"),
+                        f"{variant.method} needs port {port.name}, {_article(port.type_name)}, "
+                        f"which is not wired",
+                    )
+
+
+def _accepted_ports(step: DraftStep) -> Mapping[str, str] | None:
+    """Input port -> product type; None when the step's kind is unknown."""
+    for variant in step.variants:
+        if variant.kind is not None and not variant.kind.is_source:
+            return variant.kind.inputs
+        if variant.info is not None:
+            return {port.name: port.type_name for port in variant.info.takes.values()}
+    return None
+
+
+def _given_ports(step: DraftStep) -> Mapping[str, str] | None:
+    """Output port -> product type; None when the step's kind is unknown."""
+    for variant in step.variants:
+        if variant.kind is not None and not variant.kind.is_source:
+            return variant.kind.outputs
+        if variant.info is not None:
+            return variant.info.gives
+    return None
+
+
+def _article(type_name: str) -> str:
+    return "files of an input" if type_name == FILES else f"the product {type_name}"
+
+
+def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
+    wires: dict[tuple[str, str], DraftReference] = {}
+    names = {step.name for step in steps}
+    for step in steps:
+        for port in step.ports:
+            for draft in port.references:
+                if draft.reference.source in names:
+                    wires.setdefault((draft.reference.source, step.name), draft)
+    graph: nx.DiGraph[str] = nx.DiGraph(list(wires))
+    for members in nx.strongly_connected_components(graph):
+        inside = graph.subgraph(members)
+        if inside.number_of_edges() == 0:
+            continue
+        edges = [(str(edge[0]), str(edge[1])) for edge in nx.find_cycle(inside)]
+        first = min(range(len(edges)), key=lambda index: wires[edges[index]].position)
+        edges = edges[first:] + edges[:first]
+        drafts = [wires[edge] for edge in edges]
+        listed = ", ".join(
+            f"{edge[1]} takes {draft.reference} (line {draft.position.line})"
+            for edge, draft in zip(edges, drafts, strict=True)
+        )
+        log.add(drafts[0].position, drafts[0].path, f"the steps form a cycle: {listed}")
