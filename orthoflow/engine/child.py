@@ -1,0 +1,123 @@
+"""The process of one step: `python -m orthoflow.engine.child TASK PIPE PARENT`.
+
+Light imports on top: it must tie its life to the coordinator's before anything slow loads.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import faulthandler
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from orthoflow.engine.results import CellResult
+    from orthoflow.engine.tasks import Task
+    from orthoflow.sdk.context import StepEvent
+
+_PR_SET_PDEATHSIG: Final = 1
+_OOM_SCORE: Final = "900"
+_PROGRESS_EVERY_S: Final = 0.1
+
+
+class ProgressPipe:
+    """Writes events as JSON lines to the coordinator's pipe; threads may share it."""
+
+    def __init__(self, descriptor: int) -> None:
+        """Take an open descriptor."""
+        self._descriptor = descriptor
+        self._lock = threading.Lock()
+        self._last = 0.0
+
+    def listen(self, event: StepEvent) -> None:
+        """Pass on an event; progress at most ten times a second, the rest into the log too."""
+        if event.kind == "progress":
+            if time.monotonic() - self._last < _PROGRESS_EVERY_S and event.fraction < 1.0:
+                return
+            self._last = time.monotonic()
+        else:
+            sys.stderr.write(f"{event.text}\n")
+        self.send({"kind": event.kind, "text": event.text, "fraction": event.fraction})
+
+    def send(self, content: dict[str, object]) -> None:
+        """Write one line; without a coordinator there is nobody to work for."""
+        line = json.dumps(content, ensure_ascii=True).encode() + b"\n"
+        try:
+            with self._lock:
+                while line:
+                    line = line[os.write(self._descriptor, line) :]
+        except BrokenPipeError:
+            os._exit(1)
+
+
+class StopRequest:
+    """Remembers that SIGTERM came."""
+
+    def __init__(self) -> None:
+        self.is_set = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle the signal."""
+        self.is_set = True
+
+
+def die_with(parent: int) -> None:
+    """Let the kernel kill this process when the coordinator's spawning thread dies."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        # It died before the line above.
+        os._exit(1)
+
+
+def volunteer_for_oom_killer() -> None:
+    """Be the first that the kernel kills when memory runs out, instead of the coordinator."""
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE, encoding="ascii")
+
+
+def main(arguments: list[str]) -> None:
+    """Run one task and leave its result beside it."""
+    task_file, descriptor, parent = Path(arguments[0]), int(arguments[1]), int(arguments[2])
+    die_with(parent)
+    volunteer_for_oom_killer()
+    os.set_inheritable(descriptor, False)  # noqa: FBT003
+    stop = StopRequest()
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    faulthandler.enable()
+    pipe = ProgressPipe(descriptor)
+
+    from orthoflow.engine.running import run_task  # noqa: PLC0415 - after the ties above
+    from orthoflow.engine.tasks import read_task  # noqa: PLC0415
+
+    task = read_task(task_file)
+    result = run_task(task, pipe.listen, lambda: stop.is_set)
+    _leave(task, result, pipe)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Without the interpreter's tear-down: libraries crash there, and threads may never end.
+    os._exit(0)
+
+
+def _leave(task: Task, result: CellResult, pipe: ProgressPipe) -> None:
+    from orthoflow.engine.durability import write_whole  # noqa: PLC0415
+    from orthoflow.engine.result_files import result_to_json  # noqa: PLC0415
+    from orthoflow.errors import StoreError  # noqa: PLC0415
+
+    try:
+        write_whole(task.result_file, result_to_json(result).encode())
+    except StoreError as error:
+        reason = result.error_message or str(error)
+        pipe.send({"kind": "failed", "text": reason, "fraction": 0.0})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

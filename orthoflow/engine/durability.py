@@ -1,0 +1,117 @@
+"""Writing that survives a kill: a file is whole under its name, or it is not there."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from orthoflow.errors import StoreError
+
+_REASONS = {
+    errno.ENOSPC: "No space left on the disk; free some, or choose another folder",
+    errno.EDQUOT: "the disk quota is used up; free some space, or choose another folder",
+    errno.EFBIG: "the file would be larger than allowed here; choose another folder",
+    errno.EROFS: "the disk is read-only; choose another folder",
+    errno.EACCES: "permission is denied; choose another folder",
+    errno.EPERM: "permission is denied; choose another folder",
+    errno.ENOTDIR: "a file stands where a folder is needed; choose another folder",
+}
+
+
+def store_error(error: OSError, folder: Path) -> StoreError:
+    """Turn an error of the operating system into one sentence that names the folder."""
+    reason = _REASONS.get(error.errno or 0, error.strerror or str(error))
+    failure = StoreError(f"cannot write to {folder}: {reason}")
+    failure.errno = error.errno
+    return failure
+
+
+@contextmanager
+def writing_to(folder: Path) -> Iterator[None]:
+    """Turn every OSError inside into a StoreError that names the folder.
+
+    Raises:
+        StoreError: full disk, no permission, or another failure of the disk.
+    """
+    try:
+        yield
+    except StoreError:
+        raise
+    except OSError as error:
+        raise store_error(error, folder) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames in a folder survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_file(path: Path) -> None:
+    """Make the content of a closed file survive a power cut."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file aside and rename it into place; readers see the old one or the new one.
+
+    Raises:
+        StoreError: the disk refuses.
+    """
+    aside = path.with_name(f".{path.name[:40]}-{uuid.uuid4().hex}")
+    with writing_to(path.parent):
+        try:
+            with aside.open("wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            aside.replace(path)
+        except OSError:
+            aside.unlink(missing_ok=True)
+            raise
+        sync_folder(path.parent)
+
+
+def place_folder(aside: Path, final: Path) -> bool:
+    """Rename a finished folder into place.
+
+    Returns:
+        False when another writer was first; the newcomer is then removed.
+
+    Raises:
+        StoreError: the disk refuses.
+    """
+    with writing_to(final.parent):
+        final.parent.mkdir(parents=True, exist_ok=True)
+        sync_folder(aside)
+        try:
+            aside.rename(final)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            remove_tree(aside)
+            return False
+        sync_folder(final.parent)
+    return True
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder that may be gone already or be removed by somebody else meanwhile."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def folder_size(folder: Path) -> int:
+    """Bytes of all files below a folder, 0 when it is not there."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())

@@ -1,0 +1,83 @@
+"""Where cells run: versions, processor and commit; never a user, host or folder name."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Final
+
+from orthoflow.engine.store import canonical_json
+from orthoflow.products.product import JsonValue
+
+_GIT_TIMEOUT_S: Final = 10.0
+
+
+def environment(threads: int) -> dict[str, JsonValue]:
+    """Describe this machine and installation, as a record's environment has it.
+
+    Args:
+        threads: threads given to the cell.
+    """
+    content: dict[str, JsonValue] = {
+        "python": platform.python_version(),
+        "os": f"{platform.system()} {platform.release()}",
+        "cpu": cpu_name(),
+        "cores": os.cpu_count() or 1,
+        "threads": threads,
+        "git_commit": git_commit(),
+        "packages": dict(packages()),
+    }
+    digest = hashlib.sha256(canonical_json(content).encode()).hexdigest()
+    return {"id": f"sha256:{digest}", **content}
+
+
+@cache
+def packages() -> dict[str, str]:
+    """Installed distributions with their versions, the first of a name winning as on import."""
+    found: dict[str, str] = {}
+    for distribution in metadata.distributions():
+        name = distribution.metadata["Name"]
+        if name and name not in found:
+            found[name] = distribution.version
+    return dict(sorted(found.items(), key=lambda item: item[0].lower()))
+
+
+@cache
+def cpu_name() -> str:
+    """Model name of the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+@cache
+def git_commit() -> str:
+    """Commit of orthoflow's code when run from a checkout, `+changes` behind it when dirty."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return ""
+    commit = _git(root, "rev-parse", "HEAD")
+    changes = _git(root, "status", "--porcelain", "--untracked-files=no")
+    return f"{commit}+changes" if commit and changes else commit
+
+
+def _git(root: Path, *arguments: str) -> str:
+    try:
+        finished = subprocess.run(
+            ["git", "-C", str(root), *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_GIT_TIMEOUT_S,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return finished.stdout.strip() if finished.returncode == 0 else ""

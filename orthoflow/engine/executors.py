@@ -1,0 +1,102 @@
+"""What runs tasks: the interface, and the executor that runs them in this very process."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from orthoflow.engine.durability import write_whole
+from orthoflow.engine.results import CellResult
+from orthoflow.engine.running import run_task
+from orthoflow.engine.tasks import Task
+from orthoflow.sdk.context import StepEvent
+
+Tell = Callable[[str, StepEvent], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskEnd:
+    """A task that ended.
+
+    Attributes:
+        address: of its cell.
+        result: ok or failed, never skipped.
+    """
+
+    address: str
+    result: CellResult
+
+
+class Executor(Protocol):
+    """Runs tasks; used from one thread.
+
+    Nothing here assumes one machine: a task is JSON, its results lie in the store.
+    """
+
+    def start(self, task: Task) -> None:
+        """Begin a task, or put it in line.
+
+        Raises:
+            StoreError: its files cannot be written.
+        """
+        raise AssertionError("a protocol is never called")
+
+    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+        """Wait up to a time for tasks to end; passes on what running tasks say meanwhile."""
+        raise AssertionError("a protocol is never called")
+
+    def cancel(self) -> None:
+        """Ask all tasks to stop; they still end through `poll`, after a grace period by force."""
+        raise AssertionError("a protocol is never called")
+
+    def close(self) -> None:
+        """Stop whatever still runs, at once."""
+        raise AssertionError("a protocol is never called")
+
+
+class InlineExecutor:
+    """Runs tasks one by one in this process, for debugging: no timeout, no crash protection."""
+
+    def __init__(self, tell: Tell) -> None:
+        """Make one.
+
+        Args:
+            tell: gets the address of a task and what it says.
+        """
+        self._tell = tell
+        self._waiting: deque[Task] = deque()
+        self._is_cancelled = False
+
+    def start(self, task: Task) -> None:
+        """Put a task in line."""
+        self._waiting.append(task)
+
+    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+        """Run the next task to its end; the timeout means nothing here."""
+        if not self._waiting:
+            return ()
+        task = self._waiting.popleft()
+        log: list[str] = []
+
+        def listen(event: StepEvent) -> None:
+            if event.kind != "progress":
+                log.append(event.text)
+            self._tell(task.address, event)
+
+        result = run_task(task, listen, lambda: self._is_cancelled)
+        text = "".join(f"{line}\n" for line in log)
+        write_whole(Path(task.log), text.encode())
+        return (TaskEnd(address=task.address, result=dataclasses.replace(result, log=text)),)
+
+    def cancel(self) -> None:
+        """Ask the running task to stop and forget those in line."""
+        self._is_cancelled = True
+        self._waiting.clear()
+
+    def close(self) -> None:
+        """Forget the tasks in line."""
+        self._waiting.clear()

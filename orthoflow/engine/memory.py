@@ -1,0 +1,202 @@
+"""How much memory processes take and how much the machine, or its container, has left."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+MIB: Final = 1 << 20
+GIB: Final = 1 << 30
+_SAMPLE_S: Final = 0.05
+_CGROUPS: Final = Path("/sys/fs/cgroup")
+# Version 1 says "unlimited" with a number near 2**63.
+_UNLIMITED: Final = 1 << 60
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessMemory:
+    """Memory of one process in bytes.
+
+    Attributes:
+        anonymous: its own memory; mapped files do not count.
+        files: resident parts of mapped files.
+        peak_resident: largest sum of both so far.
+    """
+
+    anonymous: int
+    files: int
+    peak_resident: int
+
+
+def process_memory(process_id: int | str = "self") -> ProcessMemory | None:
+    """Measure a process; None when it is gone."""
+    try:
+        text = Path(f"/proc/{process_id}/status").read_text(encoding="utf-8")
+    except OSError:
+        return None
+    fields = _fields(text)
+    return ProcessMemory(
+        anonymous=fields.get("RssAnon", 0) + fields.get("RssShmem", 0),
+        files=fields.get("RssFile", 0),
+        peak_resident=fields.get("VmHWM", 0),
+    )
+
+
+def group_memory(group_id: int) -> int:
+    """Anonymous memory of all processes of a group, in bytes."""
+    total = 0
+    for entry in os.scandir("/proc"):
+        if entry.name.isdigit() and _group_of(int(entry.name)) == group_id:
+            memory = process_memory(entry.name)
+            total += memory.anonymous if memory else 0
+    return total
+
+
+@dataclass(frozen=True, kw_only=True)
+class AvailableMemory:
+    """Bytes that processes here can still get, and bytes there are in all."""
+
+    available: int
+    total: int
+
+    @property
+    def floor(self) -> int:
+        """Below this the machine starts to fail at random: 512 MiB or 3 % of all."""
+        return min(max(512 * MIB, self.total * 3 // 100), self.total // 8)
+
+
+def available_memory() -> AvailableMemory:
+    """Measure the machine and every control group that this process is in."""
+    fields = _fields(Path("/proc/meminfo").read_text(encoding="utf-8"))
+    total, available = fields["MemTotal"], fields["MemAvailable"]
+    for limit, used in _group_limits():
+        total = min(total, limit)
+        available = min(available, limit - used)
+    return AvailableMemory(available=max(0, available), total=total)
+
+
+class MemorySampler:
+    """Samples this process's memory in a thread while a method runs.
+
+    Attributes:
+        peak_mib: largest own memory; at least what the kernel's high-water mark proves.
+    """
+
+    def __init__(self) -> None:
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._sample, name="memory", daemon=True)
+        self._peak_anonymous = 0
+        self._peak_files = 0
+        self._peak_resident = 0
+
+    def __enter__(self) -> Self:
+        self._note()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._note()
+
+    @property
+    def peak_mib(self) -> float:
+        """Largest own memory in MiB.
+
+        Between two samples the kernel's mark of all resident memory less the largest part that
+        mapped files ever took is a lower bound.
+        """
+        proven = self._peak_resident - self._peak_files
+        return round(max(self._peak_anonymous, proven) / MIB, 1)
+
+    def _sample(self) -> None:
+        while not self._stop.wait(_SAMPLE_S):
+            self._note()
+
+    def _note(self) -> None:
+        memory = process_memory()
+        if memory is not None:
+            self._peak_anonymous = max(self._peak_anonymous, memory.anonymous)
+            self._peak_files = max(self._peak_files, memory.files)
+            self._peak_resident = max(self._peak_resident, memory.peak_resident)
+
+
+def _fields(text: str) -> dict[str, int]:
+    """Read `Name:   123 kB` lines as bytes."""
+    fields: dict[str, int] = {}
+    for line in text.splitlines():
+        name, _, value = line.partition(":")
+        words = value.split()
+        if len(words) == 2 and words[1] == "kB":
+            fields[name] = int(words[0]) * 1024
+    return fields
+
+
+def _group_of(process_id: int) -> int:
+    try:
+        return os.getpgid(process_id)
+    except ProcessLookupError:
+        return -1
+
+
+def _group_limits() -> list[tuple[int, int]]:
+    """(limit, used) of this process's memory control groups and their parents, in bytes."""
+    try:
+        lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return []
+    found: list[tuple[int, int]] = []
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers == "":
+            found += _limits_upwards(_CGROUPS, path, _V2)
+        elif "memory" in controllers.split(","):
+            found += _limits_upwards(_CGROUPS / "memory", path, _V1)
+    return found
+
+
+_V1: Final = {
+    "limit": "memory.limit_in_bytes",
+    "used": "memory.usage_in_bytes",
+    "cache": "total_inactive_file",
+}
+_V2: Final = {"limit": "memory.max", "used": "memory.current", "cache": "inactive_file"}
+
+
+def _limits_upwards(root: Path, path: str, names: Mapping[str, str]) -> list[tuple[int, int]]:
+    folder = root / path.lstrip("/")
+    found: list[tuple[int, int]] = []
+    # Inside a container the path may be the host's; the container's own group is then the root.
+    for level in [folder, *folder.parents]:
+        if not level.is_relative_to(root):
+            break
+        limit = _number(level / names["limit"])
+        used = _number(level / names["used"])
+        if limit is not None and used is not None and limit < _UNLIMITED:
+            found.append((limit, used - _reclaimable(level, names["cache"])))
+    return found
+
+
+def _number(path: Path) -> int | None:
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
+
+def _reclaimable(folder: Path, name: str) -> int:
+    try:
+        lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) for line in lines if line.split()[0] == name)

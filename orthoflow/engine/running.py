@@ -1,0 +1,270 @@
+"""Running one task where we are: read the inputs, call the method, keep the outputs."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import os
+import resource
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from importlib import import_module
+from pathlib import Path
+from typing import Final, cast
+
+import numpy as np
+from pydantic import ValidationError
+
+from orthoflow.engine.durability import store_error, writing_to
+from orthoflow.engine.memory import MemorySampler
+from orthoflow.engine.results import CellResult, FigureRef, MetricValue, ProductRef
+from orthoflow.engine.store import Publisher, Store, digest_of
+from orthoflow.engine.tasks import Task, TaskInput
+from orthoflow.errors import InputError, MethodError, OrthoflowError, PluginError, StepFailedError
+from orthoflow.products.input_files import InputFiles
+from orthoflow.products.product import Product
+from orthoflow.sdk.context import StepContext, StepEvent
+from orthoflow.sdk.methods import Method
+
+# Inputs up to this size are digested again after the run: they must not have changed.
+_CHECKED_BYTES: Final = 16 << 20
+_MEDIA_TYPES: Final = {".png": "image/png", ".svg": "image/svg+xml"}
+
+Listener = Callable[[StepEvent], None]
+
+
+def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> CellResult:
+    """Run a task to its end; every failure becomes a failed result, never an exception.
+
+    Args:
+        task: what to run; its folder exists.
+        listen: gets progress, log lines and warnings.
+        is_cancelled: asks whether to stop.
+    """
+    started = now()
+    sampler = MemorySampler()
+    call = _Call(task, listen, is_cancelled)
+    try:
+        with sampler:
+            result = call.run()
+    except Exception as error:  # noqa: BLE001 - a foreign method may raise anything
+        result = failed_result(task, explain_failure(task, error), _trace(error))
+    except SystemExit as error:
+        reason = MethodError(f"method {task.method} tried to end the program ({error.code})")
+        result = failed_result(task, reason, _trace(error))
+    return dataclasses.replace(
+        result,
+        started=started,
+        ended=now(),
+        wall_s=call.wall_s,
+        cpu_s=call.cpu_s,
+        peak_rss_mib=sampler.peak_mib,
+        warnings=tuple(call.warnings),
+    )
+
+
+def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellResult:
+    """Give the result of a cell that failed."""
+    return dataclasses.replace(
+        blank_result(task),
+        status="failed",
+        error_type=type(error).__name__,
+        error_message=str(error),
+        traceback=trace,
+        exit_code=error.exit_code,
+    )
+
+
+def blank_result(task: Task) -> CellResult:
+    """Give a result with everything that is known before a task runs."""
+    return CellResult(
+        status="ok",
+        key=task.key,
+        key_preimage=task.key_preimage,
+        run_id=task.run_id,
+        method=task.method,
+        distribution=task.distribution,
+        distribution_version=task.distribution_version,
+        result_version=task.result_version,
+        determinism=task.determinism,
+        citations=task.citations,
+        seed=None if task.determinism == "exact" else task.seed,
+        environment=task.environment,
+        inputs={port: given.ref for port, given in task.inputs.items()},
+    )
+
+
+def explain_failure(task: Task, error: Exception) -> OrthoflowError:
+    """Turn whatever a method raised into one of our errors with one sentence."""
+    if isinstance(error, OrthoflowError):
+        return error
+    if isinstance(error, MemoryError):
+        return StepFailedError(
+            f"method {task.method} needed more memory than it could get: "
+            f"{str(error) or 'an allocation failed'}"
+        )
+    if isinstance(error, ImportError):
+        missing = error.name or "a library"
+        return PluginError(
+            f"method {task.method} needs {missing}, which is missing or fails to import: {error}"
+        )
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return store_error(error, Path(task.store))
+    return MethodError(f"method {task.method} failed unexpectedly: {type(error).__name__}: {error}")
+
+
+def now() -> str:
+    """The time as ISO 8601 in UTC, to milliseconds."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+class _Call:
+    """One call of a method, with what it measured so far also when it fails."""
+
+    def __init__(self, task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> None:
+        self.task = task
+        self.wall_s = 0.0
+        self.cpu_s = 0.0
+        self._store = Store(Path(task.store), workspace=Path(task.folder))
+        with writing_to(self._store.folder):
+            task.scratch.mkdir(parents=True, exist_ok=True)
+        self._context = StepContext(
+            rng=np.random.default_rng(task.seed),
+            cores=task.cores,
+            scratch=task.scratch,
+            listen=listen,
+            is_cancelled=is_cancelled,
+        )
+
+    @property
+    def warnings(self) -> list[str]:
+        return self._context.warnings
+
+    def run(self) -> CellResult:
+        cls = cast("type[Method]", load_target(self.task.target))
+        inputs = {port: self._read(given) for port, given in self.task.inputs.items()}
+        params = self._params(cls)
+        wall, cpu = time.perf_counter(), _cpu_s()
+        try:
+            outputs = cls().run(cls.In(**inputs), params, self._context)
+        finally:
+            self.wall_s = round(time.perf_counter() - wall, 4)
+            self.cpu_s = round(_cpu_s() - cpu, 4)
+        self._check_inputs(inputs)
+        refs = self._keep(self._products(cls, outputs))
+        return dataclasses.replace(
+            blank_result(self.task),
+            outputs=refs,
+            metrics=tuple(
+                MetricValue(name=metric.name, value=metric.value, unit=metric.unit)
+                for metric in self._context.metrics
+            ),
+            figures=self._keep_figures(),
+        )
+
+    def _read(self, given: TaskInput) -> Product | InputFiles:
+        if given.input_name:
+            paths = tuple(Path(file.path) for file in given.files)
+            return InputFiles(name=given.input_name, paths=paths)
+        cls = cast("type[Product]", load_target(given.target))
+        return self._store.get_product(given.ref.digest, cls)
+
+    def _params(self, cls: type[Method]) -> object:
+        try:
+            return cls.Params.model_validate_json(json.dumps(dict(self.task.params)), strict=True)
+        except ValidationError as error:
+            raise MethodError(
+                f"method {self.task.method} refuses its parameters: {error}"
+            ) from error
+
+    def _check_inputs(self, inputs: Mapping[str, Product | InputFiles]) -> None:
+        for port, given in self.task.inputs.items():
+            for file in given.files:
+                _check_file(file.path, file.size_bytes, file.mtime_ns)
+            product = inputs[port]
+            is_checked = isinstance(product, Product) and _n_bytes(product) <= _CHECKED_BYTES
+            if is_checked and digest_of(cast("Product", product)) != given.ref.digest:
+                raise MethodError(
+                    f"method {self.task.method} changed its input {port}, which is read-only; "
+                    f"it must work on a copy"
+                )
+
+    def _products(self, cls: type[Method], outputs: object) -> dict[str, Product]:
+        if not isinstance(outputs, cls.Out):
+            raise MethodError(
+                f"method {self.task.method} must return its Out, got {type(outputs).__name__}"
+            )
+        products: dict[str, Product] = {}
+        for port, expected in self.task.outputs.items():
+            product = getattr(outputs, port)
+            if not isinstance(product, Product) or product.type_name != expected.type_name:
+                raise MethodError(
+                    f"method {self.task.method} must give a {expected.type_name} on its port "
+                    f"{port}, got {type(product).__name__}"
+                )
+            products[port] = product
+        return products
+
+    def _keep(self, products: Mapping[str, Product]) -> dict[str, ProductRef]:
+        refs: dict[str, ProductRef] = {}
+        for port, product in products.items():
+            target = self.task.outputs[port].publisher
+            publisher = cast("Publisher", load_target(target)) if target else None
+            refs[port] = self._store.put_product(
+                product, publisher, publisher_tag=self.task.publisher_tag
+            )
+        return refs
+
+    def _keep_figures(self) -> tuple[FigureRef, ...]:
+        return tuple(
+            FigureRef(
+                name=figure.name,
+                caption=figure.caption,
+                media_type=_MEDIA_TYPES[figure.path.suffix],
+                sha256=self._store.put_blob(figure.path.read_bytes()),
+            )
+            for figure in self._context.figures
+        )
+
+
+def load_target(target: str) -> object:
+    """Import `package.module:Name`.
+
+    Raises:
+        PluginError: the module, or a library it needs, is missing or broken.
+    """
+    module, _, name = target.partition(":")
+    try:
+        return cast("object", getattr(import_module(module), name))
+    except Exception as error:
+        raise PluginError(
+            f"{target} cannot be loaded: {type(error).__name__}: {error}; "
+            f"`orthoflow doctor` says what is missing"
+        ) from error
+
+
+def _check_file(path: str, size_bytes: int, mtime_ns: int) -> None:
+    try:
+        stat = os.stat(path)  # noqa: PTH116
+    except OSError as error:
+        raise InputError(
+            f"the input file {path} cannot be read any more: {error.strerror}"
+        ) from error
+    if (stat.st_size, stat.st_mtime_ns) != (size_bytes, mtime_ns):
+        raise InputError(f"the input file {path} changed while it was read; run again")
+
+
+def _n_bytes(product: Product) -> int:
+    return sum(array.nbytes for array in product.to_payload().arrays.values())
+
+
+def _cpu_s() -> float:
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+def _trace(error: BaseException) -> str:
+    return "".join(traceback.format_exception(error))
