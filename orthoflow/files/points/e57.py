@@ -1,0 +1,256 @@
+"""E57 through libE57's block buffers: several scans with their poses, cartesian or spherical."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.points.blocks import (
+    BLOCK_POINTS,
+    PointBlock,
+    ScanFile,
+    point_fields,
+    short_file_error,
+)
+from orthoflow.files.points.foreign import load_library, reading
+
+FORMAT: Final = "E57"
+
+_CARTESIAN: Final = ("cartesianX", "cartesianY", "cartesianZ")
+_SPHERICAL: Final = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+_COLOURS: Final = ("colorRed", "colorGreen", "colorBlue")
+_GRID: Final = ("rowIndex", "columnIndex")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanHeader:
+    """What is needed of one Data3D entry.
+
+    Attributes:
+        index: position in the file's data3D.
+        n_points: stated number of points, invalid ones included.
+        names: fields of each point.
+        rotation: (3, 3) world from scan.
+        translation: (3,) position of the scanner in the file's world.
+        is_posed: the pose is not the identity.
+        intensity_limits: stated smallest and largest value, or None.
+        rgb_limit: stated value of full brightness, or None.
+    """
+
+    index: int
+    n_points: int
+    names: frozenset[str]
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    is_posed: bool
+    intensity_limits: tuple[float, float] | None
+    rgb_limit: float | None
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the three coordinates."""
+        return _CARTESIAN if set(_CARTESIAN) <= self.names else _SPHERICAL
+
+    @property
+    def invalid_state(self) -> str:
+        """Name of the field that is not zero for points without a position."""
+        return "cartesianInvalidState" if self.axes is _CARTESIAN else "sphericalInvalidState"
+
+
+def open_e57(path: Path) -> ScanFile:
+    """Open an E57 file; every scan with points is read, in the order of the file."""
+    pye57 = load_library("pye57", path)
+    with reading(path, FORMAT), pye57.E57(str(path)) as file:
+        headers = [
+            _read_header(path, file, index)
+            for index in range(file.scan_count)
+            if file.data3d[index].isDefined("points")
+        ]
+    headers = [header for header in headers if header.n_points > 0]
+    limits = [header.intensity_limits for header in headers]
+    stated = [item for item in limits if item is not None]
+    rgb_limits = {header.rgb_limit for header in headers if set(_COLOURS) <= header.names}
+    return ScanFile(
+        name=path.name,
+        format_name=FORMAT,
+        n_most=sum(header.n_points for header in headers),
+        fields=point_fields(
+            has_intensity=all("intensity" in header.names for header in headers),
+            has_rgb=all(set(_COLOURS) <= header.names for header in headers),
+            has_grid=all(set(_GRID) <= header.names for header in headers),
+        ),
+        read=lambda: _blocks(path, pye57, headers),
+        # One scale for all scans of a file, else equal surfaces would differ between them.
+        intensity_limits=(min(low for low, _ in stated), max(high for _, high in stated))
+        if stated and len(stated) == len(limits)
+        else None,
+        rgb_limit=rgb_limits.pop() if len(rgb_limits) == 1 else None,
+        details={"scans": len(headers)},
+    )
+
+
+def _read_header(path: Path, file: Any, index: int) -> ScanHeader:
+    node = file.data3d[index]
+    points = node["points"]
+    prototype = file.get_header(index).point_fields
+    names = frozenset(str(name) for name in prototype)
+    if not (set(_CARTESIAN) <= names or set(_SPHERICAL) <= names):
+        raise InputError(
+            f"{path.name}: scan {index} has the fields {', '.join(sorted(names))}, expected "
+            "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation"
+        )
+    rotation, translation = _pose(node)
+    is_posed = not (np.allclose(rotation, np.eye(3), atol=1e-12) and not translation.any())
+    return ScanHeader(
+        index=index,
+        n_points=int(points.childCount()),
+        names=names,
+        rotation=rotation,
+        translation=translation,
+        is_posed=is_posed,
+        intensity_limits=_limits(node, "intensityLimits", "intensityMinimum", "intensityMaximum"),
+        rgb_limit=_rgb_limit(node),
+    )
+
+
+def _pose(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """World-from-scan rotation and translation; the identity where the file states none."""
+    rotation = np.eye(3)
+    translation = np.zeros(3)
+    if not node.isDefined("pose"):
+        return rotation, translation
+    pose = node["pose"]
+    if pose.isDefined("rotation"):
+        # By name: files may store the four numbers in any order.
+        rotation = _rotation([_value(pose["rotation"][name]) for name in "wxyz"])
+    if pose.isDefined("translation"):
+        translation = np.array([_value(pose["translation"][name]) for name in "xyz"])
+    return rotation, translation
+
+
+def _rotation(quaternion: list[float]) -> NDArray[np.float64]:
+    length = math.sqrt(sum(item * item for item in quaternion))
+    if not (math.isfinite(length) and length > 0.0):
+        return np.eye(3)
+    w, x, y, z = (item / length for item in quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _value(node: Any) -> float:
+    scaled = getattr(node, "scaledValue", None)
+    return float(node.value() if scaled is None else scaled())
+
+
+def _limits(node: Any, group: str, low: str, high: str) -> tuple[float, float] | None:
+    if not node.isDefined(group):
+        return None
+    limits = node[group]
+    if not (limits.isDefined(low) and limits.isDefined(high)):
+        return None
+    smallest, largest = _value(limits[low]), _value(limits[high])
+    is_usable = math.isfinite(smallest) and math.isfinite(largest) and largest > smallest
+    return (smallest, largest) if is_usable else None
+
+
+def _rgb_limit(node: Any) -> float | None:
+    """Largest colour value that the header states for any of the three channels."""
+    stated = [_limits(node, "colorLimits", f"{name}Minimum", f"{name}Maximum") for name in _COLOURS]
+    largest = [item[1] for item in stated if item is not None]
+    return max(largest) if len(largest) == 3 else None
+
+
+def _blocks(path: Path, pye57: Any, headers: list[ScanHeader]) -> Iterator[PointBlock]:
+    with reading(path, FORMAT):
+        file = pye57.E57(str(path))
+    try:
+        for scan, header in enumerate(headers):
+            yield from _scan_blocks(path, pye57.libe57, file, header, scan)
+    finally:
+        file.close()
+
+
+def _scan_blocks(
+    path: Path, libe57: Any, file: Any, header: ScanHeader, scan: int
+) -> Iterator[PointBlock]:
+    wanted = {*header.axes, header.invalid_state, "intensity", *_COLOURS, *_GRID} & header.names
+    capacity = min(BLOCK_POINTS, header.n_points)
+    with reading(path, FORMAT):
+        arrays, buffers = _buffers(libe57, file, sorted(wanted), capacity)
+        reader = file.data3d[header.index]["points"].reader(buffers)
+    n_read = 0
+    while True:
+        with reading(path, FORMAT):
+            count = int(reader.read())
+        if count == 0:
+            break
+        n_read += count
+        yield _block({name: array[:count] for name, array in arrays.items()}, header, scan)
+    reader.close()
+    if n_read != header.n_points:
+        raise short_file_error(
+            path, f"scan {header.index}", f"{n_read} points", str(header.n_points)
+        )
+
+
+def _buffers(
+    libe57: Any, file: Any, names: list[str], capacity: int
+) -> tuple[dict[str, NDArray[np.generic]], Any]:
+    arrays: dict[str, NDArray[np.generic]] = {}
+    buffers = libe57.VectorSourceDestBuffer()
+    for name in names:
+        # float64 for all: pye57 takes numpy's 64-bit integers for 32-bit ones and leaves rubbish,
+        # and its own readers' 16 bits are too few for rows and columns.
+        arrays[name] = np.zeros(capacity, dtype=np.float64)
+        buffers.append(
+            libe57.SourceDestBuffer(
+                file.image_file, name, arrays[name], capacity, doConversion=True, doScaling=True
+            )
+        )
+    return arrays, buffers
+
+
+def _block(arrays: dict[str, NDArray[np.generic]], header: ScanHeader, scan: int) -> PointBlock:
+    n_read = len(arrays[header.axes[0]])
+    state = arrays.get(header.invalid_state)
+    if state is not None and state.any():
+        arrays = {name: array[state == 0] for name, array in arrays.items()}
+    local = np.column_stack([arrays[name] for name in header.axes]).astype(np.float64)
+    if header.axes is _SPHERICAL:
+        local = _cartesian(local)
+    points = local @ header.rotation.T + header.translation if header.is_posed else local
+    has_rgb = set(_COLOURS) <= arrays.keys()
+    has_grid = set(_GRID) <= arrays.keys()
+    return PointBlock(
+        points=points,
+        scan=scan,
+        n_read=n_read,
+        n_invalid=n_read - len(points),
+        intensity=arrays["intensity"].astype(np.float32) if "intensity" in arrays else None,
+        rgb=np.column_stack([arrays[name] for name in _COLOURS]) if has_rgb else None,
+        row=arrays["rowIndex"].astype(np.int64) if has_grid else None,
+        column=arrays["columnIndex"].astype(np.int64) if has_grid else None,
+        station=header.translation,
+        station_is_posed=header.is_posed,
+    )
+
+
+def _cartesian(spherical: NDArray[np.float64]) -> NDArray[np.float64]:
+    """E57 8.4.4: azimuth from x towards y, elevation from the xy plane towards z, radians."""
+    distance, azimuth, elevation = spherical.T
+    level = distance * np.cos(elevation)
+    return np.column_stack(
+        [level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)]
+    )

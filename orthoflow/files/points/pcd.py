@@ -1,0 +1,254 @@
+"""PCD (Point Cloud Library): ascii, binary and binary_compressed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.points.blocks import (
+    BLOCK_POINTS,
+    PointBlock,
+    ScanFile,
+    point_fields,
+    short_file_error,
+)
+from orthoflow.files.points.tables import Layout, read_table
+
+FORMAT: Final = "PCD"
+_HEADER_BYTES: Final = 1 << 16
+_KINDS: Final = {"I": "i", "U": "u", "F": "f"}
+_KEYS: Final = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PcdHeader:
+    """What the header states.
+
+    Attributes:
+        fields: names of the fields.
+        dtype: one point as it lies in a binary file.
+        n_points: number of points.
+        width: points per row of an organised cloud, else all.
+        height: rows, 1 for a cloud without grid.
+        data: `ascii`, `binary` or `binary_compressed`.
+        viewpoint: (3,) where the sensor stood, or None when the header states nothing.
+        n_bytes: length of the header.
+    """
+
+    fields: tuple[str, ...]
+    dtype: np.dtype[np.void]
+    n_points: int
+    width: int
+    height: int
+    data: str
+    viewpoint: NDArray[np.float64] | None
+    n_bytes: int
+
+    @property
+    def colour(self) -> str | None:
+        """Name of the packed colour field."""
+        found = [name for name in ("rgb", "rgba") if name in self.fields]
+        return found[0] if found else None
+
+
+def open_pcd(path: Path) -> ScanFile:
+    """Open a PCD file."""
+    header = _read_header(path)
+    return ScanFile(
+        name=path.name,
+        format_name=FORMAT,
+        n_most=header.n_points,
+        fields=point_fields(
+            has_intensity="intensity" in header.fields,
+            has_rgb=header.colour is not None,
+            has_grid=header.height > 1,
+        ),
+        read=lambda: _blocks(path, header),
+        rgb_limit=255.0 if header.colour is not None else None,
+        details={"encoding": header.data},
+    )
+
+
+def _blocks(path: Path, header: PcdHeader) -> Iterator[PointBlock]:
+    columns = (
+        _ascii_columns(path, header)
+        if header.data == "ascii"
+        else _binary_columns(path, header)
+        if header.data == "binary"
+        else _compressed_columns(path, header)
+    )
+    start = 0
+    for values in columns:
+        block = _block(values, header, start)
+        start += block.n_read
+        yield block
+
+
+def _block(values: Mapping[str, NDArray[np.generic]], header: PcdHeader, start: int) -> PointBlock:
+    points = np.column_stack([values[axis].astype(np.float64) for axis in "xyz"])
+    index = np.arange(start, start + len(points), dtype=np.int64)
+    is_grid = header.height > 1
+    return PointBlock(
+        points=points,
+        scan=0,
+        n_read=len(points),
+        intensity=values["intensity"].astype(np.float32) if "intensity" in values else None,
+        rgb=None if header.colour is None else _unpacked(values[header.colour]),
+        row=index // header.width if is_grid else None,
+        column=index % header.width if is_grid else None,
+        station=header.viewpoint,
+    )
+
+
+def _unpacked(packed: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """Colours from 0x00RRGGBB, which PCD keeps in an integer or in the bits of a float."""
+    if packed.dtype.kind == "f":
+        bits = np.ascontiguousarray(packed.astype(np.float32)).view(np.uint32)
+    else:
+        bits = packed.astype(np.uint32)
+    channels = [(bits >> shift) & 255 for shift in (16, 8, 0)]
+    return np.column_stack(channels).astype(np.uint8)
+
+
+def _ascii_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
+    widths = [_count(header, name) for name in header.fields]
+    starts = np.concatenate([[0], np.cumsum(widths)])
+    positions = {name: int(starts[index]) for index, name in enumerate(header.fields)}
+    wanted = _wanted(header)
+    layout = Layout(separator=r"\s+", decimal=".", n_columns=int(starts[-1]))
+    columns = [positions[name] for name in wanted]
+    with path.open("rb") as file:
+        line = file.read(header.n_bytes).count(b"\n") + 1
+        for start in range(0, header.n_points, BLOCK_POINTS):
+            count = min(BLOCK_POINTS, header.n_points - start)
+            table = read_table(file, layout, columns, n_lines=count, first_line=line + start)
+            if len(table) != count:
+                found = f"{start + len(table)} points"
+                raise short_file_error(path, "data", found, str(header.n_points))
+            yield {
+                name: table[:, index].astype(_base(header, name))
+                if name == header.colour
+                else table[:, index]
+                for index, name in enumerate(wanted)
+            }
+
+
+def _binary_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
+    n_present = (path.stat().st_size - header.n_bytes) // header.dtype.itemsize
+    if n_present < header.n_points:
+        raise short_file_error(path, "data", f"{n_present} points", str(header.n_points))
+    points = np.memmap(
+        path, dtype=header.dtype, mode="r", offset=header.n_bytes, shape=(header.n_points,)
+    )
+    for start in range(0, header.n_points, BLOCK_POINTS):
+        part = points[start : start + BLOCK_POINTS]
+        yield {name: np.asarray(part[name]) for name in _wanted(header)}
+
+
+def _compressed_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[np.generic]]]:
+    from orthoflow.files.points.lzf_kernels import decompress_lzf
+
+    n_plain = header.n_points * header.dtype.itemsize
+    with path.open("rb") as file:
+        file.seek(header.n_bytes)
+        sizes = np.frombuffer(file.read(8), dtype="<u4")
+        packed = np.frombuffer(file.read(int(sizes[0])), np.uint8) if len(sizes) == 2 else sizes
+    if len(sizes) != 2 or len(packed) != int(sizes[0]):
+        found = f"{packed.nbytes} bytes"
+        raise short_file_error(path, "compressed data", found, str(sizes[0]) if len(sizes) else "8")
+    plain = np.zeros(n_plain, dtype=np.uint8)
+    if int(sizes[1]) != n_plain or decompress_lzf(packed.astype(np.uint8), plain) != n_plain:
+        raise InputError(
+            f"{path.name} cannot be unpacked: {header.n_points} points need {n_plain} bytes; the "
+            "file is damaged, export it again"
+        )
+    fields = _field_arrays(plain, header)
+    for start in range(0, header.n_points, BLOCK_POINTS):
+        yield {name: fields[name][start : start + BLOCK_POINTS] for name in _wanted(header)}
+
+
+def _field_arrays(plain: NDArray[np.uint8], header: PcdHeader) -> dict[str, NDArray[np.generic]]:
+    """Compressed files hold field after field, not point after point."""
+    arrays: dict[str, NDArray[np.generic]] = {}
+    offset = 0
+    for name in header.fields:
+        n_bytes = header.dtype[name].itemsize * header.n_points
+        if _count(header, name) == 1:
+            arrays[name] = plain[offset : offset + n_bytes].view(_base(header, name))
+        offset += n_bytes
+    return arrays
+
+
+def _wanted(header: PcdHeader) -> list[str]:
+    names = ["x", "y", "z", "intensity", header.colour]
+    return [name for name in names if name is not None and name in header.fields]
+
+
+def _base(header: PcdHeader, name: str) -> np.dtype[np.generic]:
+    return header.dtype[name].base
+
+
+def _count(header: PcdHeader, name: str) -> int:
+    shape = header.dtype[name].shape
+    return shape[0] if shape else 1
+
+
+def _read_header(path: Path) -> PcdHeader:
+    with path.open("rb") as file:
+        start = file.read(_HEADER_BYTES)
+    entries: dict[str, list[str]] = {}
+    n_bytes = 0
+    for line in start.splitlines(keepends=True):
+        n_bytes += len(line)
+        words = line.decode("ascii", "replace").split()
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+        if "DATA" in entries:
+            break
+    try:
+        return _parse_header(entries, n_bytes)
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        missing = [key for key in _KEYS if key not in entries]
+        reason = f"without {', '.join(missing)}" if missing else str(error)
+        raise InputError(
+            f"{path.name} has no PCD header that can be read ({reason}); export it again"
+        ) from error
+
+
+def _parse_header(entries: Mapping[str, list[str]], n_bytes: int) -> PcdHeader:
+    fields = entries["FIELDS"]
+    counts = [int(item) for item in entries.get("COUNT", ["1"] * len(fields))]
+    kinds = [
+        "<" + _KINDS[kind.upper()] + str(int(size))
+        for kind, size in zip(entries["TYPE"], entries["SIZE"], strict=True)
+    ]
+    # Padding fields are all called `_`; numpy wants names to differ.
+    names = [name if name != "_" else f"_{index}" for index, name in enumerate(fields)]
+    members = [
+        (name, kind, (count,)) if count != 1 else (name, kind)
+        for name, kind, count in zip(names, kinds, counts, strict=True)
+    ]
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError(f"its fields are {' '.join(fields)}, expected x, y and z")
+    data = entries["DATA"][0].lower()
+    if data not in {"ascii", "binary", "binary_compressed"}:
+        raise ValueError(f"data are {data}, expected ascii, binary or binary_compressed")
+    width, height = int(entries["WIDTH"][0]), int(entries["HEIGHT"][0])
+    pose = [float(item) for item in entries.get("VIEWPOINT", [])]
+    return PcdHeader(
+        fields=tuple(names),
+        dtype=np.dtype(members),
+        n_points=int(entries["POINTS"][0]) if "POINTS" in entries else width * height,
+        width=max(width, 1),
+        height=height,
+        data=data,
+        # The default, 0 0 0 and no rotation, says nothing.
+        viewpoint=np.array(pose[:3]) if any(pose[:3]) else None,
+        n_bytes=n_bytes,
+    )

@@ -1,0 +1,178 @@
+"""Lines of numbers: how they are separated, and reading many of them fast."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+
+_NUMBER: Final = re.compile(
+    r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE
+)
+_COMMENTS: Final = (b"#", b"//")
+_SCAN_BYTES: Final = 1 << 24
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    r"""How the numbers of a line are told apart.
+
+    Attributes:
+        separator: pattern for pandas: a character, or `\s+` for any white space.
+        decimal: `.` or `,`.
+        n_columns: numbers in the first line.
+    """
+
+    separator: str
+    decimal: str
+    n_columns: int
+
+
+def split_fields(line: str) -> tuple[list[str], str]:
+    """Fields of a line, and the separator found: semicolon, tab, comma or white space."""
+    for mark in (";", "\t"):
+        if mark in line:
+            return _trimmed(line.split(mark)), mark
+    words = line.split()
+    # `1,5 2,5 3,5` is three numbers with decimal commas, `1, 2, 3` and `1,2,3` are not.
+    if "," in line and not (len(words) >= 3 and all(_NUMBER.fullmatch(word) for word in words)):
+        return _trimmed(line.split(",")), ","
+    return words, r"\s+"
+
+
+def find_layout(line: str) -> Layout | None:
+    """Layout of a line that begins with three numbers, or None when it does not."""
+    fields, separator = split_fields(line)
+    if len(fields) < 3 or not all(_NUMBER.fullmatch(field) for field in fields[:3]):
+        return None
+    has_comma = separator != "," and any("," in field for field in fields)
+    return Layout(separator=separator, decimal="," if has_comma else ".", n_columns=len(fields))
+
+
+def numbers_of(line: str, layout: Layout) -> list[float]:
+    """Numbers of a line; NaN for a field that is none."""
+    fields, _ = split_fields(line)
+    numbers = []
+    for field in fields:
+        is_number = _NUMBER.fullmatch(field) is not None
+        numbers.append(float(field.replace(layout.decimal, ".")) if is_number else float("nan"))
+    return numbers
+
+
+def count_lines(path: Path) -> int:
+    """Count the lines of a file; a last line without an end counts too."""
+    lines = 0
+    last = b"\n"
+    with path.open("rb") as file:
+        while block := file.read(_SCAN_BYTES):
+            lines += block.count(b"\n")
+            last = block[-1:]
+    return lines + (last != b"\n")
+
+
+def read_table(
+    file: BinaryIO, layout: Layout, columns: Sequence[int], *, n_lines: int, first_line: int
+) -> NDArray[np.float64]:
+    """Read the next lines of a file as numbers.
+
+    Args:
+        file: open at the start of a line.
+        layout: how numbers are told apart.
+        columns: which columns are wanted, counted from 0.
+        n_lines: at most so many lines are read.
+        first_line: number of the next line, counted from 1, for messages.
+
+    Returns:
+        (n, len(columns)) float64; fewer rows at the end of the file and where lines are blank or
+        comments; NaN where a line is too short.
+
+    Raises:
+        InputError: a line holds something else than numbers.
+    """
+    lines = list(islice(file, n_lines))
+    try:
+        return _parse(lines, layout, columns)
+    except ValueError as error:
+        kept = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
+        try:
+            return _parse(kept, layout, columns)
+        except ValueError:
+            raise _bad_line(Path(file.name), lines, layout, columns, first_line) from error
+
+
+def read_tables(
+    file: BinaryIO, layout: Layout, columns: Sequence[int], *, block_lines: int, first_line: int
+) -> Iterator[NDArray[np.float64]]:
+    """Read the rest of a file in blocks of lines."""
+    line = first_line
+    while file.peek(1) if isinstance(file, io.BufferedReader) else True:
+        table = read_table(file, layout, columns, n_lines=block_lines, first_line=line)
+        line += block_lines
+        yield table
+
+
+def _parse(lines: list[bytes], layout: Layout, columns: Sequence[int]) -> NDArray[np.float64]:
+    import pandas as pd
+
+    content = b"".join(lines)
+    if not content.strip():
+        return np.empty((0, len(columns)))
+    with warnings.catch_warnings():
+        # A longer first line is only warned about and would lose numbers.
+        warnings.simplefilter("error", pd.errors.ParserWarning)
+        try:
+            frame = pd.read_csv(
+                io.BytesIO(content),
+                sep=layout.separator,
+                decimal=layout.decimal,
+                header=None,
+                names=list(range(layout.n_columns)),
+                usecols=sorted(set(columns)),
+                index_col=False,
+                engine="c",
+                dtype=np.float64,
+                skipinitialspace=True,
+                quoting=3,
+            )
+        except pd.errors.ParserWarning as warning:
+            raise ValueError(str(warning)) from warning
+    table: NDArray[np.float64] = frame[list(columns)].to_numpy(dtype=np.float64)
+    return table
+
+
+def _bad_line(
+    path: Path, lines: list[bytes], layout: Layout, columns: Sequence[int], first_line: int
+) -> InputError:
+    for offset, line in enumerate(lines):
+        try:
+            _parse([line], layout, columns)
+        except ValueError:
+            if line.lstrip().startswith(_COMMENTS):
+                continue
+            text = line.decode("utf-8", "replace").strip()[:60]
+            return InputError(
+                f"{path.name}, line {first_line + offset}: expected {layout.n_columns} numbers as "
+                f"in the lines before, got {text!r}; correct the line or export the file again"
+            )
+    return InputError(
+        f"{path.name}, from line {first_line}: expected {layout.n_columns} numbers per line; "
+        "export the file again"
+    )
+
+
+def _trimmed(fields: list[str]) -> list[str]:
+    """Fields without blanks around them, and without the empty one after a closing separator."""
+    trimmed = [field.strip() for field in fields]
+    while trimmed and not trimmed[-1]:
+        trimmed.pop()
+    return trimmed

@@ -1,0 +1,211 @@
+"""Blocks of points from several files into the arrays of one cloud, without holding them twice."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError, StoreError
+from orthoflow.files.points import PointBlock, ScanFile
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.read.colours import ColourScale
+from orthoflow_plugins.read.precision import rounding_m
+from orthoflow_plugins.read.stations import ScanSummary
+
+# Beyond any survey frame on Earth; what lies farther comes from damaged numbers.
+FARTHEST_M: Final = 1e9
+_POINT_BYTES: Final = 40
+_MOST_SCANS: Final = 2**16
+
+
+@dataclass(kw_only=True)
+class FileCount:
+    """What became of the points of one file."""
+
+    name: str
+    format_name: str
+    n_read: int = 0
+    n_kept: int = 0
+    n_invalid: int = 0
+    n_withheld: int = 0
+    n_not_finite: int = 0
+    rounding_m: float = 0.0
+    rgb_scale: str | None = None
+    details: dict[str, str | int | float] = field(default_factory=dict)
+
+
+class CloudAssembly:
+    """Arrays of a growing cloud.
+
+    Attributes:
+        origin: (3,) whole metres near the data; set by the first points.
+        n_points: points so far.
+        files: counts per file.
+        intensity_range: smallest and largest finite intensity.
+        n_intensity_lost: intensities that are not finite.
+    """
+
+    def __init__(self, ctx: StepContext, files: list[ScanFile], unit_m: float) -> None:
+        """Allocate for the most points that may come; what is not filled is cut off later."""
+        self._ctx = ctx
+        self._unit_m = unit_m
+        self._capacity = sum(file.n_most for file in files)
+        _require_space(ctx, self._capacity)
+        self.fields = frozenset.intersection(*(file.fields for file in files))
+        self._axes = [self._new(name, np.float32) for name in "xyz"]
+        self._intensity = self._new("intensity", np.float32) if "intensity" in self.fields else None
+        self._rgb = self._new("rgb", np.uint8, 3) if "rgb" in self.fields else None
+        grid = "grid" in self.fields
+        self._grid = [self._new(name, np.uint32) for name in ("row", "column")] if grid else []
+        self._scan: NDArray[Any] | None = None
+        self._scans: list[ScanSummary] = []
+        self.origin: NDArray[np.float64] = np.zeros(3)
+        self.n_points = 0
+        self.files: list[FileCount] = []
+        self.intensity_range = (np.inf, -np.inf)
+        self.n_intensity_lost = 0
+
+    def add_file(self, file: ScanFile) -> None:
+        """Read all blocks of a file.
+
+        Raises:
+            InputError: the file is damaged, or none of its points can be used.
+        """
+        count = FileCount(name=file.name, format_name=file.format_name, details=file.details)
+        self.files.append(count)
+        first_scan = len(self._scans)
+        colours = (
+            None if self._rgb is None else ColourScale(self._rgb[self.n_points :], file.rgb_limit)
+        )
+        for block in file.read():
+            if count.n_read == 0:
+                count.rounding_m = rounding_m(block.points, self._unit_m)
+            self._add(block, first_scan + block.scan, count, colours)
+            done = sum(item.n_read for item in self.files) / self._capacity
+            self._ctx.progress(min(done, 1.0), f"{file.name}: {count.n_read} points")
+        if colours is not None:
+            count.rgb_scale = colours.scale
+        if count.n_kept == 0:
+            raise InputError(
+                f"{file.name} holds no usable points: of {count.n_read}, {count.n_invalid} are "
+                f"marked as invalid, {count.n_withheld} as deleted and {count.n_not_finite} are "
+                "not finite; export it again"
+            )
+
+    @property
+    def offsets(self) -> list[NDArray[Any]]:
+        """x, y and z from the origin, cut to the points that came."""
+        return [array[: self.n_points] for array in self._axes]
+
+    def array(self, name: str) -> NDArray[Any] | None:
+        """One of the other arrays, cut to the points that came; None when the files lack it."""
+        found: dict[str, NDArray[Any] | None] = {
+            "intensity": self._intensity,
+            "rgb": self._rgb,
+            "scan": self._scan,
+            **dict(zip(("row", "column"), self._grid, strict=False)),
+        }
+        array = found.get(name)
+        return None if array is None else array[: self.n_points]
+
+    @property
+    def scans(self) -> list[ScanSummary]:
+        """The scans so far, in the order of the files."""
+        return self._scans
+
+    def _add(
+        self, block: PointBlock, scan: int, count: FileCount, colours: ColourScale | None
+    ) -> None:
+        count.n_read += block.n_read
+        count.n_invalid += block.n_invalid
+        count.n_withheld += block.n_withheld
+        points = block.points * self._unit_m if self._unit_m != 1.0 else block.points
+        # NaN compares as False.
+        is_usable = np.all(np.abs(points) < FARTHEST_M, axis=1)
+        kept: NDArray[np.bool_] | slice = is_usable
+        n_kept = int(np.count_nonzero(is_usable))
+        if n_kept == len(points):
+            kept = slice(None)
+        count.n_not_finite += len(points) - n_kept
+        count.n_kept += n_kept
+        self._summarise(block, scan, points[kept])
+        if n_kept == 0:
+            return
+        if self.n_points + n_kept > self._capacity:
+            raise InputError(f"{count.name} holds more points than its header states")
+        part = slice(self.n_points, self.n_points + n_kept)
+        self._store_points(points[kept], part)
+        self._store_fields(block, kept, part)
+        if colours is not None and block.rgb is not None:
+            colours.add(block.rgb[kept])
+        if scan > 0:
+            self._store_scan(scan, part)
+        self.n_points = part.stop
+
+    def _store_points(self, points: NDArray[np.float64], part: slice) -> None:
+        if self.n_points == 0:
+            # The median, so that stray points far away cannot cost the scan its precision.
+            self.origin = np.floor(np.median(points, axis=0))
+        for axis, array in enumerate(self._axes):
+            array[part] = points[:, axis] - self.origin[axis]
+
+    def _store_fields(
+        self, block: PointBlock, kept: NDArray[np.bool_] | slice, part: slice
+    ) -> None:
+        if self._intensity is not None and block.intensity is not None:
+            values = block.intensity[kept]
+            self._intensity[part] = values
+            finite = values[np.isfinite(values)]
+            self.n_intensity_lost += len(values) - len(finite)
+            if len(finite):
+                low, high = self.intensity_range
+                self.intensity_range = (
+                    min(low, float(finite.min())),
+                    max(high, float(finite.max())),
+                )
+        if self._grid and block.row is not None and block.column is not None:
+            for array, values_of in zip(self._grid, (block.row, block.column), strict=True):
+                array[part] = np.clip(values_of[kept], 0, 2**32 - 1)
+
+    def _store_scan(self, scan: int, part: slice) -> None:
+        if scan >= _MOST_SCANS:
+            raise InputError(
+                f"there are more than {_MOST_SCANS} scans: read them in several workflows"
+            )
+        if self._scan is None:
+            # Zeros are right for everything that came before.
+            self._scan = self._new("scan", np.uint16)
+        self._scan[part] = scan
+
+    def _summarise(self, block: PointBlock, scan: int, points: NDArray[np.float64]) -> None:
+        low = points.min(axis=0) if len(points) else np.full(3, np.inf)
+        high = points.max(axis=0) if len(points) else np.full(3, -np.inf)
+        if scan < len(self._scans):
+            before = self._scans[scan]
+            low, high = np.minimum(low, before.low), np.maximum(high, before.high)
+        summary = ScanSummary(
+            station=None if block.station is None else block.station * self._unit_m,
+            is_posed=block.station_is_posed,
+            low=low,
+            high=high,
+        )
+        self._scans[scan:] = [summary]
+
+    def _new(self, name: str, dtype: type[np.generic], width: int = 1) -> NDArray[Any]:
+        shape = (self._capacity,) if width == 1 else (self._capacity, width)
+        return self._ctx.allocate("cloud", name, shape, dtype)
+
+
+def _require_space(ctx: StepContext, n_points: int) -> None:
+    """Refuse before writing: a mapped file on a full disk ends the process by a signal."""
+    needed = n_points * _POINT_BYTES
+    free = shutil.disk_usage(ctx.scratch).free
+    if free < needed:
+        raise StoreError(
+            f"{n_points} points need {needed / 1e9:.2f} GB of scratch space, but only "
+            f"{free / 1e9:.2f} GB are free: free some space or choose another --store"
+        )

@@ -1,0 +1,98 @@
+"""Intensity to 0..1 on one linear scale for the whole cloud, and whether it is one at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+_BLOCK: Final = 4_000_000
+_SAMPLE: Final = 200_000
+# lion-takanawa, whose intensity is the grey of its colours, has 0.99997; laser intensity at
+# 532..1550 nm stays far below.
+LUMINANCE_CORRELATION: Final = 0.999
+_REC_601: Final = np.array([0.299, 0.587, 0.114])
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntensityScale:
+    """The linear scale from a file's intensities to 0..1.
+
+    Attributes:
+        low: what becomes 0.
+        high: what becomes 1.
+        rule: where the two come from.
+    """
+
+    low: float
+    high: float
+    rule: str
+
+
+def choose_scale(
+    seen: tuple[float, float],
+    stated: Sequence[tuple[float, float] | None],
+    intensity_max: float | None,
+) -> IntensityScale:
+    """Choose one scale for all scans, so that equal surfaces stay equal.
+
+    Args:
+        seen: smallest and largest value of the data.
+        stated: limits that each file states.
+        intensity_max: what the user says is full intensity, or None.
+
+    Returns:
+        The user's; else the limits that all files state, when the data keep to them; else the
+        range of the data.
+    """
+    if intensity_max is not None:
+        return IntensityScale(low=0.0, high=intensity_max, rule="0 to intensity_max")
+    low, high = seen
+    known = [item for item in stated if item is not None]
+    if known and len(known) == len(stated):
+        bottom, top = min(item[0] for item in known), max(item[1] for item in known)
+        slack = 1e-6 * (top - bottom)
+        if bottom - slack <= low and high <= top + slack:
+            return IntensityScale(low=bottom, high=top, rule="limits that the files state")
+    if high > low:
+        return IntensityScale(low=low, high=high, rule="range of the data")
+    return IntensityScale(low=min(0.0, low), high=max(high, 0.0), rule="0 to the only value")
+
+
+def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
+    """Scale in place to 0..1, what is not finite to 0.
+
+    Returns:
+        How many values lay beyond the scale and were clipped.
+    """
+    n_clipped = 0
+    for start in range(0, len(intensity), _BLOCK):
+        part = intensity[start : start + _BLOCK]
+        scaled = (part.astype(np.float64) - scale.low) / (scale.high - scale.low)
+        n_clipped += int(np.count_nonzero((scaled < -1e-6) | (scaled > 1.0 + 1e-6)))
+        part[:] = np.clip(np.nan_to_num(scaled, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+    return n_clipped
+
+
+def correlation_with_grey(intensity: NDArray[np.float32], rgb: NDArray[np.uint8]) -> float:
+    """Correlation of intensity with the grey of the colours, on a sample; 0 where undefined."""
+    step = max(1, len(intensity) // _SAMPLE)
+    values = intensity[::step].astype(np.float64)
+    colours = rgb[::step].astype(np.float64)
+    greys = (colours @ _REC_601, colours.mean(axis=1))
+    return max(_correlation(values, grey) for grey in greys)
+
+
+def is_grey(rgb: NDArray[np.uint8]) -> bool:
+    """Whether every colour of a sample is a grey."""
+    part = rgb[:: max(1, len(rgb) // _SAMPLE)]
+    return bool(np.all(part[:, 0] == part[:, 1]) and np.all(part[:, 1] == part[:, 2]))
+
+
+def _correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    if len(first) < 100 or first.std() == 0.0 or second.std() == 0.0:
+        return 0.0
+    return float(np.corrcoef(first, second)[0, 1])
