@@ -15,7 +15,7 @@ from orthoflow.catalog.entries import (
     MethodEntry,
     ProductEntry,
 )
-from orthoflow.catalog.suggestions import did_you_mean
+from orthoflow.catalog.suggestions import did_you_mean, nearest
 
 __all__ = [
     "BrokenPlugin",
@@ -27,4 +27,5 @@ __all__ = [
     "ProductEntry",
     "did_you_mean",
     "discover_catalog",
+    "nearest",
 ]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 from orthoflow.catalog.entries import BrokenPlugin, KindEntry, MethodEntry, ProductEntry
-from orthoflow.catalog.suggestions import did_you_mean
+from orthoflow.catalog.suggestions import did_you_mean, nearest
 from orthoflow.errors import PluginError, WorkflowError
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ class Catalog:
                 if plugin.mentions(method_id):
                     raise PluginError(f"method {method_id} cannot be used: {plugin}")
             raise WorkflowError(
-                f"unknown method {method_id}{did_you_mean(method_id, self.methods)}"
-                f"{self._hint_at_broken()}; `orthoflow plugins list` names all"
+                f"unknown method {method_id}{self._suggest(method_id)}{self._hint_at_broken()}; "
+                f"`orthoflow plugins list` names all"
             )
         if entry.state != "fine":
             raise PluginError(entry.problem)
@@ -109,6 +109,19 @@ class Catalog:
         if entry.state != "fine":
             raise PluginError(entry.problem)
         return entry
+
+    def _suggest(self, method_id: str) -> str:
+        # Inside a kind only the second part tells names apart; `plane.` is alike in all of them.
+        kind, _, name = method_id.partition(".")
+        siblings = {other.partition(".")[2]: other for other in self._of_kind(kind)}
+        if not siblings:
+            return did_you_mean(method_id, self.methods)
+        if near := nearest(name, siblings):
+            return f" (did you mean {siblings[near]}?)"
+        return f"; kind {kind} has {', '.join(siblings.values())}"
+
+    def _of_kind(self, kind: str) -> list[str]:
+        return [method for method, entry in self.methods.items() if entry.spec.kind == kind]
 
     def _hint_at_broken(self) -> str:
         return "".join(f"; {plugin}" for plugin in self.broken)

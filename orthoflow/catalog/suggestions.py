@@ -6,13 +6,23 @@ import difflib
 from collections.abc import Iterable
 
 
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Give the known name most like another, or nothing when none is near.
+
+    >>> nearest("hugh2d", ["hough2d", "ransac"])
+    'hough2d'
+    """
+    matches = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.6)
+    return matches[0] if matches else ""
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Give ` (did you mean X?)` for the nearest known name, or nothing when none is near.
 
-    >>> did_you_mean("plane.hugh2d", ["plane.hough2d", "plane.ransac"])
-    ' (did you mean plane.hough2d?)'
-    >>> did_you_mean("colour", ["plane.hough2d"])
+    >>> did_you_mean("gsd", ["gsd_m", "buffer_m"])
+    ' (did you mean gsd_m?)'
+    >>> did_you_mean("colour", ["gsd_m", "buffer_m"])
     ''
     """
-    near = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.6)
-    return f" (did you mean {near[0]}?)" if near else ""
+    near = nearest(name, known)
+    return f" (did you mean {near}?)" if near else ""

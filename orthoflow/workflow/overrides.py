@@ -84,9 +84,9 @@ def _targets(
     chosen = [variant for variant in variants if _may_have(variant, keys[0])]
     if not chosen:
         known = sorted({name for variant in variants for name in _parameters(variant)})
-        who = " and ".join(dict.fromkeys(variant.method for variant in variants))
+        who = " or ".join(dict.fromkeys(variant.method for variant in variants))
         raise ArgumentError(
-            f"{who} has no parameter {keys[0]}{did_you_mean(keys[0], known)}; it has "
+            f"there is no parameter {keys[0]} in {who}{did_you_mean(keys[0], known)}; known: "
             f"{', '.join(known) or 'none'}"
         )
     override = Override(option=option, keys=tuple(keys), value=value)

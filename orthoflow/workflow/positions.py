@@ -14,6 +14,12 @@ from typing import Final, TypeAlias
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import (
+    CollectionStartEvent,
+    MappingEndEvent,
+    NodeEvent,
+    SequenceEndEvent,
+)
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from orthoflow.products.product import JsonValue
@@ -136,6 +142,7 @@ def _compose(text: str) -> Node:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
+            _check_size(text)
             node: Node | None = YAML(typ="rt", pure=True).compose(text)
     except MarkedYAMLError as error:
         raise _UnreadableError(
@@ -145,13 +152,27 @@ def _compose(text: str) -> Node:
         raise _UnreadableError(
             _reader_position(text, error), f"this is not YAML: {_first_line(error)}"
         ) from error
-    except RecursionError as error:
-        raise _UnreadableError(
-            _START, f"the document is nested deeper than {MAX_DEPTH} levels"
-        ) from error
     if node is None:
         raise _UnreadableError(_START, "the document is empty")
     return node
+
+
+def _check_size(text: str) -> None:
+    # Events come one by one, so this stops early where composing would take minutes.
+    depth = n_nodes = 0
+    for event in YAML(typ="rt", pure=True).parse(text):
+        if isinstance(event, MappingEndEvent | SequenceEndEvent):
+            depth -= 1
+            continue
+        n_nodes += isinstance(event, NodeEvent)
+        depth += isinstance(event, CollectionStartEvent)
+        if depth > MAX_DEPTH or n_nodes > MAX_NODES:
+            raise _UnreadableError(
+                _mark_position(event.start_mark),
+                f"the document is nested deeper than {MAX_DEPTH} levels"
+                if depth > MAX_DEPTH
+                else f"the document has more than {MAX_NODES} values",
+            )
 
 
 def _mark_position(mark: object) -> Position:
@@ -188,10 +209,11 @@ class _Converter:
             raise _UnreadableError(
                 position, f"the document has more than {MAX_NODES} values once aliases are expanded"
             )
-        if depth > MAX_DEPTH or id(node) in self.open_nodes:
+        if id(node) in self.open_nodes:
+            raise _UnreadableError(position, "the value contains itself through its anchor")
+        if depth > MAX_DEPTH:
             raise _UnreadableError(
-                position,
-                f"the document is nested deeper than {MAX_DEPTH} levels or contains itself",
+                position, f"the document is nested deeper than {MAX_DEPTH} levels"
             )
         if isinstance(node, ScalarNode):
             return Text(position=position, value=self._scalar(node, position, path))

@@ -1,0 +1,214 @@
+"""Workflow files: what is read, and mistakes with their places."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import Catalog
+from orthoflow.errors import PluginError, WorkflowError
+from orthoflow.workflow import (
+    UnusablePluginError,
+    load_workflow,
+)
+from tests.laboratories import (
+    GOOD,
+    laboratory_catalog,
+    load,
+    problems,
+    with_steps,
+    write_distribution,
+)
+
+
+@pytest.fixture
+def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    return laboratory_catalog(monkeypatch)
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The path of the workflow of a test, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return Path("flow.yaml")
+
+
+def test_a_good_file_is_read_as_it_is_written(catalog: Catalog, write: Path) -> None:
+    workflow = load(GOOD, write, catalog)
+    assert (workflow.name, workflow.seed, workflow.source) == ("palace-room", 1729, GOOD)
+    assert tuple(workflow.inputs) == ("scan", "photos", "calibration")
+    assert workflow.inputs["photos"].files == ("data/photos/*.jpg",)
+    assert workflow.inputs["calibration"].optional
+    plane = workflow.steps["plane"]
+    assert [variant.name for variant in plane.variants] == ["hough2d", "ransac"]
+    assert plane.variant("ransac").params == {"tolerance_m": 0.005, "iterations": 15}
+    assert plane.variant("ransac").repeat == 10
+    bundle = workflow.steps["orient"].variant("bundle")
+    assert (bundle.cores, bundle.timeout_s) == (2, 1800.0)
+    assert str(workflow.steps["wall"].inputs["planes"][0]) == "plane.planes"
+    assert workflow.compare is not None
+    assert workflow.compare.exclude == ({"plane": "ransac", "orient": "pnp"},)
+    assert workflow.compare.metrics == ("plane.rms_mm", "*.wall_s")
+    assert workflow.baseline == {"plane": "ransac", "orient": "bundle"}
+
+
+def test_defaults_are_resolved_and_what_was_set_is_kept_apart(
+    catalog: Catalog, write: Path
+) -> None:
+    variant = load(GOOD, write, catalog).steps["plane"].variant("hough2d")
+    assert variant.params_set == {"cell_m": 0.02}
+    assert variant.params == {
+        "cell_m": 0.02,
+        "tolerance_m": 0.05,
+        "normal": None,
+        "limits": {"low_m": 0.0, "high_m": 1.0},
+    }
+
+
+def test_a_whole_number_where_a_float_is_meant_resolves_to_a_float(
+    catalog: Catalog, write: Path
+) -> None:
+    gsd = load(GOOD, write, catalog).steps["wall"].variants[0].params["gsd_m"]
+    assert isinstance(gsd, float)
+    assert gsd == 1.0
+
+
+def test_six_kinds_of_mistakes_are_reported_at_once_with_their_lines(
+    catalog: Catalog, write: Path
+) -> None:
+    text = textwrap.dedent(
+        """\
+        orthoflow: 1
+        name: flow
+        sede: 4
+        inputs:
+          scan: {files: a.e57}
+          scan: {files: b.e57}
+        steps:
+          cloud: {use: read.scan, in: {files: inputs.scan}}
+          plane: {use: plane.hough2d, in: {cloud: cloud.cloud}, params: {cell_m: "0.003"}}
+          other: {use: plane.hugh2d, in: {cloud: cloud.cloud}}
+          wall: {use: raster.grid, in: {cloud: cloud.cloud}}
+          t: {use: match.guided, in: {photos: p.photos, walls: wall.walls, cameras: orient.cameras}}
+          p: {use: read.photos, in: {files: inputs.scan}}
+          orient: {use: orient.pnp, in: {photos: p.photos, ties: t.ties}}
+        """
+    )
+    found = problems(text, write, catalog)
+    assert [(line, column, path) for line, column, path, _ in found] == [
+        (3, 1, "sede"),
+        (6, 3, "inputs.scan"),
+        (9, 66, "steps.plane.params.cell_m"),
+        (10, 16, "steps.other.use"),
+        (11, 15, "steps.wall.in"),
+        (12, 77, "steps.t.in.cameras"),
+    ]
+    messages = [message for *_, message in found]
+    assert messages[0].startswith("unknown key sede (did you mean seed?)")
+    assert messages[1] == "the key is there already, in line 5; remove one of them"
+    assert messages[2] == 'cell_m: input should be a valid number, got the text "0.003"'
+    assert messages[3].startswith("unknown method plane.hugh2d (did you mean plane.hough2d?)")
+    assert messages[4] == ("raster.grid needs port planes, the product planes, which is not wired")
+    assert messages[5] == (
+        "the steps form a cycle: t takes orient.cameras (line 12), orient takes t.ties (line 14)"
+    )
+
+
+def test_a_problem_reads_file_line_column_path_message_and_shows_the_line(
+    catalog: Catalog, write: Path
+) -> None:
+    write.write_text("orthoflow: 1\nsteps:\n  cloud: {use: plane.nothing}\n")
+    with pytest.raises(WorkflowError) as caught:
+        load_workflow("flow.yaml", catalog)
+    first, line, caret = str(caught.value).splitlines()
+    assert re.match(r"flow\.yaml:3:16: steps\.cloud\.use: unknown method plane\.nothing", first)
+    assert line == "    cloud: {use: plane.nothing}"
+    assert caret == "    " + " " * 13 + "^"
+
+
+def test_a_file_that_is_not_utf8_is_refused_with_its_line(catalog: Catalog, write: Path) -> None:
+    write.write_bytes(b"orthoflow: 1\nname: caf\xe9\n")
+    with pytest.raises(WorkflowError, match=r"flow.yaml:2: expected UTF-8 text, got the byte 0xe9"):
+        load_workflow(write, catalog)
+
+
+def test_a_file_of_megabytes_is_refused_before_it_is_parsed(catalog: Catalog, write: Path) -> None:
+    write.write_text("a" * 2_000_000)
+    with pytest.raises(WorkflowError, match="a workflow file has at most 1048576"):
+        load_workflow(write, catalog)
+
+
+@pytest.mark.parametrize("name", ["nowhere.yaml", "folder"])
+def test_a_name_that_is_neither_file_nor_recipe_lists_the_recipes(
+    name: str, catalog: Catalog, write: Path
+) -> None:
+    write.with_name("folder").mkdir()
+    with pytest.raises(WorkflowError, match=rf"no workflow file {name} .*shipped: .*direct"):
+        load_workflow(name, catalog)
+
+
+def test_yaml_12_words_stay_text_and_anchors_stand_for_their_value(
+    catalog: Catalog, write: Path
+) -> None:
+    text = with_steps(
+        """
+        a: {use: plane.ransac, in: &wires {cloud: cloud.cloud}, params: &same {tolerance_m: 5e-3}}
+        b: {use: plane.ransac, in: *wires, params: *same}
+        """
+    )
+    steps = load(text, write, catalog).steps
+    assert steps["a"].variants[0].params == steps["b"].variants[0].params
+    assert steps["b"].variants[0].params["tolerance_m"] == 0.005
+
+
+BROKEN_METHOD = """
+    from orthoflow.sdk.hooks import MethodSpec, hookimpl
+
+    @hookimpl
+    def orthoflow_methods():
+        return [MethodSpec(id="plane.broken", target="no_such_library:Plane", summary="-")]
+    """
+
+
+def test_a_workflow_that_needs_a_missing_library_ends_as_plugin_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Path
+) -> None:
+    folder = write_distribution(tmp_path / "b", "broken", {"broken_hooks.py": BROKEN_METHOD})
+    catalog = laboratory_catalog(monkeypatch, folder)
+    write.write_text(with_steps("x: {use: plane.broken, in: {cloud: cloud.cloud}}"))
+    with pytest.raises(UnusablePluginError) as caught:
+        load_workflow(write, catalog)
+    assert isinstance(caught.value, PluginError)
+    assert caught.value.exit_code == 4
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.path) == (6, "steps.x.use")
+    assert "method plane.broken of broken 1.0 cannot be loaded" in problem.message
+    assert "No module named 'no_such_library'" in problem.message
+
+
+def test_a_broken_plugin_harms_no_workflow_that_does_without_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Path
+) -> None:
+    sources = {"lost_hooks.py": "import no_such_library  # brings 'plane.lost'\n"}
+    folder = write_distribution(tmp_path / "b", "lost", sources)
+    catalog = laboratory_catalog(monkeypatch, folder)
+    assert load(GOOD, write, catalog).name == "palace-room"
+    write.write_text(with_steps("x: {use: plane.lost, in: {cloud: cloud.cloud}}"))
+    with pytest.raises(
+        UnusablePluginError,
+        match=r"plane\.lost cannot be used: plugin lost of lost 1\.0 fails to load: ModuleNotFound",
+    ):
+        load_workflow(write, catalog)
+
+
+def test_mistakes_of_the_file_come_before_broken_plugins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Path
+) -> None:
+    folder = write_distribution(tmp_path / "b", "broken", {"broken_hooks.py": BROKEN_METHOD})
+    catalog = laboratory_catalog(monkeypatch, folder)
+    steps = "x: {use: plane.broken, in: {clod: cloud.cloud}}"
+    found = problems(with_steps(steps), write, catalog)
+    assert [path for _, _, path, _ in found] == ["steps.x.use", "steps.x.in.clod"]

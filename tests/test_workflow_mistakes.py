@@ -1,0 +1,384 @@
+"""Every mistake that a workflow file can hold, and the sentence it gets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import Catalog
+from orthoflow.workflow import (
+    InvalidWorkflowError,
+    load_workflow,
+)
+from tests.laboratories import (
+    GOOD,
+    laboratory_catalog,
+    problems,
+    with_steps,
+)
+
+
+@pytest.fixture
+def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    return laboratory_catalog(monkeypatch)
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The path of the workflow of a test, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return Path("flow.yaml")
+
+
+STEP = "x: {use: plane.hough2d, in: {cloud: cloud.cloud}%s}"
+CASES = {
+    "unknown parameter": (
+        STEP % ", params: {cel_m: 1}",
+        "steps.x.params.cel_m",
+        (
+            "unknown parameter cel_m (did you mean cell_m?); plane.hough2d has cell_m, "
+            "tolerance_m, normal, limits"
+        ),
+    ),
+    "parameter out of range": (
+        STEP % ", params: {cell_m: -0.02}",
+        "steps.x.params.cell_m",
+        "cell_m: input should be greater than 0, got -0.02",
+    ),
+    "not a finite number": (
+        STEP % ", params: {cell_m: .inf}",
+        "steps.x.params.cell_m",
+        "cell_m: input should be a finite number, got inf",
+    ),
+    "parameters that disagree": (
+        STEP % ", params: {cell_m: 0.06}",
+        "steps.x.params",
+        "the parameters: cell_m 0.06 must not exceed tolerance_m",
+    ),
+    "item of a list": (
+        STEP % ", params: {normal: [1, 0, up]}",
+        "steps.x.params.normal[2]",
+        'input should be a valid number, got the text "up"',
+    ),
+    "nested parameter": (
+        STEP % ", params: {limits: {low_m: true}}",
+        "steps.x.params.limits.low_m",
+        "low_m: input should be a valid number, got true",
+    ),
+    "parameters are no mapping": (
+        STEP % ", params: [1]",
+        "steps.x.params",
+        "expected a mapping, got a list",
+    ),
+    "exact method repeated": (
+        STEP % ", repeat: 3",
+        "steps.x.repeat",
+        "plane.hough2d gives the same result every time, so repeating it tells nothing",
+    ),
+    "repeat is no number": (
+        STEP % ", repeat: often",
+        "steps.x.repeat",
+        'expected a whole number from 1 on, got the text "often"',
+    ),
+    "timeout without unit": (
+        STEP % ', timeout: "30"',
+        "steps.x.timeout",
+        'expected a time such as 90s, 30min, 2h or a number of seconds above 0, got the text "30"',
+    ),
+    "timeout zero": (STEP % ", timeout: 0", "steps.x.timeout", "expected a time such as"),
+    "unknown resource": (
+        STEP % ", resources: {core: 2}",
+        "steps.x.resources.core",
+        "unknown key core (did you mean cores?)",
+    ),
+    "no cores": (
+        STEP % ", resources: {cores: 0}",
+        "steps.x.resources.cores",
+        "expected a whole number from 1 on, got 0",
+    ),
+    "unless a step": (
+        STEP % ", unless: cloud.cloud",
+        "steps.x.unless",
+        "expected an input such as inputs.scan, got cloud.cloud",
+    ),
+    "unless an unknown input": (
+        STEP % ", unless: inputs.scam",
+        "steps.x.unless",
+        "there is no input scam (did you mean scan?)",
+    ),
+    "no use": ("x: {in: {cloud: cloud.cloud}}", "steps.x", "needs the key use"),
+    "use is no text": ("x: {use: 3}", "steps.x.use", "expected a text, got 3"),
+    "step is no mapping": ("x: plane.hough2d", "steps.x", "expected a mapping, got the text"),
+    "step called inputs": (
+        "inputs: {use: simulate.room}",
+        "steps.inputs",
+        "a step cannot be called inputs",
+    ),
+    "name in capitals": ("X: {use: simulate.room}", "steps.X", "'X' cannot be a name"),
+    "unknown port": (
+        "x: {use: plane.hough2d, in: {cloud: cloud.cloud, clouds: cloud.cloud}}",
+        "steps.x.in.clouds",
+        "plane.hough2d has no input port clouds (did you mean cloud?); it has cloud",
+    ),
+    "no reference": (
+        "x: {use: plane.hough2d, in: {cloud: cloud}}",
+        "steps.x.in.cloud",
+        'expected step.port or inputs.name, got the text "cloud"',
+    ),
+    "empty list of references": (
+        "x: {use: plane.hough2d, in: {cloud: []}}",
+        "steps.x.in.cloud",
+        "expected at least one reference, got an empty list",
+    ),
+    "unknown step": (
+        "x: {use: plane.hough2d, in: {cloud: clud.cloud}}",
+        "steps.x.in.cloud",
+        "there is no step clud (did you mean cloud?); steps: cloud, x",
+    ),
+    "unknown input": (
+        "x: {use: read.photos, in: {files: inputs.scans}}",
+        "steps.x.in.files",
+        "there is no input scans (did you mean scan?); inputs: scan",
+    ),
+    "unknown output port": (
+        "x: {use: plane.hough2d, in: {cloud: [cloud.clouds]}}",
+        "steps.x.in.cloud[0]",
+        "step cloud has no output port clouds (did you mean cloud?); it has cloud",
+    ),
+    "files where a product is meant": (
+        "x: {use: plane.hough2d, in: {cloud: inputs.scan}}",
+        "steps.x.in.cloud",
+        "expected the product cloud, but inputs.scan gives files of an input",
+    ),
+    "product of another type": (
+        "x: {use: read.photos, in: {files: cloud.cloud}}",
+        "steps.x.in.files",
+        "expected files of an input, but cloud.cloud gives the product cloud",
+    ),
+    "step that feeds itself": (
+        (
+            "x: {use: match.guided, in: {photos: y.photos, walls: z.walls, cameras: x.ties}}\n"
+            "y: {use: simulate.room}\n"
+            "z: {use: raster.grid, in: {cloud: cloud.cloud, planes: p.planes}}\n"
+            "p: {use: plane.hough2d, in: {cloud: cloud.cloud}}"
+        ),
+        "steps.x.in.cameras",
+        "the steps form a cycle: x takes x.ties (line 6)",
+    ),
+    "params beside variants": (
+        "x: {in: {cloud: cloud.cloud}, params: {cell_m: 1}, variants: {a: {use: plane.hough2d}}}",
+        "steps.x.params",
+        "with variants, params belongs into each of them",
+    ),
+    "no variants": (
+        "x: {in: {cloud: cloud.cloud}, variants: {}}",
+        "steps.x.variants",
+        "expected at least one variant",
+    ),
+    "variants of two kinds": (
+        "x: {in: {cloud: cloud.cloud}, variants: {a: {use: plane.hough2d}, b: {use: orient.pnp}}}",
+        "steps.x.variants.b.use",
+        "variants of a step must be of one kind, got orient beside plane",
+    ),
+    "variants of a source": (
+        "x: {variants: {a: {use: simulate.room}}}",
+        "steps.x.variants.a.use",
+        "simulate.room is a source, and sources take no variants; give it a step",
+    ),
+    "in of a variant": (
+        "x: {variants: {a: {use: plane.hough2d, in: {cloud: cloud.cloud}}}}",
+        "steps.x.variants.a.in",
+        "unknown key in",
+    ),
+    "a tag": ("x: !python {use: simulate.room}", "steps.x", "tags are not allowed in a workflow"),
+    "a key that is no text": ("3: {use: simulate.room}", "steps", "a key must be text, got 3"),
+    "a key that is a list": ("? [a]\n: 1", "steps", "a key must be text, got a list or mapping"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_each_mistake_in_a_step_is_named_at_its_place(
+    case: str, catalog: Catalog, write: Path
+) -> None:
+    steps, path, message = CASES[case]
+    found = problems(with_steps(steps), write, catalog)
+    assert (path, True) in [(at, message in text) for _, _, at, text in found], found
+
+
+HEADS = {
+    "no format": ("name: flow\n", "orthoflow", "a workflow begins with orthoflow: 1"),
+    "newer format": (
+        "orthoflow: 2\n",
+        "orthoflow",
+        "the file has workflow format 2, this orthoflow reads 1; upgrade orthoflow",
+    ),
+    "format is no number": ("orthoflow: new\n", "orthoflow", "expected a whole number from 1 on"),
+    "seed below zero": ("orthoflow: 1\nseed: -1\n", "seed", "expected a whole number from 0 on"),
+    "name with blanks": ("orthoflow: 1\nname: a b\n", "name", "'a b' cannot be a name"),
+    "input is no mapping": (
+        "orthoflow: 1\ninputs: {scan: a.e57}\n",
+        "inputs.scan",
+        'expected a mapping, got the text "a.e57"',
+    ),
+    "files are numbers": (
+        "orthoflow: 1\ninputs: {scan: {files: [a.e57, 3]}}\n",
+        "inputs.scan.files[1]",
+        "expected a text, got 3",
+    ),
+    "files are an empty list": (
+        "orthoflow: 1\ninputs: {scan: {files: []}}\n",
+        "inputs.scan.files",
+        "expected at least one text, got an empty list",
+    ),
+    "optional is no flag": (
+        "orthoflow: 1\ninputs: {scan: {optional: no}}\n",
+        "inputs.scan.optional",
+        'expected true or false, got the text "no"',
+    ),
+    "inputs are a list": (
+        "orthoflow: 1\ninputs: [scan]\n",
+        "inputs",
+        "expected a mapping, got a list",
+    ),
+    "merge key": ("orthoflow: 1\n<<: {seed: 1}\n", "<<", "unknown key <<"),
+}
+
+
+@pytest.mark.parametrize("case", HEADS)
+def test_each_mistake_outside_the_steps_is_named_at_its_place(
+    case: str, catalog: Catalog, write: Path
+) -> None:
+    head, path, message = HEADS[case]
+    found = problems(head + "steps: {room: {use: simulate.room}}\n", write, catalog)
+    assert len(found) == 1
+    assert found[0][2] == path
+    assert message in found[0][3]
+
+
+@pytest.mark.parametrize(
+    ("steps", "message"),
+    [("", "a workflow needs the key steps"), ("steps: {}", "a workflow needs at least one step")],
+)
+def test_a_workflow_without_steps_is_refused(
+    steps: str, message: str, catalog: Catalog, write: Path
+) -> None:
+    assert problems(f"orthoflow: 1\n{steps}\n", write, catalog)[0][2:] == ("steps", message)
+
+
+COMPARISONS = {
+    "unknown key": ("{desing: product}", "compare.desing", "(did you mean design?)"),
+    "unknown design": (
+        "{design: one-at-time}",
+        "compare.design",
+        "unknown design one-at-time (did you mean one-at-a-time?); known: product, one-at-a-time",
+    ),
+    "baseline of an unknown step": (
+        "{baseline: {plain: ransac}}",
+        "compare.baseline.plain",
+        "there is no step plain with variants (did you mean plane?); with variants: plane, orient",
+    ),
+    "baseline of a step without variants": (
+        "{baseline: {wall: a}}",
+        "compare.baseline.wall",
+        "there is no step wall with variants",
+    ),
+    "baseline names an unknown variant": (
+        "{baseline: {plane: ransak}}",
+        "compare.baseline.plane",
+        "step plane has no variant ransak (did you mean ransac?); it has hough2d, ransac",
+    ),
+    "exclude is no list": (
+        "{exclude: {plane: ransac}}",
+        "compare.exclude",
+        "expected a list of mappings step: variant, got a mapping",
+    ),
+    "exclude names an unknown variant": (
+        "{exclude: [{plane: ransac, orient: dlt}]}",
+        "compare.exclude[0].orient",
+        "step orient has no variant dlt",
+    ),
+    "exclude is empty": ("{exclude: [{}]}", "compare.exclude[0]", "got an empty mapping"),
+    "baseline is excluded": (
+        "{baseline: {plane: ransac}, exclude: [{plane: ransac}]}",
+        "compare.exclude",
+        "the baseline contains the excluded combination {plane: ransac}; name another baseline",
+    ),
+    "metric without step": (
+        "{metrics: [rms_mm]}",
+        "compare.metrics",
+        "expected step.metric, * allowed, got rms_mm",
+    ),
+    "metric of an unknown step": (
+        "{metrics: [plan.rms_mm]}",
+        "compare.metrics",
+        "there is no step plan for plan.rms_mm (did you mean plane?)",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", COMPARISONS)
+def test_each_mistake_in_the_comparison_is_named_at_its_place(
+    case: str, catalog: Catalog, write: Path
+) -> None:
+    section, path, message = COMPARISONS[case]
+    text = GOOD[: GOOD.index("compare:")] + f"compare: {section}\n"
+    found = problems(text, write, catalog)
+    assert len(found) == 1
+    assert found[0][2] == path
+    assert message in found[0][3]
+
+
+def test_a_step_that_cannot_be_read_does_not_bring_problems_of_its_users(
+    catalog: Catalog, write: Path
+) -> None:
+    steps = """
+        plane: {use: plane.unheard-of, in: {cloud: cloud.cloud}}
+        wall: {use: raster.grid, in: {cloud: cloud.cloud, planes: plane.planes}}
+        """
+    found = problems(with_steps(steps), write, catalog)
+    assert [path for _, _, path, _ in found] == ["steps.plane.use"]
+
+
+UNREADABLE = {
+    "unclosed bracket": ("steps: [1", 1, "this is not YAML: while parsing a flow sequence"),
+    "tab": ("orthoflow: 1\n\tsteps: 2\n", 2, "this is not YAML"),
+    "undefined alias": ("steps: *nothing\n", 1, "this is not YAML: found undefined alias"),
+    "two documents": ("a: 1\n---\nb: 2\n", 2, "expected a single document"),
+    "control character": ("orthoflow: 1\nname: a\x01\n", 2, "this is not YAML: unacceptable"),
+    "empty": ("", 1, "the document is empty"),
+    "list": ("- a\n", 1, "expected a mapping, got a list"),
+    "deep nesting": ("[" * 100 + "]" * 100, 1, "nested deeper than 60 levels"),
+    "very deep nesting": ("[" * 3000, 1, "nested deeper than 60 levels"),
+    "a value inside itself": ("a: &x [*x]\n", 1, "the value contains itself through its anchor"),
+    "deep nesting through anchors": (
+        "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}]\n" for i in range(1, 70)),
+        1,
+        "nested deeper than 60 levels",
+    ),
+    "many values": ("- x\n" * 12_000, 10_000, "the document has more than 10000 values"),
+    "YAML 1.1": ("%YAML 1.1\n---\na: 1\n", 1, "expected YAML 1.2"),
+    "anchor bomb": (
+        (
+            "a: &a [x,x,x,x,x,x,x,x,x,x]\n"
+            "b: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a,*a]\n"
+            "c: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b,*b]\n"
+            "d: &d [*c,*c,*c,*c,*c,*c,*c,*c,*c,*c]\n"
+        ),
+        1,
+        "more than 10000 values once aliases are expanded",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_what_is_no_workflow_at_all_is_one_problem_with_its_line(
+    case: str, catalog: Catalog, write: Path
+) -> None:
+    text, line, message = UNREADABLE[case]
+    write.write_text(text, encoding="utf-8")
+    with pytest.raises(InvalidWorkflowError) as caught:
+        load_workflow(write, catalog)
+    (problem,) = caught.value.problems
+    assert problem.line == line
+    assert message in problem.message

@@ -1,0 +1,116 @@
+"""`--set` and `--input`: parameters and files from the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import Catalog
+from orthoflow.errors import ArgumentError
+from orthoflow.workflow import (
+    InvalidArgumentsError,
+    load_workflow,
+)
+from tests.laboratories import (
+    GOOD,
+    laboratory_catalog,
+    load,
+)
+
+
+@pytest.fixture
+def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    return laboratory_catalog(monkeypatch)
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The path of the workflow of a test, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    return Path("flow.yaml")
+
+
+SETS = {
+    "plain": ("wall.gsd_m=0.002", "wall", "", "gsd_m", 0.002),
+    "method name of a step without variants": ("wall.grid.gsd_m=2", "wall", "", "gsd_m", 2.0),
+    "variant": ("plane.ransac.iterations=7", "plane", "ransac", "iterations", 7),
+    "list": ("plane.hough2d.normal=[1, 0, 0]", "plane", "hough2d", "normal", [1.0, 0.0, 0.0]),
+    "text with a minus": ("cloud.up=-x", "cloud", "", "up", "-x"),
+    "text that YAML 1.1 takes for a flag": ("cloud.up=y", "cloud", "", "up", "y"),
+    "inside a mapping": (
+        "plane.hough2d.limits.low_m=0.5",
+        "plane",
+        "hough2d",
+        "limits",
+        {"low_m": 0.5, "high_m": 1.0},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SETS)
+def test_set_overrides_a_parameter_and_is_kept(case: str, catalog: Catalog, write: Path) -> None:
+    text, step, variant, parameter, value = SETS[case]
+    workflow = load(GOOD, write, catalog, text)
+    assert workflow.steps[step].variant(variant).params[parameter] == value
+    assert parameter in workflow.steps[step].variant(variant).params_set
+    assert workflow.overrides == (f"--set {text}",)
+
+
+def test_set_without_variant_reaches_every_variant_that_has_the_parameter(
+    catalog: Catalog, write: Path
+) -> None:
+    plane = load(GOOD, write, catalog, "plane.tolerance_m=0.5").steps["plane"]
+    assert [variant.params["tolerance_m"] for variant in plane.variants] == [0.5, 0.5]
+    plane = load(GOOD, write, catalog, "plane.iterations=5").steps["plane"]
+    assert plane.variant("ransac").params["iterations"] == 5
+    assert "iterations" not in plane.variant("hough2d").params_set
+
+
+def test_the_last_of_two_sets_wins_and_can_mend_a_value_of_the_file(
+    catalog: Catalog, write: Path
+) -> None:
+    text = GOOD.replace("gsd_m: 1", "gsd_m: -1")
+    workflow = load(text, write, catalog, "wall.gsd_m=2", "wall.gsd_m=3")
+    assert workflow.steps["wall"].variants[0].params == {"gsd_m": 3.0}
+
+
+BAD_SETS = {
+    "wal.gsd_m=1": "there is no step wal (did you mean wall?); steps: cloud",
+    "wall.gsd=1": "there is no parameter gsd in raster.grid (did you mean gsd_m?); known: gsd_m",
+    "plane.ransak.iterations=1": "step plane has no variant ransak (did you mean ransac?); it has",
+    "plane.depth=1": "no parameter depth in plane.hough2d or plane.ransac; known: cell_m, iter",
+    "wall.gsd_m": "expected step.parameter=value or step.variant.parameter=value",
+    "gsd_m=1": "expected step.parameter=value or step.variant.parameter=value",
+    "wall.gsd_m=": "expected a value behind the equals sign",
+    "wall.gsd_m=[1": "the value cannot be read as YAML: this is not YAML",
+    "wall.gsd_m=-1": "gsd_m: input should be greater than 0, got -1",
+    'wall.gsd_m="1"': 'gsd_m: input should be a valid number, got the text "1"',
+    "plane.ransac.tolerance_m.x=1": "tolerance_m is no mapping, so nothing in it can be set",
+}
+
+
+@pytest.mark.parametrize("text", BAD_SETS)
+def test_a_set_that_does_not_fit_is_refused(text: str, catalog: Catalog, write: Path) -> None:
+    with pytest.raises(ArgumentError) as caught:
+        load(GOOD, write, catalog, text)
+    assert isinstance(caught.value, InvalidArgumentsError)
+    assert str(caught.value).startswith(f"--set {text}: ")
+    assert BAD_SETS[text] in str(caught.value)
+
+
+def test_all_options_that_do_not_fit_are_named_together(catalog: Catalog, write: Path) -> None:
+    write.write_text(GOOD)
+    with pytest.raises(InvalidArgumentsError) as caught:
+        load_workflow(
+            write, catalog, sets=["wal.x=1", "wall.gsd=1"], inputs=["scam=a", "scan", "=b"]
+        )
+    assert [problem.file for problem in caught.value.problems] == [
+        "--input scam=a",
+        "--input scan",
+        "--input =b",
+        "--set wal.x=1",
+        "--set wall.gsd=1",
+    ]
+    assert "there is no input scam (did you mean scan?)" in str(caught.value)
+    assert "--input scan: expected NAME=PATH" in str(caught.value)
