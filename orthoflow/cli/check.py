@@ -10,7 +10,7 @@ import click
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import Command, json_option, workflow_arguments
 from orthoflow.cli.tables import counted, echo_json
-from orthoflow.errors import OrthoflowError, WorkflowError
+from orthoflow.errors import OrthoflowError
 
 
 @click.command(cls=Command)
@@ -27,12 +27,9 @@ def check(workflow: str, sets: Sequence[str], inputs: Sequence[str], *, as_json:
         return EXIT_GOOD
     try:
         summary = _check(workflow, sets, inputs)
-    except WorkflowError as error:
+    except OrthoflowError as error:
         problems = [asdict(problem) for problem in getattr(error, "problems", ())]
         echo_json({"ok": False, "message": str(error), "problems": problems})
-        return error.exit_code
-    except OrthoflowError as error:
-        echo_json({"ok": False, "message": str(error), "problems": []})
         return error.exit_code
     echo_json({"ok": True, "message": summary, "problems": []})
     return EXIT_GOOD

@@ -209,27 +209,13 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def available_memory() -> int | None:
-    """Bytes of memory still free for use, also under a container's limit; None when unknown."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        candidates = [
-            int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")
-        ]
-    except (OSError, ValueError):
-        return None
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit = int((group / "memory.max").read_text(encoding="ascii"))
-        candidates.append(limit - int((group / "memory.current").read_text(encoding="ascii")))
-    except (OSError, ValueError):
-        pass  # no limit, or another version of control groups
-    return min(candidates, default=None)
-
-
 def _diagnose_memory() -> Diagnosis:
-    n_bytes = available_memory()
-    if n_bytes is None:
+    try:
+        from orthoflow.engine.memory import available_memory
+
+        n_bytes = available_memory().available
+    except (ImportError, OSError, KeyError, ValueError):
+        # The engine does not load when a core library is missing, which is a finding of its own.
         return Diagnosis(name="memory", verdict="limited", found="unknown", cost="cannot be told")
     is_enough = n_bytes >= _COMFORTABLE_MEMORY_BYTES
     return Diagnosis(

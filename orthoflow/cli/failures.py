@@ -10,6 +10,7 @@ from typing import Final
 import click
 
 from orthoflow.cli.sessions import Session
+from orthoflow.cli.tables import counted
 from orthoflow.errors import OrthoflowError
 
 EXIT_GOOD: Final = 0
@@ -35,7 +36,7 @@ def explain(error: Exception, session: Session) -> int:
         return EXIT_INTERRUPTED
     if isinstance(error, OrthoflowError):
         interrupted = error.exit_code == EXIT_INTERRUPTED
-        say_error((session.resume_hint if interrupted else "") or f"error: {error_text(error)}")
+        say_error((session.resume_hint if interrupted else "") or _sentence(error))
         return error.exit_code
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
@@ -46,6 +47,14 @@ def explain(error: Exception, session: Session) -> int:
         "repeat the command with --debug and report what it prints"
     )
     return EXIT_CELL_FAILED
+
+
+def _sentence(error: OrthoflowError) -> str:
+    n_problems = len(getattr(error, "problems", ()))
+    if not n_problems:
+        return f"error: {error_text(error)}"
+    # Lines that begin with file:line:column, as editors and other tools expect them.
+    return f"{error}\nerror: {counted(n_problems, 'problem')}"
 
 
 def error_text(error: Exception) -> str:

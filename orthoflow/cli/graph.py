@@ -15,7 +15,8 @@ from orthoflow.cli.options import Command, workflow_arguments
 def graph(workflow: str, sets: Sequence[str], inputs: Sequence[str]) -> int:
     """Draw WORKFLOW as a Mermaid graph, which GitHub, GitLab and many editors show."""
     from orthoflow.catalog import discover_catalog
-    from orthoflow.workflow import load_workflow, mermaid
+    from orthoflow.workflow import load_workflow
+    from orthoflow.workflow.mermaid import mermaid
 
     catalog = discover_catalog()
     loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)

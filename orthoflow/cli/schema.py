@@ -18,7 +18,7 @@ def schema(*, as_json: bool) -> int:
     JSON with or without --json.
     """
     from orthoflow.catalog import discover_catalog
-    from orthoflow.workflow import workflow_schema
+    from orthoflow.workflow.schema import workflow_schema
 
     del as_json
     echo_json(workflow_schema(discover_catalog()))

@@ -36,9 +36,11 @@ def echo_json(value: object) -> None:
 def duration(seconds: float) -> str:
     """Say a time as people do.
 
-    >>> [duration(seconds) for seconds in (0.042, 3.14159, 75, 3700)]
-    ['0.04 s', '3.1 s', '1 min 15 s', '1 h 02 min']
+    >>> [duration(seconds) for seconds in (0.001, 0.042, 3.14159, 75, 3700)]
+    ['< 0.01 s', '0.04 s', '3.1 s', '1 min 15 s', '1 h 02 min']
     """
+    if seconds < 0.01:
+        return "< 0.01 s"
     if seconds < 1:
         return f"{seconds:.2f} s"
     if seconds < 60:

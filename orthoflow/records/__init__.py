@@ -1,1 +1,39 @@
-"""The record of a run: writing run.h5 at the end, and reading it back."""
+"""Finished runs: writing the record, and the read API."""
+
+from __future__ import annotations
+
+from orthoflow_provenance.model import (
+    RecordedCell,
+    RecordedEnvironment,
+    RecordedFigure,
+    RecordedFile,
+    RecordedInput,
+    RecordedMetric,
+    RecordedProduct,
+    RunRecord,
+)
+
+from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run, open_run
+from orthoflow.records.verification import Verification, verify_run
+from orthoflow.records.writing import write_run
+
+__all__ = [
+    "RECORD_FILE",
+    "REPORT_FILE",
+    "MetricRow",
+    "RecordedCell",
+    "RecordedEnvironment",
+    "RecordedFigure",
+    "RecordedFile",
+    "RecordedInput",
+    "RecordedMetric",
+    "RecordedProduct",
+    "Run",
+    "RunRecord",
+    "Verification",
+    "cell_metrics",
+    "open_run",
+    "verify_run",
+    "write_run",
+]

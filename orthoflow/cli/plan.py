@@ -1,0 +1,80 @@
+"""`orthoflow plan`: say which steps would run, which are cached, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import (
+    Command,
+    json_option,
+    selection_options,
+    store_option,
+    workflow_arguments,
+)
+from orthoflow.cli.tables import counted, echo_json, echo_table
+
+if TYPE_CHECKING:
+    from orthoflow.engine import PlannedCell
+
+
+@click.command(cls=Command)
+@workflow_arguments
+@selection_options
+@store_option
+@json_option
+def plan(
+    workflow: str,
+    sets: Sequence[str],
+    inputs: Sequence[str],
+    store: Path,
+    *,
+    as_json: bool,
+    **selection: tuple[str, ...],
+) -> int:
+    """Say for every cell of WORKFLOW whether its result is stored, and if not, why it would run.
+
+    Nothing is computed. "unknown yet" means that it depends on results that are not there yet.
+    """
+    from orthoflow.catalog import discover_catalog
+    from orthoflow.engine import RunOptions, Store, plan_run
+    from orthoflow.workflow import expand_cells, load_workflow
+
+    catalog = discover_catalog()
+    loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
+    cells = expand_cells(loaded, catalog)
+    planned = plan_run(cells, loaded, catalog, Store(store), RunOptions(**selection)).cells
+    if as_json:
+        echo_json([_as_json(item) for item in planned])
+        return EXIT_GOOD
+    echo_table(
+        ("cell", "method", "status", "reason"),
+        [(item.cell.address, item.cell.method, item.status, item.reason) for item in planned],
+    )
+    click.echo(f"\n{_summary(planned)}")
+    return EXIT_GOOD
+
+
+def _summary(planned: Sequence[PlannedCell]) -> str:
+    counts = [
+        f"{number} {status}"
+        for status in ("cached", "will run", "unknown yet", "skipped")
+        if (number := sum(item.status == status for item in planned))
+    ]
+    return f"{counted(len(planned), 'cell')}: {', '.join(counts)}"
+
+
+def _as_json(item: PlannedCell) -> dict[str, object]:
+    return {
+        "cell": item.cell.address,
+        "step": item.cell.step,
+        "method": item.cell.method,
+        "status": item.status,
+        "reason": item.reason,
+        "key": item.key.key if item.key is not None else None,
+        "params": dict(item.cell.params),
+    }

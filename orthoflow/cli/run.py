@@ -1,0 +1,119 @@
+"""`orthoflow run`: run a workflow; makes orthoimages, report and record."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from orthoflow.cli.options import (
+    Command,
+    selection_options,
+    store_option,
+    workflow_arguments,
+)
+from orthoflow.cli.sessions import current_session
+
+if TYPE_CHECKING:
+    from orthoflow.engine import RunOutcome, RunPlan, Store
+    from orthoflow.workflow import Workflow
+
+
+@click.command(cls=Command)
+@workflow_arguments
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="RUNDIR",
+    help="Folder of this run.  [default: runs/<name>-<run id>]",
+)
+@selection_options
+@click.option("--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time.")
+@click.option(
+    "--executor",
+    type=click.Choice(["local", "inline"]),
+    default="local",
+    help="A process per step, or all in this one (for debugging).",
+)
+@store_option
+@click.option("--embed", is_flag=True, help="Put every product into the record, also point clouds.")
+def run(
+    workflow: str,
+    sets: Sequence[str],
+    inputs: Sequence[str],
+    output: Path | None,
+    store: Path,
+    *,
+    embed: bool,
+    **choices: object,
+) -> int:
+    """Run WORKFLOW, a file or the name of a shipped one.
+
+    Results that are stored already are not computed again. An interrupted run goes on with the
+    same command and the same -o. The folder of the run gets run.h5 (the record), report.html, and
+    products/ with the files for other programs.
+    """
+    from orthoflow.catalog import discover_catalog
+    from orthoflow.engine import RunOptions, Store, plan_run
+    from orthoflow.workflow import expand_cells, load_workflow
+
+    options = RunOptions(**choices)  # type: ignore[arg-type] - click has checked the types
+    catalog = discover_catalog()
+    loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
+    opened = Store(store)
+    # Held until the record is written, so that no `cache gc` takes what it needs.
+    with opened.in_use():
+        cells = expand_cells(loaded, catalog)
+        planned = plan_run(cells, loaded, catalog, opened, options)
+        return _Call(workflow=loaded, plan=planned, store=opened, folder=output, embed=embed).go()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Call:
+    """One call of the command, ready to go."""
+
+    workflow: Workflow
+    plan: RunPlan
+    store: Store
+    folder: Path | None
+    embed: bool
+
+    def go(self) -> int:
+        """Execute, record, report and say what came out."""
+        from orthoflow.cli.run_summaries import print_failures, print_summary
+        from orthoflow.engine.journal import new_run_id
+        from orthoflow.records import REPORT_FILE, write_run
+        from orthoflow.report import write_report
+
+        run_id = new_run_id()
+        folder = self.folder or Path("runs") / f"{self.workflow.name}-{run_id}"
+        current_session().resume_hint = (
+            "interrupted; what is finished is kept, and the same command with "
+            f"-o {folder} goes on from there"
+        )
+        outcome = self._execute(folder, run_id)
+        report = folder / REPORT_FILE
+        finished = write_run(
+            outcome,
+            self.plan,
+            self.workflow,
+            folder,
+            self.store,
+            embed=self.embed,
+            before_finish=lambda run: write_report([run], report),
+        )
+        print_failures(finished.record.cells)
+        print_summary(finished, report)
+        return outcome.exit_code
+
+    def _execute(self, folder: Path, run_id: str) -> RunOutcome:
+        from orthoflow.cli.progress import make_progress
+        from orthoflow.engine import execute
+
+        addresses = tuple(item.cell.address for item in self.plan.cells)
+        with make_progress(addresses) as progress:
+            return execute(self.plan, folder, self.store, progress.tell, run_id=run_id)

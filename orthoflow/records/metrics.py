@@ -1,0 +1,65 @@
+"""Metrics as rows: one number of one cell, the shape of `metrics.csv`."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+from orthoflow_provenance.model import RecordedCell
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricRow:
+    """One number of one cell.
+
+    Attributes:
+        cell: address of the cell.
+        step: name of its step.
+        method: method id.
+        metric: name, with its unit at the end where it has one.
+        value: finite number.
+        unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
+    """
+
+    cell: str
+    step: str
+    method: str
+    metric: str
+    value: float
+    unit: str
+
+
+def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
+    """Give what the method reported and then what the engine measured (time and memory).
+
+    Cells without a result have no rows: their cost is not comparable with that of a result.
+    """
+    if cell.status != "ok":
+        return ()
+    reported = [(metric.name, metric.value, metric.unit) for metric in cell.metrics]
+    measured = [
+        ("wall_s", cell.wall_s, "s"),
+        ("cpu_s", cell.cpu_s, "s"),
+        ("peak_rss_mib", cell.peak_rss_mib, "MiB"),
+    ]
+    return tuple(
+        MetricRow(
+            cell=cell.address,
+            step=cell.step,
+            method=cell.method,
+            metric=name,
+            value=value,
+            unit=unit,
+        )
+        for name, value, unit in [*reported, *measured]
+    )
+
+
+def write_metrics_csv(path: Path, rows: Iterable[MetricRow]) -> None:
+    """Write rows with a header; numbers with every digit that they have."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([field.name for field in fields(MetricRow)])
+        writer.writerows(astuple(row) for row in rows)

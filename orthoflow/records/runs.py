@@ -1,0 +1,200 @@
+"""The read API: a finished run as Python objects."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord
+from orthoflow_provenance.reader import open_record, read_record
+
+from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
+from orthoflow.products.product import Payload, Product
+from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.published import PRODUCTS_FOLDER, published_files
+
+RECORD_FILE: Final = "run.h5"
+REPORT_FILE: Final = "report.html"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        path: the record file.
+        record: everything the record says except the products' arrays.
+    """
+
+    path: Path
+    record: RunRecord
+
+    @property
+    def folder(self) -> Path:
+        """The folder the record lies in, with `products/` and the report beside it."""
+        return self.path.parent
+
+    @cached_property
+    def cells(self) -> Mapping[str, RecordedCell]:
+        """Cells by address, in the order of the graph."""
+        return {cell.address: cell for cell in self.record.cells}
+
+    def cell(self, address: str) -> RecordedCell:
+        """Give one cell.
+
+        Raises:
+            ArgumentError: the run has no such cell.
+        """
+        if address not in self.cells:
+            raise ArgumentError(
+                f"the run {self.record.run_id} has no cell {address!r}; it has "
+                f"{', '.join(self.cells)}"
+            )
+        return self.cells[address]
+
+    def metrics(self) -> tuple[MetricRow, ...]:
+        """Every number of every cell, those that the engine measured included."""
+        return tuple(row for cell in self.record.cells for row in cell_metrics(cell))
+
+    def figure(self, address: str, name: str) -> RecordedFigure:
+        """Give one picture of a cell.
+
+        Raises:
+            ArgumentError: the run has no such cell, or the cell no such picture.
+        """
+        figures = {figure.name: figure for figure in self.cell(address).figures}
+        if name not in figures:
+            raise ArgumentError(
+                f"the cell {address} has no figure {name!r}; it has "
+                f"{', '.join(figures) or 'none at all'}"
+            )
+        return figures[name]
+
+    def payload(self, address: str, port: str) -> Payload:
+        """Give an output as named arrays and JSON; needs no plugin.
+
+        Raises:
+            ArgumentError: the run has no such cell, or the cell no such output.
+            RecordError: the record holds only the digest of the output, or is damaged.
+        """
+        outputs = self.cell(address).outputs
+        if port not in outputs:
+            raise ArgumentError(
+                f"the cell {address} has no output {port!r}; it has "
+                f"{', '.join(outputs) or 'none at all'}"
+            )
+        if not outputs[port].embedded:
+            raise RecordError(
+                f"{self.path} names {address}.{port} only by its digest; run the workflow with "
+                "--embed to put every product into the record"
+            )
+        with record_errors(self.path), open_record(self.path) as opened:
+            stored = opened.payload(address, port)
+            return Payload(
+                type_name=stored.type_name,
+                encoding_version=stored.encoding_version,
+                metadata=stored.metadata,
+                arrays=dict(stored.arrays),
+                mapped=stored.mapped,
+            )
+
+    def product(self, address: str, port: str) -> Product:
+        """Give an output as an object of its product class.
+
+        Raises:
+            ArgumentError: the run has no such cell, or the cell no such output.
+            RecordError: the record holds only the digest of the output, or is damaged.
+            PluginError: no installed plugin knows the product's type.
+        """
+        from orthoflow.catalog import discover_catalog  # noqa: PLC0415 - only products need it
+
+        payload = self.payload(address, port)
+        return discover_catalog().product_class(payload.type_name).from_payload(payload)
+
+    @property
+    def files(self) -> Mapping[str, tuple[Path, ...]]:
+        """Published files by cell address; cells without files are left out."""
+        found = {address: published_files(self.folder, address) for address in self.cells}
+        return {address: files for address, files in found.items() if files}
+
+    @property
+    def orthoimages(self) -> tuple[Path, ...]:
+        """The orthoimages among the published files, in the order of the graph."""
+        return tuple(
+            file
+            for files in self.files.values()
+            for file in files
+            if file.name.endswith("_ortho.tif")
+        )
+
+    @property
+    def products_folder(self) -> Path:
+        """The folder of the published files."""
+        return self.folder / PRODUCTS_FOLDER
+
+
+def open_run(path: str | Path) -> Run:
+    """Open a finished run.
+
+    Args:
+        path: a run folder, or the `run.h5` in it.
+
+    Raises:
+        ArgumentError: nothing is there, or the folder holds no finished run.
+        RecordError: the record is damaged, no record at all, or of a newer format.
+    """
+    record_path = find_record(path)
+    with record_errors(record_path):
+        return Run(path=record_path, record=read_record(record_path))
+
+
+def find_record(path: str | Path) -> Path:
+    """Give the record file of a run folder; a file stands for itself.
+
+    Raises:
+        ArgumentError: nothing is there, or the folder holds no finished run.
+    """
+    given = Path(path)
+    if given.is_dir():
+        inside = given / RECORD_FILE
+        if inside.is_file():
+            return inside
+        raise ArgumentError(
+            f"{given} holds no {RECORD_FILE}: it is no run folder, or its run was not finished; "
+            f"repeat the run with -o {given} to finish it"
+        )
+    if not given.exists():
+        raise ArgumentError(f"{given} does not exist; give a run folder or its {RECORD_FILE}")
+    return given
+
+
+@contextmanager
+def record_errors(path: Path) -> Iterator[None]:
+    """Turn whatever goes wrong while reading a record into one sentence.
+
+    Raises:
+        RecordError: in place of every error but orthoflow's own and missing permission.
+    """
+    try:
+        yield
+    except OrthoflowError:
+        raise
+    except RecordFormatError as error:
+        raise RecordError(_with_path(path, str(error))) from error
+    except PermissionError as error:
+        raise ArgumentError(f"{path} cannot be read: permission denied") from error
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        # h5py reports damage with any of these, depending on which structure is hit.
+        if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EISDIR):
+            raise ArgumentError(f"{path} is no file; give a run folder or its run.h5") from error
+        raise RecordError(f"{path} is no record or is damaged: {error}") from error
+
+
+def _with_path(path: Path, sentence: str) -> str:
+    return sentence if str(path) in sentence else f"{path}: {sentence}"

@@ -1,0 +1,273 @@
+"""Writing a finished run: published products, then the record, whose name says it is complete."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Final, cast
+
+from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.model import (
+    RecordedCell,
+    RecordedEnvironment,
+    RecordedFigure,
+    RecordedFile,
+    RecordedInput,
+    RecordedMetric,
+    RecordedProduct,
+    RunRecord,
+)
+from orthoflow_provenance.reader import read_record
+from orthoflow_provenance.writer import write_record
+
+from orthoflow import __version__
+from orthoflow.engine.durability import sync_folder, writing_to
+from orthoflow.errors import StoreError
+from orthoflow.products.product import JsonValue
+from orthoflow.records.published import publish_products
+from orthoflow.records.runs import RECORD_FILE, Run
+from orthoflow.workflow import resolved_json
+
+if TYPE_CHECKING:
+    from orthoflow.engine import CellResult, ProductRef, RunOutcome, RunPlan, Store
+    from orthoflow.engine.results import FigureRef
+    from orthoflow.workflow import Workflow
+    from orthoflow.workflow.cells import Cell
+
+_UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
+
+
+def write_run(
+    outcome: RunOutcome,
+    plan: RunPlan,
+    workflow: Workflow,
+    run_folder: Path,
+    store: Store,
+    *,
+    embed: bool = False,
+    before_finish: Callable[[Run], None] | None = None,
+) -> Run:
+    """Write `products/` and `run.h5` of a run.
+
+    `run.h5` gets its name last: a folder that has one is finished, everything else in it is
+    written again by the same command.
+
+    Args:
+        outcome: what the engine's run gave.
+        plan: what it was asked to do.
+        workflow: the document behind the plan.
+        run_folder: the folder, made when missing.
+        store: holds the products and pictures of the run.
+        embed: put the arrays of every product into the record, also those of scan size.
+        before_finish: called with the run before the record gets its name, e.g. for the report.
+
+    Returns:
+        The finished run.
+
+    Raises:
+        StoreError: the disk refuses, or the store lost a product of the run.
+    """
+    record = build_record(outcome, plan, workflow, store, embed=embed)
+    with writing_to(run_folder):
+        run_folder.mkdir(parents=True, exist_ok=True)
+    publish_products(run_folder, record.cells, _published(outcome, store))
+    unfinished = run_folder / _UNFINISHED
+    with writing_to(run_folder):
+        for leftover in run_folder.glob(f".{RECORD_FILE}.*"):
+            leftover.unlink()
+        _write_record(unfinished, record, store, embed=embed)
+        if before_finish is not None:
+            before_finish(Run(path=unfinished, record=read_record(unfinished)))
+        finished = unfinished.replace(run_folder / RECORD_FILE)
+        sync_folder(run_folder)
+    return Run(path=finished, record=record)
+
+
+def _write_record(path: Path, record: RunRecord, store: Store, *, embed: bool) -> None:
+    try:
+        write_record(path, record, store.product_file, embed=embed)
+    except RecordFormatError as error:
+        raise StoreError(
+            f"the record cannot be assembled from the store {store.folder}: {error}; run again "
+            "with --force STEP for the step that made it"
+        ) from error
+
+
+def build_record(
+    outcome: RunOutcome,
+    plan: RunPlan,
+    workflow: Workflow,
+    store: Store,
+    *,
+    embed: bool = False,
+) -> RunRecord:
+    """Turn what the engine gave into what a record says.
+
+    Raises:
+        StoreError: the store lost a picture of the run.
+    """
+    results = outcome.results
+    recorder = _CellRecorder(outcome=outcome, plan=plan, store=store, embed=embed)
+    cells = tuple(
+        recorder.record(item.cell, results[item.cell.address])
+        for item in plan.cells
+        if item.cell.address in results
+    )
+    return RunRecord(
+        run_id=outcome.run_id,
+        name=workflow.name,
+        created_by=f"orthoflow {__version__}",
+        status="failed" if any(cell.status == "failed" for cell in cells) else "ok",
+        started=outcome.started,
+        ended=outcome.ended,
+        seed=workflow.seed,
+        workflow_source=workflow.source,
+        workflow_resolved=resolved_json(workflow),
+        overrides=tuple(workflow.overrides),
+        inputs=_recorded_inputs(plan),
+        environments=_recorded_environments(results),
+        cells=cells,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _CellRecorder:
+    """Turns cells with their results into recorded cells."""
+
+    outcome: RunOutcome
+    plan: RunPlan
+    store: Store
+    embed: bool
+
+    def record(self, cell: Cell, result: CellResult) -> RecordedCell:
+        """Give what the record says of one cell."""
+        facts = self.plan.methods.get(cell.method)
+        if facts is not None and not result.distribution:
+            # A cell that never started knows nothing of its method.
+            result = dataclasses.replace(
+                result,
+                distribution=facts.distribution,
+                distribution_version=facts.distribution_version,
+                result_version=facts.result_version,
+                determinism=facts.determinism,
+                citations=facts.citations,
+            )
+        return RecordedCell(
+            address=cell.address,
+            step=cell.step,
+            method=cell.method,
+            status=result.status,
+            assignment=dict(cell.assignment),
+            repeat=cell.repeat,
+            distribution=result.distribution,
+            distribution_version=result.distribution_version,
+            result_version=result.result_version,
+            determinism=result.determinism,
+            error_type=result.error_type,
+            error_message=result.error_message,
+            params=dict(cell.params),
+            params_set=dict(cell.params_set),
+            key=result.key,
+            key_preimage=result.key_preimage,
+            seed=result.seed,
+            started=result.started,
+            ended=result.ended,
+            wall_s=result.wall_s,
+            cpu_s=result.cpu_s,
+            peak_rss_mib=result.peak_rss_mib,
+            environment=str(result.environment.get("id", "")),
+            cached_from=self.outcome.cached.get(cell.address, ""),
+            metrics=tuple(
+                RecordedMetric(name=metric.name, value=metric.value, unit=metric.unit)
+                for metric in result.metrics
+            ),
+            figures=tuple(_recorded_figure(figure, self.store) for figure in result.figures),
+            warnings=result.warnings,
+            citations=result.citations,
+            log=result.log,
+            inputs={
+                port: _recorded_product(ref, source=str(cell.inputs.get(port, "")))
+                for port, ref in result.inputs.items()
+            },
+            outputs={
+                port: _recorded_product(ref, embedded=self._is_embedded(ref))
+                for port, ref in result.outputs.items()
+            },
+        )
+
+    def _is_embedded(self, ref: ProductRef) -> bool:
+        target = self.plan.products[ref.type_name].target
+        return self.embed or bool(resolve_name(target).embedded)
+
+
+def _recorded_product(
+    ref: ProductRef, *, source: str = "", embedded: bool = False
+) -> RecordedProduct:
+    return RecordedProduct(
+        type_name=ref.type_name,
+        encoding_version=ref.encoding_version,
+        digest=ref.digest,
+        source=source,
+        embedded=embedded,
+    )
+
+
+def _recorded_figure(figure: FigureRef, store: Store) -> RecordedFigure:
+    path = store.blob_path(figure.sha256)
+    if path is None:
+        raise StoreError(
+            f"the store {store.folder} lost the figure {figure.name}; run again and it is drawn "
+            "anew"
+        )
+    return RecordedFigure(
+        name=figure.name,
+        caption=figure.caption,
+        media_type=figure.media_type,
+        data=path.read_bytes(),
+    )
+
+
+def _recorded_inputs(plan: RunPlan) -> tuple[RecordedInput, ...]:
+    return tuple(
+        RecordedInput(
+            name=name,
+            files=tuple(
+                RecordedFile(name=file.name, size_bytes=file.size_bytes, sha256=file.sha256)
+                for file in (given.files if given is not None else ())
+            ),
+        )
+        for name, given in plan.inputs.items()
+    )
+
+
+def _recorded_environments(results: Mapping[str, CellResult]) -> tuple[RecordedEnvironment, ...]:
+    found: dict[str, RecordedEnvironment] = {}
+    for result in results.values():
+        given = result.environment
+        if given and str(given["id"]) not in found:
+            found[str(given["id"])] = _recorded_environment(given)
+    return tuple(found.values())
+
+
+def _recorded_environment(given: Mapping[str, JsonValue]) -> RecordedEnvironment:
+    packages = cast("dict[str, str]", given["packages"])
+    return RecordedEnvironment(
+        id=str(given["id"]),
+        python=str(given["python"]),
+        os=str(given["os"]),
+        cpu=str(given["cpu"]),
+        cores=cast("int", given["cores"]),
+        threads=cast("int", given["threads"]),
+        git_commit=str(given["git_commit"]),
+        packages=dict(packages),
+    )
+
+
+def _published(outcome: RunOutcome, store: Store) -> dict[str, dict[str, tuple[Path, ...]]]:
+    return {
+        address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
+        for address, result in outcome.results.items()
+    }

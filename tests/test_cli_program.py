@@ -1,0 +1,216 @@
+"""The program itself: fast start, exit codes, one sentence per error."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from orthoflow import __version__
+from orthoflow.cli import program
+from orthoflow.cli.lazy_groups import LazyCommand
+from orthoflow.cli.program import Program
+from orthoflow.cli.sessions import current_session
+from orthoflow.errors import (
+    ArgumentError,
+    CancelledStepError,
+    InputError,
+    PluginError,
+    RecordError,
+    StoreError,
+    WorkflowError,
+)
+
+HEAVY = ("numpy", "pydantic", "networkx", "rich", "ruamel", "h5py", "numba", "jinja2")
+COMMANDS = [
+    "check",
+    "plan",
+    "graph",
+    "run",
+    "show",
+    "report",
+    "verify",
+    "plugins",
+    "schema",
+    "cache",
+    "doctor",
+]
+
+
+def orthoflow(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "orthoflow", *arguments], capture_output=True, text=True, check=False
+    )
+
+
+def invoke_failing(error: BaseException | Callable[[], int], *arguments: str) -> Result:
+    """Run a program whose only command raises the error, or does what it is told."""
+
+    def fail() -> int:
+        if callable(error):
+            return error()
+        raise error
+
+    broken = Program(name="orthoflow", callback=lambda: None, params=program.params, lazy={})
+    broken._lazy = {"fail": LazyCommand(target="unused:unused", summary="fails")}
+    broken.get_command = lambda _ctx, _name: click.Command("fail", callback=fail)  # type: ignore[method-assign]
+    return CliRunner().invoke(broken, [*arguments, "fail"])
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["plugins", "list"], ["run", "--help"]])
+def test_listing_loads_no_heavy_library(arguments: list[str]) -> None:
+    code = (
+        "import sys\n"
+        "from orthoflow.cli import program\n"
+        "try:\n"
+        f"    program.main({arguments!r})\n"
+        "except SystemExit as exit:\n"
+        "    assert exit.code == 0, exit.code\n"
+        f"print('LOADED', [name for name in {HEAVY!r} if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines()[-1] == "LOADED []", done.stderr
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["plugins", "list"]])
+def test_listing_takes_less_than_half_a_second(arguments: list[str]) -> None:
+    times_s = []
+    for _ in range(5):
+        start = time.perf_counter()
+        assert orthoflow(*arguments).returncode == 0
+        times_s.append(time.perf_counter() - start)
+    # The fastest of five: other work on the machine only ever adds time.
+    assert min(times_s) < 0.5
+
+
+def test_help_names_every_command_and_every_exit_code() -> None:
+    shown = orthoflow("--help").stdout
+    listed = [line.split()[0] for line in shown.partition("Commands:")[2].splitlines() if line]
+    assert listed == COMMANDS
+    words = " ".join(shown.split())
+    for code in ("0 good", "1 some cell failed", "2 the workflow", "3 a record", "4 a plugin"):
+        assert code in words
+    assert "130 interrupted" in words
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_loads_and_takes_debug(name: str) -> None:
+    result = CliRunner().invoke(program, [name, "--help"])
+    assert result.exit_code == 0
+    if name not in ("plugins", "cache"):
+        assert "--debug" in result.output
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "check",
+        "plan",
+        "show",
+        "verify",
+        "schema",
+        "doctor",
+        "plugins list",
+        "plugins show",
+        "cache list",
+        "cache gc",
+    ],
+)
+def test_every_listing_verb_has_json(command: str) -> None:
+    assert "--json" in CliRunner().invoke(program, [*command.split(), "--help"]).output
+
+
+def test_version_is_that_of_the_package() -> None:
+    assert orthoflow("--version").stdout == f"orthoflow {__version__}\n"
+
+
+def test_an_unknown_command_ends_with_2_and_says_which_was_meant() -> None:
+    done = orthoflow("verfy", "x")
+    assert done.returncode == 2
+    assert "No such command 'verfy'; did you mean 'verify'?" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (WorkflowError("w"), 2),
+        (ArgumentError("a"), 2),
+        (InputError("i"), 2),
+        (RecordError("r"), 3),
+        (PluginError("p"), 4),
+        (StoreError("s"), 1),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else str(value),
+)
+def test_errors_become_one_sentence_and_their_exit_code(error: Exception, code: int) -> None:
+    result = invoke_failing(error)
+    assert result.exit_code == code
+    assert result.stderr == f"error: {error}\n"
+    assert result.stdout == ""
+
+
+def test_a_full_disk_is_named_with_its_file() -> None:
+    result = invoke_failing(OSError(28, "No space left on device", "runs/x/run.h5"))
+    assert result.exit_code == 1
+    assert result.stderr == "error: runs/x/run.h5: no space left on device\n"
+
+
+def test_a_bug_of_ours_asks_for_debug_instead_of_a_traceback() -> None:
+    result = invoke_failing(ZeroDivisionError("division by zero"))
+    assert result.exit_code == 1
+    assert result.stderr == (
+        "error: orthoflow itself failed (ZeroDivisionError: division by zero); repeat the command "
+        "with --debug and report what it prints\n"
+    )
+
+
+def test_debug_shows_the_traceback_as_well() -> None:
+    result = invoke_failing(InputError("the scan is empty"), "--debug")
+    assert result.exit_code == 2
+    assert "Traceback (most recent call last)" in result.stderr
+    assert result.stderr.endswith("error: the scan is empty\n")
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), CancelledStepError("stopped")])
+def test_an_interrupt_ends_with_130_and_says_how_to_go_on(error: BaseException) -> None:
+    def interrupted() -> int:
+        current_session().resume_hint = "interrupted; repeat the command with -o runs/x"
+        raise error
+
+    result = invoke_failing(interrupted)
+    assert result.exit_code == 130
+    assert result.stderr.strip() == "interrupted; repeat the command with -o runs/x"
+
+
+def test_a_closed_pipe_makes_no_noise() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as closed:
+        done = subprocess.run(
+            [sys.executable, "-m", "orthoflow", "plugins", "list"],
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_only_the_standard_library_click_and_pluggy_load_for_help(tmp_path: Path) -> None:
+    code = (
+        "import sys\n"
+        "import orthoflow.cli\n"
+        "print([m for m in sys.modules if m.startswith('orthoflow.') "
+        "and not m.startswith(('orthoflow.cli', 'orthoflow.errors'))])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert done.stdout == "[]\n"

@@ -1,0 +1,451 @@
+"""`orthoflow run` and what reads its results, with real processes and real files."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from orthoflow.records import open_run
+from tests.workshop_runs import command, orthoflow, workshop_environment, write_studio
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
+    """A folder with a finished run `good`; what the run wrote to stdout and stderr."""
+    folder = tmp_path_factory.mktemp("finished")
+    write_studio(folder)
+    done = orthoflow(folder, "run", "studio.yaml", "-o", "good", "--set", "survey.offset_m=-3")
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout, done.stderr
+
+
+def test_a_run_ends_by_naming_report_record_and_orthoimages(
+    finished: tuple[Path, str, str],
+) -> None:
+    folder, stdout, _ = finished
+    assert stdout.splitlines()[-3:] == [
+        "report: good/report.html",
+        "record: good/run.h5",
+        "orthoimage: good/products/paint/wall_0_ortho.tif",
+    ]
+    for line in stdout.splitlines()[-3:]:
+        assert (folder / line.partition(": ")[2]).is_file()
+
+
+def test_a_run_shows_every_cell_and_every_warning(finished: tuple[Path, str, str]) -> None:
+    _, stdout, stderr = finished
+    rows = [line.split() for line in stdout.splitlines()]
+    assert ["survey", "survey.offset", "ok"] in [row[:3] for row in rows]
+    assert "warning, survey: the plane lies behind the viewer" in stdout.splitlines()
+    assert "0 of 2 steps cached" in stdout.splitlines()
+    said = stderr.splitlines()
+    assert said[1:3] == [
+        "survey: started",
+        "survey: warning: the plane lies behind the viewer",
+    ]
+    assert said[-1].startswith("paint: ok in ")
+    assert said[-1].endswith("(2 of 2)")
+
+
+def test_a_finished_folder_holds_nothing_unfinished(finished: tuple[Path, str, str]) -> None:
+    folder = finished[0] / "good"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "journal.jsonl",
+        "logs",
+        "products",
+        "report.html",
+        "run.h5",
+    ]
+
+
+def test_the_record_says_what_happened(finished: tuple[Path, str, str]) -> None:
+    run = open_run(finished[0] / "good")
+    assert run.record.status == "ok"
+    assert run.record.overrides == ("--set survey.offset_m=-3",)
+    survey = run.cells["survey"]
+    assert survey.params == {"offset_m": -3.0}
+    assert survey.warnings == ("the plane lies behind the viewer",)
+    assert survey.citations == ("https://doi.org/10.1000/workshop",)
+    assert (survey.distribution, survey.distribution_version) == ("workshop", "1.0")
+    paint = run.cells["paint"]
+    assert paint.inputs["planes"].digest == survey.outputs["planes"].digest
+    assert paint.inputs["planes"].source == "survey.planes"
+    assert {cell.environment for cell in run.record.cells} == {
+        environment.id for environment in run.record.environments
+    }
+    rows = {(row.cell, row.metric): row.value for row in run.metrics()}
+    assert rows["survey", "offset_m"] == -3.0
+    assert rows["paint", "wall_s"] >= 0.0
+
+
+def test_a_record_names_no_folder(finished: tuple[Path, str, str]) -> None:
+    folder = finished[0]
+    content = (folder / "good" / "run.h5").read_bytes()
+    assert str(folder).encode() not in content
+
+
+def test_a_second_run_is_all_cached_and_says_so(finished: tuple[Path, str, str]) -> None:
+    folder = finished[0]
+    arguments = ("run", "studio.yaml", "--set", "survey.offset_m=-3")
+    again = orthoflow(folder, *arguments)
+    assert again.returncode == 0, again.stderr
+    assert "all 2 steps were cached" in again.stdout.splitlines()
+    [named] = (folder / "runs").glob("studio-*")
+    run = open_run(named)
+    assert named.name == f"studio-{run.record.run_id}"
+    original = open_run(folder / "good").record.run_id
+    assert {cell.cached_from for cell in run.record.cells} == {original}
+    assert run.cells["survey"].outputs == open_run(folder / "good").cells["survey"].outputs
+
+
+def test_a_forced_step_runs_again(finished: tuple[Path, str, str]) -> None:
+    folder = finished[0]
+    again = orthoflow(
+        folder,
+        *("run", "studio.yaml", "--set", "survey.offset_m=-3", "--force", "survey", "-o", "forced"),
+    )
+    assert again.returncode == 0, again.stderr
+    # Early cut-off: the forced step gives equal planes, so the paint is not done again.
+    assert "1 of 2 steps cached" in again.stdout.splitlines()
+
+
+def test_until_leaves_out_what_follows(finished: tuple[Path, str, str]) -> None:
+    folder = finished[0]
+    assert (
+        orthoflow(folder, "run", "studio.yaml", "--until", "survey", "-o", "part").returncode == 0
+    )
+    assert list(open_run(folder / "part").cells) == ["survey"]
+
+
+def test_a_finished_folder_is_refused(finished: tuple[Path, str, str]) -> None:
+    done = orthoflow(finished[0], "run", "studio.yaml", "-o", "good")
+    assert done.returncode == 2
+    assert "holds a finished run (run.h5); choose another folder with -o" in done.stderr
+
+
+def test_an_input_from_the_command_line_is_recorded_by_content(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    (tmp_path / "n.txt").write_text("1.5", encoding="utf-8")
+    done = orthoflow(tmp_path, "run", "studio.yaml", "--input", "number=n.txt", "-o", "r")
+    assert done.returncode == 0, done.stderr
+    [given] = open_run(tmp_path / "r").record.inputs
+    assert (given.name, given.files[0].name, given.files[0].size_bytes) == ("number", "n.txt", 3)
+    shown = orthoflow(tmp_path, "show", "r").stdout
+    assert "input number: n.txt, 3 B, sha256 " in shown
+
+
+def test_embed_makes_a_record_that_verifies(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    done = orthoflow(tmp_path, "run", "studio.yaml", "--embed", "-o", "r", "--executor", "inline")
+    assert done.returncode == 0, done.stderr
+    checked = orthoflow(tmp_path, "verify", "r")
+    assert (checked.returncode, checked.stdout) == (0, "verified: 2 products, seal ok\n")
+
+
+@pytest.mark.parametrize(
+    ("method", "code", "sentence"),
+    [
+        ("paint.fail", 1, "paint failed: no colour sticks to this plane"),
+        ("paint.lacking", 4, "paint failed: method paint.lacking needs no_such_library"),
+    ],
+)
+def test_a_failed_cell_leaves_a_record_a_report_and_its_exit_code(
+    tmp_path: Path, method: str, code: int, sentence: str
+) -> None:
+    write_studio(tmp_path, method)
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r")
+    assert done.returncode == code
+    assert any(line.startswith(sentence) for line in done.stderr.splitlines())
+    assert "Traceback" not in done.stderr + done.stdout
+    run = open_run(tmp_path / "r")
+    assert run.record.status == "failed"
+    assert [cell.status for cell in run.record.cells] == ["ok", "failed"]
+    assert (tmp_path / "r" / "report.html").is_file()
+    assert orthoflow(tmp_path, "verify", "r").returncode == 0
+
+
+def test_a_bad_input_ends_with_2_and_skips_what_needs_it(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    (tmp_path / "empty.txt").touch()
+    done = orthoflow(tmp_path, "run", "studio.yaml", "--input", "number=empty.txt", "-o", "r")
+    assert done.returncode == 2
+    assert "survey failed: empty.txt is empty, expected one number" in done.stderr.splitlines()
+    assert open_run(tmp_path / "r").cells["paint"].error_message == "needs survey, which failed"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    write_studio(tmp_path, "paint.slow")
+    with subprocess.Popen(
+        command("run", "studio.yaml", "-o", "r"),
+        cwd=tmp_path,
+        env=workshop_environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as running:
+        assert running.stderr is not None
+        seen = [next(running.stderr)]
+        while not seen[-1].startswith("paint: started"):
+            seen.append(next(running.stderr))
+        time.sleep(1.0)
+        running.send_signal(number)
+        _, rest = running.communicate(timeout=30)
+    assert running.returncode == 130
+    assert rest.splitlines()[-1] == (
+        "interrupted; what is finished is kept, and the same command with -o r goes on from there"
+    )
+    assert "Traceback" not in rest
+    write_studio(tmp_path, "paint.plain")
+    again = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r")
+    assert again.returncode == 0, again.stderr
+    assert again.stderr.startswith("going on with run ")
+    assert open_run(tmp_path / "r").cells["survey"].cached_from == ""
+
+
+def test_a_terminal_gets_a_live_table_that_leaves_nothing_behind(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    controlling, terminal = pty.openpty()
+    done = subprocess.Popen(
+        command("run", "studio.yaml", "-o", "r"),
+        cwd=tmp_path,
+        env={**workshop_environment(), "TERM": "xterm", "COLUMNS": "100", "LINES": "30"},
+        stdout=subprocess.PIPE,
+        stderr=terminal,
+    )
+    os.close(terminal)
+    shown = b""
+    while True:
+        try:
+            block = os.read(controlling, 65536)
+        except OSError:
+            break
+        if not block:
+            break
+        shown += block
+    stdout, _ = done.communicate(timeout=60)
+    os.close(controlling)
+    assert done.returncode == 0
+    assert b"survey" in shown
+    assert b"\x1b[?25h" in shown  # the cursor is visible again
+    assert stdout.decode().splitlines()[-1].startswith("orthoimage: ")
+
+
+def test_a_reader_that_leaves_does_not_stop_the_run(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "wb") as closed:
+        done = subprocess.run(
+            command("run", "studio.yaml", "-o", "r"),
+            cwd=tmp_path,
+            env=workshop_environment(),
+            stdout=closed,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
+    assert open_run(tmp_path / "r").record.status == "ok"
+
+
+def test_show_tells_cells_metrics_warnings_and_environment(
+    finished: tuple[Path, str, str],
+) -> None:
+    shown = orthoflow(finished[0], "show", "good").stdout
+    assert "2 cells, 2 ok" in shown.splitlines()[0]
+    assert "overrides: --set survey.offset_m=-3" in shown
+    assert "input number: not given" in shown
+    assert "warning, survey: the plane lies behind the viewer" in shown
+    assert ["survey", "offset_m", "-3", "m"] in [line.split() for line in shown.splitlines()]
+    assert "environment: Python " in shown
+    assert "numpy " in shown
+
+
+def test_show_gives_json(finished: tuple[Path, str, str]) -> None:
+    answer = json.loads(orthoflow(finished[0], "show", "good/run.h5", "--json").stdout)
+    assert [cell["address"] for cell in answer["cells"]] == ["survey", "paint"]
+    assert answer["cells"][0]["metrics"] == [{"name": "offset_m", "value": -3.0, "unit": "m"}]
+    assert "good/products/paint/wall_0_ortho.tif" in answer["files"]
+
+
+def test_verify_passes_and_finds_a_changed_byte(
+    finished: tuple[Path, str, str], tmp_path: Path
+) -> None:
+    folder = finished[0]
+    good = orthoflow(folder, "verify", "good", "--json")
+    assert good.returncode == 0
+    assert json.loads(good.stdout)["ok"] is True
+    content = bytearray((folder / "good" / "run.h5").read_bytes())
+    content[content.find(b"name: studio")] ^= 1
+    (tmp_path / "run.h5").write_bytes(content)
+    bad = orthoflow(tmp_path, "verify", "run.h5")
+    assert bad.returncode == 3
+    assert "workflow" in bad.stdout
+    assert bad.stderr == "error: run.h5 is not as it was written, see above\n"
+
+
+def test_a_truncated_record_ends_with_3_everywhere(
+    finished: tuple[Path, str, str], tmp_path: Path
+) -> None:
+    content = (finished[0] / "good" / "run.h5").read_bytes()
+    (tmp_path / "run.h5").write_bytes(content[: len(content) // 2])
+    for verb in ("show", "verify", "report"):
+        done = orthoflow(tmp_path, verb, "run.h5")
+        assert (verb, done.returncode) == (verb, 3)
+        assert "Traceback" not in done.stderr
+        assert "run.h5" in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("verb", ["show", "verify", "report"])
+def test_a_missing_run_ends_with_2(tmp_path: Path, verb: str) -> None:
+    done = orthoflow(tmp_path, verb, "nowhere")
+    assert done.returncode == 2
+    assert done.stderr == "error: nowhere does not exist; give a run folder or its run.h5\n"
+
+
+def test_report_writes_one_page_for_several_runs(finished: tuple[Path, str, str]) -> None:
+    folder = finished[0]
+    refused = orthoflow(folder, "report", "good", "good")
+    assert refused.returncode == 2
+    assert "2 runs were given: say with -o FILE where their common report goes" in refused.stderr
+    done = orthoflow(folder, "report", "good", "good", "-o", "both.html")
+    assert (done.returncode, done.stdout) == (0, "report: both.html\n")
+    assert (folder / "both.html").read_text(encoding="utf-8").startswith("<!")
+    nowhere = orthoflow(folder, "report", "good", "-o", "none/both.html")
+    assert nowhere.returncode == 2
+    assert "none does not exist: make the folder, or choose another" in nowhere.stderr
+
+
+def test_plan_says_what_is_cached_and_what_changed(finished: tuple[Path, str, str]) -> None:
+    folder = finished[0]
+    same = orthoflow(folder, "plan", "studio.yaml", "--set", "survey.offset_m=-3")
+    assert same.stdout.splitlines()[-1] == "2 cells: 2 cached"
+    other = json.loads(
+        orthoflow(
+            folder,
+            *("plan", "studio.yaml", "--set", "survey.offset_m=-3", "--set", "paint.grey=9"),
+            "--json",
+        ).stdout
+    )
+    assert [item["status"] for item in other] == ["cached", "will run"]
+    assert "grey" in other[1]["reason"]
+
+
+def test_cache_lists_results_and_collects_garbage(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    assert orthoflow(tmp_path, "run", "studio.yaml", "-o", "r").returncode == 0
+    listed = orthoflow(tmp_path, "cache", "list").stdout
+    assert listed.splitlines()[-1] == "2 results in .orthoflow"
+    methods = {
+        item["method"] for item in json.loads(orthoflow(tmp_path, "cache", "list", "--json").stdout)
+    }
+    assert methods == {"survey.offset", "paint.plain"}
+    kept = json.loads(orthoflow(tmp_path, "cache", "gc", "--json").stdout)
+    assert (kept["n_results"], kept["n_objects"]) == (0, 0)
+    would = orthoflow(tmp_path, "cache", "gc", "--older-than", "0", "--dry-run").stdout
+    assert would.startswith("would remove 2 results and 2 objects, ")
+    assert orthoflow(tmp_path, "cache", "gc", "--older-than", "0").returncode == 0
+    assert json.loads(orthoflow(tmp_path, "cache", "list", "--json").stdout) == []
+
+
+def test_the_store_may_lie_elsewhere(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", "--store", "elsewhere")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "elsewhere" / "results").is_dir()
+    assert not (tmp_path / ".orthoflow").exists()
+
+
+def test_check_is_content_with_a_good_workflow(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    done = orthoflow(tmp_path, "check", "studio.yaml")
+    assert (done.returncode, done.stdout) == (0, "studio is fine: 2 steps, 2 cells\n")
+
+
+def test_check_names_every_problem_with_its_place(tmp_path: Path) -> None:
+    path = write_studio(tmp_path, "paint.plane")
+    path.write_text(path.read_text(encoding="utf-8") + "colour: red\n", encoding="utf-8")
+    done = orthoflow(tmp_path, "check", "studio.yaml")
+    assert done.returncode == 2
+    lines = done.stderr.splitlines()
+    assert any(line.startswith("studio.yaml:8:") and "paint.plain" in line for line in lines)
+    assert any(line.startswith("studio.yaml:9:1: ") for line in lines)
+    assert lines[-1] == "error: 2 problems"
+    answer = json.loads(orthoflow(tmp_path, "check", "studio.yaml", "--json").stdout)
+    assert answer["ok"] is False
+    assert [problem["line"] for problem in answer["problems"]] == [8, 9]
+
+
+def test_check_looks_for_the_files(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    done = orthoflow(tmp_path, "check", "studio.yaml", "--input", "number=none.txt")
+    assert done.returncode == 2
+    assert "there is no file none.txt" in done.stderr
+
+
+def test_graph_and_schema_print_what_other_programs_read(tmp_path: Path) -> None:
+    write_studio(tmp_path)
+    graph = orthoflow(tmp_path, "graph", "studio.yaml")
+    assert graph.returncode == 0, graph.stderr
+    assert graph.stdout.splitlines()[0].startswith(("flowchart", "graph"))
+    schema = json.loads(orthoflow(tmp_path, "schema").stdout)
+    assert "paint.plain" in json.dumps(schema)
+
+
+def test_plugins_show_gives_parameters_with_units_and_limits(tmp_path: Path) -> None:
+    shown = orthoflow(tmp_path, "plugins", "show", "survey.offset").stdout
+    row = next(line.split() for line in shown.splitlines() if line.startswith("offset_m"))
+    assert row == [
+        "offset_m",
+        "number",
+        ">=",
+        "-10",
+        "<=",
+        "10",
+        "2.0",
+        "m",
+        *["Distance", "of", "the", "plane."],
+    ]
+    assert "https://doi.org/10.1000/workshop" in shown
+    answer = json.loads(orthoflow(tmp_path, "plugins", "show", "survey.offset", "--json").stdout)
+    assert answer["in"] == [{"port": "files", "product": "files", "required": False}]
+    assert (answer["distribution"], answer["version"]) == ("workshop", "1.0")
+
+
+def test_an_unknown_method_ends_with_2(tmp_path: Path) -> None:
+    done = orthoflow(tmp_path, "plugins", "show", "paint.plane")
+    assert done.returncode == 2
+    assert "did you mean paint.plain?" in done.stderr
+
+
+def test_a_broken_plugin_is_listed_and_harms_nobody(tmp_path: Path) -> None:
+    (tmp_path / "broken_plugin.py").write_text("import no_such_library\n", encoding="utf-8")
+    info = tmp_path / "broken-2.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 2.0\n")
+    (info / "entry_points.txt").write_text("[orthoflow.plugins]\nbad = broken_plugin\n")
+    environment = dict(workshop_environment())
+    environment["PYTHONPATH"] += os.pathsep + str(tmp_path)
+    done = subprocess.run(
+        command("plugins", "list", "--json"),
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    answer = json.loads(done.stdout)
+    assert [broken["distribution"] for broken in answer["broken"]] == ["broken"]
+    assert "no_such_library" in answer["broken"][0]["problem"]
+    assert "paint.plain" in {method["id"] for method in answer["methods"]}

@@ -1,0 +1,339 @@
+"""The read API and verification, on records made without the engine."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_provenance.model import RunRecord
+from orthoflow_provenance.payloads import write_product_file
+from orthoflow_provenance.writer import write_record
+
+import orthoflow
+from orthoflow.errors import ArgumentError, RecordError
+from orthoflow.products import Planes
+from orthoflow.records import (
+    RecordedCell,
+    RecordedEnvironment,
+    RecordedFigure,
+    RecordedFile,
+    RecordedInput,
+    RecordedMetric,
+    RecordedProduct,
+    Run,
+    cell_metrics,
+    open_run,
+    verify_run,
+)
+from orthoflow.records.metrics import write_metrics_csv
+from orthoflow.records.published import folder_name, publish_products
+
+PNG = b"\x89PNG\r\n\x1a\n picture"
+PREIMAGE = '{"method":"plane.given"}'
+ENVIRONMENT = RecordedEnvironment(
+    id="sha256:" + "e" * 64,
+    python="3.11.7",
+    os="Linux 6",
+    cpu="a processor",
+    cores=2,
+    threads=2,
+    git_commit="",
+    packages={"numpy": "2.4.6"},
+)
+CLOUD_DIGEST = "sha256:" + "c" * 64
+
+
+def one_plane() -> Planes:
+    return Planes(
+        normal=np.array([[0.0, -1.0, 0.0]]),
+        offset=np.array([-2.0]),
+        corners=np.array([[[0, 2, 3], [0, 2, 0], [4, 2, 0], [4, 2, 3]]], dtype=np.float64),
+        covariance=np.zeros((1, 4, 4)),
+        n_points=np.array([1200]),
+        rms_m=np.array([0.002]),
+        up=np.array([0.0, 0.0, 1.0]),
+        names=("wall 0",),
+    )
+
+
+def planes_cell(digest: str) -> RecordedCell:
+    return RecordedCell(
+        address="plane@plane=given",
+        step="plane",
+        method="plane.given",
+        status="ok",
+        assignment={"plane": "given"},
+        distribution="orthoflow-tls",
+        distribution_version="0.1.0",
+        result_version=1,
+        determinism="exact",
+        environment=ENVIRONMENT.id,
+        params={"tolerance_m": 0.02},
+        key=hashlib.sha256(PREIMAGE.encode()).hexdigest(),
+        key_preimage=PREIMAGE,
+        started="2026-01-02T03:04:05.000Z",
+        ended="2026-01-02T03:04:06.500Z",
+        wall_s=1.5,
+        cpu_s=1.25,
+        peak_rss_mib=128.0,
+        metrics=(RecordedMetric(name="rms_mm", value=2.0, unit="mm"),),
+        figures=(RecordedFigure(name="plan", caption="seen", media_type="image/png", data=PNG),),
+        warnings=("the side of the viewer is a guess",),
+        inputs={
+            "cloud": RecordedProduct(
+                type_name="cloud", encoding_version=1, digest=CLOUD_DIGEST, source="cloud.cloud"
+            )
+        },
+        outputs={
+            "planes": RecordedProduct(
+                type_name="planes", encoding_version=1, digest=digest, embedded=True
+            )
+        },
+    )
+
+
+def cloud_cell() -> RecordedCell:
+    return RecordedCell(
+        address="cloud",
+        step="cloud",
+        method="read.scan",
+        status="ok",
+        distribution="orthoflow-tls",
+        distribution_version="0.1.0",
+        result_version=1,
+        determinism="exact",
+        environment=ENVIRONMENT.id,
+        started="2026-01-02T03:04:05.000Z",
+        ended="2026-01-02T03:04:05.000Z",
+        key=hashlib.sha256(b"{}").hexdigest(),
+        key_preimage="{}",
+        outputs={
+            "cloud": RecordedProduct(type_name="cloud", encoding_version=1, digest=CLOUD_DIGEST)
+        },
+    )
+
+
+def failed_cell() -> RecordedCell:
+    return RecordedCell(
+        address="wall",
+        step="wall",
+        method="raster.grid",
+        status="failed",
+        error_type="MethodError",
+        error_message="no cell has a point",
+        wall_s=0.5,
+    )
+
+
+def a_record(digest: str) -> RunRecord:
+    return RunRecord(
+        run_id="20260102-abc",
+        name="room",
+        created_by="orthoflow 0.1.0",
+        status="failed",
+        started="2026-01-02T03:04:05.000Z",
+        ended="2026-01-02T03:04:07.000Z",
+        seed=1729,
+        workflow_source="orthoflow: 1\nname: room\n",
+        workflow_resolved='{"name":"room"}',
+        inputs=(
+            RecordedInput(
+                name="scan",
+                files=(RecordedFile(name="room.e57", size_bytes=10, sha256="a" * 64),),
+            ),
+        ),
+        environments=(ENVIRONMENT,),
+        cells=(cloud_cell(), planes_cell(digest), failed_cell()),
+    )
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Path:
+    """A finished run folder with one embedded product and one that is only named."""
+    product = tmp_path / "product.h5"
+    digest = write_product_file(product, one_plane().to_payload())
+    folder = tmp_path / "run"
+    folder.mkdir()
+    record = a_record(digest)
+    write_record(folder / "run.h5", record, lambda asked: product if asked == digest else None)
+    published = tmp_path / "planes.json"
+    published.write_text('{"planes": []}', encoding="utf-8")
+    publish_products(folder, record.cells, {"plane@plane=given": {"planes": (published,)}})
+    return folder
+
+
+@pytest.fixture
+def run(run_folder: Path) -> Run:
+    return open_run(run_folder)
+
+
+def test_a_run_opens_by_folder_and_by_record_alike(run_folder: Path) -> None:
+    by_folder = orthoflow.open_run(run_folder)
+    assert by_folder == orthoflow.open_run(str(run_folder / "run.h5"))
+    assert by_folder.record.run_id == "20260102-abc"
+    assert list(by_folder.cells) == ["cloud", "plane@plane=given", "wall"]
+    assert by_folder.folder == run_folder
+
+
+def test_a_product_comes_back_as_it_was(run: Run) -> None:
+    planes = run.product("plane@plane=given", "planes")
+    assert isinstance(planes, Planes)
+    for field in dataclasses.fields(Planes):
+        expected, got = getattr(one_plane(), field.name), getattr(planes, field.name)
+        if isinstance(expected, np.ndarray):
+            np.testing.assert_array_equal(got, expected)
+        else:
+            assert got == expected
+
+
+def test_a_figure_comes_back_as_bytes(run: Run) -> None:
+    assert run.figure("plane@plane=given", "plan").data == PNG
+
+
+def test_metrics_hold_what_the_method_and_the_engine_measured_of_good_cells_only(run: Run) -> None:
+    rows = [(row.cell, row.metric, row.value, row.unit) for row in run.metrics()]
+    assert rows[3:] == [
+        ("plane@plane=given", "rms_mm", 2.0, "mm"),
+        ("plane@plane=given", "wall_s", 1.5, "s"),
+        ("plane@plane=given", "cpu_s", 1.25, "s"),
+        ("plane@plane=given", "peak_rss_mib", 128.0, "MiB"),
+    ]
+    assert {row.cell for row in run.metrics()} == {"cloud", "plane@plane=given"}
+
+
+def test_published_files_and_metrics_lie_below_products(run: Run) -> None:
+    folder = run.folder / "products"
+    assert run.files["plane@plane=given"] == (
+        folder / "plane@plane=given" / "metrics.csv",
+        folder / "plane@plane=given" / "planes.json",
+    )
+    assert "wall" not in run.files
+    with (folder / "metrics.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["cell", "step", "method", "metric", "value", "unit"]
+    assert rows[4] == ["plane@plane=given", "plane", "plane.given", "rms_mm", "2.0", "mm"]
+    assert len(rows) == 8
+
+
+def test_numbers_in_metrics_csv_keep_every_digit(tmp_path: Path) -> None:
+    value = 0.1 + 0.2
+    cell = dataclasses.replace(
+        cloud_cell(), metrics=(RecordedMetric(name="x", value=value, unit="1"),)
+    )
+    write_metrics_csv(tmp_path / "metrics.csv", cell_metrics(cell))
+    with (tmp_path / "metrics.csv").open(encoding="utf-8", newline="") as file:
+        assert float(next(iter(csv.DictReader(file)))["value"]) == value
+
+
+def test_two_outputs_that_publish_the_same_name_both_stay(tmp_path: Path) -> None:
+    for port in ("a", "b"):
+        (tmp_path / port).mkdir()
+        (tmp_path / port / "planes.json").write_text(port, encoding="utf-8")
+    files = {port: (tmp_path / port / "planes.json",) for port in ("a", "b")}
+    publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files})
+    cell = tmp_path / "run" / "products" / "cloud"
+    assert (cell / "planes.json").read_text(encoding="utf-8") == "a"
+    assert (cell / "b_planes.json").read_text(encoding="utf-8") == "b"
+
+
+def test_orthoimages_come_in_the_order_of_the_walls(run: Run) -> None:
+    folder = run.folder / "products" / "plane@plane=given"
+    for k in (10, 2, 0):
+        (folder / f"wall_{k}_ortho.tif").touch()
+    assert [path.name for path in run.orthoimages] == [
+        "wall_0_ortho.tif",
+        "wall_2_ortho.tif",
+        "wall_10_ortho.tif",
+    ]
+
+
+def test_a_long_address_gets_a_folder_name_that_file_systems_take() -> None:
+    address = "ortho@" + ",".join(f"step{i}=variant{i}" for i in range(40))
+    other = address + "x"
+    assert len(folder_name(address).encode()) <= 200
+    assert folder_name(address) != folder_name(other)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (
+            lambda run: run.payload("cloud", "cloud"),
+            RecordError,
+            "names cloud.cloud only by its digest; run the workflow with --embed",
+        ),
+        (lambda run: run.payload("roof", "x"), ArgumentError, "has no cell 'roof'; it has cloud, "),
+        (
+            lambda run: run.payload("cloud", "x"),
+            ArgumentError,
+            "the cell cloud has no output 'x'; it has cloud",
+        ),
+        (
+            lambda run: run.figure("cloud", "plan"),
+            ArgumentError,
+            "the cell cloud has no figure 'plan'; it has none at all",
+        ),
+    ],
+    ids=["not embedded", "no such cell", "no such output", "no such figure"],
+)
+def test_what_a_run_does_not_have_is_said(run: Run, call, error, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(error) as caught:
+        call(run)
+    assert message in str(caught.value)
+
+
+def test_a_missing_path_is_an_argument_error(tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match="does not exist; give a run folder or its "):
+        open_run(tmp_path / "none")
+
+
+def test_a_folder_without_a_record_is_an_unfinished_run(tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match=r"holds no run.h5: .* repeat the run with -o "):
+        open_run(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not HDF5 at all", b"\x89HDF\r\n\x1a\n cut off"])
+def test_a_file_that_is_no_record_is_refused_with_one_sentence(
+    tmp_path: Path, content: bytes
+) -> None:
+    path = tmp_path / "run.h5"
+    path.write_bytes(content)
+    with pytest.raises(RecordError) as caught:
+        open_run(path)
+    assert "run.h5" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_truncated_record_is_refused_and_does_not_verify(run_folder: Path, share: float) -> None:
+    path = run_folder / "run.h5"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    with pytest.raises(RecordError):
+        open_run(path)
+    assert verify_run(path).findings
+
+
+def test_an_untouched_record_verifies(run_folder: Path) -> None:
+    verification = verify_run(run_folder)
+    assert (verification.findings, verification.n_products) == ((), 1)
+    assert verification.path == run_folder / "run.h5"
+
+
+@pytest.mark.parametrize(
+    "needle",
+    [b"name: room", b"rms_mm", np.float64(-2.0).tobytes(), PNG, b"a guess"],
+    ids=["workflow text", "metric name", "product array", "figure", "warning"],
+)
+def test_one_changed_byte_is_found(run_folder: Path, needle: bytes) -> None:
+    path = run_folder / "run.h5"
+    content = bytearray(path.read_bytes())
+    at = content.find(needle)
+    assert at >= 0
+    content[at + len(needle) - 1] ^= 1
+    path.write_bytes(content)
+    assert verify_run(path).findings

@@ -1,0 +1,1 @@
+"""Small methods that really run, in milliseconds."""

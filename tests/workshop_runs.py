@@ -1,0 +1,52 @@
+"""Running the command line on the workshop's methods, in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+WORKSHOP = Path(__file__).resolve().parent / "workshop"
+
+STUDIO = """\
+orthoflow: 1
+name: studio
+seed: 7
+inputs:
+  number: {optional: true}
+steps:
+  survey: {use: survey.offset, in: {files: inputs.number}}
+  paint: {use: METHOD, in: {planes: survey.planes}}
+"""
+
+
+def workshop_environment() -> Mapping[str, str]:
+    """The environment with the workshop installed."""
+    path = os.pathsep.join([str(WORKSHOP), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    return {**os.environ, "PYTHONPATH": path}
+
+
+def write_studio(folder: Path, method: str = "paint.plain") -> Path:
+    """Write a workflow of two steps whose second uses the method."""
+    path = folder / "studio.yaml"
+    path.write_text(STUDIO.replace("METHOD", method), encoding="utf-8")
+    return path
+
+
+def command(*arguments: str) -> list[str]:
+    """The command line of `orthoflow`."""
+    return [sys.executable, "-m", "orthoflow", *arguments]
+
+
+def orthoflow(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder and wait for its end."""
+    return subprocess.run(
+        command(*arguments),
+        cwd=folder,
+        env=workshop_environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
