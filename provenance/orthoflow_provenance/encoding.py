@@ -183,14 +183,6 @@ def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
     return found
 
 
-def _attribute(group: h5py.Group, name: str) -> object:
-    with reading(f"{group.name}@{name}"):
-        value: object = group.attrs.get(name)
-    if value is None:
-        raise RecordFormatError(f"{group.name} lacks the attribute {name}")
-    return value
-
-
 def decoded(data: bytes, place: str) -> str:
     """Decode UTF-8.
 
@@ -201,6 +193,14 @@ def decoded(data: bytes, place: str) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise RecordFormatError(f"{place} must be UTF-8 text: {error}") from error
+
+
+def _attribute(group: h5py.Group, name: str) -> object:
+    with reading(f"{group.name}@{name}"):
+        value: object = group.attrs.get(name)
+    if value is None:
+        raise RecordFormatError(f"{group.name} lacks the attribute {name}")
+    return value
 
 
 def _wrong_attribute(

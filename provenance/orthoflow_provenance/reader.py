@@ -1,0 +1,269 @@
+"""Reading a record: the run as dataclasses, products on demand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import h5py
+
+from orthoflow_provenance import layout
+from orthoflow_provenance.encoding import (
+    dataset_of,
+    float_attribute,
+    int_attribute,
+    read_json,
+    read_text,
+    reading,
+    text_attribute,
+)
+from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.model import (
+    CellStatus,
+    RecordedCell,
+    RecordedEnvironment,
+    RecordedFigure,
+    RecordedFile,
+    RecordedInput,
+    RecordedMetric,
+    RecordedProduct,
+    RunRecord,
+)
+from orthoflow_provenance.payloads import StoredPayload, check_format, open_group, read_payload
+from orthoflow_provenance.safe import safe_open
+from orthoflow_provenance.seal import SEAL_ATTRIBUTE
+from orthoflow_provenance.tables import read_table, read_texts
+
+Entry = TypeVar("Entry")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenRecord:
+    """An open record.
+
+    Attributes:
+        record: everything but the arrays.
+        content_sha256: the content digest that seals the record, 64 hexadecimal digits.
+        file: the HDF5 file.
+    """
+
+    record: RunRecord
+    content_sha256: str
+    file: h5py.File
+
+    def payload(self, address: str, port: str) -> StoredPayload:
+        """Read an output of a cell; arrays of mapped products stay valid after closing.
+
+        Raises:
+            RecordFormatError: there is no such output, it is not embedded, or it is damaged.
+        """
+        cell = next((cell for cell in self.record.cells if cell.address == address), None)
+        output = None if cell is None else cell.outputs.get(port)
+        if output is None:
+            raise RecordFormatError(f"the record has no output {port} of the cell {address}")
+        if not output.embedded:
+            raise RecordFormatError(
+                f"the record names the output {port} of {address} ({output.type_name}) by its "
+                f"digest only, {output.digest}: it is in the store, or run again with --embed"
+            )
+        outputs = open_group(
+            open_group(open_group(self.file, layout.CELLS), address), layout.CELL_OUTPUTS
+        )
+        return read_payload(open_group(outputs, port), map_arrays=True)
+
+
+def read_record(path: Path) -> RunRecord:
+    """Read all of a record but the arrays.
+
+    Raises:
+        RecordFormatError: the file is no record, damaged, incomplete, or of a newer format.
+        OSError: the file cannot be opened.
+    """
+    with open_record(path) as opened:
+        return opened.record
+
+
+@contextmanager
+def open_record(path: Path) -> Iterator[OpenRecord]:
+    """Open a record for reading.
+
+    Raises:
+        RecordFormatError: the file is no record, damaged, incomplete, or of a newer format.
+        OSError: the file cannot be opened.
+    """
+    with safe_open(path) as file:
+        check_format(file, layout.RUN_FORMAT, layout.RUN_FORMAT_VERSION)
+        yield OpenRecord(
+            record=record_of(file), content_sha256=text_attribute(file, SEAL_ATTRIBUTE), file=file
+        )
+
+
+def record_of(file: h5py.File) -> RunRecord:
+    """Read the record of a file whose format has been checked.
+
+    Raises:
+        RecordFormatError: something required is missing or damaged.
+    """
+    workflow = open_group(file, layout.WORKFLOW)
+    return RunRecord(
+        run_id=text_attribute(file, "run_id"),
+        name=text_attribute(file, "name"),
+        created_by=text_attribute(file, "created_by"),
+        status=_run_status(file),
+        started=text_attribute(file, "started"),
+        ended=text_attribute(file, "ended"),
+        seed=_whole_number(text_attribute(file, "seed"), "/@seed"),
+        workflow_source=read_text(workflow, "source"),
+        workflow_resolved=read_text(workflow, "resolved"),
+        overrides=read_texts(workflow, "overrides"),
+        inputs=_entries(file, layout.INPUTS, _input),
+        environments=_entries(file, layout.ENVIRONMENTS, _environment),
+        cells=_entries(file, layout.CELLS, _cell),
+    )
+
+
+def _entries(
+    file: h5py.File, name: str, read: Callable[[str, h5py.Group], Entry]
+) -> tuple[Entry, ...]:
+    parent = open_group(file, name)
+    with reading(f"/{name}"):
+        names = sorted(parent)
+    groups = [(open_group(parent, child), child) for child in names]
+    groups.sort(key=lambda pair: int_attribute(pair[0], "index"))
+    return tuple(read(child, group) for group, child in groups)
+
+
+def _input(name: str, group: h5py.Group) -> RecordedInput:
+    files = tuple(
+        RecordedFile(name=str(file), size_bytes=int(size), sha256=str(sha256))
+        for file, size, sha256 in read_table(group, "files", layout.FILE_COLUMNS)
+    )
+    return RecordedInput(name=name, files=files)
+
+
+def _environment(name: str, group: h5py.Group) -> RecordedEnvironment:
+    return RecordedEnvironment(
+        id=name,
+        python=text_attribute(group, "python"),
+        os=text_attribute(group, "os"),
+        cpu=text_attribute(group, "cpu"),
+        cores=int_attribute(group, "cores"),
+        threads=int_attribute(group, "threads"),
+        git_commit=text_attribute(group, "git_commit"),
+        packages={
+            str(package): str(version)
+            for package, version in read_table(group, "packages", layout.PACKAGE_COLUMNS)
+        },
+    )
+
+
+def _cell(address: str, group: h5py.Group) -> RecordedCell:
+    seed = text_attribute(group, "seed")
+    return RecordedCell(
+        address=address,
+        step=text_attribute(group, "step"),
+        method=text_attribute(group, "method"),
+        status=_cell_status(group),
+        assignment={
+            str(step): str(variant)
+            for step, variant in read_table(group, "assignment", layout.ASSIGNMENT_COLUMNS)
+        },
+        repeat=int_attribute(group, "repeat"),
+        distribution=text_attribute(group, "distribution"),
+        distribution_version=text_attribute(group, "distribution_version"),
+        result_version=int_attribute(group, "result_version"),
+        determinism=text_attribute(group, "determinism"),
+        error_type=text_attribute(group, "error_type"),
+        error_message=read_text(group, "error_message"),
+        params=read_json(group, "params"),
+        params_set=read_json(group, "params_set"),
+        key=text_attribute(group, "key"),
+        key_preimage=read_text(group, "key_preimage"),
+        seed=_whole_number(seed, f"{group.name}@seed") if seed else None,
+        started=text_attribute(group, "started"),
+        ended=text_attribute(group, "ended"),
+        wall_s=float_attribute(group, "wall_s"),
+        cpu_s=float_attribute(group, "cpu_s"),
+        peak_rss_mib=float_attribute(group, "peak_rss_mib"),
+        environment=text_attribute(group, "environment"),
+        cached_from=text_attribute(group, "cached_from"),
+        metrics=_metrics(group),
+        figures=_figures(group),
+        warnings=read_texts(group, "warnings"),
+        citations=read_texts(group, "citations"),
+        log=read_text(group, "log"),
+        inputs=_products(group, layout.CELL_INPUTS),
+        outputs=_products(group, layout.CELL_OUTPUTS),
+    )
+
+
+def _metrics(group: h5py.Group) -> tuple[RecordedMetric, ...]:
+    return tuple(
+        RecordedMetric(name=str(name), value=float(value), unit=str(unit))
+        for name, value, unit in read_table(group, "metrics", layout.METRIC_COLUMNS)
+    )
+
+
+def _figures(group: h5py.Group) -> tuple[RecordedFigure, ...]:
+    figures = open_group(group, layout.FIGURES)
+    with reading(figures.name):
+        names = sorted(figures)
+    return tuple(_figure(dataset_of(figures, name)) for name in names)
+
+
+def _figure(dataset: h5py.Dataset) -> RecordedFigure:
+    with reading(dataset.name):
+        data = dataset[()].tobytes()
+    return RecordedFigure(
+        name=text_attribute(dataset, "name"),
+        caption=text_attribute(dataset, "caption"),
+        media_type=text_attribute(dataset, "media_type"),
+        data=data,
+    )
+
+
+def _products(group: h5py.Group, name: str) -> dict[str, RecordedProduct]:
+    parent = open_group(group, name)
+    with reading(parent.name):
+        ports = sorted(parent)
+    return {port: _product(open_group(parent, port)) for port in ports}
+
+
+def _product(group: h5py.Group) -> RecordedProduct:
+    return RecordedProduct(
+        type_name=text_attribute(group, "type"),
+        encoding_version=int_attribute(group, "encoding_version"),
+        digest=text_attribute(group, "digest"),
+        source=text_attribute(group, "source"),
+        embedded=bool(int_attribute(group, "embedded")),
+    )
+
+
+def _run_status(file: h5py.File) -> Literal["ok", "failed"]:
+    status = text_attribute(file, "status")
+    if status == "ok":
+        return "ok"
+    if status == "failed":
+        return "failed"
+    raise RecordFormatError(f"/@status must be ok or failed, got {status!r}")
+
+
+def _cell_status(group: h5py.Group) -> CellStatus:
+    status = text_attribute(group, "status")
+    if status == "ok":
+        return "ok"
+    if status == "failed":
+        return "failed"
+    if status == "skipped":
+        return "skipped"
+    raise RecordFormatError(f"{group.name}@status must be ok, failed or skipped, got {status!r}")
+
+
+def _whole_number(text: str, place: str) -> int:
+    digits = text.removeprefix("-")
+    if not (digits.isascii() and digits.isdigit() and len(digits) < 100):
+        raise RecordFormatError(f"{place} must be a whole number in decimal digits, got {text!r}")
+    return int(text)
