@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -81,13 +80,20 @@ def test_listing_loads_no_heavy_library(arguments: list[str]) -> None:
 
 @pytest.mark.parametrize("arguments", [["--help"], ["plugins", "list"]])
 def test_listing_takes_less_than_half_a_second(arguments: list[str]) -> None:
+    # Processor time, which bounds the time on the clock from below and does not count what else
+    # the machine does; the fastest of three, because the first fills the file system's cache.
     times_s = []
-    for _ in range(5):
-        start = time.perf_counter()
+    for _ in range(3):
+        before = os.times()
         assert orthoflow(*arguments).returncode == 0
-        times_s.append(time.perf_counter() - start)
-    # The fastest of five: other work on the machine only ever adds time.
-    assert min(times_s) < 0.5
+        after = os.times()
+        times_s.append(
+            after.children_user
+            - before.children_user
+            + after.children_system
+            - before.children_system
+        )
+    assert min(times_s) < 0.4
 
 
 def test_help_names_every_command_and_every_exit_code() -> None:

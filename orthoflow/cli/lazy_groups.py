@@ -52,15 +52,16 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the command, and say which one was probably meant when there is none."""
-        import difflib
-
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
+            import difflib
+
             close = difflib.get_close_matches(args[0], self._lazy, n=1)
-            if close and "did you mean" not in error.message.lower():
-                error.message = f"{error.message.rstrip('.')}; did you mean {close[0]!r}?"
-            raise
+            if not close or "did you mean" in error.message.lower():
+                raise
+            sentence = f"{error.message.rstrip('.')}; did you mean {close[0]!r}?"
+            raise click.UsageError(sentence, ctx) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands from the table."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -34,7 +34,8 @@ def plan(
     store: Path,
     *,
     as_json: bool,
-    **selection: tuple[str, ...],
+    # Any: the fields of RunOptions, whose types click has checked.
+    **selection: Any,
 ) -> int:
     """Say for every cell of WORKFLOW whether its result is stored, and if not, why it would run.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -49,7 +49,8 @@ def run(
     store: Path,
     *,
     embed: bool,
-    **choices: object,
+    # Any: the fields of RunOptions, whose types click has checked.
+    **choices: Any,
 ) -> int:
     """Run WORKFLOW, a file or the name of a shipped one.
 
@@ -61,7 +62,7 @@ def run(
     from orthoflow.engine import RunOptions, Store, plan_run
     from orthoflow.workflow import expand_cells, load_workflow
 
-    options = RunOptions(**choices)  # type: ignore[arg-type] - click has checked the types
+    options = RunOptions(**choices)
     catalog = discover_catalog()
     loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
     opened = Store(store)

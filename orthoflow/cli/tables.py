@@ -36,19 +36,18 @@ def echo_json(value: object) -> None:
 def duration(seconds: float) -> str:
     """Say a time as people do.
 
-    >>> [duration(seconds) for seconds in (0.001, 0.042, 3.14159, 75, 3700)]
-    ['< 0.01 s', '0.04 s', '3.1 s', '1 min 15 s', '1 h 02 min']
+    >>> [duration(seconds) for seconds in (0.001, 0.042, 59.97, 75, 3700)]
+    ['< 0.01 s', '0.04 s', '1 min 00 s', '1 min 15 s', '1 h 02 min']
     """
     if seconds < 0.01:
         return "< 0.01 s"
     if seconds < 1:
         return f"{seconds:.2f} s"
-    if seconds < 60:
+    if seconds < 59.95:
         return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
+    if seconds < 3599.5:
+        return "{} min {:02d} s".format(*divmod(round(seconds), 60))
+    return "{} h {:02d} min".format(*divmod(round(seconds / 60), 60))
 
 
 def size(n_bytes: float) -> str:
