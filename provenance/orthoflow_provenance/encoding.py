@@ -11,6 +11,7 @@ from typing import Final
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.model import JsonValue
@@ -72,10 +73,14 @@ def storable_text(text: str) -> str:
 
 
 def set_attributes(group: h5py.Group, values: Mapping[str, AttributeValue]) -> None:
-    """Write scalar attributes: text as UTF-8, whole numbers as int64, others as float64."""
+    """Write scalar attributes: text as UTF-8, whole numbers as int64, others as float64.
+
+    Text has a fixed length: text of variable length lies in HDF5's global heap, the one structure
+    without a checksum, in which one changed byte can make the library loop for ever.
+    """
     for name, value in values.items():
         if isinstance(value, str):
-            group.attrs[name] = storable_text(value)
+            group.attrs[name] = _fixed_text(value)
         elif isinstance(value, int):
             group.attrs[name] = np.int64(value)
         else:
@@ -89,11 +94,9 @@ def text_attribute(group: h5py.Group, name: str) -> str:
         RecordFormatError: it is missing or not text.
     """
     value = _attribute(group, name)
-    if isinstance(value, bytes):
-        value = decoded(bytes(value), f"{group.name}@{name}")
-    if not isinstance(value, str):
+    if not isinstance(value, bytes):
         raise _wrong_attribute(group, name, "text", value)
-    return value
+    return decoded(bytes(value), f"{group.name}@{name}")
 
 
 def int_attribute(group: h5py.Group, name: str) -> int:
@@ -122,13 +125,11 @@ def float_attribute(group: h5py.Group, name: str) -> float:
 
 def write_text(group: h5py.Group, name: str, text: str) -> None:
     """Write a text of any length as a scalar UTF-8 dataset of fixed length."""
-    data = storable_text(text).encode("utf-8")
-    dtype = h5py.string_dtype("utf-8", max(1, len(data)))
-    group.create_dataset(name, data=np.array(data, dtype=dtype), track_times=False)
+    group.create_dataset(name, data=_fixed_text(text), track_times=False)
 
 
 def read_text(group: h5py.Group, name: str) -> str:
-    """Read what `write_text` wrote; text of variable length is read as well.
+    """Read what `write_text` wrote.
 
     Raises:
         RecordFormatError: the dataset is missing, damaged or not text.
@@ -193,6 +194,11 @@ def decoded(data: bytes, place: str) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise RecordFormatError(f"{place} must be UTF-8 text: {error}") from error
+
+
+def _fixed_text(text: str) -> NDArray[np.bytes_]:
+    data = storable_text(text).encode("utf-8")
+    return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
 
 
 def _attribute(group: h5py.Group, name: str) -> object:

@@ -124,7 +124,7 @@ class _Inspection:
                 place, f"must use each of {', '.join(_FILTERS.values())} at most once and no other"
             )
         kind = dataset.id.get_type()
-        if not (_is_allowed(kind) or (dataset.shape == () and _is_text(kind))):
+        if not (_is_allowed(kind) or (_is_note(place) and _is_text(kind))):
             raise self._refusal(place, f"has a type outside the format ({dataset.dtype})")
         if layout == h5py.h5d.CHUNKED and (
             math.prod(properties.get_chunk()) * kind.get_size() > _LARGEST_CHUNK_BYTES
@@ -148,13 +148,19 @@ class _Inspection:
             attribute = item.attrs.get_id(name)
             kind = attribute.get_type()
             n_values = math.prod(attribute.shape)
-            if not (_is_allowed(kind) or (n_values == 1 and _is_text(kind))):
+            if not (_is_allowed(kind) or (_is_note(place) and _is_text(kind))):
                 raise self._refusal(f"{place}@{name}", "has a type outside the format")
             if n_values * kind.get_size() > _LARGEST_ATTRIBUTE_BYTES:
                 raise self._refusal(f"{place}@{name}", "is larger than 1 MiB")
 
     def _refusal(self, place: str, reason: str) -> RecordFormatError:
         return RecordFormatError(f"{self._name}:{place} {reason}: the file is not opened")
+
+
+def _is_note(place: str) -> bool:
+    # Notes are never read here, so people may write them as h5py does by itself: text of variable
+    # length, which elsewhere could unpack to any size.
+    return place.startswith("/notes/") or place == "/notes"
 
 
 def _is_text(kind: h5py.h5t.TypeID) -> bool:

@@ -135,20 +135,12 @@ def _object_digest(
 
 
 def _attribute_digest(value: object) -> JsonValue:
-    if isinstance(value, str):
-        value = value.encode("utf-8", "surrogateescape")
-    if isinstance(value, bytes):
-        return ["utf8", [], hashlib.sha256(value).hexdigest()]
     array = np.asarray(value)
     return [_dtype_code(array.dtype), list(array.shape), _digest_blocks(iter([array]))]
 
 
 def _fingerprint(dataset: h5py.Dataset) -> ArrayFingerprint:
     shape = tuple(dataset.shape)
-    if h5py.check_string_dtype(dataset.dtype) is not None and dataset.dtype.kind == "O":
-        return ArrayFingerprint(
-            dtype="utf8", shape=shape, sha256=hashlib.sha256(dataset[()]).hexdigest()
-        )
     return ArrayFingerprint(
         dtype=_dtype_code(dataset.dtype), shape=shape, sha256=_digest_blocks(_values(dataset))
     )
