@@ -1,0 +1,273 @@
+"""Compiled passes that look for planes: votes, moments, cells on a plane, claims, deviations.
+
+A slab is handed over as a row of 12 float64: normal (3) and offset in the cloud's own offsets, then
+the in-plane axes u (3) with its origin and v (3) with its origin. Passes over the cloud skip blocks
+whose box lies outside the slab, and sum integers only (distances as multiples of a fixed step), so
+that neither the number of threads nor the order of blocks shows in the result.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from orthoflow.geometry.point_kernels import (
+    BLOCK_POINTS,
+    BlockedPoints,
+    compiled,
+    compiled_parallel,
+)
+
+# Distances are summed in steps of the fit tolerance over this: half a micrometre at 15 mm, and the
+# squares of 48 million points still fit into 64 bits.
+STEPS_PER_TOLERANCE: Final = 32768
+# Columns of what `claim_slab` and `measure_deviations` count.
+HISTOGRAM_BINS: Final = 200
+
+
+@compiled_parallel
+def vote_lines(
+    cells: NDArray[np.float32],
+    weights: NDArray[np.int64],
+    angles_rad: NDArray[np.float64],
+    low_m: float,
+    bin_m: float,
+    votes: NDArray[np.int64],
+) -> None:
+    """Let each plan cell vote for all lines through it.
+
+    Args:
+        cells: (m, 2) centres in the plan, metres.
+        weights: (m,) votes a cell has.
+        angles_rad: (a,) directions of the lines' normals.
+        low_m: distance of the first bin's lower edge; bins that miss the table are dropped.
+        bin_m: width of a bin.
+        votes: (a, bins) table, added to. Equation 4 of markiewicz2015: r = x cos + y sin.
+    """
+    n_bins = votes.shape[1]
+    for angle in prange(angles_rad.size):
+        cosine = math.cos(angles_rad[angle]) / bin_m
+        sine = math.sin(angles_rad[angle]) / bin_m
+        start = low_m / bin_m
+        for i in range(cells.shape[0]):
+            position = cells[i, 0] * cosine + cells[i, 1] * sine - start
+            if 0.0 <= position < n_bins:
+                votes[angle, int(position)] += weights[i]
+
+
+@compiled
+def robust_moments(
+    points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float
+) -> NDArray[np.float64]:
+    """Weighted sums of the points near a plane, Tukey's weights with a cut at the tolerance.
+
+    Args:
+        points: (m, 3) offsets, metres.
+        plane: (4,) normal and offset.
+        tolerance_m: distance at which a point's weight has fallen to zero.
+
+    Returns:
+        (10,) sum of weights, of w x, w y, w z, and of w times xx, xy, xz, yy, yz, zz.
+    """
+    sums = np.zeros(10)
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        ratio = (plane[0] * x + plane[1] * y + plane[2] * z - plane[3]) / tolerance_m
+        if abs(ratio) >= 1.0:
+            continue
+        weight = (1.0 - ratio * ratio) ** 2
+        sums[0] += weight
+        sums[1] += weight * x
+        sums[2] += weight * y
+        sums[3] += weight * z
+        sums[4] += weight * x * x
+        sums[5] += weight * x * y
+        sums[6] += weight * x * z
+        sums[7] += weight * y * y
+        sums[8] += weight * y * z
+        sums[9] += weight * z * z
+    return sums
+
+
+@compiled
+def _misses(box: NDArray[np.float32], slab: NDArray[np.float64], reach_m: float) -> bool:
+    """Whether no point of a block's box lies within the reach of the slab's plane."""
+    centre = -slab[3]
+    half = reach_m
+    for axis in range(3):
+        centre += slab[axis] * 0.5 * (box[2 * axis] + box[2 * axis + 1])
+        half += abs(slab[axis]) * 0.5 * (box[2 * axis + 1] - box[2 * axis])
+    return bool(abs(centre) > half)
+
+
+@compiled
+def _place(row: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32) -> int:
+    """Cell of an offset along one axis of the plan, as `count_over_plan` has it; -1 before it."""
+    position = row[0] * x + row[1] * y + row[2] * z - row[3]
+    return int(position) if position >= 0.0 else -1
+
+
+@compiled_parallel
+def sum_cells(
+    points: BlockedPoints,
+    claims: NDArray[np.int8],
+    slab: NDArray[np.float64],
+    limits: NDArray[np.float64],
+    counts: NDArray[np.int32],
+    sums: NDArray[np.int64],
+) -> None:
+    """Sum distances of unclaimed points per cell of a raster on a plane.
+
+    Args:
+        points: (n,) offsets in blocks.
+        claims: (n,) plane of each point, negative for none.
+        slab: (12,) see module.
+        limits: cell side, find tolerance, inner tolerance, fit tolerance; metres.
+        counts: (parts, rows, columns, 3) points within the find, inner and fit tolerance; added to.
+        sums: (parts, rows, columns, 2) distances and squared distances of the points within the
+            fit tolerance, in steps and squared steps; added to.
+    """
+    x, y, z, boxes = points.x, points.y, points.z, points.boxes
+    parts, n_rows, n_columns, _ = counts.shape
+    n_blocks = boxes.shape[0]
+    per_m = 1.0 / limits[0]
+    find_m, inner_m, fit_m = limits[1], limits[2], limits[3]
+    to_steps = STEPS_PER_TOLERANCE / fit_m
+    n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
+    u0, u1, u2, u3 = slab[4] * per_m, slab[5] * per_m, slab[6] * per_m, slab[7] * per_m
+    v0, v1, v2, v3 = slab[8] * per_m, slab[9] * per_m, slab[10] * per_m, slab[11] * per_m
+    for part in prange(parts):
+        for block in range(part * n_blocks // parts, (part + 1) * n_blocks // parts):
+            if _misses(boxes[block], slab, find_m):
+                continue
+            start = block * BLOCK_POINTS
+            for i in range(start, min(start + BLOCK_POINTS, x.size)):
+                if claims[i] >= 0:
+                    continue
+                px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+                distance = n0 * px + n1 * py + n2 * pz - n3
+                size = abs(distance)
+                if size > find_m:
+                    continue
+                column = math.floor(u0 * px + u1 * py + u2 * pz - u3)
+                row = math.floor(v0 * px + v1 * py + v2 * pz - v3)
+                if not (0 <= column < n_columns and 0 <= row < n_rows):
+                    continue
+                counts[part, row, column, 0] += 1
+                if size <= inner_m:
+                    counts[part, row, column, 1] += 1
+                if size <= fit_m:
+                    steps = np.int64(round(distance * to_steps))
+                    counts[part, row, column, 2] += 1
+                    sums[part, row, column, 0] += steps
+                    sums[part, row, column, 1] += steps * steps
+
+
+@compiled_parallel
+def claim_slab(
+    points: BlockedPoints,
+    claims: NDArray[np.int8],
+    slabs: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    frame: NDArray[np.float32],
+    taken: NDArray[np.int32],
+    taken_heights: NDArray[np.int32],
+) -> None:
+    """Give the points of the last slab to it, unless an earlier slab that has them is nearer.
+
+    Args:
+        points: (n,) offsets in blocks.
+        claims: (n,) plane of each point, negative for none; changed.
+        slabs: (k, 12) all slabs so far, the new one last.
+        bounds: (5,) of the new slab: find tolerance, then smallest and largest u and v, metres.
+        frame: (3, 4) plan cells and storeys of a point, see `count_over_plan`.
+        taken: (parts, cells along e1, along e2) points that were unclaimed and no longer are.
+        taken_heights: (parts, storeys + 1) the same per storey, and in the last column in all.
+    """
+    x, y, z, boxes = points.x, points.y, points.z, points.boxes
+    parts, n_first, n_second = taken.shape
+    n_storeys = taken_heights.shape[1] - 1
+    n_blocks = boxes.shape[0]
+    index = slabs.shape[0] - 1
+    slab = slabs[index]
+    find_m = bounds[0]
+    for part in prange(parts):
+        for block in range(part * n_blocks // parts, (part + 1) * n_blocks // parts):
+            if _misses(boxes[block], slab, find_m):
+                continue
+            start = block * BLOCK_POINTS
+            for i in range(start, min(start + BLOCK_POINTS, x.size)):
+                px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+                size = abs(slab[0] * px + slab[1] * py + slab[2] * pz - slab[3])
+                if size > find_m:
+                    continue
+                u = slab[4] * px + slab[5] * py + slab[6] * pz - slab[7]
+                v = slab[8] * px + slab[9] * py + slab[10] * pz - slab[11]
+                if u < bounds[1] or u > bounds[2] or v < bounds[3] or v > bounds[4]:
+                    continue
+                owner = claims[i]
+                if owner >= 0:
+                    other = slabs[owner]
+                    rival = abs(other[0] * px + other[1] * py + other[2] * pz - other[3])
+                    if size < rival:
+                        claims[i] = index
+                    continue
+                claims[i] = index
+                taken_heights[part, n_storeys] += 1
+                first = _place(frame[0], x[i], y[i], z[i])
+                second = _place(frame[1], x[i], y[i], z[i])
+                storey = _place(frame[2], x[i], y[i], z[i])
+                if 0 <= first < n_first and 0 <= second < n_second:
+                    taken[part, first, second] += 1
+                    if 0 <= storey < n_storeys:
+                        taken_heights[part, storey] += 1
+
+
+@compiled_parallel
+def measure_deviations(
+    points: BlockedPoints,
+    claims: NDArray[np.int8],
+    slabs: NDArray[np.float64],
+    tolerances: NDArray[np.float64],
+    sums: NDArray[np.int64],
+    histogram: NDArray[np.int64],
+) -> None:
+    """Sum the distances of claimed points to their plane, and count them per bin.
+
+    Args:
+        points: (n,) offsets in blocks.
+        claims: (n,) plane of each point, negative for none.
+        slabs: (k, 12) the planes.
+        tolerances: find tolerance, fit tolerance; metres.
+        sums: (parts, k, 6) of points within the find tolerance: number, steps, squared steps, then
+            the same within the fit tolerance; added to.
+        histogram: (parts, k, HISTOGRAM_BINS) points per bin of -find tolerance..find tolerance.
+    """
+    x, y, z = points.x, points.y, points.z
+    parts = sums.shape[0]
+    n_blocks = -(-x.size // BLOCK_POINTS)
+    find_m, fit_m = tolerances[0], tolerances[1]
+    to_steps = STEPS_PER_TOLERANCE / fit_m
+    to_bins = 0.5 * HISTOGRAM_BINS / find_m
+    for part in prange(parts):
+        first = part * n_blocks // parts * BLOCK_POINTS
+        last = min((part + 1) * n_blocks // parts * BLOCK_POINTS, x.size)
+        for i in range(first, last):
+            k = claims[i]
+            if k < 0:
+                continue
+            distance = slabs[k, 0] * x[i] + slabs[k, 1] * y[i] + slabs[k, 2] * z[i] - slabs[k, 3]
+            steps = np.int64(round(distance * to_steps))
+            sums[part, k, 0] += 1
+            sums[part, k, 1] += steps
+            sums[part, k, 2] += steps * steps
+            if abs(distance) <= fit_m:
+                sums[part, k, 3] += 1
+                sums[part, k, 4] += steps
+                sums[part, k, 5] += steps * steps
+            place = int((distance + find_m) * to_bins)
+            histogram[part, k, min(max(place, 0), HISTOGRAM_BINS - 1)] += 1

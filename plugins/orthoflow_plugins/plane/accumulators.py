@@ -1,0 +1,198 @@
+"""The modified 2D Hough transform of markiewicz2015, and the histogram along up beside it.
+
+The plan (a map of the cloud, 2 cm cells) votes for lines; a cell has as many votes as points, since
+with one vote per cell floors and ceilings drown every wall (their Figure 10). From each maximum the
+level of its surroundings at the same angle is subtracted: that level is what surfaces cut across
+leave, and with it goes the advantage of the longest diagonal through the room.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane
+from orthoflow.geometry.plane_kernels import vote_lines
+from orthoflow.geometry.point_kernels import PlanGrid
+from orthoflow_plugins.plane.peeling import Candidate, Remainder
+
+# A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
+# several bins until it is refined.
+_VOTE_CAUTION: Final = 0.25
+_NOT_AGAIN_ANGLES: Final = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Accumulator:
+    """Parameter space of the lines in a plan.
+
+    Attributes:
+        angles_rad: (a,) direction of the lines' normals in the (e1, e2) frame, 0 to pi.
+        low_m: lower edge of the first bin, as a distance from `centre_m`.
+        bin_m: width of a bin.
+        centre_m: (2,) centre of the plan in the (e1, e2) frame of the cloud's offsets.
+        votes: (a, bins) points that speak for each line.
+    """
+
+    angles_rad: NDArray[np.float64]
+    low_m: float
+    bin_m: float
+    centre_m: NDArray[np.float64]
+    votes: NDArray[np.int64]
+
+
+class PlanProposer:
+    """Proposes walls from the maxima of the accumulator and levels from those of the heights.
+
+    Attributes:
+        first: the accumulator of the untouched cloud.
+    """
+
+    def __init__(
+        self, grid: PlanGrid, *, angle_step_deg: float, least_points: float, with_levels: bool
+    ) -> None:
+        """Get ready to propose; a candidate needs about `least_points` points."""
+        self._grid = grid
+        self._with_levels = with_levels
+        self._least_votes = _VOTE_CAUTION * least_points
+        n_angles = max(4, round(180.0 / angle_step_deg))
+        self._angles_rad = np.arange(n_angles, dtype=np.float64) * (math.pi / n_angles)
+        half_m = 0.5 * grid.cell_m * math.hypot(grid.shape[0], grid.shape[1])
+        self._reach_bins = math.ceil(half_m / grid.cell_m) + 1
+        # Half an angle step off, a wall's ends lie in other bins than its middle.
+        self._smear_bins = max(1, round(0.3 * half_m * math.pi / n_angles / grid.cell_m))
+        self._barred = np.zeros((n_angles, 2 * self._reach_bins), dtype=bool)
+        self._barred_heights = np.zeros(grid.shape[2], dtype=bool)
+        self._voted_for = -1
+        self._scores = np.zeros((0, 0))
+        self._accumulator: Accumulator | None = None
+        self._last = (-1, -1)
+        self.first: Accumulator | None = None
+
+    def propose(self, remainder: Remainder) -> Candidate | None:
+        """Name the better of the best line and the best height."""
+        self._vote(remainder)
+        scores = np.where(self._barred, -np.inf, self._scores)
+        angle, place = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        line_score = float(scores[angle, place])
+        height_score, storey = -math.inf, -1
+        if self._with_levels:
+            heights = _contrast(remainder.heights[None, :], 1)[0]
+            heights = np.where(self._barred_heights, -np.inf, heights)
+            storey = int(np.argmax(heights))
+            height_score = float(heights[storey])
+        if max(line_score, height_score) < self._least_votes:
+            return None
+        if height_score > line_score:
+            self._last = (-1, storey)
+            return self._level(storey, height_score)
+        self._last = (int(angle), int(place))
+        return self._wall(remainder, int(angle), int(place), line_score)
+
+    def reject(self, candidate: Candidate) -> None:
+        """Bar the surroundings of the last maximum."""
+        angle, place = self._last
+        reach = self._smear_bins + 1
+        if angle < 0:
+            self._barred_heights[max(0, place - 2) : place + 3] = True
+            return
+        n_angles, n_bins = self._barred.shape
+        for step in range(-_NOT_AGAIN_ANGLES, _NOT_AGAIN_ANGLES + 1):
+            # A line at 180 degrees is the line at 0 with its distance counted the other way.
+            wrapped = not 0 <= angle + step < n_angles
+            centre = n_bins - 1 - place if wrapped else place
+            row = self._barred[(angle + step) % n_angles]
+            row[max(0, centre - reach) : centre + reach + 1] = True
+
+    def _vote(self, remainder: Remainder) -> None:
+        if self._voted_for == remainder.n_unclaimed:
+            return
+        cells, weights, centre_m = _occupied(self._grid, remainder.cells)
+        bin_m = self._grid.cell_m
+        low_m = -self._reach_bins * bin_m
+        votes = np.zeros((len(self._angles_rad), 2 * self._reach_bins), dtype=np.int64)
+        vote_lines(cells, weights, self._angles_rad, low_m, bin_m, votes)
+        self._accumulator = Accumulator(
+            angles_rad=self._angles_rad, low_m=low_m, bin_m=bin_m, centre_m=centre_m, votes=votes
+        )
+        if self.first is None:
+            self.first = self._accumulator
+        self._scores = _contrast(votes, self._smear_bins)
+        self._voted_for = remainder.n_unclaimed
+
+    def _wall(self, remainder: Remainder, angle: int, place: int, score: float) -> Candidate:
+        """Look around a maximum with finer angles and half-cell bins."""
+        cells, weights, centre_m = _occupied(self._grid, remainder.cells)
+        bin_m = self._grid.cell_m
+        distance_m = (place + 0.5 - self._reach_bins) * bin_m
+        step = math.pi / len(self._angles_rad)
+        reach_m = (self._smear_bins + 3) * bin_m
+        fine_step = max(step / 40.0, 0.5 / self._reach_bins)
+        n_fine = max(1, math.ceil(step / fine_step))
+        angles = self._angles_rad[angle] + np.arange(-n_fine, n_fine + 1) * (step / n_fine)
+        fine = np.zeros((len(angles), 4 * (self._smear_bins + 3)), dtype=np.int64)
+        # A point moves by up to half the plan times a step; cells further off cannot matter.
+        direction = np.array([math.cos(self._angles_rad[angle]), math.sin(self._angles_rad[angle])])
+        near_m = reach_m + step * self._reach_bins * bin_m
+        near = np.abs(cells @ direction - distance_m) < near_m
+        low_m = distance_m - reach_m
+        vote_lines(cells[near], weights[near], angles, low_m, 0.5 * bin_m, fine)
+        scores = _contrast(fine, 1)
+        best, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        shift = _parabola(scores[best], int(column))
+        normal_plan = np.array([math.cos(angles[best]), math.sin(angles[best])])
+        offset_m = low_m + (column + 0.5 + shift) * 0.5 * bin_m + float(normal_plan @ centre_m)
+        normal = normal_plan @ self._grid.basis[:2]
+        return Candidate(
+            plane=Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m),
+            is_level=False,
+            support=score,
+        )
+
+    def _level(self, storey: int, score: float) -> Candidate:
+        height_m = self._grid.low_m[2] + (storey + 0.5) * self._grid.cell_m
+        up = self._grid.basis[2]
+        plane = Plane(normal=up / np.linalg.norm(up), offset_m=float(height_m))
+        return Candidate(plane=plane, is_level=True, support=score)
+
+
+def _occupied(
+    grid: PlanGrid, counts: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float64]]:
+    """Centres (m, 2) and points (m,) of occupied cells, centres relative to the plan's centre."""
+    first, second = np.nonzero(counts > 0)
+    centre_m = grid.low_m[:2] + 0.5 * grid.cell_m * np.array(grid.shape[:2])
+    cells = np.column_stack(
+        [
+            (first + 0.5 - 0.5 * grid.shape[0]) * grid.cell_m,
+            (second + 0.5 - 0.5 * grid.shape[1]) * grid.cell_m,
+        ]
+    ).astype(np.float32)
+    return cells, counts[first, second], centre_m
+
+
+def _contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
+    """Votes in a window of 2 half + 1 bins above those of the emptier neighbouring window."""
+    width = 2 * half + 1
+    gap = width + 1
+    padded = np.pad(votes, ((0, 0), (half + gap + 1, half + gap)))
+    running = np.cumsum(padded, axis=1)
+    window = (running[:, width:] - running[:, :-width]).astype(np.float64)
+    n_bins = votes.shape[1]
+    middle = window[:, gap : gap + n_bins]
+    left, right = window[:, :n_bins], window[:, 2 * gap : 2 * gap + n_bins]
+    contrast: NDArray[np.float64] = middle - np.minimum(left, right)
+    return contrast
+
+
+def _parabola(values: NDArray[np.float64], place: int) -> float:
+    """Where between bins a maximum lies, -0.5..0.5."""
+    if not 0 < place < len(values) - 1:
+        return 0.0
+    before, here, after = values[place - 1 : place + 2]
+    bend = before - 2.0 * here + after
+    return 0.0 if bend >= 0.0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))

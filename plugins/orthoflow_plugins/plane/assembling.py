@@ -1,0 +1,278 @@
+"""Found planes turned into products: sides, order, names, rectangles in the world, labels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane, wall_axes
+from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
+from orthoflow.geometry.plane_kernels import (
+    HISTOGRAM_BINS,
+    STEPS_PER_TOLERANCE,
+    measure_deviations,
+)
+from orthoflow.products import Planes, PointCloud
+from orthoflow_plugins.plane.facing import (
+    Viewpoint,
+    known_viewpoint,
+    side_of_remaining,
+    side_of_stations,
+)
+from orthoflow_plugins.plane.peeling import FoundPlane, Remainder
+
+_VOTERS_MOST: Final = 5000
+# Cosine of 20 degrees.
+_PARALLEL: Final = 0.94
+
+
+@dataclass(frozen=True, kw_only=True)
+class Deviations:
+    """How far the points of each plane lie from it.
+
+    Attributes:
+        n_find: (k,) int64 points that belong to the plane.
+        rms_find_m: (k,) root mean square of their distances.
+        n_fit: (k,) int64 those of them within the fit tolerance.
+        rms_fit_m: (k,) root mean square of the distances of those.
+        mean_fit_m: (k,) mean of the distances of those.
+        histogram: (k, bins) points per bin of -find_m..find_m.
+        find_m: find tolerance.
+        fit_m: fit tolerance.
+    """
+
+    n_find: NDArray[np.int64]
+    rms_find_m: NDArray[np.float64]
+    n_fit: NDArray[np.int64]
+    rms_fit_m: NDArray[np.float64]
+    mean_fit_m: NDArray[np.float64]
+    histogram: NDArray[np.int64]
+    find_m: float
+    fit_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assembly:
+    """The products of a detector, and what else is known about them.
+
+    Attributes:
+        planes: ordered by support.
+        labels_from_claims: (k + 1,) int16 label of each claim; the last entry is for -1.
+        deviations: of the planes in their final order.
+        n_guessed: planes whose side was guessed.
+    """
+
+    planes: Planes
+    labels_from_claims: NDArray[np.int16]
+    deviations: Deviations
+    n_guessed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Faced:
+    """A found plane with its normal towards the viewer, in offsets."""
+
+    plane: Plane
+    covariance: NDArray[np.float64]
+    corners_m: NDArray[np.float64]
+    part_corners_m: NDArray[np.float64]
+    is_guessed: bool
+
+
+def measure_planes(
+    remainder: Remainder, slabs: NDArray[np.float64], *, find_m: float, fit_m: float
+) -> Deviations:
+    """Measure the deviations of all claimed points in one pass."""
+    sums = np.zeros((remainder.parts, len(slabs), 6), dtype=np.int64)
+    histogram = np.zeros((remainder.parts, len(slabs), HISTOGRAM_BINS), dtype=np.int64)
+    limits = np.array([find_m, min(fit_m, find_m)])
+    measure_deviations(remainder.points, remainder.claims, slabs, limits, sums, histogram)
+    total = sums.sum(axis=0)
+    step_m = limits[1] / STEPS_PER_TOLERANCE
+    n_find, n_fit = total[:, 0], total[:, 3]
+    return Deviations(
+        n_find=n_find,
+        rms_find_m=np.sqrt(total[:, 2] / np.maximum(n_find, 1)) * step_m,
+        n_fit=n_fit,
+        rms_fit_m=np.sqrt(total[:, 5] / np.maximum(n_fit, 1)) * step_m,
+        mean_fit_m=total[:, 4] / np.maximum(n_fit, 1) * step_m,
+        histogram=histogram.sum(axis=0),
+        find_m=find_m,
+        fit_m=float(limits[1]),
+    )
+
+
+def assemble(
+    found: list[FoundPlane], remainder: Remainder, deviations: Deviations, cloud: PointCloud
+) -> Assembly:
+    """Give planes their side, order and names."""
+    order = np.argsort(-deviations.n_find, kind="stable")
+    ordered = _reordered(deviations, order)
+    faced = [_faced(found, int(i), remainder, cloud, ordered.find_m) for i in order]
+    # Histograms and means follow the normal when it was turned.
+    flips = np.array(
+        [
+            float(item.plane.normal @ found[i].raster.plane.normal) < 0.0
+            for item, i in zip(faced, order, strict=True)
+        ]
+    )
+    ordered.histogram[flips] = ordered.histogram[flips][:, ::-1]
+    ordered.mean_fit_m[flips] *= -1.0
+    viewpoint: Viewpoint = known_viewpoint(cloud)
+    if all(item.is_guessed for item in faced):
+        viewpoint = "guess"
+    planes = Planes(
+        normal=np.array([item.plane.normal for item in faced]),
+        offset=np.array([_world_offset(item.plane, cloud) for item in faced]),
+        corners=np.array([cloud.origin + item.corners_m for item in faced]),
+        covariance=np.array([_world_covariance(item.covariance, cloud) for item in faced]),
+        n_points=ordered.n_find,
+        rms_m=ordered.rms_find_m,
+        up=cloud.up.copy(),
+        names=plane_names(
+            np.array([item.plane.normal for item in faced]),
+            np.array([item.corners_m.mean(axis=0) @ cloud.up for item in faced]),
+            cloud.up,
+        ),
+        part_corners=np.concatenate([cloud.origin + item.part_corners_m for item in faced]),
+        part_plane=np.repeat(
+            np.arange(len(faced), dtype=np.int32), [len(item.part_corners_m) for item in faced]
+        ),
+        viewpoint=viewpoint,
+        details={
+            "fit_n_points": [int(n) for n in ordered.n_fit],
+            "fit_rms_m": [float(value) for value in ordered.rms_fit_m],
+            "find_tolerance_m": ordered.find_m,
+            "fit_tolerance_m": ordered.fit_m,
+            "guessed_sides": [index for index, item in enumerate(faced) if item.is_guessed],
+        },
+    )
+    labels = np.full(len(found) + 1, -1, dtype=np.int16)
+    labels[order] = np.arange(len(found), dtype=np.int16)
+    return Assembly(
+        planes=planes,
+        labels_from_claims=labels,
+        deviations=ordered,
+        n_guessed=sum(item.is_guessed for item in faced),
+    )
+
+
+def plane_names(
+    normals: NDArray[np.float64], heights_m: NDArray[np.float64], up: NDArray[np.float64]
+) -> tuple[str, ...]:
+    """Name planes by what they are: `wall 0`, `floor`, `ceiling`, `level 4`, `slope 5`.
+
+    The number is the plane's position in the product, as in the files wall_<k>_*.tif. The floor is
+    the lowest level plane that is seen from above, the ceiling the highest that is seen from below.
+
+    Args:
+        normals: (k, 3) towards the viewer.
+        heights_m: (k,) along up.
+        up: (3,) unit vector.
+    """
+    rises = normals @ up
+    level = np.abs(rises) > math.cos(math.radians(LEVEL_LIMIT_DEG))
+    names = [
+        f"level {i}" if level[i] else f"wall {i}" if abs(rises[i]) < 0.5 else f"slope {i}"
+        for i in range(len(normals))
+    ]
+    seen_from_above = np.flatnonzero(level & (rises > 0.0))
+    seen_from_below = np.flatnonzero(level & (rises < 0.0))
+    if len(seen_from_above):
+        names[int(seen_from_above[np.argmin(heights_m[seen_from_above])])] = "floor"
+    if len(seen_from_below):
+        names[int(seen_from_below[np.argmax(heights_m[seen_from_below])])] = "ceiling"
+    return tuple(names)
+
+
+def rectangle_m(
+    plane: Plane, axes: NDArray[np.float64], bounds_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Corners (4, 3) on a plane: top-left first, counter-clockwise for the viewer.
+
+    Args:
+        plane: the plane, normal towards the viewer.
+        axes: (2, 3) u to the viewer's right and v down (`wall_axes`).
+        bounds_m: (4,) smallest and largest u, smallest and largest v.
+    """
+    left, right, top, bottom = bounds_m
+    around = np.array([[left, top], [left, bottom], [right, bottom], [right, top]])
+    corners: NDArray[np.float64] = around @ axes + plane.offset_m * plane.normal
+    return corners
+
+
+def enclosing(
+    corners_m: NDArray[np.float64], plane: Plane, axes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Give the rectangle along other axes of a plane that encloses one; for a flip the same one."""
+    placed = corners_m @ axes.T
+    low, high = placed.min(axis=0), placed.max(axis=0)
+    return rectangle_m(plane, axes, np.array([low[0], high[0], low[1], high[1]]))
+
+
+def _faced(
+    found: list[FoundPlane], claim: int, remainder: Remainder, cloud: PointCloud, find_m: float
+) -> _Faced:
+    raster, place = found[claim].raster, found[claim].footprint
+    plane, axes = raster.plane, raster.axes
+    corners_m = rectangle_m(plane, axes, place.bounds_m)
+    claims = remainder.sample_claims
+    members = remainder.sample.index[claims == claim]
+    # Evenly thinned, since a plane's first points may all be from one scan.
+    members = members[:: max(1, len(members) // _VOTERS_MOST)]
+    side = side_of_stations(plane, corners_m.mean(axis=0), cloud, members)
+    is_guessed = side == 0
+    if is_guessed:
+        # The last entry stands for points on no plane: a claim of -1 picks it.
+        parallel = [
+            abs(float(item.raster.plane.normal @ plane.normal)) > _PARALLEL for item in found
+        ]
+        side = side_of_remaining(
+            plane,
+            corners_m,
+            remainder.sample.offsets_m,
+            np.array([*parallel, False])[claims],
+            clear_m=find_m,
+        )
+    parts_m = [rectangle_m(plane, axes, bounds) for bounds in place.parts_m]
+    covariance = found[claim].adjusted.covariance
+    if side < 0:
+        # Normal and offset change sign together, so their covariance stays as it is.
+        plane = plane.flipped()
+    turned = wall_axes(plane.normal, cloud.up)
+    return _Faced(
+        plane=plane,
+        covariance=covariance,
+        corners_m=enclosing(corners_m, plane, turned),
+        part_corners_m=np.array([enclosing(part, plane, turned) for part in parts_m]),
+        is_guessed=is_guessed,
+    )
+
+
+def _world_offset(plane: Plane, cloud: PointCloud) -> float:
+    return plane.offset_m + float(plane.normal @ cloud.origin)
+
+
+def _world_covariance(covariance: NDArray[np.float64], cloud: PointCloud) -> NDArray[np.float64]:
+    """Covariance of (normal, offset) with the offset counted from the world's origin."""
+    shift = np.eye(4)
+    shift[3, :3] = cloud.origin
+    moved: NDArray[np.float64] = shift @ covariance @ shift.T
+    return 0.5 * (moved + moved.T)
+
+
+def _reordered(deviations: Deviations, order: NDArray[np.int64]) -> Deviations:
+    return Deviations(
+        n_find=deviations.n_find[order],
+        rms_find_m=deviations.rms_find_m[order],
+        n_fit=deviations.n_fit[order],
+        rms_fit_m=deviations.rms_fit_m[order],
+        mean_fit_m=deviations.mean_fit_m[order],
+        histogram=deviations.histogram[order],
+        find_m=deviations.find_m,
+        fit_m=deviations.fit_m,
+    )

@@ -1,0 +1,125 @@
+"""Pictures of a detection: deviations of the points, and the accumulator beside the plan."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.plane_kernels import HISTOGRAM_BINS
+from orthoflow.geometry.point_kernels import PlanGrid
+from orthoflow.products import Planes, PointCloud
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.accumulators import Accumulator
+from orthoflow_plugins.plane.assembling import Assembly
+
+_PANELS_MOST: Final = 4
+_PIXELS_MOST: Final = 900
+
+
+def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
+    """Draw how the points of the first planes lie about them, with the Gauss curve of the fit."""
+    from matplotlib.figure import Figure
+
+    deviations, names = assembly.deviations, assembly.planes.names
+    count = min(_PANELS_MOST, len(names))
+    figure = Figure(figsize=(3.2 * count, 2.8), layout="constrained")
+    edges_mm = 1000.0 * np.linspace(-deviations.find_m, deviations.find_m, HISTOGRAM_BINS + 1)
+    middles_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1])
+    for index in range(count):
+        axes = figure.add_subplot(1, count, index + 1)
+        axes.stairs(deviations.histogram[index], edges_mm, fill=True, color="#9db8d2")
+        sigma_mm = 1000.0 * float(deviations.rms_fit_m[index])
+        if sigma_mm > 0.0:
+            offset_mm = middles_mm - 1000.0 * float(deviations.mean_fit_m[index])
+            scale = float(deviations.n_fit[index]) * (edges_mm[1] - edges_mm[0])
+            curve = np.exp(-0.5 * (offset_mm / sigma_mm) ** 2)
+            curve *= scale / (sigma_mm * math.sqrt(2.0 * math.pi))
+            axes.plot(middles_mm, curve, color="#b03a2e", linewidth=1.0)
+        axes.set_title(f"{names[index]}: {sigma_mm:.1f} mm", fontsize=9)
+        axes.set_xlabel("distance to the plane [mm]", fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.set_yticks([])
+    ctx.figure(
+        "deviations",
+        figure,
+        "Distances of the points to their plane, positive towards the viewer; the curve is the "
+        f"normal distribution of those within {1000.0 * deviations.fit_m:.0f} mm.",
+    )
+
+
+def draw_accumulator(
+    ctx: StepContext,
+    grid: PlanGrid,
+    plan: NDArray[np.int64],
+    accumulator: Accumulator,
+    planes: Planes,
+    cloud: PointCloud,
+) -> None:
+    """Draw the plan with the walls found, and the parameter space with their maxima.
+
+    Args:
+        ctx: takes the figure.
+        grid: where the cells of the plan lie.
+        plan: (e1, e2) points per cell before any plane was taken.
+        accumulator: votes of that plan.
+        planes: the planes, world.
+        cloud: where they are from.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    basis = basis_from_up(planes.up)
+    low = grid.low_m[:2]
+    high = low + grid.cell_m * np.array(grid.shape[:2])
+    image = np.log1p(_thinned_sum(plan))
+    left.imshow(image.T, origin="lower", cmap="gray_r", extent=(low[0], high[0], low[1], high[1]))
+    votes = _thinned_sum(accumulator.votes)
+    reach_m = -accumulator.low_m
+    right.imshow(
+        np.sqrt(votes.T),
+        origin="lower",
+        aspect="auto",
+        cmap="gray",
+        extent=(0.0, 180.0, -reach_m, reach_m),
+    )
+    for index in np.flatnonzero(np.abs(planes.normal @ planes.up) < 0.5):
+        corners = (planes.corners[index] - cloud.origin) @ basis.T
+        left.plot(corners[[1, 2], 0], corners[[1, 2], 1], linewidth=1.2, label=planes.names[index])
+        omega, distance_m = _line_of(corners, basis @ planes.normal[index], accumulator)
+        right.plot(omega, distance_m, "o", fillstyle="none", markersize=9)
+    left.set_xlabel("e1 [m from the cloud's origin]")
+    left.set_ylabel("e2 [m]")
+    right.set_xlabel("direction of the normal [deg]")
+    right.set_ylabel("distance from the middle of the plan [m]")
+    if left.lines:
+        left.legend(fontsize=7, loc="upper right")
+    ctx.figure(
+        "accumulator",
+        figure,
+        "Left: points per plan cell with the walls found. Right: the parameter space, each cell "
+        "voting with its number of points; circles mark the walls.",
+    )
+
+
+def _line_of(
+    corners: NDArray[np.float64], normal: NDArray[np.float64], accumulator: Accumulator
+) -> tuple[float, float]:
+    """Where a wall lies in the parameter space: degrees and metres."""
+    angle = math.atan2(normal[1], normal[0]) % math.pi
+    direction = np.array([math.cos(angle), math.sin(angle)])
+    middle = corners.mean(axis=0)[:2] - accumulator.centre_m
+    return math.degrees(angle), float(direction @ middle)
+
+
+def _thinned_sum(values: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Sum blocks of an image until it is small enough to draw."""
+    rows, columns = (max(1, -(-size // _PIXELS_MOST)) for size in values.shape)
+    padded = np.pad(values, ((0, -values.shape[0] % rows), (0, -values.shape[1] % columns)))
+    blocks = padded.reshape(padded.shape[0] // rows, rows, padded.shape[1] // columns, columns)
+    thinned: NDArray[np.float64] = blocks.sum(axis=(1, 3)).astype(np.float64)
+    return thinned

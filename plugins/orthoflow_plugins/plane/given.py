@@ -1,0 +1,171 @@
+"""`plane.given`: the reference plane of skarlatos2012, which the user states."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from orthoflow.errors import GeometryError, MethodError
+from orthoflow.geometry import Plane, basis_from_up, plane_through
+from orthoflow.products import Planes, PointCloud, PointLabels
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+
+Vector = tuple[float, float, float]
+
+# The horizontal plane lies below this share of the points: below the scene, above stray echoes.
+_GROUND_SHARE: Final = 0.01
+# The paper's buffer of three tolerances on either side of a wall.
+_BUFFER_TOLERANCES: Final = 3.0
+
+
+class GivenPlane(Method):
+    """Lay the reference plane where the user says.
+
+    Exactly one of three ways: `normal` with `offset_m` (the side of the normal is the viewer's and
+    is never turned), three `points` (world metres; the normal is turned towards the viewer), or the
+    `horizontal` plane seen from above, which is also the default, as in skarlatos2012. Without
+    `height_m` it lies at the height that 1 % of the points are below.
+
+    The rectangle spans the points within `buffer_m` of the plane (every point for the horizontal
+    one), without parts too small to matter, such as stray echoes beside the scene.
+    """
+
+    id = "plane.given"
+    result_version = 1
+    determinism = "exact"
+    citations = (
+        (
+            "Skarlatos, Kiparissi, Theodoridou 2012: Direct orthophoto generation from color point "
+            "clouds of complex scenes"
+        ),
+    )
+
+    class Params(MethodParams):
+        """Where the plane is."""
+
+        normal: Vector | None = Field(
+            None, description="Direction towards the viewer, world axes; any length."
+        )
+        offset_m: float | None = Field(
+            None, description="Distance of the plane from the world origin along the unit normal."
+        )
+        points: tuple[Vector, Vector, Vector] | None = Field(
+            None, description="Three points on the plane, world metres."
+        )
+        horizontal: bool = Field(
+            default=False,
+            description="The plane across `up`, seen from above; also what holds by default.",
+        )
+        height_m: float | None = Field(
+            None,
+            description="Height of the horizontal plane along `up`, world metres; by default the "
+            "height that 1 % of the points are below.",
+        )
+        tolerance_m: float = Field(
+            0.05, gt=0.0, description="Points this near to the plane are labelled with it."
+        )
+        buffer_m: float | None = Field(
+            None,
+            gt=0.0,
+            description="Points this near to the plane span its rectangle; by default three "
+            "times tolerance_m, and every point for the horizontal plane.",
+        )
+
+        @model_validator(mode="after")
+        def _one_way_only(self) -> Self:
+            ways = {
+                "normal": self.normal is not None or self.offset_m is not None,
+                "points": self.points is not None,
+                "horizontal": self.horizontal or self.height_m is not None,
+            }
+            named = [way for way, is_used in ways.items() if is_used]
+            if len(named) > 1:
+                raise ValueError(
+                    f"plane.given takes one of normal with offset_m, points, or horizontal, got "
+                    f"{' and '.join(named)}"
+                )
+            if (self.normal is None) != (self.offset_m is None):
+                raise ValueError("plane.given needs normal and offset_m together, got only one")
+            if self.normal is not None and math.hypot(*self.normal) < 1e-9:
+                raise ValueError("normal must have a length, got (0, 0, 0)")
+            return self
+
+    class In(Ports):
+        """What it works on."""
+
+        cloud: PointCloud
+
+    class Out(Ports):
+        """What it gives."""
+
+        planes: Planes
+        labels: PointLabels
+
+    _too_far: ClassVar[str] = (
+        "no point of the cloud lies within {buffer:g} m of the given plane; along its normal the "
+        "points lie between {low:.3f} m and {high:.3f} m of it: check normal and offset_m, points "
+        "or height_m, or raise buffer_m (plane.given)"
+    )
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Lay the plane and find which points are on it."""
+        from orthoflow.geometry.point_kernels import use_threads
+        from orthoflow_plugins.plane.reference import lay_reference, place_reference
+
+        cloud = inputs.cloud
+        use_threads(ctx.cores)
+        if len(cloud) < 3:
+            cloud.require_points(3)
+        ctx.progress(0.0, "placing the plane")
+        plane, is_settled = self._stated(params, cloud)
+        buffer_m = params.buffer_m
+        if buffer_m is None and (params.normal is not None or params.points is not None):
+            buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
+        reference = place_reference(plane, cloud, buffer_m=buffer_m, keeps_side=is_settled)
+        if reference is None:
+            low_m, high_m = _reach(plane, cloud)
+            raise MethodError(
+                self._too_far.format(buffer=buffer_m or math.inf, low=low_m, high=high_m)
+            )
+        ctx.progress(0.4, "labelling points")
+        labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
+        planes = lay_reference(reference, cloud, labels, tolerance_m=params.tolerance_m, ctx=ctx)
+        return self.Out(planes=planes, labels=PointLabels(plane_index=labels))
+
+    @staticmethod
+    def _stated(params: Params, cloud: PointCloud) -> tuple[Plane, bool]:
+        """The plane in the cloud's offsets, and whether its side is settled."""
+        if params.normal is not None and params.offset_m is not None:
+            normal = np.array(params.normal) / math.hypot(*params.normal)
+            normal = normal / np.linalg.norm(normal)
+            offset_m = params.offset_m - float(normal @ cloud.origin)
+            return Plane(normal=normal, offset_m=offset_m), True
+        if params.points is not None:
+            try:
+                return plane_through(np.array(params.points) - cloud.origin), False
+            except GeometryError as error:
+                raise MethodError(
+                    f"plane.given needs three points that span a plane, got {params.points}, "
+                    "which lie on one line"
+                ) from error
+        up = basis_from_up(cloud.up)[2]
+        if params.height_m is not None:
+            return Plane(normal=up, offset_m=params.height_m - float(up @ cloud.origin)), True
+        return Plane(normal=up, offset_m=_ground_m(cloud, up)), True
+
+
+def _ground_m(cloud: PointCloud, up: NDArray[np.float64]) -> float:
+    from orthoflow_plugins.plane.sampling import draw_sample
+
+    return float(np.quantile(draw_sample(cloud).offsets_m @ up, _GROUND_SHARE))
+
+
+def _reach(plane: Plane, cloud: PointCloud) -> tuple[float, float]:
+    from orthoflow_plugins.plane.sampling import draw_sample
+
+    distances_m = plane.distances_m(draw_sample(cloud).offsets_m)
+    return float(distances_m.min()), float(distances_m.max())

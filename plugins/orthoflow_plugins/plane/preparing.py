@@ -1,0 +1,65 @@
+"""One pass over the cloud that every detector starts with: sample, robust box, plan, blocks."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry.point_kernels import blocked, count_over_plan, read_only
+from orthoflow.products import PointCloud
+from orthoflow_plugins.plane.peeling import Remainder
+from orthoflow_plugins.plane.sampling import draw_sample, plan_grid
+
+# Thread-private plans and surface rasters must stay small beside the cloud.
+_PARTS_MOST: Final = 8
+# Clouds thinner than this in two directions are a line or a point.
+_THINNEST_M: Final = 1e-4
+
+
+def prepare(
+    cloud: PointCloud,
+    basis: NDArray[np.float64],
+    *,
+    cell_m: float,
+    least_share: float,
+    parts: int,
+) -> Remainder:
+    """Sample a cloud and count its points over the plan; nothing is claimed yet.
+
+    Args:
+        cloud: the cloud.
+        basis: (3, 3) rows e1, e2, up.
+        cell_m: side of a plan cell.
+        least_share: share of the points that a plane must hold.
+        parts: threads.
+
+    Raises:
+        ProductError: the cloud has fewer than three points, or coordinates that are not finite.
+        MethodError: the points coincide or lie on one line.
+    """
+    sample = draw_sample(cloud)
+    spread = np.linalg.svd(
+        sample.offsets_m - sample.offsets_m.mean(axis=0), compute_uv=False, full_matrices=False
+    ) / np.sqrt(len(sample.index))
+    if spread[1] < _THINNEST_M:
+        where = "coincide" if spread[0] < _THINNEST_M else "lie on one line"
+        raise MethodError(f"the {len(cloud)} points of the cloud {where}, which fixes no plane")
+    grid = plan_grid(sample, basis, cell_m=cell_m, outside_share=0.25 * least_share)
+    parts = min(parts, _PARTS_MOST)
+    offsets = read_only(cloud.x, cloud.y, cloud.z)
+    counts = count_over_plan(offsets, grid, parts=parts)
+    if counts.n_unusable:
+        cloud.require_points(3)
+    return Remainder(
+        points=blocked(offsets, counts.boxes),
+        sample=sample,
+        grid=grid,
+        up=basis[2],
+        parts=parts,
+        claims=np.full(len(cloud), -1, dtype=np.int8),
+        cells=counts.cells,
+        heights=counts.heights,
+    )

@@ -1,0 +1,185 @@
+"""A stated plane laid over a cloud: its rectangle, its viewer's side, and the points on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane, basis_from_up, omega_phi_deg, wall_axes
+from orthoflow.products import Planes, PointCloud
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.assembling import (
+    Deviations,
+    enclosing,
+    measure_planes,
+    plane_names,
+    rectangle_m,
+)
+from orthoflow_plugins.plane.facing import (
+    known_viewpoint,
+    side_of_remaining,
+    side_of_stations,
+)
+from orthoflow_plugins.plane.footprints import (
+    Footprint,
+    SurfaceRaster,
+    cell_for,
+    footprint,
+    measure_cells,
+    surface_raster,
+)
+from orthoflow_plugins.plane.peeling import Remainder
+from orthoflow_plugins.plane.preparing import prepare
+from orthoflow_plugins.plane.reporting import warn_of_guesses
+
+_PLAN_CELL_M: Final = 0.05
+# Of so small a share of the points per side the extent does not depend: stray echoes.
+_STRAY_SHARE: Final = 0.002
+_EVERYWHERE_M: Final = 1e9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """A stated plane with its rectangle.
+
+    Attributes:
+        plane: in the cloud's offsets, normal towards the viewer.
+        corners_m: (4, 3) offsets, top-left first, counter-clockwise for the viewer.
+        part_corners_m: (p, 4, 3) the same of each connected part.
+        viewpoint: how the side was chosen.
+        remainder: the cloud, nothing claimed.
+    """
+
+    plane: Plane
+    corners_m: NDArray[np.float64]
+    part_corners_m: NDArray[np.float64]
+    viewpoint: str
+    remainder: Remainder
+
+
+def place_reference(
+    plane: Plane, cloud: PointCloud, *, buffer_m: float | None, keeps_side: bool
+) -> Reference | None:
+    """Put a rectangle about the points near a plane, and turn its normal to the viewer.
+
+    Args:
+        plane: the plane, in the cloud's offsets.
+        cloud: the cloud.
+        buffer_m: points this near span the rectangle; None for all points.
+        keeps_side: leave the normal as it is.
+
+    Returns:
+        The plane with its rectangle, or None where no point is near.
+
+    Raises:
+        MethodError: the points of the cloud coincide or lie on one line.
+    """
+    remainder = prepare(
+        cloud,
+        basis_from_up(cloud.up),
+        cell_m=_PLAN_CELL_M,
+        least_share=_STRAY_SHARE,
+        parts=1,
+    )
+    raster, place = _rectangle(plane, remainder, buffer_m)
+    if place is None:
+        return None
+    corners_m = rectangle_m(plane, raster.axes, place.bounds_m)
+    parts_m = [rectangle_m(plane, raster.axes, bounds) for bounds in place.parts_m]
+    viewpoint = "given"
+    if not keeps_side:
+        members = remainder.sample.offsets_m
+        near = np.abs(plane.distances_m(members)) <= (buffer_m or _EVERYWHERE_M)
+        index = remainder.sample.index[near]
+        side = side_of_stations(plane, corners_m.mean(axis=0), cloud, index)
+        viewpoint = known_viewpoint(cloud) if side else "guess"
+        if side == 0:
+            nowhere = np.zeros(len(members), dtype=bool)
+            side = side_of_remaining(
+                plane, corners_m, members, nowhere, clear_m=(buffer_m or 0.0) / 3.0
+            )
+        plane = plane.flipped() if side < 0 else plane
+    axes = wall_axes(plane.normal, cloud.up)
+    return Reference(
+        plane=plane,
+        corners_m=enclosing(corners_m, plane, axes),
+        part_corners_m=np.array([enclosing(part, plane, axes) for part in parts_m]),
+        viewpoint=viewpoint,
+        remainder=remainder,
+    )
+
+
+def lay_reference(
+    reference: Reference,
+    cloud: PointCloud,
+    labels: NDArray[np.int16],
+    *,
+    tolerance_m: float,
+    ctx: StepContext,
+) -> Planes:
+    """Label the points on a placed plane, and report how they lie about it.
+
+    Args:
+        reference: the plane.
+        cloud: the cloud.
+        labels: (n,) filled with 0 on the plane and -1 elsewhere.
+        tolerance_m: how near a point must be.
+        ctx: takes metrics and warnings.
+    """
+    plane, remainder = reference.plane, reference.remainder
+    axes = wall_axes(plane.normal, cloud.up)
+    slabs = np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])[None]
+    everywhere = _EVERYWHERE_M * np.array([-1.0, 1.0, -1.0, 1.0])
+    remainder.claim(slabs, np.concatenate([[tolerance_m], everywhere]))
+    labels[:] = remainder.claims
+    deviations = measure_planes(remainder, slabs, find_m=tolerance_m, fit_m=tolerance_m)
+    height_m = reference.corners_m.mean(axis=0) @ cloud.up
+    planes = Planes(
+        normal=plane.normal[None].copy(),
+        offset=np.array([plane.offset_m + float(plane.normal @ cloud.origin)]),
+        corners=cloud.origin + reference.corners_m[None],
+        covariance=np.zeros((1, 4, 4)),
+        n_points=deviations.n_find,
+        rms_m=deviations.rms_find_m,
+        up=cloud.up.copy(),
+        names=plane_names(plane.normal[None], np.array([height_m]), cloud.up),
+        part_corners=cloud.origin + reference.part_corners_m,
+        part_plane=np.zeros(len(reference.part_corners_m), dtype=np.int32),
+        viewpoint=reference.viewpoint,
+        details={"tolerance_m": tolerance_m},
+    )
+    _report(ctx, planes, deviations, n_points=len(cloud))
+    return planes
+
+
+def _rectangle(
+    plane: Plane, remainder: Remainder, buffer_m: float | None
+) -> tuple[SurfaceRaster, Footprint | None]:
+    """Cells of the points near a plane that hang together."""
+    reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
+    points_m = remainder.sample.offsets_m
+    near = points_m[np.abs(plane.distances_m(points_m)) <= reach_m]
+    corners = remainder.box_corners()
+    placed = near @ wall_axes(plane.normal, remainder.up).T
+    area_m2 = float(np.prod(np.ptp(placed, axis=0))) if len(near) else 0.0
+    n_near = len(near) * remainder.sample.n_represented
+    raster = surface_raster(plane, corners, remainder.up, cell_m=cell_for(n_near, area_m2))
+    sums = measure_cells(
+        remainder.points, remainder.claims, raster, find_m=reach_m, fit_m=reach_m, parts=1
+    )
+    return raster, footprint(raster, sums.n_find > 0, sums)
+
+
+def _report(ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int) -> None:
+    omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
+    ctx.metric("n_planes", 1, "1")
+    ctx.metric("labelled_share", float(deviations.n_find[0]) / n_points, "1")
+    ctx.metric("rms_mm", 1000.0 * float(planes.rms_m[0]), "mm")
+    ctx.metric("omega_deg", omega_deg, "deg")
+    ctx.metric("phi_deg", phi_deg, "deg")
+    ctx.metric("offset_m", float(planes.offset[0]), "m")
+    if planes.viewpoint == "guess":
+        warn_of_guesses(ctx, 1, 1)

@@ -1,0 +1,50 @@
+"""What a detector says about its planes: metrics of the first, a warning of guessed sides."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from orthoflow.geometry import omega_phi_deg
+from orthoflow.products import Planes
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.assembling import Assembly
+
+
+def report_planes(ctx: StepContext, assembly: Assembly, *, n_points: int) -> None:
+    """Report number, shares, angles and accuracy of the planes."""
+    planes, deviations = assembly.planes, assembly.deviations
+    omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
+    sigma_deg, sigma_m = first_plane_sigmas(planes)
+    ctx.metric("n_planes", len(planes), "1")
+    ctx.metric("labelled_share", float(deviations.n_find.sum()) / n_points, "1")
+    ctx.metric("first_share", float(deviations.n_find[0]) / n_points, "1")
+    ctx.metric("rms_mm", 1000.0 * float(planes.rms_m[0]), "mm")
+    ctx.metric("fit_rms_mm", 1000.0 * float(deviations.rms_fit_m[0]), "mm")
+    ctx.metric("omega_deg", omega_deg, "deg")
+    ctx.metric("phi_deg", phi_deg, "deg")
+    ctx.metric("offset_m", float(planes.offset[0]), "m")
+    ctx.metric("sigma_angle_deg", sigma_deg, "deg")
+    ctx.metric("sigma_offset_mm", 1000.0 * sigma_m, "mm")
+    if assembly.n_guessed:
+        warn_of_guesses(ctx, assembly.n_guessed, len(planes))
+
+
+def warn_of_guesses(ctx: StepContext, n_guessed: int, n_planes: int) -> None:
+    """Say that the side from which planes are seen was guessed, and how to state it."""
+    ctx.warn(
+        f"no scanner station says from which side {n_guessed} of {n_planes} planes were seen; the "
+        "side with more of the other points was taken: if an image comes out mirrored, set "
+        "view_from of read.scan"
+    )
+
+
+def first_plane_sigmas(planes: Planes) -> tuple[float, float]:
+    """Standard deviations of the first plane: direction in degrees, position at its middle, m."""
+    covariance = planes.covariance[0]
+    direction = float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance[:3, :3])[-1])))
+    # The offset belongs to the origin, which may be far away; the wall's middle is what matters.
+    at_middle = np.append(planes.corners[0].mean(axis=0), -1.0)
+    variance = float(at_middle @ covariance @ at_middle)
+    return math.degrees(direction), math.sqrt(max(0.0, variance))
