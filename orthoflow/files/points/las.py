@@ -76,7 +76,8 @@ def _blocks(
 
 def _block(chunk: Any) -> PointBlock:
     # laspy applies scale and offset in float64: survey coordinates keep every digit.
-    points = np.column_stack([np.asarray(chunk[axis], dtype=np.float64) for axis in "xyz"])
+    # Axis by axis in memory: later passes go along the axes.
+    points = np.vstack([np.asarray(chunk[axis], dtype=np.float64) for axis in "xyz"]).T
     names = set(chunk.point_format.dimension_names)
     intensity = np.asarray(chunk.intensity, dtype=np.float32) if "intensity" in names else None
     rgb = None
@@ -106,6 +107,10 @@ def _outside(path: Path, points: NDArray[np.float64], bounds: NDArray[np.float64
     extent = float(np.linalg.norm(high - low))
     if not (np.isfinite(extent) and extent > 0.0 and np.all(high >= low)) or not len(points):
         return 0
+    # Headers are often rounded to the last digit.
+    slack = 1e-3 * max(extent, 1.0)
+    if np.all(points.min(axis=0) >= low - slack) and np.all(points.max(axis=0) <= high + slack):
+        return 0
     beyond = np.maximum(low - points, points - high).max(axis=1)
     far = float(beyond.max())
     if far > max(extent, 1.0):
@@ -113,5 +118,4 @@ def _outside(path: Path, points: NDArray[np.float64], bounds: NDArray[np.float64
             f"{path.name} is damaged: points lie {far:.0f} units outside the bounds its header "
             f"states ({low.tolist()} to {high.tolist()}); copy or export it again"
         )
-    # Headers are often rounded to the last digit.
-    return int(np.count_nonzero(beyond > 1e-3 * max(extent, 1.0)))
+    return int(np.count_nonzero(beyond > slack))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 
 _NUMBER: Final = re.compile(
-    r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE
+    r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE
 )
 _COMMENTS: Final = (b"#", b"//")
 _SCAN_BYTES: Final = 1 << 24
@@ -40,20 +40,22 @@ class Layout:
 
 def split_fields(line: str) -> tuple[list[str], str]:
     """Fields of a line, and the separator found: semicolon, tab, comma or white space."""
-    for mark in (";", "\t"):
-        if mark in line:
-            return _trimmed(line.split(mark)), mark
+    if ";" in line:
+        return _split(line, ";"), ";"
     words = line.split()
+    tabbed = _split(line, "\t")
+    if "\t" in line and not any(_are_numbers(field.split()) for field in tabbed if " " in field):
+        return tabbed, "\t"
     # `1,5 2,5 3,5` is three numbers with decimal commas, `1, 2, 3` and `1,2,3` are not.
-    if "," in line and not (len(words) >= 3 and all(_NUMBER.fullmatch(word) for word in words)):
-        return _trimmed(line.split(",")), ","
+    if "," in line and not (len(words) >= 3 and _are_numbers(words)):
+        return _split(line, ","), ","
     return words, r"\s+"
 
 
 def find_layout(line: str) -> Layout | None:
     """Layout of a line that begins with three numbers, or None when it does not."""
     fields, separator = split_fields(line)
-    if len(fields) < 3 or not all(_NUMBER.fullmatch(field) for field in fields[:3]):
+    if len(fields) < 3 or not _are_numbers(fields[:3]):
         return None
     has_comma = separator != "," and any("," in field for field in fields)
     return Layout(separator=separator, decimal="," if has_comma else ".", n_columns=len(fields))
@@ -61,12 +63,11 @@ def find_layout(line: str) -> Layout | None:
 
 def numbers_of(line: str, layout: Layout) -> list[float]:
     """Numbers of a line; NaN for a field that is none."""
-    fields, _ = split_fields(line)
-    numbers = []
-    for field in fields:
-        is_number = _NUMBER.fullmatch(field) is not None
-        numbers.append(float(field.replace(layout.decimal, ".")) if is_number else float("nan"))
-    return numbers
+    fields = line.split() if layout.separator == r"\s+" else _split(line, layout.separator)
+    return [
+        float(field.replace(layout.decimal, ".")) if _NUMBER.fullmatch(field) else float("nan")
+        for field in fields
+    ]
 
 
 def count_lines(path: Path) -> int:
@@ -136,11 +137,12 @@ def _parse(lines: list[bytes], layout: Layout, columns: Sequence[int]) -> NDArra
                 sep=layout.separator,
                 decimal=layout.decimal,
                 header=None,
+                # All columns, wanted or not: only so does pandas notice a line with too many.
                 names=list(range(layout.n_columns)),
-                usecols=sorted(set(columns)),
                 index_col=False,
                 engine="c",
-                dtype=np.float64,
+                low_memory=False,
+                dtype=dict.fromkeys(columns, np.float64),
                 skipinitialspace=True,
                 quoting=3,
             )
@@ -170,9 +172,13 @@ def _bad_line(
     )
 
 
-def _trimmed(fields: list[str]) -> list[str]:
+def _split(line: str, separator: str) -> list[str]:
     """Fields without blanks around them, and without the empty one after a closing separator."""
-    trimmed = [field.strip() for field in fields]
-    while trimmed and not trimmed[-1]:
-        trimmed.pop()
-    return trimmed
+    fields = [field.strip() for field in line.split(separator)]
+    while fields and not fields[-1]:
+        fields.pop()
+    return fields
+
+
+def _are_numbers(fields: Sequence[str]) -> bool:
+    return all(_NUMBER.fullmatch(field) for field in fields)

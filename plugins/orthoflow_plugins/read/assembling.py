@@ -125,7 +125,9 @@ class CloudAssembly:
         count.n_withheld += block.n_withheld
         points = block.points * self._unit_m if self._unit_m != 1.0 else block.points
         # NaN compares as False.
-        is_usable = np.all(np.abs(points) < FARTHEST_M, axis=1)
+        is_usable = np.logical_and.reduce(
+            [np.abs(points[:, axis]) < FARTHEST_M for axis in (0, 1, 2)]
+        )
         kept: NDArray[np.bool_] | slice = is_usable
         n_kept = int(np.count_nonzero(is_usable))
         if n_kept == len(points):

@@ -11,7 +11,7 @@ from orthoflow.geometry import basis_from_up
 from orthoflow.products import PointCloud
 
 _SIDE_PX: Final = 640
-_SAMPLE: Final = 1_000_000
+_SAMPLE: Final = 250_000
 
 
 def plan_view_png(cloud: PointCloud) -> bytes:

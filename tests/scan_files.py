@@ -1,0 +1,250 @@
+"""Small point files of every format, written by the simplest means, for tests of the readers."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def write_las(
+    path: Path,
+    points: NDArray[np.float64],
+    *,
+    intensity: NDArray[np.int64] | None = None,
+    rgb: NDArray[np.int64] | None = None,
+    withheld: NDArray[np.bool_] | None = None,
+    scale: float = 0.0001,
+) -> Path:
+    import laspy
+
+    header = laspy.LasHeader(point_format=7 if rgb is not None else 6, version="1.4")
+    header.offsets = np.floor(points.min(axis=0)) if len(points) else np.zeros(3)
+    header.scales = np.full(3, scale)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = points.T
+    if intensity is not None:
+        las.intensity = intensity.astype(np.uint16)
+    if rgb is not None:
+        las.red, las.green, las.blue = rgb.astype(np.uint16).T
+    if withheld is not None:
+        las.withheld = withheld
+    las.write(path)
+    return path
+
+
+def write_e57(path: Path, scans: Sequence[Mapping[str, Any]]) -> Path:
+    """Write scans, each with `fields` (name -> values) and optional `rotation` and `translation`.
+
+    Optional `intensity_limits` and `rgb_limit` go into the header.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import pye57
+        from pye57 import libe57
+
+    with pye57.E57(str(path), mode="w") as file:
+        image = file.image_file
+        for index, scan in enumerate(scans):
+            node = libe57.StructureNode(image)
+            node.set("guid", libe57.StringNode(image, f"{{scan-{index}}}"))
+            _set_pose(libe57, image, node, scan)
+            _set_limits(libe57, image, node, scan)
+            _set_points(libe57, file, node, scan["fields"])
+    return path
+
+
+def _set_pose(libe57: Any, image: Any, node: Any, scan: Mapping[str, Any]) -> None:
+    if "translation" not in scan:
+        return
+    pose = libe57.StructureNode(image)
+    node.set("pose", pose)
+    for name, letters in (("rotation", "wxyz"), ("translation", "xyz")):
+        part = libe57.StructureNode(image)
+        # Reversed: the order in the file must not matter.
+        for letter, value in reversed(list(zip(letters, scan[name], strict=True))):
+            part.set(letter, libe57.FloatNode(image, float(value)))
+        pose.set(name, part)
+
+
+def _set_limits(libe57: Any, image: Any, node: Any, scan: Mapping[str, Any]) -> None:
+    if "intensity_limits" in scan:
+        limits = libe57.StructureNode(image)
+        low, high = scan["intensity_limits"]
+        limits.set("intensityMinimum", libe57.FloatNode(image, low))
+        limits.set("intensityMaximum", libe57.FloatNode(image, high))
+        node.set("intensityLimits", limits)
+    if "rgb_limit" in scan:
+        limits = libe57.StructureNode(image)
+        for name in ("colorRed", "colorGreen", "colorBlue"):
+            limits.set(f"{name}Minimum", libe57.IntegerNode(image, 0))
+            limits.set(f"{name}Maximum", libe57.IntegerNode(image, scan["rgb_limit"]))
+        node.set("colorLimits", limits)
+
+
+def _set_points(libe57: Any, file: Any, node: Any, fields: Mapping[str, Any]) -> None:
+    image = file.image_file
+    count = len(next(iter(fields.values())))
+    prototype = libe57.StructureNode(image)
+    buffers = libe57.VectorSourceDestBuffer()
+    kept = []
+    for name, values in fields.items():
+        array = np.ascontiguousarray(values, dtype=np.float64)
+        kept.append(array)
+        if name.startswith(("cartesianX", "cartesianY", "cartesianZ")):
+            # Scaled integers, as most scanners write them.
+            raw = libe57.ScaledIntegerNode(image, 0, -(2**40), 2**40, 1e-6, 0.0)
+        elif name.startswith(("spherical", "intensity")) and not name.endswith("State"):
+            raw = libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE, -1e9, 1e9)
+        else:
+            raw = libe57.IntegerNode(image, 0, 0, 2**20)
+        prototype.set(name, raw)
+        buffers.append(libe57.SourceDestBuffer(image, name, array, max(count, 1), True, True))
+    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    node.set("points", points)
+    file.data3d.append(node)
+    writer = points.writer(buffers)
+    if count:
+        writer.write(count)
+    writer.close()
+
+
+def write_ply(
+    path: Path,
+    fields: Mapping[str, NDArray[np.generic]],
+    *,
+    encoding: str = "binary_little_endian",
+    before: str = "",
+    before_data: bytes = b"",
+) -> Path:
+    """Write vertices; `before` are header lines of elements that come before them."""
+    names = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}
+    count = len(next(iter(fields.values())))
+    lines = ["ply", f"format {encoding} 1.0", "comment made by hand"]
+    lines += before.split("\n") if before else []
+    lines += [f"element vertex {count}"]
+    lines += [f"property {names[array.dtype.str[1:]]} {name}" for name, array in fields.items()]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header", ""]
+    header = "\n".join(lines).encode()
+    if encoding == "ascii":
+        rows = [
+            " ".join(repr(item.item()) for item in row)
+            for row in zip(*fields.values(), strict=True)
+        ]
+        path.write_bytes(header + before_data + "\n".join([*rows, "3 0 1 2", ""]).encode())
+        return path
+    order = "<" if "little" in encoding else ">"
+    dtype = np.dtype([(name, order + array.dtype.str[1:]) for name, array in fields.items()])
+    table = np.zeros(count, dtype)
+    for name, array in fields.items():
+        table[name] = array
+    path.write_bytes(
+        header + before_data + table.tobytes() + struct.pack(order + "B3i", 3, 0, 1, 2)
+    )
+    return path
+
+
+def write_pcd(
+    path: Path,
+    fields: Mapping[str, NDArray[np.generic]],
+    *,
+    data: str = "binary",
+    width: int | None = None,
+    viewpoint: str = "0 0 0 1 0 0 0",
+) -> Path:
+    count = len(next(iter(fields.values())))
+    arrays = list(fields.values())
+    kinds = {"f": "F", "u": "U", "i": "I"}
+    columns = width or count
+    header = "\n".join(
+        [
+            "# .PCD v0.7 - Point Cloud Data file format",
+            "VERSION 0.7",
+            f"FIELDS {' '.join(fields)}",
+            f"SIZE {' '.join(str(array.dtype.itemsize) for array in arrays)}",
+            f"TYPE {' '.join(kinds[array.dtype.kind] for array in arrays)}",
+            f"COUNT {' '.join('1' for _ in arrays)}",
+            f"WIDTH {columns}",
+            f"HEIGHT {count // columns}",
+            f"VIEWPOINT {viewpoint}",
+            f"POINTS {count}",
+            f"DATA {data}",
+            "",
+        ]
+    ).encode()
+    if data == "ascii":
+        rows = [" ".join(repr(item.item()) for item in row) for row in zip(*arrays, strict=True)]
+        path.write_bytes(header + "\n".join([*rows, ""]).encode())
+    elif data == "binary":
+        dtype = np.dtype([(name, array.dtype) for name, array in fields.items()])
+        table = np.zeros(count, dtype)
+        for name, array in fields.items():
+            table[name] = array
+        path.write_bytes(header + table.tobytes())
+    else:
+        plain = b"".join(array.tobytes() for array in arrays)
+        packed = compress_lzf(plain)
+        path.write_bytes(header + struct.pack("<II", len(packed), len(plain)) + packed)
+    return path
+
+
+def compress_lzf(plain: bytes) -> bytes:
+    """LZF by the book: literals, and back references of up to 264 bytes found greedily."""
+    packed = bytearray()
+    literals = bytearray()
+    seen: dict[bytes, int] = {}
+    position = 0
+
+    def flush() -> None:
+        while literals:
+            part = literals[:32]
+            packed.append(len(part) - 1)
+            packed.extend(part)
+            del literals[:32]
+
+    while position < len(plain):
+        key = plain[position : position + 3]
+        found = seen.get(key, -1)
+        seen[key] = position
+        if len(key) < 3 or found < 0 or position - found > 8191:
+            literals.append(plain[position])
+            position += 1
+            continue
+        length = 3
+        while (
+            length < 264
+            and position + length < len(plain)
+            and plain[found + length] == plain[position + length]
+        ):
+            length += 1
+        flush()
+        distance = position - found - 1
+        if length - 2 < 7:
+            packed.append(((length - 2) << 5) | (distance >> 8))
+        else:
+            packed.append((7 << 5) | (distance >> 8))
+            packed.append(length - 2 - 7)
+        packed.append(distance & 255)
+        position += length
+    flush()
+    return bytes(packed)
+
+
+def write_ptx(
+    path: Path, scans: Sequence[tuple[NDArray[np.float64], int, NDArray[np.float64]]]
+) -> Path:
+    """Write scans: table of point lines (column by column), rows per column, world_from_scan."""
+    lines: list[str] = []
+    for table, n_rows, matrix in scans:
+        lines += [str(len(table) // n_rows), str(n_rows)]
+        lines += [" ".join(map(repr, matrix[:3, 3].tolist()))]
+        lines += [" ".join(map(repr, matrix[:3, axis].tolist())) for axis in range(3)]
+        lines += [" ".join(map(repr, row)) for row in matrix.T.tolist()]
+        lines += [" ".join(f"{value:.10g}" for value in row) for row in table]
+    path.write_text("\n".join([*lines, ""]))
+    return path
