@@ -125,7 +125,7 @@ class LiveProgress:
         self._console = Console(stderr=True)
         self._live = Live(
             console=self._console,
-            get_renderable=self._table,
+            get_renderable=self.table,
             refresh_per_second=_REFRESH_PER_S,
             transient=True,
         )
@@ -176,7 +176,8 @@ class LiveProgress:
         with self._lock:
             self._rows[address] = row
 
-    def _table(self) -> Table:
+    def table(self) -> Table:
+        """Give the table as it is now."""
         from rich.table import Table
         from rich.text import Text
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from orthoflow.cli.failures import silence_stdout
 from orthoflow.cli.options import (
     Command,
     selection_options,
@@ -66,10 +67,10 @@ def run(
     catalog = discover_catalog()
     loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
     opened = Store(store)
+    cells = expand_cells(loaded, catalog)
+    planned = plan_run(cells, loaded, catalog, opened, options)
     # Held until the record is written, so that no `cache gc` takes what it needs.
     with opened.in_use():
-        cells = expand_cells(loaded, catalog)
-        planned = plan_run(cells, loaded, catalog, opened, options)
         return _Call(workflow=loaded, plan=planned, store=opened, folder=output, embed=embed).go()
 
 
@@ -108,7 +109,11 @@ class _Call:
             before_finish=lambda run: write_report([run], report),
         )
         print_failures(finished.record.cells)
-        print_summary(finished, report)
+        try:
+            print_summary(finished, report)
+        except BrokenPipeError:
+            # Nobody reads the summary any more; the exit code still says how the run went.
+            silence_stdout()
         return outcome.exit_code
 
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:

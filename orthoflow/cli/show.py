@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
+from orthoflow.cli.diagnosis import LIBRARIES
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import Command, json_option
 from orthoflow.cli.tables import counted, duration, echo_json, echo_table, size
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell, Run
+
+_OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 
 
 @click.command(cls=Command)
@@ -107,8 +110,9 @@ def _print_environments(run: Run) -> None:
             f"{counted(environment.cores, 'core')}, {counted(environment.threads, 'thread')}"
             f"{commit}"
         )
-        if packages:
-            click.echo(", ".join(f"{name} {packages[name]}" for name in sorted(packages)))
+        used = [name for name in packages if name.lower() in _OWN_LIBRARIES]
+        others = f" and {len(packages) - len(used)} others (--json names them)"
+        click.echo(", ".join(f"{name} {packages[name]}" for name in used) + others)
 
 
 def _print_files(run: Run) -> None:

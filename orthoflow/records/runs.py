@@ -197,4 +197,7 @@ def record_errors(path: Path) -> Iterator[None]:
 
 
 def _with_path(path: Path, sentence: str) -> str:
-    return sentence if str(path) in sentence else f"{path}: {sentence}"
+    """Name the file as the user did; the format's own sentences begin with its bare name."""
+    if sentence.startswith(path.name):
+        return f"{path}{sentence.removeprefix(path.name)}"
+    return f"{path}: {sentence}"
