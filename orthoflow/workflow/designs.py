@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, TypeAlias
 
 from orthoflow.errors import WorkflowError
@@ -14,20 +14,20 @@ Assignment: TypeAlias = dict[str, str]
 MAX_COMBINATIONS: Final = 20_000
 
 
-def combinations(workflow: Workflow, steps: Collection[str]) -> Iterator[Assignment]:
-    """Give the combinations of variants that reach a step, each once, the file's order kept.
+def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignment]:
+    """Give the combinations of variants that reach a step, each once, the last step fastest.
 
     Args:
         workflow: the workflow.
-        steps: varied steps that matter: the step itself and what lies before it.
+        steps: the steps that matter, in graph order: the step itself and what lies before it.
 
     Raises:
         WorkflowError: there are more combinations than anybody can run.
     """
     varied = {
-        step.name: tuple(variant.name for variant in step.variants)
-        for step in workflow.steps.values()
-        if step.is_varied and step.name in steps
+        name: tuple(variant.name for variant in workflow.steps[name].variants)
+        for name in steps
+        if workflow.steps[name].is_varied
     }
     baseline = {name: workflow.baseline[name] for name in varied}
     if workflow.compare is None:

@@ -97,7 +97,8 @@ class _Expansion:
         cells: dict[str, Cell] = {}
         for name in self.rank:
             step = self.workflow.steps[name]
-            relevant = {name, *nx.ancestors(graph, name)}
+            before = nx.ancestors(graph, name)
+            relevant = [other for other in self.rank if other in before or other == name]
             made: dict[frozenset[tuple[str, str]], _Node] = {}
             self.nodes[name] = made
             for assignment in combinations(self.workflow, relevant):
@@ -126,6 +127,8 @@ class _Expansion:
     def _node(self, step: WorkflowStep, full: Mapping[str, str]) -> _Node:
         variant = step.variant(full.get(step.name, ""))
         own = {step.name: variant.name} if step.is_varied else {}
+        if is_excluded(self.workflow, own):
+            raise _ExcludedError
         if step.unless and step.unless in self.present:
             cause = f"inputs.{step.unless} is given"
             cell = self._cell(step, variant, own, {}, f"not needed, because {cause}")

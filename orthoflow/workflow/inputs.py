@@ -68,4 +68,4 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     if not files:
         where = "in the working directory" if spec.is_given else f"beside the workflow ({path})"
         raise InputError(f"input {spec.name}: {missing} {where}")
-    return [item.resolve() for item in files]
+    return [item.absolute() for item in files]

@@ -143,7 +143,7 @@ def _compose(text: str) -> Node:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
             _check_size(text)
-            node: Node | None = YAML(typ="rt", pure=True).compose(text)
+            node: Node | None = YAML(typ="safe", pure=True).compose(text)
     except MarkedYAMLError as error:
         raise _UnreadableError(
             _mark_position(error.problem_mark), f"this is not YAML: {_words(error)}"
@@ -160,7 +160,7 @@ def _compose(text: str) -> Node:
 def _check_size(text: str) -> None:
     # Events come one by one, so this stops early where composing would take minutes.
     depth = n_nodes = 0
-    for event in YAML(typ="rt", pure=True).parse(text):
+    for event in YAML(typ="safe", pure=True).parse(text):
         if isinstance(event, MappingEndEvent | SequenceEndEvent):
             depth -= 1
             continue

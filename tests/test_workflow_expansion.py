@@ -1,0 +1,355 @@
+"""From steps and variants to cells: addresses, order, seeds, absent data, selections."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import Catalog
+from orthoflow.errors import ArgumentError, InputError, WorkflowError
+from orthoflow.workflow import (
+    Cell,
+    CellOutput,
+    Selection,
+    WorkflowInput,
+    check_step_names,
+    derive_seed,
+    expand_cells,
+    load_workflow,
+)
+from tests.laboratories import GOOD, laboratory_catalog, load
+
+TWO_ORTHOS = """\
+orthoflow: 1
+seed: 5
+inputs:
+  scan: {optional: true}
+  photos: {optional: true}
+steps:
+  mosaic: {use: mosaic.seams, in: {layers: ortho.layers}}
+  ortho:
+    in: {walls: wall.walls, cloud: [cloud.cloud, room.cloud], photos: shots.photos,
+         cameras: orient.cameras}
+    variants: {backward: {use: ortho.backward}, direct: {use: ortho.direct}}
+  orient:
+    in: {ties: ties.ties, photos: shots.photos}
+    variants: {pnp: {use: orient.pnp}, bundle: {use: orient.bundle}}
+  ties: {use: match.sift, in: {photos: shots.photos, walls: wall.walls}}
+  wall: {use: raster.grid, in: {cloud: [cloud.cloud, room.cloud], planes: plane.planes}}
+  plane:
+    in: {cloud: [cloud.cloud, room.cloud]}
+    variants: {hough2d: {use: plane.hough2d}, ransac: {use: plane.ransac, repeat: 3}}
+  shots: {use: read.photos, in: {files: inputs.photos}}
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+  room: {use: simulate.room, unless: inputs.scan}
+  check:
+    use: inspect.truth
+    in: {orthoimages: mosaic.orthoimages, walls: wall.walls, truth: room.truth}
+"""
+COMPARE = "compare: {design: %s, baseline: {plane: ransac}}\n"
+
+
+@pytest.fixture
+def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    return laboratory_catalog(monkeypatch)
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The path of the workflow of a test; a scan and photos lie beside it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.e57").touch()
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "1.jpg").touch()
+    return Path("flow.yaml")
+
+
+def cells_of(
+    text: str, write: Path, catalog: Catalog, *inputs: str, selection: Selection | None = None
+) -> dict[str, Cell]:
+    write.write_text(text)
+    workflow = load_workflow(write, catalog, inputs=inputs)
+    cells = expand_cells(workflow, catalog, selection=selection or Selection())
+    addresses = [cell.address for cell in cells]
+    assert len(set(addresses)) == len(addresses)
+    for index, cell in enumerate(cells):
+        for source in cell.inputs.values():
+            if isinstance(source, CellOutput):
+                assert source.address in addresses[:index]
+    return {cell.address: cell for cell in cells}
+
+
+def addresses(cells: dict[str, Cell], step: str) -> list[str]:
+    return [address for address, cell in cells.items() if cell.step == step]
+
+
+def test_variants_fan_out_downstream_and_shared_prefixes_come_once(
+    catalog: Catalog, write: Path
+) -> None:
+    cells = cells_of(GOOD.replace("  exclude:", "  #"), write, catalog)
+    assert addresses(cells, "cloud") == ["cloud"]
+    assert addresses(cells, "wall") == ["wall@plane=hough2d", "wall@plane=ransac"]
+    assert addresses(cells, "mosaic") == [
+        "mosaic@plane=hough2d,orient=pnp",
+        "mosaic@plane=hough2d,orient=bundle",
+        "mosaic@plane=ransac,orient=pnp",
+        "mosaic@plane=ransac,orient=bundle",
+    ]
+    mosaic = cells["mosaic@plane=ransac,orient=pnp"]
+    assert mosaic.assignment == {"plane": "ransac", "orient": "pnp"}
+    assert mosaic.inputs == {
+        "layers": CellOutput(address="ortho@plane=ransac,orient=pnp", port="layers")
+    }
+
+
+def test_excluded_combinations_are_dropped_and_their_parts_are_kept(
+    catalog: Catalog, write: Path
+) -> None:
+    cells = cells_of(GOOD, write, catalog)
+    assert "orient@plane=ransac,orient=pnp" not in cells
+    assert "mosaic@plane=ransac,orient=pnp" not in cells
+    assert "wall@plane=ransac" in cells
+    assert "mosaic@plane=ransac,orient=bundle" in cells
+
+
+def test_excluding_every_partner_of_a_variant_keeps_the_cells_before_them(
+    catalog: Catalog, write: Path
+) -> None:
+    both = "exclude: [{plane: ransac, orient: pnp}, {plane: ransac, orient: bundle}]"
+    text = GOOD.replace("exclude: [{plane: ransac, orient: pnp}]", both)
+    cells = cells_of(
+        text.replace("baseline: {plane: ransac", "baseline: {plane: hough2d"), write, catalog
+    )
+    assert "reties@plane=ransac" in cells
+    assert addresses(cells, "orient") == [
+        "orient@plane=hough2d,orient=pnp",
+        "orient@plane=hough2d,orient=bundle",
+    ]
+
+
+def test_one_variant_excluded_alone_leaves_the_comparison(catalog: Catalog, write: Path) -> None:
+    text = GOOD.replace("{plane: ransac, orient: pnp}]", "{plane: hough2d}]")
+    assert not any("hough2d" in address for address in cells_of(text, write, catalog))
+
+
+def test_without_compare_only_the_first_variants_run(catalog: Catalog, write: Path) -> None:
+    cells = cells_of(GOOD[: GOOD.index("compare:")], write, catalog)
+    assert list(cells)[-1] == "mosaic@plane=hough2d,orient=pnp"
+    assert len(cells) == 10
+
+
+def test_one_at_a_time_is_the_baseline_and_every_single_deviation(
+    catalog: Catalog, write: Path
+) -> None:
+    text = TWO_ORTHOS + COMPARE % "one-at-a-time"
+    cells = cells_of(text, write, catalog, "scan=a.e57", "photos=photos")
+    assert addresses(cells, "mosaic") == [
+        "mosaic@plane=ransac,orient=pnp,ortho=backward",
+        "mosaic@plane=hough2d,orient=pnp,ortho=backward",
+        "mosaic@plane=ransac,orient=bundle,ortho=backward",
+        "mosaic@plane=ransac,ortho=direct",
+    ]
+
+
+def test_a_method_that_ignores_a_port_is_not_repeated_for_it(catalog: Catalog, write: Path) -> None:
+    text = TWO_ORTHOS + COMPARE % "product"
+    cells = cells_of(text, write, catalog, "scan=a.e57", "photos=photos")
+    assert addresses(cells, "ortho") == [
+        "ortho@plane=hough2d,orient=pnp,ortho=backward",
+        "ortho@plane=hough2d,ortho=direct",
+        "ortho@plane=hough2d,orient=bundle,ortho=backward",
+        "ortho@plane=ransac,orient=pnp,ortho=backward",
+        "ortho@plane=ransac,ortho=direct",
+        "ortho@plane=ransac,orient=bundle,ortho=backward",
+    ]
+    assert set(cells["ortho@plane=ransac,ortho=direct"].inputs) == {"walls", "cloud"}
+
+
+def test_repeats_have_seeds_of_their_own_and_downstream_uses_the_first(
+    catalog: Catalog, write: Path
+) -> None:
+    text = TWO_ORTHOS + COMPARE % "product"
+    cells = cells_of(text, write, catalog, "scan=a.e57", "photos=photos")
+    names = [f"plane@plane=ransac{mark}" for mark in ("", "#1", "#2")]
+    repeats = [cells[name] for name in names]
+    assert [cell.repeat for cell in repeats] == [0, 1, 2]
+    assert [cell.seed for cell in repeats] == [derive_seed(5, "plane.ransac", n) for n in range(3)]
+    assert len({cell.seed for cell in repeats}) == 3
+    assert all(
+        "#" not in source.address
+        for cell in cells.values()
+        for source in cell.inputs.values()
+        if isinstance(source, CellOutput)
+    )
+
+
+def test_the_seed_is_the_start_of_a_digest_and_exact_in_a_double() -> None:
+    digest = hashlib.sha256(b'["orthoflow/seed", 1, 1729, "plane.ransac", 2]').digest()
+    seed = derive_seed(1729, "plane.ransac", 2)
+    assert seed == int.from_bytes(digest[:8], "big") // 2**11
+    assert float(seed) == seed < 2**53
+
+
+def test_the_first_present_reference_of_a_list_wins(catalog: Catalog, write: Path) -> None:
+    cells = cells_of(TWO_ORTHOS, write, catalog, "scan=a.e57", "photos=photos")
+    assert cells["plane@plane=hough2d"].inputs["cloud"] == CellOutput(address="cloud", port="cloud")
+    assert cells["cloud"].inputs == {"files": WorkflowInput(name="scan")}
+    assert cells["room"].skip_reason == "not needed, because inputs.scan is given"
+    cells = cells_of(TWO_ORTHOS, write, catalog, "photos=photos")
+    assert cells["plane@plane=hough2d"].inputs["cloud"] == CellOutput(address="room", port="cloud")
+    assert cells["room"].skip_reason == ""
+
+
+def test_steps_without_their_data_are_skipped_and_say_which_data(
+    catalog: Catalog, write: Path
+) -> None:
+    cells = cells_of(TWO_ORTHOS, write, catalog)
+    reasons = {cell.step: cell.skip_reason for cell in cells.values() if cell.skip_reason}
+    assert reasons == {
+        "cloud": "port files stays empty, because inputs.scan is not given",
+        "shots": "port files stays empty, because inputs.photos is not given",
+        "ties": "port photos stays empty, because inputs.photos is not given",
+        "orient": "port ties stays empty, because inputs.photos is not given",
+        "ortho": "port photos stays empty, because inputs.photos is not given",
+        "mosaic": "port layers stays empty, because inputs.photos is not given",
+        "check": "port orthoimages stays empty, because inputs.photos is not given",
+    }
+
+
+def test_a_skipped_variant_does_not_take_the_others_with_it(catalog: Catalog, write: Path) -> None:
+    text = TWO_ORTHOS + COMPARE % "product"
+    cells = cells_of(text, write, catalog, "scan=a.e57")
+    going = [cell.address for cell in cells.values() if not cell.skip_reason]
+    assert going == [
+        "cloud",
+        "plane@plane=hough2d",
+        "plane@plane=ransac",
+        "plane@plane=ransac#1",
+        "plane@plane=ransac#2",
+        "wall@plane=hough2d",
+        "wall@plane=ransac",
+        "ortho@plane=hough2d,ortho=direct",
+        "ortho@plane=ransac,ortho=direct",
+        "mosaic@plane=hough2d,ortho=direct",
+        "mosaic@plane=ransac,ortho=direct",
+    ]
+    check = cells["check@plane=ransac,ortho=direct"]
+    assert check.skip_reason == "port truth stays empty, because inputs.scan is given"
+
+
+def test_a_skipped_candidate_does_not_multiply_those_who_pass_it_over(
+    catalog: Catalog, write: Path
+) -> None:
+    text = """\
+orthoflow: 1
+inputs: {photos: {optional: true}}
+steps:
+  room: {use: simulate.room}
+  shots: {use: read.photos, in: {files: inputs.photos}}
+  plane: {use: plane.hough2d, in: {cloud: room.cloud}}
+  wall: {use: raster.grid, in: {cloud: room.cloud, planes: plane.planes}}
+  ties: {use: match.sift, in: {photos: shots.photos, walls: wall.walls}}
+  orient:
+    in: {ties: ties.ties, photos: shots.photos}
+    variants: {pnp: {use: orient.pnp}, bundle: {use: orient.bundle}}
+  photo: {use: ortho.backward,
+          in: {walls: wall.walls, photos: shots.photos, cameras: orient.cameras}}
+  cloud: {use: ortho.direct, in: {walls: wall.walls, cloud: room.cloud}}
+  mosaic: {use: mosaic.seams, in: {layers: [photo.layers, cloud.layers]}}
+compare: {}
+"""
+    without = cells_of(text, write, catalog)
+    assert addresses(without, "mosaic") == ["mosaic"]
+    assert without["mosaic"].inputs == {"layers": CellOutput(address="cloud", port="layers")}
+    given = cells_of(text, write, catalog, "photos=photos")
+    assert addresses(given, "mosaic") == ["mosaic@orient=pnp", "mosaic@orient=bundle"]
+
+
+def test_an_absent_optional_port_is_left_out(catalog: Catalog, write: Path) -> None:
+    text = GOOD[: GOOD.index("compare:")].replace("data/", "")
+    assert set(cells_of(text, write, catalog)["shots"].inputs) == {"files"}
+    Path("calibration.yaml").touch()
+    assert set(cells_of(text, write, catalog)["shots"].inputs) == {"files", "calibration"}
+
+
+def test_an_optional_input_that_was_asked_for_must_be_there(catalog: Catalog, write: Path) -> None:
+    with pytest.raises(InputError, match=r"input scan: there is no file b\.e57"):
+        cells_of(TWO_ORTHOS, write, catalog, "scan=b.e57")
+
+
+def test_cells_carry_what_the_file_asks_for(catalog: Catalog, write: Path) -> None:
+    cells = cells_of(GOOD, write, catalog)
+    bundle = cells["orient@plane=ransac,orient=bundle"]
+    assert (bundle.method, bundle.cores, bundle.timeout_s) == ("orient.bundle", 2, 1800.0)
+    assert cells["wall@plane=ransac"].params == {"gsd_m": 1.0}
+    assert cells["wall@plane=ransac"].params_set == {"gsd_m": 1}
+
+
+def test_more_combinations_than_anybody_can_run_are_refused(catalog: Catalog, write: Path) -> None:
+    variants = ", ".join(f"v{n}: {{use: plane.ransac}}" for n in range(200))
+    text = f"""\
+orthoflow: 1
+steps:
+  room: {{use: simulate.room}}
+  plane: {{in: {{cloud: room.cloud}}, variants: {{{variants}}}}}
+  wall: {{in: {{cloud: room.cloud, planes: plane.planes}},
+          variants: {{{variants.replace("plane.ransac", "raster.grid")}}}}}
+compare: {{}}
+"""
+    with pytest.raises(WorkflowError, match=r"flow has 40000 combinations .*one-at-a-time"):
+        cells_of(text, write, catalog)
+
+
+SELECTIONS = {
+    "until takes what comes before": (
+        Selection(until=("ties",)),
+        {"cloud", "shots", "plane", "wall", "ties"},
+    ),
+    "from takes what follows and what that needs": (
+        Selection(from_=("mosaic",)),
+        {"cloud", "shots", "plane", "wall", "ties", "first", "reties", "orient", "ortho", "mosaic"},
+    ),
+    "only takes the step and what it needs": (Selection(only=("plane",)), {"cloud", "plane"}),
+    "from and until together": (
+        Selection(from_=("plane",), until=("wall",)),
+        {"cloud", "plane", "wall"},
+    ),
+    "nothing chosen is everything": (
+        Selection(),
+        {"cloud", "shots", "plane", "wall", "ties", "first", "reties", "orient", "ortho", "mosaic"},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SELECTIONS)
+def test_a_selection_keeps_its_steps_and_what_they_need(
+    case: str, catalog: Catalog, write: Path
+) -> None:
+    selection, steps = SELECTIONS[case]
+    cells = cells_of(GOOD, write, catalog, selection=selection)
+    assert {cell.step for cell in cells.values()} == steps
+
+
+def test_a_selected_cell_brings_only_the_variants_it_uses(catalog: Catalog, write: Path) -> None:
+    text = TWO_ORTHOS.replace("backward: {use: ortho.backward}, ", "") + COMPARE % "product"
+    selection = Selection(only=("ortho",))
+    cells = cells_of(text, write, catalog, "scan=a.e57", "photos=photos", selection=selection)
+    assert {cell.step for cell in cells.values()} == {"cloud", "plane", "wall", "ortho"}
+    assert not any("#" in address for address in cells)
+
+
+def test_an_unknown_step_of_a_selection_is_refused(catalog: Catalog, write: Path) -> None:
+    workflow = load(GOOD, write, catalog)
+    with pytest.raises(ArgumentError, match=r"--until wal: .* has no step wal \(did you mean wall"):
+        expand_cells(workflow, catalog, selection=Selection(until=("wal",)))
+    with pytest.raises(ArgumentError, match=r"--force plan: .* \(did you mean plane\?\)"):
+        check_step_names(workflow, ["plan"], "--force")
+
+
+def test_a_selection_that_leaves_nothing_is_refused(catalog: Catalog, write: Path) -> None:
+    workflow = load(GOOD, write, catalog)
+    message = "no step of workflow palace-room is left by --from ortho --until wall together"
+    with pytest.raises(ArgumentError, match=message):
+        expand_cells(workflow, catalog, selection=Selection(from_=("ortho",), until=("wall",)))

@@ -1,0 +1,112 @@
+"""Which files a workflow's inputs stand for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import Catalog
+from orthoflow.errors import InputError
+from orthoflow.workflow import load_workflow, present_inputs, resolve_input_files
+from tests.laboratories import laboratory_catalog
+
+
+@pytest.fixture
+def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    return laboratory_catalog(monkeypatch)
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a workflow and data, which is not the working directory."""
+    folder = tmp_path / "project"
+    for name in ("b.jpg", "a.jpg", ".hidden.jpg", "deep/c.jpg", "[1].jpg"):
+        path = folder / "photos" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(name)
+    (folder / "empty").mkdir()
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "mine.jpg").touch()
+    monkeypatch.chdir(elsewhere)
+    return folder
+
+
+def names(project: Path, catalog: Catalog, spec: str, *options: str) -> list[str] | None:
+    path = project / "flow.yaml"
+    path.write_text(
+        f"orthoflow: 1\ninputs: {{photos: {spec}}}\n"
+        f"steps: {{shots: {{use: read.photos, in: {{files: inputs.photos}}}}}}\n"
+    )
+    workflow = load_workflow(path, catalog, inputs=options)
+    files = resolve_input_files(workflow)["photos"]
+    assert (files is not None) == ("photos" in present_inputs(workflow))
+    if files is None:
+        return None
+    assert files.name == "photos"
+    assert all(item.is_file() and item.is_absolute() for item in files.paths)
+    return [item.name for item in files.paths]
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        ("{files: photos/b.jpg}", ["b.jpg"]),
+        ("{files: photos}", ["[1].jpg", "a.jpg", "b.jpg"]),
+        ("{files: photos/*.jpg}", ["[1].jpg", "a.jpg", "b.jpg"]),
+        ("{files: 'photos/[1].jpg'}", ["[1].jpg"]),
+        ("{files: 'photos/**/?.jpg'}", ["a.jpg", "b.jpg", "c.jpg"]),
+        ("{files: [photos/deep, photos/b.jpg, photos/b.*]}", ["b.jpg", "c.jpg"]),
+        ("{optional: true}", None),
+        ("{files: nowhere.jpg, optional: true}", None),
+        ("{files: empty, optional: true}", None),
+    ],
+)
+def test_files_are_found_beside_the_workflow_and_sorted_by_name(
+    spec: str, expected: list[str] | None, project: Path, catalog: Catalog
+) -> None:
+    assert names(project, catalog, spec) == expected
+
+
+def test_absolute_patterns_work(project: Path, catalog: Catalog) -> None:
+    assert names(project, catalog, f"{{files: '{project}/photos/a.*'}}") == ["a.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("{files: nowhere.jpg}", "input photos: there is no file nowhere.jpg beside the workflow"),
+        ("{files: '*.png'}", r"input photos: no file matches \*.png beside the workflow"),
+        ("{files: empty}", "input photos: the folder empty holds no files beside the workflow"),
+        ("{files: [photos/a.jpg, x.jpg]}", "input photos: there is no file x.jpg"),
+        ("{}", r"input photos has no files; name them .* or with --input photos=PATH"),
+    ],
+)
+def test_missing_files_are_one_sentence(
+    spec: str, message: str, project: Path, catalog: Catalog
+) -> None:
+    with pytest.raises(InputError, match=message):
+        names(project, catalog, spec)
+
+
+def test_input_options_replace_the_files_and_start_from_the_working_directory(
+    project: Path, catalog: Catalog
+) -> None:
+    spec = "{files: photos/a.jpg}"
+    assert names(project, catalog, spec, "photos=mine.jpg") == ["mine.jpg"]
+    both = names(project, catalog, spec, "photos=mine.jpg", f"photos={project}/photos/b.jpg")
+    assert both == ["b.jpg", "mine.jpg"]
+    assert names(project, catalog, "{optional: true}", "photos=*.jpg") == ["mine.jpg"]
+
+
+def test_an_input_option_must_exist_even_when_the_input_is_optional(
+    project: Path, catalog: Catalog
+) -> None:
+    with pytest.raises(InputError, match=r"there is no file a\.jpg in the working directory"):
+        names(project, catalog, "{optional: true}", "photos=a.jpg")
+
+
+def test_a_link_keeps_its_own_name(project: Path, catalog: Catalog) -> None:
+    (project / "photos" / "deep" / "link.jpg").symlink_to(project / "photos" / "a.jpg")
+    assert names(project, catalog, "{files: photos/deep}") == ["c.jpg", "link.jpg"]
