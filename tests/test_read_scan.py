@@ -1,0 +1,640 @@
+"""`read.scan`: one cloud in metres from files in any unit, and honest words on what limits it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.read import assembling
+from orthoflow_plugins.read.colours import ColourScale
+from orthoflow_plugins.read.intensities import choose_scale, normalise
+from orthoflow_plugins.read.precision import rounding_m
+from orthoflow_plugins.read.scan import ReadScan
+from orthoflow_plugins.read.stations import ScanSummary, choose_stations
+
+from orthoflow.errors import CancelledStepError, InputError, StoreError
+from orthoflow.products import InputFiles, PointCloud
+from orthoflow.sdk import StepContext
+from tests import scan_files
+
+
+class Reader:
+    """Runs the method and keeps what it said."""
+
+    def __init__(self, scratch: Path) -> None:
+        self.scratch = scratch
+        self.ctx: StepContext
+        self.count = 0
+
+    def __call__(self, *paths: Path, **params: object) -> PointCloud:
+        self.count += 1
+        scratch = self.scratch / f"scratch-{self.count}"
+        scratch.mkdir()
+        self.ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=scratch)
+        inputs = ReadScan.In(files=InputFiles(name="scan", paths=paths))
+        text = json.dumps(params)
+        checked = ReadScan.Params.model_validate_json(text, strict=True)
+        return ReadScan().run(inputs, checked, self.ctx).cloud
+
+    @property
+    def warnings(self) -> str:
+        return "\n".join(self.ctx.warnings)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        return {metric.name: metric.value for metric in self.ctx.metrics}
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Reader:
+    return Reader(tmp_path)
+
+
+@pytest.fixture
+def points() -> NDArray[np.float64]:
+    return np.round(np.random.default_rng(3).uniform(-5.0, 5.0, (400, 3)), 4)
+
+
+def write_text(path: Path, table: Iterable[Iterable[float]], header: str = "") -> Path:
+    rows = [" ".join(repr(float(value)) for value in row) for row in table]
+    path.write_text("\n".join([*([header] if header else []), *rows, ""]))
+    return path
+
+
+def cartesian(points: NDArray[np.float64], **more: object) -> dict[str, object]:
+    return {
+        "cartesianX": points[:, 0],
+        "cartesianY": points[:, 1],
+        "cartesianZ": points[:, 2],
+        **more,
+    }
+
+
+# Coordinates
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("m", 1.0), ("mm", 0.001), ("ft", 0.3048), ("us-ft", 1200 / 3937)]
+)
+def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64], unit: str, factor: float
+) -> None:
+    shift = np.array([634512.347, 486215.781, 112.193])
+    world_m = points + shift
+    cloud = read(write_text(tmp_path / "a.xyz", world_m / factor), unit=unit)
+    np.testing.assert_allclose(cloud.points_world(), world_m, atol=1e-5)
+    assert (cloud.origin == np.floor(cloud.origin)).all()
+    assert np.abs(cloud.origin - shift).max() < 5.0
+    assert cloud.source["unit"] == unit
+    assert cloud.x.dtype == np.float32
+
+
+def test_a_shift_by_whole_metres_changes_the_origin_only(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    near = read(scan_files.write_las(tmp_path / "a.las", points))
+    far = read(
+        scan_files.write_las(tmp_path / "b.las", points + np.array([634512.0, 486215.0, 112.0]))
+    )
+    np.testing.assert_array_equal(far.origin - near.origin, [634512.0, 486215.0, 112.0])
+    np.testing.assert_allclose(far.x, near.x, atol=1e-6)
+
+
+def test_stray_points_do_not_cost_the_scan_its_precision(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    world = points + np.array([634512.347, 486215.781, 112.193])
+    world[:3] = 0.0
+    cloud = read(write_text(tmp_path / "a.xyz", world))
+    np.testing.assert_allclose(cloud.points_world()[3:], world[3:], atol=1e-5)
+    assert "coordinates are kept to 62.50 mm only" in read.warnings
+
+
+@pytest.mark.parametrize("up", ["z", "x", "-x", "y", "-y", "-z"])
+def test_up_is_told_and_nothing_is_turned(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64], up: str
+) -> None:
+    cloud = read(write_text(tmp_path / "a.xyz", points), up=up)
+    expected = np.zeros(3)
+    expected["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
+    np.testing.assert_array_equal(cloud.up, expected)
+    np.testing.assert_allclose(cloud.points_world(), points, atol=1e-6)
+
+
+def test_points_that_are_not_finite_are_dropped_and_counted(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    dirty = points.copy()
+    dirty[7, 1] = np.nan
+    dirty[9, 2] = np.inf
+    dirty[11, 0] = -np.inf
+    dirty[13, 0] = 1e300
+    table = np.column_stack([dirty, np.arange(400.0)])
+    cloud = read(write_text(tmp_path / "a.xyz", table))
+    kept = np.setdiff1d(np.arange(400), [7, 9, 11, 13])
+    np.testing.assert_allclose(cloud.points_world(), points[kept], atol=1e-6)
+    np.testing.assert_allclose(cloud.intensity, kept / 399.0, atol=1e-6)
+    assert read.metrics["n_not_finite"] == 4
+    assert read.metrics["n_points"] == 396
+    assert cloud.source["counts"] == {"read": 400, "kept": 396, "dropped": 4}
+
+
+def test_one_point_is_a_cloud(tmp_path: Path, read: Reader) -> None:
+    cloud = read(write_text(tmp_path / "a.xyz", [[1.5, 2.5, 3.5, 0.5]]))
+    np.testing.assert_array_equal(cloud.points_world(), [[1.5, 2.5, 3.5]])
+    assert cloud.intensity is not None
+    assert cloud.intensity.tolist() == [1.0]
+
+
+@pytest.mark.parametrize("step", [0.01, 0.005, 2.0**-5])
+def test_rounded_coordinates_are_noticed(step: float, points: NDArray[np.float64]) -> None:
+    rounded = np.rint(points / step) * step
+    assert rounding_m(rounded, 1.0) == pytest.approx(step, rel=1e-12)
+    assert rounding_m(rounded / 0.3048, 0.3048) == pytest.approx(0.0, abs=1e-12)
+    assert rounding_m(points, 1.0) == 0.0
+
+
+def test_rounding_is_told_in_metres_whatever_the_unit(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    cloud = read(write_text(tmp_path / "a.xyz", np.rint(points * 100) * 10), unit="mm")
+    assert "the coordinates of a.xyz are rounded to 10 mm" in read.warnings
+    assert cloud.source["rounding_m"] == pytest.approx(0.01, rel=1e-12)
+
+
+# Several files and scans
+
+
+def test_several_files_become_one_cloud(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    first = write_text(tmp_path / "a.xyz", points)
+    second = scan_files.write_e57(
+        tmp_path / "b.e57",
+        [
+            {
+                "fields": cartesian(points),
+                "rotation": (1, 0, 0, 0),
+                "translation": (number, 0, 0),
+            }
+            for number in (10, 20)
+        ],
+    )
+    cloud = read(first, second)
+    # Numbers that would not point to rows of the stations are worse than none.
+    assert cloud.scan is None
+    assert len(cloud) == 1200
+    np.testing.assert_allclose(
+        cloud.points_world()[400:800], points + np.array([10.0, 0, 0]), atol=1e-6
+    )
+    np.testing.assert_array_equal(cloud.stations, [[10.0, 0, 0], [20.0, 0, 0]])
+    assert "only 2 of 3 scans say where the scanner stood" in read.warnings
+    assert [item["name"] for item in cloud.source["files"]] == ["a.xyz", "b.e57"]  # type: ignore[union-attr, call-overload, index]
+
+
+def test_stations_belong_to_scans_in_their_order(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    half = np.sqrt(0.5)
+    scans = [
+        {"fields": cartesian(points)},
+        {
+            "fields": cartesian(points),
+            "rotation": (half, 0, 0, half),
+            "translation": (3.0, 4.0, 0.5),
+        },
+    ]
+    cloud = read(scan_files.write_e57(tmp_path / "a.e57", scans), unit="ft")
+    np.testing.assert_allclose(cloud.stations, np.array([[0, 0, 0], [3.0, 4.0, 0.5]]) * 0.3048)
+    assert cloud.stations_source == "file"
+    assert cloud.scan is not None
+    np.testing.assert_array_equal(cloud.scan, np.repeat([0, 1], 400))
+    assert read.metrics["n_scans"] == 2
+
+
+def test_fields_that_only_some_files_have_are_left_out_with_a_word(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    first = write_text(tmp_path / "a.xyz", points)
+    second = write_text(tmp_path / "b.xyz", np.column_stack([points, np.arange(400)]))
+    cloud = read(first, second)
+    assert cloud.intensity is None
+    assert "a.xyz has no intensity, the other files have" in read.warnings
+
+
+# Stations
+
+
+def summary(
+    station: tuple[float, float, float] | None, *, is_posed: bool, at: float = 0.0
+) -> ScanSummary:
+    return ScanSummary(
+        station=None if station is None else np.array(station),
+        is_posed=is_posed,
+        low=np.full(3, at - 2.0),
+        high=np.full(3, at + 2.0),
+    )
+
+
+def test_a_scan_without_pose_was_seen_from_its_origin_when_it_lies_around_it() -> None:
+    stations = choose_stations([summary((0, 0, 0), is_posed=False)], None)
+    assert stations.source == "file"
+    np.testing.assert_array_equal(stations.positions, [[0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "scans",
+    [
+        [summary((0, 0, 0), is_posed=False, at=1000.0)],
+        [summary((0, 0, 0), is_posed=False)] * 2,
+        [summary(None, is_posed=False)],
+        [],
+    ],
+    ids=["survey-coordinates", "registered-before-export", "no-station", "no-scan"],
+)
+def test_an_origin_that_cannot_be_a_scanner_is_none(scans: list[ScanSummary]) -> None:
+    assert choose_stations(scans, None).positions is None
+    viewed = choose_stations(scans, (1.0, 2.0, 3.0))
+    assert viewed.source == "view_from"
+    np.testing.assert_array_equal(viewed.positions, [[1.0, 2.0, 3.0]])
+
+
+def test_view_from_is_in_metres_and_gives_way_to_the_scanner(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    cloud = read(write_text(tmp_path / "a.xyz", points), view_from=[1.0, 2, 3.5], unit="ft")
+    np.testing.assert_array_equal(cloud.stations, [[1.0, 2.0, 3.5]])
+    assert cloud.stations_source == "view_from"
+    scan = scan_files.write_e57(tmp_path / "a.e57", [{"fields": cartesian(points)}])
+    cloud = read(scan, view_from=[1.0, 2.0, 3.5])
+    assert cloud.stations_source == "file"
+    assert "view_from has no effect" in read.warnings
+
+
+def test_ptx_scanner_positions_are_stations(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    matrix = np.eye(4)
+    matrix[:3, 3] = [100.0, 200.0, 3.0]
+    table = points.copy()
+    table[::8] = 0.0
+    cloud = read(scan_files.write_ptx(tmp_path / "a.ptx", [(table, 20, matrix)]))
+    np.testing.assert_array_equal(cloud.stations, [[100.0, 200.0, 3.0]])
+    assert cloud.stations_source == "file"
+    assert len(cloud) == 350
+    assert read.metrics["n_invalid"] == 50
+    assert cloud.row is not None
+    assert cloud.row.dtype == np.uint32
+    np.testing.assert_array_equal(cloud.row, (np.arange(400) % 20)[np.arange(400) % 8 != 0])
+
+
+# Intensity
+
+
+@pytest.mark.parametrize(
+    ("seen", "stated", "intensity_max", "expected"),
+    [
+        ((0.4, 0.7), [(0.0, 1.0)], None, (0.0, 1.0)),
+        ((0.4, 0.7), [(0.0, 1.0), (0.5, 2.0)], None, (0.0, 2.0)),
+        ((0.4, 1.7), [(0.0, 1.0)], None, (0.4, 1.7)),
+        ((28.0, 44114.0), [None], None, (28.0, 44114.0)),
+        ((28.0, 44114.0), [(0.0, 50000.0), None], None, (28.0, 44114.0)),
+        ((28.0, 44114.0), [(0.0, 50000.0)], 65535.0, (0.0, 65535.0)),
+        ((5.0, 5.0), [None], None, (0.0, 5.0)),
+        ((-5.0, -5.0), [None], None, (-5.0, 0.0)),
+    ],
+)
+def test_the_intensity_scale_is_the_users_the_files_or_that_of_the_data(
+    seen: tuple[float, float],
+    stated: list[tuple[float, float] | None],
+    intensity_max: float | None,
+    expected: tuple[float, float],
+) -> None:
+    scale = choose_scale(seen, stated, intensity_max)
+    assert (scale.low, scale.high) == expected
+
+
+def test_normalising_is_linear_and_counts_what_it_clips() -> None:
+    values = np.array([0.0, 25.0, 100.0, 150.0, np.nan, -1.0], np.float32)
+    n_clipped = normalise(values, choose_scale((0.0, 150.0), [None], 100.0))
+    np.testing.assert_allclose(values, [0.0, 0.25, 1.0, 1.0, 0.0, 0.0], atol=1e-7)
+    assert n_clipped == 2
+
+
+def test_limits_in_an_e57_header_set_the_scale(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    fields = cartesian(points, intensity=np.linspace(100.0, 300.0, 400))
+    scan = {"fields": fields, "intensity_limits": (0.0, 400.0)}
+    cloud = read(scan_files.write_e57(tmp_path / "a.e57", [scan]))
+    np.testing.assert_allclose(cloud.intensity, np.linspace(0.25, 0.75, 400), atol=1e-6)
+    assert cloud.source["intensity"]["rule"] == "limits that the files state"  # type: ignore[index, call-overload]
+
+
+def test_the_user_can_set_full_intensity(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    table = np.column_stack([points, np.arange(400)])
+    cloud = read(write_text(tmp_path / "a.xyz", table), intensity_max=200.0)
+    np.testing.assert_allclose(cloud.intensity, np.minimum(np.arange(400) / 200, 1), atol=1e-6)
+    assert "199 intensities lie beyond 0..200 (intensity_max) and were clipped" in read.warnings
+
+
+def test_zero_intensity_and_zero_colours_are_absent_not_black(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    zeros = np.zeros((400, 3), np.int64)
+    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=zeros[:, 0], rgb=zeros)
+    cloud = read(path)
+    assert cloud.intensity is None
+    assert cloud.rgb is None
+    assert cloud.source["intensity_source"] == "none"
+    assert "the intensity of all points is zero: it is taken as absent" in read.warnings
+    assert "the colours of all points are zero" in read.warnings
+
+
+def test_an_intensity_that_repeats_the_colours_is_no_laser_intensity(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
+    grey = np.rint(rgb @ [0.299, 0.587, 0.114] * 257).astype(np.int64)
+    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=grey, rgb=rgb * 256)
+    cloud = read(path)
+    assert cloud.intensity is None
+    assert cloud.source["intensity_source"] == "luminance"
+    assert "the intensity is not the laser's but the luminance of the colours" in read.warnings
+
+
+def test_grey_colours_made_from_the_intensity_leave_it_a_laser_intensity(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    grey = np.random.default_rng(0).integers(0, 256, 400)
+    rgb = np.repeat(grey[:, None], 3, axis=1)
+    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=grey * 200, rgb=rgb)
+    cloud = read(path)
+    assert cloud.intensity is not None
+    assert cloud.source["intensity_source"] == "laser"
+    assert "they are no photographs" in read.warnings
+
+
+# Colours
+
+
+@pytest.mark.parametrize("factor", [1, 256, 257], ids=["low-byte", "times-256", "times-257"])
+def test_eight_bit_colours_in_las_come_back_however_they_were_stored(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64], factor: int
+) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
+    cloud = read(scan_files.write_las(tmp_path / "a.laz", points, rgb=rgb * factor))
+    np.testing.assert_array_equal(cloud.rgb, rgb)
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected", "scale"),
+    [
+        ([[[0.0, 0.5, 1.0]]], [[0, 128, 255]], "0..1"),
+        ([[[0.0, 1.0, 1.0]], [[7.0, 8.0, 255.0]]], [[0, 1, 1], [7, 8, 255]], "8 bit"),
+        ([[[0.0, 1.0, 200.0]], [[65535.0, 256.0, 0.0]]], [[0, 0, 0], [255, 1, 0]], "16 bit"),
+        ([[[-3.0, np.nan, 200.0]]], [[0, 0, 200]], "8 bit"),
+    ],
+    ids=["unit", "bytes-found-late", "words-found-late", "rubbish"],
+)
+def test_the_scale_of_colours_is_found_while_they_come(
+    parts: list[list[list[float]]], expected: list[list[int]], scale: str
+) -> None:
+    stored = np.zeros((4, 3), np.uint8)
+    colours = ColourScale(stored, None)
+    for part in parts:
+        colours.add(np.array(part))
+    np.testing.assert_array_equal(stored[: len(expected)], expected)
+    assert colours.scale == scale
+
+
+def test_a_stated_colour_limit_sets_the_scale() -> None:
+    stored = np.zeros((1, 3), np.uint8)
+    ColourScale(stored, 65535.0).add(np.array([[0, 32768, 65535]], np.uint16))
+    np.testing.assert_array_equal(stored, [[0, 128, 255]])
+
+
+# The method as a whole
+
+
+def test_reading_twice_gives_the_same_bits(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (400, 3))
+    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=np.arange(400), rgb=rgb)
+    first, second = read(path).to_payload(), read(path).to_payload()
+    assert first.metadata == second.metadata
+    for name, array in first.arrays.items():
+        np.testing.assert_array_equal(array, second.arrays[name])
+
+
+def test_the_way_a_file_is_cut_into_blocks_does_not_show(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from orthoflow.files.points import las
+
+    path = scan_files.write_las(tmp_path / "a.laz", points, intensity=np.arange(400))
+    whole = read(path)
+    monkeypatch.setattr(las, "BLOCK_POINTS", 399)
+    parted = read(path)
+    np.testing.assert_array_equal(parted.points_world(), whole.points_world())
+    np.testing.assert_array_equal(parted.intensity, whole.intensity)
+
+
+def test_no_path_enters_the_cloud(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    cloud = read(write_text(tmp_path / "a.xyz", points))
+    assert str(tmp_path) not in json.dumps(cloud.source)
+
+
+def test_a_picture_from_above_is_drawn(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    read(write_text(tmp_path / "a.xyz", points))
+    (figure,) = read.ctx.figures
+    assert figure.path.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (
+            lambda folder: scan_files.write_ptx(
+                folder / "a.ptx", [(np.zeros((6, 3)), 2, np.eye(4))]
+            ),
+            "a.ptx holds no usable points: of 6, 6 are marked as invalid, 0 as deleted and 0",
+        ),
+        (
+            lambda folder: write_text(folder / "a.xyz", [], header="x y z"),
+            "a.xyz has no line that begins with three numbers",
+        ),
+        (
+            lambda folder: scan_files.write_las(folder / "a.laz", np.empty((0, 3))),
+            "a.laz holds no points",
+        ),
+        (
+            lambda folder: write_text(folder / "a.xyz", [[1.0, 2.0, np.nan]]),
+            "a.xyz holds no usable points: of 1, 0 are marked as invalid, 0 as deleted and 1",
+        ),
+    ],
+    ids=["no-returns", "blank", "empty", "not-finite"],
+)
+def test_an_empty_cloud_is_refused(
+    tmp_path: Path, read: Reader, write: Callable[[Path], Path], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        read(write(tmp_path))
+
+
+def test_an_input_without_files_is_refused(read: Reader) -> None:
+    with pytest.raises(InputError, match="the input scan names no files"):
+        read()
+
+
+def test_columns_without_a_text_file_are_said_to_do_nothing(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    read(scan_files.write_las(tmp_path / "a.laz", points), columns="x y z")
+    assert "columns only speaks of text files" in read.warnings
+
+
+def test_too_little_scratch_space_is_said_before_anything_is_written(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=1000))
+    with pytest.raises(StoreError, match=r"400 points need 0\.00 GB of scratch space, but only"):
+        read(scan_files.write_las(tmp_path / "a.laz", points))
+
+
+def test_more_scans_than_can_be_numbered_are_refused(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(assembling, "_MOST_SCANS", 2)
+    paths = [write_text(tmp_path / f"{name}.xyz", points) for name in "abc"]
+    with pytest.raises(InputError, match="there are more than 2 scans"):
+        read(*paths)
+
+
+def test_a_cancelled_step_stops_between_blocks(tmp_path: Path, points: NDArray[np.float64]) -> None:
+    ctx = StepContext(
+        rng=np.random.default_rng(0), cores=1, scratch=tmp_path, is_cancelled=lambda: True
+    )
+    path = write_text(tmp_path / "a.xyz", points)
+    inputs = ReadScan.In(files=InputFiles(name="scan", paths=(path,)))
+    with pytest.raises(CancelledStepError):
+        ReadScan().run(inputs, ReadScan.Params(), ctx)
+
+
+# Real scans
+
+
+@pytest.mark.parametrize(
+    ("name", "params", "n_points", "bounds", "fields"),
+    [
+        (
+            "heritage-hall-west-wall/west_wall.laz",
+            {},
+            3_022_234,
+            ([-3.459, -13.567, -1.101], [-1.500, 11.275, 3.894]),
+            {"rgb"},
+        ),
+        (
+            "fountain-p11/cloud_from_photos.laz",
+            {"up": "-z"},
+            1_505_670,
+            ([-23.064, -16.171, -5.829], [-10.970, -7.678, 1.821]),
+            {"rgb"},
+        ),
+        (
+            "pump-e57/pumpAVisualReferenceImage.e57",
+            {},
+            155_201,
+            ([-2.904, -5.301, -1.900], [1.722, -0.793, 1.843]),
+            {"rgb", "intensity", "row", "column", "stations"},
+        ),
+        (
+            "lion-takanawa/lion_takanawa_1mm.laz",
+            {},
+            341_989,
+            ([-4.985, 1.039, -3.445], [-0.789, 6.724, 1.124]),
+            {"rgb"},
+        ),
+        (
+            "lion-takanawa/lion_takanawa.copc.laz",
+            {},
+            341_989,
+            ([-4.99, 1.04, -3.45], [-0.79, 6.72, 1.12]),
+            {"rgb"},
+        ),
+        (
+            "indoor-laz/indoor.laz",
+            {"up": "y"},
+            808_042,
+            ([-22.99, -1.97, -7.90], [5.63, 7.55, 12.36]),
+            set(),
+        ),
+        (
+            "ceiling-808/808_db.ply",
+            {},
+            47_043,
+            ([-2.289, -3.123, 1.431], [6.019, 7.651, 4.588]),
+            {"rgb"},
+        ),
+        (
+            "ceiling-808/808-60.ply",
+            {"up": "y"},
+            211_368,
+            ([8.090, 2.468, -4.472], [15.891, 5.822, 3.962]),
+            {"rgb"},
+        ),
+        (
+            "tls-targets-sp1/T1.1.txt",
+            {},
+            12_174,
+            ([-0.141, 5.283, -0.030], [0.001, 5.821, 0.115]),
+            {"rgb", "intensity"},
+        ),
+    ],
+)
+def test_real_scans_come_out_whole(
+    shared_data: Path,
+    read: Reader,
+    name: str,
+    params: dict[str, object],
+    n_points: int,
+    bounds: tuple[list[float], list[float]],
+    fields: set[str],
+) -> None:
+    cloud = read(shared_data / name, **params)
+    assert len(cloud) == n_points
+    extremes = [(float(axis.min()), float(axis.max())) for axis in (cloud.x, cloud.y, cloud.z)]
+    # The README's figures are rounded to a millimetre.
+    np.testing.assert_allclose(np.array(extremes)[:, 0] + cloud.origin, bounds[0], atol=6e-4)
+    np.testing.assert_allclose(np.array(extremes)[:, 1] + cloud.origin, bounds[1], atol=6e-4)
+    optional = ("rgb", "intensity", "row", "column", "scan", "stations")
+    assert {item for item in optional if getattr(cloud, item) is not None} == fields
+    is_rounded = name.endswith(("indoor.laz", "copc.laz"))
+    assert ("are rounded to 10 mm" in read.warnings) == is_rounded
+    assert ("luminance of the colours" in read.warnings) == ("lion" in name)
+
+
+def test_the_pump_is_seen_from_its_origin_on_its_grid(shared_data: Path, read: Reader) -> None:
+    cloud = read(shared_data / "pump-e57/pumpAVisualReferenceImage.e57")
+    np.testing.assert_array_equal(cloud.stations, [[0.0, 0.0, 0.0]])
+    assert cloud.stations_source == "file"
+    assert cloud.row is not None
+    assert cloud.column is not None
+    assert (int(cloud.row.max()), int(cloud.column.max())) == (1073, 344)
+    assert cloud.intensity is not None
+    assert (float(cloud.intensity.min()), float(cloud.intensity.max())) == pytest.approx(
+        (0.3838, 0.6984), abs=1e-4
+    )
