@@ -19,10 +19,15 @@ from numpy.typing import NDArray
 
 # Points handled by one task; an entry slot exists for each, so that tasks never wait for another.
 BLOCK: Final = 8192
-# Cells are dealt out to threads in runs of 2^10: scans write neighbouring cells one after the
-# other, and two threads on one cache line would slow each other down.
-_RUN_SHIFT: Final = 10
+# Points transformed together; their positions stay in the first-level cache.
+_LANE: Final = 512
+# Cells are dealt out to threads in runs of 2^17, some dozens of rows: a scan runs along columns or
+# rows, and a thread that meets its own points in long runs is not slowed by the others'.
+_RUN_SHIFT: Final = 17
 NO_POINT: Final = np.uint32(0xFFFFFFFF)
+# One cell in one record: a scan along columns touches another row of the raster with every point,
+# and one cache line for each is what the passes wait for.
+WINNER: Final = np.dtype([("depth_m", "f4"), ("square", "f4"), ("point", "u4"), ("n_points", "u4")])
 
 
 class Target(NamedTuple):
@@ -61,28 +66,6 @@ class Entries(NamedTuple):
     n_inside: NDArray[np.int64]
 
 
-class Winners(NamedTuple):
-    """The point that won each cell, flat.
-
-    Attributes:
-        depths_m: float32.
-        squares: float32, squared distance to the centre of the cell, in cells.
-        points: uint32 index in the cloud, `NO_POINT` where the cell is void.
-    """
-
-    depths_m: NDArray[np.float32]
-    squares: NDArray[np.float32]
-    points: NDArray[np.uint32]
-
-
-class Moments(NamedTuple):
-    """Number, sum and sum of squares of the depths in each cell, flat."""
-
-    n_points: NDArray[np.uint32]
-    sum_m: NDArray[np.float64]
-    sum_m2: NDArray[np.float64]
-
-
 @njit(parallel=True, cache=True)
 def project_points(
     x: NDArray[np.float32],
@@ -118,35 +101,60 @@ def _project_block(
     entries: Entries,
     block: int,
 ) -> None:
-    m = target.wall_from_offset
+    u, v, depth = np.empty(_LANE), np.empty(_LANE), np.empty(_LANE)
+    is_inside = np.empty(_LANE, dtype=np.bool_)
     slot = begin = block * BLOCK
-    for i in range(begin, min(x.size, begin + BLOCK)):
-        # float64 on purpose: the pass waits for memory, not for arithmetic.
-        px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-        depth = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3]
-        if not (target.behind_m <= depth <= target.front_m):
-            continue
-        u = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3]
-        v = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3]
-        if not (0.0 <= u < target.width and 0.0 <= v < target.height):
-            continue
-        column, row = np.int64(u), np.int64(v)
-        du, dv = u - column - 0.5, v - row - 0.5
-        entries.cells[slot] = row * target.width + column
-        entries.depths_m[slot] = depth
-        entries.squares[slot] = du * du + dv * dv
-        entries.points[slot] = first + i
-        slot += 1
+    for lane in range(begin, min(x.size, begin + BLOCK), _LANE):
+        part = slice(lane, min(x.size, begin + BLOCK, lane + _LANE))
+        _transform(x[part], y[part], z[part], target, (u, v, depth), is_inside)
+        for k in range(part.stop - part.start):
+            if not is_inside[k]:
+                continue
+            column, row = np.int32(u[k]), np.int32(v[k])
+            du, dv = u[k] - column - 0.5, v[k] - row - 0.5
+            entries.cells[slot] = row * target.width + column
+            entries.depths_m[slot] = depth[k]
+            entries.squares[slot] = du * du + dv * dv
+            entries.points[slot] = first + lane + k
+            slot += 1
     entries.n_inside[block] = slot - begin
 
 
+@njit(cache=True)
+def _transform(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    z: NDArray[np.float32],
+    target: Target,
+    position: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    is_inside: NDArray[np.bool_],
+) -> None:
+    """Transform at most `_LANE` points; without branches, so that it vectorises."""
+    us, vs, depths = position
+    m = target.wall_from_offset
+    u0, u1, u2, u3 = m[0, 0], m[0, 1], m[0, 2], m[0, 3]
+    v0, v1, v2, v3 = m[1, 0], m[1, 1], m[1, 2], m[1, 3]
+    d0, d1, d2, d3 = m[2, 0], m[2, 1], m[2, 2], m[2, 3]
+    behind_m, front_m = target.behind_m, target.front_m
+    width, height = np.float64(target.width), np.float64(target.height)
+    for k in range(x.size):
+        # float64 on purpose: the pass waits for memory, not for arithmetic.
+        px, py, pz = np.float64(x[k]), np.float64(y[k]), np.float64(z[k])
+        u = u0 * px + u1 * py + u2 * pz + u3
+        v = v0 * px + v1 * py + v2 * pz + v3
+        depth = d0 * px + d1 * py + d2 * pz + d3
+        us[k], vs[k], depths[k] = u, v, depth
+        is_in_raster = (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)
+        is_inside[k] = is_in_raster & (depth >= behind_m) & (depth <= front_m)
+
+
 @njit(parallel=True, cache=True)
-def keep_topmost(entries: Entries, winners: Winners, owners: int) -> None:
+def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int) -> None:
     """Let the largest depth win; ties go to the point nearer the centre, then the lower index.
 
     Args:
         entries: one chunk.
-        winners: updated; depths start at minus infinity.
+        winners: (cells,) of `WINNER`, updated; depths start at minus infinity.
         owners: a power of two, how many threads share the cells.
     """
     for owner in prange(owners):
@@ -154,28 +162,30 @@ def keep_topmost(entries: Entries, winners: Winners, owners: int) -> None:
 
 
 @njit(cache=True)
-def _keep_topmost_of(entries: Entries, winners: Winners, owners: int, owner: int) -> None:
+def _keep_topmost_of(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
             if (cell >> _RUN_SHIFT) & (owners - 1) != owner:
                 continue
+            winner = winners[cell]
+            winner.n_points += np.uint32(1)
             depth = entries.depths_m[k]
-            top = winners.depths_m[cell]
-            if depth > top or (depth == top and entries.squares[k] < winners.squares[cell]):
-                winners.depths_m[cell] = depth
-                winners.squares[cell] = entries.squares[k]
-                winners.points[cell] = entries.points[k]
+            is_tie = depth == winner.depth_m
+            if depth > winner.depth_m or (is_tie and entries.squares[k] < winner.square):
+                winner.depth_m = depth
+                winner.square = entries.squares[k]
+                winner.point = entries.points[k]
 
 
 @njit(parallel=True, cache=True)
-def keep_nearest(entries: Entries, winners: Winners, owners: int) -> None:
+def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int) -> None:
     """Let the point nearest the centre of the cell win; ties go to the lower index.
 
     Args:
         entries: one chunk.
-        winners: updated; squares start at infinity.
+        winners: (cells,) of `WINNER`, updated; squares start at infinity.
         owners: a power of two, how many threads share the cells.
     """
     for owner in prange(owners):
@@ -183,38 +193,59 @@ def keep_nearest(entries: Entries, winners: Winners, owners: int) -> None:
 
 
 @njit(cache=True)
-def _keep_nearest_of(entries: Entries, winners: Winners, owners: int, owner: int) -> None:
+def _keep_nearest_of(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
             if (cell >> _RUN_SHIFT) & (owners - 1) != owner:
                 continue
-            if entries.squares[k] < winners.squares[cell]:
-                winners.depths_m[cell] = entries.depths_m[k]
-                winners.squares[cell] = entries.squares[k]
-                winners.points[cell] = entries.points[k]
+            winner = winners[cell]
+            winner.n_points += np.uint32(1)
+            if entries.squares[k] < winner.square:
+                winner.depth_m = entries.depths_m[k]
+                winner.square = entries.squares[k]
+                winner.point = entries.points[k]
 
 
 @njit(parallel=True, cache=True)
-def add_moments(entries: Entries, moments: Moments, owners: int) -> None:
-    """Count the points of each cell and sum their depths and squared depths."""
+def count_points(entries: Entries, n_points: NDArray[np.uint32], owners: int) -> None:
+    """Count the points of each cell."""
+    for owner in prange(owners):
+        _count_points_of(entries, n_points, owners, owner)
+
+
+@njit(cache=True)
+def _count_points_of(
+    entries: Entries, n_points: NDArray[np.uint32], owners: int, owner: int
+) -> None:
+    for block in range(entries.n_inside.size):
+        first = block * BLOCK
+        for k in range(first, first + entries.n_inside[block]):
+            cell = entries.cells[k]
+            if (cell >> _RUN_SHIFT) & (owners - 1) == owner:
+                n_points[cell] += np.uint32(1)
+
+
+@njit(parallel=True, cache=True)
+def add_moments(entries: Entries, moments: NDArray[np.float64], owners: int) -> None:
+    """Sum depths and squared depths of each cell into `moments` (cells, 2)."""
     for owner in prange(owners):
         _add_moments_of(entries, moments, owners, owner)
 
 
 @njit(cache=True)
-def _add_moments_of(entries: Entries, moments: Moments, owners: int, owner: int) -> None:
+def _add_moments_of(
+    entries: Entries, moments: NDArray[np.float64], owners: int, owner: int
+) -> None:
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
-            if (cell >> _RUN_SHIFT) & (owners - 1) != owner:
-                continue
-            depth = np.float64(entries.depths_m[k])
-            moments.n_points[cell] += np.uint32(1)
-            moments.sum_m[cell] += depth
-            moments.sum_m2[cell] += depth * depth
+            if (cell >> _RUN_SHIFT) & (owners - 1) == owner:
+                depth = np.float64(entries.depths_m[k])
+                moments[cell, 0] += depth
+                moments[cell, 1] += depth * depth
 
 
 @njit(parallel=True, cache=True)
@@ -255,15 +286,16 @@ def _sort_into_cells_of(
 def median_depths(
     ends: NDArray[np.int64], sorted_m: NDArray[np.float32], layer_m: float
 ) -> NDArray[np.float32]:
-    """Median depth of each cell that never lies between two layers.
+    """Median depth of each cell's best supported layer.
 
-    With an even number of depths the two middle ones are averaged if they lie within `layer_m`;
-    otherwise the one nearer the viewer counts, because a mean of two layers is on neither.
+    The depths of a cell are split into layers where neighbours in depth lie more than `layer_m`
+    apart; the layer with the most points counts, among equals the one nearest the viewer. So no
+    depth lies between two surfaces, and a stray point does not matter.
 
     Args:
         ends: (cells,) end of each cell's depths in `sorted_m`.
         sorted_m: depths grouped by cell; sorted in place.
-        layer_m: distance beyond which two depths belong to different layers.
+        layer_m: depth step that separates two layers.
 
     Returns:
         (cells,) metres, NaN where the cell is void.
@@ -271,16 +303,27 @@ def median_depths(
     medians_m = np.empty(ends.size, dtype=np.float32)
     for cell in prange(ends.size):
         begin = np.int64(0) if cell == 0 else ends[cell - 1]
-        count = ends[cell] - begin
-        if count == 0:
+        if begin == ends[cell]:
             medians_m[cell] = np.nan
-            continue
-        depths = sorted_m[begin : ends[cell]]
-        depths.sort()
-        upper = depths[count // 2]
-        lower = depths[(count - 1) // 2]
-        medians_m[cell] = np.float32(0.5) * (lower + upper) if upper - lower <= layer_m else upper
+        else:
+            depths = sorted_m[begin : ends[cell]]
+            depths.sort()
+            medians_m[cell] = _layer_median(depths, layer_m)
     return medians_m
+
+
+@njit(cache=True)
+def _layer_median(depths: NDArray[np.float32], layer_m: float) -> float:
+    best_size, best_first, first = 0, 0, 0
+    for k in range(1, depths.size + 1):
+        if k == depths.size or depths[k] - depths[k - 1] > layer_m:
+            # At least as large: depths ascend, the later layer is nearer to the viewer.
+            if k - first >= best_size:
+                best_size, best_first = k - first, first
+            first = k
+    lower = depths[best_first + (best_size - 1) // 2]
+    upper = depths[best_first + best_size // 2]
+    return float(0.5 * (lower + upper))
 
 
 @njit(parallel=True, cache=True)
@@ -328,59 +371,3 @@ def _add_values_of(
             for channel in range(channels):
                 sums[cell, channel] += values[entries.points[k], channel]
             sums[cell, channels] += 1
-
-
-@njit(parallel=True, cache=True)
-def nearest_within(
-    is_measured: NDArray[np.bool_], offsets: NDArray[np.int64], reach: int
-) -> NDArray[np.int32]:
-    """Flat index of the measured cell nearest to each cell, -1 without one within the disc.
-
-    Args:
-        is_measured: (rows, cols), framed by `reach` cells whose own result stays -1.
-        offsets: (k, 2) rows and columns of a disc without its centre, nearest first.
-        reach: largest offset.
-
-    Returns:
-        (rows, cols); a measured cell is its own nearest.
-    """
-    rows, columns = is_measured.shape
-    nearest = np.full((rows, columns), -1, dtype=np.int32)
-    for row in prange(reach, rows - reach):
-        for column in range(reach, columns - reach):
-            if is_measured[row, column]:
-                nearest[row, column] = row * columns + column
-                continue
-            for k in range(offsets.shape[0]):
-                r, c = row + offsets[k, 0], column + offsets[k, 1]
-                if is_measured[r, c]:
-                    nearest[row, column] = r * columns + c
-                    break
-    return nearest
-
-
-@njit(parallel=True, cache=True)
-def is_narrow_gap(
-    is_measured: NDArray[np.bool_], nearest: NDArray[np.int32], offsets: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Whether a cell is void and no disc that covers it fits into the void around it.
-
-    Args:
-        is_measured: (rows, cols), framed by twice the disc's radius.
-        nearest: (rows, cols) of `nearest_within` the same disc; -1 where a disc fits.
-        offsets: (k, 2) rows and columns of the disc without its centre.
-    """
-    rows, columns = is_measured.shape
-    reach = 2 * np.abs(offsets).max()
-    is_narrow = np.zeros((rows, columns), dtype=np.bool_)
-    for row in prange(reach, rows - reach):
-        for column in range(reach, columns - reach):
-            if is_measured[row, column] or nearest[row, column] < 0:
-                continue
-            fits = False
-            for k in range(offsets.shape[0]):
-                if nearest[row + offsets[k, 0], column + offsets[k, 1]] < 0:
-                    fits = True
-                    break
-            is_narrow[row, column] = not fits
-    return is_narrow

@@ -13,9 +13,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry import raster_gap_kernels as gaps
 from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.frames import WallFrame
-from orthoflow.geometry.raster_kernels import Entries, Moments, Target, Winners
+from orthoflow.geometry.raster_kernels import WINNER, Entries, Target
 
 # 2^19 points: the entries of a chunk (8 MB) stay in the processor's cache between the passes.
 _CHUNK: Final = 1 << 19
@@ -58,21 +59,6 @@ class Slab:
         return self.frame.width * self.frame.height
 
 
-@dataclass(frozen=True, kw_only=True)
-class CellStatistics:
-    """What all points of a cell say together, flat.
-
-    Attributes:
-        count: uint32.
-        mean_m: float32 metres, NaN where void.
-        sigma_m: float32 metres, sample standard deviation, NaN with fewer than two points.
-    """
-
-    count: NDArray[np.uint32]
-    mean_m: NDArray[np.float32]
-    sigma_m: NDArray[np.float32]
-
-
 def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[np.float64]:
     """Transform (3, 4) from offsets of a cloud in metres to (column, row, depth in metres).
 
@@ -107,10 +93,13 @@ def entries_inside(points: OffsetPoints, slab: Slab) -> Iterator[Entries]:
         yield entries
 
 
-def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> Winners:
+def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> NDArray[np.void]:
     """The point nearest to the viewer in each cell: the rule of skarlatos2012.
 
     Ties go to the point nearer the centre of its cell, then to the lower index.
+
+    Returns:
+        (cells,) of `raster_kernels.WINNER`; `point` is `NO_POINT` where the cell is void.
     """
     winners = empty_winners(slab.n_cells)
     owners = owners_among(threads)
@@ -119,38 +108,33 @@ def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> Winners
     return winners
 
 
-def empty_winners(n_cells: int) -> Winners:
+def empty_winners(n_cells: int) -> NDArray[np.void]:
     """Give cells that nobody has won yet."""
-    return Winners(
-        depths_m=np.full(n_cells, -np.inf, dtype=np.float32),
-        squares=np.full(n_cells, np.inf, dtype=np.float32),
-        points=np.full(n_cells, kernels.NO_POINT, dtype=np.uint32),
-    )
+    nobody = np.array((-np.inf, np.inf, kernels.NO_POINT, 0), dtype=WINNER)
+    return np.full(n_cells, nobody, dtype=WINNER)
 
 
-def empty_moments(n_cells: int) -> Moments:
-    """Give sums over no points."""
-    return Moments(
-        n_points=np.zeros(n_cells, dtype=np.uint32),
-        sum_m=np.zeros(n_cells),
-        sum_m2=np.zeros(n_cells),
-    )
+def spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Sample standard deviation of the depths in each cell.
 
+    Args:
+        n_points: (cells,).
+        moments: (cells, 2) sums of depths and squared depths; used up.
 
-def statistics_of(moments: Moments) -> CellStatistics:
-    """Mean and spread of each cell; the moments' arrays are used up."""
-    count, mean, squares = moments.n_points, moments.sum_m, moments.sum_m2
+    Returns:
+        (cells,) metres, NaN with fewer than two points.
+    """
+    mean, squares = moments.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        np.divide(mean, count, out=mean)
-        squares -= mean * mean * count
+        np.divide(mean, n_points, out=mean)
+        squares -= mean * mean * n_points
         np.maximum(squares, 0.0, out=squares)
-        # Unsigned: 0 - 1 would be four thousand million points.
-        np.divide(squares, count - 1.0, out=squares)
+        # 1.0, not 1: unsigned, 0 - 1 would be four thousand million points.
+        np.divide(squares, n_points - 1.0, out=squares)
         np.sqrt(squares, out=squares)
-    squares[count < 2] = np.nan
-    return CellStatistics(
-        count=count, mean_m=mean.astype(np.float32), sigma_m=squares.astype(np.float32)
-    )
+    squares[n_points < 2] = np.nan
+    sigma_m: NDArray[np.float32] = squares.astype(np.float32)
+    return sigma_m
 
 
 def disc_offsets(radius_cells: int) -> NDArray[np.int64]:
@@ -182,8 +166,8 @@ def lenders_in_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArra
     offsets = disc_offsets(radius_cells)
     frame = 2 * radius_cells
     padded: NDArray[np.bool_] = np.pad(is_measured, frame)
-    nearest = kernels.nearest_within(padded, offsets, radius_cells)
-    void = np.flatnonzero(kernels.is_narrow_gap(padded, nearest, offsets))
+    nearest = gaps.nearest_within(padded, offsets, radius_cells)
+    void = np.flatnonzero(gaps.is_narrow_gap(padded, nearest, offsets))
     width, padded_width = is_measured.shape[1], padded.shape[1]
 
     def unpadded(cells: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -76,7 +76,7 @@ class PointcloudDirect(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Project the cloud onto each wall, then fill its gaps."""
-        inputs.cloud.require_points(1)
+        inputs.cloud.require_points(3)
         colours = _colours(inputs.cloud, ctx)
         layers: list[Layer] = []
         seconds = np.zeros(2)
@@ -120,14 +120,14 @@ def _project(
     points = OffsetPoints(origin=cloud.origin, x=cloud.x, y=cloud.y, z=cloud.z)
     slab = Slab(frame=wall.frame, front_m=walls.buffer_front_m, behind_m=walls.buffer_behind_m)
     winners = topmost_points(points, slab, threads=threads)
-    has_point = winners.points != NO_POINT
+    has_point = winners["point"] != NO_POINT
     rgb = np.zeros((slab.n_cells, 3), dtype=np.uint8)
-    rgb[has_point] = colours[winners.points[has_point]]
+    rgb[has_point] = colours[winners["point"][has_point]]
     shape = wall.frame.shape
     return _Projection(
         rgb=rgb.reshape(*shape, 3),
         is_void=~has_point.reshape(shape),
-        distance_cells=np.sqrt(winners.squares).reshape(shape),
+        distance_cells=np.sqrt(winners["square"]).reshape(shape),
     )
 
 

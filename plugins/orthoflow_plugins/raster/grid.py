@@ -22,8 +22,10 @@ from orthoflow_plugins.raster.surfaces import CellSurface, Surface, SurfaceRule,
 
 # Rec. 601 luma on the sRGB values as they are: the grey of cv2.cvtColor.
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
-# What the passes hold per cell at their peak, outputs included; measured with a 5 megapixel wall.
-_BYTES_PER_CELL: Final = 110
+# Bytes per cell: what a finished wall keeps, and what the passes over one wall hold on top.
+_BYTES_KEPT: Final = 25
+_BYTES_WORKING: Final = 90
+_MEMORY_SHARE: Final = 0.75
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,14 +64,14 @@ class RasterGrid(Method):
         )
         surface: Surface = Field(
             default="median",
-            description="Depth of a cell: median of its points; the point nearest its centre "
-            "(markiewicz2015); the topmost point (skarlatos2012); or the mean.",
+            description="Depth of a cell: median of its best supported layer; the point nearest "
+            "its centre (markiewicz2015); the topmost point (skarlatos2012); or the mean of all.",
         )
         layer_m: float = Field(
             default=0.02,
             gt=0,
-            description="A depth step beyond which two points of a cell are two surfaces, which "
-            "the median never averages.",
+            description="Depth step within a cell that separates two layers, of which the median "
+            "takes the one with more points.",
         )
         recover_gap_cells: int = Field(
             default=2,
@@ -160,15 +162,16 @@ def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
 
 
 def _require_memory(frames: list[WallFrame]) -> None:
-    n_cells = sum(frame.width * frame.height for frame in frames)
+    n_cells = [frame.width * frame.height for frame in frames]
+    needed = _BYTES_KEPT * sum(n_cells) + _BYTES_WORKING * max(n_cells)
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    limit = min(memory // (2 * _BYTES_PER_CELL), np.iinfo(np.int32).max)
-    if n_cells > limit:
-        largest = max(frames, key=lambda frame: frame.width * frame.height)
+    # Cells are numbered with 32 bits.
+    if needed > _MEMORY_SHARE * memory or max(n_cells) > np.iinfo(np.int32).max:
+        largest = frames[int(np.argmax(n_cells))]
         raise MethodError(
-            f"cells of gsd_m = {largest.gsd_m:g} m give {n_cells:.3g} cells ({largest.width} x "
-            f"{largest.height} on the largest wall), but at most {limit:.3g} fit into this "
-            "machine's memory: raise gsd_m, or lower n_walls_max"
+            f"cells of gsd_m = {largest.gsd_m:g} m make {sum(n_cells):.3g} cells ({largest.width} "
+            f"x {largest.height} on the largest wall), which need {needed / 2**30:.3g} GiB where "
+            f"this machine has {memory / 2**30:.3g} GiB: raise gsd_m, or lower n_walls_max"
         )
 
 

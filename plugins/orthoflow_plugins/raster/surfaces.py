@@ -13,11 +13,10 @@ from orthoflow.geometry.raster_kernels import NO_POINT
 from orthoflow.geometry.rastering import (
     OffsetPoints,
     Slab,
-    empty_moments,
     empty_winners,
     entries_inside,
     owners_among,
-    statistics_of,
+    spread_m,
 )
 from orthoflow.products import PointCloud
 
@@ -30,7 +29,7 @@ class SurfaceRule:
 
     Attributes:
         surface: name of the rule.
-        layer_m: depth step that separates two surfaces within a cell; for `median`.
+        layer_m: depth step that separates two layers within a cell; for `median`.
         threads: how many threads work.
     """
 
@@ -72,21 +71,19 @@ def surface_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
 
 def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """One pass: the winning point gives depth, intensity and colour."""
-    winners, moments = empty_winners(slab.n_cells), empty_moments(slab.n_cells)
+    winners, moments = empty_winners(slab.n_cells), np.zeros((slab.n_cells, 2))
     keep = kernels.keep_topmost if rule.surface == "topmost" else kernels.keep_nearest
     owners = owners_among(rule.threads)
     for entries in entries_inside(offset_points(cloud), slab):
         keep(entries, winners, owners)
         kernels.add_moments(entries, moments, owners)
-    statistics = statistics_of(moments)
-    has_point = winners.points != NO_POINT
-    depth_m = winners.depths_m
-    depth_m[~has_point] = np.nan
-    points = winners.points[has_point]
+    sigma_m = spread_m(winners["n_points"], moments)
+    has_point = winners["point"] != NO_POINT
+    points = winners["point"][has_point]
     return CellSurface(
-        depth_m=depth_m,
-        sigma_m=statistics.sigma_m,
-        count=statistics.count,
+        depth_m=np.where(has_point, winners["depth_m"], np.float32(np.nan)),
+        sigma_m=sigma_m,
+        count=winners["n_points"].copy(),
         intensity=_gathered_intensity(cloud, points, has_point),
         rgb=_gathered_rgb(cloud, points, has_point),
     )
@@ -114,19 +111,22 @@ def _gathered_rgb(
 
 def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """Two or three passes: count, sort if a median is wanted, average what lies on the surface."""
-    moments, owners = empty_moments(slab.n_cells), owners_among(rule.threads)
+    owners = owners_among(rule.threads)
+    count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
     for entries in entries_inside(offset_points(cloud), slab):
+        kernels.count_points(entries, count, owners)
         kernels.add_moments(entries, moments, owners)
-    statistics = statistics_of(moments)
-    depth_m, layer_m = statistics.mean_m, np.inf
+    with np.errstate(invalid="ignore"):
+        depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
+    sigma_m = spread_m(count, moments)
     if rule.surface == "median":
         layer_m = rule.layer_m
-        depth_m = _medians_m(cloud, slab, statistics.count, rule)
+        depth_m = _medians_m(cloud, slab, count, rule)
     intensity, rgb = _averaged_values(cloud, slab, depth_m, layer_m=layer_m, owners=owners)
     return CellSurface(
         depth_m=depth_m,
-        sigma_m=statistics.sigma_m,
-        count=statistics.count,
+        sigma_m=sigma_m,
+        count=count,
         intensity=intensity,
         rgb=rgb,
     )

@@ -1,0 +1,107 @@
+"""Small walls whose every cell is known, for the tests of raster, ortho and mosaic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import wall_axes
+from orthoflow.products import Planes, PointCloud
+from orthoflow.sdk import StepContext
+
+UP = np.array([0.0, 0.0, 1.0])
+SURVEY = np.array([634512.347, 486215.781, 112.193])
+
+
+def context(folder: Path, *, cores: int = 2) -> StepContext:
+    return StepContext(rng=np.random.default_rng(7), cores=cores, scratch=folder)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownWall:
+    """A wall of `shape` cells; points are given by cell position and depth."""
+
+    normal: NDArray[np.float64]
+    top_left: NDArray[np.float64]
+    gsd_m: float
+    shape: tuple[int, int]
+
+    @property
+    def axes(self) -> NDArray[np.float64]:
+        return wall_axes(self.normal, UP)
+
+    def world(
+        self, columns: NDArray[np.float64], rows: NDArray[np.float64], depths_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        u, v = self.axes
+        in_plane = self.gsd_m * (np.outer(columns, u) + np.outer(rows, v))
+        return self.top_left + in_plane + np.outer(depths_m, self.normal)
+
+    def planes(self, *, name: str = "wall 0") -> Planes:
+        rows, columns = self.shape
+        outline = np.array([[0, 0], [0, rows], [columns, rows], [columns, 0]], dtype=np.float64)
+        return Planes(
+            normal=self.normal[np.newaxis],
+            offset=np.array([self.normal @ self.top_left]),
+            corners=self.world(outline[:, 0], outline[:, 1], np.zeros(4))[np.newaxis],
+            covariance=np.zeros((1, 4, 4)),
+            n_points=np.array([1]),
+            rms_m=np.zeros(1),
+            up=UP,
+            names=(name,),
+        )
+
+
+def leaning_wall(*, shape: tuple[int, int] = (30, 40), at_survey: bool = True) -> KnownWall:
+    """A wall turned by 102 deg and leaning by 0.8 deg, as the one of markiewicz2015."""
+    omega, phi = np.radians([102.0, 0.8])
+    normal = np.array([np.cos(phi) * np.cos(omega), np.cos(phi) * np.sin(omega), np.sin(phi)])
+    corner = np.array([1.0, 2.0, 3.0]) + (SURVEY if at_survey else 0.0)
+    return KnownWall(normal=normal, top_left=corner, gsd_m=0.01, shape=shape)
+
+
+def upright_wall(*, shape: tuple[int, int] = (30, 40), gsd_m: float = 0.125) -> KnownWall:
+    """A wall seen along +y whose cell borders are exact in binary."""
+    return KnownWall(
+        normal=np.array([0.0, -1.0, 0.0]), top_left=np.zeros(3), gsd_m=gsd_m, shape=shape
+    )
+
+
+def cloud_of(
+    points_world: NDArray[np.float64],
+    *,
+    rgb: NDArray[np.uint8] | None = None,
+    intensity: NDArray[np.float32] | None = None,
+) -> PointCloud:
+    origin = np.round(points_world.mean(axis=0))
+    x, y, z = (points_world - origin).astype(np.float32).T
+    return PointCloud(
+        origin=origin,
+        x=np.ascontiguousarray(x),
+        y=np.ascontiguousarray(y),
+        z=np.ascontiguousarray(z),
+        up=UP,
+        rgb=rgb,
+        intensity=intensity,
+    )
+
+
+def cell_centres(shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Columns and rows of all cell centres, flat, row by row."""
+    rows, columns = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return columns.ravel(), rows.ravel()
+
+
+def relief_m(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Steps of +8 cm and -10 cm every ten columns."""
+    return np.choose((columns // 10).astype(int) % 3, [0.0, 0.08, -0.10])
+
+
+def checker(columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Colours (n, 3): every cell differs from its neighbours; black occurs."""
+    odd = (columns.astype(int) + rows.astype(int)) % 2
+    red, green = columns.astype(int) * 3 % 251, rows.astype(int) * 5 % 251
+    return np.column_stack([odd * red, odd * green, odd * 90]).astype(np.uint8)

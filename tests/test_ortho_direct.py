@@ -1,0 +1,223 @@
+"""`ortho.pointcloud-direct`: which point paints a cell, which gaps are filled, and from what."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.ortho.gaps import fillable_gaps, inpainted, void_counts
+from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+
+from orthoflow.errors import MethodError, ProductError
+from orthoflow.geometry import frame_over
+from orthoflow.products import Layer, LayerMask, PointCloud, Wall, Walls
+from tests import raster_scenes as scenes
+
+
+def bare_walls(known: scenes.KnownWall, *, buffer_m: float = 0.15) -> Walls:
+    frame = frame_over(known.planes().corners[0], known.normal, gsd_m=known.gsd_m)
+    wall = Wall(
+        frame=frame,
+        plane_index=0,
+        name="wall 0",
+        depth_m=np.full(frame.shape, np.nan, dtype=np.float32),
+        sigma_m=np.full(frame.shape, np.nan, dtype=np.float32),
+        count=np.zeros(frame.shape, dtype=np.uint32),
+        mask=np.zeros(frame.shape, dtype=np.uint8),
+    )
+    return Walls(
+        walls=(wall,),
+        up=scenes.UP,
+        intensity_source="none",
+        buffer_front_m=buffer_m,
+        buffer_behind_m=buffer_m,
+    )
+
+
+def painted(cloud: PointCloud, walls: Walls, folder: Path, **params: object) -> Layer:
+    inputs = PointcloudDirect.In(walls=walls, cloud=cloud)
+    chosen = PointcloudDirect.Params.model_validate(params)
+    layers = PointcloudDirect().run(inputs, chosen, scenes.context(folder)).layers
+    assert layers.names == ("wall 0",)
+    return layers.layers[0]
+
+
+@pytest.mark.parametrize("at_survey", [False, True], ids=["local", "survey"])
+def test_a_painted_relief_comes_back_cell_by_cell(tmp_path: Path, at_survey: bool) -> None:
+    known = scenes.leaning_wall(at_survey=at_survey)
+    columns, rows = scenes.cell_centres(known.shape)
+    rgb = scenes.checker(columns, rows)
+    behind = known.world(columns, rows, scenes.relief_m(columns) - 0.03)
+    front = known.world(columns + 0.4, rows - 0.4, scenes.relief_m(columns))
+    hidden = np.full_like(rgb, 200)
+    cloud = scenes.cloud_of(np.vstack([behind, front]), rgb=np.vstack([hidden, rgb]))
+    layer = painted(cloud, bare_walls(known), tmp_path)
+    np.testing.assert_array_equal(layer.rgb.reshape(-1, 3), rgb)
+    assert (layer.mask == LayerMask.PAINTED).all()
+    assert layer.filled is not None
+    assert not layer.filled.any()
+    # Distance to the centre of 0.4 * sqrt(2) cells: quality 1 - 0.4.
+    np.testing.assert_allclose(layer.quality, 0.6, atol=1e-4)
+
+
+def test_a_point_in_front_of_the_buffer_never_shows(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    columns, rows = scenes.cell_centres(known.shape)
+    wall = known.world(columns, rows, np.zeros(columns.size))
+    obstacle = known.world(columns, rows, np.full(columns.size, 0.1501))
+    colours = np.repeat(np.array([[10, 20, 30], [250, 0, 0]], dtype=np.uint8), columns.size, 0)
+    cloud = scenes.cloud_of(np.vstack([wall, obstacle]), rgb=colours)
+    layer = painted(cloud, bare_walls(known), tmp_path)
+    assert np.unique(layer.rgb.reshape(-1, 3), axis=0).tolist() == [[10, 20, 30]]
+
+
+def test_of_points_equally_high_the_one_nearest_the_centre_paints(tmp_path: Path) -> None:
+    known = scenes.upright_wall()
+    columns, rows = scenes.cell_centres(known.shape)
+    flat = np.zeros(columns.size)
+    off_centre = known.world(columns + 0.25, rows, flat)
+    central = known.world(columns + 0.125, rows, flat)
+    colours = np.repeat(np.array([[9, 9, 9], [70, 80, 90]], dtype=np.uint8), columns.size, 0)
+    cloud = scenes.cloud_of(np.vstack([off_centre, central]), rgb=colours)
+    layer = painted(cloud, bare_walls(known), tmp_path)
+    assert np.unique(layer.rgb.reshape(-1, 3), axis=0).tolist() == [[70, 80, 90]]
+
+
+def holey_wall(is_void: NDArray[np.bool_], *, black: bool = False) -> tuple[PointCloud, Walls]:
+    known = scenes.leaning_wall(shape=(is_void.shape[0], is_void.shape[1]))
+    columns, rows = scenes.cell_centres(known.shape)
+    rgb = scenes.checker(columns, rows) // 2 + 100
+    if black:
+        rgb[:] = 0
+    kept = ~is_void.ravel()
+    points = known.world(columns, rows, np.zeros(columns.size))[kept]
+    return scenes.cloud_of(points, rgb=rgb[kept]), bare_walls(known)
+
+
+def brute_force_counts(is_void: NDArray[np.bool_], window: int) -> NDArray[np.int64]:
+    reach = window // 2
+    counts = np.zeros(is_void.shape, dtype=np.int64)
+    for row, column in np.ndindex(is_void.shape):
+        for r in range(row - reach, row + reach + 1):
+            for c in range(column - reach, column + reach + 1):
+                outside = not (0 <= r < is_void.shape[0] and 0 <= c < is_void.shape[1])
+                counts[row, column] += outside or bool(is_void[r, c])
+    return counts
+
+
+@pytest.mark.parametrize("window", [3, 5, 7])
+def test_void_counts_include_the_centre_and_what_lies_outside(window: int) -> None:
+    is_void = np.random.default_rng(window).random((19, 23)) < 0.6
+    np.testing.assert_array_equal(void_counts(is_void, window), brute_force_counts(is_void, window))
+    assert void_counts(np.zeros((20, 20), dtype=bool), window)[0, 0] == (
+        window**2 - (window // 2 + 1) ** 2
+    )
+
+
+@pytest.mark.parametrize(
+    "limits", [(7, 23, 46), (9, 25, 49), (4, 25, 49), (9, 12, 49), (9, 25, 20)]
+)
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.93])
+def test_gaps_are_filled_where_all_three_limits_hold(
+    limits: tuple[int, int, int], share: float
+) -> None:
+    is_void = np.random.default_rng(8).random((31, 29)) < share
+    expected = is_void.copy()
+    for window, limit in zip((3, 5, 7), limits, strict=True):
+        expected &= brute_force_counts(is_void, window) <= limit
+    np.testing.assert_array_equal(fillable_gaps(is_void, limits), expected)
+
+
+@pytest.mark.parametrize("method", ["telea", "navier-stokes"])
+def test_only_gaps_are_filled_and_they_are_marked(tmp_path: Path, method: str) -> None:
+    is_void = np.random.default_rng(4).random((40, 50)) < 0.25
+    is_void[12:30, 15:35] = True
+    cloud, walls = holey_wall(is_void)
+    before = painted(cloud, walls, tmp_path, inpaint="none")
+    layer = painted(cloud, walls, tmp_path, inpaint=method)
+    expected = fillable_gaps(is_void, (7, 23, 46))
+    assert expected.any()
+    assert layer.filled is not None
+    np.testing.assert_array_equal(layer.filled > 0, expected)
+    np.testing.assert_array_equal(layer.mask == LayerMask.PAINTED, ~is_void | expected)
+    np.testing.assert_array_equal(layer.mask == LayerMask.NO_SURFACE, is_void & ~expected)
+    np.testing.assert_array_equal(layer.rgb[~is_void], before.rgb[~is_void])
+    assert not layer.rgb[layer.mask != LayerMask.PAINTED].any()
+    assert (layer.quality[expected] < layer.quality[~is_void].min()).all()
+    assert not layer.quality[layer.mask != LayerMask.PAINTED].any()
+
+
+@pytest.mark.parametrize("method", ["telea", "navier-stokes"])
+def test_no_black_of_a_large_void_creeps_into_the_gaps_beside_it(
+    tmp_path: Path, method: str
+) -> None:
+    is_void = np.random.default_rng(4).random((40, 50)) < 0.25
+    is_void[12:30, 15:35] = True
+    cloud, walls = holey_wall(is_void)
+    assert cloud.rgb is not None
+    even = dataclasses.replace(cloud, rgb=np.full_like(cloud.rgb, 180))
+    layer = painted(even, walls, tmp_path, inpaint=method)
+    shown = layer.rgb[layer.mask == LayerMask.PAINTED].astype(int)
+    # 2 grey levels: Telea's own rounding on an even grey; black would pull by 50 and more.
+    assert np.abs(shown - 180).max() <= 2
+
+
+def test_a_black_wall_is_painted_and_not_void(tmp_path: Path) -> None:
+    is_void = np.zeros((20, 25), dtype=bool)
+    is_void[5:15, 5:15] = True
+    cloud, walls = holey_wall(is_void, black=True)
+    layer = painted(cloud, walls, tmp_path, inpaint="none")
+    np.testing.assert_array_equal(layer.mask == LayerMask.PAINTED, ~is_void)
+
+
+def test_inpainting_what_is_void_everywhere_paints_nothing() -> None:
+    is_void = np.ones((5, 5), dtype=bool)
+    rgb = np.full((5, 5, 3), 9, dtype=np.uint8)
+    filled = inpainted(rgb, is_void, is_void, method="telea", radius_px=3.0)
+    assert not filled.any()
+
+
+def test_without_colours_the_intensity_is_painted_as_grey(tmp_path: Path) -> None:
+    cloud, walls = holey_wall(np.zeros((10, 12), dtype=bool))
+    grey = dataclasses.replace(
+        cloud, rgb=None, intensity=np.linspace(0, 1, len(cloud), dtype=np.float32)
+    )
+    ctx = scenes.context(tmp_path)
+    inputs = PointcloudDirect.In(walls=walls, cloud=grey)
+    layer = PointcloudDirect().run(inputs, PointcloudDirect.Params(), ctx).layers.layers[0]
+    assert grey.intensity is not None
+    expected = np.rint(255 * grey.intensity).astype(np.uint8)
+    for channel in range(3):
+        np.testing.assert_array_equal(layer.rgb[..., channel].ravel(), expected)
+    assert ctx.warnings == ["the cloud has no colours: its intensity is painted as grey"]
+
+
+def test_a_cloud_that_cannot_paint_is_refused(tmp_path: Path) -> None:
+    cloud, walls = holey_wall(np.zeros((10, 12), dtype=bool))
+    with pytest.raises(MethodError, match="neither colours nor intensity"):
+        painted(dataclasses.replace(cloud, rgb=None), walls, tmp_path)
+    with pytest.raises(MethodError, match="no point of the cloud lies within the buffer"):
+        painted(dataclasses.replace(cloud, origin=cloud.origin + 9.0), walls, tmp_path)
+    empty = dataclasses.replace(cloud, x=cloud.x[:0], y=cloud.y[:0], z=cloud.z[:0], rgb=None)
+    with pytest.raises(ProductError, match="has 0 points"):
+        painted(empty, walls, tmp_path)
+
+
+def test_times_and_shares_are_reported_apart(tmp_path: Path) -> None:
+    is_void = np.zeros((10, 20), dtype=bool)
+    is_void[4, 4] = True
+    is_void[:, 10:] = True
+    cloud, walls = holey_wall(is_void)
+    ctx = scenes.context(tmp_path)
+    inputs = PointcloudDirect.In(walls=walls, cloud=cloud)
+    PointcloudDirect().run(inputs, PointcloudDirect.Params(void_limits=(1, 25, 49)), ctx)
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    assert metrics["painted_share"] == pytest.approx(99 / 200)
+    assert metrics["filled_share"] == pytest.approx(1 / 200)
+    assert metrics["void_share"] == pytest.approx(100 / 200)
+    assert metrics["projection_s"] > 0.0
+    assert metrics["filling_s"] > 0.0
+    assert [figure.name for figure in ctx.figures] == ["filling"]

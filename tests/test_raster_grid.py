@@ -1,0 +1,345 @@
+"""`raster.grid`: depth, spread, intensity and colour of walls that are known to the cell."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.raster.grid import RasterGrid, scan_step_m
+
+from orthoflow.errors import MethodError, OrthoflowError
+from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
+from tests import raster_scenes as scenes
+
+SURFACES = ["median", "nearest", "topmost", "mean"]
+
+
+def rastered(
+    cloud: PointCloud, planes: Planes, folder: Path, *, cores: int = 2, **params: object
+) -> Walls:
+    ctx = scenes.context(folder, cores=cores)
+    inputs = RasterGrid.In(cloud=cloud, planes=planes)
+    return RasterGrid().run(inputs, RasterGrid.Params.model_validate(params), ctx).walls
+
+
+def one_point_per_cell(
+    wall: scenes.KnownWall, *, moved_cells: float = 0.0
+) -> tuple[PointCloud, NDArray[np.float64]]:
+    columns, rows = scenes.cell_centres(wall.shape)
+    depths_m = scenes.relief_m(columns)
+    rng = np.random.default_rng(3)
+    shift = moved_cells * rng.uniform(-1, 1, (2, columns.size))
+    points = wall.world(columns + shift[0], rows + shift[1], depths_m)
+    intensity = np.linspace(0.1, 0.9, columns.size, dtype=np.float32)
+    rgb = scenes.checker(columns, rows)
+    return scenes.cloud_of(points, rgb=rgb, intensity=intensity), depths_m.reshape(wall.shape)
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("at_survey", [False, True], ids=["local", "survey"])
+def test_each_cell_gets_the_depth_intensity_and_colour_of_its_point(
+    tmp_path: Path, surface: str, at_survey: bool
+) -> None:
+    known = scenes.leaning_wall(at_survey=at_survey)
+    cloud, depths_m = one_point_per_cell(known, moved_cells=0.45)
+    walls = rastered(cloud, known.planes(), tmp_path, gsd_m=known.gsd_m, surface=surface)
+    wall = walls.walls[0]
+    assert wall.frame.shape == known.shape
+    # 0.05 mm: what a survey may lose to arithmetic; in fact float32 offsets of a metre lose less.
+    np.testing.assert_allclose(wall.depth_m, depths_m, atol=5e-5)
+    columns, rows = scenes.cell_centres(known.shape)
+    assert wall.rgb is not None
+    assert wall.intensity is not None
+    assert cloud.intensity is not None
+    np.testing.assert_array_equal(wall.rgb.reshape(-1, 3), scenes.checker(columns, rows))
+    np.testing.assert_array_equal(wall.intensity.ravel(), cloud.intensity)
+    assert (wall.count == 1).all()
+    assert (wall.mask == SurfaceMask.MEASURED).all()
+    assert np.isnan(wall.sigma_m).all()
+    assert walls.intensity_source == "laser"
+
+
+def test_a_cell_of_the_frame_leads_back_to_its_point(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, _ = one_point_per_cell(known)
+    wall = rastered(cloud, known.planes(), tmp_path, gsd_m=known.gsd_m).walls[0]
+    columns, rows = scenes.cell_centres(known.shape)
+    world = wall.frame.world_from_wall(
+        np.column_stack([columns, rows]), wall.depth_m.ravel().astype(np.float64)
+    )
+    np.testing.assert_allclose(world, cloud.points_world(), atol=1e-6)
+
+
+def cell_with(depths_m: list[float], folder: Path, **params: object) -> Wall:
+    """The wall of a cloud whose points all lie in cell (4, 3), the first nearest to its centre."""
+    known = scenes.upright_wall()
+    shift = 0.01 * np.arange(len(depths_m))
+    points = known.world(3.5 + shift, 4.5 + shift, np.array(depths_m))
+    grey = np.linspace(0.1, 0.5, len(depths_m), dtype=np.float32)
+    cloud = scenes.cloud_of(points, intensity=grey)
+    params = {"recover_gap_cells": 0, "gsd_m": known.gsd_m, "buffer_m": 1.0, **params}
+    return rastered(cloud, known.planes(), folder, **params).walls[0]
+
+
+@pytest.mark.parametrize(
+    ("surface", "depth_m"),
+    [("nearest", 0.015), ("topmost", 0.25), ("mean", 0.0754), ("median", 0.012)],
+)
+def test_surfaces_choose_as_they_say(tmp_path: Path, surface: str, depth_m: float) -> None:
+    # Median: the layer at 1 cm has three points, the one at 25 cm a stray one, the one behind one.
+    wall = cell_with([0.015, 0.25, 0.010, 0.012, 0.09], tmp_path, surface=surface)
+    assert wall.depth_m[4, 3] == pytest.approx(depth_m, abs=1e-7)
+    assert wall.count[4, 3] == 5
+    spread = np.std([0.015, 0.25, 0.010, 0.012, 0.09], ddof=1)
+    assert wall.sigma_m[4, 3] == pytest.approx(spread, abs=1e-7)
+    assert np.count_nonzero(wall.mask) == 1
+
+
+def test_a_median_never_lies_between_two_surfaces(tmp_path: Path) -> None:
+    wall = cell_with([0.0, 0.001, 0.08, 0.081], tmp_path, surface="median")
+    assert wall.depth_m[4, 3] == pytest.approx(0.0805, abs=1e-7)
+    assert wall.intensity is not None
+    # Intensity of the two points on that surface only: (0.3667 + 0.5) / 2.
+    assert wall.intensity[4, 3] == pytest.approx(0.43333, abs=1e-5)
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+def test_points_outside_the_buffer_never_show(tmp_path: Path, surface: str) -> None:
+    wall = cell_with(
+        [0.31, 0.05, -0.11], tmp_path, surface=surface, buffer_front_m=0.3, buffer_behind_m=0.1
+    )
+    assert wall.count[4, 3] == 1
+    assert wall.depth_m[4, 3] == pytest.approx(0.05, abs=1e-7)
+
+
+@pytest.mark.parametrize("surface", SURFACES)
+@pytest.mark.parametrize("cores", [1, 2])
+def test_counts_conserve_the_points_and_threads_change_nothing(
+    tmp_path: Path, surface: str, cores: int
+) -> None:
+    known = scenes.leaning_wall(shape=(45, 70))
+    rng = np.random.default_rng(11)
+    n_points = 30_000
+    columns, rows = rng.uniform(-5, 75, n_points), rng.uniform(-5, 50, n_points)
+    depths_m = rng.normal(0.0, 0.1, n_points)
+    rgb = rng.integers(0, 256, (n_points, 3), dtype=np.uint8)
+    intensity = rng.random(n_points, dtype=np.float32)
+    cloud = scenes.cloud_of(known.world(columns, rows, depths_m), rgb=rgb, intensity=intensity)
+    params = {"gsd_m": known.gsd_m, "surface": surface}
+    folder, other = tmp_path / "a", tmp_path / "b"
+    folder.mkdir()
+    other.mkdir()
+    walls = rastered(cloud, known.planes(), folder, cores=cores, **params)
+    inside = (
+        (np.abs(depths_m) <= 0.15) & (columns >= 0) & (columns < 70) & (rows >= 0) & (rows < 45)
+    )
+    assert walls.walls[0].count.sum() == np.count_nonzero(inside)
+    alone = rastered(cloud, known.planes(), other, cores=1, **params).to_payload()
+    for name, array in walls.to_payload().arrays.items():
+        np.testing.assert_array_equal(array, alone.arrays[name], err_msg=name)
+
+
+def test_narrow_gaps_are_recovered_and_windows_stay_void(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, depths_m = one_point_per_cell(known)
+    kept = np.ones(known.shape, dtype=bool)
+    kept[8:22, 12:26] = False
+    kept[5, 7] = kept[25, 33] = False
+    index = np.flatnonzero(kept)
+    assert cloud.rgb is not None
+    assert cloud.intensity is not None
+    thinned = dataclasses.replace(
+        cloud,
+        x=cloud.x[index],
+        y=cloud.y[index],
+        z=cloud.z[index],
+        rgb=cloud.rgb[index],
+        intensity=cloud.intensity[index],
+    )
+    wall = rastered(thinned, known.planes(), tmp_path, gsd_m=known.gsd_m).walls[0]
+    assert wall.rgb is not None
+    assert wall.intensity is not None
+    assert wall.rgb_mask is not None
+    assert wall.mask[5, 7] == wall.mask[25, 33] == SurfaceMask.RECOVERED
+    assert wall.depth_m[5, 7] == pytest.approx(depths_m[5, 7], abs=1e-6)
+    assert wall.intensity[5, 7] == wall.intensity[4, 7]
+    assert wall.count[5, 7] == 0
+    assert np.isnan(wall.sigma_m[5, 7])
+    window = wall.mask[9:21, 13:25]
+    assert (window == SurfaceMask.VOID).all()
+    assert np.isnan(wall.depth_m[9:21, 13:25]).all()
+    assert np.isnan(wall.intensity[9:21, 13:25]).all()
+    np.testing.assert_array_equal(wall.rgb_mask > 0, wall.mask != SurfaceMask.VOID)
+
+
+def test_without_intensity_the_grey_of_the_colours_stands_in(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, _ = one_point_per_cell(known)
+    ctx = scenes.context(tmp_path)
+    inputs = RasterGrid.In(cloud=dataclasses.replace(cloud, intensity=None), planes=known.planes())
+    walls = RasterGrid().run(inputs, RasterGrid.Params(gsd_m=known.gsd_m), ctx).walls
+    assert walls.intensity_source == "luminance"
+    assert any("no laser intensity" in warning for warning in ctx.warnings)
+    assert cloud.rgb is not None
+    expected = cloud.rgb @ np.array([0.299, 0.587, 0.114]) / 255.0
+    intensity = walls.walls[0].intensity
+    assert intensity is not None
+    np.testing.assert_allclose(intensity.ravel(), expected, atol=1e-6)
+
+
+def test_a_cloud_of_bare_points_gives_depth_only(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, _ = one_point_per_cell(known)
+    ctx = scenes.context(tmp_path)
+    bare = dataclasses.replace(cloud, intensity=None, rgb=None)
+    walls = (
+        RasterGrid()
+        .run(
+            RasterGrid.In(cloud=bare, planes=known.planes()),
+            RasterGrid.Params(gsd_m=known.gsd_m),
+            ctx,
+        )
+        .walls
+    )
+    assert walls.intensity_source == "none"
+    assert walls.walls[0].intensity is None
+    assert walls.walls[0].rgb is None
+    assert any("neither intensity nor colour" in warning for warning in ctx.warnings)
+
+
+@pytest.mark.parametrize("step_cells", [0.4, 1.0, 2.0, 5.0])
+def test_the_scan_step_is_read_from_the_counts(step_cells: float) -> None:
+    positions = np.arange(0.0, 400.0, step_cells) + 0.1
+    count, _, _ = np.histogram2d(
+        np.repeat(positions, positions.size),
+        np.tile(positions, positions.size),
+        bins=400,
+        range=[[0, 400], [0, 400]],
+    )
+    # 6 %: blocks at the rim are partly empty.
+    assert scan_step_m(count.astype(np.uint32), gsd_m=0.01) == pytest.approx(
+        0.01 * step_cells, rel=0.06
+    )
+
+
+def test_cells_finer_than_the_scan_are_warned_about(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, _ = one_point_per_cell(known)
+    ctx = scenes.context(tmp_path)
+    inputs = RasterGrid.In(cloud=cloud, planes=known.planes())
+    RasterGrid().run(inputs, RasterGrid.Params(gsd_m=known.gsd_m / 2), ctx)
+    assert any("finer than the scan" in warning for warning in ctx.warnings)
+
+
+def three_planes() -> Planes:
+    """A floor of 20 m2, a wall of 12 m2 and a wall of 0.5 m2, by support."""
+    rectangles = [
+        [[0, 4, 0], [0, 0, 0], [5, 0, 0], [5, 4, 0]],
+        [[0, 4, 3], [0, 4, 0], [4, 4, 0], [4, 4, 3]],
+        [[0, 2, 1], [0, 2, 0], [0.5, 2, 0], [0.5, 2, 1]],
+    ]
+    normals = np.array([[0.0, 0, 1], [0, -1, 0], [0, -1, 0]])
+    corners = np.array(rectangles, dtype=np.float64)
+    return Planes(
+        normal=normals,
+        offset=np.einsum("ki,ki->k", normals, corners[:, 0]),
+        corners=corners,
+        covariance=np.zeros((3, 4, 4)),
+        n_points=np.array([30, 20, 10]),
+        rms_m=np.zeros(3),
+        up=scenes.UP,
+        names=("floor", "wall 0", "wall 1"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("params", "expected"),
+    [
+        ({}, [0, 1]),
+        ({"min_area_m2": 0.1}, [0, 1, 2]),
+        ({"constraint": "vertical"}, [1]),
+        ({"constraint": "horizontal"}, [0]),
+        ({"n_walls_max": 1}, [0]),
+        ({"min_area_m2": 100.0}, [0]),
+    ],
+    ids=str,
+)
+def test_planes_become_walls_by_direction_area_and_rank(
+    tmp_path: Path, params: dict[str, object], expected: list[int]
+) -> None:
+    planes = three_planes()
+    cloud = scenes.cloud_of(planes.corners.reshape(-1, 3))
+    walls = rastered(cloud, planes, tmp_path, gsd_m=0.1, **params)
+    assert [wall.plane_index for wall in walls.walls] == expected
+    assert [wall.name for wall in walls.walls] == [planes.names[k] for k in expected]
+
+
+def test_a_margin_widens_the_frame_on_all_sides(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, _ = one_point_per_cell(known)
+    plain = rastered(cloud, known.planes(), tmp_path, gsd_m=0.01)
+    folder = tmp_path / "wide"
+    folder.mkdir()
+    wide = rastered(cloud, known.planes(), folder, gsd_m=0.01, margin_m=0.02)
+    rows, columns = plain.walls[0].frame.shape
+    assert wide.walls[0].frame.shape == (rows + 4, columns + 4)
+    np.testing.assert_array_equal(wide.walls[0].count[2:-2, 2:-2], plain.walls[0].count)
+
+
+def failing(cloud: PointCloud, planes: Planes, folder: Path, **params: object) -> str:
+    with pytest.raises(OrthoflowError) as caught:
+        rastered(cloud, planes, folder, **params)
+    return str(caught.value)
+
+
+def test_a_raster_that_no_memory_holds_is_refused_before_it_is_allocated(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, _ = one_point_per_cell(known)
+    message = failing(cloud, known.planes(), tmp_path, gsd_m=1e-6)
+    assert "gsd_m = 1e-06 m" in message
+    assert "raise gsd_m" in message
+
+
+def test_clouds_and_planes_without_a_result_give_a_sentence(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, _ = one_point_per_cell(known)
+    empty = dataclasses.replace(
+        cloud, x=cloud.x[:0], y=cloud.y[:0], z=cloud.z[:0], rgb=None, intensity=None
+    )
+    assert "has 0 points" in failing(empty, known.planes(), tmp_path)
+    broken = dataclasses.replace(cloud, x=np.where(cloud.x > 0, cloud.x, np.float32(np.nan)))
+    assert "NaN or infinite" in failing(broken, known.planes(), tmp_path)
+    far = dataclasses.replace(cloud, origin=cloud.origin + 50.0)
+    assert "no point of the cloud lies inside" in failing(far, known.planes(), tmp_path)
+    assert "is horizontal within" in failing(
+        cloud, known.planes(), tmp_path, constraint="horizontal"
+    )
+    none = dataclasses.replace(
+        known.planes(),
+        normal=np.zeros((0, 3)),
+        offset=np.zeros(0),
+        corners=np.zeros((0, 4, 3)),
+        covariance=np.zeros((0, 4, 4)),
+        n_points=np.zeros(0, dtype=np.int64),
+        rms_m=np.zeros(0),
+        names=(),
+    )
+    with pytest.raises(MethodError, match="no plane was found"):
+        rastered(cloud, none, tmp_path)
+
+
+def test_metrics_and_a_picture_of_the_depth_are_reported(tmp_path: Path) -> None:
+    known = scenes.leaning_wall()
+    cloud, _ = one_point_per_cell(known)
+    ctx = scenes.context(tmp_path)
+    inputs = RasterGrid.In(cloud=cloud, planes=known.planes())
+    RasterGrid().run(inputs, RasterGrid.Params(gsd_m=known.gsd_m), ctx)
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    assert metrics["n_walls"] == 1
+    assert metrics["n_points_inside"] == 1200
+    assert metrics["measured_share"] == 1.0
+    assert metrics["void_share"] == metrics["recovered_share"] == 0.0
+    assert [figure.name for figure in ctx.figures] == ["depth"]

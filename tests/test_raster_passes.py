@@ -1,0 +1,178 @@
+"""The compiled passes: which cell a point falls into, who wins it, which gaps are narrow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.geometry import frame_over
+from orthoflow.geometry.raster_kernels import NO_POINT
+from orthoflow.geometry.rastering import (
+    OffsetPoints,
+    Slab,
+    disc_offsets,
+    lenders_in_gaps,
+    topmost_points,
+    use_threads,
+    wall_from_offset,
+)
+from orthoflow.products import PointCloud
+from tests import raster_scenes as scenes
+
+
+def offsets(cloud: PointCloud) -> OffsetPoints:
+    return OffsetPoints(origin=cloud.origin, x=cloud.x, y=cloud.y, z=cloud.z)
+
+
+def slab_of(wall: scenes.KnownWall, *, front_m: float = 0.15, behind_m: float = 0.15) -> Slab:
+    frame = frame_over(wall.planes().corners[0], wall.normal, gsd_m=wall.gsd_m)
+    assert frame.shape == wall.shape
+    return Slab(frame=frame, front_m=front_m, behind_m=behind_m)
+
+
+def random_cloud(wall: scenes.KnownWall, *, n_points: int, seed: int) -> PointCloud:
+    rng = np.random.default_rng(seed)
+    rows, columns = wall.shape
+    # A few depths only, so that ties in depth are frequent; beyond all borders on purpose.
+    depths_m = rng.choice(np.linspace(-0.25, 0.25, 9), n_points)
+    return scenes.cloud_of(
+        wall.world(
+            rng.uniform(-3, columns + 3, n_points), rng.uniform(-3, rows + 3, n_points), depths_m
+        )
+    )
+
+
+def sorted_winners(cloud: PointCloud, slab: Slab) -> NDArray[np.uint32]:
+    """The winners by sorting all points: depth, then distance to the centre, then index."""
+    matrix = wall_from_offset(slab.frame, cloud.origin)
+    xyz = np.stack([cloud.x, cloud.y, cloud.z]).astype(np.float64)
+    # Term by term, as the kernel adds: a matrix product rounds differently.
+    u, v, depth = (m[0] * xyz[0] + m[1] * xyz[1] + m[2] * xyz[2] + m[3] for m in matrix)
+    rows, columns = slab.frame.shape
+    inside = (depth >= -slab.behind_m) & (depth <= slab.front_m)
+    inside &= (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+    points = np.flatnonzero(inside)
+    u, v, depth = u[inside], v[inside], depth[inside].astype(np.float32)
+    cells = np.floor(v).astype(int) * columns + np.floor(u).astype(int)
+    squares = ((u % 1 - 0.5) ** 2 + (v % 1 - 0.5) ** 2).astype(np.float32)
+    order = np.lexsort((points, squares, -depth, cells))
+    is_first = np.append(True, np.diff(cells[order]) != 0)
+    winners = np.full(rows * columns, NO_POINT, dtype=np.uint32)
+    winners[cells[order[is_first]]] = points[order[is_first]]
+    return winners
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_topmost_point_is_the_one_that_sorting_finds(seed: int) -> None:
+    wall = scenes.upright_wall(shape=(60, 80))
+    cloud, slab = random_cloud(wall, n_points=60_000, seed=seed), slab_of(wall)
+    winners = topmost_points(offsets(cloud), slab, threads=use_threads(2))
+    np.testing.assert_array_equal(winners["point"], sorted_winners(cloud, slab))
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 8])
+def test_no_bit_depends_on_the_number_of_threads(threads: int) -> None:
+    wall = scenes.leaning_wall(shape=(60, 80))
+    cloud, slab = random_cloud(wall, n_points=60_000, seed=1), slab_of(wall)
+    alone = topmost_points(offsets(cloud), slab, threads=1)
+    shared = topmost_points(offsets(cloud), slab, threads=threads)
+    np.testing.assert_array_equal(alone, shared)
+
+
+def test_of_equal_points_the_first_wins() -> None:
+    wall = scenes.upright_wall()
+    twins = wall.world(np.full(5, 3.5), np.full(5, 4.5), np.zeros(5))
+    winners = topmost_points(offsets(scenes.cloud_of(twins)), slab_of(wall), threads=1)
+    assert winners["point"][4 * 40 + 3] == 0
+
+
+def test_a_cell_owns_its_left_and_upper_border() -> None:
+    wall = scenes.upright_wall()
+    corners = wall.world(np.array([7.0, 0.0, 40.0]), np.array([5.0, 0.0, 0.0]), np.zeros(3))
+    winners = topmost_points(offsets(scenes.cloud_of(corners)), slab_of(wall), threads=1)
+    assert np.flatnonzero(winners["point"] != NO_POINT).tolist() == [0, 5 * 40 + 7]
+
+
+def test_both_ends_of_the_buffer_are_inside() -> None:
+    wall = scenes.upright_wall()
+    depths_m = np.array([0.25, 0.2500001, -0.5, -0.5000001])
+    points = wall.world(np.array([0.5, 1.5, 2.5, 3.5]), np.full(4, 0.5), depths_m)
+    winners = topmost_points(
+        offsets(scenes.cloud_of(points)), slab_of(wall, front_m=0.25, behind_m=0.5), threads=1
+    )
+    assert np.flatnonzero(winners["point"] != NO_POINT).tolist() == [0, 2]
+
+
+def test_discs_list_their_cells_from_near_to_far() -> None:
+    assert disc_offsets(1).tolist() == [[-1, 0], [0, -1], [0, 1], [1, 0]]
+    squares = (disc_offsets(5) ** 2).sum(axis=1)
+    assert np.all(np.diff(squares) >= 0)
+    assert len(squares) == 80  # Gauss's circle: 81 points within radius 5, less the centre.
+
+
+def opened_void(is_void: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    from scipy import ndimage
+
+    steps = np.arange(-radius, radius + 1)
+    disc = steps[:, None] ** 2 + steps**2 <= radius**2
+    padded = np.pad(is_void, 2 * radius, constant_values=True)
+    inner = slice(2 * radius, -2 * radius)
+    opened: NDArray[np.bool_] = ndimage.binary_opening(padded, disc)[inner, inner]
+    return opened
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3])
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.7])
+def test_narrow_gaps_are_the_void_without_its_opening(radius: int, share: float) -> None:
+    is_measured = np.random.default_rng(radius).random((37, 53)) < share
+    lent = lenders_in_gaps(is_measured, radius)
+    expected = ~is_measured & ~opened_void(~is_measured, radius)
+    np.testing.assert_array_equal(np.unique(lent[:, 0]), np.flatnonzero(expected))
+
+
+def test_a_gap_takes_its_value_from_the_nearest_measured_cell() -> None:
+    from scipy import ndimage
+
+    is_measured = np.random.default_rng(5).random((40, 60)) < 0.4
+    void, lender = lenders_in_gaps(is_measured, 3).T
+    assert is_measured.ravel()[lender].all()
+    rows, columns = np.divmod(np.stack([void, lender]), 60)
+    distances = np.hypot(rows[0] - rows[1], columns[0] - columns[1])
+    nearest = ndimage.distance_transform_edt(~is_measured).ravel()[void]
+    np.testing.assert_allclose(distances, nearest, atol=1e-12)
+
+
+def test_radius_zero_finds_no_gap() -> None:
+    assert lenders_in_gaps(np.eye(5, dtype=bool), 0).shape == (0, 2)
+
+
+def test_a_window_keeps_its_shape_to_the_cell() -> None:
+    is_measured = np.ones((30, 30), dtype=bool)
+    is_measured[8:20, 10:18] = False
+    is_measured[5, :] = False
+    void = np.unique(lenders_in_gaps(is_measured, 2)[:, 0])
+    # The line at row 5 closes, where it does not end at the border; the window does not, but for
+    # its corners, into which no disc of radius 2 reaches.
+    rows, columns = np.divmod(void, 30)
+    window = (rows >= 8) & (columns >= 10)
+    assert set(rows[~window]) == {5}
+    corners = {(8, 10), (8, 17), (19, 10), (19, 17)}
+    near_corner = [
+        min(abs(r - a) + abs(c - b) for a, b in corners)
+        for r, c in zip(rows[window], columns[window], strict=True)
+    ]
+    assert max(near_corner) <= 1
+
+
+def test_inputs_may_be_read_only_and_mapped(tmp_path: Path) -> None:
+    wall = scenes.upright_wall()
+    cloud, slab = random_cloud(wall, n_points=1000, seed=2), slab_of(wall)
+    np.save(tmp_path / "x.npy", cloud.x)
+    mapped = np.load(tmp_path / "x.npy", mmap_mode="r")
+    points = OffsetPoints(origin=cloud.origin, x=mapped, y=cloud.y, z=cloud.z)
+    np.testing.assert_array_equal(
+        topmost_points(points, slab, threads=1)["point"], sorted_winners(cloud, slab)
+    )
