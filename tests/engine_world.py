@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import os
+import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PathDistribution
 from pathlib import Path
@@ -12,6 +15,7 @@ from pathlib import Path
 from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.engine import RunOptions, RunOutcome, RunPlan, Store, execute, plan_run
 from orthoflow.engine.events import RunEvent
+from orthoflow.errors import OrthoflowError
 from orthoflow.workflow import expand_cells, load_workflow
 
 HOOKS = """
@@ -107,9 +111,9 @@ class File(Method):
         numbers: Numbers
 
     def run(self, inputs, params, ctx):
-        text = inputs.files.paths[0].read_text()
         try:
-            return self.Out(numbers=Numbers(values=np.array([float(word) for word in text.split()])))
+            values = [float(word) for word in inputs.files.paths[0].read_text().split()]
+            return self.Out(numbers=Numbers(values=np.array(values)))
         except ValueError as error:
             raise InputError(f"{inputs.files.paths[0].name} must hold numbers: {error}") from error
 """
@@ -343,6 +347,37 @@ class World:
         return [float(x) for x in self.store.get_product(digest, Numbers).values]
 
 
+@contextmanager
+def toy_world(folder: Path) -> Iterator[World]:
+    """Install the toys below a folder and make them importable while the block runs."""
+    site = folder / "site"
+    if not site.exists():
+        install_toys(site)
+    sys.path.insert(0, str(site))
+    forget_toys()
+    try:
+        yield World(folder=folder, site=site)
+    finally:
+        sys.path.remove(str(site))
+        forget_toys()
+
+
+def start_coordinator(world: World, steps: str, into: str) -> subprocess.Popen[bytes]:
+    """Run a workflow in a process of its own, which tests may kill."""
+    (world.folder / "steps.txt").write_text(steps)
+    root = Path(__file__).resolve().parents[1]
+    paths = [str(root / part) for part in ("", "plugins", "provenance")]
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.engine_world", str(world.folder), into],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+    )
+
+
 def install_toys(site: Path) -> None:
     """Write the toy plugin with its metadata, as an installer does."""
     package = site / "toy_plugin"
@@ -360,3 +395,19 @@ def forget_toys() -> None:
     """Let the next import see the plugin as it lies on the disk."""
     for name in [name for name in sys.modules if name.partition(".")[0] == "toy_plugin"]:
         del sys.modules[name]
+
+
+def _main(folder: Path, into: str) -> None:
+    with toy_world(folder) as world:
+        sys.stdout.write("ready\n")
+        sys.stdout.flush()
+        try:
+            outcome = world.run((folder / "steps.txt").read_text(), into=into)
+        except OrthoflowError as error:
+            sys.stdout.write(f"{type(error).__name__}: {error}\n")
+            sys.exit(error.exit_code)
+        sys.exit(outcome.exit_code)
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]), sys.argv[2])

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Final
 
 from orthoflow.engine.keys import CellKey, read_preimage
 from orthoflow.engine.store import Preimage
-from orthoflow.products.product import JsonValue
 
 _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
@@ -27,40 +27,37 @@ def explain(key: CellKey, step: str, earlier: Sequence[Preimage]) -> str:
         return "never ran before"
     if any(preimage.key == key.key for preimage in earlier):
         return "its result is no longer in the store"
-    now = _ingredients(read_preimage(key.preimage))
+    now = _ingredients(key.preimage)
     candidates = [preimage for preimage in earlier if preimage.step == step] or list(earlier)
-    changes = min(
-        (_changes(_ingredients(read_preimage(item.text)), now) for item in candidates), key=len
+    before = min(
+        (_ingredients(item.text) for item in candidates),
+        key=lambda ingredients: len(_changed(ingredients, now)),
     )
+    changes = _changed(before, now)
     if not changes:
         return "its key is made in another way than before"
-    named = list(dict.fromkeys(changes))
+    named = list(dict.fromkeys(_sentence(name, before, now) for name in changes))
     more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
     return ", ".join(named[:_MOST_NAMED]) + more
 
 
-def _ingredients(preimage: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    """Flatten a preimage by one level: `params.cell_m`, `inputs.cloud`, `seed`."""
-    flat: dict[str, JsonValue] = {}
-    for name, value in preimage.items():
-        if isinstance(value, dict):
-            flat |= {f"{name}.{inner}": item for inner, item in value.items()}
-        else:
-            flat[name] = value
+@lru_cache(maxsize=1024)
+def _ingredients(text: str) -> Mapping[str, str]:
+    """Flatten a preimage by one level: `params.cell_m`, `inputs.cloud`, ...; values as JSON."""
+    flat: dict[str, str] = {}
+    for name, value in read_preimage(text).items():
+        prefix, items = (f"{name}.", value) if isinstance(value, dict) else ("", {name: value})
+        for key, item in items.items():
+            flat[prefix + key] = json.dumps(item, ensure_ascii=False, sort_keys=True)
     return flat
 
 
-def _changes(before: Mapping[str, JsonValue], now: Mapping[str, JsonValue]) -> list[str]:
-    names = list(dict.fromkeys([*now, *before]))
-    return [
-        _sentence(name, before, now)
-        for name in names
-        if (name in before) != (name in now)
-        or json.dumps(before[name], sort_keys=True) != json.dumps(now[name], sort_keys=True)
-    ]
+def _changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    names = dict.fromkeys([*now, *before])
+    return [name for name in names if before.get(name) != now.get(name)]
 
 
-def _sentence(name: str, before: Mapping[str, JsonValue], now: Mapping[str, JsonValue]) -> str:
+def _sentence(name: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:
     group, _, inner = name.partition(".")
     if group == "inputs":
         if name not in before:
@@ -74,8 +71,6 @@ def _sentence(name: str, before: Mapping[str, JsonValue], now: Mapping[str, Json
     return f"{inner if group == 'tools' else name} {change}"
 
 
-def _shown(ingredients: Mapping[str, JsonValue], name: str) -> str:
-    if name not in ingredients:
-        return _ABSENT
-    text = json.dumps(ingredients[name], ensure_ascii=False)
+def _shown(ingredients: Mapping[str, str], name: str) -> str:
+    text = ingredients.get(name, _ABSENT)
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 3] + "..."

@@ -11,8 +11,9 @@ from typing import Protocol
 
 from orthoflow.engine.durability import write_whole
 from orthoflow.engine.results import CellResult
-from orthoflow.engine.running import run_task
+from orthoflow.engine.running import failed_result, run_task
 from orthoflow.engine.tasks import Task
+from orthoflow.errors import CancelledStepError
 from orthoflow.sdk.context import StepEvent
 
 Tell = Callable[[str, StepEvent], None]
@@ -61,13 +62,15 @@ class Executor(Protocol):
 class InlineExecutor:
     """Runs tasks one by one in this process, for debugging: no timeout, no crash protection."""
 
-    def __init__(self, tell: Tell) -> None:
+    def __init__(self, tell: Tell, is_interrupted: Callable[[], bool]) -> None:
         """Make one.
 
         Args:
             tell: gets the address of a task and what it says.
+            is_interrupted: whether the user asked to stop, also while a task runs.
         """
         self._tell = tell
+        self._is_interrupted = is_interrupted
         self._waiting: deque[Task] = deque()
         self._is_cancelled = False
 
@@ -80,6 +83,9 @@ class InlineExecutor:
         if not self._waiting:
             return ()
         task = self._waiting.popleft()
+        if self._is_cancelled:
+            reason = CancelledStepError(f"step {task.address} was interrupted")
+            return (TaskEnd(address=task.address, result=failed_result(task, reason)),)
         log: list[str] = []
 
         def listen(event: StepEvent) -> None:
@@ -87,15 +93,14 @@ class InlineExecutor:
                 log.append(event.text)
             self._tell(task.address, event)
 
-        result = run_task(task, listen, lambda: self._is_cancelled)
+        result = run_task(task, listen, self._is_interrupted)
         text = "".join(f"{line}\n" for line in log)
         write_whole(Path(task.log), text.encode())
         return (TaskEnd(address=task.address, result=dataclasses.replace(result, log=text)),)
 
     def cancel(self) -> None:
-        """Ask the running task to stop and forget those in line."""
+        """Let the tasks in line end without running; none runs while this is called."""
         self._is_cancelled = True
-        self._waiting.clear()
 
     def close(self) -> None:
         """Forget the tasks in line."""

@@ -94,7 +94,9 @@ class Journal:
         self.finished_keys = frozenset(
             str(event["key"])
             for event in events
-            if event.get("event") == "finished" and event.get("status") == "ok"
+            if event.get("event") == "finished"
+            and event.get("status") == "ok"
+            and not event.get("cached")
         )
         if not events:
             self.write("run", format=_FORMAT, run_id=self.run_id, workflow=name)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from orthoflow import __version__
 from orthoflow.catalog import Catalog
 from orthoflow.engine.changes import explain
 from orthoflow.engine.file_digests import FileRef
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, files_digest, method_facts
 from orthoflow.engine.options import RunOptions
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.sources import framework_digest, is_framework_released
-from orthoflow.engine.store import Store
-from orthoflow.errors import InputError, PluginError
+from orthoflow.engine.sources import framework_tag
+from orthoflow.engine.store import Preimage, Store
+from orthoflow.errors import InputError, PluginError, StoreError
 from orthoflow.products.input_files import InputFiles
 from orthoflow.workflow import Workflow, check_step_names, resolve_input_files
 from orthoflow.workflow.cells import Cell, CellOutput
@@ -115,16 +115,16 @@ def plan_run(
         for method in dict.fromkeys(cell.method for cell in selected if not cell.skip_reason)
     }
     inputs = _digest_inputs(resolve_input_files(workflow), store)
-    planned: dict[str, PlannedCell] = {}
+    planner = _Planner(inputs=inputs, methods=methods, store=store, force=options.force)
     for cell in selected:
-        planned[cell.address] = _plan_cell(cell, planned, inputs, methods, store, options)
+        planner.add(cell)
     return RunPlan(
         name=workflow.name,
-        cells=tuple(planned.values()),
+        cells=tuple(planner.planned.values()),
         inputs=inputs,
         methods=methods,
         products=_product_targets(methods, catalog),
-        publisher_tag=__version__ if is_framework_released() else framework_digest(),
+        publisher_tag=framework_tag(),
         options=options,
     )
 
@@ -156,43 +156,55 @@ def known_inputs(
     return known
 
 
-def _plan_cell(
-    cell: Cell,
-    planned: Mapping[str, PlannedCell],
-    inputs: Mapping[str, PlannedInput | None],
-    methods: Mapping[str, MethodFacts],
-    store: Store,
-    options: RunOptions,
-) -> PlannedCell:
-    if cell.skip_reason:
-        return PlannedCell(cell=cell, status="skipped", reason=cell.skip_reason)
-    before = [planned[address] for address in needed_addresses(cell)]
-    for earlier in before:
-        if earlier.status == "skipped":
-            reason = f"needs {earlier.cell.address}, which is skipped"
-            return PlannedCell(cell=cell, status="skipped", reason=reason)
-    for earlier in before:
-        if earlier.status != "cached":
-            what = "will run" if earlier.status == "will run" else "is not known yet"
-            reason = f"needs {earlier.cell.address}, which {what}"
-            return PlannedCell(cell=cell, status="unknown yet", reason=reason)
-    results = {item.cell.address: item.result for item in before if item.result is not None}
-    refs = known_inputs(cell, inputs, results)
-    key = cell_key(cell, methods[cell.method], refs)
-    if cell.step in options.force:
-        return PlannedCell(cell=cell, status="will run", reason="forced", key=key, inputs=refs)
-    result = store.result(key.key)
-    if result is None:
-        reason = explain(key, cell.step, store.earlier_preimages(cell.method))
-        return PlannedCell(cell=cell, status="will run", reason=reason, key=key, inputs=refs)
-    return PlannedCell(
-        cell=cell,
-        status="cached",
-        reason=f"in the store since {result.ended}",
-        key=key,
-        inputs=refs,
-        result=result,
-    )
+@dataclass(kw_only=True)
+class _Planner:
+    """Plans cell after cell, each behind all it needs."""
+
+    inputs: Mapping[str, PlannedInput | None]
+    methods: Mapping[str, MethodFacts]
+    store: Store
+    force: tuple[str, ...]
+    planned: dict[str, PlannedCell] = field(default_factory=dict)
+    _earlier: dict[str, tuple[Preimage, ...]] = field(default_factory=dict)
+
+    def add(self, cell: Cell) -> None:
+        """Plan one more cell."""
+        self.planned[cell.address] = self._without_inputs(cell) or self._with_inputs(cell)
+
+    def _without_inputs(self, cell: Cell) -> PlannedCell | None:
+        if cell.skip_reason:
+            return PlannedCell(cell=cell, status="skipped", reason=cell.skip_reason)
+        before = [self.planned[address] for address in needed_addresses(cell)]
+        for earlier in before:
+            if earlier.status == "skipped":
+                reason = f"needs {earlier.cell.address}, which is skipped"
+                return PlannedCell(cell=cell, status="skipped", reason=reason)
+        for earlier in before:
+            if earlier.status != "cached":
+                what = "will run" if earlier.status == "will run" else "is not known yet"
+                reason = f"needs {earlier.cell.address}, which {what}"
+                return PlannedCell(cell=cell, status="unknown yet", reason=reason)
+        return None
+
+    def _with_inputs(self, cell: Cell) -> PlannedCell:
+        before = (self.planned[address] for address in needed_addresses(cell))
+        results = {item.cell.address: item.result for item in before if item.result is not None}
+        refs = known_inputs(cell, self.inputs, results)
+        key = cell_key(cell, self.methods[cell.method], refs)
+        is_forced = cell.step in self.force
+        result = None if is_forced else self.store.result(key.key)
+        if result is None:
+            reason = "forced" if is_forced else explain(key, cell.step, self._before(cell.method))
+            return PlannedCell(cell=cell, status="will run", reason=reason, key=key, inputs=refs)
+        reason = f"in the store since {result.ended}"
+        return PlannedCell(
+            cell=cell, status="cached", reason=reason, key=key, inputs=refs, result=result
+        )
+
+    def _before(self, method: str) -> tuple[Preimage, ...]:
+        if method not in self._earlier:
+            self._earlier[method] = self.store.earlier_preimages(method)
+        return self._earlier[method]
 
 
 def _digest_inputs(
@@ -208,7 +220,9 @@ def _digest_inputs(
         ref = ProductRef(type_name="files", encoding_version=0, digest=files_digest(refs))
         planned[name] = PlannedInput(ref=ref, paths=files.paths, files=refs)
     if store.folder.is_dir():
-        digests.save()
+        # Only a memory: a plan must also be possible on a full or read-only disk.
+        with contextlib.suppress(StoreError):
+            digests.save()
     return planned
 
 

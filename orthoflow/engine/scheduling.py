@@ -5,11 +5,11 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.durability import remove_tree, writing_to
-from orthoflow.engine.environment import environment
 from orthoflow.engine.events import (
     CellFinished,
     CellLogged,
@@ -23,14 +23,12 @@ from orthoflow.engine.events import (
 from orthoflow.engine.executors import Executor, InlineExecutor, TaskEnd, Tell
 from orthoflow.engine.interruption import Interruption, watching_interruptions
 from orthoflow.engine.journal import Journal
-from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
+from orthoflow.engine.keys import CellKey, cell_key
 from orthoflow.engine.local_executor import LocalExecutor
 from orthoflow.engine.locks import exclusive_lock, is_locked
 from orthoflow.engine.options import ExecutorName
 from orthoflow.engine.outcome import RunOutcome
 from orthoflow.engine.plan import (
-    PlannedCell,
-    PlannedInput,
     RunPlan,
     known_inputs,
     needed_addresses,
@@ -38,13 +36,13 @@ from orthoflow.engine.plan import (
 from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.engine.running import now
 from orthoflow.engine.store import Store
-from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput
+from orthoflow.engine.task_making import TaskMaker
+from orthoflow.engine.tasks import Task
 from orthoflow.errors import CancelledStepError
 from orthoflow.sdk.context import StepEvent
-from orthoflow.workflow.cells import Cell, WorkflowInput
+from orthoflow.workflow.cells import Cell
 
 _POLL_S: Final = 0.25
-_LONGEST_FILE_NAME: Final = 200
 
 
 def execute(
@@ -82,33 +80,45 @@ def execute(
             )
         )
         with _scratch(store, journal.run_id) as scratch, watching_interruptions() as interruption:
-            tell = _passing_on(listen)
-            executor = _executor(plan.options.executor, tell)
+            tasks = TaskMaker(
+                plan=plan,
+                store=store,
+                scratch=scratch,
+                logs=folder / "logs",
+                run_id=journal.run_id,
+            )
+            executor = _executor(plan.options.executor, _passing_on(listen), interruption)
+            run = _Run(tasks, journal, listen)
             try:
-                run = _Run(plan, folder, store, journal, listen)
-                run.scratch = scratch
                 run.go(executor, interruption)
             finally:
                 executor.close()
         return run.outcome()
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Ready:
+    """Key and inputs of a cell that only waits for room."""
+
+    key: CellKey
+    refs: Mapping[str, ProductRef]
+
+
 class _Run:
     """The state of one run; used from one thread."""
 
-    def __init__(
-        self, plan: RunPlan, folder: Path, store: Store, journal: Journal, listen: RunListener
-    ) -> None:
-        self.scratch = store.scratch
-        self._plan = plan
-        self._folder = folder
-        self._store = store
+    def __init__(self, tasks: TaskMaker, journal: Journal, listen: RunListener) -> None:
+        self._tasks = tasks
+        self._plan = tasks.plan
+        self._store = tasks.store
         self._journal = journal
         self._listen = listen
         self._results: dict[str, CellResult] = {}
         self._cached: dict[str, str] = {}
         self._resumed: set[str] = set()
-        self._waiting: dict[str, PlannedCell] = {item.cell.address: item for item in plan.cells}
+        self._made: set[str] = set()
+        self._waiting = {item.cell.address: item for item in self._plan.cells}
+        self._ready: dict[str, _Ready] = {}
         self._running: dict[str, Task] = {}
 
     def go(self, executor: Executor, interruption: Interruption) -> None:
@@ -145,27 +155,41 @@ class _Run:
                 self._take(end)
         self._journal.write("interrupted")
         raise CancelledStepError(
-            f"the run was interrupted; the same command with -o {self._folder.name} goes on where "
-            f"it stopped"
+            f"the run was interrupted; the same command goes on where it stopped, given "
+            f"-o {self._tasks.logs.parent.name}"
         )
 
     def _advance(self, executor: Executor) -> None:
         """Settle or start every cell whose inputs are known, as far as the cores go."""
         for address, planned in list(self._waiting.items()):
-            needed = needed_addresses(planned.cell)
-            if not all(other in self._results for other in needed):
+            if address not in self._ready:
+                self._prepare(planned.cell)
+            ready = self._ready.get(address)
+            if ready is None or self._is_under_way(ready.key):
                 continue
-            reason = planned.cell.skip_reason or self._missing(needed)
-            if reason:
-                self._settle(planned.cell, self._skipped(planned.cell, reason))
-                continue
-            refs = known_inputs(planned.cell, self._plan.inputs, self._results)
-            key = cell_key(planned.cell, self._plan.methods[planned.cell.method], refs)
-            known = self._known(planned.cell, key)
+            # An equal cell of this run may have ended meanwhile.
+            known = self._store.result(ready.key.key) if ready.key.key in self._made else None
             if known is not None:
                 self._settle(planned.cell, known, is_cached=True)
-            elif self._has_room(planned.cell) and not self._is_under_way(key):
-                self._start(address, planned.cell, key, refs, executor)
+            elif self._has_room(planned.cell):
+                self._start(planned.cell, ready, executor)
+
+    def _prepare(self, cell: Cell) -> None:
+        """Settle a cell from the store, or make it ready, as soon as its inputs are known."""
+        needed = needed_addresses(cell)
+        if not all(address in self._results for address in needed):
+            return
+        reason = cell.skip_reason or self._missing(needed)
+        if reason:
+            self._settle(cell, self._skipped(cell, reason))
+            return
+        refs = known_inputs(cell, self._plan.inputs, self._results)
+        key = cell_key(cell, self._plan.methods[cell.method], refs)
+        known = self._known(cell, key)
+        if known is not None:
+            self._settle(cell, known, is_cached=True)
+        else:
+            self._ready[cell.address] = _Ready(key=key, refs=refs)
 
     def _missing(self, needed: tuple[str, ...]) -> str:
         for address in needed:
@@ -189,7 +213,8 @@ class _Run:
 
     def _known(self, cell: Cell, key: CellKey) -> CellResult | None:
         # A forced cell that this run computed before it was interrupted is not computed twice.
-        if cell.step in self._plan.options.force and key.key not in self._journal.finished_keys:
+        is_done = key.key in self._journal.finished_keys or key.key in self._made
+        if cell.step in self._plan.options.force and not is_done:
             return None
         result = self._store.result(key.key)
         if result is not None:
@@ -212,71 +237,19 @@ class _Run:
         is_fitting = taken + self._cores(cell) <= self._plan.options.all_cores
         return len(self._running) < self._plan.options.jobs and is_fitting
 
-    def _start(
-        self,
-        address: str,
-        cell: Cell,
-        key: CellKey,
-        refs: Mapping[str, ProductRef],
-        executor: Executor,
-    ) -> None:
-        task = self._task(cell, key, refs)
-        del self._waiting[address]
-        self._running[address] = task
-        self._journal.write("started", address=address, key=key.key)
-        self._listen(CellStarted(address=address))
+    def _start(self, cell: Cell, ready: _Ready, executor: Executor) -> None:
+        task = self._tasks.make(cell, ready.key, ready.refs, self._cores(cell))
+        del self._waiting[cell.address]
+        self._running[cell.address] = task
+        self._journal.write("started", address=cell.address, key=task.key)
+        self._listen(CellStarted(address=cell.address))
         executor.start(task)
-
-    def _task(self, cell: Cell, key: CellKey, refs: Mapping[str, ProductRef]) -> Task:
-        facts = self._plan.methods[cell.method]
-        cores = self._cores(cell)
-        return Task(
-            address=cell.address,
-            run_id=self._journal.run_id,
-            method=cell.method,
-            target=facts.target,
-            key=key.key,
-            key_preimage=key.preimage,
-            params=cell.params,
-            seed=cell.seed,
-            inputs={port: self._task_input(cell, port, ref) for port, ref in refs.items()},
-            outputs=self._task_outputs(facts),
-            cores=cores,
-            timeout_s=cell.timeout_s,
-            store=str(self._store.folder),
-            folder=str(self.scratch / uuid.uuid4().hex[:12]),
-            log=str(self._folder / "logs" / f"{log_name(cell.address)}.log"),
-            numba_folder=str(self._store.numba_folder(facts.compiled_digest)),
-            publisher_tag=self._plan.publisher_tag,
-            environment=environment(cores),
-            distribution=facts.distribution,
-            distribution_version=facts.distribution_version,
-            result_version=facts.result_version,
-            determinism=facts.determinism,
-            citations=facts.citations,
-        )
-
-    def _task_input(self, cell: Cell, port: str, ref: ProductRef) -> TaskInput:
-        source = cell.inputs[port]
-        if not isinstance(source, WorkflowInput):
-            return TaskInput(ref=ref, target=self._plan.products[ref.type_name].target)
-        given = self._plan.inputs[source.name]
-        return TaskInput(ref=ref, input_name=source.name, files=_task_files(given) if given else ())
-
-    def _task_outputs(self, facts: MethodFacts) -> dict[str, TaskOutput]:
-        return {
-            port: TaskOutput(
-                type_name=type_name,
-                target=self._plan.products[type_name].target,
-                publisher=self._plan.products[type_name].publisher,
-            )
-            for port, type_name in facts.outputs.items()
-        }
 
     def _take(self, end: TaskEnd) -> None:
         task = self._running.pop(end.address)
         cell = next(item.cell for item in self._plan.cells if item.cell.address == end.address)
         if end.result.status == "ok":
+            self._made.add(task.key)
             self._store.put_result(task.key, end.result, cell.step)
         remove_tree(Path(task.folder))
         self._settle(cell, end.result)
@@ -299,22 +272,10 @@ class _Run:
         self._listen(CellFinished(address=cell.address, result=result, cached=is_cached))
 
 
-def log_name(address: str) -> str:
-    """File name, without suffix, for what belongs to a cell."""
-    if len(address) <= _LONGEST_FILE_NAME:
-        return address
-    return f"{address[: _LONGEST_FILE_NAME - 9]}~{uuid.uuid5(uuid.NAMESPACE_OID, address).hex[:8]}"
-
-
-def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
-    return tuple(
-        TaskFile(path=str(path.absolute()), size_bytes=file.size_bytes, mtime_ns=file.mtime_ns)
-        for path, file in zip(given.paths, given.files, strict=True)
-    )
-
-
-def _executor(name: ExecutorName, tell: Tell) -> Executor:
-    return InlineExecutor(tell) if name == "inline" else LocalExecutor(tell)
+def _executor(name: ExecutorName, tell: Tell, interruption: Interruption) -> Executor:
+    if name == "inline":
+        return InlineExecutor(tell, lambda: interruption.is_asked)
+    return LocalExecutor(tell)
 
 
 def _passing_on(listen: RunListener) -> Tell:

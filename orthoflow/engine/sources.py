@@ -31,6 +31,11 @@ def is_framework_released() -> bool:
     return _ROOT.is_relative_to(Path(str(distribution.locate_file(""))).resolve())
 
 
+def framework_tag() -> str:
+    """What stands for the framework's code: the version of a release, else the digest."""
+    return metadata.version(_DISTRIBUTION) if is_framework_released() else framework_digest()
+
+
 @cache
 def framework_digest() -> str:
     """Digest of the framework's code that methods use."""

@@ -1,0 +1,358 @@
+"""The plan says what will run and why; keys hold what decides a result and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine.changes import explain
+from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
+from orthoflow.engine.results import ProductRef
+from orthoflow.engine.store import Preimage
+from orthoflow.errors import ArgumentError, InputError
+from orthoflow.workflow.cells import Cell, WorkflowInput
+from tests.engine_world import World, forget_toys, toy_world
+
+CHAIN = """
+steps:
+  first: {use: make.range}
+  second: {use: work.add, in: {numbers: first.numbers}}
+  third: {use: work.add, in: {numbers: second.numbers}, params: {amount: 3.0}}
+"""
+
+FROM_FILE = """
+inputs: {data: {files: data.txt}}
+steps:
+  first: {use: make.file, in: {files: inputs.data}}
+  second: {use: work.add, in: {numbers: first.numbers}}
+"""
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def statuses(world: World, steps: str, **options: object) -> dict[str, str]:
+    return {address: status for address, (status, _) in world.status(steps, **options).items()}
+
+
+def run(world: World, steps: str, into: str = "run", **options: object) -> None:
+    outcome = world.run(steps, into=into, executor="inline", **options)  # type: ignore[arg-type]
+    assert outcome.status == "ok"
+
+
+def write_data(world: World, text: str, name: str = "data.txt") -> Path:
+    path = world.folder / name
+    path.write_text(text)
+    return path
+
+
+# Keys ---------------------------------------------------------------------------------------------
+
+FACTS = MethodFacts(
+    id="work.noise",
+    target="x:Y",
+    result_version=1,
+    determinism="seeded",
+    citations=(),
+    distribution="toys",
+    distribution_version="1",
+    tools={"tool": "1"},
+    code={"plugin": "aa"},
+    compiled_digest="bb",
+    inputs={"left": "numbers", "right": "numbers"},
+    outputs={"numbers": "numbers"},
+)
+CELL = Cell(address="step", step="step", method="work.noise", params={"amount": 1.0}, seed=5)
+LEFT = ProductRef(type_name="numbers", encoding_version=1, digest="sha256:" + "1" * 64)
+RIGHT = dataclasses.replace(LEFT, digest="sha256:" + "2" * 64)
+INPUTS = {"left": LEFT, "right": RIGHT}
+
+
+def key_of(
+    cell: Cell = CELL, facts: MethodFacts = FACTS, inputs: dict[str, ProductRef] | None = None
+) -> str:
+    return cell_key(cell, facts, INPUTS if inputs is None else inputs).key
+
+
+DIFFERENT = {
+    "as it is": key_of(),
+    "another method": key_of(facts=dataclasses.replace(FACTS, id="work.add")),
+    "another result_version": key_of(facts=dataclasses.replace(FACTS, result_version=2)),
+    "another tool version": key_of(facts=dataclasses.replace(FACTS, tools={"tool": "2"})),
+    "another tool": key_of(facts=dataclasses.replace(FACTS, tools={"loot": "1"})),
+    "other code of the plugin": key_of(facts=dataclasses.replace(FACTS, code={"plugin": "ab"})),
+    "code of the framework": key_of(facts=dataclasses.replace(FACTS, code={"framework": "aa"})),
+    "released code": key_of(facts=dataclasses.replace(FACTS, code={})),
+    "another value": key_of(dataclasses.replace(CELL, params={"amount": 1.0000000000000002})),
+    "another type of value": key_of(dataclasses.replace(CELL, params={"amount": 1})),
+    "true instead of one": key_of(dataclasses.replace(CELL, params={"amount": True})),
+    "text instead of number": key_of(dataclasses.replace(CELL, params={"amount": "1.0"})),
+    "null": key_of(dataclasses.replace(CELL, params={"amount": None})),
+    "negative zero": key_of(dataclasses.replace(CELL, params={"amount": -0.0})),
+    "zero": key_of(dataclasses.replace(CELL, params={"amount": 0.0})),
+    "another name": key_of(dataclasses.replace(CELL, params={"amounts": 1.0})),
+    "no parameters": key_of(dataclasses.replace(CELL, params={})),
+    "another seed": key_of(dataclasses.replace(CELL, seed=6)),
+    "no seed": key_of(facts=dataclasses.replace(FACTS, determinism="exact")),
+    "swapped inputs": key_of(inputs={"left": RIGHT, "right": LEFT}),
+    "another input": key_of(inputs={"left": LEFT, "right": LEFT}),
+    "one input": key_of(inputs={"left": LEFT}),
+    "another encoding": key_of(
+        inputs={"left": LEFT, "right": dataclasses.replace(RIGHT, encoding_version=2)}
+    ),
+    "another type": key_of(
+        inputs={"left": LEFT, "right": dataclasses.replace(RIGHT, type_name="heights")}
+    ),
+}
+
+
+def test_whatever_decides_a_result_changes_the_key() -> None:
+    assert len(set(DIFFERENT.values())) == len(DIFFERENT)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"address": "other@a=b"},
+        {"step": "other"},
+        {"repeat": 3},
+        {"cores": 1},
+        {"timeout_s": 5.0},
+        {"assignment": {"step": "x"}},
+        {"params_set": {"amount": 1.0}},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_names_and_resources_do_not_change_the_key(change: dict[str, object]) -> None:
+    assert key_of(dataclasses.replace(CELL, **change)) == key_of()  # type: ignore[arg-type]
+
+
+def test_an_exact_method_has_the_same_key_for_every_seed() -> None:
+    exact = dataclasses.replace(FACTS, determinism="exact")
+    assert key_of(facts=exact) == key_of(dataclasses.replace(CELL, seed=99), facts=exact)
+
+
+# Reasons ------------------------------------------------------------------------------------------
+
+
+def preimage_of(step: str = "step", cell: Cell = CELL, **facts: object) -> Preimage:
+    made = cell_key(cell, dataclasses.replace(FACTS, **facts), INPUTS)  # type: ignore[arg-type]
+    return Preimage(key=made.key, step=step, text=made.preimage)
+
+
+NOW = cell_key(CELL, FACTS, INPUTS)
+
+
+@pytest.mark.parametrize(
+    ("earlier", "reason"),
+    [
+        (preimage_of(cell=dataclasses.replace(CELL, params={"amount": 2.5})),
+         "params.amount: 2.5 -> 1.0"),
+        (preimage_of(cell=dataclasses.replace(CELL, params={})), "params.amount: absent -> 1.0"),
+        (preimage_of(cell=dataclasses.replace(CELL, params={"amount": "x" * 99})),
+         f'params.amount: "{"x" * 36}... -> 1.0'),
+        (preimage_of(result_version=7), "result_version 7 -> 1"),
+        (preimage_of(tools={"tool": "0.9"}), 'tool "0.9" -> "1"'),
+        (preimage_of(code={"plugin": "zz"}), "code changed"),
+        (preimage_of(code={}), "code changed"),
+        (preimage_of(cell=dataclasses.replace(CELL, seed=6)), "seed 6 -> 5"),
+        (Preimage(key=NOW.key, step="step", text=NOW.preimage),
+         "its result is no longer in the store"),
+    ],
+)  # fmt: skip
+def test_the_changed_ingredient_is_named(earlier: Preimage, reason: str) -> None:
+    assert explain(NOW, "step", [earlier]) == reason
+
+
+def test_changed_inputs_are_named_by_port() -> None:
+    before = cell_key(CELL, FACTS, {"left": RIGHT, "third": RIGHT})
+    reason = explain(NOW, "step", [Preimage(key=before.key, step="step", text=before.preimage)])
+    assert reason == "input left changed, input right added, input third removed"
+
+
+def test_many_changes_are_counted() -> None:
+    cell = dataclasses.replace(CELL, params=dict.fromkeys("abcdef", 1))
+    before = cell_key(cell, FACTS, INPUTS)
+    reason = explain(NOW, "step", [Preimage(key=before.key, step="step", text=before.preimage)])
+    assert reason.endswith(" and 3 more")
+
+
+def test_the_nearest_earlier_result_of_the_same_step_is_compared() -> None:
+    far = preimage_of(cell=dataclasses.replace(CELL, params={"amount": 9.0}), result_version=3)
+    near = preimage_of(cell=dataclasses.replace(CELL, params={"amount": 8.0}))
+    elsewhere = preimage_of("elsewhere", result_version=2)
+    assert explain(NOW, "step", [far, elsewhere, near]) == "params.amount: 8.0 -> 1.0"
+    assert explain(NOW, "new step", [far, elsewhere]) == "result_version 2 -> 1"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{"])
+def test_an_unreadable_earlier_preimage_does_no_harm(text: str) -> None:
+    earlier = Preimage(key="x", step="step", text=text)
+    assert explain(CellKey(key="k", preimage="{}"), "step", [earlier]) == (
+        "its key is made in another way than before"
+    )
+
+
+# Plans --------------------------------------------------------------------------------------------
+
+
+def test_a_first_plan_knows_only_the_first_step(world: World) -> None:
+    assert world.status(CHAIN) == {
+        "first": ("will run", "never ran before"),
+        "second": ("unknown yet", "needs first, which will run"),
+        "third": ("unknown yet", "needs second, which is not known yet"),
+    }
+    assert not world.store.folder.exists()
+
+
+def test_after_a_run_all_is_cached(world: World) -> None:
+    run(world, CHAIN)
+    assert statuses(world, CHAIN) == dict.fromkeys(("first", "second", "third"), "cached")
+
+
+def test_a_changed_parameter_reruns_only_what_depends_on_it(world: World) -> None:
+    run(world, CHAIN)
+    changed = CHAIN.replace("first.numbers}", "first.numbers}, params: {amount: 2.0}")
+    assert world.status(changed)["first"][0] == "cached"
+    assert world.status(changed)["second"] == ("will run", "params.amount: 1.0 -> 2.0")
+    assert world.status(changed)["third"] == ("unknown yet", "needs second, which will run")
+    again = world.run(changed, into="again", executor="inline")
+    assert set(again.cached) == {"first"}
+
+
+def test_equal_outputs_cut_off_what_follows(world: World) -> None:
+    steps = """
+steps:
+  first: {use: make.range}
+  second: {use: work.add, in: {numbers: first.numbers}, params: {amount: AMOUNT}}
+  sign: {use: work.sign, in: {numbers: second.numbers}}
+  last: {use: work.add, in: {numbers: sign.numbers}}
+"""
+    run(world, steps.replace("AMOUNT", "1.0"))
+    outcome = world.run(steps.replace("AMOUNT", "2.0"), into="again", executor="inline")
+    assert set(outcome.cached) == {"first", "last"}
+
+
+def test_forced_steps_run_and_equal_results_end_it_there(world: World) -> None:
+    run(world, CHAIN)
+    status = world.status(CHAIN, force=("second",))
+    assert status["second"] == ("will run", "forced")
+    outcome = world.run(CHAIN, into="again", executor="inline", force=("second",))
+    assert set(outcome.cached) == {"first", "third"}
+    assert outcome.results["second"].run_id == outcome.run_id
+
+
+def test_an_unknown_forced_step_is_named(world: World) -> None:
+    with pytest.raises(ArgumentError, match=r"--force secnd.*did you mean second"):
+        world.plan(CHAIN, force=("secnd",))
+
+
+def test_a_selection_leaves_out_the_rest(world: World) -> None:
+    assert list(statuses(world, CHAIN, until=("second",))) == ["first", "second"]
+    assert list(statuses(world, CHAIN, only=("first",))) == ["first"]
+    assert list(statuses(world, CHAIN, from_=("third",))) == ["first", "second", "third"]
+
+
+@pytest.mark.parametrize("options", [{"jobs": 0}, {"cores": 0}, {"executor": "cloud"}])
+def test_impossible_options_are_refused(world: World, options: dict[str, object]) -> None:
+    with pytest.raises(ArgumentError, match=r"must be .* got"):
+        world.plan(CHAIN, **options)
+
+
+def test_file_content_and_name_count_but_not_its_time(world: World) -> None:
+    data = write_data(world, "1 2 3")
+    run(world, FROM_FILE)
+    os.utime(data, (1, 1))
+    assert set(statuses(world, FROM_FILE).values()) == {"cached"}
+    write_data(world, "1 2 4")
+    assert world.status(FROM_FILE)["first"] == ("will run", "input files changed")
+    write_data(world, "1 2 3", "other.txt")
+    renamed = FROM_FILE.replace("data.txt", "other.txt")
+    assert world.status(renamed)["first"] == ("will run", "input files changed")
+
+
+def test_a_moved_file_is_the_same_file(world: World) -> None:
+    write_data(world, "1 2 3")
+    run(world, FROM_FILE)
+    (world.folder / "moved").mkdir()
+    (world.folder / "data.txt").rename(world.folder / "moved" / "data.txt")
+    moved = FROM_FILE.replace("data.txt", "moved/data.txt")
+    assert set(statuses(world, moved).values()) == {"cached"}
+
+
+def test_a_missing_input_file_is_an_input_error(world: World) -> None:
+    with pytest.raises(InputError, match=r"data\.txt"):
+        world.plan(FROM_FILE)
+
+
+def test_a_step_whose_data_are_absent_is_skipped_with_all_behind_it(world: World) -> None:
+    steps = FROM_FILE.replace("{files: data.txt}", "{optional: true}")
+    assert statuses(world, steps) == {"first": "skipped", "second": "skipped"}
+    outcome = world.run(steps, executor="inline")
+    assert {r.status for r in outcome.results.values()} == {"skipped"}
+    assert outcome.exit_code == 0
+
+
+def test_changed_code_of_an_unreleased_plugin_counts(world: World) -> None:
+    (world.site / "toy_plugin-1.0.dist-info" / "direct_url.json").write_text("{}")
+    run(world, CHAIN)
+    works = world.site / "toy_plugin" / "works.py"
+    works.write_text(works.read_text().replace("values + params.amount", "values - params.amount"))
+    forget_toys()
+    assert world.status(CHAIN)["first"] == ("will run", "code changed")
+
+
+def test_changed_code_of_a_released_plugin_does_not_count(world: World) -> None:
+    run(world, CHAIN)
+    works = world.site / "toy_plugin" / "works.py"
+    works.write_text(works.read_text() + "\n# A comment.\n")
+    forget_toys()
+    assert set(statuses(world, CHAIN).values()) == {"cached"}
+
+
+def test_a_raised_result_version_counts(world: World) -> None:
+    run(world, CHAIN)
+    makes = world.site / "toy_plugin" / "makes.py"
+    makes.write_text(
+        makes.read_text().replace('"make.range"', '"make.range"\n    result_version = 2')
+    )
+    forget_toys()
+    assert world.status(CHAIN)["first"] == ("will run", "result_version 1 -> 2")
+
+
+def test_planning_a_large_comparison_is_quick(world: World) -> None:
+    variants = "".join(
+        f"      v{i}: {{use: work.add, params: {{amount: {i}.5}}}}\n" for i in range(60)
+    )
+    steps = f"""
+steps:
+  first: {{use: make.range}}
+  second:
+    in: {{numbers: first.numbers}}
+    variants:
+{variants}
+  third: {{use: work.add, in: {{numbers: second.numbers}}}}
+compare: {{design: product}}
+"""
+    run(world, steps)
+    started = time.perf_counter()
+    plan = world.plan(steps, sets=["third.amount=9.0"])
+    assert time.perf_counter() - started < 1.0  # seconds, as the contract says
+    assert len(plan.cells) == 121
+
+
+def test_an_input_that_is_not_wired_in_the_workflow_is_still_digested(world: World) -> None:
+    write_data(world, "5")
+    plan = world.plan("inputs: {data: {files: data.txt}}\n" + CHAIN.lstrip())
+    given = plan.inputs["data"]
+    assert given is not None
+    assert [(file.name, file.size_bytes) for file in given.files] == [("data.txt", 1)]
+    assert str(WorkflowInput(name="data")) == "inputs.data"

@@ -1,0 +1,397 @@
+"""The store keeps what is whole, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.engine import CellResult, ProductRef, Store, collect_garbage, list_results
+from orthoflow.engine.file_digests import FileDigests
+from orthoflow.engine.result_files import result_from_json, result_to_json
+from orthoflow.engine.results import FigureRef, MetricValue
+from orthoflow.engine.store import digest_of
+from orthoflow.errors import ArgumentError, InputError, ProductError, StoreError
+from orthoflow.products.product import Product
+
+KEY = "ab" * 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heights(Product):
+    type_name: ClassVar[str] = "heights"
+    values: NDArray[np.float64]
+    note: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points(Product):
+    type_name: ClassVar[str] = "points"
+    mapped: ClassVar[bool] = True
+    values: NDArray[np.float64]
+
+
+def publish(product: Product, folder: Path, digest: str, /) -> None:
+    assert isinstance(product, Heights)
+    (folder / "heights.txt").write_text(f"{digest} {product.note}")
+
+
+def heights(note: str = "", n: int = 2000) -> Heights:
+    return Heights(values=np.linspace(0.0, 1.0, n), note=note)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+def ok_result(store: Store, *products: Product, key: str = KEY) -> CellResult:
+    refs = {f"p{index}": store.put_product(item) for index, item in enumerate(products)}
+    return CellResult(
+        status="ok", key=key, key_preimage='{"v":1}', method="toy.make", run_id="r1", outputs=refs
+    )
+
+
+def object_folder(store: Store, ref: ProductRef) -> Path:
+    return store.objects / ref.digest.removeprefix("sha256:")
+
+
+def flip_middle(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+
+
+def truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size - 1)
+
+
+def test_a_product_comes_back_equal_and_read_only(store: Store) -> None:
+    product = heights("first")
+    ref = store.put_product(product)
+    back = store.get_product(ref.digest, Heights)
+    np.testing.assert_array_equal(back.values, product.values)
+    assert back.note == "first"
+    assert ref == ProductRef(type_name="heights", encoding_version=1, digest=digest_of(product))
+    with pytest.raises(ValueError, match="read-only"):
+        back.values[0] = 1.0
+
+
+def test_products_of_scan_size_are_memory_mapped(store: Store) -> None:
+    product = Points(values=np.arange(5000.0))
+    back = store.get_product(store.put_product(product).digest, Points)
+    assert isinstance(back.values.base, np.memmap)
+    np.testing.assert_array_equal(back.values, product.values)
+    with pytest.raises(ValueError, match="read-only"):
+        back.values[0] = 1.0
+
+
+def test_published_files_lie_beside_the_product(store: Store) -> None:
+    ref = store.put_product(heights("seen"), publish)
+    (file,) = store.published_files(ref.digest)
+    assert file.name == "heights.txt"
+    assert file.read_text() == f"{ref.digest} seen"
+
+
+def test_an_equal_product_is_kept_once(store: Store) -> None:
+    first = store.put_product(heights(), publish)
+    written = object_folder(store, first).stat().st_ino
+    assert store.put_product(heights(), publish) == first
+    assert object_folder(store, first).stat().st_ino == written
+    assert [path.name for path in store.objects.iterdir()] == [first.digest[7:]]
+    assert list((store.scratch / "loose").iterdir()) == []
+
+
+def test_another_version_of_the_publisher_makes_its_files_anew(store: Store) -> None:
+    ref = store.put_product(heights("x"), publish, publisher_tag="1")
+    object_folder(store, ref).joinpath("files", "heights.txt").write_text("old")
+    store.put_product(heights("x"), publish, publisher_tag="1")
+    assert store.published_files(ref.digest)[0].read_text() == "old"
+    store.put_product(heights("x"), publish, publisher_tag="2")
+    assert store.published_files(ref.digest)[0].read_text() == f"{ref.digest} x"
+
+
+@pytest.mark.parametrize("damage", [flip_middle, truncate, Path.unlink], ids=lambda f: f.__name__)
+def test_a_damaged_product_is_replaced_when_it_is_computed_again(
+    store: Store, damage: object
+) -> None:
+    ref = store.put_product(heights())
+    damage(object_folder(store, ref) / "product.h5")  # type: ignore[operator]
+    assert store.put_product(heights()) == ref
+    np.testing.assert_array_equal(store.get_product(ref.digest, Heights).values, heights().values)
+
+
+def test_reading_a_damaged_product_says_so_and_removes_it(store: Store) -> None:
+    ref = store.put_product(heights())
+    truncate(object_folder(store, ref) / "product.h5")
+    with pytest.raises(StoreError, match=r"was damaged .* run again and it is computed anew"):
+        store.get_product(ref.digest, Heights)
+    with pytest.raises(StoreError, match="has no product sha256:"):
+        store.get_product(ref.digest, Heights)
+
+
+def test_a_product_of_another_type_is_refused(store: Store) -> None:
+    ref = store.put_product(heights())
+    with pytest.raises(ProductError, match="expected a points product, got heights"):
+        store.get_product(ref.digest, Points)
+
+
+def test_what_no_store_can_keep_is_named(store: Store) -> None:
+    bad = Heights(values=np.array([object()]))  # type: ignore[arg-type]
+    with pytest.raises(ProductError, match="a heights cannot be stored: an array of type object"):
+        store.put_product(bad)
+
+
+@pytest.mark.parametrize("digest", ["sha256:../../etc", "", "sha256:" + "Z" * 64])
+def test_only_digests_name_objects(store: Store, digest: str) -> None:
+    with pytest.raises(StoreError, match="is not a digest"):
+        store.product_file(digest)
+
+
+def test_figures_are_kept_by_their_bytes(store: Store) -> None:
+    sha256 = store.put_blob(b"\x89PNG...")
+    assert store.put_blob(b"\x89PNG...") == sha256
+    path = store.blob_path(sha256)
+    assert path is not None
+    assert path.read_bytes() == b"\x89PNG..."
+    assert store.blob_path("00" * 32) is None
+
+
+def test_a_result_comes_back_equal(store: Store) -> None:
+    result = dataclasses.replace(
+        ok_result(store, heights()),
+        citations=("doi:1",),
+        metrics=(MetricValue(name="rms_mm", value=0.1, unit="mm"),),
+        figures=(
+            FigureRef(
+                name="f", caption="c", media_type="image/png", sha256=store.put_blob(b"\x89PNG")
+            ),
+        ),
+        warnings=("half of it is missing",),
+        environment={"id": "sha256:0", "packages": {"numpy": "2"}},
+        log="λ\nline",
+        seed=2**53 - 1,
+    )
+    store.put_result(KEY, result, "step")
+    assert store.result(KEY) == result
+    assert result_from_json(result_to_json(result), "x") == result
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "orthoflow/result/9"}', "{}"])
+def test_an_unreadable_result_is_a_miss(store: Store, text: str) -> None:
+    store.put_result(KEY, ok_result(store, heights()), "step")
+    (store.results / f"{KEY}.json").write_text(text)
+    assert store.result(KEY) is None
+
+
+@pytest.mark.parametrize("damage", [truncate, Path.unlink], ids=lambda f: f.__name__)
+def test_a_result_without_its_products_is_a_miss(store: Store, damage: object) -> None:
+    result = ok_result(store, heights("a"), heights("b"))
+    store.put_result(KEY, result, "step")
+    assert store.result(KEY) is not None
+    damage(object_folder(store, result.outputs["p1"]) / "product.h5")  # type: ignore[operator]
+    assert store.result(KEY) is None
+
+
+def test_a_result_under_another_key_is_a_miss(store: Store) -> None:
+    store.put_result(KEY, ok_result(store, heights()), "step")
+    other = "cd" * 32
+    shutil.copy(store.results / f"{KEY}.json", store.results / f"{other}.json")
+    assert store.result(other) is None
+
+
+# Full disk ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 1 MiB."""
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a file system can be mounted by root only")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_nothing_valid(tiny_disk: Path) -> None:
+    store = Store(tiny_disk / "store")
+    rng = np.random.default_rng(1)
+    large = Heights(values=rng.random(300_000))
+    with pytest.raises(StoreError, match=r"cannot write to .*store.*: No space left on the disk"):
+        store.put_product(large)
+    assert not list(store.objects.glob("*"))
+    assert not list((store.scratch / "loose").iterdir())
+    small = store.put_product(heights())
+    assert store.get_product(small.digest, Heights).values.shape == (2000,)
+
+
+def test_a_full_disk_while_publishing_leaves_nothing_valid(tiny_disk: Path) -> None:
+    store = Store(tiny_disk / "store")
+
+    def fill(product: Product, folder: Path, digest: str, /) -> None:
+        (folder / "large.txt").write_bytes(bytes(4 << 20))
+
+    with pytest.raises(StoreError, match="No space left"):
+        store.put_product(heights(), fill)
+    assert not list(store.objects.glob("*"))
+
+
+def test_a_full_disk_while_writing_a_result_keeps_the_old_one(tiny_disk: Path) -> None:
+    store = Store(tiny_disk / "store")
+    old = ok_result(store, heights())
+    store.put_result(KEY, old, "step")
+    with pytest.raises(StoreError, match="No space left"):
+        store.put_result(KEY, dataclasses.replace(old, log="x" * (4 << 20)), "step")
+    assert store.result(KEY) == old
+
+
+def test_a_limit_on_file_sizes_is_one_sentence(store: Store) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, before[1]))
+    try:
+        with pytest.raises(StoreError, match=r"cannot write to .*store"):
+            store.put_product(Points(values=np.zeros(1 << 20)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(store.objects.glob("*"))
+
+
+def test_a_file_in_place_of_the_store_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "store").write_text("not a folder")
+    with (
+        pytest.raises(StoreError, match=r"cannot write to .*store"),
+        Store(tmp_path / "store").in_use(),
+    ):
+        pass
+
+
+# Garbage ------------------------------------------------------------------------------------------
+
+
+def test_garbage_collection_keeps_exactly_what_results_need(store: Store) -> None:
+    with store.in_use():
+        kept = ok_result(store, heights("kept"))
+        store.put_result(KEY, kept, "step")
+        lost = ok_result(store, heights("lost"), key="cd" * 32)
+        store.put_result("cd" * 32, lost, "step")
+    (object_folder(store, lost.outputs["p0"]) / "product.h5").unlink()
+    store.put_product(heights("nobody needs me"))
+    (store.scratch / "left-over").mkdir()
+    expected = collect_garbage(store, dry_run=True)
+    assert (expected.n_results, expected.n_objects) == (1, 2)
+    assert expected.freed_bytes > 0
+    assert store.result(KEY) == kept
+    assert collect_garbage(store) == expected
+    assert store.result(KEY) == kept
+    assert [path.name for path in store.objects.iterdir()] == [kept.outputs["p0"].digest[7:]]
+    assert list(store.scratch.iterdir()) == []
+    assert [item.key for item in store.earlier_preimages("toy.make")] == [KEY]
+
+
+def test_garbage_collection_removes_what_was_not_used_for_long(store: Store) -> None:
+    with store.in_use():
+        for key in (KEY, "cd" * 32):
+            store.put_result(key, ok_result(store, heights(key), key=key), "step")
+    old = time.time() - 10 * 86400
+    os.utime(store.results / f"{KEY}.json", (old, old))
+    assert collect_garbage(store, older_than_days=5).n_results == 1
+    assert store.result(KEY) is None
+    assert store.result("cd" * 32) is not None
+    assert collect_garbage(store, older_than_days=0).n_results == 1
+    assert list(store.objects.iterdir()) == []
+
+
+def test_a_used_result_counts_as_new(store: Store) -> None:
+    store.put_result(KEY, ok_result(store, heights()), "step")
+    old = time.time() - 10 * 86400
+    os.utime(store.results / f"{KEY}.json", (old, old))
+    store.touch(KEY)
+    assert collect_garbage(store, older_than_days=5).n_results == 0
+
+
+def test_garbage_collection_refuses_while_a_run_uses_the_store(store: Store) -> None:
+    refusal = pytest.raises(StoreError, match="is in use by a run; wait until it has ended")
+    with store.in_use(), store.in_use(), refusal:
+        collect_garbage(store)
+    assert collect_garbage(store).n_results == 0
+
+
+def test_garbage_collection_of_nothing_and_of_negative_days(store: Store) -> None:
+    assert collect_garbage(store).freed_bytes == 0
+    assert not store.folder.exists()
+    with pytest.raises(ArgumentError, match="days must be 0 or more, got -1"):
+        collect_garbage(store, older_than_days=-1)
+
+
+def test_the_listing_names_results_with_their_size(store: Store) -> None:
+    assert list_results(store) == ()
+    result = ok_result(store, heights())
+    store.put_result(KEY, result, "step")
+    (item,) = list_results(store)
+    size = sum(path.stat().st_size for path in object_folder(store, result.outputs["p0"]).iterdir())
+    assert (item.key, item.method, item.run_id, item.size_bytes, item.is_complete) == (
+        KEY,
+        "toy.make",
+        "r1",
+        size,
+        True,
+    )
+
+
+# Digests of input files ---------------------------------------------------------------------------
+
+
+def settled_file(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    before = time.time() - 60
+    os.utime(path, (before, before))
+    return path
+
+
+def test_file_digests_are_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = settled_file(tmp_path / "scan.xyz", b"1 2 3\n")
+    memo = tmp_path / "digests.json"
+    digests = FileDigests(memo)
+    first = digests.digest(file)
+    digests.save()
+    monkeypatch.setattr("orthoflow.engine.file_digests._sha256", lambda path: pytest.fail("read"))
+    assert FileDigests(memo).digest_all([file, file]) == (first, first)
+    assert (first.name, first.size_bytes) == ("scan.xyz", 6)
+
+
+def test_a_changed_file_has_another_digest(tmp_path: Path) -> None:
+    digests = FileDigests(tmp_path / "digests.json")
+    first = digests.digest(settled_file(tmp_path / "scan.xyz", b"1 2 3\n"))
+    assert digests.digest(settled_file(tmp_path / "scan.xyz", b"1 2 4\n")).sha256 != first.sha256
+
+
+def test_a_file_changed_just_now_is_not_remembered(tmp_path: Path) -> None:
+    (tmp_path / "scan.xyz").write_bytes(b"1 2 3\n")
+    digests = FileDigests(tmp_path / "digests.json")
+    digests.digest(tmp_path / "scan.xyz")
+    digests.save()
+    assert not (tmp_path / "digests.json").exists()
+
+
+def test_a_damaged_memory_of_digests_is_ignored(tmp_path: Path) -> None:
+    (tmp_path / "digests.json").write_text("{")
+    file = settled_file(tmp_path / "scan.xyz", b"1 2 3\n")
+    assert len(FileDigests(tmp_path / "digests.json").digest(file).sha256) == 64
+
+
+def test_a_missing_input_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot read the input file .*gone.xyz: No such file"):
+        FileDigests(tmp_path / "digests.json").digest(tmp_path / "gone.xyz")
