@@ -1,11 +1,45 @@
-"""Simulated scenes of textured rectangles: what a ray hits and what colour it sees there."""
+"""Simulated scenes of textured rectangles: what there is, wherever the world lies.
+
+What a ray hits and what it sees there is in `orthoflow.geometry.scene_views`, apart from here so
+that products can hold a scene without loading compiled kernels.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
+
+from orthoflow.errors import GeometryError
+
+N_TEXTURE_PARAMS = 8
+
+
+class SurfaceRole(IntEnum):
+    """What a rectangle is in the room."""
+
+    WALL = 0
+    RELIEF = 1
+    RECESS = 2
+    OBJECT = 3
+
+
+class TextureKind(IntEnum):
+    """How a rectangle is painted; `texture_params` says with what.
+
+    All are functions of the position (a, b) in the rectangle, so they can be evaluated exactly
+    anywhere, and of 8 numbers: red, green, blue (0..255), laser reflectance (0..1), contrast
+    (0..1), period in metres, seed, spectral gap. The gap is 0 when the laser sees the pattern that
+    the eye sees, and 1 when it sees another one.
+    """
+
+    PLAIN = 0  # one colour with smooth stains
+    FRESCO = 1  # stains, rosettes that all differ, painted lines
+    TEXTILE = 2  # one motif, repeated exactly
+    TILES = 3  # checker of stained tiles with joints
+    WOOD = 4  # grain along b
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -13,22 +47,89 @@ class Scene:
     """Rectangles with holes and procedural textures; one row per rectangle.
 
     Attributes:
-        centre: (r, 3) float64 metres, world.
-        axis_a: (r, 3) float64 unit vector in the rectangle; axis_b alike, perpendicular.
+        origin: (3,) float64 metres, world; all positions of the scene are relative to it, so that
+            a shift of the world changes nothing else.
+        centre: (r, 3) float64 metres from `origin`, world axes: where a = b = 0.
+        axis_a: (r, 3) float64 unit vector in the rectangle, world axes.
+        axis_b: (r, 3) likewise, perpendicular to `axis_a`.
         extent: (r, 4) float64 metres: a_min, a_max, b_min, b_max from the centre.
         plane_index: (r,) int16 index of the true plane the rectangle belongs to, -1 for none.
-        texture: (r,) int32 number of the texture; parameters in `texture_params`.
-        texture_params: (r, 8) float64.
-        hole_rectangle: (h,) int32 rectangle a hole is in.
-        hole_extent: (h, 4) float64 metres, as `extent`.
+        role: (r,) uint8 `SurfaceRole`.
+        texture: (r,) int32 `TextureKind`.
+        texture_params: (r, 8) float64, see `TextureKind`.
+        hole_rectangle: (h,) int32 rectangle a hole is in, ascending.
+        hole_extent: (h, 4) float64 metres, as `extent`; a hole's rim belongs to the rectangle.
     """
 
+    origin: NDArray[np.float64]
     centre: NDArray[np.float64]
     axis_a: NDArray[np.float64]
     axis_b: NDArray[np.float64]
     extent: NDArray[np.float64]
     plane_index: NDArray[np.int16]
+    role: NDArray[np.uint8]
     texture: NDArray[np.int32]
     texture_params: NDArray[np.float64]
     hole_rectangle: NDArray[np.int32]
     hole_extent: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        count = len(self.centre)
+        shapes = {
+            "origin": (self.origin.shape, (3,)),
+            "centre": (self.centre.shape, (count, 3)),
+            "axis_a": (self.axis_a.shape, (count, 3)),
+            "axis_b": (self.axis_b.shape, (count, 3)),
+            "extent": (self.extent.shape, (count, 4)),
+            "plane_index": (self.plane_index.shape, (count,)),
+            "role": (self.role.shape, (count,)),
+            "texture": (self.texture.shape, (count,)),
+            "texture_params": (self.texture_params.shape, (count, N_TEXTURE_PARAMS)),
+            "hole_extent": (self.hole_extent.shape, (len(self.hole_rectangle), 4)),
+        }
+        for name, (shape, expected) in shapes.items():
+            if shape != expected:
+                raise GeometryError(f"scene.{name} must have shape {expected}, got {shape}")
+        if np.any(np.diff(self.hole_rectangle) < 0):
+            raise GeometryError("scene.hole_rectangle must ascend")
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """Unit normals (r, 3), axis_a x axis_b, world axes."""
+        return np.cross(self.axis_a, self.axis_b)
+
+    def corners_m(self) -> NDArray[np.float64]:
+        """Corners (r, 4, 3) of all rectangles, metres from `origin`, in order round each."""
+        a = self.extent[:, [0, 1, 1, 0], None] * self.axis_a[:, None, :]
+        b = self.extent[:, [2, 2, 3, 3], None] * self.axis_b[:, None, :]
+        corners: NDArray[np.float64] = self.centre[:, None, :] + a + b
+        return corners
+
+    def turned(self, rotation: NDArray[np.float64]) -> Scene:
+        """Turn the scene about its origin by a rotation matrix (3, 3)."""
+        return replace(
+            self,
+            centre=self.centre @ rotation.T,
+            axis_a=self.axis_a @ rotation.T,
+            axis_b=self.axis_b @ rotation.T,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Viewers:
+    """Where somebody or something looks from, all round, within a range of elevations.
+
+    Attributes:
+        positions_world: (s, 3) float64 metres.
+        up: (3,) float64 unit vector.
+        lowest_elevation_deg: lowest direction that is seen, above the horizon positive.
+        highest_elevation_deg: highest direction that is seen.
+    """
+
+    positions_world: NDArray[np.float64]
+    up: NDArray[np.float64]
+    lowest_elevation_deg: float = -90.0
+    highest_elevation_deg: float = 90.0

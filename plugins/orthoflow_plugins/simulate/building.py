@@ -1,0 +1,305 @@
+"""Building a scene out of rectangles: walls with what stands out of them and goes into them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane
+from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+
+# In rectangle or wall coordinates: a_min, a_max, b_min, b_max, metres.
+Extent = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paint:
+    """A texture with its parameters.
+
+    Attributes:
+        kind: how it is painted.
+        rgb: ground colour, 0..255.
+        reflectance: for the laser, 0..1.
+        contrast: 0..1.
+        period_m: size of the motif.
+        seed: which of the textures of its kind.
+    """
+
+    kind: TextureKind
+    rgb: tuple[float, float, float]
+    reflectance: float
+    contrast: float = 0.35
+    period_m: float = 0.3
+    seed: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """One rectangle of a scene in the making: where, how large, and what it is."""
+
+    centre: NDArray[np.float64]
+    axis_a: NDArray[np.float64]
+    axis_b: NDArray[np.float64]
+    extent: Extent
+    paint: Paint
+    role: SurfaceRole
+    plane: int = -1
+    holes: Sequence[Extent] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TruePlane:
+    """A plane that a detector should find.
+
+    Attributes:
+        name: label.
+        plane: the plane, normal towards the room.
+        outline: (4, 3) float64 metres, a rectangle on it that contains what belongs to it.
+    """
+
+    name: str
+    plane: Plane
+    outline: NDArray[np.float64]
+
+
+@dataclass(kw_only=True)
+class SceneDraft:
+    """Collects rectangles and true planes.
+
+    Attributes:
+        surfaces: the rectangles so far.
+        planes: the true planes so far; `Surface.plane` counts in them.
+    """
+
+    surfaces: list[Surface] = field(default_factory=list)
+    planes: list[TruePlane] = field(default_factory=list)
+
+    def finished(self, *, spectral_gap: float) -> Scene:
+        """Give the scene, its origin at (0, 0, 0).
+
+        Args:
+            spectral_gap: 0 when the laser sees the patterns of the photos, 1 when other ones.
+        """
+        surfaces = self.surfaces
+        holes = [(i, hole) for i, surface in enumerate(surfaces) for hole in surface.holes]
+        paints = [surface.paint for surface in surfaces]
+        return Scene(
+            origin=np.zeros(3),
+            centre=np.array([surface.centre for surface in surfaces]),
+            axis_a=np.array([surface.axis_a for surface in surfaces]),
+            axis_b=np.array([surface.axis_b for surface in surfaces]),
+            extent=np.array([surface.extent for surface in surfaces], dtype=np.float64),
+            plane_index=np.array([surface.plane for surface in surfaces], dtype=np.int16),
+            role=np.array([surface.role for surface in surfaces], dtype=np.uint8),
+            texture=np.array([paint.kind for paint in paints], dtype=np.int32),
+            texture_params=np.array(
+                [
+                    (*p.rgb, p.reflectance, p.contrast, p.period_m, p.seed, spectral_gap)
+                    for p in paints
+                ],
+                dtype=np.float64,
+            ),
+            hole_rectangle=np.array([index for index, _ in holes], dtype=np.int32),
+            hole_extent=np.array([hole for _, hole in holes], dtype=np.float64).reshape(-1, 4),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """A wall, floor or ceiling in the making, with coordinates of its own.
+
+    Attributes:
+        draft: what the rectangles go to.
+        foot: (3,) point of the wall nearest to the room's origin; a = b = 0.
+        axis_a: (3,) to the right for a viewer in the room.
+        axis_b: (3,) up in the wall.
+        normal: (3,) into the room.
+    """
+
+    draft: SceneDraft
+    foot: NDArray[np.float64]
+    axis_a: NDArray[np.float64]
+    axis_b: NDArray[np.float64]
+    normal: NDArray[np.float64]
+
+    def place(
+        self,
+        extent: Extent,
+        depth_m: float,
+        paint: Paint,
+        role: SurfaceRole,
+        *,
+        plane: int = -1,
+        holes: Sequence[Extent] = (),
+    ) -> None:
+        """Add a rectangle parallel to the wall, `depth_m` in front of it."""
+        self.draft.surfaces.append(
+            Surface(
+                centre=self.foot + depth_m * self.normal,
+                axis_a=self.axis_a,
+                axis_b=self.axis_b,
+                extent=extent,
+                paint=paint,
+                role=role,
+                plane=plane,
+                holes=holes,
+            )
+        )
+
+    def rims(
+        self, extent: Extent, depths_m: tuple[float, float], paint: Paint, role: SurfaceRole
+    ) -> None:
+        """Add the four faces that run from one depth to another along an extent's outline."""
+        a0, a1, b0, b1 = extent
+        low, high = min(depths_m), max(depths_m)
+        for a in (a0, a1):
+            self._across(self.axis_a, a, self.axis_b, (b0, b1, low, high), paint, role)
+        for b in (b0, b1):
+            self._across(self.axis_b, b, self.axis_a, (a0, a1, low, high), paint, role)
+
+    def box(self, extent: Extent, depth_m: float, paint: Paint, *, base_m: float = 0.0) -> None:
+        """Add relief that stands `depth_m` out of the depth `base_m`; none when that is zero."""
+        if depth_m <= 0.0:
+            return
+        role = SurfaceRole.RELIEF if base_m >= 0.0 else SurfaceRole.RECESS
+        self.place(extent, base_m + depth_m, paint, role)
+        self.rims(extent, (base_m, base_m + depth_m), paint, role)
+
+    def bars(
+        self, extent: Extent, width_m: float, depth_m: float, paint: Paint, *, base_m: float = 0.0
+    ) -> None:
+        """Add a frame of four mouldings inside an extent."""
+        a0, a1, b0, b1 = extent
+        for bar in (
+            (a0, a0 + width_m, b0, b1),
+            (a1 - width_m, a1, b0, b1),
+            (a0 + width_m, a1 - width_m, b0, b0 + width_m),
+            (a0 + width_m, a1 - width_m, b1 - width_m, b1),
+        ):
+            self.box(bar, depth_m, paint, base_m=base_m)
+
+    def recess(self, extent: Extent, depth_m: float, paint: Paint, *, plane: int = -1) -> Extent:
+        """Add a recess `depth_m` behind the wall; give the hole that the wall needs."""
+        self.place(extent, -depth_m, paint, SurfaceRole.RECESS, plane=plane)
+        self.rims(extent, (-depth_m, 0.0), paint, SurfaceRole.RECESS)
+        return extent
+
+    def true_plane(self, name: str, extent: Extent, depth_m: float = 0.0) -> int:
+        """Announce a plane parallel to the wall; give its number."""
+        a0, a1, b0, b1 = extent
+        foot = self.foot + depth_m * self.normal
+        outline = np.array(
+            [
+                foot + a * self.axis_a + b * self.axis_b
+                for a, b in ((a0, b1), (a0, b0), (a1, b0), (a1, b1))
+            ]
+        )
+        plane = Plane(normal=self.normal, offset_m=float(self.normal @ foot))
+        self.draft.planes.append(TruePlane(name=name, plane=plane, outline=outline))
+        return len(self.draft.planes) - 1
+
+    def _across(  # noqa: PLR0913 - the six say one rectangle
+        self,
+        along: NDArray[np.float64],
+        position_m: float,
+        axis: NDArray[np.float64],
+        extent: Extent,
+        paint: Paint,
+        role: SurfaceRole,
+    ) -> None:
+        self.draft.surfaces.append(
+            Surface(
+                centre=self.foot + position_m * along,
+                axis_a=axis,
+                axis_b=self.normal,
+                extent=extent,
+                paint=paint,
+                role=role,
+            )
+        )
+
+
+def wall_side(draft: SceneDraft, *, omega_deg: float, phi_deg: float, distance_m: float) -> Side:
+    """Begin a wall.
+
+    Args:
+        draft: what the rectangles go to.
+        omega_deg: direction of the outward normal, as markiewicz2015 gives it.
+        phi_deg: its inclination.
+        distance_m: of the wall from the room's origin.
+    """
+    omega, phi = math.radians(omega_deg), math.radians(phi_deg)
+    outward = np.array(
+        [math.cos(phi) * math.cos(omega), math.cos(phi) * math.sin(omega), math.sin(phi)]
+    )
+    right = np.array([math.sin(omega), -math.cos(omega), 0.0])
+    return Side(
+        draft=draft,
+        foot=distance_m * outward,
+        axis_a=right,
+        axis_b=np.cross(right, outward),
+        normal=-outward,
+    )
+
+
+def flat_side(draft: SceneDraft, *, normal: tuple[float, float, float], height_m: float) -> Side:
+    """Begin a floor or ceiling at a height over the room's origin, normal into the room."""
+    n = np.array(normal) / np.linalg.norm(normal)
+    right = np.array([1.0, 0.0, 0.0]) - n[0] * n
+    right /= np.linalg.norm(right)
+    return Side(
+        draft=draft,
+        foot=float(n[2]) * height_m * n,
+        axis_a=right,
+        axis_b=np.cross(n, right),
+        normal=n,
+    )
+
+
+def add_block(
+    draft: SceneDraft,
+    *,
+    base: NDArray[np.float64],
+    yaw_deg: float,
+    size_m: tuple[float, float, float],
+    paint: Paint,
+) -> None:
+    """Add a free-standing box.
+
+    Args:
+        draft: what the rectangles go to.
+        base: (3,) middle of its bottom, metres.
+        yaw_deg: turn about the vertical; 0 lays the first size along x.
+        size_m: length, depth, height.
+        paint: all its faces.
+    """
+    yaw = math.radians(yaw_deg)
+    along = np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    across = np.array([-math.sin(yaw), math.cos(yaw), 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    length, depth, height = size_m
+    half = (length / 2, depth / 2)
+    faces = [
+        (base + sign * half[0] * along, across, up, (-half[1], half[1], 0.0, height))
+        for sign in (-1.0, 1.0)
+    ]
+    faces += [
+        (base + sign * half[1] * across, along, up, (-half[0], half[0], 0.0, height))
+        for sign in (-1.0, 1.0)
+    ]
+    faces.append((base + height * up, along, across, (-half[0], half[0], -half[1], half[1])))
+    draft.surfaces += [
+        Surface(
+            centre=centre,
+            axis_a=axis_a,
+            axis_b=axis_b,
+            extent=extent,
+            paint=paint,
+            role=SurfaceRole.OBJECT,
+        )
+        for centre, axis_a, axis_b, extent in faces
+    ]

@@ -1,0 +1,275 @@
+"""The simulated room: four decorated walls, none quite square to the next, and what stands inside.
+
+Room frame: metres, z up, origin in the middle of the room 1.5 m over the floor. The main wall is
+that of markiewicz2015: omega 102 deg, leaning by 0.8 deg.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane, wall_axes
+from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+from orthoflow_plugins.simulate.building import (
+    Extent,
+    Paint,
+    SceneDraft,
+    Side,
+    TruePlane,
+    add_block,
+    flat_side,
+    wall_side,
+)
+
+FLOOR_M: Final = -1.5
+CEILING_M: Final = 1.6
+MAIN_WALL_M: Final = 2.4
+MAIN_OMEGA_DEG: Final = 102.0
+
+_UP: Final = np.array([0.0, 0.0, 1.0])
+# Walls reach a little past the corners of the room, where others hide them.
+_FULL: Final[Extent] = (-2.9, 2.9, FLOOR_M - 0.1, CEILING_M + 0.1)
+
+_STUCCO = Paint(
+    kind=TextureKind.PLAIN, rgb=(214, 206, 190), reflectance=0.7, contrast=0.18, seed=11
+)
+_GILT = Paint(kind=TextureKind.PLAIN, rgb=(196, 158, 82), reflectance=0.55, contrast=0.3, seed=12)
+_OAK = Paint(
+    kind=TextureKind.WOOD, rgb=(132, 92, 58), reflectance=0.35, period_m=0.12, contrast=0.4, seed=13
+)
+_DARK = Paint(kind=TextureKind.PLAIN, rgb=(92, 88, 84), reflectance=0.2, contrast=0.4, seed=14)
+_OBJECT = Paint(
+    kind=TextureKind.TILES, rgb=(38, 96, 160), reflectance=0.3, period_m=0.09, contrast=0.5, seed=15
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoomPlan:
+    """What the room is like.
+
+    Attributes:
+        relief: scale of all mouldings, 1 = as designed (up to 15 cm).
+        obstacle: an object stands free before the main wall.
+        spectral_gap: 0 when the laser sees the painted patterns, 1 when others.
+    """
+
+    relief: float = 1.0
+    obstacle: bool = True
+    spectral_gap: float = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """The room as built.
+
+    Attributes:
+        scene: its surfaces, in the room frame; `scene.plane_index` counts in `planes`.
+        planes: planes that a detector should find, clipped to the room.
+    """
+
+    scene: Scene
+    planes: tuple[TruePlane, ...]
+
+
+def build_room(plan: RoomPlan) -> Room:
+    """Build the room."""
+    draft = SceneDraft()
+    main = wall_side(draft, omega_deg=MAIN_OMEGA_DEG, phi_deg=0.8, distance_m=MAIN_WALL_M)
+    opposite = wall_side(draft, omega_deg=282.4, phi_deg=-0.2, distance_m=2.0)
+    right = wall_side(draft, omega_deg=12.2, phi_deg=0.3, distance_m=2.7)
+    left = wall_side(draft, omega_deg=191.7, phi_deg=-0.3, distance_m=2.7)
+    _build_main_wall(main, plan)
+    _build_opposite_wall(opposite, plan)
+    _build_right_wall(right, plan)
+    _build_left_wall(left, plan)
+    _build_floor_and_ceiling(draft)
+    _furnish(draft, plan)
+    return Room(scene=draft.finished(spectral_gap=plan.spectral_gap), planes=_clipped(draft.planes))
+
+
+def main_wall_axes() -> NDArray[np.float64]:
+    """Horizontal directions (2, 3): along the main wall to the viewer's right, and towards it."""
+    omega = math.radians(MAIN_OMEGA_DEG)
+    return np.array(
+        [[math.sin(omega), -math.cos(omega), 0.0], [math.cos(omega), math.sin(omega), 0.0]]
+    )
+
+
+def _build_main_wall(wall: Side, plan: RoomPlan) -> None:
+    fresco = Paint(
+        kind=TextureKind.FRESCO, rgb=(206, 180, 138), reflectance=0.5, period_m=0.32, seed=101
+    )
+    damask = Paint(
+        kind=TextureKind.TEXTILE, rgb=(150, 62, 58), reflectance=0.4, period_m=0.15, seed=102
+    )
+    niche: Extent = (-1.95, -1.15, -1.1, 0.75)
+    door: Extent = (1.22, 2.12, FLOOR_M - 0.1, 0.65)
+    cloth: Extent = (-0.45, 0.65, -0.45, 1.0)
+    full = wall.true_plane("main wall", _FULL)
+    in_niche = wall.true_plane("niche", niche, -0.25)
+    in_door = wall.true_plane("door", door, -0.12)
+    holes = [
+        wall.recess(niche, 0.25, fresco, plane=in_niche),
+        wall.recess(door, 0.12, _OAK, plane=in_door),
+        cloth,
+    ]
+    wall.place(_FULL, 0.0, fresco, SurfaceRole.WALL, plane=full, holes=holes)
+    wall.place(cloth, 0.0, damask, SurfaceRole.WALL, plane=full)
+    wall.bars((-0.53, 0.73, -0.53, 1.08), 0.08, 0.03 * plan.relief, _GILT)
+    wall.bars((-0.53, 0.73, -1.2, -0.7), 0.06, 0.025 * plan.relief, _STUCCO)
+    wall.bars((1.10, 2.24, FLOOR_M - 0.1, 0.77), 0.12, 0.04 * plan.relief, _STUCCO)
+    for bottom, top in ((-1.3, -0.5), (-0.35, 0.5)):
+        wall.bars((1.34, 2.0, bottom, top), 0.05, 0.02 * plan.relief, _OAK, base_m=-0.12)
+    for middle in (-2.3, -0.84, 0.94, 2.48):
+        _add_pilaster(wall, middle, plan)
+    for middle, height in ((-1.55, 1.02), (1.68, 1.02)):
+        square: Extent = (middle - 0.09, middle + 0.09, height - 0.09, height + 0.09)
+        wall.box(square, 0.045 * plan.relief, _GILT)
+    _add_cornice(wall, plan)
+    for start, end in ((-2.17, -0.97), (-0.71, 0.81)):
+        wall.box((start, end, FLOOR_M - 0.1, -1.32), 0.02 * plan.relief, _STUCCO)
+
+
+def _build_opposite_wall(wall: Side, plan: RoomPlan) -> None:
+    fresco = Paint(
+        kind=TextureKind.FRESCO, rgb=(160, 186, 152), reflectance=0.45, period_m=0.4, seed=201
+    )
+    windows: list[Extent] = [(-1.7, -0.7, -0.6, 1.0), (0.7, 1.7, -0.6, 1.0)]
+    full = wall.true_plane("opposite wall", _FULL)
+    holes = [wall.recess(window, 0.3, _STUCCO) for window in windows]
+    wall.place(_FULL, 0.0, fresco, SurfaceRole.WALL, plane=full, holes=holes)
+    for middle in (-2.2, 0.0, 2.2):
+        _add_pilaster(wall, middle, plan)
+    _add_cornice(wall, plan)
+
+
+def _build_right_wall(wall: Side, plan: RoomPlan) -> None:
+    damask = Paint(
+        kind=TextureKind.TEXTILE, rgb=(72, 104, 120), reflectance=0.35, period_m=0.3, seed=301
+    )
+    full = wall.true_plane("right wall", _FULL)
+    wall.place(_FULL, 0.0, damask, SurfaceRole.WALL, plane=full)
+    for start, end in ((-1.9, -0.7), (-0.5, 0.7)):
+        wall.bars((start, end, -0.9, 1.0), 0.07, 0.03 * plan.relief, _GILT)
+    _add_pilaster(wall, 1.3, plan)
+    _add_cornice(wall, plan)
+
+
+def _build_left_wall(wall: Side, plan: RoomPlan) -> None:
+    fresco = Paint(
+        kind=TextureKind.FRESCO, rgb=(196, 150, 132), reflectance=0.45, period_m=0.36, seed=401
+    )
+    full = wall.true_plane("left wall", _FULL)
+    wall.place(_FULL, 0.0, fresco, SurfaceRole.WALL, plane=full)
+    hearth: Extent = (-0.45, 0.45, FLOOR_M - 0.1, -0.65)
+    front: Extent = (-0.75, 0.75, FLOOR_M - 0.1, -0.4)
+    wall.place(front, 0.28, _STUCCO, SurfaceRole.RELIEF, holes=[hearth])
+    wall.rims(front, (0.0, 0.28), _STUCCO, SurfaceRole.RELIEF)
+    wall.place(hearth, 0.03, _DARK, SurfaceRole.RELIEF)
+    wall.rims(hearth, (0.03, 0.28), _DARK, SurfaceRole.RELIEF)
+    wall.box((-0.6, 0.6, -0.2, 1.1), 0.05 * plan.relief, _GILT)
+    for middle in (-1.6, 1.6):
+        _add_pilaster(wall, middle, plan)
+    _add_cornice(wall, plan)
+
+
+def _build_floor_and_ceiling(draft: SceneDraft) -> None:
+    tiles = Paint(
+        kind=TextureKind.TILES, rgb=(150, 138, 122), reflectance=0.35, period_m=0.35, seed=501
+    )
+    painted = Paint(
+        kind=TextureKind.FRESCO, rgb=(206, 206, 210), reflectance=0.8, period_m=0.5, seed=502
+    )
+    wide: Extent = (-3.4, 3.4, -3.2, 3.2)
+    for name, side, paint in (
+        ("floor", flat_side(draft, normal=(0.0017, 0.0, 1.0), height_m=FLOOR_M), tiles),
+        ("ceiling", flat_side(draft, normal=(0.003, 0.002, -1.0), height_m=CEILING_M), painted),
+    ):
+        plane = side.true_plane(name, wide)
+        side.place(wide, 0.0, paint, SurfaceRole.WALL, plane=plane)
+
+
+def _furnish(draft: SceneDraft, plan: RoomPlan) -> None:
+    along, towards = main_wall_axes()
+    yaw_deg = MAIN_OMEGA_DEG - 90.0
+    floor = FLOOR_M * _UP
+    if plan.obstacle:
+        # A screen 0.6 m before the main wall, turned so that no face is parallel to it.
+        add_block(
+            draft,
+            base=floor + 0.1 * along + 1.78 * towards,
+            yaw_deg=yaw_deg + 6.0,
+            size_m=(0.9, 0.1, 1.3),
+            paint=_OBJECT,
+        )
+    add_block(
+        draft,
+        base=floor + 2.3 * along - 0.9 * towards,
+        yaw_deg=yaw_deg - 4.0,
+        size_m=(0.5, 0.9, 0.75),
+        paint=_OAK,
+    )
+    add_block(
+        draft,
+        base=floor - 0.2 * along - 1.3 * towards,
+        yaw_deg=yaw_deg + 20.0,
+        size_m=(0.8, 0.5, 0.7),
+        paint=_DARK,
+    )
+
+
+def _add_pilaster(wall: Side, middle: float, plan: RoomPlan) -> None:
+    scale = plan.relief
+    wall.box((middle - 0.11, middle + 0.11, FLOOR_M - 0.1, 1.3), 0.07 * scale, _STUCCO)
+    wall.box((middle - 0.13, middle + 0.13, FLOOR_M - 0.1, -1.2), 0.1 * scale, _STUCCO)
+    wall.box((middle - 0.13, middle + 0.13, 1.12, 1.3), 0.11 * scale, _GILT)
+
+
+def _add_cornice(wall: Side, plan: RoomPlan) -> None:
+    wall.box((-2.9, 2.9, 1.3, CEILING_M + 0.1), 0.08 * plan.relief, _STUCCO)
+    wall.box((-2.9, 2.9, 1.44, CEILING_M + 0.1), 0.15 * plan.relief, _GILT)
+
+
+def _clipped(planes: list[TruePlane]) -> tuple[TruePlane, ...]:
+    """Cut each outline to the room and lay the smallest upright rectangle round what remains."""
+    bounds = [item.plane for item in planes if not item.name.startswith(("niche", "door"))]
+    return tuple(
+        TruePlane(name=item.name, plane=item.plane, outline=_visible_rectangle(item, bounds))
+        for item in planes
+    )
+
+
+def _visible_rectangle(item: TruePlane, bounds: list[Plane]) -> NDArray[np.float64]:
+    polygon = item.outline
+    for bound in bounds:
+        if abs(float(bound.normal @ item.plane.normal)) < 0.9:
+            polygon = _cut(polygon, bound)
+    u, v = wall_axes(item.plane.normal, _UP)
+    columns, rows = polygon @ u, polygon @ v
+    base = item.plane.offset_m * item.plane.normal
+    ends = (
+        (columns.min(), rows.min()),
+        (columns.min(), rows.max()),
+        (columns.max(), rows.max()),
+        (columns.max(), rows.min()),
+    )
+    return np.array([base + column * u + row * v for column, row in ends])
+
+
+def _cut(polygon: NDArray[np.float64], bound: Plane) -> NDArray[np.float64]:
+    """Keep the part of a convex polygon (n, 3) before a plane (Sutherland and Hodgman)."""
+    distances = bound.distances_m(polygon)
+    kept: list[NDArray[np.float64]] = []
+    for start in range(len(polygon)):
+        end = (start + 1) % len(polygon)
+        if distances[start] >= 0.0:
+            kept.append(polygon[start])
+        if (distances[start] >= 0.0) != (distances[end] >= 0.0):
+            share = distances[start] / (distances[start] - distances[end])
+            kept.append(polygon[start] + share * (polygon[end] - polygon[start]))
+    return np.array(kept)
