@@ -21,6 +21,7 @@ from orthoflow.workflow.problems import (
     UnusablePluginError,
 )
 from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
+from orthoflow.workflow.schema import workflow_schema
 from orthoflow.workflow.selection import Selection, check_step_names
 from orthoflow.workflow.wiring import topological_steps
 
@@ -49,4 +50,5 @@ __all__ = [
     "shipped_workflow",
     "shipped_workflows",
     "topological_steps",
+    "workflow_schema",
 ]

@@ -1,0 +1,354 @@
+"""Plugins: found one by one, never harming each other, and checked before use."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.errors import PluginError, WorkflowError
+from orthoflow.products.planes import Planes
+from tests.laboratories import (
+    LABORATORY,
+    entry_points_in,
+    laboratory_catalog,
+    write_distribution,
+)
+
+HOOKS = """\
+from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec, hookimpl
+
+@hookimpl
+def orthoflow_methods():
+    return [{methods}]
+
+@hookimpl
+def orthoflow_kinds():
+    return [{kinds}]
+
+@hookimpl
+def orthoflow_products():
+    return [{products}]
+"""
+
+
+def hooks(methods: str = "", kinds: str = "", products: str = "") -> str:
+    return HOOKS.format(methods=methods, kinds=kinds, products=products)
+
+
+def method(method_id: str, target: str) -> str:
+    return f"MethodSpec(id={method_id!r}, target={target!r}, summary='-')"
+
+
+def with_plugin(
+    name: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **more: str
+) -> Catalog:
+    """The laboratory beside one more plugin, whose hooks are in `<name>_hooks`."""
+    sources = {f"{name}_hooks.py": text} | {f"{key}.py": value for key, value in more.items()}
+    folder = write_distribution(tmp_path / name, name, sources)
+    return laboratory_catalog(monkeypatch, folder)
+
+
+def test_a_strangers_distribution_is_found_by_its_metadata(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    catalog = laboratory_catalog(monkeypatch)
+    entry = catalog.method("plane.hough2d")
+    assert (entry.distribution.name, entry.distribution.version) == ("laboratory", "1.0")
+    assert str(entry.distribution) == "laboratory 1.0"
+    assert entry.load().result_version == 3
+    assert catalog.kinds["plane"].spec.outputs == {"planes": "planes", "labels": "labels"}
+    assert catalog.product_class("planes") is Planes
+    assert catalog.publisher("cloud") is None
+    assert catalog.broken == ()
+
+
+def test_listing_plugins_loads_no_heavy_library() -> None:
+    program = textwrap.dedent(
+        """
+        import sys, json
+        from orthoflow.catalog import discover_catalog
+        catalog = discover_catalog()
+        heavy = {"numpy", "pydantic", "networkx", "h5py", "ruamel.yaml"} & set(sys.modules)
+        print(json.dumps([sorted(catalog.methods), sorted(heavy)]))
+        """
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    methods, heavy = json.loads(done.stdout)
+    assert "plane.hough2d" in methods
+    assert heavy == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "error"),
+    [
+        ("missing", "import no_such_library", "ModuleNotFoundError: No module named"),
+        ("leaving", "raise SystemExit('bye')", "SystemExit: bye"),
+        ("spelt", "def orthoflow_methods(:", "SyntaxError"),
+        ("raising", "raise ValueError('a\\nb')", "ValueError: a b"),
+        ("mute", "x = 1", "PluginError: mute_hooks announces nothing"),
+        ("listless", hooks().replace("return []", "return 3", 1), "expected a list of MethodSpec"),
+        ("mixed", hooks(methods="'plane.mine'"), "expected a MethodSpec, got 'plane.mine'"),
+        ("badid", hooks(methods=method("Mine", "a:B")), "method id must be kind.method in lower"),
+        ("badkind", hooks(kinds="KindSpec(name='A b', summary='-')"), "must match"),
+        ("badtarget", hooks(methods=method("plane.x", "a.B")), "target must be package.module"),
+        (
+            "strayhook",
+            "from orthoflow.sdk import hookimpl\n@hookimpl\ndef orthoflow_method():\n    return []",
+            "PluginValidationError",
+        ),
+    ],
+)
+def test_a_plugin_that_fails_is_listed_and_harms_nobody(
+    name: str, text: str, error: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    catalog = with_plugin(name, text, tmp_path, monkeypatch)
+    (broken,) = catalog.broken
+    assert (broken.entry_point, broken.module) == (name, f"{name}_hooks")
+    assert error in broken.error
+    assert "\n" not in broken.error
+    assert "Traceback" in broken.traceback
+    assert str(broken).startswith(f"plugin {name} of {name} 1.0 fails to load: ")
+    assert len(catalog.methods) == 14
+
+
+def test_ctrl_c_is_not_taken_for_a_broken_plugin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        with_plugin("stopping", "raise KeyboardInterrupt", tmp_path, monkeypatch)
+
+
+def test_a_method_claimed_twice_names_both_distributions_and_spoils_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = hooks(methods=method("plane.ransac", "zwei:Plane"))
+    catalog = with_plugin("second", text, tmp_path, monkeypatch)
+    message = (
+        "method plane.ransac is claimed by laboratory 1.0 and second 1.0; "
+        "uninstall all but one of them"
+    )
+    assert catalog.methods["plane.ransac"].state == "clash"
+    with pytest.raises(PluginError, match=message):
+        catalog.method("plane.ransac")
+    with pytest.raises(PluginError, match=message):
+        catalog.methods["plane.ransac"].load()
+    assert catalog.method("plane.hough2d").load().id == "plane.hough2d"
+
+
+def test_a_kind_claimed_with_other_ports_spoils_its_methods_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = "KindSpec(name='plane', summary='-', inputs={'cloud': 'cloud'}, outputs={})"
+    catalog = with_plugin("other", hooks(kinds=kind), tmp_path, monkeypatch)
+    message = "kind plane is claimed by laboratory 1.0 and other 1.0"
+    assert message in catalog.kinds["plane"].problem
+    with pytest.raises(PluginError, match=f"plane.ransac of laboratory 1.0 .* {message}"):
+        catalog.method("plane.ransac")
+    assert catalog.method("raster.grid").load().id == "raster.grid"
+
+
+def test_the_same_kind_announced_twice_with_the_same_ports_is_fine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = (
+        "KindSpec(name='mosaic', summary='mine', inputs={'layers': 'layers'}, "
+        "outputs={'orthoimages': 'orthoimages'})"
+    )
+    catalog = with_plugin("alike", hooks(kinds=kind), tmp_path, monkeypatch)
+    assert catalog.method("mosaic.seams").load().id == "mosaic.seams"
+
+
+def test_a_product_type_claimed_twice_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    product = "ProductSpec(type_name='planes', target='a:B', summary='-')"
+    catalog = with_plugin("typed", hooks(products=product), tmp_path, monkeypatch)
+    with pytest.raises(PluginError, match=r"product type planes is claimed by .* and typed 1\.0"):
+        catalog.product_class("planes")
+
+
+@pytest.mark.parametrize(
+    ("kinds", "problem"),
+    [
+        ("", "method colour.mine of lonely0 1.0 is of kind colour, which no plugin announces"),
+        (
+            "KindSpec(name='colour', summary='-', inputs={'x': 'unheard'}, outputs={})",
+            "kind colour of lonely1 1.0 has ports of product types that no plugin announces: unh",
+        ),
+    ],
+)
+def test_a_method_without_a_usable_kind_is_broken(
+    kinds: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "lonely1" if kinds else "lonely0"
+    text = hooks(methods=method("colour.mine", "a:B"), kinds=kinds)
+    catalog = with_plugin(name, text, tmp_path, monkeypatch)
+    assert catalog.methods["colour.mine"].state == "broken"
+    with pytest.raises(PluginError, match=problem):
+        catalog.method("colour.mine")
+
+
+def test_an_unknown_method_gets_a_suggestion_of_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    catalog = laboratory_catalog(monkeypatch)
+    with pytest.raises(WorkflowError, match=r"unknown method plane\.rnsac \(did you mean plane\.r"):
+        catalog.method("plane.rnsac")
+    with pytest.raises(WorkflowError, match=r"kind plane has plane\.hough2d, plane\.ransac"):
+        catalog.method("plane.voxels")
+    with pytest.raises(WorkflowError, match=r"plain\.ransac \(did you mean plane\.ransac\?\)"):
+        catalog.method("plain.ransac")
+
+
+def test_an_unknown_method_mentions_plugins_that_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "import no_such_library\nid = 'plane.deep'\n"
+    catalog = with_plugin("deep", text, tmp_path, monkeypatch)
+    with pytest.raises(WorkflowError, match=r"unknown method plane\.odd; .* plugin deep of deep"):
+        catalog.method("plane.odd")
+    with pytest.raises(PluginError, match=r"method plane\.deep cannot be used: plugin deep of"):
+        catalog.method("plane.deep")
+
+
+def test_an_unknown_product_type_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    catalog = laboratory_catalog(monkeypatch)
+    message = r"no installed plugin brings product type plans \(did you mean planes\?\)"
+    with pytest.raises(PluginError, match=message):
+        catalog.product_class("plans")
+
+
+CLASS = """\
+from orthoflow.products.cloud import PointCloud
+from orthoflow.products.planes import Planes, PointLabels
+from orthoflow.products.walls import Walls
+from orthoflow.sdk import Method, MethodParams, Ports
+
+class Mine(Method):
+    id = "plane.mine"
+    Params = MethodParams
+
+    class In(Ports):
+        cloud: PointCloud
+
+    class Out(Ports):
+        planes: Planes
+        labels: PointLabels
+
+    def run(self, inputs, params, ctx):
+        raise NotImplementedError
+"""
+CHANGES = {
+    "other id": ('"plane.mine"', '"plane.yours"', "its class says id 'plane.yours'"),
+    "no Params": ("    Params = MethodParams\n", "", "Params must be a subclass of MethodParams"),
+    "no Ports": ("class In(Ports):", "class In:", "its In must be a subclass of Ports"),
+    "no Out": ("class Out(Ports):", "class Result(Ports):", "its Out must be a subclass of Ports"),
+    "no run": ("def run(", "def go(", "it has no run"),
+    "no Method": ("class Mine(Method):", "class Mine:", "must be a subclass of Method"),
+    "determinism": (
+        "    Params",
+        "    determinism = 'maybe'\n    Params",
+        "exact, seeded or loose",
+    ),
+    "version": (
+        "    Params",
+        "    result_version = 0\n    Params",
+        "whole number from 1 on, got 0",
+    ),
+    "citations": ("    Params", "    citations = 'doi'\n    Params", "must be a tuple of texts"),
+    "invented port": ("cloud: P", "cloud: PointCloud\n        more: P", "kind plane has no input"),
+    "other type": ("cloud: PointCloud", "cloud: Walls", "port cloud carries cloud in kind plane"),
+    "lacking output": ("        labels: PointLabels\n", "", "its outputs must be planes, labels"),
+    "no product": ("cloud: PointCloud", "cloud: int", "its ports cannot be read: PluginError"),
+    "name lacks": ("class Mine(", "class Yours(", "AttributeError"),
+    "import fails": ("from orthoflow.sdk", "import no_such_library\nfrom orthoflow.sdk", "No mod"),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_a_class_that_breaks_a_rule_is_refused_when_it_is_loaded(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, after, complaint = CHANGES[case]
+    assert before in CLASS
+    name = "rule_" + case.replace(" ", "_")
+    text = hooks(methods=method("plane.mine", f"{name}_class:Mine"))
+    source = CLASS.replace(before, after, 1)
+    catalog = with_plugin(name, text, tmp_path, monkeypatch, **{f"{name}_class": source})
+    entry = catalog.method("plane.mine")
+    with pytest.raises(PluginError, match=rf"method plane\.mine of {name} 1\.0 ") as caught:
+        entry.load()
+    assert complaint in str(caught.value)
+
+
+def test_a_class_that_keeps_the_rules_is_loaded_and_may_ignore_ports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = hooks(methods=method("plane.mine", "kept_class:Mine"))
+    source = CLASS.replace("cloud: PointCloud", "pass")
+    catalog = with_plugin("kept", text, tmp_path, monkeypatch, kept_class=source)
+    assert catalog.method("plane.mine").load().id == "plane.mine"
+
+
+def test_an_install_from_an_index_is_released_and_one_from_a_folder_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = hooks(methods=method("plane.mine", "origin_class:Mine"))
+    catalog = with_plugin("origin", text, tmp_path, monkeypatch)
+    assert catalog.methods["plane.mine"].distribution.is_released
+    url = tmp_path / "origin" / "origin-1.0.dist-info" / "direct_url.json"
+    url.write_text('{"url": "file:///somewhere", "dir_info": {}}')
+    again = discover_catalog(entry_points_in(tmp_path / "origin"))
+    assert not again.methods["plane.mine"].distribution.is_released
+
+
+def test_code_in_front_of_an_installed_release_is_not_released(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = hooks(methods=method("plane.mine", "front_class:Mine"))
+    release = write_distribution(tmp_path / "site", "front", {"front_hooks.py": text})
+    checkout = tmp_path / "checkout"
+    checkout.mkdir()
+    (checkout / "front_hooks.py").write_text(text)
+    monkeypatch.syspath_prepend(release)
+    monkeypatch.syspath_prepend(checkout)
+    catalog = discover_catalog(entry_points_in(release))
+    assert not catalog.methods["plane.mine"].distribution.is_released
+
+
+def test_source_files_are_the_packages_of_hooks_and_class(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    catalog = laboratory_catalog(monkeypatch)
+    folder = LABORATORY / "laboratory"
+    entry = catalog.method("plane.hough2d")
+    assert entry.distribution.source_folder == folder
+    assert entry.source_files() == tuple(
+        folder / name for name in ("__init__.py", "hooks.py", "methods.py")
+    )
+    text = hooks(methods=method("plane.mine", "single_class:Mine"))
+    catalog = with_plugin("single", text, tmp_path, monkeypatch, single_class="")
+    entry = catalog.methods["plane.mine"]
+    assert entry.distribution.source_folder is None
+    assert [path.name for path in entry.source_files()] == ["single_class.py"]
+
+
+def test_publishers_are_loaded_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = "ProductSpec(type_name='notes', target='orthoflow.products.planes:Planes', summary='-'"
+    catalog = with_plugin(
+        "press",
+        hooks(products=f"{spec}, publisher='press_files:publish')"),
+        tmp_path,
+        monkeypatch,
+        press_files="def publish(product, folder, digest):\n    return digest\n",
+    )
+    publish = catalog.publisher("notes")
+    assert publish is not None
+    with pytest.raises(PluginError, match=r"product type notes of press .* its class says planes"):
+        catalog.product_class("notes")

@@ -1,0 +1,152 @@
+"""A workflow seen from outside: canonical JSON, JSON Schema, Mermaid, shipped recipes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+from ruamel.yaml import YAML
+
+from orthoflow.catalog import Catalog
+from orthoflow.workflow import (
+    load_workflow,
+    resolved_json,
+    shipped_workflow,
+    shipped_workflows,
+    workflow_schema,
+)
+from orthoflow.workflow.mermaid import mermaid
+from tests.laboratories import GOOD, laboratory_catalog, load, write_distribution
+
+
+@pytest.fixture
+def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    return laboratory_catalog(monkeypatch)
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return Path("flow.yaml")
+
+
+def test_the_resolved_workflow_is_canonical_json_without_paths_of_this_machine(
+    catalog: Catalog, write: Path, tmp_path: Path
+) -> None:
+    write.write_text(GOOD)
+    workflow = load_workflow(
+        write, catalog, sets=["wall.gsd_m=0.5"], inputs=[f"scan={tmp_path}/secret/mine.e57"]
+    )
+    text = resolved_json(workflow)
+    document = json.loads(text)
+    assert text == json.dumps(document, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    assert str(tmp_path) not in text
+    assert document["inputs"]["scan"]["files"] == ["mine.e57"]
+    assert document["inputs"]["photos"]["files"] == ["data/photos/*.jpg"]
+    assert document["overrides"] == ["--set wall.gsd_m=0.5", "--input scan=mine.e57"]
+    (wall,) = document["steps"]["wall"]["variants"]
+    assert (wall["params"], wall["params_set"]) == ({"gsd_m": 0.5}, {"gsd_m": 0.5})
+    assert document["steps"]["wall"]["in"] == {"cloud": ["cloud.cloud"], "planes": ["plane.planes"]}
+    assert document["compare"]["exclude"] == [{"plane": "ransac", "orient": "pnp"}]
+
+
+def test_the_schema_accepts_what_the_reader_accepts(catalog: Catalog) -> None:
+    schema = workflow_schema(catalog)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    document = YAML(typ="safe", pure=True).load(GOOD)
+    assert not list(jsonschema.Draft202012Validator(schema).iter_errors(document))
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("seed:", "sede:"),
+        ("orthoflow: 1", "orthoflow: 2"),
+        ("cell_m: 0.02", "cell_m: -1"),
+        ("cell_m: 0.02", 'cell_m: "0.02"'),
+        ("cell_m: 0.02", "limits: {low: 1}"),
+        ("gsd_m: 1", "gds_m: 1"),
+        ("use: plane.hough2d", "use: plane.hugh2d"),
+        ("use: raster.grid", "use: raster.gird"),
+        ("use: orient.pnp,", "variants: {},"),
+        ("timeout: 30min", "timeout: soon"),
+        ("cores: 2", "cores: none"),
+        ("repeat: 10", "repeat: 0"),
+        ("optional: true", "optional: perhaps"),
+        ("planes: plane.planes", "planes: planes"),
+        ("design: product", "design: everything"),
+        ("  ties: ", "  Ties: "),
+        ("  shots: ", "  inputs: "),
+    ],
+)
+def test_the_schema_refuses_mistakes_of_form(before: str, after: str, catalog: Catalog) -> None:
+    assert before in GOOD
+    document = YAML(typ="safe", pure=True).load(GOOD.replace(before, after, 1))
+    validator = jsonschema.Draft202012Validator(workflow_schema(catalog))
+    assert list(validator.iter_errors(document))
+
+
+def test_the_schema_carries_descriptions_and_leaves_out_what_cannot_be_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = """
+        from orthoflow.sdk.hooks import MethodSpec, hookimpl
+
+        @hookimpl
+        def orthoflow_methods():
+            return [MethodSpec(id="plane.gone", target="no_such_library:Plane", summary="-")]
+        """
+    folder = write_distribution(tmp_path / "gone", "gone", {"gone_hooks.py": text})
+    schema = json.dumps(workflow_schema(laboratory_catalog(monkeypatch, folder)))
+    assert "Edge of an accumulator cell." in schema
+    assert "plane.gone" not in schema
+
+
+def test_mermaid_draws_inputs_steps_and_what_flows(catalog: Catalog, write: Path) -> None:
+    text = """\
+orthoflow: 1
+inputs: {scan: {optional: true}, photos: {files: photos}}
+steps:
+  end: {use: read.scan, in: {files: inputs.scan}}
+  room: {use: simulate.room, unless: inputs.scan}
+  plane:
+    in: {cloud: [end.cloud, room.cloud]}
+    variants: {hough2d: {use: plane.hough2d}, many: {use: plane.ransac, repeat: 10}}
+  wall: {use: raster.grid, in: {cloud: room.cloud, planes: plane.planes}}
+  ortho: {use: ortho.direct, in: {walls: wall.walls, cloud: room.cloud, photos: room.photos}}
+"""
+    assert mermaid(load(text, write, catalog), catalog) == (
+        "flowchart LR\n"
+        '    input0[/"scan<br/>optional"/]\n'
+        '    input1[/"photos"/]\n'
+        '    step0["<b>end</b><br/>read.scan"]\n'
+        '    step1["<b>room</b><br/>simulate.room"]\n'
+        '    step2["<b>plane</b><br/>hough2d: plane.hough2d<br/>many: plane.ransac, 10 times"]\n'
+        '    step3["<b>wall</b><br/>raster.grid"]\n'
+        '    step4["<b>ortho</b><br/>ortho.direct"]\n'
+        '    input0 -->|"files"| step0\n'
+        '    input0 -.->|"unless"| step1\n'
+        '    step0 -.->|"cloud"| step2\n'
+        '    step1 -.->|"cloud"| step2\n'
+        '    step1 -->|"cloud"| step3\n'
+        '    step2 -->|"planes"| step3\n'
+        '    step3 -->|"walls"| step4\n'
+        '    step1 -->|"cloud"| step4\n'
+    )
+
+
+@pytest.mark.parametrize("name", ["direct", "direct.yaml", "workflows/direct.yaml"])
+def test_a_shipped_recipe_is_found_from_anywhere(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = shipped_workflow(name)
+    assert path == shipped_workflows()["direct"]
+    assert path.read_text(encoding="utf-8").count("name: direct") == 1
+
+
+def test_a_file_of_that_name_comes_before_the_recipe(catalog: Catalog, write: Path) -> None:
+    write.with_name("direct").write_text(GOOD)
+    assert load_workflow("direct", catalog).name == "palace-room"
