@@ -129,6 +129,20 @@ def test_a_problem_reads_file_line_column_path_message_and_shows_the_line(
     assert caret == "    " + " " * 13 + "^"
 
 
+def test_of_a_long_line_only_the_part_around_the_mistake_is_shown(
+    catalog: Catalog, write: Path
+) -> None:
+    padding = "x" * 500
+    write.write_text(f"{{orthoflow: 1, seed: -1, name: a, steps: {{room: {{use: {padding}}}}}}}")
+    with pytest.raises(InvalidWorkflowError) as caught:
+        load_workflow(write, catalog)
+    seed, _ = caught.value.problems
+    head, line, caret = str(seed).splitlines()
+    assert head == "flow.yaml:1:22: seed: expected a whole number from 0 on, got -1"
+    assert len(line) <= 124
+    assert line[caret.index("^") :].startswith("-1")
+
+
 def test_a_file_that_is_not_utf8_is_refused_with_its_line(catalog: Catalog, write: Path) -> None:
     write.write_bytes(b"orthoflow: 1\nname: caf\xe9\n")
     with pytest.raises(WorkflowError, match=r"flow.yaml:2: expected UTF-8 text, got the byte 0xe9"):

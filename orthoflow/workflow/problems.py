@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from orthoflow.workflow.positions import Position
 
 
-_SNIPPET_WIDTH: Final = 100
+_SNIPPET_WIDTH: Final = 120
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,8 @@ class Problem:
 
     def _snippet(self) -> str:
         # Around the column, so that a line of a thousand characters does not bury the message.
-        start = max(0, self.column - 1 - _SNIPPET_WIDTH // 2)
+        is_long = len(self.text) > _SNIPPET_WIDTH
+        start = max(0, self.column - 1 - _SNIPPET_WIDTH // 2) if is_long else 0
         cut = self.text[start : start + _SNIPPET_WIDTH]
         shown = "".join(char if char.isprintable() else " " for char in cut)
         if not shown.strip():
