@@ -11,6 +11,7 @@ import pytest
 from orthoflow.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.workflow import (
+    InvalidWorkflowError,
     UnusablePluginError,
     load_workflow,
 )
