@@ -1,0 +1,172 @@
+"""Digests see logical content, all of it, and nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from orthoflow_provenance.blocks import BLOCK_BYTES, block_indices
+from orthoflow_provenance.digests import canonical_json, payload_digest
+from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.payloads import StoredPayload
+
+from tests.provenance_records import Given
+
+JSON_VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+
+STRIPED = np.arange(24, dtype=np.float32).reshape(4, 6)
+
+
+@given(JSON_VALUES)
+def test_canonical_json_reads_back_to_the_same_value(value: object) -> None:
+    read = json.loads(canonical_json(value))
+    assert repr(_sorted(read)) == repr(_sorted(value))
+
+
+@given(st.dictionaries(st.text(), st.integers(), min_size=2))
+def test_canonical_json_does_not_depend_on_the_order_of_keys(value: dict[str, int]) -> None:
+    assert canonical_json(value) == canonical_json(dict(reversed(value.items())))
+
+
+def test_canonical_json_keeps_look_alikes_apart() -> None:
+    look_alikes = [1, 1.0, True, "1", 0, 0.0, -0.0, False, None, "", [], {}, [1], "1.0"]
+    assert len({canonical_json(value) for value in look_alikes}) == len(look_alikes)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (float("nan"), "JSON needs finite numbers, got nan at root"),
+        ({"a": [0, float("inf")]}, "got inf at /a/1"),
+        ({1: 2}, "keys of a JSON object must be text, got 1 at root"),
+        ({"a": np.zeros(2)}, "JSON knows no ndarray, got one at /a"),
+        ("\ud800", "half a surrogate pair"),
+    ],
+)
+def test_what_is_not_json_is_refused(value: object, message: str) -> None:
+    with pytest.raises(RecordFormatError, match=message):
+        canonical_json(value)
+
+
+def test_the_digest_is_the_one_that_the_specification_describes() -> None:
+    depth = np.arange(6, dtype=">f4").reshape(2, 3)
+    payload = Given(metadata={"gsd_m": 0.01, "name": "Wänd"}, arrays={"walls/0/depth_m": depth})
+    array_digest = hashlib.sha256(depth.astype("<f4").tobytes()).hexdigest()
+    content = (
+        '{"arrays":{"walls/0/depth_m":["<f4",[2,3],"' + array_digest + '"]},'
+        '"encoding_version":1,"metadata":{"gsd_m":0.01,"name":"Wänd"},"type":"walls","v":1,'
+        '"what":"orthoflow/product"}'
+    )
+    assert payload_digest(payload) == "sha256:" + hashlib.sha256(content.encode()).hexdigest()
+    assert payload_digest(payload) == (
+        "sha256:6eab819bb17fb277001d7da91ed23fa9f4a617752842f39c858bfbdfcaf50f90"
+    )
+
+
+@pytest.mark.parametrize(
+    "same",
+    [
+        pytest.param(lambda array: array.astype(">f4"), id="big-endian"),
+        pytest.param(np.asfortranarray, id="Fortran order"),
+        pytest.param(lambda array: np.repeat(array, 2, axis=1)[:, ::2], id="strided"),
+        pytest.param(lambda array: array[::-1].copy()[::-1], id="negative strides"),
+    ],
+)
+def test_memory_layout_does_not_show_in_the_digest(
+    same: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+) -> None:
+    assert payload_digest(Given(arrays={"a": same(STRIPED)})) == payload_digest(
+        Given(arrays={"a": STRIPED})
+    )
+
+
+def test_a_memory_mapped_array_has_the_digest_of_its_content(tmp_path: Path) -> None:
+    STRIPED.tofile(tmp_path / "a.f4")
+    mapped = np.memmap(tmp_path / "a.f4", dtype=np.float32, mode="r", shape=STRIPED.shape)
+    assert payload_digest(Given(arrays={"a": mapped})) == payload_digest(
+        Given(arrays={"a": STRIPED})
+    )
+
+
+def test_layout_in_storage_does_not_show_in_the_digest() -> None:
+    arrays = {"a": STRIPED}
+    assert payload_digest(Given(arrays=arrays, mapped=True)) == payload_digest(Given(arrays=arrays))
+
+
+def test_everything_logical_shows_in_the_digest() -> None:
+    zeros = np.zeros((2, 3), dtype=np.float32)
+    different = [
+        Given(arrays={"a": zeros}),
+        Given(arrays={"a": zeros}, type_name="layers"),
+        Given(arrays={"a": zeros}, encoding_version=2),
+        Given(arrays={"a": zeros}, metadata={"a": 1}),
+        Given(arrays={"a": zeros}, metadata={"a": 1.0}),
+        Given(arrays={"b": zeros}),
+        Given(arrays={"a": zeros.reshape(3, 2)}),
+        Given(arrays={"a": zeros.reshape(-1)}),
+        Given(arrays={"a": zeros.astype(np.int32)}),
+        Given(arrays={"a": -zeros}),
+        Given(arrays={"a": zeros, "b": zeros}),
+        Given(arrays={"a": np.zeros((0, 3), dtype=np.float32)}),
+        Given(arrays={"a": np.zeros((0, 4), dtype=np.float32)}),
+        Given(),
+    ]
+    assert len({payload_digest(payload) for payload in different}) == len(different)
+
+
+@pytest.mark.parametrize("dtype", ["c16", "U3", "S4", "O", "M8[s]", "f16"])
+def test_array_types_outside_the_format_are_refused(dtype: str) -> None:
+    with pytest.raises(RecordFormatError, match="cannot be stored, only bool, integers and floats"):
+        payload_digest(Given(arrays={"a": np.zeros(2, dtype=dtype)}))
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 60), max_size=3).map(tuple), st.sampled_from([1, 8, 4096, 1 << 20]))
+def test_blocks_cover_an_array_once_in_c_order(shape: tuple[int, ...], itemsize: int) -> None:
+    # Elements are counted instead of made: an index block is a run of a known length.
+    n_covered = 0
+    strides = [int(np.prod(shape[axis + 1 :])) for axis in range(len(shape))]
+    for index in block_indices(shape, itemsize):
+        starts = [part.start if isinstance(part, slice) else part for part in index]
+        first = sum(start * stride for start, stride in zip(starts, strides, strict=False))
+        assert first == n_covered
+        n_rows = [part.stop - part.start for part in index if isinstance(part, slice)]
+        n_elements = int(np.prod(n_rows)) * (strides[len(index) - 1] if index else 1)
+        assert n_elements * itemsize <= BLOCK_BYTES
+        n_covered += n_elements
+    assert n_covered == int(np.prod(shape))
+
+
+def test_a_stored_payload_is_digested_like_a_given_one() -> None:
+    stored = StoredPayload(
+        type_name="walls",
+        encoding_version=1,
+        metadata={},
+        arrays={"a": STRIPED},
+        mapped=False,
+        digest="",
+    )
+    assert payload_digest(stored) == payload_digest(Given(arrays={"a": STRIPED}))
+
+
+def _sorted(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _sorted(value[key]) for key in sorted(value)}
+    if isinstance(value, list):
+        return [_sorted(item) for item in value]
+    return value

@@ -1,0 +1,227 @@
+"""Products come back from their files as they went in, and a full disk is an ordinary error."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from orthoflow_provenance.digests import payload_digest
+from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.payloads import (
+    read_payload,
+    read_product_file,
+    write_payload,
+    write_product_file,
+)
+from orthoflow_provenance.safe import safe_open
+from orthoflow_provenance.sinks import create_file, create_group
+
+from tests.provenance_records import Given, cloud_payload, walls_payload
+
+NUMBERS = (
+    npst.boolean_dtypes() | npst.integer_dtypes() | npst.unsigned_integer_dtypes()
+) | npst.floating_dtypes(sizes=(16, 32, 64))
+ARRAYS = npst.arrays(NUMBERS, npst.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=40))
+# One level each, so that no array lies below another one.
+NAMES = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="/"), min_size=1).map(
+    lambda text: f"field/{text}0"
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    arrays=st.dictionaries(NAMES, ARRAYS, max_size=4),
+    metadata=st.dictionaries(
+        st.text(st.characters(exclude_categories=["Cs"])), st.floats(allow_nan=False) | st.text()
+    ).filter(lambda value: "inf" not in repr(value)),
+    is_mapped=st.booleans(),
+)
+def test_a_product_comes_back_from_its_file(
+    tmp_path_factory: pytest.TempPathFactory,
+    arrays: dict[str, np.ndarray],
+    metadata: dict[str, float | str],
+    is_mapped: bool,
+) -> None:
+    path = tmp_path_factory.mktemp("product") / "product.h5"
+    payload = Given(arrays=arrays, metadata=metadata, mapped=is_mapped)
+    digest = write_product_file(path, payload)
+    stored = read_product_file(path)
+    assert stored.digest == digest == payload_digest(payload) == payload_digest(stored)
+    assert (stored.type_name, stored.encoding_version) == ("walls", 1)
+    assert (stored.metadata, stored.mapped) == (metadata, is_mapped)
+    assert stored.arrays.keys() == arrays.keys()
+    for name, array in arrays.items():
+        assert stored.arrays[name].dtype == array.dtype.newbyteorder("<")
+        assert stored.arrays[name].shape == array.shape
+        np.testing.assert_array_equal(stored.arrays[name], array)
+
+
+def test_equal_products_give_equal_files(tmp_path: Path) -> None:
+    for name in ("a.h5", "b.h5"):
+        write_product_file(tmp_path / name, walls_payload())
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_mapped_arrays_are_aligned_read_only_views_of_the_file(tmp_path: Path) -> None:
+    payload = cloud_payload()
+    write_product_file(tmp_path / "cloud.h5", payload)
+    stored = read_product_file(tmp_path / "cloud.h5")
+    for axis in "xyz":
+        array = stored.arrays[axis]
+        assert isinstance(array.base, np.memmap)
+        assert array.flags.aligned
+        assert array.flags.c_contiguous
+        assert not array.flags.writeable
+        np.testing.assert_array_equal(array, payload.arrays[axis])
+
+
+def test_arrays_are_loaded_when_mapping_is_not_wanted(tmp_path: Path) -> None:
+    write_product_file(tmp_path / "cloud.h5", cloud_payload())
+    stored = read_product_file(tmp_path / "cloud.h5", map_arrays=False)
+    assert stored.arrays["x"].base is None
+    assert not stored.arrays["x"].flags.writeable
+    np.testing.assert_array_equal(stored.arrays["x"], cloud_payload().arrays["x"])
+
+
+def test_rasters_are_packed_with_checksums_and_clouds_lie_plain(tmp_path: Path) -> None:
+    write_product_file(tmp_path / "walls.h5", walls_payload())
+    write_product_file(tmp_path / "cloud.h5", cloud_payload())
+    with h5py.File(tmp_path / "walls.h5") as file:
+        depth = file["product/arrays/walls/0/depth_m"]
+        assert (depth.compression, depth.compression_opts) == ("gzip", 1)
+        assert (depth.shuffle, depth.fletcher32) == (True, True)
+        assert file["product/arrays/walls/0/origin_world"].chunks is None
+    with h5py.File(tmp_path / "cloud.h5") as file:
+        assert file["product/arrays/x"].chunks is None
+        assert file["product/arrays/x"].id.get_offset() % 64 == 0
+
+
+@pytest.mark.parametrize("is_mapped", [True, False])
+def test_arrays_of_any_memory_layout_larger_than_a_block_come_back(
+    tmp_path: Path, is_mapped: bool
+) -> None:
+    values = np.arange(3 * 1_100_000, dtype=np.float64).reshape(-1, 3)
+    payload = Given(arrays={"columns": values.T, "every_other": values[::2]}, mapped=is_mapped)
+    digest = write_product_file(tmp_path / "a.h5", payload)
+    stored = read_product_file(tmp_path / "a.h5")
+    np.testing.assert_array_equal(stored.arrays["columns"], values.T)
+    np.testing.assert_array_equal(stored.arrays["every_other"], values[::2])
+    assert payload_digest(stored) == digest
+
+
+def test_a_payload_can_be_written_into_any_group(tmp_path: Path) -> None:
+    payload = walls_payload()
+    with create_file(tmp_path / "a.h5") as file:
+        write_payload(create_group(file, "here"), payload, payload_digest(payload))
+    with safe_open(tmp_path / "a.h5") as file:
+        stored = read_payload(file["here"], map_arrays=True)
+    assert stored.digest == payload_digest(stored)
+
+
+@pytest.mark.parametrize(
+    ("payload", "message"),
+    [
+        (Given(arrays={"a//b": np.zeros(1)}), "the array '' cannot be a name in a record"),
+        (Given(arrays={"a/..": np.zeros(1)}), "the array '..' cannot be a name in a record"),
+        (Given(arrays={"a\nb": np.zeros(1)}), "neither `/` nor control characters"),
+        (Given(type_name=""), "the product type '' cannot be a name"),
+        (
+            Given(arrays={"a": np.zeros(1), "a/b": np.zeros(1)}),
+            "the array a/b cannot lie below a, which is an array itself",
+        ),
+        (Given(arrays={"a": np.zeros(1, dtype="U4")}), "cannot be stored"),
+        (Given(metadata={"a": float("nan")}), "JSON needs finite numbers"),
+    ],
+)
+def test_payloads_that_cannot_be_stored_leave_no_file(
+    tmp_path: Path, payload: Given, message: str
+) -> None:
+    with pytest.raises(RecordFormatError, match=message):
+        write_product_file(tmp_path / "a.h5", payload)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_product_file_of_another_format_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x"] = 1
+    with pytest.raises(
+        RecordFormatError, match="must be of format orthoflow-product, but it names"
+    ):
+        read_product_file(tmp_path / "a.h5")
+
+
+def test_a_product_file_of_a_newer_format_is_refused(tmp_path: Path) -> None:
+    write_product_file(tmp_path / "a.h5", walls_payload())
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file.attrs["format_version"] = np.bytes_(b"2.0")
+    with pytest.raises(RecordFormatError, match=r"has format version 2\.0.*use a newer orthoflow"):
+        read_product_file(tmp_path / "a.h5")
+
+
+def test_a_product_without_one_of_its_parts_is_refused(tmp_path: Path) -> None:
+    for part, message in (
+        ("metadata", "lacks the dataset metadata"),
+        ("arrays", "lacks the group arrays"),
+    ):
+        write_product_file(tmp_path / "a.h5", walls_payload())
+        with h5py.File(tmp_path / "a.h5", "r+") as file:
+            del file["product"][part]
+        with pytest.raises(RecordFormatError, match=message):
+            read_product_file(tmp_path / "a.h5")
+
+
+def test_a_missing_product_file_is_an_error_of_the_operating_system(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        read_product_file(tmp_path / "a.h5")
+
+
+def test_a_folder_that_does_not_exist_is_an_error_of_the_operating_system(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        write_product_file(tmp_path / "nowhere" / "a.h5", walls_payload())
+
+
+FULL_DISK = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from orthoflow_provenance.payloads import read_product_file, write_product_file
+from tests.provenance_records import Given
+
+# A limit on the size of files fails where a full disk does: in the middle of a write.
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
+noise = np.random.default_rng(0).integers(0, 255, 6_000_000, dtype=np.uint8)
+path = Path(sys.argv[1])
+try:
+    write_product_file(path, Given(arrays={"a": noise, "b": noise}, mapped=sys.argv[3] == "mapped"))
+except OSError as error:
+    print(error.errno, path.exists())
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+write_product_file(path, Given(arrays={"a": noise}))
+print(read_product_file(path).arrays["a"].sum() == noise.sum())
+"""
+
+
+@pytest.mark.parametrize("limit_bytes", [0, 1000, 3_000_000, 11_999_000, 12_001_000])
+@pytest.mark.parametrize("layout", ["mapped", "packed"])
+def test_a_full_disk_is_an_ordinary_error_and_the_process_lives(
+    tmp_path: Path, limit_bytes: int, layout: str
+) -> None:
+    command = [sys.executable, "-c", FULL_DISK, str(tmp_path / "a.h5"), str(limit_bytes), layout]
+    root = Path(__file__).parent.parent
+    path = [str(root), str(root / "provenance")]
+    done = subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"PYTHONPATH": ":".join(path), "PYTHONDONTWRITEBYTECODE": "1"},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "27 False\nTrue\n"  # EFBIG, the half-written file is gone

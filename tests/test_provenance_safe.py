@@ -1,0 +1,228 @@
+"""A file from a stranger reads nothing outside itself and never becomes larger than it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.safe import safe_open
+from orthoflow_provenance.verify import verify_record
+
+SECRET = np.arange(5.0)
+
+
+def external_link(file: h5py.File) -> None:
+    file["a"] = h5py.ExternalLink("secret.h5", "/secret")
+
+
+def external_link_in_a_group(file: h5py.File) -> None:
+    # Asked for `b/c/a`, h5py says "hard link" unless every part of the way is looked at.
+    file.create_group("b/c")["a"] = h5py.ExternalLink("secret.h5", "/")
+
+
+def soft_link(file: h5py.File) -> None:
+    file["numbers"] = SECRET
+    file["a"] = h5py.SoftLink("/numbers")
+
+
+def soft_link_cycle(file: h5py.File) -> None:
+    file["a"] = h5py.SoftLink("/b")
+    file["b"] = h5py.SoftLink("/a")
+
+
+def hard_link_cycle(file: h5py.File) -> None:
+    group = file.create_group("a")
+    group["b"] = group
+
+
+def way_back_to_the_root(file: h5py.File) -> None:
+    file["a"] = file["/"]
+
+
+def two_names_for_one_dataset(file: h5py.File) -> None:
+    file["a"] = SECRET
+    file["b"] = file["a"]
+
+
+def named_type(file: h5py.File) -> None:
+    file["a"] = np.dtype("f8")
+
+
+def external_storage(file: h5py.File) -> None:
+    file.create_dataset("a", (5,), "f8", external=[("secret.raw", 0, h5py.h5f.UNLIMITED)])
+
+
+def virtual_dataset(file: h5py.File) -> None:
+    layout = h5py.VirtualLayout((5,), "f8")
+    layout[:] = h5py.VirtualSource("secret.h5", "secret", shape=(5,))
+    file.create_virtual_dataset("a", layout)
+
+
+def dataset_without_data(file: h5py.File) -> None:
+    file.create_dataset("a", (10**12,), "f8", chunks=(1 << 20,), compression="gzip")
+
+
+def contiguous_dataset_without_data(file: h5py.File) -> None:
+    file.create_dataset("a", (10**12,), "f8")
+
+
+def gigantic_chunk(file: h5py.File) -> None:
+    file.create_dataset("a", (3,), "f8", chunks=(1 << 24,), maxshape=(None,), compression="gzip")
+
+
+def gzip_twice(file: h5py.File) -> None:
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_chunk((1 << 16,))
+    properties.set_deflate(9)
+    properties.set_deflate(9)
+    space = h5py.h5s.create_simple((1 << 16,))
+    h5py.h5d.create(file.id, b"a", h5py.h5t.NATIVE_DOUBLE, space, dcpl=properties)
+
+
+def other_filter(file: h5py.File) -> None:
+    file.create_dataset("a", data=np.arange(4096), compression="lzf")
+
+
+def text_of_variable_length(file: h5py.File) -> None:
+    file["a"] = "text"
+
+
+def list_of_lists(file: h5py.File) -> None:
+    file.create_dataset("a", (2,), h5py.vlen_dtype(np.float64))
+
+
+def reference(file: h5py.File) -> None:
+    file.create_dataset("a", data=file.ref, dtype=h5py.ref_dtype)
+
+
+def nested_compound(file: h5py.File) -> None:
+    file.create_dataset("a", (2,), np.dtype([("b", np.dtype([("c", "f8")]))]))
+
+
+def reference_in_an_attribute(file: h5py.File) -> None:
+    file.attrs.create("a", file.ref, dtype=h5py.ref_dtype)
+
+
+def text_of_variable_length_in_an_attribute(file: h5py.File) -> None:
+    file.create_group("b").attrs["a"] = "text"
+
+
+def large_attribute(file: h5py.File) -> None:
+    file.attrs["a"] = np.zeros(1 << 18)
+
+
+def deep_nesting(file: h5py.File) -> None:
+    file.create_group("/".join("g" * 40))
+
+
+FORBIDDEN: list[tuple[Callable[[h5py.File], None], str]] = [
+    (external_link, ":/a is a link into another file: the file is not opened"),
+    (external_link_in_a_group, ":/b/c/a is a link into another file"),
+    (soft_link, ":/a is a soft link, only hard links are allowed"),
+    (soft_link_cycle, " is a soft link"),
+    (hard_link_cycle, ":/a/b leads to an object that has another place as well"),
+    (way_back_to_the_root, ":/a leads to an object that has another place as well"),
+    (two_names_for_one_dataset, ":/b leads to an object that has another place as well"),
+    (named_type, ":/a is neither a group nor a dataset"),
+    (external_storage, ":/a keeps its data in another file"),
+    (virtual_dataset, ":/a is a virtual dataset"),
+    (dataset_without_data, "says it has 8000000000000 bytes, but the file holds 0 for it"),
+    (contiguous_dataset_without_data, "says it has 8000000000000 bytes"),
+    (gigantic_chunk, ":/a has chunks of more than 64 MiB"),
+    (gzip_twice, "must use each of shuffle, gzip, fletcher32 at most once and no other"),
+    (other_filter, "must use each of shuffle, gzip, fletcher32 at most once and no other"),
+    (text_of_variable_length, ":/a has a type outside the format"),
+    (list_of_lists, ":/a has a type outside the format"),
+    (reference, ":/a has a type outside the format"),
+    (nested_compound, ":/a has a type outside the format"),
+    (reference_in_an_attribute, ":/@a has a type outside the format"),
+    (text_of_variable_length_in_an_attribute, ":/b@a has a type outside the format"),
+    (large_attribute, ":/@a is larger than 1 MiB"),
+    (deep_nesting, "is nested more than 32 groups deep"),
+]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"), [pytest.param(*case, id=case[0].__name__) for case in FORBIDDEN]
+)
+def test_forbidden_files_are_refused_with_a_sentence(
+    tmp_path: Path, make: Callable[[h5py.File], None], message: str
+) -> None:
+    with h5py.File(tmp_path / "secret.h5", "w") as secret:
+        secret["secret"] = SECRET
+    SECRET.tofile(tmp_path / "secret.raw")
+    path = tmp_path / "stranger.h5"
+    with h5py.File(path, "w", libver=("v110", "v110")) as file:
+        make(file)
+    with pytest.raises(RecordFormatError) as refusal, safe_open(path):
+        pass
+    assert str(refusal.value).startswith("stranger.h5")
+    assert message in str(refusal.value)
+    (finding,) = verify_record(path)
+    assert finding.problem == str(refusal.value)
+
+
+def test_datasets_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "stranger.h5"
+    with h5py.File(path, "w") as file:
+        for name in "ab":
+            file[name] = np.full(100_000, ord(name), dtype=np.uint8)
+        start, other = (file[name].id.get_offset() for name in "ab")
+    # The same offset for both; old structures have no checksum that would tell.
+    content = path.read_bytes().replace(other.to_bytes(8, "little"), start.to_bytes(8, "little"))
+    path.write_bytes(content[: start + 150_000])
+    with pytest.raises(RecordFormatError), safe_open(path):
+        pass
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.6, 0.999])
+def test_truncated_files_are_refused_with_a_sentence(tmp_path: Path, share: float) -> None:
+    path = tmp_path / "cut.h5"
+    with h5py.File(path, "w", libver=("v110", "v110")) as file:
+        file["a"] = np.arange(10_000)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(RecordFormatError, match=r"^cut\.h5"), safe_open(path):
+        pass
+
+
+def test_files_that_are_not_hdf5_are_refused_with_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    path.write_text("not a record")
+    with (
+        pytest.raises(RecordFormatError, match=r"run\.h5 must be an HDF5 file, but does not begin"),
+        safe_open(path),
+    ):
+        pass
+
+
+def test_notes_may_be_written_as_h5py_does_by_itself(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["notes/first"] = "text of variable length"
+        file["notes"].attrs["author"] = "A. Nother"
+    with safe_open(path) as file:
+        assert list(file["notes"]) == ["first"]
+
+
+def test_notes_may_not_lead_out_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group("notes")["a"] = h5py.ExternalLink("secret.h5", "/")
+    with pytest.raises(RecordFormatError, match="is a link into another file"), safe_open(path):
+        pass
+
+
+def test_well_packed_data_of_any_size_is_allowed(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset(
+            "a", data=np.zeros(80 << 20, dtype=np.uint8), chunks=(1 << 20,), compression=9
+        )
+        assert file["a"].nbytes > 500 * file["a"].id.get_storage_size()
+    with safe_open(path) as file:
+        assert file["a"].shape == (80 << 20,)
