@@ -72,28 +72,32 @@ LIBRARIES: Final = (
     Library(
         distribution="numba",
         module="numba",
-        loss="no simulated room, plane detection, rasters or orthoimages: the methods of "
-        "simulate, plane, raster, ortho",
+        loss="no method of simulate, plane, raster, ortho and inspect",
     ),
-    Library(distribution="scipy", module="scipy", loss="methods that use scipy fail to load"),
+    Library(distribution="scipy", module="scipy", loss="no method of plane and inspect"),
     Library(
         distribution="opencv-python-headless",
         module="cv2",
-        loss="no photographs and no filling of gaps: read.photos, ortho.pointcloud-direct",
+        loss="no photographs, no filled gaps, no previews: simulate.room and the methods of raster "
+        "and ortho",
     ),
     Library(
         distribution="rasterio",
         module="rasterio",
-        loss="no GeoTIFF files: the products of raster and mosaic",
+        loss="no GeoTIFF files: what raster and mosaic publish",
     ),
     Library(distribution="laspy", module="laspy", loss="no LAS and LAZ files: read.scan"),
     Library(distribution="lazrs", module="lazrs", loss="no compressed LAZ files: read.scan"),
     Library(distribution="pye57", module="pye57", loss="no E57 files: read.scan"),
-    Library(distribution="pandas", module="pandas", loss="no text point files: read.scan"),
-    Library(distribution="mahotas", module="mahotas", loss="no inspect.surf"),
-    Library(distribution="matplotlib", module="matplotlib", loss="no figures drawn by methods"),
-    Library(distribution="pycolmap", module="pycolmap", loss="no orient.colmap-bundle"),
-    Library(distribution="pyceres", module="pyceres", loss="no orient.colmap-bundle"),
+    Library(distribution="pandas", module="pandas", loss="no text files of points: read.scan"),
+    Library(
+        distribution="matplotlib",
+        module="matplotlib",
+        loss="no method of plane, which draw their plans with it",
+    ),
+    Library(distribution="mahotas", module="mahotas", loss="no inspection by SURF features"),
+    Library(distribution="pycolmap", module="pycolmap", loss="no bundle adjustment"),
+    Library(distribution="pyceres", module="pyceres", loss="no bundle adjustment"),
     Library(
         distribution="libusb-package",
         module="libusb_package",
@@ -102,7 +106,7 @@ LIBRARIES: Final = (
     Library(
         distribution="open3d-cpu",
         module="open3d",
-        loss="no plane.open3d-ransac, no plane.open3d-patches; the default methods work without it",
+        loss="no comparators of open3d; the default methods work without it",
     ),
 )
 

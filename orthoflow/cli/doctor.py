@@ -65,9 +65,13 @@ def _print(findings: list[Diagnosis], *, broken_core: bool) -> None:
 
 
 def _diagnose_plugins() -> list[Diagnosis]:
-    from orthoflow.catalog import discover_catalog
+    try:
+        from orthoflow.catalog import discover_catalog
 
-    catalog = discover_catalog()
+        catalog = discover_catalog()
+    except ImportError as error:
+        cost = "no method can be found; install what is missing"
+        return [Diagnosis(name="plugins", verdict="missing", found=str(error), cost=cost)]
     findings = [
         Diagnosis(
             name="plugins",

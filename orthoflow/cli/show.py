@@ -11,7 +11,7 @@ import click
 from orthoflow.cli.diagnosis import LIBRARIES
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import Command, json_option
-from orthoflow.cli.tables import counted, duration, echo_json, echo_table, size
+from orthoflow.cli.tables import counted, duration, echo_json, echo_table, number, size
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell, Run
@@ -56,9 +56,9 @@ def _print_head(run: Run) -> None:
 
 def _status_text(run: Run) -> str:
     counts = [
-        f"{number} {status}"
+        f"{count} {status}"
         for status in ("ok", "failed", "skipped")
-        if (number := sum(cell.status == status for cell in run.record.cells))
+        if (count := sum(cell.status == status for cell in run.record.cells))
     ]
     return f"{counted(len(run.record.cells), 'cell')}, {', '.join(counts)}"
 
@@ -92,7 +92,7 @@ def _cell_status(cell: RecordedCell) -> str:
 
 def _print_metrics(run: Run) -> None:
     rows = [
-        (cell.address, metric.name, f"{metric.value:.6g}", metric.unit)
+        (cell.address, metric.name, number(metric.value), metric.unit)
         for cell in run.record.cells
         for metric in cell.metrics
     ]
@@ -116,11 +116,10 @@ def _print_environments(run: Run) -> None:
 
 
 def _print_files(run: Run) -> None:
-    files = [file for group in run.files.values() for file in group]
-    if files:
-        click.echo("\nfiles:")
-    for file in files:
-        click.echo(f"  {file}")
+    n_files = sum(len(files) for files in run.files.values())
+    click.echo(f"\nproducts: {run.products_folder}, {counted(n_files, 'file')}")
+    for image in run.orthoimages:
+        click.echo(f"orthoimage: {image}")
 
 
 def _as_json(run: Run) -> dict[str, object]:

@@ -64,10 +64,19 @@ def size(n_bytes: float) -> str:
     return f"{value:.1f} TiB"
 
 
-def counted(number: int, noun: str) -> str:
+def number(value: float) -> str:
+    """Say a number to six significant digits, counts to the last one.
+
+    >>> number(2251930.0), number(0.0012345678), number(-3.0)
+    ('2251930', '0.00123457', '-3')
+    """
+    return str(int(value)) if value.is_integer() and abs(value) < 1e15 else f"{value:.6g}"
+
+
+def counted(count: int, noun: str) -> str:
     """Say a number with its noun.
 
     >>> counted(1, "cell"), counted(3, "cell")
     ('1 cell', '3 cells')
     """
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
