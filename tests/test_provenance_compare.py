@@ -1,0 +1,148 @@
+"""Two products are compared number by number, within limits that carry a unit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_provenance.compare import ArrayDifference, compare_payloads
+from orthoflow_provenance.model import JsonValue
+
+from tests.provenance_records import Given, walls_payload
+
+LIMITS = {"depth_m": (1e-4, "m"), "gsd_m": (1e-6, "m"), "rgb": (2.0, "grey")}
+
+
+def compare(
+    left: NDArray[np.generic], right: NDArray[np.generic], name: str = "walls/0/depth_m"
+) -> tuple[ArrayDifference, ...]:
+    return compare_payloads(Given(arrays={name: left}), Given(arrays={name: right}), LIMITS)
+
+
+def test_a_product_does_not_differ_from_itself() -> None:
+    assert compare_payloads(walls_payload(), walls_payload(), {}) == ()
+
+
+def test_a_difference_within_the_limit_is_none_and_beyond_it_is_measured() -> None:
+    depth = np.zeros((4, 5))
+    moved = depth.copy()
+    moved[1, 2], moved[3, 3] = 9e-5, -0.25
+    assert compare(depth, np.where(moved < 0, 0, moved)) == ()
+    (difference,) = compare(depth, moved)
+    assert difference == ArrayDifference(
+        name="walls/0/depth_m",
+        largest=0.25,
+        limit=1e-4,
+        unit="m",
+        n_values=1,
+        problem="1 of 20 values differ by more than 0.0001 m, the largest by 0.25",
+    )
+
+
+def test_fields_without_a_limit_must_be_equal() -> None:
+    mask = np.zeros(9, dtype=np.uint8)
+    changed = mask.copy()
+    changed[4:6] = (1, 255)
+    (difference,) = compare(mask, changed, "walls/0/mask")
+    assert (difference.largest, difference.n_values, difference.limit) == (255.0, 2, 0.0)
+
+
+def test_nan_equals_nan_and_nothing_else() -> None:
+    left = np.array([np.nan, 1.0, np.nan])
+    assert compare(left, left.copy()) == ()
+    (difference,) = compare(left, np.array([np.nan, np.nan, 1.0]))
+    assert (difference.largest, difference.n_values) == (math.inf, 2)
+
+
+@pytest.mark.parametrize(("left", "right"), [(np.inf, 1.0), (np.inf, -np.inf), (np.inf, np.nan)])
+def test_infinity_equals_only_itself(left: float, right: float) -> None:
+    assert compare(np.array([left]), np.array([left])) == ()
+    (difference,) = compare(np.array([left]), np.array([right]))
+    assert difference.largest == math.inf
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.uint64])
+def test_neighbouring_large_integers_differ_by_one(dtype: type[np.int64] | type[np.uint64]) -> None:
+    largest = np.iinfo(dtype).max
+    left, right = np.array([largest, 5], dtype=dtype), np.array([largest - 1, 5], dtype=dtype)
+    (difference,) = compare(left, right, "count")
+    assert (difference.largest, difference.n_values) == (1.0, 1)
+
+
+def test_signed_integers_do_not_overflow() -> None:
+    limits = np.iinfo(np.int64)
+    (difference,) = compare(np.array([limits.min]), np.array([limits.max]), "count")
+    assert difference.largest == 2.0**64
+
+
+def test_unsigned_integers_do_not_wrap_around() -> None:
+    left, right = np.array([0], dtype=np.uint8), np.array([2], dtype=np.uint8)
+    assert compare(left, right, "rgb") == ()
+    assert compare(right, left, "rgb") == ()
+
+
+def test_scalars_booleans_and_empty_arrays_are_compared() -> None:
+    assert compare(np.array(1.0), np.array(1.00001)) == ()
+    (difference,) = compare(np.array(1.0), np.array(2.0))
+    assert difference.largest == 1.0
+    assert len(compare(np.array([True]), np.array([False]))) == 1
+    assert compare(np.zeros((0, 3)), np.zeros((0, 3))) == ()
+
+
+def test_differences_are_found_in_arrays_of_several_blocks() -> None:
+    left = np.zeros((3, 1_500_000))
+    right = left.copy()
+    right[2, -1] = right[0, 0] = 1.0
+    (difference,) = compare(left, right)
+    assert (difference.largest, difference.n_values) == (1.0, 2)
+
+
+@pytest.mark.parametrize(
+    ("right", "problem"),
+    [
+        (np.zeros((5, 4)), "float64 of shape (4, 5) against float64 of (5, 4)"),
+        (np.zeros((4, 5), dtype=np.float32), "float64 of shape (4, 5) against float32 of (4, 5)"),
+    ],
+)
+def test_other_shapes_and_types_cannot_be_compared(
+    right: NDArray[np.generic], problem: str
+) -> None:
+    (difference,) = compare(np.zeros((4, 5)), right)
+    assert (difference.problem, difference.largest) == (problem, math.inf)
+
+
+def test_arrays_that_only_one_product_has_are_named() -> None:
+    left, right = Given(arrays={"a": np.zeros(1)}), Given(arrays={"b": np.zeros(1)})
+    differences = compare_payloads(left, right, {})
+    assert [difference.name for difference in differences] == ["a", "b"]
+    assert {difference.problem for difference in differences} == {"only one of the products has it"}
+
+
+def test_products_of_other_types_cannot_be_compared() -> None:
+    (difference,) = compare_payloads(Given(), Given(encoding_version=2), {})
+    assert difference.problem == "the products are walls version 1 and walls version 2"
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "expected"),
+    [
+        ({"walls": [{"gsd_m": 0.01}]}, {"walls": [{"gsd_m": 0.0100005}]}, []),
+        (
+            {"walls": [{"gsd_m": 0.01}]},
+            {"walls": [{"gsd_m": 0.02}]},
+            [("walls/0/gsd_m", "0.01 against 0.02, 1e-06 m are allowed")],
+        ),
+        ({"a": 1}, {"a": 1.0}, []),
+        ({"a": 1}, {"a": True}, [("a", "1 against True")]),
+        ({"a": "x"}, {"a": "y"}, [("a", "'x' against 'y'")]),
+        ({"a": [1]}, {"a": [1, 2]}, [("a", "[1] against [1, 2]")]),
+        ({"a": None}, {}, [("a", "only one of the products has it")]),
+    ],
+)
+def test_metadata_are_compared_value_by_value(
+    left: dict[str, JsonValue], right: dict[str, JsonValue], expected: list[tuple[str, str]]
+) -> None:
+    found = compare_payloads(Given(metadata=left), Given(metadata=right), LIMITS)
+    assert [(difference.name, difference.problem) for difference in found] == expected
