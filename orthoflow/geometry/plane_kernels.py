@@ -12,14 +12,12 @@ import math
 from typing import Final
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from orthoflow.geometry.point_kernels import (
     BLOCK_POINTS,
     BlockedPoints,
     compiled,
-    compiled_parallel,
 )
 
 # Distances are summed in steps of the fit tolerance over this: half a micrometre at 15 mm, and the
@@ -29,7 +27,7 @@ STEPS_PER_TOLERANCE: Final = 32768
 HISTOGRAM_BINS: Final = 200
 
 
-@compiled_parallel
+@compiled
 def vote_lines(
     cells: NDArray[np.float32],
     weights: NDArray[np.int64],
@@ -49,7 +47,7 @@ def vote_lines(
         votes: (a, bins) table, added to. Equation 4 of markiewicz2015: r = x cos + y sin.
     """
     n_bins = votes.shape[1]
-    for angle in prange(angles_rad.size):
+    for angle in range(angles_rad.size):
         cosine = math.cos(angles_rad[angle]) / bin_m
         sine = math.sin(angles_rad[angle]) / bin_m
         start = low_m / bin_m
@@ -105,13 +103,39 @@ def _misses(box: NDArray[np.float32], slab: NDArray[np.float64], reach_m: float)
 
 
 @compiled
+def _distance(slab: NDArray[np.float64], x: float, y: float, z: float) -> float:
+    return float(abs(slab[0] * x + slab[1] * y + slab[2] * z - slab[3]))
+
+
+@compiled
+def _within(
+    slab: NDArray[np.float64], bounds: NDArray[np.float64], x: float, y: float, z: float
+) -> bool:
+    """Whether a point projects into a rectangle on the slab's plane."""
+    u = slab[4] * x + slab[5] * y + slab[6] * z - slab[7]
+    v = slab[8] * x + slab[9] * y + slab[10] * z - slab[11]
+    return bool(bounds[1] <= u <= bounds[2] and bounds[3] <= v <= bounds[4])
+
+
+@compiled
+def _widen(
+    extent: NDArray[np.float64], slab: NDArray[np.float64], x: float, y: float, z: float
+) -> None:
+    """Widen smallest and largest u and v to hold a point."""
+    u = slab[4] * x + slab[5] * y + slab[6] * z - slab[7]
+    v = slab[8] * x + slab[9] * y + slab[10] * z - slab[11]
+    extent[0], extent[1] = min(extent[0], u), max(extent[1], u)
+    extent[2], extent[3] = min(extent[2], v), max(extent[3], v)
+
+
+@compiled
 def _place(row: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32) -> int:
     """Cell of an offset along one axis of the plan, as `count_over_plan` has it; -1 before it."""
     position = row[0] * x + row[1] * y + row[2] * z - row[3]
     return int(position) if position >= 0.0 else -1
 
 
-@compiled_parallel
+@compiled
 def sum_cells(
     points: BlockedPoints,
     claims: NDArray[np.int8],
@@ -127,47 +151,45 @@ def sum_cells(
         claims: (n,) plane of each point, negative for none.
         slab: (12,) see module.
         limits: cell side, find tolerance, inner tolerance, fit tolerance; metres.
-        counts: (parts, rows, columns, 3) points within the find, inner and fit tolerance; added to.
-        sums: (parts, rows, columns, 2) distances and squared distances of the points within the
+        counts: (rows, columns, 3) points within the find, inner and fit tolerance; added to.
+        sums: (rows, columns, 2) distances and squared distances of the points within the
             fit tolerance, in steps and squared steps; added to.
     """
     x, y, z, boxes = points.x, points.y, points.z, points.boxes
-    parts, n_rows, n_columns, _ = counts.shape
-    n_blocks = boxes.shape[0]
+    n_rows, n_columns, _ = counts.shape
     per_m = 1.0 / limits[0]
     find_m, inner_m, fit_m = limits[1], limits[2], limits[3]
     to_steps = STEPS_PER_TOLERANCE / fit_m
     n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
     u0, u1, u2, u3 = slab[4] * per_m, slab[5] * per_m, slab[6] * per_m, slab[7] * per_m
     v0, v1, v2, v3 = slab[8] * per_m, slab[9] * per_m, slab[10] * per_m, slab[11] * per_m
-    for part in prange(parts):
-        for block in range(part * n_blocks // parts, (part + 1) * n_blocks // parts):
-            if _misses(boxes[block], slab, find_m):
+    for block in range(boxes.shape[0]):
+        if _misses(boxes[block], slab, find_m):
+            continue
+        start = block * BLOCK_POINTS
+        for i in range(start, min(start + BLOCK_POINTS, x.size)):
+            if claims[i] >= 0:
                 continue
-            start = block * BLOCK_POINTS
-            for i in range(start, min(start + BLOCK_POINTS, x.size)):
-                if claims[i] >= 0:
-                    continue
-                px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-                distance = n0 * px + n1 * py + n2 * pz - n3
-                size = abs(distance)
-                if size > find_m:
-                    continue
-                column = math.floor(u0 * px + u1 * py + u2 * pz - u3)
-                row = math.floor(v0 * px + v1 * py + v2 * pz - v3)
-                if not (0 <= column < n_columns and 0 <= row < n_rows):
-                    continue
-                counts[part, row, column, 0] += 1
-                if size <= inner_m:
-                    counts[part, row, column, 1] += 1
-                if size <= fit_m:
-                    steps = np.int64(round(distance * to_steps))
-                    counts[part, row, column, 2] += 1
-                    sums[part, row, column, 0] += steps
-                    sums[part, row, column, 1] += steps * steps
+            px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+            distance = n0 * px + n1 * py + n2 * pz - n3
+            size = abs(distance)
+            if size > find_m:
+                continue
+            column = math.floor(u0 * px + u1 * py + u2 * pz - u3)
+            row = math.floor(v0 * px + v1 * py + v2 * pz - v3)
+            if not (0 <= column < n_columns and 0 <= row < n_rows):
+                continue
+            counts[row, column, 0] += 1
+            if size <= inner_m:
+                counts[row, column, 1] += 1
+            if size <= fit_m:
+                steps = np.int64(round(distance * to_steps))
+                counts[row, column, 2] += 1
+                sums[row, column, 0] += steps
+                sums[row, column, 1] += steps * steps
 
 
-@compiled_parallel
+@compiled
 def claim_slab(
     points: BlockedPoints,
     claims: NDArray[np.int8],
@@ -185,89 +207,82 @@ def claim_slab(
         slabs: (k, 12) all slabs so far, the new one last.
         bounds: (5,) of the new slab: find tolerance, then smallest and largest u and v, metres.
         frame: (3, 4) plan cells and storeys of a point, see `count_over_plan`.
-        taken: (parts, cells along e1, along e2) points that were unclaimed and no longer are.
-        taken_heights: (parts, storeys + 1) the same per storey, and in the last column in all.
+        taken: (cells along e1, along e2) points that were unclaimed and no longer are.
+        taken_heights: (storeys + 1,) the same per storey, and in the last column in all.
     """
     x, y, z, boxes = points.x, points.y, points.z, points.boxes
-    parts, n_first, n_second = taken.shape
-    n_storeys = taken_heights.shape[1] - 1
-    n_blocks = boxes.shape[0]
+    n_first, n_second = taken.shape
+    n_storeys = taken_heights.size - 1
     index = slabs.shape[0] - 1
     slab = slabs[index]
     find_m = bounds[0]
-    for part in prange(parts):
-        for block in range(part * n_blocks // parts, (part + 1) * n_blocks // parts):
-            if _misses(boxes[block], slab, find_m):
+    for block in range(boxes.shape[0]):
+        if _misses(boxes[block], slab, find_m):
+            continue
+        start = block * BLOCK_POINTS
+        for i in range(start, min(start + BLOCK_POINTS, x.size)):
+            px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+            size = _distance(slab, px, py, pz)
+            if size > find_m or not _within(slab, bounds, px, py, pz):
                 continue
-            start = block * BLOCK_POINTS
-            for i in range(start, min(start + BLOCK_POINTS, x.size)):
-                px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-                size = abs(slab[0] * px + slab[1] * py + slab[2] * pz - slab[3])
-                if size > find_m:
-                    continue
-                u = slab[4] * px + slab[5] * py + slab[6] * pz - slab[7]
-                v = slab[8] * px + slab[9] * py + slab[10] * pz - slab[11]
-                if u < bounds[1] or u > bounds[2] or v < bounds[3] or v > bounds[4]:
-                    continue
-                owner = claims[i]
-                if owner >= 0:
-                    other = slabs[owner]
-                    rival = abs(other[0] * px + other[1] * py + other[2] * pz - other[3])
-                    if size < rival:
-                        claims[i] = index
-                    continue
-                claims[i] = index
-                taken_heights[part, n_storeys] += 1
-                first = _place(frame[0], x[i], y[i], z[i])
-                second = _place(frame[1], x[i], y[i], z[i])
-                storey = _place(frame[2], x[i], y[i], z[i])
-                if 0 <= first < n_first and 0 <= second < n_second:
-                    taken[part, first, second] += 1
-                    if 0 <= storey < n_storeys:
-                        taken_heights[part, storey] += 1
+            owner = claims[i]
+            if owner >= 0:
+                if size < _distance(slabs[owner], px, py, pz):
+                    claims[i] = index
+                continue
+            claims[i] = index
+            taken_heights[n_storeys] += 1
+            first = _place(frame[0], x[i], y[i], z[i])
+            second = _place(frame[1], x[i], y[i], z[i])
+            storey = _place(frame[2], x[i], y[i], z[i])
+            if 0 <= first < n_first and 0 <= second < n_second:
+                taken[first, second] += 1
+                if 0 <= storey < n_storeys:
+                    taken_heights[storey] += 1
 
 
-@compiled_parallel
+@compiled
 def measure_deviations(
     points: BlockedPoints,
     claims: NDArray[np.int8],
     slabs: NDArray[np.float64],
-    tolerances: NDArray[np.float64],
+    limits: NDArray[np.float64],
     sums: NDArray[np.int64],
     histogram: NDArray[np.int64],
+    extents: NDArray[np.float64],
 ) -> None:
-    """Sum the distances of claimed points to their plane, and count them per bin.
+    """Sum and bin the distances of claimed points to their plane, and see how far they reach.
 
     Args:
         points: (n,) offsets in blocks.
         claims: (n,) plane of each point, negative for none.
         slabs: (k, 12) the planes.
-        tolerances: find tolerance, fit tolerance; metres.
-        sums: (parts, k, 6) of points within the find tolerance: number, steps, squared steps, then
+        limits: (k, 6) find tolerance, fit tolerance, smallest and largest u, smallest and largest
+            v of the plane's rectangle; metres.
+        sums: (k, 6) of points within the find tolerance: number, steps, squared steps, then
             the same within the fit tolerance; added to.
-        histogram: (parts, k, HISTOGRAM_BINS) points per bin of -find tolerance..find tolerance.
+        histogram: (k, HISTOGRAM_BINS) points per bin of -find tolerance..find tolerance.
+        extents: (k, 4) smallest and largest u, smallest and largest v of the points within the fit
+            tolerance and the rectangle; widened.
     """
     x, y, z = points.x, points.y, points.z
-    parts = sums.shape[0]
-    n_blocks = -(-x.size // BLOCK_POINTS)
-    find_m, fit_m = tolerances[0], tolerances[1]
-    to_steps = STEPS_PER_TOLERANCE / fit_m
-    to_bins = 0.5 * HISTOGRAM_BINS / find_m
-    for part in prange(parts):
-        first = part * n_blocks // parts * BLOCK_POINTS
-        last = min((part + 1) * n_blocks // parts * BLOCK_POINTS, x.size)
-        for i in range(first, last):
-            k = claims[i]
-            if k < 0:
-                continue
-            distance = slabs[k, 0] * x[i] + slabs[k, 1] * y[i] + slabs[k, 2] * z[i] - slabs[k, 3]
-            steps = np.int64(round(distance * to_steps))
-            sums[part, k, 0] += 1
-            sums[part, k, 1] += steps
-            sums[part, k, 2] += steps * steps
-            if abs(distance) <= fit_m:
-                sums[part, k, 3] += 1
-                sums[part, k, 4] += steps
-                sums[part, k, 5] += steps * steps
-            place = int((distance + find_m) * to_bins)
-            histogram[part, k, min(max(place, 0), HISTOGRAM_BINS - 1)] += 1
+    for i in range(x.size):
+        k = claims[i]
+        if k < 0:
+            continue
+        slab, limit = slabs[k], limits[k]
+        px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+        distance = slab[0] * px + slab[1] * py + slab[2] * pz - slab[3]
+        steps = np.int64(round(distance * (STEPS_PER_TOLERANCE / limit[1])))
+        sums[k, 0] += 1
+        sums[k, 1] += steps
+        sums[k, 2] += steps * steps
+        place = int((distance / limit[0] + 1.0) * (0.5 * HISTOGRAM_BINS))
+        histogram[k, min(max(place, 0), HISTOGRAM_BINS - 1)] += 1
+        if abs(distance) > limit[1]:
+            continue
+        sums[k, 3] += 1
+        sums[k, 4] += steps
+        sums[k, 5] += steps * steps
+        if _within(slab, limit[1:], px, py, pz):
+            _widen(extents[k], slab, px, py, pz)

@@ -1,19 +1,21 @@
 """Compiled passes over all points of a cloud: how many lie in each cell, and where blocks lie.
 
 Kernels read float32 offsets as three contiguous arrays, in `BLOCK_POINTS` blocks. Work is split
-into parts, one per thread, and everything summed across parts is an integer, so the result has the
-same bits for any number of threads.
+into parts, one per thread, each with tables of its own; everything summed across parts is an
+integer, so the result has the same bits for any number of threads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple, TypeVar, cast
 
 import numba
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 # Small enough that a block of a scan column is a short piece of one surface, so that its box tells
@@ -24,20 +26,35 @@ _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
 
 def compiled(function: _Kernel) -> _Kernel:
-    """Compile a kernel for one thread; the compiled code is kept between processes."""
-    return cast("_Kernel", numba.njit(cache=True)(function))
+    """Compile a kernel that lets other threads run; the code is kept between processes.
+
+    Threads come from `each_part`, not from numba's own loops: those take seconds more to compile.
+    """
+    return cast("_Kernel", numba.njit(cache=True, nogil=True)(function))
 
 
-def compiled_parallel(function: _Kernel) -> _Kernel:
-    """Compile a kernel whose `prange` loops use the threads of `use_threads`."""
-    return cast("_Kernel", numba.njit(cache=True, parallel=True)(function))
+def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> None:
+    """Cut a range into parts at multiples of `BLOCK_POINTS` and run a task on each, in threads.
+
+    Args:
+        n_items: length of the range.
+        parts: into how many parts; some may be empty.
+        task: gets the number of the part and its piece of the range.
+    """
+    n_blocks = -(-n_items // BLOCK_POINTS)
+    edges = [part * n_blocks // parts * BLOCK_POINTS for part in range(parts)] + [n_items]
+    pieces = [slice(first, last) for first, last in itertools.pairwise(edges)]
+    in_threads([partial(task, part, piece) for part, piece in enumerate(pieces)])
 
 
-def use_threads(cores: int) -> int:
-    """Let parallel kernels use up to so many threads; gives how many there are."""
-    threads = max(1, min(cores, int(numba.config.NUMBA_NUM_THREADS)))
-    numba.set_num_threads(threads)
-    return threads
+def in_threads(tasks: Sequence[Callable[[], None]]) -> None:
+    """Run tasks at the same time, each in a thread of its own."""
+    if len(tasks) == 1:
+        tasks[0]()
+        return
+    with ThreadPoolExecutor(len(tasks)) as pool:
+        for future in [pool.submit(task) for task in tasks]:
+            future.result()
 
 
 class Offsets(NamedTuple):
@@ -73,6 +90,12 @@ def read_only(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.floa
 def blocked(offsets: Offsets, boxes: NDArray[np.float32]) -> BlockedPoints:
     """Join points and the boxes of their blocks."""
     return BlockedPoints(offsets.x, offsets.y, offsets.z, boxes)
+
+
+def piece_of(points: BlockedPoints, piece: slice) -> BlockedPoints:
+    """Give a piece of the points that starts at a block."""
+    blocks = slice(piece.start // BLOCK_POINTS, -(-piece.stop // BLOCK_POINTS))
+    return BlockedPoints(points.x[piece], points.y[piece], points.z[piece], points.boxes[blocks])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,12 +142,18 @@ def plan_frame(grid: PlanGrid) -> NDArray[np.float32]:
 
 def count_over_plan(offsets: Offsets, grid: PlanGrid, *, parts: int) -> PlanCounts:
     """Count points per plan cell and per storey, and find the box of each block, in one pass."""
-    n_blocks = -(-len(offsets.x) // BLOCK_POINTS)
+    n_points = len(offsets.x)
     cells = np.zeros((parts, *grid.shape[:2]), dtype=np.int32)
     heights = np.zeros((parts, grid.shape[2]), dtype=np.int32)
-    boxes = np.empty((n_blocks, 6), dtype=np.float32)
+    boxes = np.empty((-(-n_points // BLOCK_POINTS), 6), dtype=np.float32)
     unusable = np.zeros(parts, dtype=np.int64)
-    _count_over_plan(offsets, plan_frame(grid), cells, heights, boxes, unusable)
+    frame = plan_frame(grid)
+
+    def count(part: int, piece: slice) -> None:
+        points = piece_of(blocked(offsets, boxes), piece)
+        unusable[part] = _count_over_plan(points, frame, cells[part], heights[part])
+
+    each_part(n_points, parts, count)
     return PlanCounts(
         cells=cells.sum(axis=0, dtype=np.int64),
         heights=heights.sum(axis=0, dtype=np.int64),
@@ -133,49 +162,44 @@ def count_over_plan(offsets: Offsets, grid: PlanGrid, *, parts: int) -> PlanCoun
     )
 
 
-@compiled_parallel
+@compiled
 def _count_over_plan(
-    offsets: Offsets,
+    points: BlockedPoints,
     frame: NDArray[np.float32],
     cells: NDArray[np.int32],
     heights: NDArray[np.int32],
-    boxes: NDArray[np.float32],
-    unusable: NDArray[np.int64],
-) -> None:
-    x, y, z = offsets.x, offsets.y, offsets.z
-    parts, n_first, n_second = cells.shape
-    n_storeys = heights.shape[1]
-    n_blocks = boxes.shape[0]
+) -> int:
+    """Add to cells and heights, set the boxes, and give the number of unusable points."""
+    x, y, z, boxes = points.x, points.y, points.z, points.boxes
+    n_first, n_second = cells.shape
     a0, a1, a2, a3 = frame[0, 0], frame[0, 1], frame[0, 2], frame[0, 3]
     b0, b1, b2, b3 = frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3]
     c0, c1, c2, c3 = frame[2, 0], frame[2, 1], frame[2, 2], frame[2, 3]
     zero = np.float32(0.0)
     top_first, top_second = np.float32(n_first), np.float32(n_second)
-    top_storey = np.float32(n_storeys)
-    for part in prange(parts):
-        bad = 0
-        for block in range(part * n_blocks // parts, (part + 1) * n_blocks // parts):
-            start = block * BLOCK_POINTS
-            stop = min(start + BLOCK_POINTS, x.size)
-            x_low = x_high = x[start]
-            y_low = y_high = y[start]
-            z_low = z_high = z[start]
-            for i in range(start, stop):
-                px, py, pz = x[i], y[i], z[i]
-                x_low, x_high = min(x_low, px), max(x_high, px)
-                y_low, y_high = min(y_low, py), max(y_high, py)
-                z_low, z_high = min(z_low, pz), max(z_high, pz)
-                first = a0 * px + a1 * py + a2 * pz - a3
-                second = b0 * px + b1 * py + b2 * pz - b3
-                storey = c0 * px + c1 * py + c2 * pz - c3
-                if not np.isfinite(first + second + storey):
-                    bad += 1
-                    continue
-                if zero <= first < top_first and zero <= second < top_second:
-                    cells[part, int(first), int(second)] += 1
-                    if zero <= storey < top_storey:
-                        heights[part, int(storey)] += 1
-            boxes[block, 0], boxes[block, 1] = x_low, x_high
-            boxes[block, 2], boxes[block, 3] = y_low, y_high
-            boxes[block, 4], boxes[block, 5] = z_low, z_high
-        unusable[part] = bad
+    top_storey = np.float32(heights.size)
+    bad = 0
+    for block in range(boxes.shape[0]):
+        start = block * BLOCK_POINTS
+        x_low = x_high = x[start]
+        y_low = y_high = y[start]
+        z_low = z_high = z[start]
+        for i in range(start, min(start + BLOCK_POINTS, x.size)):
+            px, py, pz = x[i], y[i], z[i]
+            x_low, x_high = min(x_low, px), max(x_high, px)
+            y_low, y_high = min(y_low, py), max(y_high, py)
+            z_low, z_high = min(z_low, pz), max(z_high, pz)
+            first = a0 * px + a1 * py + a2 * pz - a3
+            second = b0 * px + b1 * py + b2 * pz - b3
+            storey = c0 * px + c1 * py + c2 * pz - c3
+            if not np.isfinite(first + second + storey):
+                bad += 1
+                continue
+            if zero <= first < top_first and zero <= second < top_second:
+                cells[int(first), int(second)] += 1
+                if zero <= storey < top_storey:
+                    heights[int(storey)] += 1
+        boxes[block, 0], boxes[block, 1] = x_low, x_high
+        boxes[block, 2], boxes[block, 3] = y_low, y_high
+        boxes[block, 4], boxes[block, 5] = z_low, z_high
+    return bad

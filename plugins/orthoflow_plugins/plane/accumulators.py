@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
 from orthoflow.geometry.plane_kernels import vote_lines
-from orthoflow.geometry.point_kernels import PlanGrid
+from orthoflow.geometry.point_kernels import PlanGrid, in_threads
 from orthoflow_plugins.plane.peeling import Candidate, Remainder
 
 # A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
@@ -115,7 +116,17 @@ class PlanProposer:
         bin_m = self._grid.cell_m
         low_m = -self._reach_bins * bin_m
         votes = np.zeros((len(self._angles_rad), 2 * self._reach_bins), dtype=np.int64)
-        vote_lines(cells, weights, self._angles_rad, low_m, bin_m, votes)
+        shares = zip(
+            np.array_split(self._angles_rad, remainder.parts),
+            np.array_split(votes, remainder.parts),
+            strict=True,
+        )
+        in_threads(
+            [
+                partial(vote_lines, cells, weights, angles, low_m, bin_m, table)
+                for angles, table in shares
+            ]
+        )
         self._accumulator = Accumulator(
             angles_rad=self._angles_rad, low_m=low_m, bin_m=bin_m, centre_m=centre_m, votes=votes
         )

@@ -42,12 +42,16 @@ class AdjustedPlane:
         covariance: (4, 4) of (normal, offset), in offsets.
         moved_m: how far the fit moved a corner of the cells at most.
         sigma_cell_m: spread of the cells about the plane, robust.
+        bend_per_m: strongest curvature of the surface that the cells show, 1 over its radius.
+        bend_share: share of the cells' variance that this curvature explains.
     """
 
     plane: Plane
     covariance: NDArray[np.float64]
     moved_m: float
     sigma_cell_m: float
+    bend_per_m: float
+    bend_share: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,11 +116,14 @@ def adjust_plane(
         observed, weights, solution
     )
     plane, jacobian = _tilted(raster, change, centre)
+    bend_per_m, bend_share = _bend(full, heights_m)
     return AdjustedPlane(
         plane=plane,
         covariance=jacobian @ covariance @ jacobian.T,
         moved_m=float(np.abs(full @ change).max()),
         sigma_cell_m=sigma_cell_m,
+        bend_per_m=bend_per_m,
+        bend_share=bend_share,
     )
 
 
@@ -145,6 +152,21 @@ def _solve(
         if settled:
             break
     return solution, weights, sigma_cell_m
+
+
+def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[float, float]:
+    """Curvature of the cells' heights, and the share of their variance that it explains."""
+    u, v = design[:, 1], design[:, 2]
+    curved = np.column_stack([design, u * u, u * v, v * v])
+    flat_residuals = heights_m - design @ np.linalg.lstsq(design, heights_m)[0]
+    terms = np.linalg.lstsq(curved, heights_m)[0]
+    curved_residuals = heights_m - curved @ terms
+    variance = float(flat_residuals @ flat_residuals)
+    if variance < len(heights_m) * _FLATTEST_M**2:
+        return 0.0, 0.0
+    hessian = np.array([[2.0 * terms[3], terms[4]], [terms[4], 2.0 * terms[5]]])
+    strongest = float(np.abs(np.linalg.eigvalsh(hessian)).max())
+    return strongest, 1.0 - float(curved_residuals @ curved_residuals) / variance
 
 
 def _tile_covariance(

@@ -16,6 +16,7 @@ from orthoflow.geometry.plane_kernels import (
     STEPS_PER_TOLERANCE,
     measure_deviations,
 )
+from orthoflow.geometry.point_kernels import each_part, piece_of
 from orthoflow.products import Planes, PointCloud
 from orthoflow_plugins.plane.facing import (
     Viewpoint,
@@ -41,6 +42,8 @@ class Deviations:
         rms_fit_m: (k,) root mean square of the distances of those.
         mean_fit_m: (k,) mean of the distances of those.
         histogram: (k, bins) points per bin of -find_m..find_m.
+        extents_m: (k, 4) smallest and largest u, smallest and largest v of the points within the
+            fit tolerance in the plane's rectangle.
         find_m: find tolerance.
         fit_m: fit tolerance.
     """
@@ -51,6 +54,7 @@ class Deviations:
     rms_fit_m: NDArray[np.float64]
     mean_fit_m: NDArray[np.float64]
     histogram: NDArray[np.int64]
+    extents_m: NDArray[np.float64]
     find_m: float
     fit_m: float
 
@@ -84,16 +88,46 @@ class _Faced:
 
 
 def measure_planes(
-    remainder: Remainder, slabs: NDArray[np.float64], *, find_m: float, fit_m: float
+    remainder: Remainder,
+    slabs: NDArray[np.float64],
+    bounds_m: NDArray[np.float64],
+    *,
+    find_m: float,
+    fit_m: float,
 ) -> Deviations:
-    """Measure the deviations of all claimed points in one pass."""
-    sums = np.zeros((remainder.parts, len(slabs), 6), dtype=np.int64)
-    histogram = np.zeros((remainder.parts, len(slabs), HISTOGRAM_BINS), dtype=np.int64)
-    limits = np.array([find_m, min(fit_m, find_m)])
-    measure_deviations(remainder.points, remainder.claims, slabs, limits, sums, histogram)
+    """Measure the deviations of all claimed points in one pass.
+
+    Args:
+        remainder: the cloud with its claims.
+        slabs: (k, 12) the planes.
+        bounds_m: (k, 4) their rectangles, smallest and largest u, smallest and largest v.
+        find_m: find tolerance.
+        fit_m: fit tolerance.
+    """
+    parts, count = remainder.parts, len(slabs)
+    sums = np.zeros((parts, count, 6), dtype=np.int64)
+    histogram = np.zeros((parts, count, HISTOGRAM_BINS), dtype=np.int64)
+    extents = np.tile([np.inf, -np.inf, np.inf, -np.inf], (parts, count, 1))
+    fit_m = min(fit_m, find_m)
+    limits = np.column_stack([np.full(count, find_m), np.full(count, fit_m), bounds_m])
+
+    def measure(part: int, piece: slice) -> None:
+        measure_deviations(
+            piece_of(remainder.points, piece),
+            remainder.claims[piece],
+            slabs,
+            limits,
+            sums[part],
+            histogram[part],
+            extents[part],
+        )
+
+    each_part(len(remainder.claims), parts, measure)
     total = sums.sum(axis=0)
-    step_m = limits[1] / STEPS_PER_TOLERANCE
+    step_m = fit_m / STEPS_PER_TOLERANCE
     n_find, n_fit = total[:, 0], total[:, 3]
+    low, high = extents.min(axis=0), extents.max(axis=0)
+    reached = np.column_stack([low[:, 0], high[:, 1], low[:, 2], high[:, 3]])
     return Deviations(
         n_find=n_find,
         rms_find_m=np.sqrt(total[:, 2] / np.maximum(n_find, 1)) * step_m,
@@ -101,8 +135,10 @@ def measure_planes(
         rms_fit_m=np.sqrt(total[:, 5] / np.maximum(n_fit, 1)) * step_m,
         mean_fit_m=total[:, 4] / np.maximum(n_fit, 1) * step_m,
         histogram=histogram.sum(axis=0),
+        # A later, nearer plane may have taken every point within the fit tolerance.
+        extents_m=np.where(np.isfinite(reached), reached, bounds_m),
         find_m=find_m,
-        fit_m=float(limits[1]),
+        fit_m=fit_m,
     )
 
 
@@ -112,7 +148,7 @@ def assemble(
     """Give planes their side, order and names."""
     order = np.argsort(-deviations.n_find, kind="stable")
     ordered = _reordered(deviations, order)
-    faced = [_faced(found, int(i), remainder, cloud, ordered.find_m) for i in order]
+    faced = [_faced(found, int(i), remainder, cloud, deviations) for i in order]
     # Histograms and means follow the normal when it was turned.
     flips = np.array(
         [
@@ -215,11 +251,16 @@ def enclosing(
 
 
 def _faced(
-    found: list[FoundPlane], claim: int, remainder: Remainder, cloud: PointCloud, find_m: float
+    found: list[FoundPlane],
+    claim: int,
+    remainder: Remainder,
+    cloud: PointCloud,
+    deviations: Deviations,
 ) -> _Faced:
     raster, place = found[claim].raster, found[claim].footprint
     plane, axes = raster.plane, raster.axes
-    corners_m = rectangle_m(plane, axes, place.bounds_m)
+    extent_m = deviations.extents_m[claim]
+    corners_m = rectangle_m(plane, axes, extent_m)
     claims = remainder.sample_claims
     members = remainder.sample.index[claims == claim]
     # Evenly thinned, since a plane's first points may all be from one scan.
@@ -236,9 +277,13 @@ def _faced(
             corners_m,
             remainder.sample.offsets_m,
             np.array([*parallel, False])[claims],
-            clear_m=find_m,
+            clear_m=deviations.find_m,
         )
-    parts_m = [rectangle_m(plane, axes, bounds) for bounds in place.parts_m]
+    # Parts are known to a cell; none reaches beyond the points that are there.
+    parts_m = [
+        rectangle_m(plane, axes, np.clip(bounds, extent_m[[0, 0, 2, 2]], extent_m[[1, 1, 3, 3]]))
+        for bounds in place.parts_m
+    ]
     covariance = found[claim].adjusted.covariance
     if side < 0:
         # Normal and offset change sign together, so their covariance stays as it is.
@@ -273,6 +318,7 @@ def _reordered(deviations: Deviations, order: NDArray[np.int64]) -> Deviations:
         rms_fit_m=deviations.rms_fit_m[order],
         mean_fit_m=deviations.mean_fit_m[order],
         histogram=deviations.histogram[order],
+        extents_m=deviations.extents_m[order],
         find_m=deviations.find_m,
         fit_m=deviations.fit_m,
     )

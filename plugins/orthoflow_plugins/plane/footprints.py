@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.plane_kernels import sum_cells
-from orthoflow.geometry.point_kernels import BlockedPoints
+from orthoflow.geometry.point_kernels import BlockedPoints, each_part, piece_of
 
 CELL_LEAST_M: Final = 0.05
 _CELLS_MOST: Final = 1_000_000
@@ -156,7 +156,11 @@ def measure_cells(
     sums = np.zeros((parts, *raster.shape, 2), dtype=np.int64)
     limits = np.array([raster.cell_m, find_m, INNER_SHARE * find_m, min(fit_m, find_m)])
     slab = raster.slab(from_low=True)
-    sum_cells(points, claims, slab, limits, counts, sums)
+
+    def add(part: int, piece: slice) -> None:
+        sum_cells(piece_of(points, piece), claims[piece], slab, limits, counts[part], sums[part])
+
+    each_part(len(claims), parts, add)
     total = counts.sum(axis=0, dtype=np.int64)
     steps = sums.sum(axis=0)
     return CellSums(

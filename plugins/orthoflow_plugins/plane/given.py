@@ -113,11 +113,9 @@ class GivenPlane(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Lay the plane and find which points are on it."""
-        from orthoflow.geometry.point_kernels import use_threads
         from orthoflow_plugins.plane.reference import lay_reference, place_reference
 
         cloud = inputs.cloud
-        use_threads(ctx.cores)
         if len(cloud) < 3:
             cloud.require_points(3)
         ctx.progress(0.0, "placing the plane")
@@ -125,7 +123,9 @@ class GivenPlane(Method):
         buffer_m = params.buffer_m
         if buffer_m is None and (params.normal is not None or params.points is not None):
             buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
-        reference = place_reference(plane, cloud, buffer_m=buffer_m, keeps_side=is_settled)
+        reference = place_reference(
+            plane, cloud, buffer_m=buffer_m, keeps_side=is_settled, parts=ctx.cores
+        )
         if reference is None:
             low_m, high_m = _reach(plane, cloud)
             raise MethodError(

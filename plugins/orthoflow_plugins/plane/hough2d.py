@@ -95,7 +95,6 @@ class Hough2d(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
-        from orthoflow.geometry.point_kernels import use_threads
         from orthoflow_plugins.plane.accumulators import PlanProposer
         from orthoflow_plugins.plane.assembling import assemble, measure_planes
         from orthoflow_plugins.plane.figures import draw_accumulator, draw_deviations
@@ -113,14 +112,13 @@ class Hough2d(Method):
             tilt_most_deg=params.max_tilt_deg,
             is_exact=params.constraint == "exact",
         )
-        parts = use_threads(ctx.cores)
         ctx.progress(0.0, "counting points over the plan")
         remainder = prepare(
             cloud,
             basis_from_up(cloud.up),
             cell_m=params.cell_m,
             least_share=params.min_share,
-            parts=parts,
+            parts=ctx.cores,
         )
         plan = remainder.cells.copy()
         proposer = PlanProposer(
@@ -139,8 +137,13 @@ class Hough2d(Method):
                 )
             )
         ctx.progress(0.8, "measuring deviations")
-        slabs = np.array([item.raster.slab() for item in found])
-        deviations = measure_planes(remainder, slabs, find_m=rules.find_m, fit_m=rules.fit_m)
+        deviations = measure_planes(
+            remainder,
+            np.array([item.raster.slab() for item in found]),
+            np.array([item.footprint.bounds_m for item in found]),
+            find_m=rules.find_m,
+            fit_m=rules.fit_m,
+        )
         assembly = assemble(found, remainder, deviations, cloud)
         labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16)
         np.take(assembly.labels_from_claims, remainder.claims, out=labels, mode="wrap")

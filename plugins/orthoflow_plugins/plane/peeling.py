@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.plane_kernels import claim_slab
-from orthoflow.geometry.point_kernels import BlockedPoints, PlanGrid, plan_frame
+from orthoflow.geometry.point_kernels import (
+    BlockedPoints,
+    PlanGrid,
+    each_part,
+    piece_of,
+    plan_frame,
+)
 from orthoflow_plugins.plane.adjustment import AdjustedPlane, adjust_plane
 from orthoflow_plugins.plane.fitting import Freedom, refine_plane, shrinking_tolerances
 from orthoflow_plugins.plane.footprints import (
@@ -40,6 +46,9 @@ _REJECTED_MOST: Final = 40
 _SAMPLE_CAUTION: Final = 0.7
 # Share of the points in a plane's slab and rectangle that must lie in crowded cells.
 _CROWDED_LEAST: Final = 0.5
+# Surfaces rounder than this radius are no planes, when the rounding is what shows in their cells.
+_RADIUS_LEAST_M: Final = 5.0
+_BENT_SHARE: Final = 0.5
 # Passes over all points that one plane may take, and the share of the fit tolerance by which a fit
 # may move without asking for another.
 _LOOKS_MOST: Final = 3
@@ -141,9 +150,20 @@ class Remainder:
         """Give the points of the last slab to it, and count what is left."""
         taken = np.zeros((self.parts, *self.cells.shape), dtype=np.int32)
         taken_heights = np.zeros((self.parts, len(self.heights) + 1), dtype=np.int32)
-        claim_slab(
-            self.points, self.claims, slabs, bounds, plan_frame(self.grid), taken, taken_heights
-        )
+        frame = plan_frame(self.grid)
+
+        def take(part: int, piece: slice) -> None:
+            claim_slab(
+                piece_of(self.points, piece),
+                self.claims[piece],
+                slabs,
+                bounds,
+                frame,
+                taken[part],
+                taken_heights[part],
+            )
+
+        each_part(len(self.claims), self.parts, take)
         self.cells -= taken.sum(axis=0)
         in_all = taken_heights.sum(axis=0, dtype=np.int64)
         self.heights -= in_all[:-1]
@@ -263,7 +283,9 @@ def _look(
     if _is_strip(place, raster) or _is_smear(place, raster, sums):
         return None
     adjusted = adjust_plane(raster, sums, place.cells, fit_m=rules.fit_m, freedom=freedom)
-    return None if adjusted is None else _Look(footprint=place, adjusted=adjusted)
+    if adjusted is None or _is_bent(adjusted):
+        return None
+    return _Look(footprint=place, adjusted=adjusted)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -352,6 +374,11 @@ def _is_smear(place: Footprint, raster: SurfaceRaster, sums: CellSums) -> bool:
     left, right, top, bottom = place.bounds_m
     within = (u > left) & (u < right) & (v > top) & (v < bottom)
     return bool(place.n_points < _CROWDED_LEAST * sums.n_find[within].sum())
+
+
+def _is_bent(adjusted: AdjustedPlane) -> bool:
+    """Whether the cells lie on a column or barrel that the plane only touches."""
+    return adjusted.bend_per_m > 1.0 / _RADIUS_LEAST_M and adjusted.bend_share > _BENT_SHARE
 
 
 def _carried(raster: SurfaceRaster, plane: Plane, up: NDArray[np.float64]) -> SurfaceRaster:

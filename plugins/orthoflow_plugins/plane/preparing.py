@@ -48,7 +48,7 @@ def prepare(
         where = "coincide" if spread[0] < _THINNEST_M else "lie on one line"
         raise MethodError(f"the {len(cloud)} points of the cloud {where}, which fixes no plane")
     grid = plan_grid(sample, basis, cell_m=cell_m, outside_share=0.25 * least_share)
-    parts = min(parts, _PARTS_MOST)
+    parts = max(1, min(parts, _PARTS_MOST))
     offsets = read_only(cloud.x, cloud.y, cloud.z)
     counts = count_over_plan(offsets, grid, parts=parts)
     if counts.n_unusable:

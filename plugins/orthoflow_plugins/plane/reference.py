@@ -61,7 +61,7 @@ class Reference:
 
 
 def place_reference(
-    plane: Plane, cloud: PointCloud, *, buffer_m: float | None, keeps_side: bool
+    plane: Plane, cloud: PointCloud, *, buffer_m: float | None, keeps_side: bool, parts: int
 ) -> Reference | None:
     """Put a rectangle about the points near a plane, and turn its normal to the viewer.
 
@@ -70,6 +70,7 @@ def place_reference(
         cloud: the cloud.
         buffer_m: points this near span the rectangle; None for all points.
         keeps_side: leave the normal as it is.
+        parts: threads.
 
     Returns:
         The plane with its rectangle, or None where no point is near.
@@ -82,13 +83,19 @@ def place_reference(
         basis_from_up(cloud.up),
         cell_m=_PLAN_CELL_M,
         least_share=_STRAY_SHARE,
-        parts=1,
+        parts=parts,
     )
     raster, place = _rectangle(plane, remainder, buffer_m)
     if place is None:
         return None
-    corners_m = rectangle_m(plane, raster.axes, place.bounds_m)
-    parts_m = [rectangle_m(plane, raster.axes, bounds) for bounds in place.parts_m]
+    extent_m = _extent(raster, place, remainder, buffer_m)
+    corners_m = rectangle_m(plane, raster.axes, extent_m)
+    parts_m = [
+        rectangle_m(
+            plane, raster.axes, np.clip(part, extent_m[[0, 0, 2, 2]], extent_m[[1, 1, 3, 3]])
+        )
+        for part in place.parts_m
+    ]
     viewpoint = "given"
     if not keeps_side:
         members = remainder.sample.offsets_m
@@ -135,7 +142,9 @@ def lay_reference(
     everywhere = _EVERYWHERE_M * np.array([-1.0, 1.0, -1.0, 1.0])
     remainder.claim(slabs, np.concatenate([[tolerance_m], everywhere]))
     labels[:] = remainder.claims
-    deviations = measure_planes(remainder, slabs, find_m=tolerance_m, fit_m=tolerance_m)
+    deviations = measure_planes(
+        remainder, slabs, everywhere[None], find_m=tolerance_m, fit_m=tolerance_m
+    )
     height_m = reference.corners_m.mean(axis=0) @ cloud.up
     planes = Planes(
         normal=plane.normal[None].copy(),
@@ -164,13 +173,35 @@ def _rectangle(
     near = points_m[np.abs(plane.distances_m(points_m)) <= reach_m]
     corners = remainder.box_corners()
     placed = near @ wall_axes(plane.normal, remainder.up).T
-    area_m2 = float(np.prod(np.ptp(placed, axis=0))) if len(near) else 0.0
+    # Not the full range: three echoes far away would make the cells as large as the scene.
+    low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(near) else np.zeros((2, 2))
+    area_m2 = float(np.prod(high - low))
     n_near = len(near) * remainder.sample.n_represented
     raster = surface_raster(plane, corners, remainder.up, cell_m=cell_for(n_near, area_m2))
     sums = measure_cells(
-        remainder.points, remainder.claims, raster, find_m=reach_m, fit_m=reach_m, parts=1
+        remainder.points,
+        remainder.claims,
+        raster,
+        find_m=reach_m,
+        fit_m=reach_m,
+        parts=remainder.parts,
     )
     return raster, footprint(raster, sums.n_find > 0, sums)
+
+
+def _extent(
+    raster: SurfaceRaster, place: Footprint, remainder: Remainder, buffer_m: float | None
+) -> NDArray[np.float64]:
+    """(4,) smallest and largest u and v of the points near a plane in its cells' rectangle."""
+    reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
+    slabs = raster.slab()[None]
+    remainder.claim(slabs, np.concatenate([[reach_m], place.bounds_m]))
+    deviations = measure_planes(
+        remainder, slabs, place.bounds_m[None], find_m=reach_m, fit_m=reach_m
+    )
+    remainder.claims.fill(-1)
+    extent_m: NDArray[np.float64] = deviations.extents_m[0]
+    return extent_m
 
 
 def _report(ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int) -> None:

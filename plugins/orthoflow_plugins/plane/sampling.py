@@ -22,6 +22,7 @@ from orthoflow.products import PointCloud
 SAMPLE_POINTS: Final = 400_000
 # More cells than this cost more than they show; the cell grows instead.
 PLAN_CELLS_MOST: Final = 8_000_000
+_TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
 
 
@@ -92,6 +93,11 @@ def plan_grid(
             so no plane worth finding is cut off.
     """
     framed = sample.offsets_m @ basis.T
+    low, high = np.quantile(framed, (_TAIL_SHARE, 1.0 - _TAIL_SHARE), axis=0)
+    # The tails may be a side room or stray echoes; only what is far beyond the scene's own size
+    # can be told to be stray. A lone wall is thin one way, so the largest extent is the measure.
+    reach_m = float((high - low).max())
+    framed = framed[((framed >= low - reach_m) & (framed <= high + reach_m)).all(axis=1)]
     low = np.quantile(framed, outside_share, axis=0)
     high = np.quantile(framed, 1.0 - outside_share, axis=0)
     margin = 0.02 * (high - low) + 5.0 * cell_m

@@ -1,0 +1,92 @@
+"""Clouds of rectangles with known planes, for the tests of plane detection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.products import PointCloud
+from orthoflow.sdk import StepContext
+
+NOISE_M = 0.002
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A true surface: centre, two half axes (metres), how many points."""
+
+    name: str
+    centre: tuple[float, float, float]
+    half_a: tuple[float, float, float]
+    half_b: tuple[float, float, float]
+    n_points: int
+
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        normal = np.cross(self.half_a, self.half_b)
+        return normal / np.linalg.norm(normal)
+
+    def points(self, rng: np.random.Generator, noise_m: float) -> NDArray[np.float64]:
+        spread = rng.uniform(-1.0, 1.0, (self.n_points, 2))
+        flat = np.array(self.centre) + spread @ np.array([self.half_a, self.half_b])
+        return flat + rng.normal(0.0, noise_m, (self.n_points, 1)) * self.normal
+
+
+# A room of 6 x 4 x 3 m; the front wall (y = 2) leans by 0.4 degrees and is the densest.
+LEAN = np.radians(0.4)
+ROOM = (
+    Rectangle("front", (0, 2, 0), (3, 0, 0), (0, 1.5 * np.sin(LEAN), 1.5 * np.cos(LEAN)), 30_000),
+    Rectangle("back", (0, -2, 0), (3, 0, 0), (0, 0, 1.5), 9_000),
+    Rectangle("left", (-3, 0, 0), (0, 2, 0), (0, 0, 1.5), 8_000),
+    Rectangle("right", (3, 0, 0), (0, 2, 0), (0, 0, 1.5), 7_000),
+    Rectangle("floor", (0, 0, -1.5), (3, 0, 0), (0, 2, 0), 16_000),
+    Rectangle("ceiling", (0, 0, 1.5), (3, 0, 0), (0, 2, 0), 15_000),
+    Rectangle("table", (1, -0.5, -0.75), (0.8, 0, 0), (0, 0.5, 0), 2_500),
+)
+
+
+def turned(angle_deg: float) -> NDArray[np.float64]:
+    """Rotation (3, 3) about z."""
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
+
+
+def sampled(
+    rectangles: tuple[Rectangle, ...] = ROOM, *, seed: int = 1, noise_m: float = NOISE_M
+) -> NDArray[np.float64]:
+    """Points (n, 3) of rectangles, one after the other."""
+    rng = np.random.default_rng(seed)
+    return np.concatenate([rectangle.points(rng, noise_m) for rectangle in rectangles])
+
+
+def cloud_of(
+    points: NDArray[np.float64],
+    *,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    stations: NDArray[np.float64] | None = None,
+    source: str | None = "file",
+) -> PointCloud:
+    """A cloud of points given relative to its origin; read-only, as methods get them."""
+    offsets = points.astype(np.float32)
+    columns = [np.ascontiguousarray(offsets[:, axis]) for axis in range(3)]
+    for column in columns:
+        column.flags.writeable = False
+    return PointCloud(
+        origin=np.array(origin),
+        x=columns[0],
+        y=columns[1],
+        z=columns[2],
+        up=np.array(up),
+        stations=None if stations is None else stations + np.array(origin),
+        stations_source=None if stations is None else source,
+    )
+
+
+def context(folder: Path, *, cores: int = 2) -> StepContext:
+    """A step context with a scratch folder of its own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return StepContext(rng=np.random.default_rng(0), cores=cores, scratch=folder)
