@@ -233,7 +233,7 @@ def needs_library(values, params, ctx):
 
 @work("exact")
 def no_memory(values, params, ctx):
-    return np.empty(1 << 60)
+    return np.empty(1 << 46)
 
 @work("exact")
 def full_disk(values, params, ctx):

@@ -8,18 +8,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final, cast
 
 from orthoflow.catalog import Catalog
 from orthoflow.engine.file_digests import FileRef
 from orthoflow.engine.results import ProductRef
-from orthoflow.engine.sources import (
-    compiled_digest,
-    framework_digest,
-    is_framework_released,
-    plugin_digest,
-)
+from orthoflow.engine.sources import compiled_digest, files_digest, unreleased_code
 from orthoflow.engine.store import canonical_json
 from orthoflow.errors import PluginError
 from orthoflow.products.product import JsonValue
@@ -47,6 +43,7 @@ class MethodFacts:
         compiled_digest: names the folder for compiled kernels.
         inputs: port -> product type.
         outputs: port -> product type.
+        sources: the files behind `code`.
     """
 
     id: str
@@ -61,6 +58,14 @@ class MethodFacts:
     compiled_digest: str
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
+    sources: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
+
+    def is_code_unchanged(self) -> bool:
+        """Whether the code on the disk is still the one in the keys."""
+        try:
+            return all(files_digest(self.sources[name]) == self.code[name] for name in self.sources)
+        except OSError:
+            return False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,11 +85,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
     entry = catalog.method(method_id)
     cls: type[Method] = entry.load()
     distribution = entry.distribution
-    code: dict[str, str] = {}
-    if not distribution.is_released:
-        code["plugin"] = plugin_digest(entry)
-    if not is_framework_released():
-        code["framework"] = framework_digest()
+    sources = unreleased_code(entry)
     return MethodFacts(
         id=method_id,
         target=entry.spec.target,
@@ -94,14 +95,15 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
         distribution=distribution.name,
         distribution_version=distribution.version,
         tools=_tools(cls),
-        code=code,
+        code={name: files_digest(files) for name, files in sources.items()},
+        sources=sources,
         compiled_digest=compiled_digest(entry),
         inputs={name: port.type_name for name, port in port_specs(cls.In).items()},
         outputs={name: port.type_name for name, port in port_specs(cls.Out).items()},
     )
 
 
-def files_digest(files: tuple[FileRef, ...]) -> str:
+def input_digest(files: tuple[FileRef, ...]) -> str:
     """Digest of a workflow input: names without folders, sizes and contents, in order."""
     listing: JsonValue = [
         {"name": file.name, "size_bytes": file.size_bytes, "sha256": file.sha256} for file in files

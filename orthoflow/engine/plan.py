@@ -11,7 +11,7 @@ from typing import Literal
 from orthoflow.catalog import Catalog
 from orthoflow.engine.changes import explain
 from orthoflow.engine.file_digests import FileRef
-from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, files_digest, method_facts
+from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, input_digest, method_facts
 from orthoflow.engine.options import RunOptions
 from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.engine.sources import framework_tag
@@ -217,7 +217,7 @@ def _digest_inputs(
             planned[name] = None
             continue
         refs = digests.digest_all(files.paths)
-        ref = ProductRef(type_name="files", encoding_version=0, digest=files_digest(refs))
+        ref = ProductRef(type_name="files", encoding_version=0, digest=input_digest(refs))
         planned[name] = PlannedInput(ref=ref, paths=files.paths, files=refs)
     if store.folder.is_dir():
         # Only a memory: a plan must also be possible on a full or read-only disk.

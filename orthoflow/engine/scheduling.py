@@ -34,11 +34,11 @@ from orthoflow.engine.plan import (
     needed_addresses,
 )
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.running import now
+from orthoflow.engine.running import failed_result, now
 from orthoflow.engine.store import Store
 from orthoflow.engine.task_making import TaskMaker
 from orthoflow.engine.tasks import Task
-from orthoflow.errors import CancelledStepError
+from orthoflow.errors import CancelledStepError, StepFailedError
 from orthoflow.sdk.context import StepEvent
 from orthoflow.workflow.cells import Cell
 
@@ -248,11 +248,16 @@ class _Run:
     def _take(self, end: TaskEnd) -> None:
         task = self._running.pop(end.address)
         cell = next(item.cell for item in self._plan.cells if item.cell.address == end.address)
-        if end.result.status == "ok":
+        result = end.result
+        if result.status == "ok" and not self._plan.methods[cell.method].is_code_unchanged():
+            # Its key would promise what other code has computed.
+            changed = f"the code of method {cell.method} changed during the run; run again"
+            result = failed_result(task, StepFailedError(changed))
+        if result.status == "ok":
             self._made.add(task.key)
-            self._store.put_result(task.key, end.result, cell.step)
+            self._store.put_result(task.key, result, cell.step)
         remove_tree(Path(task.folder))
-        self._settle(cell, end.result)
+        self._settle(cell, result)
 
     def _settle(self, cell: Cell, result: CellResult, *, is_cached: bool = False) -> None:
         self._waiting.pop(cell.address, None)

@@ -1,0 +1,351 @@
+"""Whatever a method does, its cell fails with a reason and the rest of the run is complete."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine import memory_guard
+from orthoflow.engine.endings import describe_exit
+from orthoflow.engine.memory import (
+    AvailableMemory,
+    MemorySampler,
+    available_memory,
+    group_memory,
+    process_memory,
+)
+from orthoflow.engine.memory_guard import MemoryGuard, Victim
+from orthoflow.engine.results import CellResult
+from orthoflow.errors import StoreError
+from tests.engine_world import World, toy_world
+
+MIB = 1 << 20
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def company(bad: str, timeout: str = "") -> str:
+    """A bad method beside good ones, with a step behind each."""
+    limit = f", timeout: {timeout}" if timeout else ""
+    return f"""
+steps:
+  first: {{use: make.range}}
+  second:
+    in: {{numbers: first.numbers}}
+    variants:
+      bad: {{use: work.{bad}{limit}}}
+      good: {{use: work.add}}
+  third: {{use: work.add, in: {{numbers: second.numbers}}}}
+compare: {{design: product}}
+"""
+
+
+def bad_result(world: World, bad: str, timeout: str = "", **options: object) -> CellResult:
+    """Run a bad method in good company; the company must come through."""
+    outcome = world.run(company(bad, timeout), **options)  # type: ignore[arg-type]
+    good = ["first", "second@second=good", "third@second=good"]
+    assert [outcome.results[address].status for address in good] == ["ok"] * 3
+    behind = outcome.results["third@second=bad"]
+    assert behind.status == "skipped"
+    assert behind.error_message == "needs second@second=bad, which failed"
+    assert not list(world.store.scratch.iterdir())
+    result = outcome.results["second@second=bad"]
+    assert result.status == "failed"
+    assert result.outputs == {}
+    assert outcome.exit_code == result.exit_code
+    return result
+
+
+RAISED = {
+    "raises": (
+        "MethodError",
+        "method work.raises failed unexpectedly: KeyError: 'missing'",
+        1,
+    ),
+    "refuses": ("MethodError", "no number is large enough", 1),
+    "unreadable": ("InputError", "the numbers are unreadable", 2),
+    "needs_library": (
+        "PluginError",
+        (
+            "method work.needs_library needs no_such_library, which is missing or fails to import: "
+            "No module named 'no_such_library'"
+        ),
+        4,
+    ),
+    "changes_input": (
+        "MethodError",
+        "method work.changes_input failed unexpectedly: ValueError: output array is read-only",
+        1,
+    ),
+    "wrong_type": (
+        "MethodError",
+        "method work.wrong_type must give a numbers on its port numbers, got Strangers",
+        1,
+    ),
+    "wrong_out": ("MethodError", "method work.wrong_out must return its Out, got Numbers", 1),
+    "bad_param": ("ProductError", "metric nan must be finite, got nan", 1),
+    "leave": ("MethodError", "method work.leave tried to end the program (bye)", 1),
+    "unstorable": (
+        "ProductError",
+        (
+            "a numbers cannot be stored: an array of type object cannot be stored, only bool, "
+            "integers and floats of 2, 4 or 8 bytes can"
+        ),
+        1,
+    ),
+}
+
+
+@pytest.mark.parametrize("bad", RAISED)
+def test_what_a_method_raises_becomes_one_sentence(world: World, bad: str) -> None:
+    result = bad_result(world, bad, executor="inline")
+    assert (result.error_type, result.error_message, result.exit_code) == RAISED[bad]
+    assert "Traceback" in result.traceback
+    assert "Traceback" not in result.error_message
+
+
+def test_running_out_of_memory_in_an_allocation_is_a_sentence(world: World) -> None:
+    result = bad_result(world, "no_memory", executor="inline")
+    assert result.error_type == "StepFailedError"
+    assert result.error_message.startswith(
+        "method work.no_memory needed more memory than it could get: Unable to allocate"
+    )
+
+
+def test_a_full_disk_in_a_method_names_the_store(world: World) -> None:
+    result = bad_result(world, "full_disk", executor="inline")
+    assert result.error_type == "StoreError"
+    assert result.error_message.startswith(
+        f"cannot write to {world.store.folder}: No space left on the disk"
+    )
+
+
+CRASHES = {
+    "segfault": "method work.segfault crashed (segmentation fault, SIGSEGV)",
+    "abort": "method work.abort crashed (abort, SIGABRT)",
+    "quit": (
+        "method work.quit ended its process without a result (exit status 7); its log ends "
+        "with: last words"
+    ),
+    "hang": "method work.hang ran past its timeout of 1.5 s and was stopped",
+}
+
+
+def test_crashes_fail_their_cells_alone(world: World) -> None:
+    variants = "".join(f"      {bad}: {{use: work.{bad}}}\n" for bad in CRASHES)
+    variants = variants.replace("work.hang", "work.hang, timeout: 1.5s")
+    outcome = world.run(company("refuses").replace("      good:", variants + "      good:"))
+    results = {address.partition("=")[2]: result for address, result in outcome.results.items()}
+    for bad, message in CRASHES.items():
+        result = outcome.results[f"second@second={bad}"]
+        assert (result.status, result.error_type) == ("failed", "StepFailedError")
+        assert result.error_message == message
+        assert result.started < result.ended
+        assert results[bad].error_message == f"needs second@second={bad}, which failed"
+    assert results["good"].status == "ok"
+    assert "string_at" in outcome.results["second@second=segfault"].log
+    assert 1.5 <= outcome.results["second@second=hang"].wall_s < 6.5
+    assert outcome.exit_code == 1
+
+
+def test_a_method_that_ignores_being_asked_is_killed(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.engine.local_executor._GRACE_S", 0.5)
+    result = bad_result(world, "stubborn", "1.5s")
+    assert "ran past its timeout of 1.5 s" in result.error_message
+
+
+def test_processes_that_a_method_leaves_behind_are_killed(world: World) -> None:
+    outcome = world.run(
+        "steps: {a: {use: make.range}, b: {use: work.spawns, in: {numbers: a.numbers}}}"
+    )
+    (process_id,) = world.values(outcome, "b")
+    assert has_ended(int(process_id))
+
+
+def has_ended(process_id: int) -> bool:
+    for _ in range(100):
+        try:
+            state = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0]
+        except FileNotFoundError:
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A machine of 8 GiB with 1.5 GiB left, less what the steps take.
+    def little_memory() -> AvailableMemory:
+        taken = sum(
+            group_memory(int(entry.name)) for entry in Path("/proc").iterdir() if _is_child(entry)
+        )
+        return AvailableMemory(available=1536 * MIB - taken, total=8192 * MIB)
+
+    monkeypatch.setattr(memory_guard, "available_memory", little_memory)
+    result = bad_result(world, "eat")
+    assert result.error_type == "StepFailedError"
+    assert result.error_message == (
+        "method work.eat needed more memory than the machine has "
+        f"({result.peak_rss_mib / 1024:.1f} GiB when stopped); give it less data or coarser "
+        "parameters"
+    )
+    assert 900 < result.peak_rss_mib < 2000
+
+
+def _is_child(entry: Path) -> bool:
+    if not entry.name.isdigit():
+        return False
+    try:
+        fields = (entry / "stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return False
+    return int(fields[1]) == os.getpid() and int(fields[2]) == int(entry.name)
+
+
+@pytest.mark.parametrize(
+    ("available", "held", "expected"),
+    [
+        (4096, {"a": 9000}, None),
+        (100, {"a": 600, "b": 700}, Victim(address="b", n_bytes=700 * MIB)),
+        (100, {"a": 100, "b": 200}, None),
+        (100, {}, None),
+    ],
+    ids=["enough is left", "the largest goes", "somebody else eats", "nothing runs"],
+)
+def test_the_guard_stops_the_largest_step_when_memory_is_short(
+    monkeypatch: pytest.MonkeyPatch,
+    available: int,
+    held: dict[str, int],
+    expected: Victim | None,
+) -> None:
+    groups = {address: index for index, address in enumerate(held)}
+    sizes = {index: held[address] * MIB for address, index in groups.items()}
+    memory = AvailableMemory(available=available * MIB, total=8192 * MIB)
+    monkeypatch.setattr(memory_guard, "available_memory", lambda: memory)
+    monkeypatch.setattr(memory_guard, "group_memory", lambda group: sizes[group])
+    guard = MemoryGuard()
+    assert guard.check(groups) == expected
+    assert (guard.interval_s == 0.25) == (available > 2500)
+
+
+@pytest.mark.parametrize(
+    ("total_gib", "floor_mib"), [(1, 128), (4, 512), (16, 512), (64, 1966)], ids=str
+)
+def test_the_floor_grows_with_the_machine(total_gib: int, floor_mib: int) -> None:
+    memory = AvailableMemory(available=0, total=total_gib << 30)
+    assert memory.floor // MIB == floor_mib
+
+
+def test_this_machine_has_memory() -> None:
+    memory = available_memory()
+    assert 0 < memory.available <= memory.total
+
+
+def test_the_sampler_sees_memory_that_is_given_back() -> None:
+    with MemorySampler() as sampler:
+        before = sampler.peak_mib
+        hoard = bytearray(200 * MIB)
+        hoard[:: 1 << 12] = b"x" * len(hoard[:: 1 << 12])
+        time.sleep(0.2)
+        del hoard
+    assert 190 < sampler.peak_mib - before < 230
+
+
+def test_a_gone_process_has_no_memory() -> None:
+    process = subprocess.Popen(["true"])
+    process.wait()
+    assert process_memory(process.pid) is None
+
+
+def test_a_kill_from_outside_is_named() -> None:
+    assert describe_exit("a.b", -signal.SIGKILL, 3 << 30, "") == (
+        "method a.b was killed from outside (SIGKILL) while it held 3.0 GiB of memory"
+    )
+    assert "signal 64" in describe_exit("a.b", -64, 0, "").replace("SIGRTMAX", "signal 64")
+
+
+def test_a_bus_error_hints_at_the_disk() -> None:
+    assert "bus error, as when the disk is full" in describe_exit("a.b", -signal.SIGBUS, 0, "")
+
+
+# Full disk ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tiny_world(tmp_path: Path) -> Iterator[World]:
+    """Toys whose store lies on a disk of 2 MiB."""
+    disk = tmp_path / "store"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=2m", "none", str(disk)]
+    if os.geteuid() != 0 or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a file system can be mounted by root only")
+    with toy_world(tmp_path) as opened:
+        yield opened
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("executor", ["inline", "local"])
+def test_an_output_too_large_for_the_disk_fails_its_cell_in_a_sentence(
+    tiny_world: World, executor: str
+) -> None:
+    steps = """
+steps:
+  large: {use: make.range, params: {count: 1000000}}
+  small: {use: make.range}
+  behind: {use: work.add, in: {numbers: small.numbers}}
+"""
+    outcome = tiny_world.run(steps, executor=executor)
+    assert [result.status for result in outcome.results.values()] == ["failed", "ok", "ok"]
+    failed = outcome.results["large"]
+    assert failed.error_type == "StoreError"
+    assert failed.error_message.startswith(
+        f"cannot write to {tiny_world.store.folder}: No space left on the disk"
+    )
+
+
+def test_a_disk_that_fills_up_under_a_mapped_file_fails_the_cell(tiny_world: World) -> None:
+    result = bad_result(tiny_world, "fills_mapped")
+    assert result.error_type in ("StoreError", "StepFailedError")
+    assert "disk" in result.error_message
+
+
+def test_a_disk_that_is_full_from_the_start_is_one_sentence(tiny_world: World) -> None:
+    filler = tiny_world.folder / "store" / "filler"
+    with pytest.raises(OSError, match="No space left"):
+        filler.write_bytes(bytes(4 * MIB))
+    with pytest.raises(StoreError, match=r"cannot write to .*store.*: No space left on the disk"):
+        tiny_world.run("steps: {a: {use: make.range}}")
+
+
+def test_a_run_folder_that_cannot_be_written_is_one_sentence(world: World) -> None:
+    plan_first = "steps: {a: {use: make.range}}"
+    (world.folder / "file").write_text("no folder")
+    with pytest.raises(StoreError, match=r"cannot write to .*file/run: a file stands where"):
+        world.run(plan_first, into="file/run")
+
+
+def test_files_larger_than_allowed_fail_the_cell(world: World) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 * MIB, before[1]))
+    try:
+        outcome = world.run("steps: {a: {use: make.range, params: {count: 1000000}}}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert outcome.results["a"].error_type == "StoreError"
+    assert "the file would be larger than allowed" in outcome.results["a"].error_message

@@ -1,0 +1,190 @@
+"""Killed or interrupted at any instant, the same run goes on and ends with the same digests."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine import RunOutcome, collect_garbage
+from orthoflow.errors import StoreError
+from tests.engine_world import World, start_coordinator, toy_world
+
+LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
+STEPS = """
+steps:
+  first: {use: make.range, params: {count: 20000}}
+  second: {use: work.slow, in: {numbers: first.numbers}, params: {steps: 6}}
+  third: {use: work.noise, in: {numbers: second.numbers}}
+  fourth: {use: work.draws, in: {numbers: third.numbers}}
+"""
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def digests(outcome: RunOutcome) -> list[str]:
+    assert outcome.status == "ok"
+    return [result.outputs["numbers"].digest for result in outcome.results.values()]
+
+
+def events(world: World, folder: str) -> list[dict[str, object]]:
+    path = world.folder / folder / "journal.jsonl"
+    if not path.exists():
+        return []
+    whole = path.read_text().rpartition("\n")[0]
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+def wait_for(world: World, folder: str, event: str, address: str) -> None:
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        for found in events(world, folder):
+            if (found["event"], found.get("address")) == (event, address):
+                return
+        time.sleep(0.01)
+    pytest.fail(f"{address} never {event}")
+
+
+def children(process_id: int) -> list[int]:
+    text = Path(f"/proc/{process_id}/task/{process_id}/children").read_text()
+    return [int(word) for word in text.split()]
+
+
+def is_alive(process_id: int) -> bool:
+    try:
+        return Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Digests of an undisturbed run."""
+    with toy_world(tmp_path_factory.mktemp("quiet")) as world:
+        return digests(world.run(STEPS, executor="inline"))
+
+
+@pytest.mark.parametrize("attempt", range(10 if LONG else 2))
+def test_a_run_killed_at_any_moment_resumes_with_the_same_digests(
+    world: World, quiet: list[str], attempt: int
+) -> None:
+    rng = random.Random(attempt)
+    for _ in range(2 if LONG else 1):
+        process = start_coordinator(world, STEPS, "run")
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(rng.uniform(0.1, 4.0))
+        process.kill()
+        process.communicate()
+    outcome = world.run(STEPS)
+    assert digests(outcome) == quiet
+    assert [event["event"] for event in events(world, "run")].count("run") == 1
+    assert set(outcome.cached) == set()
+    assert list(world.store.scratch.iterdir()) == []
+    collect_garbage(world.store)
+    assert len(world.run(STEPS, into="after").cached) == 4
+
+
+def test_a_finished_step_is_not_computed_again_after_a_kill(world: World) -> None:
+    process = start_coordinator(world, STEPS, "run")
+    wait_for(world, "run", "started", "second")
+    process.kill()
+    process.communicate()
+    outcome = world.run(STEPS)
+    assert outcome.resumed == {"first"}
+    assert [event["event"] for event in events(world, "run")].count("resumed") == 1
+
+
+def test_steps_die_with_their_coordinator(world: World) -> None:
+    process = start_coordinator(world, STEPS.replace("steps: 6", "steps: 2000"), "run")
+    wait_for(world, "run", "started", "second")
+    time.sleep(0.3)
+    (child,) = children(process.pid)
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 5
+    while is_alive(child) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not is_alive(child)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
+def test_an_interrupted_run_says_so(world: World, number: signal.Signals) -> None:
+    long = STEPS.replace("steps: 6", "steps: 2000")
+    process = start_coordinator(world, long, "run")
+    wait_for(world, "run", "started", "second")
+    time.sleep(0.7)
+    process.send_signal(number)
+    said = process.communicate(timeout=30)[0].decode()
+    assert process.returncode == 130
+    assert "CancelledStepError: the run was interrupted; the same command goes on" in said
+    assert "Traceback" not in said
+    assert events(world, "run")[-1]["event"] == "interrupted"
+
+
+def test_an_inline_run_can_be_interrupted_too(world: World) -> None:
+    steps = STEPS.replace("steps: 6", "steps: 2000")
+    plan = world.plan(steps, executor="inline")
+
+    def interrupt(event: object) -> None:
+        if type(event).__name__ == "CellProgress":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    from orthoflow.engine import execute
+    from orthoflow.errors import CancelledStepError
+
+    with pytest.raises(CancelledStepError, match="the run was interrupted"):
+        execute(plan, world.folder / "run", world.store, interrupt)
+    assert events(world, "run")[-1]["event"] == "interrupted"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_two_runs_share_a_store_at_once(world: World, quiet: list[str]) -> None:
+    processes = [start_coordinator(world, STEPS, name) for name in ("one", "two")]
+    for process in processes:
+        said = process.communicate(timeout=120)[0].decode()
+        assert process.returncode == 0, said
+    outcome = world.run(STEPS, into="three")
+    assert len(outcome.cached) == 4
+    assert digests(outcome) == quiet
+
+
+def test_a_run_folder_in_use_is_refused_and_so_is_garbage_collection(world: World) -> None:
+    process = start_coordinator(world, STEPS.replace("steps: 6", "steps: 2000"), "run")
+    try:
+        wait_for(world, "run", "started", "second")
+        with pytest.raises(StoreError, match="is in use by another run; wait for its end"):
+            world.run(STEPS)
+        with pytest.raises(StoreError, match="is in use by a run"):
+            collect_garbage(world.store)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_step_without_its_coordinator_ends_at_once(tmp_path: Path) -> None:
+    import sys
+
+    reading, writing = os.pipe()
+    arguments = [sys.executable, "-m", "orthoflow.engine.child"]
+    process = subprocess.run(
+        [*arguments, str(tmp_path / "none.json"), str(writing), "1"],
+        pass_fds=(writing,),
+        capture_output=True,
+        check=False,
+    )
+    os.close(reading)
+    os.close(writing)
+    assert process.returncode == 1
+    assert process.stderr == b""

@@ -1,0 +1,322 @@
+"""A run computes what is missing, keeps what it computes, and says what it does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine import RunOutcome, execute
+from orthoflow.engine.environment import environment
+from orthoflow.engine.events import CellFinished, CellLogged, CellProgress, CellStarted, CellWarned
+from orthoflow.engine.results import CellResult
+from orthoflow.engine.task_making import log_name
+from orthoflow.errors import ArgumentError, InputError, StoreError
+from tests.engine_world import World, toy_world
+
+CHAIN = """
+steps:
+  first: {use: make.range}
+  second: {use: work.noise, in: {numbers: first.numbers}}
+  third: {use: work.add, in: {numbers: second.numbers}}
+"""
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def one(method: str, params: str = "{}") -> str:
+    return (
+        f"steps: {{a: {{use: make.range}}, "
+        f"b: {{use: work.{method}, in: {{numbers: a.numbers}}, params: {params}}}}}"
+    )
+
+
+def digests(outcome: RunOutcome) -> dict[str, str]:
+    return {
+        f"{address}.{port}": ref.digest
+        for address, result in outcome.results.items()
+        for port, ref in result.outputs.items()
+    }
+
+
+def journal(world: World, folder: str = "run") -> list[dict[str, object]]:
+    return [
+        json.loads(line)
+        for line in (world.folder / folder / "journal.jsonl").read_text().splitlines()
+    ]
+
+
+def test_both_executors_and_all_job_counts_give_the_same_digests(world: World) -> None:
+    inline = world.run(CHAIN, into="inline", executor="inline")
+    steps = ("first", "second", "third")
+    local = world.run(CHAIN, into="local", force=steps)
+    jobs = world.run(CHAIN, into="jobs", force=steps, jobs=2)
+    assert digests(inline) == digests(local) == digests(jobs)
+    assert not local.cached
+    assert {result.run_id for result in local.results.values()} == {local.run_id}
+
+
+def test_a_second_run_takes_everything_from_the_first(world: World) -> None:
+    first = world.run(CHAIN, into="one", executor="inline")
+    second = world.run(CHAIN, into="two")
+    assert second.cached == dict.fromkeys(("first", "second", "third"), first.run_id)
+    assert second.results == first.results
+    assert second.run_id != first.run_id
+    assert all(event.cached for event in world.events if isinstance(event, CellFinished))
+
+
+def test_a_result_says_where_it_comes_from(world: World) -> None:
+    outcome = world.run(CHAIN, executor="inline", cores=1)
+    result = outcome.results["second"]
+    assert (result.distribution, result.distribution_version) == ("toy-plugin", "1.0")
+    assert (result.determinism, result.result_version) == ("seeded", 1)
+    assert result.inputs["numbers"] == outcome.results["first"].outputs["numbers"]
+    assert json.loads(result.key_preimage)["seed"] == result.seed
+    assert outcome.results["first"].seed is None
+    assert result.environment == environment(1)
+    assert result.started <= result.ended <= outcome.ended
+    assert result.peak_rss_mib > 10
+
+
+def test_the_environment_holds_versions_but_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = json.dumps(environment(2))
+    found = environment(2)
+    assert found["threads"] == 2
+    assert isinstance(found["packages"], dict)
+    assert "numpy" in found["packages"]
+    assert str(Path.home()) not in text
+    assert found["id"] == environment(2)["id"] != environment(1)["id"]
+
+
+def test_repeats_of_a_random_method_differ_and_come_again(world: World) -> None:
+    steps = """
+steps:
+  first: {use: make.range}
+  second:
+    in: {numbers: first.numbers}
+    variants: {noise: {use: work.noise, repeat: 3}}
+compare: {design: product}
+"""
+    outcome = world.run(steps, executor="inline")
+    addresses = ["second@second=noise", "second@second=noise#1", "second@second=noise#2"]
+    found = [digests(outcome)[f"{address}.numbers"] for address in addresses]
+    assert len(set(found)) == 3
+    again = world.run(steps, into="again", executor="inline", force=("second",))
+    assert digests(again) == digests(outcome)
+
+
+def test_equal_cells_run_once(world: World) -> None:
+    steps = """
+steps:
+  first: {use: make.range}
+  second:
+    in: {numbers: first.numbers}
+    variants: {a: {use: work.add}, b: {use: work.add}}
+compare: {design: product}
+"""
+    outcome = world.run(steps, jobs=2)
+    started = [event.address for event in world.events if isinstance(event, CellStarted)]
+    assert len(started) == 2
+    assert len(set(digests(outcome).values())) == 2
+
+
+def test_figures_metrics_and_warnings_are_kept(world: World) -> None:
+    outcome = world.run(one("draws"))
+    result = outcome.results["b"]
+    (figure,) = result.figures
+    assert (figure.name, figure.caption, figure.media_type) == ("dot", "a dot", "image/png")
+    path = world.store.blob_path(figure.sha256)
+    assert path is not None
+    assert path.read_bytes() == b"\x89PNG\r\n\x1a\n0123"
+    assert [(m.name, m.value, m.unit) for m in result.metrics] == [("dots", 1.0, "1")]
+    assert result.warnings == ("the dot is small",)
+    assert CellWarned(address="b", text="the dot is small") in world.events
+
+
+def test_everything_a_step_says_is_in_its_log(world: World) -> None:
+    outcome = world.run(one("chatty"))
+    log = outcome.results["b"].log
+    assert "on stdout\n" in log
+    assert "on stderr  with NUL\n" in log
+    assert "a line of log\n" in log
+    assert (world.folder / "run" / "logs" / "b.log").read_text() == log.replace(" \0", " ") or (
+        "\0" in (world.folder / "run" / "logs" / "b.log").read_text()
+    )
+    assert CellLogged(address="b", text="a line of log") in world.events
+
+
+def test_progress_is_passed_on_while_a_step_runs(world: World) -> None:
+    world.run(one("slow", "{steps: 12}"))
+    fractions = [event.fraction for event in world.events if isinstance(event, CellProgress)]
+    assert len(fractions) >= 3
+    assert fractions == sorted(fractions)
+    order = [type(event).__name__ for event in world.events if getattr(event, "address", "") == "b"]
+    assert order[0] == "CellStarted"
+    assert order[-1] == "CellFinished"
+
+
+@pytest.mark.parametrize(("jobs", "cores"), [(1, 4), (2, 2), (8, 1)])
+def test_threads_are_fixed_before_any_library_loads(world: World, jobs: int, cores: int) -> None:
+    outcome = world.run(one("threads"), cores=4, jobs=jobs)
+    assert world.values(outcome, "b") == [float(cores)] * 5
+    numba, where, scratch = outcome.results["b"].log.split()
+    assert numba.startswith(str(world.store.folder / "numba"))
+    assert where == scratch
+    assert scratch.startswith(str(world.store.scratch))
+    assert not Path(scratch).exists()
+
+
+def test_published_files_of_a_run_are_in_the_store(world: World) -> None:
+    outcome = world.run(one("add"))
+    ref = outcome.results["b"].outputs["numbers"]
+    (file,) = world.store.published_files(ref.digest)
+    assert file.read_text() == f"{ref.digest} [1.0, 2.0, 3.0, 4.0]"
+
+
+def test_products_that_got_lost_are_computed_again(world: World) -> None:
+    outcome = world.run(CHAIN, executor="inline")
+    digest = outcome.results["second"].outputs["numbers"].digest.removeprefix("sha256:")
+    (world.store.objects / digest / "product.h5").write_bytes(b"\x89HDF\r\n\x1a\n broken")
+    again = world.run(CHAIN, into="again", executor="inline")
+    assert digests(again) == digests(outcome)
+    assert set(again.cached) == {"first", "third"}
+
+
+def test_a_bad_input_file_ends_with_exit_code_two(world: World) -> None:
+    (world.folder / "data.txt").write_text("one two")
+    steps = """
+inputs: {data: {files: data.txt}}
+steps:
+  first: {use: make.file, in: {files: inputs.data}}
+  second: {use: work.add, in: {numbers: first.numbers}}
+"""
+    outcome = world.run(steps, executor="inline")
+    assert outcome.exit_code == 2
+    assert outcome.results["first"].error_message.startswith("data.txt must hold numbers")
+    given = outcome.inputs["data"]
+    assert given is not None
+    assert given.files[0].name == "data.txt"
+
+
+def test_an_input_file_that_changes_while_it_is_read_fails_the_cell(world: World) -> None:
+    data = world.folder / "data.txt"
+    data.write_text("1 2")
+    steps = (
+        "inputs: {data: {files: data.txt}}\nsteps: {a: {use: make.file, in: {files: inputs.data}}}"
+    )
+    plan = world.plan(steps, executor="inline")
+    data.write_text("1 2 3")
+    outcome = execute(plan, world.folder / "run", world.store)
+    assert outcome.results["a"].error_type == InputError.__name__
+    assert "changed while it was read; run again" in outcome.results["a"].error_message
+
+
+def test_code_that_changes_during_the_run_makes_no_result(world: World) -> None:
+    (world.site / "toy_plugin-1.0.dist-info" / "direct_url.json").write_text("{}")
+    plan = world.plan(CHAIN, executor="inline")
+    works = world.site / "toy_plugin" / "works.py"
+
+    def edit(event: object) -> None:
+        if event == CellStarted(address="second"):
+            works.write_text(works.read_text() + "\n# edited\n")
+
+    outcome = execute(plan, world.folder / "run", world.store, edit)
+    assert [result.status for result in outcome.results.values()] == ["ok", "failed", "skipped"]
+    assert outcome.results["second"].error_message == (
+        "the code of method work.noise changed during the run; run again"
+    )
+
+
+@pytest.mark.parametrize(
+    ("codes", "expected"), [([], 0), ([2, 2], 2), ([4], 4), ([2, 1], 1), ([2, 4], 1)]
+)
+def test_the_exit_code_is_the_one_that_all_failures_share(codes: list[int], expected: int) -> None:
+    results = {str(i): CellResult(status="failed", exit_code=c) for i, c in enumerate(codes)}
+    results["behind"] = CellResult(status="skipped")
+    assert RunOutcome(run_id="r", started="", ended="", results=results).exit_code == expected
+
+
+# Run folders --------------------------------------------------------------------------------------
+
+
+def test_the_journal_tells_the_whole_run(world: World) -> None:
+    outcome = world.run(CHAIN, executor="inline")
+    events = [(event["event"], event.get("address")) for event in journal(world)]
+    steps = [
+        (kind, step) for step in ("first", "second", "third") for kind in ("started", "finished")
+    ]
+    assert events == [("run", None), *steps, ("ended", None)]
+    assert journal(world)[0]["run_id"] == outcome.run_id
+
+
+def test_a_finished_run_folder_is_refused(world: World) -> None:
+    world.run(CHAIN, executor="inline")
+    (world.folder / "run" / "run.h5").write_bytes(b"")
+    with pytest.raises(ArgumentError, match=r"holds a finished run \(run.h5\); choose another"):
+        world.run(CHAIN, executor="inline")
+
+
+def test_a_folder_with_other_files_is_refused(world: World) -> None:
+    (world.folder / "mine").mkdir()
+    (world.folder / "mine" / "thesis.txt").write_text("dear")
+    with pytest.raises(ArgumentError, match="is not empty and holds no unfinished run"):
+        world.run(CHAIN, into="mine", executor="inline")
+    assert [path.name for path in (world.folder / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_an_unfinished_run_of_another_workflow_is_refused(world: World) -> None:
+    world.run(CHAIN, executor="inline")
+    path = world.folder / "run" / "journal.jsonl"
+    path.write_text(path.read_text().replace('"toy"', '"other"'))
+    with pytest.raises(ArgumentError, match="holds an unfinished run of other, not of toy"):
+        world.run(CHAIN, executor="inline")
+
+
+def test_the_same_folder_resumes_under_the_same_id(world: World) -> None:
+    first = world.run(CHAIN, executor="inline")
+    second = world.run(CHAIN, executor="inline")
+    assert second.run_id == first.run_id
+    assert second.started == first.started
+    assert second.cached == {}
+    assert second.resumed == {"first", "second", "third"}
+
+
+def test_a_forced_step_that_this_run_has_computed_is_not_computed_twice(world: World) -> None:
+    first = world.run(CHAIN, executor="inline", force=("second",))
+    second = world.run(CHAIN, executor="inline", force=("second",))
+    assert second.results == first.results
+
+
+def test_a_line_that_was_cut_off_does_no_harm(world: World) -> None:
+    world.run(CHAIN, executor="inline")
+    path = world.folder / "run" / "journal.jsonl"
+    path.write_text(path.read_text() + '{"event": "fini')
+    assert world.run(CHAIN, executor="inline").status == "ok"
+    assert [event["event"] for event in journal(world)].count("resumed") == 1
+
+
+def test_a_damaged_journal_is_named(world: World) -> None:
+    world.run(CHAIN, executor="inline")
+    (world.folder / "run" / "journal.jsonl").write_text("nonsense\n")
+    with pytest.raises(StoreError, match=r"journal.jsonl is damaged; remove"):
+        world.run(CHAIN, executor="inline")
+
+
+def test_left_overs_of_killed_runs_are_removed(world: World) -> None:
+    world.run(CHAIN, executor="inline")
+    (world.store.scratch / "dead-run" / "task").mkdir(parents=True)
+    world.run(CHAIN, into="again", executor="inline")
+    assert list(world.store.scratch.iterdir()) == []
+
+
+def test_long_addresses_become_file_names() -> None:
+    address = "step@" + ",".join(f"step{i}=variant{i}" for i in range(40))
+    assert len(log_name(address)) == 200
+    assert log_name(address) != log_name(address + "x")
+    assert log_name("a@b=c,d=e#2") == "a@b=c,d=e#2"
