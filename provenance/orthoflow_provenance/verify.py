@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -78,8 +78,15 @@ def _findings(file: h5py.File) -> Iterator[Finding]:
         return
     yield from _workflow_findings(file, record)
     yield from _run_findings(record)
+    environments = {entry.id for entry in record.environments}
+    outputs = {
+        f"{cell.address}.{port}": product.digest
+        for cell in record.cells
+        for port, product in cell.outputs.items()
+    }
     for cell in record.cells:
-        yield from _cell_findings(cell, record)
+        yield from _cell_findings(cell, environments)
+        yield from _reference_findings(cell, outputs)
         yield from _product_findings(file, cell, contents)
 
 
@@ -141,7 +148,7 @@ def _run_findings(record: RunRecord) -> Iterator[Finding]:
                 )
 
 
-def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
+def _cell_findings(cell: RecordedCell, environments: Set[str]) -> Iterator[Finding]:
     place = f"/{layout.CELLS}/{cell.address}"
     required = ["step", "method"]
     if cell.status == "ok":
@@ -154,7 +161,7 @@ def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
             yield Finding(place=place, problem=f"{name} must not be empty ({cell.status} cell)")
     if cell.key and cell.key != sha256_text(cell.key_preimage):
         yield Finding(place=f"{place}@key", problem="the key is not the SHA-256 of its preimage")
-    if cell.environment and cell.environment not in {entry.id for entry in record.environments}:
+    if cell.environment and cell.environment not in environments:
         yield Finding(
             place=f"{place}@environment", problem=f"there is no environment {cell.environment}"
         )
@@ -169,16 +176,10 @@ def _cell_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
         value = float(getattr(cell, name))
         if not math.isfinite(value) or value < 0:
             yield Finding(place=f"{place}@{name}", problem=f"must not be negative, got {value}")
-    yield from _reference_findings(cell, record)
 
 
-def _reference_findings(cell: RecordedCell, record: RunRecord) -> Iterator[Finding]:
+def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Iterator[Finding]:
     """Check that digests are digests and that an input is what its source gave."""
-    outputs = {
-        f"{other.address}.{port}": product.digest
-        for other in record.cells
-        for port, product in other.outputs.items()
-    }
     for folder, products in (
         (layout.CELL_INPUTS, cell.inputs),
         (layout.CELL_OUTPUTS, cell.outputs),
