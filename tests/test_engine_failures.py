@@ -145,17 +145,19 @@ CRASHES = {
 def test_crashes_fail_their_cells_alone(world: World) -> None:
     variants = "".join(f"      {bad}: {{use: work.{bad}}}\n" for bad in CRASHES)
     variants = variants.replace("work.hang", "work.hang, timeout: 1.5s")
-    outcome = world.run(company("refuses").replace("      good:", variants + "      good:"))
-    results = {address.partition("=")[2]: result for address, result in outcome.results.items()}
+    outcome = world.run(company("refuses").replace("      good:", f"{variants}      good:"))
+    results = outcome.results
     for bad, message in CRASHES.items():
-        result = outcome.results[f"second@second={bad}"]
+        result = results[f"second@second={bad}"]
         assert (result.status, result.error_type) == ("failed", "StepFailedError")
         assert result.error_message == message
         assert result.started < result.ended
-        assert results[bad].error_message == f"needs second@second={bad}, which failed"
-    assert results["good"].status == "ok"
-    assert "string_at" in outcome.results["second@second=segfault"].log
-    assert 1.5 <= outcome.results["second@second=hang"].wall_s < 6.5
+        behind = results[f"third@second={bad}"].error_message
+        assert behind == f"needs second@second={bad}, which failed"
+    assert results["second@second=good"].status == "ok"
+    assert results["third@second=good"].status == "ok"
+    assert "string_at" in results["second@second=segfault"].log
+    assert 1.5 <= results["second@second=hang"].wall_s < 6.5
     assert outcome.exit_code == 1
 
 

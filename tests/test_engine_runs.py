@@ -217,7 +217,7 @@ def test_an_input_file_that_changes_while_it_is_read_fails_the_cell(world: World
     assert "changed while it was read; run again" in outcome.results["a"].error_message
 
 
-def test_code_that_changes_during_the_run_makes_no_result(world: World) -> None:
+def test_results_of_code_that_changed_during_the_run_are_not_kept(world: World) -> None:
     (world.site / "toy_plugin-1.0.dist-info" / "direct_url.json").write_text("{}")
     plan = world.plan(CHAIN, executor="inline")
     works = world.site / "toy_plugin" / "works.py"
@@ -227,10 +227,15 @@ def test_code_that_changes_during_the_run_makes_no_result(world: World) -> None:
             works.write_text(works.read_text() + "\n# edited\n")
 
     outcome = execute(plan, world.folder / "run", world.store, edit)
-    assert [result.status for result in outcome.results.values()] == ["ok", "failed", "skipped"]
-    assert outcome.results["second"].error_message == (
-        "the code of method work.noise changed during the run; run again"
+    assert outcome.status == "ok"
+    warned = [address for address, result in outcome.results.items() if result.warnings]
+    assert warned == ["second", "third"]
+    assert outcome.results["second"].warnings == (
+        "the code of the method changed during the run: the result is not kept for other runs",
     )
+    results = outcome.results
+    assert world.store.result(results["first"].key) == results["first"]
+    assert world.store.result(results["second"].key) is None
 
 
 @pytest.mark.parametrize(

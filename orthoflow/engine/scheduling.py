@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -34,15 +35,18 @@ from orthoflow.engine.plan import (
     needed_addresses,
 )
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.running import failed_result, now
+from orthoflow.engine.running import now
 from orthoflow.engine.store import Store
 from orthoflow.engine.task_making import TaskMaker
 from orthoflow.engine.tasks import Task
-from orthoflow.errors import CancelledStepError, StepFailedError
+from orthoflow.errors import CancelledStepError
 from orthoflow.sdk.context import StepEvent
 from orthoflow.workflow.cells import Cell
 
 _POLL_S: Final = 0.25
+_CODE_CHANGED: Final = (
+    "the code of the method changed during the run: the result is not kept for other runs"
+)
 
 
 def execute(
@@ -249,13 +253,13 @@ class _Run:
         task = self._running.pop(end.address)
         cell = next(item.cell for item in self._plan.cells if item.cell.address == end.address)
         result = end.result
-        if result.status == "ok" and not self._plan.methods[cell.method].is_code_unchanged():
-            # Its key would promise what other code has computed.
-            changed = f"the code of method {cell.method} changed during the run; run again"
-            result = failed_result(task, StepFailedError(changed))
-        if result.status == "ok":
+        if result.status == "ok" and self._plan.methods[cell.method].is_code_unchanged():
             self._made.add(task.key)
             self._store.put_result(task.key, result, cell.step)
+        elif result.status == "ok":
+            # Kept under its key it would pass for what the code of that key computes.
+            self._listen(CellWarned(address=cell.address, text=_CODE_CHANGED))
+            result = dataclasses.replace(result, warnings=(*result.warnings, _CODE_CHANGED))
         remove_tree(Path(task.folder))
         self._settle(cell, result)
 
