@@ -72,47 +72,50 @@ class _Inspection:
         Raises:
             RecordFormatError: something forbidden was found.
         """
-        pending: list[tuple[h5py.Group, int]] = [(self._file, 0)]
-        self._visit_once(self._file, "/")
+        # Low-level identifiers: the objects of h5py on top of them would take three times as long.
+        pending: list[tuple[h5py.h5g.GroupID, str, int]] = [(self._file.id, "/", 0)]
+        self._visit_once(self._file.id, "/")
         while pending:
-            group, depth = pending.pop()
+            group, path, depth = pending.pop()
             if depth > _DEEPEST:
-                raise self._refusal(group.name, f"is nested more than {_DEEPEST} groups deep")
-            with reading(f"{self._name}:{group.name}"):
-                self._check_attributes(group, group.name)
+                raise self._refusal(path, f"is nested more than {_DEEPEST} groups deep")
+            with reading(f"{self._name}:{path}"):
+                self._check_attributes(group, path)
                 names = list(group)
             for name in names:
-                place = f"{group.name.rstrip('/')}/{name}"
+                place = f"{path.rstrip('/')}/{name.decode('utf-8', 'backslashreplace')}"
                 with reading(f"{self._name}:{place}"):
                     child = self._open(group, name, place)
-                    if isinstance(child, h5py.Group):
-                        pending.append((child, depth + 1))
+                    if isinstance(child, h5py.h5g.GroupID):
+                        pending.append((child, place, depth + 1))
                     else:
                         self._check_attributes(child, place)
                         self._check_dataset(child, place)
 
-    def _open(self, group: h5py.Group, name: str, place: str) -> h5py.Group | h5py.Dataset:
-        link = group.get(name, getlink=True)
-        if isinstance(link, h5py.ExternalLink):
+    def _open(
+        self, group: h5py.h5g.GroupID, name: bytes, place: str
+    ) -> h5py.h5g.GroupID | h5py.h5d.DatasetID:
+        link = group.links.get_info(name).type
+        if link == h5py.h5l.TYPE_EXTERNAL:
             raise self._refusal(place, "is a link into another file")
-        if not isinstance(link, h5py.HardLink):
+        if link != h5py.h5l.TYPE_HARD:
             raise self._refusal(place, "is a soft link, only hard links are allowed")
-        child = group[name]
-        if not isinstance(child, h5py.Group | h5py.Dataset):
+        child = h5py.h5o.open(group, name)
+        if not isinstance(child, h5py.h5g.GroupID | h5py.h5d.DatasetID):
             raise self._refusal(place, "is neither a group nor a dataset")
         self._visit_once(child, place)
         return child
 
-    def _visit_once(self, item: h5py.Group | h5py.Dataset, place: str) -> None:
+    def _visit_once(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
         # Two ways to one object make loops, and trees that grow without end from a few bytes.
-        info = h5py.h5o.get_info(item.id)
+        info = h5py.h5o.get_info(item)
         identity = (int(info.fileno), int(info.addr))
         if identity in self._seen:
             raise self._refusal(place, "leads to an object that has another place as well")
         self._seen.add(identity)
 
-    def _check_dataset(self, dataset: h5py.Dataset, place: str) -> None:
-        properties = dataset.id.get_create_plist()
+    def _check_dataset(self, dataset: h5py.h5d.DatasetID, place: str) -> None:
+        properties = dataset.get_create_plist()
         if properties.get_external_count():
             raise self._refusal(place, "keeps its data in another file")
         layout = properties.get_layout()
@@ -123,18 +126,18 @@ class _Inspection:
             raise self._refusal(
                 place, f"must use each of {', '.join(_FILTERS.values())} at most once and no other"
             )
-        kind = dataset.id.get_type()
+        kind = dataset.get_type()
         if not (_is_allowed(kind) or (_is_note(place) and _is_text(kind))):
-            raise self._refusal(place, f"has a type outside the format ({dataset.dtype})")
+            raise self._refusal(place, "has a type outside the format")
         if layout == h5py.h5d.CHUNKED and (
             math.prod(properties.get_chunk()) * kind.get_size() > _LARGEST_CHUNK_BYTES
         ):
             raise self._refusal(place, "has chunks of more than 64 MiB")
         self._check_size(dataset, kind.get_size(), place)
 
-    def _check_size(self, dataset: h5py.Dataset, itemsize: int, place: str) -> None:
+    def _check_size(self, dataset: h5py.h5d.DatasetID, itemsize: int, place: str) -> None:
         declared = math.prod(dataset.shape or ()) * itemsize
-        stored = dataset.id.get_storage_size()
+        stored = dataset.get_storage_size()
         if declared > max(_ALWAYS_ALLOWED_BYTES, _LARGEST_RATIO * stored):
             raise self._refusal(
                 place, f"says it has {declared} bytes, but the file holds {stored} for it"
@@ -143,15 +146,18 @@ class _Inspection:
         if self._stored_bytes > self._size_bytes:
             raise self._refusal(place, "and the datasets before it say more than the file can hold")
 
-    def _check_attributes(self, item: h5py.Group | h5py.Dataset, place: str) -> None:
-        for name in item.attrs:
-            attribute = item.attrs.get_id(name)
+    def _check_attributes(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
+        for index in range(h5py.h5a.get_num_attrs(item)):
+            attribute = h5py.h5a.open(item, index=index)
             kind = attribute.get_type()
-            n_values = math.prod(attribute.shape)
+            problem = ""
             if not (_is_allowed(kind) or (_is_note(place) and _is_text(kind))):
-                raise self._refusal(f"{place}@{name}", "has a type outside the format")
-            if n_values * kind.get_size() > _LARGEST_ATTRIBUTE_BYTES:
-                raise self._refusal(f"{place}@{name}", "is larger than 1 MiB")
+                problem = "has a type outside the format"
+            elif math.prod(attribute.shape) * kind.get_size() > _LARGEST_ATTRIBUTE_BYTES:
+                problem = "is larger than 1 MiB"
+            if problem:
+                name = attribute.name.decode("utf-8", "backslashreplace")
+                raise self._refusal(f"{place}@{name}", problem)
 
     def _refusal(self, place: str, reason: str) -> RecordFormatError:
         return RecordFormatError(f"{self._name}:{place} {reason}: the file is not opened")
