@@ -264,19 +264,43 @@ def _look_from_stations(
 
 
 @njit(cache=True)
+def _covers_cell(table: CastTable, grid: Grid, column: int, row: int, index: int) -> bool:
+    """Whether the rays through the corners of a cell all meet one rectangle first."""
+    reach = grid.front_m + grid.behind_m
+    for corner in range(4):
+        ray = _cell_ray(grid, column + float(corner % 2), row + float(corner // 2))
+        _, met = nearest_hit(table, ray, 0.0, reach, index)
+        if met != index:
+            return False
+    return True
+
+
+@njit(cache=True)
 def _mean_colour(
     table: CastTable, grid: Grid, column: int, row: int, guess: int
 ) -> tuple[float, float, float]:
-    """Mean colour of the rays of a cell that hit something; -1 when none does."""
+    """Mean colour of the rays of a cell that hit something; -1 when none does.
+
+    A rectangle met at the centre and at all corners is taken to fill the cell: what hides between
+    is narrower than the cell, and casting nine rays instead of five might miss it as well.
+    """
     n_hits, red, green, blue = 0, 0.0, 0.0, 0.0
+    is_covered = guess >= 0 and _covers_cell(table, grid, column, row, guess)
     reach = grid.front_m + grid.behind_m
-    for sub in range(grid.n_sub * grid.n_sub):
-        u = column + (sub % grid.n_sub + 0.5) / grid.n_sub
-        v = row + (sub // grid.n_sub + 0.5) / grid.n_sub
+    n_sub = grid.n_sub
+    for sub in range(n_sub * n_sub):
+        # A sheared grid: n^2 different positions in either direction, so that edges along rows or
+        # columns, which walls are full of, are not rounded to thirds of a cell.
+        i, j = sub % n_sub, sub // n_sub
+        u = column + (i + (j + 0.5) / n_sub) / n_sub
+        v = row + (j + (n_sub - i - 0.5) / n_sub) / n_sub
         ray = _cell_ray(grid, u, v)
-        t, index = nearest_hit(table, ray, 0.0, reach, guess)
+        t, index = -1.0, guess
+        if is_covered:
+            t = _hit_distance(table, guess, ray, 0.0)
+        if t < 0.0:
+            t, index = nearest_hit(table, ray, 0.0, reach, guess)
         if index >= 0:
-            guess = index
             r, g, b, _ = shade_of_hit(table, index, ray, t)
             red += r
             green += g

@@ -64,11 +64,22 @@ def uniform(state: np.uint64, draw: int) -> float:
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
+@njit("u8(i8, i8)", cache=True)
+def _column_state(i: int, seed: int) -> np.uint64:
+    return mixed_bits(np.uint64(i) * np.uint64(0xD1B54A32D192ED03) + np.uint64(seed))
+
+
 @njit("u8(i8, i8, i8)", cache=True)
 def cell_state(i: int, j: int, seed: int) -> np.uint64:
     """Random state (64 bits) of the lattice cell (i, j)."""
-    first = mixed_bits(np.uint64(np.int64(i)) * np.uint64(0xD1B54A32D192ED03) + np.uint64(seed))
-    return mixed_bits(first ^ (np.uint64(np.int64(j)) * np.uint64(0x8CB92BA72F3D8DD7)))
+    return mixed_bits(_column_state(i, seed) ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
+
+
+@njit("f8(u8, i8)", cache=True)
+def _lattice_value(column: np.uint64, j: int) -> float:
+    """Number in [0, 1) of the lattice point j of a column."""
+    bits = mixed_bits(column ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
+    return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @njit("f8(f8, f8, i8)", cache=True)
@@ -78,12 +89,9 @@ def _value_noise(a: float, b: float, seed: int) -> float:
     s, t = a - i, b - j
     s = s * s * s * (s * (s * 6.0 - 15.0) + 10.0)
     t = t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
-    low = (1.0 - s) * uniform(cell_state(i, j, seed), 0) + s * uniform(
-        cell_state(i + 1, j, seed), 0
-    )
-    high = (1.0 - s) * uniform(cell_state(i, j + 1, seed), 0) + s * uniform(
-        cell_state(i + 1, j + 1, seed), 0
-    )
+    left, right = _column_state(i, seed), _column_state(i + 1, seed)
+    low = (1.0 - s) * _lattice_value(left, j) + s * _lattice_value(right, j)
+    high = (1.0 - s) * _lattice_value(left, j + 1) + s * _lattice_value(right, j + 1)
     return 2.0 * ((1.0 - t) * low + t * high) - 1.0
 
 

@@ -202,7 +202,7 @@ class Side:
         self.draft.planes.append(TruePlane(name=name, plane=plane, outline=outline))
         return len(self.draft.planes) - 1
 
-    def _across(  # noqa: PLR0913 - the six say one rectangle
+    def _across(
         self,
         along: NDArray[np.float64],
         position_m: float,

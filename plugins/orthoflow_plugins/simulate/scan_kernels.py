@@ -1,4 +1,4 @@
-"""The compiled scanner: rays over a grid of angles, with noise that hangs on the grid place only."""
+"""The compiled scanner: rays over a grid of angles; noise hangs on the place in the grid only."""
 
 from __future__ import annotations
 

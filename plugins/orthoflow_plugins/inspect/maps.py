@@ -1,0 +1,47 @@
+"""Pictures of errors over a wall."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+
+DEPTH_SPAN_MM: Final = 10.0
+COLOUR_SPAN_GREY: Final = 60.0
+_WIDEST_PX: Final = 900
+
+
+def depth_error_map(depth_m: NDArray[np.float64]) -> bytes:
+    """PNG of depth errors: blue behind the truth, red before it, black where nothing is."""
+    import cv2
+
+    scaled = np.nan_to_num(1e3 * depth_m / DEPTH_SPAN_MM, nan=0.0)
+    grey = np.clip(127.5 * (1.0 + scaled), 0.0, 255.0).astype(np.uint8)
+    return _png(cv2.applyColorMap(grey, cv2.COLORMAP_JET), np.isnan(depth_m))
+
+
+def colour_error_map(error_grey: NDArray[np.float64]) -> bytes:
+    """PNG of colour errors: bright where they are large, blue where nothing is shown."""
+    import cv2
+
+    scaled = np.nan_to_num(error_grey / COLOUR_SPAN_GREY, nan=0.0)
+    grey = np.clip(255.0 * scaled, 0.0, 255.0).astype(np.uint8)
+    return _png(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), np.isnan(error_grey))
+
+
+def _png(bgr: NDArray[np.uint8], missing: NDArray[np.bool_]) -> bytes:
+    import cv2
+
+    bgr[missing] = (60, 40, 20)
+    scale = min(1.0, _WIDEST_PX / max(bgr.shape[:2]))
+    if scale < 1.0:
+        bgr = np.asarray(
+            cv2.resize(bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8
+        )
+    done, encoded = cv2.imencode(".png", bgr)
+    if not done:
+        raise MethodError("an error map could not be written as PNG")
+    return bytes(encoded)

@@ -1,0 +1,211 @@
+"""How far one image lies off another: patches matched by least squares to hundredths of a cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+_PATCH: Final = 32
+_SMOOTH_CELLS: Final = 1.0
+_LEAST_SHARE: Final = 0.4
+_LEAST_WEIGHT: Final = 0.8
+_ROUNDS: Final = 12
+_CONVERGED_CELLS: Final = 0.002
+# Smoothing makes neighbouring cells alike; so many cells count as one when precision is judged.
+_CELLS_PER_SAMPLE: Final = 4.0 * np.pi * _SMOOTH_CELLS**2
+_SIGMA_LIMIT_CELLS: Final = 0.15
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreyImage:
+    """A grey image of which some cells count.
+
+    Attributes:
+        grey: (rows, cols) float64.
+        valid: (rows, cols) bool.
+    """
+
+    grey: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchShifts:
+    """Displacements of the patches that have enough texture in both directions.
+
+    Attributes:
+        centre: (p, 2) float64 (column, row) of the patch's centre.
+        shift: (p, 2) float64 cells along u and v, shown - true.
+        sigma: (p, 2) float64 cells, standard deviations.
+    """
+
+    centre: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
+class _Patches(NamedTuple):
+    """Cells of the patches under work: arrays (p, 32 * 32)."""
+
+    rows: NDArray[np.float64]
+    columns: NDArray[np.float64]
+    grey: NDArray[np.float64]
+    weight: NDArray[np.float64]
+
+
+def measure_shifts(shown: GreyImage, true: GreyImage, *, reach_cells: int) -> PatchShifts:
+    """Measure where the content of `true` appears in `shown`, patch by patch.
+
+    A patch is 32 x 32 cells. It is found to a whole cell by the smallest mean square difference
+    within the reach, then by Gauss-Newton steps for shift and brightness. Patches that have too
+    few valid cells, too little texture for 0.15 cells, or do not converge are left out.
+
+    Args:
+        shown: the image to judge.
+        true: the image it should be.
+        reach_cells: largest displacement that is looked for.
+    """
+    first, second = _smoothed(shown), _smoothed(true)
+    start = _whole_cell_shifts(first, second, reach_cells)
+    if len(start.centre) == 0:
+        return start
+    return _refined(first, second, start)
+
+
+def _smoothed(image: GreyImage) -> GreyImage:
+    """Smooth by a Gaussian of one cell, as if only valid cells were there.
+
+    Beside larger invalid areas the mean leans to one side, by what the mask cuts off and not by
+    what is shown; such cells do not count. Single holes do no harm.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    weight = gaussian_filter(image.valid.astype(np.float64), _SMOOTH_CELLS, mode="constant")
+    grey = gaussian_filter(np.where(image.valid, image.grey, 0.0), _SMOOTH_CELLS, mode="constant")
+    return GreyImage(
+        grey=grey / np.maximum(weight, 1e-6), valid=image.valid & (weight > _LEAST_WEIGHT)
+    )
+
+
+def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchShifts:
+    n_rows, n_columns = (size // _PATCH for size in shown.grey.shape)
+    best = np.full((n_rows, n_columns), np.inf)
+    shift = np.zeros((n_rows, n_columns, 2))
+    for down in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            moved = np.roll(true.grey, (down, right), axis=(0, 1))
+            valid = shown.valid & _moved_mask(true.valid, down, right)
+            counts = _patch_sums(valid.astype(np.float64))
+            squares = _patch_sums(np.where(valid, shown.grey - moved, 0.0) ** 2)
+            mean = np.where(
+                counts >= _LEAST_SHARE * _PATCH**2, squares / np.maximum(counts, 1.0), np.inf
+            )
+            better = mean < best
+            best[better] = mean[better]
+            shift[better] = (right, down)
+    row, column = np.nonzero(np.isfinite(best))
+    return PatchShifts(
+        centre=np.column_stack([column + 0.5, row + 0.5]) * _PATCH,
+        shift=shift[row, column],
+        sigma=np.ones((len(row), 2)),
+    )
+
+
+def _moved_mask(mask: NDArray[np.bool_], down: int, right: int) -> NDArray[np.bool_]:
+    """Shift a mask; what comes in from beyond the border is not valid."""
+    moved = np.zeros_like(mask)
+    rows, columns = mask.shape
+    source = mask[
+        max(0, -down) : min(rows, rows - down), max(0, -right) : min(columns, columns - right)
+    ]
+    top, left = max(0, down), max(0, right)
+    moved[top : top + source.shape[0], left : left + source.shape[1]] = source
+    return moved
+
+
+def _patch_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    n_rows, n_columns = (size // _PATCH for size in values.shape)
+    tiles = values[: n_rows * _PATCH, : n_columns * _PATCH]
+    sums: NDArray[np.float64] = tiles.reshape(n_rows, _PATCH, n_columns, _PATCH).sum(axis=(1, 3))
+    return sums
+
+
+def _cut_patches(shown: GreyImage, centre: NDArray[np.float64]) -> _Patches:
+    row, column = np.mgrid[0:_PATCH, 0:_PATCH].reshape(2, -1)
+    rows = (centre[:, 1:2] - _PATCH / 2).astype(np.int64) + row
+    columns = (centre[:, :1] - _PATCH / 2).astype(np.int64) + column
+    return _Patches(
+        rows=rows.astype(np.float64),
+        columns=columns.astype(np.float64),
+        grey=shown.grey[rows, columns],
+        weight=shown.valid[rows, columns].astype(np.float64),
+    )
+
+
+def _refined(shown: GreyImage, true: GreyImage, start: PatchShifts) -> PatchShifts:
+    patches = _cut_patches(shown, start.centre)
+    sampler = _Sampler(true)
+    shift, step = start.shift.copy(), np.full(start.shift.shape, np.inf)
+    sigma = np.full(start.shift.shape, np.inf)
+    for _ in range(_ROUNDS):
+        active = np.flatnonzero(np.abs(step).max(axis=1) > _CONVERGED_CELLS)
+        if active.size == 0:
+            break
+        part = _Patches(*(array[active] for array in patches))
+        expected, design, inside = sampler.at(part, shift[active])
+        step[active], sigma[active] = _normal_step(
+            design, part.grey - expected, part.weight * inside
+        )
+        # Half a cell at most: the linear model holds no further.
+        shift[active] += np.clip(step[active], -0.5, 0.5)
+    good = (
+        (np.abs(step).max(axis=1) < 5.0 * _CONVERGED_CELLS)
+        & (sigma.max(axis=1) < _SIGMA_LIMIT_CELLS)
+        & (np.abs(shift - start.shift).max(axis=1) < 2.0)
+    )
+    return PatchShifts(centre=start.centre[good], shift=shift[good], sigma=sigma[good])
+
+
+class _Sampler:
+    """The true image between its cells: grey by cubic splines, slopes and validity linearly."""
+
+    def __init__(self, true: GreyImage) -> None:
+        from scipy.ndimage import spline_filter
+
+        self._spline = spline_filter(true.grey, order=3)
+        slope_v, slope_u = np.gradient(true.grey)
+        self._linear = (slope_u, slope_v, true.valid.astype(np.float64))
+
+    def at(
+        self, patches: _Patches, shift: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Expected grey (p, n), its derivatives (p, n, 3), and where the truth is valid (p, n)."""
+        from scipy.ndimage import map_coordinates
+
+        at = [patches.rows - shift[:, 1:2], patches.columns - shift[:, :1]]
+        expected = map_coordinates(self._spline, at, order=3, prefilter=False, mode="nearest")
+        slope_u, slope_v, valid = (
+            map_coordinates(image, at, order=1, mode="constant", cval=0.0) for image in self._linear
+        )
+        # The derivative of true(x - shift) by the shift is minus the slope.
+        design = np.stack([-slope_u, -slope_v, np.ones_like(expected)], axis=-1)
+        return expected, design, valid > 0.999
+
+
+def _normal_step(
+    design: NDArray[np.float64], residual: NDArray[np.float64], weight: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Solve every patch's normal equations: steps (p, 2) and standard deviations (p, 2)."""
+    weighted = design * weight[:, :, None]
+    normal = np.einsum("pni,pnj->pij", weighted, design) + 1e-9 * np.eye(3)
+    right = np.einsum("pni,pn->pi", weighted, residual)
+    inverse = np.linalg.inv(normal)
+    step = np.einsum("pij,pj->pi", inverse, right)
+    left_over = (residual - np.einsum("pni,pi->pn", design, step)) ** 2
+    n_free = np.maximum(weight.sum(axis=1) / _CELLS_PER_SAMPLE - 3.0, 1.0)
+    variance = (weight * left_over).sum(axis=1) / _CELLS_PER_SAMPLE / n_free
+    spread = variance[:, None] * np.diagonal(inverse, axis1=1, axis2=2)[:, :2] * _CELLS_PER_SAMPLE
+    return step[:, :2], np.sqrt(spread)
