@@ -23,7 +23,7 @@ from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.raster_kernels import NO_POINT
-from orthoflow.geometry.rastering import OffsetPoints, Slab, topmost_points, use_threads
+from orthoflow.geometry.rastering import OffsetPoints, Slab, topmost_points
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
 
@@ -129,7 +129,8 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     options = parser.parse_args()
     cloud = scan(int(options.millions * 1e6))
-    threads = use_threads(options.threads)
+    threads = options.threads
+    numba.set_num_threads(threads)
     frame = frame_over(planes().corners[0], planes().normal[0], gsd_m=GSD_M)
     slab = Slab(frame=frame, front_m=BUFFER_M, behind_m=BUFFER_M)
     seconds = interleaved(

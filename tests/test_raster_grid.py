@@ -106,6 +106,20 @@ def test_a_median_never_lies_between_two_surfaces(tmp_path: Path) -> None:
     assert wall.intensity[4, 3] == pytest.approx(0.43333, abs=1e-5)
 
 
+@pytest.mark.parametrize("n_points", [1, 2, 7, 40, 1001])
+def test_a_median_of_many_points_is_numpys(tmp_path: Path, n_points: int) -> None:
+    rng = np.random.default_rng(n_points)
+    known = scenes.upright_wall()
+    depths_m = rng.normal(0.0, 0.002, n_points)
+    positions = rng.uniform(3.0, 4.0, n_points)
+    cloud = scenes.cloud_of(known.world(positions, positions, depths_m))
+    if n_points < 3:
+        corners = known.world(np.array([0.5, 1.5, 9.5]), np.full(3, 9.5), np.zeros(3))
+        cloud = scenes.cloud_of(np.vstack([cloud.points_world(), corners]))
+    wall = rastered(cloud, known.planes(), tmp_path, gsd_m=known.gsd_m).walls[0]
+    assert wall.depth_m[3, 3] == pytest.approx(np.median(depths_m), abs=1e-6)
+
+
 @pytest.mark.parametrize("surface", SURFACES)
 def test_points_outside_the_buffer_never_show(tmp_path: Path, surface: str) -> None:
     wall = cell_with(

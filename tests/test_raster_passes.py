@@ -16,7 +16,6 @@ from orthoflow.geometry.rastering import (
     disc_offsets,
     lenders_in_gaps,
     topmost_points,
-    use_threads,
     wall_from_offset,
 )
 from orthoflow.products import PointCloud
@@ -69,7 +68,7 @@ def sorted_winners(cloud: PointCloud, slab: Slab) -> NDArray[np.uint32]:
 def test_the_topmost_point_is_the_one_that_sorting_finds(seed: int) -> None:
     wall = scenes.upright_wall(shape=(60, 80))
     cloud, slab = random_cloud(wall, n_points=60_000, seed=seed), slab_of(wall)
-    winners = topmost_points(offsets(cloud), slab, threads=use_threads(2))
+    winners = topmost_points(offsets(cloud), slab, threads=2)
     np.testing.assert_array_equal(winners["point"], sorted_winners(cloud, slab))
 
 
@@ -128,7 +127,7 @@ def opened_void(is_void: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.7])
 def test_narrow_gaps_are_the_void_without_its_opening(radius: int, share: float) -> None:
     is_measured = np.random.default_rng(radius).random((37, 53)) < share
-    lent = lenders_in_gaps(is_measured, radius)
+    lent = lenders_in_gaps(is_measured, radius, threads=2)
     expected = ~is_measured & ~opened_void(~is_measured, radius)
     np.testing.assert_array_equal(np.unique(lent[:, 0]), np.flatnonzero(expected))
 
@@ -137,7 +136,7 @@ def test_a_gap_takes_its_value_from_the_nearest_measured_cell() -> None:
     from scipy import ndimage
 
     is_measured = np.random.default_rng(5).random((40, 60)) < 0.4
-    void, lender = lenders_in_gaps(is_measured, 3).T
+    void, lender = lenders_in_gaps(is_measured, 3, threads=2).T
     assert is_measured.ravel()[lender].all()
     rows, columns = np.divmod(np.stack([void, lender]), 60)
     distances = np.hypot(rows[0] - rows[1], columns[0] - columns[1])
@@ -146,14 +145,14 @@ def test_a_gap_takes_its_value_from_the_nearest_measured_cell() -> None:
 
 
 def test_radius_zero_finds_no_gap() -> None:
-    assert lenders_in_gaps(np.eye(5, dtype=bool), 0).shape == (0, 2)
+    assert lenders_in_gaps(np.eye(5, dtype=bool), 0, threads=2).shape == (0, 2)
 
 
 def test_a_window_keeps_its_shape_to_the_cell() -> None:
     is_measured = np.ones((30, 30), dtype=bool)
     is_measured[8:20, 10:18] = False
     is_measured[5, :] = False
-    void = np.unique(lenders_in_gaps(is_measured, 2)[:, 0])
+    void = np.unique(lenders_in_gaps(is_measured, 2, threads=2)[:, 0])
     # The line at row 5 closes, where it does not end at the border; the window does not, but for
     # its corners, into which no disc of radius 2 reaches.
     rows, columns = np.divmod(void, 30)

@@ -1,29 +1,35 @@
-"""Compiled passes that tell narrow gaps of a raster from windows, and find who lends them values."""
+"""Compiled passes that tell the narrow gaps of a raster from windows, and who lends them values."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from orthoflow.geometry.point_kernels import compiled
 
-@njit(parallel=True, cache=True)
+
+@compiled
 def nearest_within(
-    is_measured: NDArray[np.bool_], offsets: NDArray[np.int64], reach: int
-) -> NDArray[np.int32]:
-    """Flat index of the measured cell nearest to each cell, -1 without one within the disc.
+    is_measured: NDArray[np.bool_],
+    offsets: NDArray[np.int64],
+    nearest: NDArray[np.int32],
+    first_row: int,
+    end_row: int,
+) -> None:
+    """Find the measured cell nearest to each cell of some rows.
 
     Args:
-        is_measured: (rows, cols), framed by `reach` cells whose own result stays -1.
+        is_measured: (rows, cols); no visited row or column is nearer to the border than the
+            largest offset.
         offsets: (k, 2) rows and columns of a disc without its centre, nearest first.
-        reach: largest offset.
-
-    Returns:
-        (rows, cols); a measured cell is its own nearest.
+        nearest: (rows, cols) flat indices, written where a measured cell lies within the disc; a
+            measured cell is its own nearest.
+        first_row: first row to visit.
+        end_row: the row after the last one.
     """
-    rows, columns = is_measured.shape
-    nearest = np.full((rows, columns), -1, dtype=np.int32)
-    for row in prange(reach, rows - reach):
+    columns = is_measured.shape[1]
+    reach = np.abs(offsets).max()
+    for row in range(first_row, end_row):
         for column in range(reach, columns - reach):
             if is_measured[row, column]:
                 nearest[row, column] = row * columns + column
@@ -33,31 +39,33 @@ def nearest_within(
                 if is_measured[r, c]:
                     nearest[row, column] = r * columns + c
                     break
-    return nearest
 
 
-@njit(parallel=True, cache=True)
-def is_narrow_gap(
-    is_measured: NDArray[np.bool_], nearest: NDArray[np.int32], offsets: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Whether a cell is void and no disc that covers it fits into the void around it.
+@compiled
+def find_narrow_gaps(
+    nearest: NDArray[np.int32],
+    offsets: NDArray[np.int64],
+    is_narrow: NDArray[np.bool_],
+    first_row: int,
+    end_row: int,
+) -> None:
+    """Tell which void cells of some rows no disc covers that fits into the void.
 
     Args:
-        is_measured: (rows, cols), framed by twice the disc's radius.
         nearest: (rows, cols) of `nearest_within` the same disc; -1 where a disc fits.
         offsets: (k, 2) rows and columns of the disc without its centre.
+        is_narrow: (rows, cols), made true for such cells, and for measured ones, which no such
+            disc covers either.
+        first_row: first row to visit, at least twice the disc's radius from the border.
+        end_row: the row after the last one.
     """
-    rows, columns = is_measured.shape
+    columns = nearest.shape[1]
     reach = 2 * np.abs(offsets).max()
-    is_narrow = np.zeros((rows, columns), dtype=np.bool_)
-    for row in prange(reach, rows - reach):
+    for row in range(first_row, end_row):
         for column in range(reach, columns - reach):
-            if is_measured[row, column] or nearest[row, column] < 0:
-                continue
-            fits = False
+            fits = nearest[row, column] < 0
             for k in range(offsets.shape[0]):
-                if nearest[row + offsets[k, 0], column + offsets[k, 1]] < 0:
-                    fits = True
+                if fits:
                     break
+                fits = nearest[row + offsets[k, 0], column + offsets[k, 1]] < 0
             is_narrow[row, column] = not fits
-    return is_narrow

@@ -4,9 +4,6 @@ A pass works on one chunk of the cloud after the other. `project_points` transfo
 keeps what falls into the raster, in the order of the points; the other passes then run over the
 kept entries, each thread on the cells it owns. Every cell is therefore visited in the order of the
 points whatever the number of threads, and no result depends on it, sums of floats included.
-
-The bodies of the parallel loops are functions of their own: written in place, numba 0.68 drops
-stores into an array that is reached through a named tuple as if nobody read them.
 """
 
 from __future__ import annotations
@@ -14,8 +11,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
+
+from orthoflow.geometry.point_kernels import Offsets, compiled
 
 # Points handled by one task; an entry slot exists for each, so that tasks never wait for another.
 BLOCK: Final = 8192
@@ -66,65 +64,48 @@ class Entries(NamedTuple):
     n_inside: NDArray[np.int64]
 
 
-@njit(parallel=True, cache=True)
+@compiled
 def project_points(
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    z: NDArray[np.float32],
-    first: int,
-    target: Target,
-    entries: Entries,
+    offsets: Offsets, first: int, target: Target, entries: Entries, first_block: int, end_block: int
 ) -> None:
-    """Fill `entries` with the points of a chunk that lie inside the raster and its buffer.
+    """Fill blocks of `entries` with the points of a chunk inside the raster and its buffer.
 
     Both ends of the buffer are inside. A cell owns its left and upper edge.
 
     Args:
-        x: (n,) offsets of the chunk in metres; y and z alike.
-        y: see x.
-        z: see x.
+        offsets: of the chunk.
         first: index in the cloud of the chunk's first point.
         target: the raster.
         entries: overwritten.
+        first_block: first block to fill.
+        end_block: the block after the last one.
     """
-    for block in prange((x.size + BLOCK - 1) // BLOCK):
-        _project_block(x, y, z, first, target, entries, block)
-
-
-@njit(cache=True)
-def _project_block(
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    z: NDArray[np.float32],
-    first: int,
-    target: Target,
-    entries: Entries,
-    block: int,
-) -> None:
     u, v, depth = np.empty(_LANE), np.empty(_LANE), np.empty(_LANE)
     is_inside = np.empty(_LANE, dtype=np.bool_)
-    slot = begin = block * BLOCK
-    for lane in range(begin, min(x.size, begin + BLOCK), _LANE):
-        part = slice(lane, min(x.size, begin + BLOCK, lane + _LANE))
-        _transform(x[part], y[part], z[part], target, (u, v, depth), is_inside)
-        for k in range(part.stop - part.start):
-            if not is_inside[k]:
-                continue
-            column, row = np.int32(u[k]), np.int32(v[k])
-            du, dv = u[k] - column - 0.5, v[k] - row - 0.5
-            entries.cells[slot] = row * target.width + column
-            entries.depths_m[slot] = depth[k]
-            entries.squares[slot] = du * du + dv * dv
-            entries.points[slot] = first + lane + k
-            slot += 1
-    entries.n_inside[block] = slot - begin
+    for block in range(first_block, end_block):
+        slot = begin = block * BLOCK
+        end = min(offsets.x.size, begin + BLOCK)
+        for lane in range(begin, end, _LANE):
+            n_lane = min(_LANE, end - lane)
+            _transform(offsets, lane, n_lane, target, (u, v, depth), is_inside)
+            for k in range(n_lane):
+                if not is_inside[k]:
+                    continue
+                column, row = np.int32(u[k]), np.int32(v[k])
+                du, dv = u[k] - column - 0.5, v[k] - row - 0.5
+                entries.cells[slot] = row * target.width + column
+                entries.depths_m[slot] = depth[k]
+                entries.squares[slot] = du * du + dv * dv
+                entries.points[slot] = first + lane + k
+                slot += 1
+        entries.n_inside[block] = slot - begin
 
 
-@njit(cache=True)
+@compiled
 def _transform(
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    z: NDArray[np.float32],
+    offsets: Offsets,
+    first: int,
+    n_points: int,
     target: Target,
     position: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     is_inside: NDArray[np.bool_],
@@ -137,7 +118,8 @@ def _transform(
     d0, d1, d2, d3 = m[2, 0], m[2, 1], m[2, 2], m[2, 3]
     behind_m, front_m = target.behind_m, target.front_m
     width, height = np.float64(target.width), np.float64(target.height)
-    for k in range(x.size):
+    x, y, z = offsets.x[first:], offsets.y[first:], offsets.z[first:]
+    for k in range(n_points):
         # float64 on purpose: the pass waits for memory, not for arithmetic.
         px, py, pz = np.float64(x[k]), np.float64(y[k]), np.float64(z[k])
         u = u0 * px + u1 * py + u2 * pz + u3
@@ -148,21 +130,16 @@ def _transform(
         is_inside[k] = is_in_raster & (depth >= behind_m) & (depth <= front_m)
 
 
-@njit(parallel=True, cache=True)
-def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int) -> None:
+@compiled
+def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
     """Let the largest depth win; ties go to the point nearer the centre, then the lower index.
 
     Args:
         entries: one chunk.
         winners: (cells,) of `WINNER`, updated; depths start at minus infinity.
         owners: a power of two, how many threads share the cells.
+        owner: whose cells to visit.
     """
-    for owner in prange(owners):
-        _keep_topmost_of(entries, winners, owners, owner)
-
-
-@njit(cache=True)
-def _keep_topmost_of(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
@@ -179,21 +156,16 @@ def _keep_topmost_of(entries: Entries, winners: NDArray[np.void], owners: int, o
                 winner.point = entries.points[k]
 
 
-@njit(parallel=True, cache=True)
-def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int) -> None:
+@compiled
+def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
     """Let the point nearest the centre of the cell win; ties go to the lower index.
 
     Args:
         entries: one chunk.
         winners: (cells,) of `WINNER`, updated; squares start at infinity.
         owners: a power of two, how many threads share the cells.
+        owner: whose cells to visit.
     """
-    for owner in prange(owners):
-        _keep_nearest_of(entries, winners, owners, owner)
-
-
-@njit(cache=True)
-def _keep_nearest_of(entries: Entries, winners: NDArray[np.void], owners: int, owner: int) -> None:
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
@@ -208,17 +180,9 @@ def _keep_nearest_of(entries: Entries, winners: NDArray[np.void], owners: int, o
                 winner.point = entries.points[k]
 
 
-@njit(parallel=True, cache=True)
-def count_points(entries: Entries, n_points: NDArray[np.uint32], owners: int) -> None:
+@compiled
+def count_points(entries: Entries, n_points: NDArray[np.uint32], owners: int, owner: int) -> None:
     """Count the points of each cell."""
-    for owner in prange(owners):
-        _count_points_of(entries, n_points, owners, owner)
-
-
-@njit(cache=True)
-def _count_points_of(
-    entries: Entries, n_points: NDArray[np.uint32], owners: int, owner: int
-) -> None:
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
@@ -227,17 +191,9 @@ def _count_points_of(
                 n_points[cell] += np.uint32(1)
 
 
-@njit(parallel=True, cache=True)
-def add_moments(entries: Entries, moments: NDArray[np.float64], owners: int) -> None:
+@compiled
+def add_moments(entries: Entries, moments: NDArray[np.float64], owners: int, owner: int) -> None:
     """Sum depths and squared depths of each cell into `moments` (cells, 2)."""
-    for owner in prange(owners):
-        _add_moments_of(entries, moments, owners, owner)
-
-
-@njit(cache=True)
-def _add_moments_of(
-    entries: Entries, moments: NDArray[np.float64], owners: int, owner: int
-) -> None:
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
@@ -248,9 +204,13 @@ def _add_moments_of(
                 moments[cell, 1] += depth * depth
 
 
-@njit(parallel=True, cache=True)
+@compiled
 def sort_into_cells(
-    entries: Entries, cursors: NDArray[np.int64], sorted_m: NDArray[np.float32], owners: int
+    entries: Entries,
+    cursors: NDArray[np.int64],
+    sorted_m: NDArray[np.float32],
+    owners: int,
+    owner: int,
 ) -> None:
     """Write each depth behind those its cell already holds.
 
@@ -259,19 +219,8 @@ def sort_into_cells(
         cursors: (cells,) where the cell's next depth goes; moved on.
         sorted_m: (points inside,) depths grouped by cell.
         owners: a power of two, how many threads share the cells.
+        owner: whose cells to visit.
     """
-    for owner in prange(owners):
-        _sort_into_cells_of(entries, cursors, sorted_m, owners, owner)
-
-
-@njit(cache=True)
-def _sort_into_cells_of(
-    entries: Entries,
-    cursors: NDArray[np.int64],
-    sorted_m: NDArray[np.float32],
-    owners: int,
-    owner: int,
-) -> None:
     for block in range(entries.n_inside.size):
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
@@ -282,10 +231,15 @@ def _sort_into_cells_of(
             cursors[cell] += 1
 
 
-@njit(parallel=True, cache=True)
+@compiled
 def median_depths(
-    ends: NDArray[np.int64], sorted_m: NDArray[np.float32], layer_m: float
-) -> NDArray[np.float32]:
+    ends: NDArray[np.int64],
+    sorted_m: NDArray[np.float32],
+    layer_m: float,
+    medians_m: NDArray[np.float32],
+    first: int,
+    end: int,
+) -> None:
     """Median depth of each cell's best supported layer.
 
     The depths of a cell are split into layers where neighbours in depth lie more than `layer_m`
@@ -296,23 +250,38 @@ def median_depths(
         ends: (cells,) end of each cell's depths in `sorted_m`.
         sorted_m: depths grouped by cell; sorted in place.
         layer_m: depth step that separates two layers.
-
-    Returns:
-        (cells,) metres, NaN where the cell is void.
+        medians_m: (cells,) metres, overwritten; NaN where the cell is void.
+        first: first cell to visit.
+        end: the cell after the last one.
     """
-    medians_m = np.empty(ends.size, dtype=np.float32)
-    for cell in prange(ends.size):
+    for cell in range(first, end):
         begin = np.int64(0) if cell == 0 else ends[cell - 1]
         if begin == ends[cell]:
             medians_m[cell] = np.nan
         else:
             depths = sorted_m[begin : ends[cell]]
-            depths.sort()
+            _sort(depths)
             medians_m[cell] = _layer_median(depths, layer_m)
-    return medians_m
 
 
-@njit(cache=True)
+@compiled
+def _sort(values: NDArray[np.float32]) -> None:
+    """Shell's sort with gaps of one third: numba's own takes seconds to compile."""
+    gap = 1
+    while gap < values.size // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for k in range(gap, values.size):
+            value = values[k]
+            place = k
+            while place >= gap and values[place - gap] > value:
+                values[place] = values[place - gap]
+                place -= gap
+            values[place] = value
+        gap //= 3
+
+
+@compiled
 def _layer_median(depths: NDArray[np.float32], layer_m: float) -> float:
     best_size, best_first, first = 0, 0, 0
     for k in range(1, depths.size + 1):
@@ -326,7 +295,7 @@ def _layer_median(depths: NDArray[np.float32], layer_m: float) -> float:
     return float(0.5 * (lower + upper))
 
 
-@njit(parallel=True, cache=True)
+@compiled
 def add_values(
     entries: Entries,
     values: NDArray[np.generic],
@@ -334,6 +303,7 @@ def add_values(
     layer_m: float,
     sums: NDArray[np.generic],
     owners: int,
+    owner: int,
 ) -> None:
     """Sum the values of the points that lie on the surface of their cell.
 
@@ -344,21 +314,8 @@ def add_values(
         layer_m: a point farther than this from the surface belongs to another layer.
         sums: (cells, channels + 1); the last channel counts the points.
         owners: a power of two, how many threads share the cells.
+        owner: whose cells to visit.
     """
-    for owner in prange(owners):
-        _add_values_of(entries, values, depths_m, layer_m, sums, owners, owner)
-
-
-@njit(cache=True)
-def _add_values_of(
-    entries: Entries,
-    values: NDArray[np.generic],
-    depths_m: NDArray[np.float32],
-    layer_m: float,
-    sums: NDArray[np.generic],
-    owners: int,
-    owner: int,
-) -> None:
     channels = values.shape[1]
     for block in range(entries.n_inside.size):
         first = block * BLOCK

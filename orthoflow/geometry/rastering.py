@@ -5,21 +5,24 @@ Loads numba through `raster_kernels`; import it in method modules only.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import raster_gap_kernels as gaps
 from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.frames import WallFrame
+from orthoflow.geometry.point_kernels import Offsets, in_threads, read_only
 from orthoflow.geometry.raster_kernels import WINNER, Entries, Target
 
-# 2^19 points: the entries of a chunk (8 MB) stay in the processor's cache between the passes.
-_CHUNK: Final = 1 << 19
+# 2^20 points: their entries (16 MB) stay in the processor's cache between the passes, and threads
+# wait for each other seldom.
+_CHUNK: Final = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +72,7 @@ def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[n
     return np.column_stack([axes, axes @ (origin - frame.origin_world)])
 
 
-def entries_inside(points: OffsetPoints, slab: Slab) -> Iterator[Entries]:
+def entries_inside(points: OffsetPoints, slab: Slab, *, threads: int) -> Iterator[Entries]:
     """Give the points inside a slab, chunk by chunk, in their order.
 
     The yielded arrays are overwritten by the next chunk.
@@ -82,15 +85,38 @@ def entries_inside(points: OffsetPoints, slab: Slab) -> Iterator[Entries]:
         height=frame.height,
         width=frame.width,
     )
-    x, y, z = (_read_only(values) for values in (points.x, points.y, points.z))
+    x, y, z = read_only(points.x, points.y, points.z)
     size = min(_CHUNK, max(1, x.size))
     buffers = _empty_entries(size)
     for first in range(0, x.size, size):
         part = slice(first, min(first + size, x.size))
         n_blocks = -(-(part.stop - part.start) // kernels.BLOCK)
         entries = buffers._replace(n_inside=buffers.n_inside[:n_blocks])
-        kernels.project_points(x[part], y[part], z[part], first, target, entries)
+        chunk = Offsets(x[part], y[part], z[part])
+        in_parts(n_blocks, threads, partial(kernels.project_points, chunk, first, target, entries))
         yield entries
+
+
+def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:
+    """Run passes one after the other, each thread on the cells it owns.
+
+    Args:
+        threads: how many threads; a power of two of them is used.
+        passes: take the number of owners and the owner whose cells to visit.
+    """
+    owners = 1 << (max(1, threads).bit_length() - 1)
+
+    def visit(owner: int) -> None:
+        for one_pass in passes:
+            one_pass(owners, owner)
+
+    in_threads([partial(visit, owner) for owner in range(owners)])
+
+
+def in_parts(n_items: int, threads: int, task: Callable[[int, int], None]) -> None:
+    """Run a task on parts of a range, given by first and end, one part per thread."""
+    edges = [part * n_items // threads for part in range(threads + 1)]
+    in_threads([partial(task, *edge) for edge in itertools.pairwise(edges)])
 
 
 def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> NDArray[np.void]:
@@ -102,9 +128,8 @@ def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> NDArray
         (cells,) of `raster_kernels.WINNER`; `point` is `NO_POINT` where the cell is void.
     """
     winners = empty_winners(slab.n_cells)
-    owners = owners_among(threads)
-    for entries in entries_inside(points, slab):
-        kernels.keep_topmost(entries, winners, owners)
+    for entries in entries_inside(points, slab, threads=threads):
+        share_cells(threads, partial(kernels.keep_topmost, entries, winners))
     return winners
 
 
@@ -147,7 +172,9 @@ def disc_offsets(radius_cells: int) -> NDArray[np.int64]:
     return np.column_stack([rows[order], columns[order]])
 
 
-def lenders_in_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArray[np.int64]:
+def lenders_in_gaps(
+    is_measured: NDArray[np.bool_], radius_cells: int, *, threads: int
+) -> NDArray[np.int64]:
     """For each void cell of a narrow gap the measured cell nearest to it.
 
     A gap is narrow where no disc of the radius fits into it: what stays void is the morphological
@@ -157,6 +184,7 @@ def lenders_in_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArra
     Args:
         is_measured: (rows, cols).
         radius_cells: radius of the disc; 0 finds no gap.
+        threads: how many threads work.
 
     Returns:
         (k, 2) flat indices: the void cell, and the measured cell that lends its values.
@@ -165,9 +193,21 @@ def lenders_in_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArra
         return np.empty((0, 2), dtype=np.int64)
     offsets = disc_offsets(radius_cells)
     frame = 2 * radius_cells
+    # Framed with void, so that discs may lie half outside the raster.
     padded: NDArray[np.bool_] = np.pad(is_measured, frame)
-    nearest = gaps.nearest_within(padded, offsets, radius_cells)
-    void = np.flatnonzero(gaps.is_narrow_gap(padded, nearest, offsets))
+    nearest = np.full(padded.shape, -1, dtype=np.int32)
+    is_narrow = np.zeros(padded.shape, dtype=np.bool_)
+
+    def look(first: int, end: int) -> None:
+        first_row, end_row = first + radius_cells, end + radius_cells
+        gaps.nearest_within(padded, offsets, nearest, first_row, end_row)
+
+    def judge(first: int, end: int) -> None:
+        gaps.find_narrow_gaps(nearest, offsets, is_narrow, first + frame, end + frame)
+
+    in_parts(padded.shape[0] - frame, threads, look)
+    in_parts(is_measured.shape[0], threads, judge)
+    void = np.flatnonzero(is_narrow & ~padded)
     width, padded_width = is_measured.shape[1], padded.shape[1]
 
     def unpadded(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -177,19 +217,6 @@ def lenders_in_gaps(is_measured: NDArray[np.bool_], radius_cells: int) -> NDArra
 
     lenders = nearest.ravel()[void].astype(np.int64)
     return np.column_stack([unpadded(void), unpadded(lenders)])
-
-
-def use_threads(cores: int) -> int:
-    """Let the passes use so many threads, as far as numba has them; gives their number."""
-    # numba sets the attributes of its config module when it is imported.
-    n_threads = min(cores, int(vars(numba.config)["NUMBA_NUM_THREADS"]))
-    numba.set_num_threads(n_threads)
-    return n_threads
-
-
-def owners_among(threads: int) -> int:
-    """Give the largest power of two that is not above the number of threads."""
-    return 1 << (max(1, threads).bit_length() - 1)
 
 
 def _empty_entries(n_points: int) -> Entries:
@@ -202,11 +229,3 @@ def _empty_entries(n_points: int) -> Entries:
         points=np.empty(slots, dtype=np.uint32),
         n_inside=np.zeros(n_blocks, dtype=np.int64),
     )
-
-
-def _read_only(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    # Mapped inputs are read-only, arrays of tests are not: one kernel signature serves both, so
-    # that nothing is compiled twice.
-    view = np.asarray(values).view()
-    view.flags.writeable = False
-    return view

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.raster_kernels import NO_POINT
-from orthoflow.geometry.rastering import OffsetPoints, Slab, topmost_points, use_threads
+from orthoflow.geometry.rastering import OffsetPoints, Slab, topmost_points
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
@@ -84,7 +84,7 @@ class PointcloudDirect(Method):
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
             started = time.perf_counter()
-            projection = _project(inputs, colours, wall, threads=use_threads(ctx.cores))
+            projection = _project(inputs, colours, wall, threads=ctx.cores)
             projected = time.perf_counter()
             layers.append(_filled(projection, wall, k, params))
             seconds += (projected - started, time.perf_counter() - projected)

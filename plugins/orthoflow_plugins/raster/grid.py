@@ -12,7 +12,7 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.rastering import Slab, lenders_in_gaps, use_threads
+from orthoflow.geometry.rastering import Slab, lenders_in_gaps
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
@@ -110,12 +110,11 @@ class RasterGrid(Method):
         """Raster the chosen planes, one pass over the cloud or a few for each."""
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
-        threads = use_threads(ctx.cores)
         slabs = _slabs(planes, params)
         rasters: list[_Raster] = []
         for k, (index, slab) in enumerate(slabs.items()):
             ctx.progress(k / len(slabs), planes.names[index])
-            rasters.append(_raster(cloud, slab, params, threads=threads, plane=(planes, index)))
+            rasters.append(_raster(cloud, slab, params, threads=ctx.cores, plane=(planes, index)))
         walls = tuple(raster.wall for raster in rasters)
         _require_points_near(walls, params)
         source = _intensity_source(cloud)
@@ -186,7 +185,9 @@ def _raster(
     rule = SurfaceRule(surface=params.surface, layer_m=params.layer_m, threads=threads)
     surface = surface_of(cloud, slab, rule)
     mask = np.where(surface.count > 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8)
-    lent = lenders_in_gaps(surface.count.reshape(slab.frame.shape) > 0, params.recover_gap_cells)
+    lent = lenders_in_gaps(
+        surface.count.reshape(slab.frame.shape) > 0, params.recover_gap_cells, threads=threads
+    )
     _recover(surface, mask, lent)
     planes, index = plane
     shape = slab.frame.shape

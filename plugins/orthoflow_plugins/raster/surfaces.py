@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -15,7 +16,8 @@ from orthoflow.geometry.rastering import (
     Slab,
     empty_winners,
     entries_inside,
-    owners_among,
+    in_parts,
+    share_cells,
     spread_m,
 )
 from orthoflow.products import PointCloud
@@ -73,10 +75,12 @@ def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> Cel
     """One pass: the winning point gives depth, intensity and colour."""
     winners, moments = empty_winners(slab.n_cells), np.zeros((slab.n_cells, 2))
     keep = kernels.keep_topmost if rule.surface == "topmost" else kernels.keep_nearest
-    owners = owners_among(rule.threads)
-    for entries in entries_inside(offset_points(cloud), slab):
-        keep(entries, winners, owners)
-        kernels.add_moments(entries, moments, owners)
+    for entries in entries_inside(offset_points(cloud), slab, threads=rule.threads):
+        share_cells(
+            rule.threads,
+            partial(keep, entries, winners),
+            partial(kernels.add_moments, entries, moments),
+        )
     sigma_m = spread_m(winners["n_points"], moments)
     has_point = winners["point"] != NO_POINT
     points = winners["point"][has_point]
@@ -111,18 +115,20 @@ def _gathered_rgb(
 
 def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """Two or three passes: count, sort if a median is wanted, average what lies on the surface."""
-    owners = owners_among(rule.threads)
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
-    for entries in entries_inside(offset_points(cloud), slab):
-        kernels.count_points(entries, count, owners)
-        kernels.add_moments(entries, moments, owners)
+    for entries in entries_inside(offset_points(cloud), slab, threads=rule.threads):
+        share_cells(
+            rule.threads,
+            partial(kernels.count_points, entries, count),
+            partial(kernels.add_moments, entries, moments),
+        )
     with np.errstate(invalid="ignore"):
         depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
     sigma_m = spread_m(count, moments)
     if rule.surface == "median":
         layer_m = rule.layer_m
         depth_m = _medians_m(cloud, slab, count, rule)
-    intensity, rgb = _averaged_values(cloud, slab, depth_m, layer_m=layer_m, owners=owners)
+    intensity, rgb = _averaged_values(cloud, slab, depth_m, layer_m=layer_m, threads=rule.threads)
     return CellSurface(
         depth_m=depth_m,
         sigma_m=sigma_m,
@@ -138,14 +144,19 @@ def _medians_m(
     ends = np.cumsum(count, dtype=np.int64)
     cursors = ends - count
     sorted_m = np.empty(int(ends[-1]), dtype=np.float32)
-    for entries in entries_inside(offset_points(cloud), slab):
-        kernels.sort_into_cells(entries, cursors, sorted_m, owners_among(rule.threads))
-    medians_m: NDArray[np.float32] = kernels.median_depths(ends, sorted_m, rule.layer_m)
+    for entries in entries_inside(offset_points(cloud), slab, threads=rule.threads):
+        share_cells(rule.threads, partial(kernels.sort_into_cells, entries, cursors, sorted_m))
+    medians_m = np.empty(slab.n_cells, dtype=np.float32)
+    in_parts(
+        slab.n_cells,
+        rule.threads,
+        partial(kernels.median_depths, ends, sorted_m, rule.layer_m, medians_m),
+    )
     return medians_m
 
 
 def _averaged_values(
-    cloud: PointCloud, slab: Slab, depth_m: NDArray[np.float32], *, layer_m: float, owners: int
+    cloud: PointCloud, slab: Slab, depth_m: NDArray[np.float32], *, layer_m: float, threads: int
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None]:
     channels = _channels(cloud)
     # Whole numbers for colours: half the memory, and exact.
@@ -157,9 +168,12 @@ def _averaged_values(
         for values in channels
     ]
     if channels:
-        for entries in entries_inside(offset_points(cloud), slab):
-            for values, sum_of_values in zip(channels, sums, strict=True):
-                kernels.add_values(entries, values, depth_m, layer_m, sum_of_values, owners)
+        for entries in entries_inside(offset_points(cloud), slab, threads=threads):
+            passes = [
+                partial(kernels.add_values, entries, values, depth_m, layer_m, sum_of_values)
+                for values, sum_of_values in zip(channels, sums, strict=True)
+            ]
+            share_cells(threads, *passes)
     intensity: NDArray[np.float32] | None = None
     rgb: NDArray[np.uint8] | None = None
     for sum_of_values in sums:
