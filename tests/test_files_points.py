@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,68 @@ def test_las_points_a_little_outside_the_stated_bounds_are_kept_with_a_note(
     scan = open_scan(path)
     assert sum(len(block.points) for block in scan.read()) == 40
     assert "outside the bounds its header states" in scan.notes[0]
+
+
+def change(path: Path, position: int, content: bytes) -> Path:
+    changed = bytearray(path.read_bytes())
+    changed[position : position + len(content)] = content
+    path.write_bytes(bytes(changed))
+    return path
+
+
+def chunk_table(path: Path) -> int:
+    content = path.read_bytes()
+    (start,) = struct.unpack_from("<I", content, 96)
+    (table,) = struct.unpack_from("<q", content, start)
+    return int(table)
+
+
+@pytest.mark.parametrize(
+    ("position", "content", "message"),
+    [
+        (96, b"\xff\xff\xff\x00", "its points begin outside the file, which is cut off"),
+        (100, b"\xff\xff\xff\x7f", "its header states 2147483647 records that have no room"),
+        (243, b"\x05\x00\x00\x00", "records at its end are missing"),
+    ],
+    ids=["offset", "records", "extended-records"],
+)
+def test_a_damaged_las_header_is_found_before_a_library_believes_it(
+    tmp_path: Path, points: NDArray[np.float64], position: int, content: bytes, message: str
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.laz", points)
+    if position == 243:
+        change(path, 235, struct.pack("<Q", path.stat().st_size))
+    with pytest.raises(InputError, match=rf"a\.laz cannot be read as LAS/LAZ: {message}"):
+        open_scan(change(path, position, content))
+
+
+def test_a_las_file_that_ends_within_its_header_is_refused(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.las", points)
+    path.write_bytes(path.read_bytes()[:150])
+    with pytest.raises(InputError, match="it ends within its header"):
+        open_scan(path)
+
+
+def test_a_damaged_chunk_table_is_found_before_the_decompressor_believes_it(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.laz", points)
+    table = chunk_table(path)
+    # 3 thousand million chunks of 16 bytes each would end the process.
+    change(path, table + 4, b"\xff\xff\xff\xbf")
+    with pytest.raises(InputError, match="its chunk table states 3221225471 chunks"):
+        open_scan(path)
+
+
+def test_a_number_of_points_that_the_chunks_do_not_hold_is_found(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.laz", points)
+    change(path, 247, struct.pack("<Q", 400_000))
+    with pytest.raises(InputError, match="its chunks hold 50000 points, its header states 400000"):
+        open_scan(path)
 
 
 # E57

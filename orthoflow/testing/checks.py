@@ -24,6 +24,7 @@ from orthoflow.testing.trials import Trial, TrialRun, run_trial
 UNIT_SUFFIXES: Final = (
     *("m", "mm", "m2", "px", "deg", "rad", "s", "cells", "sigma"),
     *("share", "ratio", "factor", "scale", "exponent", "power", "probability", "world"),
+    "intensity",
 )
 
 

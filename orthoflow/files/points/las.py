@@ -18,13 +18,16 @@ from orthoflow.files.points.blocks import (
     short_file_error,
 )
 from orthoflow.files.points.foreign import guarded, load_library, reading
+from orthoflow.files.points.las_headers import check_chunks, check_header
 
 FORMAT: Final = "LAS/LAZ"
+_FARTHEST: Final = 1e12
 
 
 def open_las(path: Path) -> ScanFile:
     """Open a LAS, LAZ or COPC file."""
     laspy = load_library("laspy", path)
+    check_header(path)
     with reading(path, FORMAT), laspy.open(path) as reader:
         header = reader.header
         names = set(header.point_format.dimension_names)
@@ -35,6 +38,8 @@ def open_las(path: Path) -> ScanFile:
             "point_format": int(header.point_format.id),
             "scale": float(np.max(header.scales)),
         }
+        if n_points > 0:
+            check_chunks(path, header)
     notes: list[str] = []
     return ScanFile(
         name=path.name,
@@ -104,8 +109,11 @@ def _outside(path: Path, points: NDArray[np.float64], bounds: NDArray[np.float64
     Compressed points carry no checksum, so the bounds are the only witness of a changed byte.
     """
     low, high = bounds
-    extent = float(np.linalg.norm(high - low))
-    if not (np.isfinite(extent) and extent > 0.0 and np.all(high >= low)) or not len(points):
+    # Bounds that no scan has say nothing; NaN compares as False.
+    if not (np.all(np.abs(bounds) < _FARTHEST) and np.all(high >= low)) or not len(points):
+        return 0
+    extent = float((high - low).max())
+    if extent == 0.0:
         return 0
     # Headers are often rounded to the last digit.
     slack = 1e-3 * max(extent, 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -157,13 +158,15 @@ def _compressed_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDA
     n_plain = header.n_points * header.dtype.itemsize
     with path.open("rb") as file:
         file.seek(header.n_bytes)
-        sizes = np.frombuffer(file.read(8), dtype="<u4")
-        packed = np.frombuffer(file.read(int(sizes[0])), np.uint8) if len(sizes) == 2 else sizes
-    if len(sizes) != 2 or len(packed) != int(sizes[0]):
-        found = f"{packed.nbytes} bytes"
-        raise short_file_error(path, "compressed data", found, str(sizes[0]) if len(sizes) else "8")
-    plain = np.zeros(n_plain, dtype=np.uint8)
-    if int(sizes[1]) != n_plain or decompress_lzf(packed.astype(np.uint8), plain) != n_plain:
+        sizes = file.read(8)
+        n_packed, n_stated = struct.unpack("<II", sizes) if len(sizes) == 8 else (8, 0)
+        packed = np.frombuffer(file.read(n_packed), np.uint8)
+    if len(packed) != n_packed:
+        raise short_file_error(path, "compressed data", f"{len(packed)} bytes", str(n_packed))
+    # LZF turns three bytes into 264 at best: more cannot be meant, and is not allocated.
+    is_possible = n_stated == n_plain and n_plain <= 264 * n_packed
+    plain = np.zeros(n_plain if is_possible else 0, dtype=np.uint8)
+    if not is_possible or decompress_lzf(packed, plain) != n_plain:
         raise InputError(
             f"{path.name} cannot be unpacked: {header.n_points} points need {n_plain} bytes; the "
             "file is damaged, export it again"

@@ -63,10 +63,9 @@ def find_layout(line: str) -> Layout | None:
 
 def numbers_of(line: str, layout: Layout) -> list[float]:
     """Numbers of a line; NaN for a field that is none."""
-    fields = line.split() if layout.separator == r"\s+" else _split(line, layout.separator)
     return [
         float(field.replace(layout.decimal, ".")) if _NUMBER.fullmatch(field) else float("nan")
-        for field in fields
+        for field in _fields(line, layout)
     ]
 
 
@@ -156,20 +155,26 @@ def _bad_line(
     path: Path, lines: list[bytes], layout: Layout, columns: Sequence[int], first_line: int
 ) -> InputError:
     for offset, line in enumerate(lines):
-        try:
-            _parse([line], layout, columns)
-        except ValueError:
-            if line.lstrip().startswith(_COMMENTS):
-                continue
-            text = line.decode("utf-8", "replace").strip()[:60]
+        text = line.decode("utf-8", "replace").strip()
+        if not line.lstrip().startswith(_COMMENTS) and not _fits(text, layout, columns):
             return InputError(
                 f"{path.name}, line {first_line + offset}: expected {layout.n_columns} numbers as "
-                f"in the lines before, got {text!r}; correct the line or export the file again"
+                f"in the lines before, got {text[:60]!r}; correct the line or export the file again"
             )
     return InputError(
         f"{path.name}, from line {first_line}: expected {layout.n_columns} numbers per line; "
         "export the file again"
     )
+
+
+def _fits(text: str, layout: Layout, columns: Sequence[int]) -> bool:
+    fields = _fields(text, layout)
+    wanted = [fields[column] for column in columns if column < len(fields)]
+    return len(fields) <= layout.n_columns and _are_numbers([item for item in wanted if item])
+
+
+def _fields(line: str, layout: Layout) -> list[str]:
+    return line.split() if layout.separator == r"\s+" else _split(line, layout.separator)
 
 
 def _split(line: str, separator: str) -> list[str]:

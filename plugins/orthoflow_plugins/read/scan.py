@@ -94,7 +94,9 @@ class ReadScan(Method):
         assembly = CloudAssembly(ctx, files, UNITS_M[params.unit])
         _warn_of_missing_fields(ctx, files, assembly)
         for file in files:
-            assembly.add_file(file)
+            # Damaged numbers overflow on their way; what is not finite is dropped and counted.
+            with np.errstate(all="ignore"):
+                assembly.add_file(file)
             for note in file.notes:
                 ctx.warn(note)
         cloud = _finish(ctx, assembly, files, params)
