@@ -118,17 +118,6 @@ def _within(
 
 
 @compiled
-def _widen(
-    extent: NDArray[np.float64], slab: NDArray[np.float64], x: float, y: float, z: float
-) -> None:
-    """Widen smallest and largest u and v to hold a point."""
-    u = slab[4] * x + slab[5] * y + slab[6] * z - slab[7]
-    v = slab[8] * x + slab[9] * y + slab[10] * z - slab[11]
-    extent[0], extent[1] = min(extent[0], u), max(extent[1], u)
-    extent[2], extent[3] = min(extent[2], v), max(extent[3], v)
-
-
-@compiled
 def _place(row: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32) -> int:
     """Cell of an offset along one axis of the plan, as `count_over_plan` has it; -1 before it."""
     position = row[0] * x + row[1] * y + row[2] * z - row[3]
@@ -183,7 +172,7 @@ def sum_cells(
             if size <= inner_m:
                 counts[row, column, 1] += 1
             if size <= fit_m:
-                steps = np.int64(round(distance * to_steps))
+                steps = np.int64(math.floor(distance * to_steps + 0.5))
                 counts[row, column, 2] += 1
                 sums[row, column, 0] += steps
                 sums[row, column, 1] += steps * steps
@@ -216,13 +205,14 @@ def claim_slab(
     index = slabs.shape[0] - 1
     slab = slabs[index]
     find_m = bounds[0]
+    n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
     for block in range(boxes.shape[0]):
         if _misses(boxes[block], slab, find_m):
             continue
         start = block * BLOCK_POINTS
         for i in range(start, min(start + BLOCK_POINTS, x.size)):
             px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-            size = _distance(slab, px, py, pz)
+            size = abs(n0 * px + n1 * py + n2 * pz - n3)
             if size > find_m or not _within(slab, bounds, px, py, pz):
                 continue
             owner = claims[i]
@@ -266,23 +256,26 @@ def measure_deviations(
             tolerance and the rectangle; widened.
     """
     x, y, z = points.x, points.y, points.z
+    # Numbers are picked one by one: a row of an array per point costs more than the sums.
     for i in range(x.size):
         k = claims[i]
         if k < 0:
             continue
-        slab, limit = slabs[k], limits[k]
         px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-        distance = slab[0] * px + slab[1] * py + slab[2] * pz - slab[3]
-        steps = np.int64(round(distance * (STEPS_PER_TOLERANCE / limit[1])))
+        distance = slabs[k, 0] * px + slabs[k, 1] * py + slabs[k, 2] * pz - slabs[k, 3]
+        steps = np.int64(math.floor(distance * (STEPS_PER_TOLERANCE / limits[k, 1]) + 0.5))
         sums[k, 0] += 1
         sums[k, 1] += steps
         sums[k, 2] += steps * steps
-        place = int((distance / limit[0] + 1.0) * (0.5 * HISTOGRAM_BINS))
+        place = int((distance / limits[k, 0] + 1.0) * (0.5 * HISTOGRAM_BINS))
         histogram[k, min(max(place, 0), HISTOGRAM_BINS - 1)] += 1
-        if abs(distance) > limit[1]:
+        if abs(distance) > limits[k, 1]:
             continue
         sums[k, 3] += 1
         sums[k, 4] += steps
         sums[k, 5] += steps * steps
-        if _within(slab, limit[1:], px, py, pz):
-            _widen(extents[k], slab, px, py, pz)
+        u = slabs[k, 4] * px + slabs[k, 5] * py + slabs[k, 6] * pz - slabs[k, 7]
+        v = slabs[k, 8] * px + slabs[k, 9] * py + slabs[k, 10] * pz - slabs[k, 11]
+        if limits[k, 2] <= u <= limits[k, 3] and limits[k, 4] <= v <= limits[k, 5]:
+            extents[k, 0], extents[k, 1] = min(extents[k, 0], u), max(extents[k, 1], u)
+            extents[k, 2], extents[k, 3] = min(extents[k, 2], v), max(extents[k, 3], v)

@@ -30,7 +30,7 @@ class Planes(Product):
         names: k short labels, e.g. `wall 0`, `floor`.
         part_corners: (p, 4, 3) float64 rectangles of connected parts, or None.
         part_plane: (p,) int32 index of the plane a part lies on, or None.
-        viewpoint: how the normals' side was chosen: `stations`, `view_from` or `guess`.
+        viewpoint: how the normals' side was chosen: `stations`, `view_from`, `given` or `guess`.
         details: what else the method says about itself, JSON.
     """
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Plane
 from orthoflow.geometry.plane_kernels import vote_lines
 from orthoflow.geometry.point_kernels import PlanGrid, in_threads
-from orthoflow_plugins.plane.peeling import Candidate, Remainder
+from orthoflow_plugins.plane.examining import Candidate
+from orthoflow_plugins.plane.remainders import Remainder
 
 # A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
 # several bins until it is refined.

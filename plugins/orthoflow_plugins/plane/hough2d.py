@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -11,6 +11,8 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry import basis_from_up
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+
+_LABELS_AT_ONCE: Final = 1 << 20
 
 
 class Hough2d(Method):
@@ -96,9 +98,11 @@ class Hough2d(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.accumulators import PlanProposer
-        from orthoflow_plugins.plane.assembling import assemble, measure_planes
+        from orthoflow_plugins.plane.assembling import assemble
+        from orthoflow_plugins.plane.deviations import measure_planes
+        from orthoflow_plugins.plane.examining import Rules
         from orthoflow_plugins.plane.figures import draw_accumulator, draw_deviations
-        from orthoflow_plugins.plane.peeling import Rules, find_planes
+        from orthoflow_plugins.plane.peeling import find_planes
         from orthoflow_plugins.plane.preparing import prepare
         from orthoflow_plugins.plane.reporting import report_planes
 
@@ -145,13 +149,14 @@ class Hough2d(Method):
             fit_m=rules.fit_m,
         )
         assembly = assemble(found, remainder, deviations, cloud)
-        labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16)
-        np.take(assembly.labels_from_claims, remainder.claims, out=labels, mode="wrap")
+        labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
+        # In pieces: numpy widens an index to 64 bits, four times the labels themselves.
+        for start in range(0, len(cloud), _LABELS_AT_ONCE):
+            piece = slice(start, start + _LABELS_AT_ONCE)
+            labels[piece] = assembly.labels_from_claims[remainder.claims[piece]]
         report_planes(ctx, assembly, n_points=len(cloud))
         ctx.progress(0.9, "drawing")
         draw_deviations(ctx, assembly)
         if proposer.first is not None:
             draw_accumulator(ctx, remainder.grid, plan, proposer.first, assembly.planes, cloud)
-        return self.Out(
-            planes=assembly.planes, labels=PointLabels(plane_index=labels.view(np.int16))
-        )
+        return self.Out(planes=assembly.planes, labels=PointLabels(plane_index=labels))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry.point_kernels import blocked, count_over_plan, read_only
 from orthoflow.products import PointCloud
-from orthoflow_plugins.plane.peeling import Remainder
+from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.sampling import draw_sample, plan_grid
 
 # Thread-private plans and surface rasters must stay small beside the cloud.

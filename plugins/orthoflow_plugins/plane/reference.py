@@ -12,12 +12,11 @@ from orthoflow.geometry import Plane, basis_from_up, omega_phi_deg, wall_axes
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import (
-    Deviations,
     enclosing,
-    measure_planes,
     plane_names,
     rectangle_m,
 )
+from orthoflow_plugins.plane.deviations import Deviations, measure_planes
 from orthoflow_plugins.plane.facing import (
     known_viewpoint,
     side_of_remaining,
@@ -31,8 +30,8 @@ from orthoflow_plugins.plane.footprints import (
     measure_cells,
     surface_raster,
 )
-from orthoflow_plugins.plane.peeling import Remainder
 from orthoflow_plugins.plane.preparing import prepare
+from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.reporting import warn_of_guesses
 
 _PLAN_CELL_M: Final = 0.05

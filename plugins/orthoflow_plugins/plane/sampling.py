@@ -19,9 +19,11 @@ from orthoflow.geometry.point_kernels import (
 )
 from orthoflow.products import PointCloud
 
-SAMPLE_POINTS: Final = 400_000
+SAMPLE_POINTS: Final = 200_000
 # More cells than this cost more than they show; the cell grows instead.
 PLAN_CELLS_MOST: Final = 8_000_000
+# Points that are enough to see where a scene ends.
+_BOX_POINTS: Final = 40_000
 _TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
 
@@ -92,7 +94,7 @@ def plan_grid(
             and stray points do not blow up the grid. It is well below the share a plane must have,
             so no plane worth finding is cut off.
     """
-    framed = sample.offsets_m @ basis.T
+    framed = sample.offsets_m[:: max(1, len(sample.index) // _BOX_POINTS)] @ basis.T
     low, high = np.quantile(framed, (_TAIL_SHARE, 1.0 - _TAIL_SHARE), axis=0)
     # The tails may be a side room or stray echoes; only what is far beyond the scene's own size
     # can be told to be stray. A lone wall is thin one way, so the largest extent is the measure.
