@@ -43,6 +43,7 @@ def nearest_within(
 
 @compiled
 def find_narrow_gaps(
+    is_measured: NDArray[np.bool_],
     nearest: NDArray[np.int32],
     offsets: NDArray[np.int64],
     is_narrow: NDArray[np.bool_],
@@ -52,10 +53,10 @@ def find_narrow_gaps(
     """Tell which void cells of some rows no disc covers that fits into the void.
 
     Args:
+        is_measured: (rows, cols).
         nearest: (rows, cols) of `nearest_within` the same disc; -1 where a disc fits.
         offsets: (k, 2) rows and columns of the disc without its centre.
-        is_narrow: (rows, cols), made true for such cells, and for measured ones, which no such
-            disc covers either.
+        is_narrow: (rows, cols), made true for such cells.
         first_row: first row to visit, at least twice the disc's radius from the border.
         end_row: the row after the last one.
     """
@@ -63,9 +64,11 @@ def find_narrow_gaps(
     reach = 2 * np.abs(offsets).max()
     for row in range(first_row, end_row):
         for column in range(reach, columns - reach):
-            fits = nearest[row, column] < 0
+            if is_measured[row, column] or nearest[row, column] < 0:
+                continue
+            fits = False
             for k in range(offsets.shape[0]):
-                if fits:
+                if nearest[row + offsets[k, 0], column + offsets[k, 1]] < 0:
+                    fits = True
                     break
-                fits = nearest[row + offsets[k, 0], column + offsets[k, 1]] < 0
             is_narrow[row, column] = not fits

@@ -203,11 +203,12 @@ def lenders_in_gaps(
         gaps.nearest_within(padded, offsets, nearest, first_row, end_row)
 
     def judge(first: int, end: int) -> None:
-        gaps.find_narrow_gaps(nearest, offsets, is_narrow, first + frame, end + frame)
+        first_row, end_row = first + frame, end + frame
+        gaps.find_narrow_gaps(padded, nearest, offsets, is_narrow, first_row, end_row)
 
     in_parts(padded.shape[0] - frame, threads, look)
     in_parts(is_measured.shape[0], threads, judge)
-    void = np.flatnonzero(is_narrow & ~padded)
+    void = np.flatnonzero(is_narrow)
     width, padded_width = is_measured.shape[1], padded.shape[1]
 
     def unpadded(cells: NDArray[np.int64]) -> NDArray[np.int64]:
