@@ -1,0 +1,281 @@
+"""The source of the toy plugin: two sources of numbers, and methods that fail in every way."""
+
+from __future__ import annotations
+
+HOOKS = """
+from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec, hookimpl
+
+WORKS = ["add", "noise", "sign", "slow", "segfault", "abort", "eat", "hang", "stubborn", "quit",
+         "leave", "raises", "refuses", "unreadable", "needs_library", "no_memory", "full_disk",
+         "changes_input", "wrong_type", "wrong_out", "bad_param", "draws", "chatty", "unstorable",
+         "spawns", "threads", "fills_mapped"]
+
+@hookimpl
+def orthoflow_kinds():
+    return [
+        KindSpec(name="make", summary="makes numbers", is_source=True),
+        KindSpec(name="work", summary="works on numbers", inputs={"numbers": "numbers"},
+                 outputs={"numbers": "numbers"}),
+    ]
+
+@hookimpl
+def orthoflow_products():
+    return [ProductSpec(type_name="numbers", target="toy_plugin.products:Numbers",
+                        summary="numbers", publisher="toy_plugin.products:publish")]
+
+@hookimpl
+def orthoflow_methods():
+    makes = [MethodSpec(id=f"make.{name}", target=f"toy_plugin.makes:{name.title()}", summary="")
+             for name in ("range", "file")]
+    works = [MethodSpec(id=f"work.{name}", target=f"toy_plugin.works:{name}", summary="")
+             for name in WORKS]
+    return makes + works
+"""
+
+PRODUCTS = """
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.products.product import Product
+
+@dataclass(frozen=True, kw_only=True)
+class Numbers(Product):
+    type_name: ClassVar[str] = "numbers"
+    values: NDArray[np.float64]
+    note: str = ""
+
+@dataclass(frozen=True, kw_only=True)
+class Strangers(Product):
+    type_name: ClassVar[str] = "strangers"
+
+def publish(product, folder, digest):
+    (folder / "numbers.txt").write_text(f"{digest} {product.values.tolist()}")
+"""
+
+MAKES = """
+import numpy as np
+from pydantic import Field
+
+from orthoflow.errors import InputError
+from orthoflow.products import InputFiles
+from orthoflow.sdk import Method, MethodParams, Ports
+from toy_plugin.products import Numbers
+
+class Range(Method):
+    id = "make.range"
+
+    class Params(MethodParams):
+        count: int = Field(4, ge=1, description="How many.")
+
+    class In(Ports):
+        pass
+
+    class Out(Ports):
+        numbers: Numbers
+
+    def run(self, inputs, params, ctx):
+        ctx.metric("count", params.count, "1")
+        return self.Out(numbers=Numbers(values=np.arange(float(params.count))))
+
+class File(Method):
+    id = "make.file"
+
+    class Params(MethodParams):
+        pass
+
+    class In(Ports):
+        files: InputFiles
+
+    class Out(Ports):
+        numbers: Numbers
+
+    def run(self, inputs, params, ctx):
+        try:
+            values = [float(word) for word in inputs.files.paths[0].read_text().split()]
+            return self.Out(numbers=Numbers(values=np.array(values)))
+        except ValueError as error:
+            raise InputError(f"{inputs.files.paths[0].name} must hold numbers: {error}") from error
+"""
+
+WORKS = """
+import ctypes
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+from pydantic import Field
+
+from orthoflow.errors import InputError, MethodError
+from orthoflow.sdk import Method, MethodParams, Ports
+from toy_plugin.products import Numbers, Strangers
+
+class Work(Method):
+    class Params(MethodParams):
+        amount: float = Field(1.0, description="How much.")
+        steps: int = Field(0, description="How many steps.")
+
+    class In(Ports):
+        numbers: Numbers
+
+    class Out(Ports):
+        numbers: Numbers
+
+    def run(self, inputs, params, ctx):
+        values = self.work(inputs.numbers.values, params, ctx)
+        return self.Out(numbers=Numbers(values=np.asarray(values)))
+
+def work(method):
+    def named(function):
+        class Named(Work):
+            id = f"work.{function.__name__}"
+            determinism = method
+            def work(self, values, params, ctx):
+                return function(values, params, ctx)
+        Named.__name__ = function.__name__
+        return Named
+    return named
+
+@work("exact")
+def add(values, params, ctx):
+    return values + params.amount
+
+@work("seeded")
+def noise(values, params, ctx):
+    return values + params.amount * ctx.rng.standard_normal(values.shape)
+
+@work("exact")
+def sign(values, params, ctx):
+    return np.sign(values)
+
+@work("exact")
+def slow(values, params, ctx):
+    for index in range(params.steps):
+        ctx.progress(index / params.steps, f"step {index}")
+        time.sleep(0.05)
+    return values + params.amount
+
+@work("exact")
+def segfault(values, params, ctx):
+    ctypes.string_at(0)
+
+@work("exact")
+def abort(values, params, ctx):
+    os.abort()
+
+@work("exact")
+def eat(values, params, ctx):
+    hoard = []
+    while True:
+        hoard.append(np.ones(16 << 20 >> 3))
+        time.sleep(0.001)
+
+@work("exact")
+def hang(values, params, ctx):
+    while not ctx.cancelled():
+        time.sleep(0.01)
+    raise MethodError("gave up")
+
+@work("exact")
+def stubborn(values, params, ctx):
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+    time.sleep(600)
+
+@work("exact")
+def quit(values, params, ctx):
+    print("last words")
+    os._exit(7)
+
+@work("exact")
+def leave(values, params, ctx):
+    sys.exit("bye")
+
+@work("exact")
+def raises(values, params, ctx):
+    return {}["missing"]
+
+@work("exact")
+def refuses(values, params, ctx):
+    raise MethodError("no number is large enough")
+
+@work("exact")
+def unreadable(values, params, ctx):
+    raise InputError("the numbers are unreadable")
+
+@work("exact")
+def needs_library(values, params, ctx):
+    import no_such_library
+
+@work("exact")
+def no_memory(values, params, ctx):
+    return np.empty(1 << 46)
+
+@work("exact")
+def full_disk(values, params, ctx):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(ctx.scratch / "x"))
+
+@work("exact")
+def changes_input(values, params, ctx):
+    values += 1.0
+    return values
+
+@work("exact")
+def draws(values, params, ctx):
+    ctx.figure("dot", b"\\x89PNG\\r\\n\\x1a\\n0123", "a dot")
+    ctx.warn("the dot is small")
+    ctx.metric("dots", 1, "1")
+    return values
+
+@work("exact")
+def chatty(values, params, ctx):
+    print("on stdout")
+    os.write(2, b"on stderr \\0 with NUL\\n")
+    ctx.log("a line of log")
+    return values
+
+@work("exact")
+def unstorable(values, params, ctx):
+    return np.array([object()])
+
+@work("exact")
+def spawns(values, params, ctx):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    return np.array([float(child.pid)])
+
+@work("exact")
+def threads(values, params, ctx):
+    names = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
+    cache = os.environ["NUMBA_CACHE_DIR"]
+    print(cache, os.getcwd(), ctx.scratch)
+    return np.array([ctx.cores, *[float(os.environ[name]) for name in names]])
+
+@work("exact")
+def fills_mapped(values, params, ctx):
+    array = ctx.allocate("numbers", "values", (8 << 20,), np.float64)
+    array[:] = 1.0
+    return array
+
+class wrong_type(Work):
+    id = "work.wrong_type"
+    def run(self, inputs, params, ctx):
+        return self.Out(numbers=Strangers())
+
+class wrong_out(Work):
+    id = "work.wrong_out"
+    def run(self, inputs, params, ctx):
+        return inputs.numbers
+
+class bad_param(Work):
+    id = "work.bad_param"
+    def run(self, inputs, params, ctx):
+        ctx.metric("nan", float("nan"), "1")
+"""
