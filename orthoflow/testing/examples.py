@@ -21,8 +21,8 @@ from orthoflow.sdk import StepContext
 # The road of built-in methods that makes an example of each product type, with parameters small
 # enough for a test: product type -> (method, output port, parameters, inputs by port).
 _ROAD: Final[Mapping[str, tuple[str, str, Mapping[str, object], Mapping[str, str]]]] = {
-    "cloud": ("simulate.room", "cloud", {"scan_step_m": 0.03}, {}),
-    "truth": ("simulate.room", "truth", {"scan_step_m": 0.03}, {}),
+    "cloud": ("simulate.room", "cloud", {"scan_step_m": 0.08}, {}),
+    "truth": ("simulate.room", "truth", {"scan_step_m": 0.08}, {}),
     "planes": ("plane.hough2d", "planes", {"n_planes_max": 2}, {"cloud": "cloud"}),
     "labels": ("plane.hough2d", "labels", {"n_planes_max": 2}, {"cloud": "cloud"}),
     "walls": ("raster.grid", "walls", {"gsd_m": 0.05}, {"cloud": "cloud", "planes": "planes"}),

@@ -77,6 +77,8 @@ def _environment(places: Mapping[str, Path], folder: Path) -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
         "PYTHONHASHSEED": "12345",
         "NUMBA_CACHE_DIR": numba_cache,
+        # As the engine does for its steps: a font cache is matplotlib's, not the method's.
+        "MPLCONFIGDIR": str(folder / "matplotlib"),
         "PYTHONDONTWRITEBYTECODE": "1",
     }
 

@@ -91,6 +91,11 @@ class RasterGrid(Method):
         n_walls_max: int = Field(
             default=12, ge=1, le=1000, description="At most so many planes, by support."
         )
+        skip_covered: bool = Field(
+            default=True,
+            description="Leave out a plane that lies within the buffer of a larger parallel wall, "
+            "which shows it as relief.",
+        )
         margin_m: float = Field(
             default=0.0, ge=0, description="Widens the rectangle of a plane on all sides."
         )
@@ -142,17 +147,21 @@ def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
     Raises:
         MethodError: the rasters would not fit into memory.
     """
+    front = params.buffer_m if params.buffer_front_m is None else params.buffer_front_m
+    behind = params.buffer_m if params.buffer_behind_m is None else params.buffer_behind_m
     choice = WallChoice(
         constraint=params.constraint,
         min_area_m2=params.min_area_m2,
         n_walls_max=params.n_walls_max,
+        skip_covered=params.skip_covered,
+        front_m=front,
+        behind_m=behind,
     )
-    front, behind = params.buffer_front_m, params.buffer_behind_m
     slabs = {
         index: Slab(
             frame=frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m),
-            front_m=params.buffer_m if front is None else front,
-            behind_m=params.buffer_m if behind is None else behind,
+            front_m=front,
+            behind_m=behind,
         )
         for index in chosen_planes(planes, choice)
     }

@@ -17,6 +17,9 @@ Constraint = Literal["vertical", "horizontal", "any"]
 
 # How far a plane may lean and still count as vertical or horizontal.
 _LEAN_DEG: Final = 10.0
+# A plane counts as part of a larger wall's relief below this angle and above this overlap.
+_PARALLEL_DEG: Final = 5.0
+_COVERED_SHARE: Final = 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +30,17 @@ class WallChoice:
         constraint: direction of the planes.
         min_area_m2: smallest rectangle; the plane with the most support is exempt.
         n_walls_max: at most so many, by support.
+        skip_covered: leave out planes that a larger wall shows as its relief.
+        front_m: reach of a wall towards the viewer.
+        behind_m: reach behind it.
     """
 
     constraint: Constraint
     min_area_m2: float
     n_walls_max: int
+    skip_covered: bool
+    front_m: float
+    behind_m: float
 
 
 def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
@@ -50,7 +59,11 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
         )
     large = [k for k in fitting if area_m2(planes.corners[k]) >= choice.min_area_m2]
     # The best supported plane stays whatever its size: a scan of one small object has a wall too.
-    chosen = sorted({fitting[0], *large})
+    chosen: list[int] = []
+    for index in sorted({fitting[0], *large}):
+        if choice.skip_covered and any(_covers(planes, wall, index, choice) for wall in chosen):
+            continue
+        chosen.append(index)
     return chosen[: choice.n_walls_max]
 
 
@@ -68,6 +81,25 @@ def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> Wa
     steps = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
     widened = corners + margin_m * (steps[:, :1] * right + steps[:, 1:] * down)
     return frame_over(widened, planes.normal[index], gsd_m=gsd_m)
+
+
+def _covers(planes: Planes, wall: int, index: int, choice: WallChoice) -> bool:
+    """Whether a plane lies within a wall's buffer, parallel to it and mostly inside its frame."""
+    normal = planes.normal[wall]
+    if float(normal @ planes.normal[index]) < math.cos(math.radians(_PARALLEL_DEG)):
+        return False
+    depths_m = planes.corners[index] @ normal - planes.offset[wall]
+    if depths_m.min() < -choice.behind_m or depths_m.max() > choice.front_m:
+        return False
+    corners = planes.corners[wall]
+    axes = np.vstack([_unit(corners[3] - corners[0]), _unit(corners[1] - corners[0])])
+    outer, inner = corners @ axes.T, planes.corners[index] @ axes.T
+    shared_m = np.minimum(outer.max(axis=0), inner.max(axis=0)) - np.maximum(
+        outer.min(axis=0), inner.min(axis=0)
+    )
+    extent_m = inner.max(axis=0) - inner.min(axis=0)
+    share = np.clip(shared_m, 0.0, None).prod() / max(float(extent_m.prod()), 1e-12)
+    return bool(share >= _COVERED_SHARE)
 
 
 def _fits(planes: Planes, index: int, constraint: Constraint) -> bool:

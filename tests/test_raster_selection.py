@@ -1,0 +1,98 @@
+"""Which planes become walls: relief of a larger wall does not become a wall of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.raster.selection import WallChoice, chosen_planes
+
+from orthoflow.products import Planes
+
+CHOICE = WallChoice(
+    constraint="any",
+    min_area_m2=0.5,
+    n_walls_max=10,
+    skip_covered=True,
+    front_m=0.15,
+    behind_m=0.15,
+)
+
+
+def planes(*walls: tuple[float, float, float, float]) -> Planes:
+    """Walls facing -y: (depth in front of y = 3, left, width, tilt about z in degrees)."""
+    normals, offsets, corners = [], [], []
+    for depth_m, left_m, width_m, tilt_deg in walls:
+        tilt = np.radians(tilt_deg)
+        normal = np.array([np.sin(tilt), -np.cos(tilt), 0.0])
+        right = np.array([np.cos(tilt), np.sin(tilt), 0.0])
+        start = np.array([left_m, 3.0 - depth_m, 2.0])
+        down = np.array([0.0, 0.0, -2.0])
+        corners.append(_rectangle(start, right * width_m, down))
+        normals.append(normal)
+        offsets.append(normal @ start)
+    count = len(walls)
+    return Planes(
+        normal=np.array(normals),
+        offset=np.array(offsets),
+        corners=np.array(corners),
+        covariance=np.zeros((count, 4, 4)),
+        n_points=np.arange(count, 0, -1),
+        rms_m=np.zeros(count),
+        up=np.array([0.0, 0.0, 1.0]),
+        names=tuple(f"wall {k}" for k in range(count)),
+    )
+
+
+def _rectangle(
+    start: NDArray[np.float64], right: NDArray[np.float64], down: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.array([start, start + down, start + down + right, start + right])
+
+
+MAIN = (0.0, 0.0, 5.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("other", "is_covered"),
+    [
+        ((0.08, 1.0, 3.0, 0.0), True),
+        ((-0.10, 1.0, 3.0, 0.0), True),
+        ((0.08, -0.3, 5.0, 0.0), True),
+        ((0.25, 1.0, 3.0, 0.0), False),
+        ((-0.25, 1.0, 3.0, 0.0), False),
+        ((0.08, 4.0, 3.0, 0.0), False),
+        ((0.08, 6.0, 3.0, 0.0), False),
+        ((0.0, 2.0, 2.0, 20.0), False),
+        ((0.0, 0.0, 5.0, 180.0), False),
+    ],
+    ids=[
+        "pilasters before it",
+        "panels behind it",
+        "a little wider",
+        "before the buffer",
+        "behind the buffer",
+        "mostly beside it",
+        "beside it",
+        "inclined to it",
+        "its other side",
+    ],
+)
+def test_a_plane_inside_a_walls_buffer_is_its_relief(
+    other: tuple[float, float, float, float], is_covered: bool
+) -> None:
+    chosen = chosen_planes(planes(MAIN, other), CHOICE)
+    assert chosen == ([0] if is_covered else [0, 1])
+
+
+def test_covered_planes_are_kept_when_asked_for() -> None:
+    both = planes(MAIN, (0.08, 1.0, 3.0, 0.0))
+    assert chosen_planes(both, replace(CHOICE, skip_covered=False)) == [0, 1]
+
+
+def test_a_plane_is_not_covered_by_one_that_was_left_out_itself() -> None:
+    # The third lies within the second's buffer, but not within the first's.
+    three = planes(MAIN, (0.10, 0.0, 5.0, 0.0), (0.20, 0.0, 5.0, 0.0))
+    assert chosen_planes(three, CHOICE) == [0, 2]
