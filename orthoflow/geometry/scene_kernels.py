@@ -2,22 +2,25 @@
 
 The nearest hit is exact: the tree only skips what a ray cannot meet, and of two rectangles at the
 same distance the one with the smaller index wins, so no order of visiting shows.
+
+The kernels release the GIL and work on a range of rays or rows, so that plain threads share the
+work; numba's own parallel loops would double the time to compile.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from orthoflow.geometry.texture_kernels import colour_at
 
-_BLOCK: Final = 1024
+Index: TypeAlias = int | np.int64
+
 _NOTHING: Final = np.int64(-1)
-_OBJECT: Final = 3  # SurfaceRole.OBJECT; compiled code knows numbers only
 # A point counts as seen when nothing is hit more than this before it, metres.
 _SEEN_WITHIN_M: Final = 0.0005
 
@@ -27,7 +30,6 @@ class CastTable(NamedTuple):
 
     Attributes:
         rectangles: (r, 16) float64: centre, axis a, axis b, normal (3 each), extent (4).
-        role: (r,) uint8 `SurfaceRole`.
         kinds: (r,) int32 `TextureKind`.
         params: (r, 8) float64 texture parameters.
         holes: (h, 4) float64 extents.
@@ -41,7 +43,6 @@ class CastTable(NamedTuple):
     """
 
     rectangles: NDArray[np.float64]
-    role: NDArray[np.uint8]
     kinds: NDArray[np.int32]
     params: NDArray[np.float64]
     holes: NDArray[np.float64]
@@ -94,6 +95,14 @@ class Stations(NamedTuple):
     highest_sine: float
 
 
+class ViewedScene(NamedTuple):
+    """A scene, its free-standing objects alone, and who looks at it."""
+
+    table: CastTable
+    objects: CastTable
+    stations: Stations
+
+
 class CellTruth(NamedTuple):
     """What is seen in each cell, filled by `look_at_cells`; shapes (rows, columns[, 3])."""
 
@@ -113,7 +122,7 @@ def _safe_inverse(value: float) -> float:
 
 
 @njit(cache=True)
-def _hit_distance(table: CastTable, index: int, ray: Ray, t_min: float) -> float:
+def _hit_distance(table: CastTable, index: Index, ray: Ray, t_min: float) -> float:
     """Distance at which a ray meets one rectangle, in units of its direction; -1 if it does not."""
     # Single numbers on purpose: a row as an array would be counted in and out of use each time.
     r = table.rectangles
@@ -121,7 +130,7 @@ def _hit_distance(table: CastTable, index: int, ray: Ray, t_min: float) -> float
     if abs(facing) < 1e-12:
         return -1.0
     x, y, z = r[index, 0] - ray.x, r[index, 1] - ray.y, r[index, 2] - ray.z
-    t = (r[index, 9] * x + r[index, 10] * y + r[index, 11] * z) / facing
+    t: float = (r[index, 9] * x + r[index, 10] * y + r[index, 11] * z) / facing
     if t < t_min:
         return -1.0
     x, y, z = t * ray.dx - x, t * ray.dy - y, t * ray.dz - z
@@ -148,7 +157,8 @@ def _enters_box(table: CastTable, node: int, ray: Ray, t_min: float, t_max: floa
     low, high = max(low, min(near, far)), min(high, max(near, far))
     near, far = (box[node, 2] - ray.z) * ray.dz, (box[node, 5] - ray.z) * ray.dz
     low, high = max(low, min(near, far)), min(high, max(near, far))
-    return high >= low and high >= t_min and low <= t_max
+    meets: bool = high >= low and high >= t_min and low <= t_max
+    return meets
 
 
 @njit(cache=True)
@@ -167,18 +177,18 @@ def _ray_in_boxes(table: CastTable, ray: Ray) -> Ray:
 
 @njit(cache=True)
 def nearest_hit(
-    table: CastTable, ray: Ray, t_min: float, t_max: float, guess: int
-) -> tuple[float, int]:
+    table: CastTable, ray: Ray, t_min: float, t_max: float, guess: Index
+) -> tuple[float, Index]:
     """First rectangle a ray meets between two distances: (t, index), or (t_max, -1).
 
     The guess, -1 for none, changes no result: trying first what a neighbouring ray hit spares the
     boxes behind it.
     """
-    best_t, best = t_max, _NOTHING
+    best_t, best = t_max, np.int64(_NOTHING)
     if guess >= 0:
         t = _hit_distance(table, guess, ray, t_min)
         if 0.0 <= t < best_t:
-            best_t, best = t, guess
+            best_t, best = t, np.int64(guess)
     inverse = _ray_in_boxes(table, ray)
     node, n_nodes = 0, table.boxes.shape[0]
     while node < n_nodes:
@@ -194,7 +204,7 @@ def nearest_hit(
     return best_t, best
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def cast_rays(
     table: CastTable,
     origins: NDArray[np.float64],
@@ -203,19 +213,23 @@ def cast_rays(
     rectangle: NDArray[np.int32],
 ) -> None:
     """Fill t (n,) and rectangle (n,) for rays (n, 3) from the scene's origin; inf and -1 = none."""
-    n_rays = directions.shape[0]
-    for block in prange((n_rays + _BLOCK - 1) // _BLOCK):
-        guess = _NOTHING
-        for i in range(block * _BLOCK, min(n_rays, (block + 1) * _BLOCK)):
-            o, d = origins[i], directions[i]
-            ray = Ray(o[0], o[1], o[2], d[0], d[1], d[2])
-            t[i], guess = nearest_hit(table, ray, 1e-9, np.inf, guess)
-            rectangle[i] = guess
+    guess: Index = _NOTHING
+    for i in range(directions.shape[0]):
+        ray = Ray(
+            origins[i, 0],
+            origins[i, 1],
+            origins[i, 2],
+            directions[i, 0],
+            directions[i, 1],
+            directions[i, 2],
+        )
+        t[i], guess = nearest_hit(table, ray, 1e-9, np.inf, guess)
+        rectangle[i] = guess
 
 
 @njit(cache=True)
 def shade_of_hit(
-    table: CastTable, index: int, ray: Ray, t: float
+    table: CastTable, index: Index, ray: Ray, t: float
 ) -> tuple[float, float, float, float]:
     """Red, green, blue, reflectance where a ray hits a rectangle."""
     r = table.rectangles
@@ -243,28 +257,32 @@ def _cell_ray(grid: Grid, column: float, row: float) -> Ray:
 
 @njit(cache=True)
 def _look_from_stations(
-    table: CastTable, stations: Stations, x: float, y: float, z: float
+    table: CastTable, objects: CastTable, stations: Stations, point: Ray
 ) -> tuple[bool, bool]:
     """Whether a station sees a surface point, and whether an object hides it from one."""
     seen, hidden = False, False
+    up = stations.up
     for station in range(stations.positions.shape[0]):
-        s, up = stations.positions[station], stations.up
-        dx, dy, dz = x - s[0], y - s[1], z - s[2]
+        x = stations.positions[station, 0]
+        y = stations.positions[station, 1]
+        z = stations.positions[station, 2]
+        dx, dy, dz = point.x - x, point.y - y, point.z - z
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         sine = (dx * up[0] + dy * up[1] + dz * up[2]) / length
         if sine < stations.lowest_sine or sine > stations.highest_sine:
             continue
-        ray = Ray(s[0], s[1], s[2], dx / length, dy / length, dz / length)
+        ray = Ray(x, y, z, dx / length, dy / length, dz / length)
         _, blocker = nearest_hit(table, ray, 1e-9, length - _SEEN_WITHIN_M, _NOTHING)
         if blocker < 0:
             seen = True
-        elif table.role[blocker] == _OBJECT:
-            hidden = True
+        elif not hidden:
+            _, blocker = nearest_hit(objects, ray, 1e-9, length - _SEEN_WITHIN_M, _NOTHING)
+            hidden = bool(blocker >= 0)
     return seen, hidden
 
 
 @njit(cache=True)
-def _covers_cell(table: CastTable, grid: Grid, column: int, row: int, index: int) -> bool:
+def _covers_cell(table: CastTable, grid: Grid, column: Index, row: Index, index: Index) -> bool:
     """Whether the rays through the corners of a cell all meet one rectangle first."""
     reach = grid.front_m + grid.behind_m
     for corner in range(4):
@@ -277,7 +295,7 @@ def _covers_cell(table: CastTable, grid: Grid, column: int, row: int, index: int
 
 @njit(cache=True)
 def _mean_colour(
-    table: CastTable, grid: Grid, column: int, row: int, guess: int
+    table: CastTable, grid: Grid, column: Index, row: Index, guess: Index
 ) -> tuple[float, float, float]:
     """Mean colour of the rays of a cell that hit something; -1 when none does.
 
@@ -313,8 +331,9 @@ def _mean_colour(
 
 @njit(cache=True)
 def _look_at_cell(
-    table: CastTable, grid: Grid, stations: Stations, truth: CellTruth, column: int, row: int
+    scene: ViewedScene, grid: Grid, truth: CellTruth, column: Index, row: Index
 ) -> None:
+    table = scene.table
     guess = np.int64(truth.rectangle[row, column - 1]) if column > 0 else _NOTHING
     ray = _cell_ray(grid, column + 0.5, row + 0.5)
     t, index = nearest_hit(table, ray, 0.0, grid.front_m + grid.behind_m, guess)
@@ -326,25 +345,26 @@ def _look_at_cell(
     truth.rgb[row, column, 2] = blue
     truth.depth_m[row, column] = grid.front_m - t
     truth.rectangle[row, column] = index
-    seen, hidden = _look_from_stations(
-        table, stations, ray.x + t * ray.dx, ray.y + t * ray.dy, ray.z + t * ray.dz
+    # The surface point; its direction is back to the front.
+    point = Ray(
+        ray.x + t * ray.dx, ray.y + t * ray.dy, ray.z + t * ray.dz, -ray.dx, -ray.dy, -ray.dz
     )
-    # Seen straight from the front, but from beyond the buffer: an object before the wall.
-    front = Ray(ray.x, ray.y, ray.z, -ray.dx, -ray.dy, -ray.dz)
-    _, blocker = nearest_hit(table, front, 1e-9, np.inf, _NOTHING)
-    in_front = blocker >= 0 and table.role[blocker] == _OBJECT
+    seen, hidden = _look_from_stations(table, scene.objects, scene.stations, point)
+    # Beyond the buffer, seen straight from the front: an object before the wall.
+    _, blocker = nearest_hit(scene.objects, point, t + 1e-9, np.inf, _NOTHING)
     truth.seen[row, column] = seen
-    truth.behind_object[row, column] = hidden or in_front
+    truth.behind_object[row, column] = hidden or blocker >= 0
 
 
-@njit(cache=True, parallel=True)
-def look_at_cells(table: CastTable, grid: Grid, stations: Stations, truth: CellTruth) -> None:
-    """Fill `truth` with what is seen orthogonally in each cell; untouched where nothing is.
+@njit(cache=True, nogil=True)
+def look_at_cells(
+    scene: ViewedScene, grid: Grid, truth: CellTruth, first_row: int, last_row: int
+) -> None:
+    """Fill rows of `truth` with what is seen orthogonally in each cell; untouched where nothing is.
 
     rgb is the mean over those rays of the cell that hit something; the rest holds for the ray
     through the cell's centre.
     """
-    n_rows, n_columns = truth.rectangle.shape
-    for row in prange(n_rows):
-        for column in range(n_columns):
-            _look_at_cell(table, grid, stations, truth, column, np.int64(row))
+    for row in range(first_row, last_row):
+        for column in range(truth.rectangle.shape[1]):
+            _look_at_cell(scene, grid, truth, column, row)

@@ -6,7 +6,10 @@ Import this module where it is used: it loads compiled kernels.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +20,15 @@ from orthoflow.geometry.scene_kernels import (
     CellTruth,
     Grid,
     Stations,
+    ViewedScene,
     cast_rays,
     look_at_cells,
 )
-from orthoflow.geometry.scenes import Scene, Viewers
+from orthoflow.geometry.scenes import Scene, SurfaceRole, Viewers
 from orthoflow.geometry.texture_kernels import paint_points
+
+_RAYS_PER_TASK: Final = 1 << 15
+_ROWS_PER_TASK: Final = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,24 +79,42 @@ class TrueOrthoimage:
     behind_object: NDArray[np.bool_]
 
 
-def cast(scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
+def cast(
+    scene: Scene,
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    *,
+    cores: int = 1,
+) -> Hits:
     """Find what rays meet first.
 
     Args:
         scene: the scene.
         origins: (n, 3) or (3,) world points in metres.
         directions: (n, 3) world vectors of any length.
+        cores: number of threads; changes no result.
     """
     n_rays = len(directions)
     starts = np.ascontiguousarray(np.broadcast_to(origins - scene.origin, (n_rays, 3)))
     t = np.full(n_rays, np.inf)
     rectangle = np.full(n_rays, -1, dtype=np.int32)
-    cast_rays(cast_table(scene), starts, np.ascontiguousarray(directions), t, rectangle)
+    ways = np.ascontiguousarray(directions, dtype=np.float64)
+    table = cast_table(scene)
+
+    def cast_part(first: int, last: int) -> None:
+        part = slice(first, last)
+        cast_rays(table, starts[part], ways[part], t[part], rectangle[part])
+
+    in_threads(cast_part, n_rays, _RAYS_PER_TASK, cores=cores)
     return Hits(t=t, rectangle=rectangle)
 
 
 def colours_at(
-    scene: Scene, rectangle: NDArray[np.int32], points_world: NDArray[np.float64]
+    scene: Scene,
+    rectangle: NDArray[np.int32],
+    points_world: NDArray[np.float64],
+    *,
+    cores: int = 1,
 ) -> Colours:
     """Colours of points (n, 3) on given rectangles (n,), e.g. those of `cast`.
 
@@ -104,13 +129,14 @@ def colours_at(
         ]
     )
     painted = np.zeros((len(relative), 4))
-    paint_points(
-        scene.texture,
-        scene.texture_params,
-        np.ascontiguousarray(rectangle, dtype=np.int32),
-        in_rectangle,
-        painted,
-    )
+    kinds, params = np.array(scene.texture), np.array(scene.texture_params)
+    chosen_rectangle = np.ascontiguousarray(rectangle, dtype=np.int32)
+
+    def paint_part(first: int, last: int) -> None:
+        part = slice(first, last)
+        paint_points(kinds, params, chosen_rectangle[part], in_rectangle[part], painted[part])
+
+    in_threads(paint_part, len(relative), _RAYS_PER_TASK, cores=cores)
     return Colours(rgb=painted[:, :3], reflectance=painted[:, 3])
 
 
@@ -122,6 +148,7 @@ def render_frame(
     buffer_behind_m: float,
     viewers: Viewers | None = None,
     supersample: int = 3,
+    cores: int = 1,
 ) -> TrueOrthoimage:
     """Render the true orthoimage of a frame.
 
@@ -132,6 +159,7 @@ def render_frame(
         buffer_behind_m: likewise behind.
         viewers: who may see the surface; without, nobody does.
         supersample: colours are the mean of supersample^2 rays per cell.
+        cores: number of threads; changes no result.
     """
     truth = CellTruth(
         rgb=np.full((*frame.shape, 3), np.nan, dtype=np.float32),
@@ -149,7 +177,13 @@ def render_frame(
         behind_m=float(buffer_behind_m),
         n_sub=supersample,
     )
-    look_at_cells(cast_table(scene), grid, _stations(scene, viewers), truth)
+    viewed = viewed_scene(scene, viewers)
+    in_threads(
+        lambda first, last: look_at_cells(viewed, grid, truth, first, last),
+        frame.height,
+        _ROWS_PER_TASK,
+        cores=cores,
+    )
     return TrueOrthoimage(
         frame=frame,
         rgb=truth.rgb,
@@ -160,22 +194,40 @@ def render_frame(
     )
 
 
+def in_threads(
+    work: Callable[[int, int], None], n_items: int, n_per_task: int, *, cores: int
+) -> None:
+    """Call `work(first, last)` over runs of items, in several threads."""
+    starts = range(0, n_items, n_per_task)
+    with ThreadPoolExecutor(max(1, cores)) as pool:
+        for task in [pool.submit(work, s, min(n_items, s + n_per_task)) for s in starts]:
+            task.result()
+
+
+def viewed_scene(scene: Scene, viewers: Viewers | None) -> ViewedScene:
+    """Lay a scene out for rendering."""
+    return ViewedScene(
+        table=cast_table(scene),
+        objects=cast_table(scene.only(scene.role == SurfaceRole.OBJECT)),
+        stations=_stations(scene, viewers),
+    )
+
+
 def cast_table(scene: Scene) -> CastTable:
-    """Lay a scene out for the kernels, with its tree of bounding boxes."""
+    """Lay a scene out for ray casting, with its tree of bounding boxes."""
     tree = _BoxTree(scene)
     first_hole = np.searchsorted(scene.hole_rectangle, np.arange(len(scene) + 1))
     return CastTable(
         rectangles=np.ascontiguousarray(
             np.hstack([scene.centre, scene.axis_a, scene.axis_b, scene.normal, scene.extent])
         ),
-        role=np.array(scene.role),
         kinds=np.array(scene.texture),
         params=np.array(scene.texture_params),
         holes=np.array(scene.hole_extent),
         first_hole=first_hole.astype(np.int64),
         box_axes=tree.axes,
-        boxes=np.array(tree.boxes),
-        links=np.array(tree.links, dtype=np.int64),
+        boxes=np.array(tree.boxes).reshape(-1, 6),
+        links=np.array(tree.links, dtype=np.int64).reshape(-1, 3),
         order=np.array(tree.order, dtype=np.int64),
     )
 
@@ -202,14 +254,17 @@ class _BoxTree:
     """
 
     def __init__(self, scene: Scene) -> None:
+        self.boxes: list[list[float]] = []
+        self.links: list[tuple[int, int, int]] = []
+        self.order: list[int] = []
+        self.axes = np.eye(3)
+        if len(scene) == 0:
+            return
         self.axes = _tightest_axes(scene)
         corners = scene.corners_m() @ self.axes.T
         # A micrometre of slack: a rectangle along the axes must not have an empty box.
         self._low = corners.min(axis=1) - 1e-6
         self._high = corners.max(axis=1) + 1e-6
-        self.boxes: list[list[float]] = []
-        self.links: list[tuple[int, int, int]] = []
-        self.order: list[int] = []
         self._add(np.arange(len(scene)))
 
     def _add(self, members: NDArray[np.int64]) -> None:
@@ -262,6 +317,9 @@ def _running_surfaces(low: NDArray[np.float64], high: NDArray[np.float64]) -> ND
 def _tightest_axes(scene: Scene) -> NDArray[np.float64]:
     corners = scene.corners_m()
     axes = np.stack([scene.axis_a, scene.axis_b, scene.normal], axis=1)
+    # Many rectangles share their axes; each set is tried once.
+    _, first = np.unique(axes.reshape(-1, 9).round(9), axis=0, return_index=True)
+    axes = axes[np.sort(first)]
     surfaces = []
     for candidate in axes:
         x, y, z = np.ptp(corners @ candidate.T, axis=1).T

@@ -108,6 +108,24 @@ class Scene:
         corners: NDArray[np.float64] = self.centre[:, None, :] + a + b
         return corners
 
+    def only(self, chosen: NDArray[np.bool_]) -> Scene:
+        """Give the chosen rectangles (r,) alone, with their holes."""
+        place = np.cumsum(chosen) - 1
+        holes = chosen[self.hole_rectangle]
+        return replace(
+            self,
+            centre=self.centre[chosen],
+            axis_a=self.axis_a[chosen],
+            axis_b=self.axis_b[chosen],
+            extent=self.extent[chosen],
+            plane_index=self.plane_index[chosen],
+            role=self.role[chosen],
+            texture=self.texture[chosen],
+            texture_params=self.texture_params[chosen],
+            hole_rectangle=place[self.hole_rectangle[holes]].astype(np.int32),
+            hole_extent=self.hole_extent[holes],
+        )
+
     def turned(self, rotation: NDArray[np.float64]) -> Scene:
         """Turn the scene about its origin by a rotation matrix (3, 3)."""
         return replace(

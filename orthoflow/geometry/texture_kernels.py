@@ -9,13 +9,11 @@ Ornaments have sharp edges.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
-
-_BLOCK: Final = 4096
 
 # The small functions carry explicit types: otherwise each constant they are called with would
 # compile a version of its own, which costs seconds at the first run.
@@ -158,7 +156,7 @@ def _grain(a: float, b: float, period: float, seed: int) -> float:
 @njit(cache=True)
 def _pattern(kind: int, params: NDArray[np.float64], a: float, b: float) -> Pattern:
     """What is painted at (a, b)."""
-    period, seed = params[5], np.int64(params[6])
+    period, seed = params[5], int(params[6])
     light = _stains(a, b, period, seed)
     warmth = _stains(a + 11.0, b - 7.0, 1.7 * period, seed + 10)
     paint, hue, other = 0.0, 0.0, warmth
@@ -209,7 +207,7 @@ def colour_at(kind: int, params: NDArray[np.float64], a: float, b: float) -> Sha
     )
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def paint_points(
     kinds: NDArray[np.int32],
     params: NDArray[np.float64],
@@ -221,16 +219,14 @@ def paint_points(
 
     Points on rectangle -1 are left as they are.
     """
-    n_points = rectangle.shape[0]
-    for block in prange((n_points + _BLOCK - 1) // _BLOCK):
-        for point in range(block * _BLOCK, min(n_points, (block + 1) * _BLOCK)):
-            index = rectangle[point]
-            if index < 0:
-                continue
-            shade = colour_at(
-                kinds[index], params[index], in_rectangle[point, 0], in_rectangle[point, 1]
-            )
-            painted[point, 0] = shade.red
-            painted[point, 1] = shade.green
-            painted[point, 2] = shade.blue
-            painted[point, 3] = shade.reflectance
+    for point in range(rectangle.shape[0]):
+        index = rectangle[point]
+        if index < 0:
+            continue
+        shade = colour_at(
+            kinds[index], params[index], in_rectangle[point, 0], in_rectangle[point, 1]
+        )
+        painted[point, 0] = shade.red
+        painted[point, 1] = shade.green
+        painted[point, 2] = shade.blue
+        painted[point, 3] = shade.reflectance

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
+
+if TYPE_CHECKING:
+    from cv2.typing import MatLike
 
 DEPTH_SPAN_MM: Final = 10.0
 COLOUR_SPAN_GREY: Final = 60.0
@@ -32,9 +35,10 @@ def colour_error_map(error_grey: NDArray[np.float64]) -> bytes:
     return _png(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), np.isnan(error_grey))
 
 
-def _png(bgr: NDArray[np.uint8], missing: NDArray[np.bool_]) -> bytes:
+def _png(coloured: MatLike, missing: NDArray[np.bool_]) -> bytes:
     import cv2
 
+    bgr = np.asarray(coloured, dtype=np.uint8)
     bgr[missing] = (60, 40, 20)
     scale = min(1.0, _WIDEST_PX / max(bgr.shape[:2]))
     if scale < 1.0:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 _PATCH: Final = 32
 _SMOOTH_CELLS: Final = 1.0
-_LEAST_SHARE: Final = 0.4
-_LEAST_WEIGHT: Final = 0.8
+_LEAST_SHARE: Final = 0.3
+_LEAST_REGION: Final = 0.8
+_LEAST_WEIGHT: Final = 0.25
 _ROUNDS: Final = 12
 _CONVERGED_CELLS: Final = 0.002
 # Smoothing makes neighbouring cells alike; so many cells count as one when precision is judged.
@@ -25,11 +26,13 @@ class GreyImage:
 
     Attributes:
         grey: (rows, cols) float64.
-        valid: (rows, cols) bool.
+        valid: (rows, cols) bool, cells that count.
+        region: (rows, cols) bool, the whole of the surface, whatever is missing on it.
     """
 
     grey: NDArray[np.float64]
     valid: NDArray[np.bool_]
+    region: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,16 +81,23 @@ def measure_shifts(shown: GreyImage, true: GreyImage, *, reach_cells: int) -> Pa
 def _smoothed(image: GreyImage) -> GreyImage:
     """Smooth by a Gaussian of one cell, as if only valid cells were there.
 
-    Beside larger invalid areas the mean leans to one side, by what the mask cuts off and not by
-    what is shown; such cells do not count. Single holes do no harm.
+    At the rim of the region the mean leans to one side, by what the region cuts off and not by
+    what is shown; such cells do not count. Scattered holes do no harm.
     """
+    inside = _gauss(image.region) > _LEAST_REGION
+    weight = _gauss(image.valid)
+    grey = _gauss(np.where(image.valid, image.grey, 0.0)) / np.maximum(weight, 1e-6)
+    valid = image.valid & inside & (weight > _LEAST_WEIGHT)
+    return GreyImage(grey=grey, valid=valid, region=image.region)
+
+
+def _gauss(values: NDArray[np.float64] | NDArray[np.bool_]) -> NDArray[np.float64]:
     from scipy.ndimage import gaussian_filter
 
-    weight = gaussian_filter(image.valid.astype(np.float64), _SMOOTH_CELLS, mode="constant")
-    grey = gaussian_filter(np.where(image.valid, image.grey, 0.0), _SMOOTH_CELLS, mode="constant")
-    return GreyImage(
-        grey=grey / np.maximum(weight, 1e-6), valid=image.valid & (weight > _LEAST_WEIGHT)
+    smooth: NDArray[np.float64] = gaussian_filter(
+        values.astype(np.float64), _SMOOTH_CELLS, mode="constant"
     )
+    return smooth
 
 
 def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchShifts:
@@ -176,8 +186,9 @@ class _Sampler:
         from scipy.ndimage import spline_filter
 
         self._spline = spline_filter(true.grey, order=3)
-        slope_v, slope_u = np.gradient(true.grey)
-        self._linear = (slope_u, slope_v, true.valid.astype(np.float64))
+        self._slope_v: NDArray[np.float64] = np.gradient(true.grey, axis=0)
+        self._slope_u: NDArray[np.float64] = np.gradient(true.grey, axis=1)
+        self._valid = true.valid.astype(np.float64)
 
     def at(
         self, patches: _Patches, shift: NDArray[np.float64]
@@ -187,9 +198,9 @@ class _Sampler:
 
         at = [patches.rows - shift[:, 1:2], patches.columns - shift[:, :1]]
         expected = map_coordinates(self._spline, at, order=3, prefilter=False, mode="nearest")
-        slope_u, slope_v, valid = (
-            map_coordinates(image, at, order=1, mode="constant", cval=0.0) for image in self._linear
-        )
+        slope_u = map_coordinates(self._slope_u, at, order=1, mode="nearest")
+        slope_v = map_coordinates(self._slope_v, at, order=1, mode="nearest")
+        valid = map_coordinates(self._valid, at, order=1, mode="constant", cval=0.0)
         # The derivative of true(x - shift) by the shift is minus the slope.
         design = np.stack([-slope_u, -slope_v, np.ones_like(expected)], axis=-1)
         return expected, design, valid > 0.999

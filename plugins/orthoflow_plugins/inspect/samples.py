@@ -87,7 +87,7 @@ def wall_errors(image: Orthoimage, wall: Wall, true: TrueOrthoimage) -> WallErro
     depth = np.where(
         (wall.mask == SurfaceMask.MEASURED) & known, wall.depth_m.astype(np.float64), np.nan
     ) - true.depth_m.astype(np.float64)
-    patches = _shifts(image, true, painted & ~steps, known & ~steps)
+    patches = _shifts(image, true, steps)
     gross = _gross_colours(image, true) & painted & ~steps
     measured = np.isfinite(depth)
     samples = WallSamples(
@@ -160,19 +160,20 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     return band
 
 
-def _shifts(
-    image: Orthoimage,
-    true: TrueOrthoimage,
-    shown: NDArray[np.bool_],
-    known: NDArray[np.bool_],
-) -> PatchShifts:
+def _shifts(image: Orthoimage, true: TrueOrthoimage, steps: NDArray[np.bool_]) -> PatchShifts:
+    known = (true.rectangle >= 0) & ~steps
+    painted = image.mask == OrthoMask.PAINTED
+    filled = image.mask == OrthoMask.FILLED
     # Two centimetres is far beyond any fair error; further off is reported as gross colour.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
     return measure_shifts(
-        GreyImage(grey=image.rgb @ _LUMINANCE, valid=shown),
+        GreyImage(
+            grey=image.rgb @ _LUMINANCE, valid=painted & known, region=(painted | filled) & known
+        ),
         GreyImage(
             grey=np.where(known, np.nan_to_num(true.rgb).astype(np.float64) @ _LUMINANCE, 0.0),
             valid=known,
+            region=known,
         ),
         reach_cells=reach,
     )

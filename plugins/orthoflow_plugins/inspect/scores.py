@@ -16,8 +16,8 @@ from orthoflow_plugins.inspect.samples import WallSamples
 FOUND_ANGLE_DEG: Final = 1.0
 FOUND_OFFSET_M: Final = 0.015
 # A wall further off than this shows no true plane.
-_SAME_ANGLE_DEG: Final = 5.0
-_SAME_OFFSET_M: Final = 0.08
+_SAME_ANGLE_DEG: Final = 3.0
+_SAME_OFFSET_M: Final = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)

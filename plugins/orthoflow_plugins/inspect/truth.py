@@ -71,7 +71,6 @@ class InspectTruth(Method):
         from orthoflow_plugins.inspect.samples import pooled
         from orthoflow_plugins.inspect.scores import found_planes, label_findings, sample_findings
 
-        _use_cores(ctx)
         if not inputs.orthoimages.images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
         findings: list[Finding] = []
@@ -79,7 +78,7 @@ class InspectTruth(Method):
         for place, image in enumerate(inputs.orthoimages.images):
             ctx.progress(place / len(inputs.orthoimages.images), f"wall {image.name}")
             wall = _wall_of(image, inputs.walls)
-            true = _true_orthoimage(image, inputs, params.supersample)
+            true = _true_orthoimage(image, inputs, params, ctx.cores)
             findings += _plane_findings(image, inputs.truth)
             errors.append(_wall_errors(image, wall, true))
             findings += sample_findings(errors[-1].samples, image.wall)
@@ -92,12 +91,6 @@ class InspectTruth(Method):
             findings += label_findings(inputs.labels, inputs.truth)
         _report(findings, inputs.orthoimages.images[0].wall, ctx)
         return self.Out(inspection=_inspection(inputs.orthoimages, errors, findings))
-
-
-def _use_cores(ctx: StepContext) -> None:
-    import numba
-
-    numba.set_num_threads(min(ctx.cores, numba.config.NUMBA_NUM_THREADS))
 
 
 def _wall_of(image: Orthoimage, walls: Walls) -> Wall:
@@ -116,7 +109,7 @@ def _wall_of(image: Orthoimage, walls: Walls) -> Wall:
 
 
 def _true_orthoimage(
-    image: Orthoimage, inputs: InspectTruth.In, supersample: int
+    image: Orthoimage, inputs: InspectTruth.In, params: InspectTruth.Params, cores: int
 ) -> TrueOrthoimage:
     from orthoflow.geometry.scene_views import render_frame
 
@@ -133,7 +126,8 @@ def _true_orthoimage(
         buffer_front_m=inputs.walls.buffer_front_m,
         buffer_behind_m=inputs.walls.buffer_behind_m,
         viewers=viewers,
-        supersample=supersample,
+        supersample=params.supersample,
+        cores=cores,
     )
 
 

@@ -45,7 +45,7 @@ def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
         ctx.metric("scan_step_p90_mm", 1000.0 * step.p90_m, "mm")
     ctx.figure(
         "main_wall",
-        _picture(truth),
+        _picture(truth, ctx.cores),
         f"True orthoimage of the {truth.planes.names[0]} at {_PICTURE_GSD_M * 1000:.0f} mm.",
     )
 
@@ -76,7 +76,7 @@ def _inner(filled: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return inner
 
 
-def _picture(truth: Truth) -> bytes:
+def _picture(truth: Truth, cores: int) -> bytes:
     import cv2
 
     frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=_PICTURE_GSD_M)

@@ -6,10 +6,10 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
-from orthoflow.geometry.scene_kernels import CastTable, Ray, nearest_hit, shade_of_hit
+from orthoflow.geometry.scene_kernels import CastTable, Index, Ray, nearest_hit, shade_of_hit
 from orthoflow.geometry.texture_kernels import cell_state, uniform
 
 # `Scanned.rectangle` of a ray that met nothing, and of a gross outlier or a mixed distance.
@@ -55,6 +55,13 @@ class Errors(NamedTuple):
     colour_noise: float
 
 
+class Columns(NamedTuple):
+    """A run of columns, the last one not included."""
+
+    first: int
+    last: int
+
+
 class Scanned(NamedTuple):
     """What a scan gives, one entry per ray, column by column.
 
@@ -79,7 +86,8 @@ class Scanned(NamedTuple):
 def _normal(state: np.uint64, draw: int) -> float:
     """Normally distributed number (Box and Muller), one per even number of a draw."""
     length = math.sqrt(-2.0 * math.log(1.0 - uniform(state, draw)))
-    return length * math.cos(6.283185307179586 * uniform(state, draw + 1))
+    value: float = length * math.cos(6.283185307179586 * uniform(state, draw + 1))
+    return value
 
 
 @njit(cache=True)
@@ -96,10 +104,11 @@ def _direction(azimuth: float, elevation: float, station: NDArray[np.float64]) -
 
 
 @njit(cache=True)
-def _cosine(table: CastTable, index: int, ray: Ray) -> float:
+def _cosine(table: CastTable, index: Index, ray: Ray) -> float:
     """Cosine of the angle of incidence."""
-    r = table.rectangles[index]
-    return abs(r[9] * ray.dx + r[10] * ray.dy + r[11] * ray.dz)
+    r = table.rectangles
+    cosine: float = abs(r[index, 9] * ray.dx + r[index, 10] * ray.dy + r[index, 11] * ray.dz)
+    return cosine
 
 
 @njit("f8(i8, f8, f8, f8)", cache=True)
@@ -112,7 +121,7 @@ def _range_sigma(kind: int, distance: float, cosine: float, noise_m: float) -> f
 
 @njit(cache=True)
 def _spoilt_distance(
-    table: CastTable, ray: Ray, index: int, distance: float, state: np.uint64, errors: Errors
+    table: CastTable, ray: Ray, index: Index, distance: float, state: np.uint64, errors: Errors
 ) -> float:
     """Distance of a gross outlier or a mixed pixel; -1 when the ray is neither."""
     if uniform(state, 0) < errors.outlier_share:
@@ -167,10 +176,12 @@ def _measure(
     scanned.rgb[point, 2] = _grey(blue, errors.colour_noise * _normal(state, 18))
 
 
-@njit(cache=True, parallel=True)
-def sweep_scene(table: CastTable, sweep: Sweep, errors: Errors, scanned: Scanned) -> None:
-    """Scan a scene; every ray's noise is a function of seed, column and row alone."""
-    for column in prange(sweep.n_columns):
+@njit(cache=True, nogil=True)
+def sweep_columns(
+    table: CastTable, sweep: Sweep, errors: Errors, scanned: Scanned, columns: Columns
+) -> None:
+    """Scan some columns; every ray's noise is a function of seed, column and row alone."""
+    for column in range(columns.first, columns.last):
         guess = np.int64(MISSED)
         for row in range(sweep.n_rows):
             point = column * sweep.n_rows + row
@@ -180,7 +191,6 @@ def sweep_scene(table: CastTable, sweep: Sweep, errors: Errors, scanned: Scanned
                 sweep.station,
             )
             scanned.rectangle[point] = guess
-            _measure(
-                table, ray, cell_state(column, row, sweep.seed), errors, np.int64(point), scanned
-            )
+            state = cell_state(column, row, sweep.seed)
+            _measure(table, ray, state, errors, point, scanned)
             guess = max(np.int64(MISSED), np.int64(scanned.rectangle[point]))

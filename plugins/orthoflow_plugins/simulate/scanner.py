@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.scene_views import cast_table
+from orthoflow.geometry.scene_kernels import CastTable
+from orthoflow.geometry.scene_views import cast_table, in_threads
 from orthoflow.geometry.scenes import Scene
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.palace import main_wall_axes
-from orthoflow_plugins.simulate.scan_kernels import MISSED, Errors, Scanned, Sweep, sweep_scene
+from orthoflow_plugins.simulate.scan_kernels import (
+    MISSED,
+    Columns,
+    Errors,
+    Scanned,
+    Sweep,
+    sweep_columns,
+)
 
 # No scan of the zenith: its points would crowd the ceiling over the station.
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
+_COLUMNS_PER_TASK: Final = 16
 
 # Along the main wall, towards it, and over the origin, metres; clear of everything in the room.
 _PLACES_M: Final = (
@@ -96,7 +105,6 @@ def planned_sweeps(
 
 def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepContext) -> Scan:
     """Scan a scene whose origin is the room's."""
-    numba.set_num_threads(min(ctx.cores, numba.config.NUMBA_NUM_THREADS))
     table = cast_table(scene)
     sizes = [sweep.n_columns * sweep.n_rows for sweep in sweeps]
     starts = np.concatenate([[0], np.cumsum(sizes)])
@@ -107,12 +115,36 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
     for index, sweep in enumerate(sweeps):
         ctx.progress(index / len(sweeps), f"scan {index + 1} of {len(sweeps)}")
         span = slice(int(starts[index]), int(starts[index + 1]))
-        sweep_scene(table, sweep, errors, Scanned(*(array[span] for array in points)))
+        part = part_of(points, span)
+        in_threads(
+            partial(_sweep, table, sweep, errors, part),
+            sweep.n_columns,
+            _COLUMNS_PER_TASK,
+            cores=ctx.cores,
+        )
         scan[span] = index
         row[span] = np.tile(np.arange(sweep.n_rows, dtype=np.uint32), sweep.n_columns)
         column[span] = np.repeat(np.arange(sweep.n_columns, dtype=np.uint32), sweep.n_rows)
     stations = np.array([sweep.station for sweep in sweeps])
     return _only_hits(Scan(points=points, scan=scan, row=row, column=column, stations=stations))
+
+
+def part_of(points: Scanned, part: slice | NDArray[np.bool_]) -> Scanned:
+    """Give some of the entries; a view for a slice."""
+    return Scanned(
+        x=points.x[part],
+        y=points.y[part],
+        z=points.z[part],
+        intensity=points.intensity[part],
+        rgb=points.rgb[part],
+        rectangle=points.rectangle[part],
+    )
+
+
+def _sweep(  # the range comes last, as `in_threads` gives it
+    table: CastTable, sweep: Sweep, errors: Errors, scanned: Scanned, first: int, last: int
+) -> None:
+    sweep_columns(table, sweep, errors, scanned, Columns(first, last))
 
 
 def _allocated(n_points: int, ctx: StepContext) -> Scanned:
@@ -135,7 +167,7 @@ def _only_hits(scan: Scan) -> Scan:
     if bool(hit.all()):
         return scan
     return Scan(
-        points=Scanned(*(array[hit] for array in scan.points)),
+        points=part_of(scan.points, hit),
         scan=scan.scan[hit],
         row=scan.row[hit],
         column=scan.column[hit],
