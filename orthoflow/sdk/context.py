@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -164,10 +165,17 @@ class StepContext:
             name: field of the product, or a name of your own for intermediate data.
             shape: shape of the array.
             dtype: numpy type.
+
+        Raises:
+            OSError: the disk has no room for it.
         """
-        if math.prod(shape) == 0:
+        size_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+        if size_bytes == 0:
             return np.zeros(shape, dtype=dtype)
         folder = self.scratch / "allocated"
         folder.mkdir(exist_ok=True)
         path = folder / f"{port}.{name.replace('/', '.')}"
-        return np.memmap(path, dtype=np.dtype(dtype), mode="w+", shape=shape)
+        with path.open("wb") as file:
+            # Writing into the hole of a sparse file on a full disk would kill the process.
+            os.posix_fallocate(file.fileno(), 0, size_bytes)
+        return np.memmap(path, dtype=np.dtype(dtype), mode="r+", shape=shape)
