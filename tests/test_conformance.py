@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import mkdtemp
+
 import pytest
 
 from orthoflow.catalog import discover_catalog
+from orthoflow.files.images import encode_jpeg
+from orthoflow.products import InputFiles
 from orthoflow.testing import ConformanceCase, conformance_cases
+from tests import photo_files
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
 QUICK: dict[str, dict[str, object]] = {
@@ -14,12 +21,31 @@ QUICK: dict[str, dict[str, object]] = {
 }
 
 
+# What a source reads where the suite's own example, a scan, does not fit.
+FILES: dict[str, str] = {"read.photos": "photo.jpg", "read.checkpoints": "points.csv"}
+
+
+def inputs(method_id: str) -> Mapping[str, InputFiles] | None:
+    if method_id not in FILES:
+        return None
+    contents = {
+        "photo.jpg": encode_jpeg(photo_files.picture()),
+        "points.csv": b"name,x,y,z\nA,1,2,3\nB,4,5,6\n",
+    }
+    name = FILES[method_id]
+    folder = Path(mkdtemp(prefix="orthoflow-conformance-"))
+    paths = photo_files.write(folder, {name: contents[name]})
+    return {"files": InputFiles(name="files", paths=paths)}
+
+
 def cases() -> list[ConformanceCase]:
     return [
         case
         for method_id, entry in sorted(discover_catalog().methods.items())
         if entry.distribution.name == "orthoflow-tls"
-        for case in conformance_cases(method_id, params=QUICK.get(method_id))
+        for case in conformance_cases(
+            method_id, inputs=inputs(method_id), params=QUICK.get(method_id)
+        )
     ]
 
 

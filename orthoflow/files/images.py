@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError
+from orthoflow.files.exif import without_orientation
 
 PREVIEW_SIDE_PX: Final = 1600
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
@@ -31,7 +32,8 @@ def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
 
     try:
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(encoded, dtype=np.uint8), flags)
+        data = np.frombuffer(without_orientation(encoded), dtype=np.uint8)
+        image = cv2.imdecode(data, flags)
     except cv2.error as error:
         raise InputError(_not_an_image(encoded, name)) from error
     if image is None:
@@ -73,6 +75,33 @@ def preview_png(
         shown: (rows, cols), True where the image holds something.
         longest_side_px: larger images are averaged down to this; smaller ones stay as they are.
     """
+    return encode_png(_preview(image, shown, longest_side_px))
+
+
+def preview_webp(
+    image: NDArray[np.uint8],
+    shown: NDArray[np.bool_],
+    *,
+    longest_side_px: int = PREVIEW_SIDE_PX,
+    quality: int = 85,
+) -> bytes:
+    """Give the picture of `preview_png` as lossy WebP, about a tenth of the bytes.
+
+    Args:
+        image: (rows, cols) grey or (rows, cols, 3) RGB.
+        shown: (rows, cols), True where the image holds something.
+        longest_side_px: larger images are averaged down to this; smaller ones stay as they are.
+        quality: 1..100.
+    """
+    import cv2
+
+    pixels = _preview(image, shown, longest_side_px)
+    return _encode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
+
+
+def _preview(
+    image: NDArray[np.uint8], shown: NDArray[np.bool_], longest_side_px: int
+) -> NDArray[np.uint8]:
     colour = np.dstack([image] * 3) if image.ndim == 2 else image
     weight = shown.astype(np.float32)
     if max(shown.shape) > longest_side_px:
@@ -81,7 +110,7 @@ def preview_png(
         weight = _shrink(weight, longest_side_px)
         colour = np.rint(summed / np.maximum(weight, 1e-6)[:, :, None]).astype(np.uint8)
     alpha = np.rint(weight * 255.0).astype(np.uint8)
-    return encode_png(np.dstack([colour, alpha]))
+    return np.dstack([colour, alpha])
 
 
 def _shrink(values: NDArray[np.float32], longest_side_px: int) -> NDArray[np.float32]:

@@ -153,6 +153,16 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="E57, LAS/LAZ, PLY, PCD, PTX and text scans -> cloud",
         ),
         MethodSpec(
+            id="read.photos",
+            target="orthoflow_plugins.read.photos:ReadPhotos",
+            summary="JPEG, PNG and TIFF photos as they are, with EXIF and calibration",
+        ),
+        MethodSpec(
+            id="read.checkpoints",
+            target="orthoflow_plugins.read.checkpoints:ReadCheckpoints",
+            summary="surveyed points from CSV files",
+        ),
+        MethodSpec(
             id="simulate.room",
             target="orthoflow_plugins.simulate.room:SimulateRoom",
             summary="a scanned room with relief, niche and obstacle, and its truth",
@@ -171,6 +181,21 @@ def orthoflow_methods() -> list[MethodSpec]:
             id="raster.grid",
             target="orthoflow_plugins.raster.grid:RasterGrid",
             summary="depth, intensity and colour per cell of each wall",
+        ),
+        MethodSpec(
+            id="match.sift",
+            target="orthoflow_plugins.match.sift:MatchSift",
+            summary="key points of the photos and of the walls, RootSIFT, mutual and distinct",
+        ),
+        MethodSpec(
+            id="match.guided",
+            target="orthoflow_plugins.match.guided:MatchGuided",
+            summary="photos laid into the walls by a first pose and measured there",
+        ),
+        MethodSpec(
+            id="orient.pnp",
+            target="orthoflow_plugins.orient.pnp:OrientPnp",
+            summary="each photo by itself from its ties, with its accuracy or the reason against",
         ),
         MethodSpec(
             id="ortho.pointcloud-direct",

@@ -1,0 +1,363 @@
+"""The calibration file: cameras by photo name or pattern, in OpenCV's model and pixel convention.
+
+```yaml
+cameras:
+  "IMG_00*.jpg": {width: 6000, height: 4000, fx: 4210.5, fy: 4211.2, cx: 2996.1, cy: 2003.7,
+                  distortion: [-0.08, 0.05, 0.0002, -0.0001, 0.0]}
+  "*": {width: 4000, height: 3000, fx: 3004.2, fy: 3004.2, cx: 1999.5, cy: 1499.5}
+```
+
+The first entry that matches a photo holds. Pixels in the file count from the centre of the first
+pixel; inside, that centre is at (0.5, 0.5), and only this module converts.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import warnings
+from collections.abc import Iterable, Mapping
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.constructor import DuplicateKeyError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.scalarbool import ScalarBoolean
+
+from orthoflow.errors import GeometryError, InputError
+from orthoflow.files.sidecars import write_text
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Calibration, Intrinsics
+
+_OPENCV_SHIFT: Final = 0.5
+_MAX_BYTES: Final = 1_000_000
+_SIZES: Final = ("width", "height")
+_FOCALS: Final = ("fx", "fy")
+_CENTRES: Final = ("cx", "cy")
+_DISTORTION: Final = "distortion"
+_REQUIRED: Final = (*_SIZES, *_FOCALS, *_CENTRES)
+_N_DISTORTION: Final = 5
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Read a calibration file.
+
+    Raises:
+        InputError: the file cannot be used; one line per problem, `file:line:column: ...`.
+    """
+    reader = _Reader(path.name)
+    calibration = reader.read(_text_of(path))
+    if calibration is None or reader.problems:
+        raise InputError("\n".join(problem for _, problem in sorted(reader.problems)))
+    return calibration
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Write a calibration file that `read_calibration` reads.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    write_text(path, calibration_text(calibration))
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """Give the content of a calibration file."""
+    lines = [
+        "# Pixels as OpenCV counts them: the centre of the first pixel is (0, 0).",
+        "# distortion: k1, k2, p1, p2, k3. The first entry that matches a photo's name holds.",
+        "cameras:",
+    ]
+    for pattern, camera in zip(calibration.patterns, calibration.intrinsics, strict=True):
+        values = {
+            "width": camera.width,
+            "height": camera.height,
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "cx": camera.cx - _OPENCV_SHIFT,
+            "cy": camera.cy - _OPENCV_SHIFT,
+            _DISTORTION: list(camera.distortion),
+        }
+        lines.append(f"  {json.dumps(pattern, ensure_ascii=False)}:")
+        lines += [f"    {key}: {json.dumps(value)}" for key, value in values.items()]
+    return "\n".join(lines) + "\n"
+
+
+def matching_pattern(calibration: Calibration, photo_name: str) -> str | None:
+    """Give the first pattern that is the photo's name, or matches it as in a shell.
+
+    The case of letters counts. A name that holds brackets matches itself.
+    """
+    for pattern in calibration.patterns:
+        if photo_name == pattern or fnmatchcase(photo_name, pattern):
+            return pattern
+    return None
+
+
+def intrinsics_for(
+    calibration: Calibration, photo_name: str, width: int, height: int
+) -> Intrinsics | None:
+    """Give the calibrated camera of a photo; None when no entry matches its name.
+
+    Args:
+        calibration: the calibrated cameras.
+        photo_name: file name of the photo.
+        width: pixels of its stored array.
+        height: pixels.
+
+    Raises:
+        InputError: the photo has another size than the calibration.
+    """
+    pattern = matching_pattern(calibration, photo_name)
+    if pattern is None:
+        return None
+    camera = calibration.intrinsics[calibration.patterns.index(pattern)]
+    if (camera.width, camera.height) == (width, height):
+        return camera
+    way_out = (
+        "it seems to be for the turned photo: calibrate the pixels as they are stored, without "
+        "the EXIF rotation, or give photos that are stored upright an entry of their own"
+        if (camera.width, camera.height) == (height, width)
+        else "calibrate at the size of the photos, or give this one an entry of its own"
+    )
+    raise InputError(
+        f'photo {photo_name} has {width} x {height} pixels, but its calibration "{pattern}" is '
+        f"for {camera.width} x {camera.height}; {way_out}"
+    )
+
+
+def _text_of(path: Path) -> str:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise InputError(
+                f"{path.name} has {path.stat().st_size} bytes: a calibration file is a short text"
+            )
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path.name} is no UTF-8 text: expected a calibration file (YAML)"
+        ) from error
+    except OSError as error:
+        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
+
+
+class _Reader:
+    """Turns the text into cameras and collects everything that is wrong with it."""
+
+    def __init__(self, file_name: str) -> None:
+        self.file_name = file_name
+        self.problems: list[tuple[tuple[int, int], str]] = []
+
+    def read(self, text: str) -> Calibration | None:
+        document = self._document(text)
+        if document is None:
+            return None
+        if not isinstance(document, CommentedMap) or "cameras" not in document:
+            self._add((0, 0), "expected the key cameras with one entry per photo name or pattern")
+            return None
+        self._refuse_unknown(document, ("cameras",), "")
+        entries = document["cameras"]
+        if not isinstance(entries, CommentedMap) or not entries:
+            self._add(
+                _place(document, "cameras"),
+                "cameras: expected one entry per photo name or pattern",
+            )
+            return None
+        cameras: dict[str, Intrinsics] = {}
+        for name, entry in entries.items():
+            camera = self._camera(entries, name, entry)
+            if camera is not None:
+                cameras[str(name)] = camera
+        return Calibration(patterns=tuple(cameras), intrinsics=tuple(cameras.values()))
+
+    def _document(self, text: str) -> object:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
+                document: object = YAML(typ="rt", pure=True).load(text)
+        except DuplicateKeyError as error:
+            # Its text goes on about switching the check off.
+            words = str(error.problem).split(" with value")[0]
+            self._add(_mark(error), f"{words}; remove one of them")
+        except MarkedYAMLError as error:
+            words = ", ".join(str(part) for part in (error.context, error.problem) if part)
+            self._add(_mark(error), f"this is not YAML: {words}")
+        except (YAMLError, ValueError, RecursionError) as error:
+            self._add((0, 0), f"this is not YAML: {(str(error).splitlines() or ['?'])[0]}")
+        else:
+            if document is None:
+                self._add((0, 0), "the calibration file is empty")
+            return document
+        return None
+
+    def _camera(self, entries: CommentedMap, name: object, entry: object) -> Intrinsics | None:
+        place = _place(entries, name)
+        if not isinstance(name, str):
+            self._add(place, f'cameras: a photo name must be text, got {name}; write "{name}"')
+            return None
+        path = f'cameras."{name}"'
+        if not isinstance(entry, CommentedMap):
+            self._add(place, f"{path}: expected {', '.join(_REQUIRED)} [, {_DISTORTION}]")
+            return None
+        n_before = len(self.problems)
+        self._refuse_unknown(entry, (*_REQUIRED, _DISTORTION), path + ".")
+        missing = [key for key in _REQUIRED if key not in entry]
+        if missing:
+            self._add(place, f"{path}: {', '.join(missing)} missing")
+        sizes = {key: self._size(entry, key, path) for key in _SIZES if key in entry}
+        numbers = {
+            key: self._number(entry, key, f"{path}.{key}", entry[key])
+            for key in (*_FOCALS, *_CENTRES)
+            if key in entry
+        }
+        distortion = self._distortion(entry, path)
+        if len(self.problems) == n_before:
+            self._check_pixels(entry, path, sizes, numbers)
+        if len(self.problems) > n_before:
+            return None
+        camera = Intrinsics(
+            width=sizes["width"],
+            height=sizes["height"],
+            fx=numbers["fx"],
+            fy=numbers["fy"],
+            cx=numbers["cx"] + _OPENCV_SHIFT,
+            cy=numbers["cy"] + _OPENCV_SHIFT,
+            distortion=distortion,
+        )
+        if _folds(camera):
+            self._add(
+                _place(entry, _DISTORTION),
+                f"{path}.{_DISTORTION}: the lens model folds back inside the image, so that two "
+                "directions share a pixel; expected k1, k2, p1, p2, k3 of a calibration that "
+                "covers the whole image",
+            )
+        return camera
+
+    def _size(self, entry: CommentedMap, key: str, path: str) -> int:
+        value = entry[key]
+        if isinstance(value, bool | ScalarBoolean) or not isinstance(value, int) or value < 1:
+            self._add(
+                _place(entry, key), f"{path}.{key}: expected a whole number of pixels, got {value}"
+            )
+            return 0
+        return int(value)
+
+    def _number(self, parent: CommentedMap, key: str, path: str, value: object) -> float:
+        is_number = isinstance(value, int | float) and not isinstance(value, bool | ScalarBoolean)
+        if not is_number or not math.isfinite(float(str(value))):
+            self._add(_place(parent, key), f"{path}: expected a number, got {_shown(value)}")
+            return 0.0
+        return float(str(value))
+
+    def _distortion(self, entry: CommentedMap, path: str) -> tuple[float, ...]:
+        path = f"{path}.{_DISTORTION}"
+        if _DISTORTION not in entry:
+            return (0.0,) * _N_DISTORTION
+        values = entry[_DISTORTION]
+        if not isinstance(values, CommentedSeq) or len(values) != _N_DISTORTION:
+            got = f"{len(values)} values" if isinstance(values, CommentedSeq) else _shown(values)
+            self._add(
+                _place(entry, _DISTORTION),
+                f"{path}: expected the five numbers [k1, k2, p1, p2, k3], got {got}; fill up with "
+                "0, other lens models are not read",
+            )
+            return ()
+        return tuple(
+            self._number(entry, _DISTORTION, f"{path}[{index}]", value)
+            for index, value in enumerate(values)
+        )
+
+    def _check_pixels(
+        self,
+        entry: CommentedMap,
+        path: str,
+        sizes: Mapping[str, int],
+        numbers: Mapping[str, float],
+    ) -> None:
+        """Refuse what looks like millimetres, or like another image."""
+        longest = max(sizes.values())
+        for key in _FOCALS:
+            if key in numbers and not numbers[key] >= 0.1 * longest:
+                self._add(
+                    _place(entry, key),
+                    f"{path}.{key}: expected the focal length in pixels, at least a tenth of the "
+                    f"image's {longest}, got {numbers[key]:g}",
+                )
+        for key, side in zip(_CENTRES, _SIZES, strict=True):
+            if not -sizes[side] <= numbers[key] <= 2 * sizes[side]:
+                self._add(
+                    _place(entry, key),
+                    f"{path}.{key}: expected the principal point in pixels, in or near the "
+                    f"image's {sizes[side]}, got {numbers[key]:g}",
+                )
+
+    def _refuse_unknown(self, table: CommentedMap, known: Iterable[str], path: str) -> None:
+        for key in table:
+            if key not in known:
+                near = difflib.get_close_matches(str(key), list(known), n=1)
+                hint = f" (did you mean {near[0]}?)" if near else ""
+                self._add(
+                    _place(table, key),
+                    f"{path}{key}: unknown key{hint}; expected {', '.join(known)}",
+                )
+
+    def _add(self, place: tuple[int, int], message: str) -> None:
+        line, column = place
+        self.problems.append((place, f"{self.file_name}:{line + 1}:{column + 1}: {message}"))
+
+
+def _place(table: CommentedMap, key: object) -> tuple[int, int]:
+    """Line and column of a key, counted from 0; of its table for keys merged in from another."""
+    data: Mapping[object, list[int]] = table.lc.data or {}
+    line, column = data[key][:2] if key in data else (table.lc.line or 0, table.lc.col or 0)
+    return int(line), int(column)
+
+
+def _mark(error: MarkedYAMLError) -> tuple[int, int]:
+    mark = error.problem_mark
+    return (0, 0) if mark is None else (int(mark.line), int(mark.column))
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, str):
+        return f'the text "{value}"'
+    return (
+        "nothing"
+        if value is None
+        else "a list or mapping"
+        if isinstance(value, CommentedMap | CommentedSeq)
+        else str(value)
+    )
+
+
+def _folds(camera: Intrinsics) -> bool:
+    """Whether the lens model cannot be undone somewhere in the image."""
+    u = np.linspace(0.0, camera.width, 9)
+    v = np.linspace(0.0, camera.height, 9)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    viewing = ViewingCamera(
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        distortion=np.array(camera.distortion, dtype=np.float64),
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+    )
+    try:
+        with np.errstate(all="ignore"):
+            rays = viewing.rays_camera(pixels)
+    except (GeometryError, np.linalg.LinAlgError):
+        return True
+    # The search may end on the far side of the fold: the radius must grow all the way to the ray.
+    k1, k2, _, _, k3 = camera.distortion
+    steps = np.linspace(0.0, float((rays[:, :2] ** 2).sum(axis=1).max()), 200)
+    growth = 1.0 + steps * (3.0 * k1 + steps * (5.0 * k2 + steps * 7.0 * k3))
+    return not bool((growth > 0.0).all())

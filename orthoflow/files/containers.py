@@ -1,0 +1,107 @@
+"""Look into photo files without decoding them: format, wholeness, and where the EXIF block is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, Literal
+
+ImageFormat = Literal["JPEG", "PNG", "TIFF"]
+
+_PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"
+_EXIF_MAGIC: Final = b"Exif\x00"
+# In entropy-coded data FF 00 is a stuffed FF and FF D0..D7 are restarts; anything else is a marker.
+_MARKER: Final = re.compile(rb"\xff([\x01-\xcf\xd8-\xfe])")
+_END: Final = 0xD9
+_SCAN: Final = 0xDA
+_APP1: Final = 0xE1
+_WITHOUT_LENGTH: Final = frozenset({0x01, *range(0xD0, 0xD9)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Segment:
+    """A JPEG marker or a PNG chunk, and where its content lies; a JPEG scan has none."""
+
+    kind: int | bytes
+    start: int
+    end: int
+
+
+def image_format(encoded: bytes) -> ImageFormat | None:
+    """Tell the format of a file by its first bytes; None for anything but JPEG, PNG and TIFF.
+
+    >>> image_format(bytes.fromhex("ffd8ffe000104a464946"))
+    'JPEG'
+    """
+    if encoded.startswith(b"\xff\xd8\xff"):
+        return "JPEG"
+    if encoded.startswith(_PNG_MAGIC):
+        return "PNG"
+    if encoded[:4] in (b"II*\x00", b"MM\x00*"):
+        return "TIFF"
+    return None
+
+
+def is_cut_off(encoded: bytes) -> bool:
+    """Whether a JPEG or PNG file ends before its image does.
+
+    Decoders fill the rest of a short JPEG with grey and say nothing, or refuse without a reason.
+    Bytes after the end of the image (previews, video of phones) do no harm. The directories of a
+    TIFF file may lie anywhere: its decoder finds out.
+    """
+    match image_format(encoded):
+        case "JPEG":
+            return not any(segment.kind == _END for segment in _jpeg_segments(encoded))
+        case "PNG":
+            return not any(segment.kind == b"IEND" for segment in _png_chunks(encoded))
+        case _:
+            return False
+
+
+def exif_block(encoded: bytes) -> bytes | None:
+    """Give the EXIF data of a file, which are laid out like a small TIFF file; None without any."""
+    match image_format(encoded):
+        case "TIFF":
+            return encoded
+        case "PNG":
+            for segment in _png_chunks(encoded):
+                if segment.kind == b"eXIf":
+                    return encoded[segment.start : segment.end]
+        case "JPEG":
+            for segment in _jpeg_segments(encoded):
+                if segment.kind == _SCAN:
+                    break
+                content = encoded[segment.start : segment.end]
+                # Other data (XMP) travel in segments of the same kind.
+                if segment.kind == _APP1 and content.startswith(_EXIF_MAGIC):
+                    return content[len(_EXIF_MAGIC) + 1 :]
+    return None
+
+
+def _jpeg_segments(encoded: bytes) -> Iterator[_Segment]:
+    """Walk from marker to marker; stops where the file breaks off."""
+    position = 2
+    while (found := _MARKER.search(encoded, position)) is not None:
+        kind, position = found.group(1)[0], found.end()
+        if kind in _WITHOUT_LENGTH:
+            continue
+        if kind == _END:
+            yield _Segment(kind=kind, start=position, end=position)
+            return
+        length = int.from_bytes(encoded[position : position + 2], "big")
+        if length < 2 or position + length > len(encoded):
+            return
+        yield _Segment(kind=kind, start=position + 2, end=position + length)
+        position += length
+
+
+def _png_chunks(encoded: bytes) -> Iterator[_Segment]:
+    position = len(_PNG_MAGIC)
+    while position + 12 <= len(encoded):
+        length = int.from_bytes(encoded[position : position + 4], "big")
+        start = position + 8
+        if start + length + 4 > len(encoded):
+            return
+        yield _Segment(kind=encoded[position + 4 : start], start=start, end=start + length)
+        position = start + length + 4

@@ -1,0 +1,81 @@
+"""`read.checkpoints`: surveyed points from text files."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from orthoflow.errors import InputError
+from orthoflow.files.survey_points import SurveyPoint, read_survey_points
+from orthoflow.products import CheckPoints, InputFiles
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.read.scan import UNITS_M, Unit
+
+
+class ReadCheckpoints(Method):
+    """Read check points: `name,x,y,z[,class]`, and `wall,u_px,v_px` where one was measured.
+
+    World coordinates are those of the scan's files. `wall` is the number of the wall, `u_px,v_px`
+    the column and row in its orthoimage, counted from the image's corner as GIS programs do: the
+    centre of the first cell is at (0.5, 0.5).
+    """
+
+    id = "read.checkpoints"
+    result_version = 1
+    determinism = "exact"
+    citations: ClassVar[tuple[str, ...]] = ()
+
+    class Params(MethodParams):
+        """What the files do not say themselves."""
+
+        unit: Unit = Field(
+            "m", description="Unit of x, y, z in the files; the points are in metres."
+        )
+
+    class In(Ports):
+        """The files."""
+
+        files: InputFiles
+
+    class Out(Ports):
+        """The points of all files."""
+
+        checkpoints: CheckPoints
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Read all files; see the class."""
+        if not inputs.files.paths:
+            raise InputError(f"the input {inputs.files.name} names no files: expected check points")
+        points: list[SurveyPoint] = []
+        places: dict[str, str] = {}
+        for path in inputs.files.paths:
+            for point in read_survey_points(path):
+                if point.name in places:
+                    raise InputError(
+                        f"check point {point.name} is in {places[point.name]} and again in "
+                        f"{path.name}: names must differ, so rename or remove one"
+                    )
+                points.append(point)
+            places.update((point.name, path.name) for point in points)
+        checkpoints = _checkpoints(points, UNITS_M[params.unit])
+        n_measured = int(np.count_nonzero(checkpoints.wall >= 0))
+        ctx.metric("n_points", len(points), "1")
+        ctx.metric("n_measured", n_measured, "1")
+        extent = np.ptp(checkpoints.points_world, axis=0)
+        for name, length in zip("xyz", extent, strict=True):
+            ctx.metric(f"extent_{name}_m", float(length), "m")
+        ctx.log(f"{len(points)} check points, {n_measured} of them measured in an orthoimage")
+        return self.Out(checkpoints=checkpoints)
+
+
+def _checkpoints(points: list[SurveyPoint], unit_m: float) -> CheckPoints:
+    nowhere = (np.nan, np.nan)
+    return CheckPoints(
+        names=tuple(point.name for point in points),
+        points_world=unit_m * np.array([point.position for point in points], dtype=np.float64),
+        classes=tuple(point.class_name for point in points),
+        wall=np.array([-1 if p.wall is None else p.wall for p in points], dtype=np.int32),
+        pixels_wall=np.array([p.pixel_wall or nowhere for p in points], dtype=np.float64),
+    )

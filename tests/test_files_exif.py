@@ -1,0 +1,256 @@
+"""EXIF and file structure: what a camera wrote, whether a file is whole, focal length in pixels."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthoflow.files.containers import image_format, is_cut_off
+from orthoflow.files.exif import Exif, focal_length, read_exif, without_orientation
+from orthoflow.files.images import decode_image, encode_jpeg, encode_png
+from tests import photo_files as made
+
+MAIN: dict[int, made.Value] = {
+    made.ORIENTATION: 6,
+    made.MAKE: "NIKON CORPORATION",
+    made.MODEL: "NIKON D3X",
+}
+INNER: dict[int, made.Value] = {
+    made.FOCAL: (285, 10),
+    made.FOCAL_35MM: 43,
+    made.WIDTH: 70_000,
+    made.HEIGHT: 4032,
+    made.RESOLUTION_X: (4000, 1),
+    made.RESOLUTION_Y: (4000, 1),
+    made.RESOLUTION_UNIT: 3,
+}
+DIAGONAL_MM = math.hypot(36.0, 24.0)
+
+
+def container(kind: str, block: bytes) -> bytes:
+    image = made.picture()
+    if kind == "jpeg":
+        return made.jpeg(image, block)
+    return made.png(image, block) if kind == "png" else block
+
+
+@pytest.mark.parametrize("order", ["<", ">"], ids=["little-endian", "big-endian"])
+@pytest.mark.parametrize("kind", ["jpeg", "png", "tiff"])
+def test_every_tag_comes_out_as_it_was_written(kind: str, order: str) -> None:
+    exif = read_exif(container(kind, made.exif_block(MAIN, INNER, order)))
+    assert exif == Exif(
+        orientation=6,
+        make="NIKON CORPORATION",
+        model="NIKON D3X",
+        focal_mm=28.5,
+        focal_35mm=43.0,
+        resolution_px_per_mm=400.0,
+        width=70_000,
+        height=4032,
+    )
+    assert exif.camera == "NIKON D3X"
+
+
+def test_a_photo_without_exif_says_nothing_and_stands_upright() -> None:
+    assert read_exif(encode_jpeg(made.picture())) == Exif()
+    assert read_exif(encode_png(made.picture())) == Exif()
+    assert read_exif(b"no image") == Exif()
+
+
+@pytest.mark.parametrize(
+    "written",
+    [{made.ORIENTATION: 0}, {made.ORIENTATION: 9}, {made.ORIENTATION: "6"}],
+    ids=["zero", "nine", "text"],
+)
+def test_an_orientation_that_means_nothing_is_upright(written: dict[int, made.Value]) -> None:
+    assert read_exif(made.jpeg(made.picture(), made.exif_block(written))).orientation == 1
+
+
+def test_zeros_stand_for_what_the_camera_did_not_know() -> None:
+    inner: dict[int, made.Value] = {
+        made.FOCAL: (0, 1),
+        made.FOCAL_35MM: 0,
+        made.RESOLUTION_X: (1, 0),
+        made.WIDTH: 0,
+    }
+    exif = read_exif(made.jpeg(made.picture(), made.exif_block({}, inner)))
+    assert exif == Exif()
+    assert focal_length(exif, 64, 48).reason == "no EXIF focal length"
+
+
+def test_a_damaged_block_gives_what_is_left_of_it() -> None:
+    block = made.exif_block(MAIN, INNER)
+    exif = read_exif(made.jpeg(made.picture(), block[:-30]))
+    assert exif.is_damaged
+    assert (exif.orientation, exif.model) == (6, "NIKON D3X")
+
+
+@given(st.binary(max_size=200), st.integers(0, 200))
+def test_no_block_of_any_content_raises(noise: bytes, at: int) -> None:
+    block = made.exif_block(MAIN, INNER)
+    for content in (b"II*\0" + noise, block[:at] + noise, block[:at] + noise + block[at:]):
+        exif = read_exif(made.jpeg(made.picture(8, 8), content))
+        focal = focal_length(exif, 64, 48)
+        assert 1 <= exif.orientation <= 8
+        assert focal.value_px is None or focal.value_px > 0.0
+
+
+# Focal length
+
+
+def exif_of(**values: float) -> Exif:
+    whole = {key: int(value) for key, value in values.items() if key in ("width", "height")}
+    return Exif(**{**values, **whole})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("exif", "size", "expected_px", "rule"),
+    [
+        (exif_of(focal_35mm=28), (1500, 1000), 28 / 36 * 1500, "35 mm"),
+        (exif_of(focal_35mm=28), (1000, 1500), 28 / 36 * 1500, "35 mm"),
+        (exif_of(focal_mm=4.74, focal_35mm=26), (4000, 3000), 26 / DIAGONAL_MM * 5000, "35 mm"),
+        (exif_of(focal_mm=50, resolution_px_per_mm=160), (6000, 4000), 8000.0, "pixel pitch"),
+        (
+            exif_of(focal_mm=50, resolution_px_per_mm=160, width=6000, height=4000),
+            (1500, 1000),
+            2000.0,
+            "pixel pitch",
+        ),
+        (
+            exif_of(focal_mm=50, resolution_px_per_mm=160, width=6000, height=4000),
+            (1000, 1500),
+            2000.0,
+            "pixel pitch",
+        ),
+        (
+            exif_of(focal_mm=50, focal_35mm=50, resolution_px_per_mm=160),
+            (1500, 1000),
+            50 / 36 * 1500,
+            "35 mm",
+        ),
+        (
+            exif_of(focal_mm=50, focal_35mm=50, resolution_px_per_mm=0.003),
+            (1500, 1000),
+            50 / 36 * 1500,
+            "35 mm",
+        ),
+    ],
+    ids=[
+        "equivalent, landscape",
+        "equivalent, portrait",
+        "equivalent of a 4:3 phone goes over the diagonal",
+        "pixel pitch",
+        "pixel pitch of a photo made smaller",
+        "pixel pitch of a photo made smaller and turned",
+        "pitch that does not fit the equivalent",
+        "pitch that fits no sensor",
+    ],
+)
+def test_the_focal_length_follows_the_stored_array(
+    exif: Exif, size: tuple[int, int], expected_px: float, rule: str
+) -> None:
+    focal = focal_length(exif, *size)
+    assert focal.value_px == pytest.approx(expected_px, rel=1e-12)
+    assert rule in focal.reason
+
+
+@pytest.mark.parametrize(
+    ("unit", "per_unit"), [(2, 4064), (3, 1600), (4, 160), (None, 4064)], ids=str
+)
+def test_the_unit_of_the_focal_plane_counts(unit: int | None, per_unit: int) -> None:
+    inner: dict[int, made.Value] = {made.FOCAL: (50, 1), made.RESOLUTION_X: (per_unit, 1)}
+    if unit is not None:
+        inner[made.RESOLUTION_UNIT] = unit
+    exif = read_exif(made.jpeg(made.picture(), made.exif_block({}, inner)))
+    assert focal_length(exif, 6000, 4000).value_px == pytest.approx(8000.0, rel=1e-12)
+
+
+def test_a_photo_that_was_cut_has_no_focal_length_from_exif() -> None:
+    exif = exif_of(focal_mm=28, focal_35mm=28, width=6000, height=4000)
+    focal = focal_length(exif, 3000, 3000)
+    assert focal.value_px is None
+    assert "the photo was cut after it was taken (6000 x 4000 became 3000 x 3000)" in focal.reason
+
+
+def test_millimetres_without_a_sensor_say_nothing() -> None:
+    focal = focal_length(exif_of(focal_mm=4.5), 4000, 3000)
+    assert focal.value_px is None
+    assert focal.reason == ("EXIF says 4.5 mm but neither the pixel pitch nor the 35 mm equivalent")
+
+
+def test_real_cameras_write_the_equivalent_over_the_diagonal() -> None:
+    # Focal length, diagonal and width of the sensor (makers' data sheets), and what EXIF says.
+    for focal_mm, diagonal_mm, width_mm, written in ((4.74, 8.0, 6.4, 26), (6.0, 7.18, 5.74, 36)):
+        assert round(focal_mm * DIAGONAL_MM / diagonal_mm) == written
+        assert round(focal_mm * 36.0 / width_mm) != written
+
+
+def test_real_photos_give_their_cameras(shared_data: Path) -> None:
+    phone = read_exif((shared_data / "ceiling-808/808_db_photo.jpg").read_bytes())
+    assert (phone.orientation, phone.camera) == (6, "Xiaomi Redmi Note 9S")
+    assert focal_length(phone, 4000, 3000).value_px == pytest.approx(3004.6, abs=0.1)
+    portrait = read_exif((shared_data / "cyprus-arch-photos/images/DSC_6471.JPG").read_bytes())
+    assert (portrait.width, portrait.height) == (6048, 4032)
+    assert focal_length(portrait, 1000, 1500).value_px == pytest.approx(1166.7, abs=0.1)
+
+
+# Whole files
+
+
+def test_formats_are_told_by_content() -> None:
+    image = made.picture()
+    assert image_format(encode_jpeg(image)) == "JPEG"
+    assert image_format(encode_png(image)) == "PNG"
+    assert image_format(made.tiff(image)) == "TIFF"
+    assert image_format(b"GIF89a") is None
+    assert image_format(b"") is None
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.9, 0.999])
+def test_a_file_that_ends_too_early_is_noticed(share: float) -> None:
+    image = made.picture(256, 192)
+    thumbnail = made.exif_block({made.MODEL: "\u00ff" * 90}) + encode_jpeg(made.picture(32, 32))
+    for whole in (encode_jpeg(image), made.jpeg(image, thumbnail), encode_png(image)):
+        assert not is_cut_off(whole)
+        assert not is_cut_off(whole + b"video of a phone")
+        assert is_cut_off(whole[: int(len(whole) * share)])
+        # What a copy that broke off leaves: the right length, zeros at the end.
+        kept = whole[: int(len(whole) * share)]
+        assert is_cut_off(kept + bytes(len(whole) - len(kept)))
+
+
+def test_a_progressive_jpeg_and_one_with_restarts_are_whole() -> None:
+    import cv2
+
+    for option in (cv2.IMWRITE_JPEG_PROGRESSIVE, cv2.IMWRITE_JPEG_RST_INTERVAL):
+        _, encoded = cv2.imencode(".jpg", made.picture(256, 192), [option, 1])
+        assert not is_cut_off(encoded.tobytes())
+        assert is_cut_off(encoded.tobytes()[:-2])
+
+
+# Orientation
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_no_format_is_turned_by_its_orientation(orientation: int) -> None:
+    image = made.picture(24, 16)
+    block = made.exif_block({made.ORIENTATION: orientation})
+    tiff = made.tiff(image, orientation)
+    assert read_exif(tiff).orientation == orientation
+    np.testing.assert_array_equal(decode_image(tiff), image)
+    np.testing.assert_array_equal(decode_image(made.png(image, block)), image)
+    decoded = decode_image(made.jpeg(image, block)).astype(int)
+    assert decoded.shape == image.shape
+    assert np.abs(decoded - decode_image(encode_jpeg(image, quality=95)).astype(int)).max() == 0
+
+
+def test_only_the_orientation_of_a_tiff_is_taken_out() -> None:
+    image = made.picture(24, 16)
+    assert without_orientation(made.tiff(image, 6)) == made.tiff(image, 1)
+    turned = made.jpeg(image, made.exif_block({made.ORIENTATION: 6}))
+    assert without_orientation(turned) is turned

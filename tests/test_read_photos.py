@@ -1,0 +1,315 @@
+"""`read.photos`: the files as they are, what is known of their cameras, and no silent damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.read.photos import ReadPhotos
+
+from orthoflow.errors import CancelledStepError, InputError
+from orthoflow.files.images import decode_image, encode_jpeg, encode_png
+from orthoflow.products import InputFiles, Photo
+from orthoflow.sdk import StepContext
+from tests import photo_files as made
+
+CAMERA = "{width: 64, height: 48, fx: 60, fy: 61, cx: 31.5, cy: 23.5}"
+
+
+class Reader:
+    """Runs the method and keeps what it said."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.count = 0
+        self.ctx: StepContext
+
+    def __call__(self, *paths: Path, calibration: str | None = None) -> tuple[Photo, ...]:
+        self.count += 1
+        scratch = self.folder / f"scratch-{self.count}"
+        scratch.mkdir()
+        self.ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=scratch)
+        inputs = ReadPhotos.In(
+            files=InputFiles(name="photos", paths=paths), calibration=self._calibration(calibration)
+        )
+        return ReadPhotos().run(inputs, ReadPhotos.Params(), self.ctx).photos.photos
+
+    def _calibration(self, text: str | None) -> InputFiles | None:
+        if text is None:
+            return None
+        path = self.folder / "calibration.yaml"
+        path.write_text(text)
+        return InputFiles(name="calibration", paths=(path,))
+
+    @property
+    def warnings(self) -> str:
+        return "\n".join(self.ctx.warnings)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        return {metric.name: metric.value for metric in self.ctx.metrics}
+
+    @property
+    def sheet(self) -> tuple[int, int]:
+        rows, columns, _ = decode_image(self.ctx.figures[0].path.read_bytes()).shape
+        return columns, rows
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Reader:
+    return Reader(tmp_path)
+
+
+def test_photos_come_by_name_with_their_bytes_untouched(tmp_path: Path, read: Reader) -> None:
+    block = made.exif_block({made.ORIENTATION: 6}, {made.FOCAL_35MM: 28})
+    files = {
+        "b.JPG": made.jpeg(made.picture(48, 64), block),
+        "c.png": encode_png(made.picture(32, 16)),
+        "a.tiff": made.tiff(made.picture(30, 20), 8),
+        "B.jpeg": encode_jpeg(made.picture()),
+    }
+    photos = read(*made.write(tmp_path, files))
+    assert [photo.name for photo in photos] == ["B.jpeg", "a.tiff", "b.JPG", "c.png"]
+    assert all(photo.encoded == files[photo.name] for photo in photos)
+    assert [(photo.width, photo.height) for photo in photos] == [
+        (64, 48), (30, 20), (48, 64), (32, 16),
+    ]  # fmt: skip
+    assert [photo.exif_orientation for photo in photos] == [1, 8, 6, 1]
+    assert photos[2].exif_focal_px == pytest.approx(28 / np.hypot(36, 24) * 80, rel=1e-12)
+    assert read.metrics == {
+        "n_photos": 4,
+        "n_calibrated": 0,
+        "n_exif_focal": 1,
+        "megapixels": (64 * 48 + 30 * 20 + 48 * 64 + 32 * 16) / 1e6,
+    }
+
+
+def test_the_same_pixels_come_out_of_every_format_for_the_steps_behind(
+    tmp_path: Path, read: Reader
+) -> None:
+    image = made.picture(30, 20)
+    files = {"a.png": encode_png(image), "b.tif": made.tiff(image, 6)}
+    for photo in read(*made.write(tmp_path, files)):
+        np.testing.assert_array_equal(decode_image(photo.encoded), image)
+
+
+def test_photos_without_focal_length_are_taken_with_a_warning(tmp_path: Path, read: Reader) -> None:
+    files = {f"{index}.jpg": encode_jpeg(made.picture()) for index in range(5)}
+    photos = read(*made.write(tmp_path, files))
+    assert all(photo.exif_focal_px is None and photo.intrinsics is None for photo in photos)
+    assert read.warnings == (
+        "the focal length of 5 photos (0.jpg, 1.jpg, 2.jpg ...) is unknown (no EXIF focal length, "
+        "and no calibration): the orientation has to find it, needs more ties for that and may "
+        "refuse; a calibration file helps"
+    )
+
+
+def test_a_cut_photo_does_not_keep_the_focal_length_of_the_whole(
+    tmp_path: Path, read: Reader
+) -> None:
+    inner: dict[int, made.Value] = {made.FOCAL_35MM: 28, made.WIDTH: 600, made.HEIGHT: 400}
+    content = made.jpeg(made.picture(), made.exif_block({}, inner))
+    (photo,) = read(*made.write(tmp_path, {"a.jpg": content}))
+    assert photo.exif_focal_px is None
+    assert "the focal length of photo a.jpg is unknown (the photo was cut" in read.warnings
+
+
+def test_damaged_exif_data_are_said(tmp_path: Path, read: Reader) -> None:
+    block = made.exif_block({made.MODEL: "a long name of a camera"})[:-9]
+    read(*made.write(tmp_path, {"a.jpg": made.jpeg(made.picture(), block)}))
+    assert "the EXIF data of photo a.jpg are damaged; what is readable was taken" in read.warnings
+
+
+# Other files in the folder
+
+
+def test_other_files_are_left_out_and_counted(tmp_path: Path, read: Reader) -> None:
+    photo = encode_jpeg(made.picture())
+    files = {
+        "a.jpg": photo,
+        "a.jpg.camera": b"1",
+        "Thumbs.db": b"\xd0\xcf",
+        "b.CR2": b"II*\0",
+        "K.txt": b"",
+    }
+    assert [item.name for item in read(*made.write(tmp_path, files))] == ["a.jpg"]
+    assert (
+        "4 of 5 files of the input photos are no JPEG, PNG or TIFF and were left out: "
+        "a.jpg.camera, Thumbs.db, b.CR2 ..." in read.warnings
+    )
+
+
+def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: Reader) -> None:
+    paths = made.write(tmp_path, {"a.heic": b"x", "b.txt": b"x"})
+    with pytest.raises(
+        InputError,
+        match=r"the input photos holds no photo, only 2 other files: a\.heic, b\.txt; expected "
+        r"JPEG, PNG or TIFF \(\.jpg, \.png, \.tif\), so develop raw and HEIC photos first",
+    ):
+        read(*paths)
+    with pytest.raises(InputError, match="the input photos names no files: expected photos"):
+        read()
+
+
+def test_two_photos_of_one_name_are_refused(tmp_path: Path, read: Reader) -> None:
+    photo = encode_jpeg(made.picture())
+    paths = made.write(tmp_path, {"x/a.jpg": photo, "y/a.jpg": photo, "y/b.jpg": photo})
+    with pytest.raises(InputError, match=r"several photos named a\.jpg in different folders"):
+        read(*paths)
+
+
+# Damage
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png"])
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.95])
+def test_a_photo_that_is_cut_off_is_named(
+    tmp_path: Path, read: Reader, name: str, share: float
+) -> None:
+    image = made.picture(256, 192)
+    whole = encode_jpeg(image) if name == "a.jpg" else encode_png(image)
+    content = whole[: int(share * len(whole))]
+    with pytest.raises(
+        InputError, match=rf"photo {name} is cut off: its {len(content)} bytes end before the image"
+    ):
+        read(*made.write(tmp_path, {"0.jpg": encode_jpeg(image), name: content}))
+
+
+def test_a_tiff_that_is_cut_off_is_named(tmp_path: Path, read: Reader) -> None:
+    whole = made.tiff(made.picture(256, 192))
+    with pytest.raises(InputError, match=r"photo a\.tif cannot be decoded as an image"):
+        read(*made.write(tmp_path, {"a.tif": whole[: len(whole) // 2]}))
+
+
+@pytest.mark.parametrize("content", [b"", b"<html>", b"\0" * 500], ids=["empty", "page", "zeros"])
+def test_a_file_that_only_has_the_name_of_a_photo_is_named(
+    tmp_path: Path, read: Reader, content: bytes
+) -> None:
+    with pytest.raises(
+        InputError, match=rf"photo a\.jpg is no JPEG, PNG or TIFF file \({len(content)} bytes\)"
+    ):
+        read(*made.write(tmp_path, {"a.jpg": content}))
+
+
+def test_a_photo_that_vanished_is_named(tmp_path: Path, read: Reader) -> None:
+    with pytest.raises(InputError, match=r"photo gone\.jpg cannot be read: No such file"):
+        read(tmp_path / "gone.jpg")
+
+
+# Calibration
+
+
+def test_the_calibration_reaches_the_photos_it_names(tmp_path: Path, read: Reader) -> None:
+    block = made.exif_block({}, {made.FOCAL_35MM: 28})
+    files = {
+        "a.jpg": made.jpeg(made.picture(), block),
+        "b.jpg": made.jpeg(made.picture(), block),
+        "c.jpg": encode_jpeg(made.picture(48, 64)),
+    }
+    other = CAMERA.replace("fx: 60", "fx: 70")
+    text = f"cameras:\n  b.jpg: {other}\n  '[ab].*': {CAMERA}\n  B.jpg: {CAMERA}\n"
+    photos = read(*made.write(tmp_path, files), calibration=text)
+    assert [None if p.intrinsics is None else p.intrinsics.fx for p in photos] == [60.0, 70.0, None]
+    assert photos[0].intrinsics is not None
+    assert (photos[0].intrinsics.cx, photos[0].intrinsics.cy) == (32.0, 24.0)
+    assert photos[0].exif_focal_px is not None
+    assert read.metrics["n_calibrated"] == 2
+    assert (
+        "the calibration has no entry for photo c.jpg; the others are calibrated" in read.warnings
+    )
+    assert "calibration entries that no photo takes: B.jpg; the case" in read.warnings
+    assert "the focal length of photo c.jpg is unknown" in read.warnings
+
+
+def test_a_calibration_of_another_size_is_refused(tmp_path: Path, read: Reader) -> None:
+    paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture(48, 64))})
+    with pytest.raises(InputError, match=r"photo a\.jpg has 48 x 64 pixels.*the turned photo"):
+        read(*paths, calibration=f"cameras: {{'*': {CAMERA}}}")
+
+
+def test_several_calibration_files_are_refused(tmp_path: Path, read: Reader) -> None:
+    paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
+    inputs = ReadPhotos.In(
+        files=InputFiles(name="photos", paths=paths),
+        calibration=InputFiles(name="calibration", paths=paths * 2),
+    )
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    with pytest.raises(InputError, match="calibration names 2 files: expected one calibration"):
+        ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
+
+
+# The rest
+
+
+def test_reading_stops_when_it_is_cancelled(tmp_path: Path, read: Reader) -> None:
+    paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
+    ctx = StepContext(
+        rng=np.random.default_rng(0), cores=1, scratch=tmp_path, is_cancelled=lambda: True
+    )
+    inputs = ReadPhotos.In(files=InputFiles(name="photos", paths=paths))
+    with pytest.raises(CancelledStepError):
+        ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
+
+
+@pytest.mark.parametrize(
+    ("count", "caption"),
+    [
+        (1, "The photos, as they are stored."),
+        (10, "The photos, as they are stored."),
+        (103, "The first 100 of 103 photos, as they are stored."),
+    ],
+)
+def test_the_contact_sheet_stays_small(
+    tmp_path: Path, read: Reader, count: int, caption: str
+) -> None:
+    image = encode_jpeg(made.picture(200, 150))
+    names = [f"äußerst langer Name eines Fotos {index:03}.jpg" for index in range(count)]
+    read(*made.write(tmp_path, dict.fromkeys(names, image)))
+    assert max(read.sheet) <= 1200
+    assert min(read.sheet) >= 100
+    assert read.ctx.figures[0].caption == caption
+
+
+def test_real_phone_photos_keep_their_stored_frame(shared_data: Path, read: Reader) -> None:
+    photos = read(*sorted((shared_data / "ceiling-808").iterdir()))
+    assert [photo.name for photo in photos] == [
+        "808_db_photo.jpg", "808_user1_photo.jpg", "808_user_photo.jpg",
+    ]  # fmt: skip
+    assert {(p.width, p.height, p.exif_orientation) for p in photos} == {(4000, 3000, 6)}
+    assert [photo.exif_focal_px for photo in photos] == pytest.approx([3004.6] * 3, abs=0.1)
+    assert "4 of 7 files of the input photos are no JPEG" in read.warnings
+
+
+def test_a_portrait_among_landscapes_needs_an_entry_of_its_own(
+    shared_data: Path, read: Reader
+) -> None:
+    folder = shared_data / "cyprus-arch-photos/images"
+    paths = [folder / f"DSC_{number}.JPG" for number in (6470, 6471, 6472)]
+    photos = read(*paths)
+    assert [(photo.width, photo.height) for photo in photos] == [
+        (1500, 1000), (1000, 1500), (1500, 1000),
+    ]  # fmt: skip
+    assert [photo.exif_focal_px for photo in photos] == pytest.approx([1166.67] * 3, abs=0.01)
+    landscape = "{width: 1500, height: 1000, fx: 1160, fy: 1160, cx: 750, cy: 500}"
+    portrait = "{width: 1000, height: 1500, fx: 1160, fy: 1160, cx: 500, cy: 750}"
+    with pytest.raises(InputError, match=r"photo DSC_6471\.JPG has 1000 x 1500 pixels"):
+        read(*paths, calibration=f'cameras: {{"*": {landscape}}}')
+    calibrated = read(
+        *paths, calibration=f'cameras: {{DSC_6471.JPG: {portrait}, "*": {landscape}}}'
+    )
+    assert [p.intrinsics and p.intrinsics.width for p in calibrated] == [1500, 1000, 1500]
+
+
+def test_real_photos_without_exif_are_read_beside_their_poses(
+    shared_data: Path, read: Reader
+) -> None:
+    folder = shared_data / "fountain-p11/images"
+    camera = "width: 3072, height: 2048, fx: 2759.48, fy: 2764.16, cx: 1520.69, cy: 1006.81"
+    photos = read(
+        *(folder / name for name in ("0003.jpg", "0000.jpg", "0000.jpg.camera", "K.txt")),
+        calibration=f'cameras: {{"*": {{{camera}}}}}',
+    )
+    assert [photo.name for photo in photos] == ["0000.jpg", "0003.jpg"]
+    assert all(p.intrinsics is not None and p.intrinsics.cx == 1521.19 for p in photos)
+    assert "focal length" not in read.warnings
