@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import preview_png, stretch_to_grey
+from orthoflow.files.images import preview_webp, stretch_to_grey
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Orthoimages, OrthoMask, SurfaceMask, Walls
 from orthoflow.records import Run
@@ -62,7 +62,7 @@ def orthoimage_pictures(run: Run) -> Iterator[Picture]:
             )
             yield Picture(
                 uri=data_uri(
-                    preview_png(image.rgb, shown, longest_side_px=LONGEST_SIDE_PX), "image/png"
+                    preview_webp(image.rgb, shown, longest_side_px=LONGEST_SIDE_PX), "image/webp"
                 ),
                 title=_title(image.name, address),
                 caption=caption,
@@ -79,10 +79,10 @@ def wall_pictures(run: Run) -> Iterator[Picture]:
             limit_m = _depth_limit_m(wall.depth_m)
             yield Picture(
                 uri=data_uri(
-                    preview_png(
+                    preview_webp(
                         depth_colours(wall.depth_m, limit_m), known, longest_side_px=LONGEST_SIDE_PX
                     ),
-                    "image/png",
+                    "image/webp",
                 ),
                 title=_title(f"{wall.name}, depth", address),
                 caption=(
@@ -95,10 +95,10 @@ def wall_pictures(run: Run) -> Iterator[Picture]:
                 grey = stretch_to_grey(wall.intensity)
                 yield Picture(
                     uri=data_uri(
-                        preview_png(
+                        preview_webp(
                             grey, np.isfinite(wall.intensity), longest_side_px=LONGEST_SIDE_PX
                         ),
-                        "image/png",
+                        "image/webp",
                     ),
                     title=_title(f"{wall.name}, intensity", address),
                     caption={

@@ -1,4 +1,4 @@
-"""The command line as a user calls it, in a folder of its own, and a stranger's plugin beside it."""
+"""The command line as a user calls it, in a folder of its own; a stranger's plugin beside it."""
 
 from __future__ import annotations
 
