@@ -30,6 +30,10 @@ FLOOR_M: Final = -1.5
 CEILING_M: Final = 1.6
 MAIN_WALL_M: Final = 2.4
 MAIN_OMEGA_DEG: Final = 102.0
+# Area of the main wall that can be seen, and how much of it is textile at most and by design.
+MAIN_WALL_M2: Final = 16.7
+MOST_TEXTILE: Final = 0.35
+TEXTILE_BY_DESIGN: Final = 0.095
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
 # Walls reach a little past the corners of the room, where others hide them.
@@ -56,11 +60,14 @@ class RoomPlan:
         relief: scale of all mouldings, 1 = as designed (up to 15 cm).
         obstacle: an object stands free before the main wall.
         spectral_gap: 0 when the laser sees the painted patterns, 1 when others.
+        textile_share: share of the main wall that is covered by one repeated motif, at most
+            `MOST_TEXTILE`.
     """
 
     relief: float = 1.0
     obstacle: bool = True
     spectral_gap: float = 0.3
+    textile_share: float = TEXTILE_BY_DESIGN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,10 +86,7 @@ class Room:
 def build_room(plan: RoomPlan) -> Room:
     """Build the room."""
     draft = SceneDraft()
-    main = wall_side(draft, omega_deg=MAIN_OMEGA_DEG, phi_deg=0.8, distance_m=MAIN_WALL_M)
-    opposite = wall_side(draft, omega_deg=282.4, phi_deg=-0.2, distance_m=2.0)
-    right = wall_side(draft, omega_deg=12.2, phi_deg=0.3, distance_m=2.7)
-    left = wall_side(draft, omega_deg=191.7, phi_deg=-0.3, distance_m=2.7)
+    main, opposite, right, left = wall_sides(draft)
     _build_main_wall(main, plan)
     _build_opposite_wall(opposite, plan)
     _build_right_wall(right, plan)
@@ -90,6 +94,16 @@ def build_room(plan: RoomPlan) -> Room:
     _build_floor_and_ceiling(draft)
     _furnish(draft, plan)
     return Room(scene=draft.finished(spectral_gap=plan.spectral_gap), planes=_clipped(draft.planes))
+
+
+def wall_sides(draft: SceneDraft) -> tuple[Side, Side, Side, Side]:
+    """Begin the main wall, the one opposite, the right and the left one."""
+    return (
+        wall_side(draft, omega_deg=MAIN_OMEGA_DEG, phi_deg=0.8, distance_m=MAIN_WALL_M),
+        wall_side(draft, omega_deg=282.4, phi_deg=-0.2, distance_m=2.0),
+        wall_side(draft, omega_deg=12.2, phi_deg=0.3, distance_m=2.7),
+        wall_side(draft, omega_deg=191.7, phi_deg=-0.3, distance_m=2.7),
+    )
 
 
 def main_wall_axes() -> NDArray[np.float64]:
@@ -109,17 +123,18 @@ def _build_main_wall(wall: Side, plan: RoomPlan) -> None:
     )
     niche: Extent = (-1.95, -1.15, -1.1, 0.75)
     door: Extent = (1.22, 2.12, FLOOR_M - 0.1, 0.65)
-    cloth: Extent = (-0.45, 0.65, -0.45, 1.0)
+    cloths = _cloths(plan.textile_share)
     full = wall.true_plane("main wall", _FULL)
     in_niche = wall.true_plane("niche", niche, -0.25)
     in_door = wall.true_plane("door", door, -0.12)
     holes = [
         wall.recess(niche, 0.25, fresco, plane=in_niche),
         wall.recess(door, 0.12, _OAK, plane=in_door),
-        cloth,
+        *cloths,
     ]
     wall.place(_FULL, 0.0, fresco, SurfaceRole.WALL, plane=full, holes=holes)
-    wall.place(cloth, 0.0, damask, SurfaceRole.WALL, plane=full)
+    for cloth in cloths:
+        wall.place(cloth, 0.0, damask, SurfaceRole.WALL, plane=full)
     wall.bars((-0.53, 0.73, -0.53, 1.08), 0.08, 0.03 * plan.relief, _GILT)
     wall.bars((-0.53, 0.73, -1.2, -0.7), 0.06, 0.025 * plan.relief, _STUCCO)
     wall.bars((1.10, 2.24, FLOOR_M - 0.1, 0.77), 0.12, 0.04 * plan.relief, _STUCCO)
@@ -133,6 +148,61 @@ def _build_main_wall(wall: Side, plan: RoomPlan) -> None:
     _add_cornice(wall, plan)
     for start, end in ((-2.17, -0.97), (-0.71, 0.81)):
         wall.box((start, end, FLOOR_M - 0.1, -1.32), 0.02 * plan.relief, _STUCCO)
+
+
+def _cloths(share: float) -> list[Extent]:
+    """Hang cloth over a share of the main wall: the panel in the middle first, then beside it."""
+    middle: Extent = (-0.73, 0.83, -1.3, 1.3)
+    by_design: Extent = (-0.45, 0.65, -0.45, 1.0)
+    beside: list[Extent] = [
+        (-2.19, -0.95, 0.75, 1.3),  # over the niche
+        (1.05, 2.37, 0.77, 1.3),  # over the door
+        (-2.19, -1.95, -1.3, 0.75),  # left of the niche
+        (-1.15, -0.95, -1.3, 0.75),  # right of it
+    ]
+    left_m2 = share * MAIN_WALL_M2
+    if left_m2 <= 0.0:
+        return []
+    cloths = [_grown(by_design, middle, left_m2)]
+    left_m2 -= _area_m2(cloths[0])
+    for extent in beside:
+        if left_m2 > 1e-6:
+            a0, a1, b0, b1 = extent
+            used = min(1.0, left_m2 / _area_m2(extent))
+            cloths.append((a0, a1, b1 - used * (b1 - b0), b1))
+            left_m2 -= used * _area_m2(extent)
+    return cloths
+
+
+def _grown(small: Extent, large: Extent, area_m2: float) -> Extent:
+    """Shrink the small rectangle about its middle, or grow it towards the large one."""
+    full = _area_m2(small)
+    if area_m2 <= full:
+        a, b = 0.5 * (small[0] + small[1]), 0.5 * (small[2] + small[3])
+        scale = math.sqrt(area_m2 / full)
+        return (
+            a + scale * (small[0] - a),
+            a + scale * (small[1] - a),
+            b + scale * (small[2] - b),
+            b + scale * (small[3] - b),
+        )
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        if _area_m2(_between(small, large, middle)) < area_m2:
+            low = middle
+        else:
+            high = middle
+    return _between(small, large, high)
+
+
+def _between(first: Extent, second: Extent, share: float) -> Extent:
+    a0, a1, b0, b1 = (p + share * (q - p) for p, q in zip(first, second, strict=True))
+    return a0, a1, b0, b1
+
+
+def _area_m2(extent: Extent) -> float:
+    return (extent[1] - extent[0]) * (extent[3] - extent[2])
 
 
 def _build_opposite_wall(wall: Side, plan: RoomPlan) -> None:

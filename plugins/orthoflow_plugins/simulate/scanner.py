@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
 from orthoflow.geometry.scene_kernels import CastTable
-from orthoflow.geometry.scene_views import cast_table, in_threads
+from orthoflow.geometry.scene_trees import cast_table
+from orthoflow.geometry.scene_views import in_threads
 from orthoflow.geometry.scenes import Scene
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.palace import main_wall_axes
