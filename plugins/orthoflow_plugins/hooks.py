@@ -203,6 +203,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="the topmost point colours its cell",
         ),
         MethodSpec(
+            id="ortho.dsm-backward",
+            target="orthoflow_plugins.ortho.dsm_backward:DsmBackward",
+            summary="each cell of a wall looks up its colour in the photos that see it",
+        ),
+        MethodSpec(
             id="mosaic.seams",
             target="orthoflow_plugins.mosaic.seams:MosaicSeams",
             summary="one orthoimage per wall from its layers",

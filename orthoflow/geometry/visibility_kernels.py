@@ -1,0 +1,324 @@
+"""Compiled passes that tell where a photo sees the cells of a wall, and what stands in between."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.camera_kernels import project_point
+from orthoflow.geometry.point_kernels import Offsets, compiled
+
+# Side of the square blocks of cells that share one bound on how high rays have to be followed.
+BLOCK_CELLS: Final = 32
+# Height of void cells in `Relief.occluding`: they hide nothing, nor do mixtures with them.
+NOTHING_M: Final = -1.0e6
+# Counts stay below this, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
+COUNT_MOST: Final = 2000
+
+# States of a cell, as in `LayerMask`.
+OUTSIDE: Final = 0
+PAINTED: Final = 1
+OCCLUDED: Final = 2
+NO_SURFACE: Final = 3
+
+# Points nearer to the projection centre than this are the camera itself.
+_NEAREST_M: Final = 0.05
+_LARGEST_SPLAT_PX: Final = 24.0
+
+
+class WallView(NamedTuple):
+    """A photo's camera before a wall, in the wall's axes.
+
+    Attributes:
+        camera: (24,) flat camera (see `camera_kernels`) for points (u, v, n) in metres from the
+            wall frame's origin.
+        column: foot of the projection centre on the wall, in cell indices; 0 is the centre of
+            the first cell. row likewise.
+        height_m: projection centre above the plane.
+        gsd_m: side of a cell.
+        front_m: up to this depth the raster itself tells what hides what; only points before it
+            are looked up in the depth buffer.
+        tolerance_m: how far a surface must be above a ray to hide it.
+        cosine_least: cells seen at a smaller cosine of incidence count as hidden.
+        border_px: quality falls to 0 over this distance from the image border.
+    """
+
+    camera: NDArray[np.float64]
+    column: float
+    row: float
+    height_m: float
+    gsd_m: float
+    front_m: float
+    tolerance_m: float
+    cosine_least: float
+    border_px: float
+
+
+class Relief(NamedTuple):
+    """The surface of a wall, and what of it hides other cells.
+
+    Attributes:
+        depth: (rows, cols) float32 metres, NaN where void.
+        occluding: (rows, cols) float32 the same without spikes, `NOTHING_M` where void.
+        tops: (blocks, blocks) float32, the highest `occluding` in 3 x 3 blocks.
+        bottoms: (blocks, blocks) float32, the lowest depth in a block, infinite in a void one.
+        highest_m: the highest `occluding` of all.
+    """
+
+    depth: NDArray[np.float32]
+    occluding: NDArray[np.float32]
+    tops: NDArray[np.float32]
+    bottoms: NDArray[np.float32]
+    highest_m: float
+
+
+class DepthBuffer(NamedTuple):
+    """The nearest points of a cloud in a reduced photo.
+
+    Attributes:
+        nearest: (rows, cols) float32 metres along the optical axis, infinite where nothing is.
+        reduction: photo pixels per pixel of the buffer.
+    """
+
+    nearest: NDArray[np.float32]
+    reduction: float
+
+
+class Sight(NamedTuple):
+    """What a photo sees of a tile of cells, filled by `look_at_cells`.
+
+    Attributes:
+        u: (rows, cols) float32 photo pixels, first centre at 0.5; only where painted. v likewise.
+        mask: (rows, cols) uint8 states.
+        quality: (rows, cols) float32 photo pixels per cell times the falling off at the border.
+        summary: (8,) float64 over painted cells: smallest and largest u, smallest and largest v,
+            their number, sums of columns, rows and depths.
+    """
+
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    quality: NDArray[np.float32]
+    summary: NDArray[np.float64]
+
+
+class VoxelGrid(NamedTuple):
+    """Cubes that tell how densely points lie.
+
+    Attributes:
+        low: (3,) float64 metres from the cloud's origin, lower corner of the first cube.
+        side_m: side of a cube.
+        counts: (nx, ny, nz) uint16 points in each, or in each and its 26 neighbours.
+    """
+
+    low: NDArray[np.float64]
+    side_m: float
+    counts: NDArray[np.uint16]
+
+
+@compiled
+def count_in_voxels(points: Offsets, grid: VoxelGrid) -> None:
+    """Count points in voxels, up to `COUNT_MOST`; points outside the grid are left out."""
+    nx, ny, nz = grid.counts.shape
+    for i in range(points.x.shape[0]):
+        a = math.floor((points.x[i] - grid.low[0]) / grid.side_m)
+        b = math.floor((points.y[i] - grid.low[1]) / grid.side_m)
+        c = math.floor((points.z[i] - grid.low[2]) / grid.side_m)
+        if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz and grid.counts[a, b, c] < COUNT_MOST:
+            grid.counts[a, b, c] += 1
+
+
+@compiled
+def splat_points(
+    points: Offsets,
+    camera: NDArray[np.float64],
+    around: VoxelGrid,
+    n_least: int,
+    buffer: DepthBuffer,
+) -> None:
+    """Lay points into a depth buffer as squares as large as the gaps between them.
+
+    Args:
+        points: offsets from the cloud's origin.
+        camera: (24,) flat camera for these offsets.
+        around: points in 3 x 3 x 3 voxels; a surface through them has 9 faces of a voxel, which
+            tells the spacing of its points.
+        n_least: points with fewer around them, themselves included, are outliers.
+        buffer: the nearest depths so far, lowered in place.
+    """
+    nx, ny, nz = around.counts.shape
+    rows, columns = buffer.nearest.shape
+    focal = math.sqrt(camera[12] * camera[13])
+    for i in range(points.x.shape[0]):
+        x, y, z = float(points.x[i]), float(points.y[i]), float(points.z[i])
+        a = math.floor((x - around.low[0]) / around.side_m)
+        b = math.floor((y - around.low[1]) / around.side_m)
+        c = math.floor((z - around.low[2]) / around.side_m)
+        if not (0 <= a < nx and 0 <= b < ny and 0 <= c < nz):
+            continue
+        n_around = around.counts[a, b, c]
+        if n_around < n_least:
+            continue
+        u, v, distance = project_point(camera, x, y, z)
+        if not distance > _NEAREST_M or math.isnan(u):
+            continue
+        spacing_m = 3.0 * around.side_m / math.sqrt(n_around)
+        half = min(spacing_m * focal / (distance * buffer.reduction), _LARGEST_SPLAT_PX)
+        u, v = u / buffer.reduction, v / buffer.reduction
+        first_row, end_row = max(0, math.floor(v - half)), min(rows, math.floor(v + half) + 1)
+        first, end = max(0, math.floor(u - half)), min(columns, math.floor(u + half) + 1)
+        nearest = np.float32(distance)
+        for row in range(first_row, end_row):
+            for column in range(first, end):
+                buffer.nearest[row, column] = min(buffer.nearest[row, column], nearest)
+
+
+@compiled
+def highest_in_the_way(view: WallView, relief: Relief, block_row: int, block_column: int) -> float:
+    """Bound the height up to which rays from the cells of a block must be followed.
+
+    At a fraction t of the way to the camera, no ray from the block is lower than the one from its
+    lowest cell, and none is farther than half a block from the one from its centre. The samples
+    are half a block apart, and each looks at 3 x 3 blocks: nothing in between is missed.
+    """
+    bottom = float(relief.bottoms[block_row, block_column])
+    top = NOTHING_M
+    if not bottom < view.height_m:
+        return top
+    centre_row = (block_row + 0.5) * BLOCK_CELLS - 0.5
+    centre_column = (block_column + 0.5) * BLOCK_CELLS - 0.5
+    down, across = view.row - centre_row, view.column - centre_column
+    n_steps = max(1, math.ceil(max(abs(down), abs(across)) / (0.5 * BLOCK_CELLS)))
+    n_block_rows, n_block_columns = relief.tops.shape
+    for k in range(n_steps + 1):
+        earliest = max(0.0, (k - 0.5) / n_steps)
+        height = bottom + earliest * (view.height_m - bottom) + view.tolerance_m
+        if height >= relief.highest_m:
+            break
+        row = math.floor((centre_row + down * k / n_steps) / BLOCK_CELLS)
+        column = math.floor((centre_column + across * k / n_steps) / BLOCK_CELLS)
+        if row < -1 or row > n_block_rows or column < -1 or column > n_block_columns:
+            break
+        row = min(max(row, 0), n_block_rows - 1)
+        column = min(max(column, 0), n_block_columns - 1)
+        here = float(relief.tops[row, column])
+        if here > height and here > top:
+            top = here
+    return top
+
+
+@compiled
+def is_hidden_by_relief(view: WallView, relief: Relief, row: int, column: int, top: float) -> bool:
+    """Follow the ray from a cell to the camera, one row or column at a time, up to a height."""
+    rows, columns = relief.occluding.shape
+    depth = float(relief.depth[row, column])
+    down, across = view.row - row, view.column - column
+    along = max(abs(down), abs(across))
+    if along < 1.0:
+        return False
+    step_down, step_across = down / along, across / along
+    rise = (view.height_m - depth) / along
+    is_along_rows = abs(down) >= abs(across)
+    height = depth + view.tolerance_m
+    for k in range(1, int(along) + 1):
+        height += rise
+        if height >= top:
+            return False
+        at_row, at_column = row + k * step_down, column + k * step_across
+        # One of the two is whole; the surface is linear between the two cells beside the other.
+        if is_along_rows:
+            first_row, first_column = round(at_row), math.floor(at_column)
+            second_row, second_column = first_row, first_column + 1
+            share = at_column - first_column
+        else:
+            first_row, first_column = math.floor(at_row), round(at_column)
+            second_row, second_column = first_row + 1, first_column
+            share = at_row - first_row
+        if share == 0.0:
+            second_row, second_column = first_row, first_column
+        if first_row < 0 or first_column < 0 or second_row >= rows or second_column >= columns:
+            return False
+        here = (1.0 - share) * relief.occluding[first_row, first_column]
+        here += share * relief.occluding[second_row, second_column]
+        if here > height:
+            return True
+    return False
+
+
+@compiled
+def look_at_cells(
+    view: WallView,
+    relief: Relief,
+    buffer: DepthBuffer,
+    sight: Sight,
+    first_row: int,
+    first_column: int,
+) -> None:
+    """Project the cells of a tile into a photo and tell which of them it sees.
+
+    Args:
+        view: the camera before the wall.
+        relief: the whole wall.
+        buffer: what else stands before the camera.
+        sight: filled; its shape is the tile's.
+        first_row: row of the wall where the tile begins.
+        first_column: column likewise.
+    """
+    end_row, end_column = first_row + sight.mask.shape[0], first_column + sight.mask.shape[1]
+    width, image_height = view.camera[21], view.camera[22]
+    pixels = view.camera[12] * view.camera[13] * view.gsd_m * view.gsd_m
+    sight.summary[0] = sight.summary[2] = math.inf
+    sight.summary[1] = sight.summary[3] = -math.inf
+    sight.summary[4:] = 0.0
+    for block_row in range(first_row // BLOCK_CELLS, (end_row - 1) // BLOCK_CELLS + 1):
+        for block_column in range(first_column // BLOCK_CELLS, (end_column - 1) // BLOCK_CELLS + 1):
+            top = highest_in_the_way(view, relief, block_row, block_column)
+            rows = range(
+                max(first_row, block_row * BLOCK_CELLS),
+                min(end_row, (block_row + 1) * BLOCK_CELLS),
+            )
+            columns = range(
+                max(first_column, block_column * BLOCK_CELLS),
+                min(end_column, (block_column + 1) * BLOCK_CELLS),
+            )
+            for row in rows:
+                for column in columns:
+                    i, j = row - first_row, column - first_column
+                    sight.quality[i, j] = 0.0
+                    depth = float(relief.depth[row, column])
+                    if math.isnan(depth):
+                        sight.mask[i, j] = NO_SURFACE
+                        continue
+                    u, v, distance = project_point(
+                        view.camera, (column + 0.5) * view.gsd_m, (row + 0.5) * view.gsd_m, depth
+                    )
+                    if not (0.0 <= u < width and 0.0 <= v < image_height):
+                        sight.mask[i, j] = OUTSIDE
+                        continue
+                    sight.mask[i, j] = OCCLUDED
+                    lift = view.height_m - depth
+                    across = (view.column - column) * view.gsd_m
+                    down = (view.row - row) * view.gsd_m
+                    cosine = lift / math.sqrt(lift * lift + across * across + down * down)
+                    if cosine <= view.cosine_least:
+                        continue
+                    # Where the ray leaves the slab that the raster describes.
+                    leaves = distance * (view.height_m - view.front_m) / lift - view.tolerance_m
+                    nearest = buffer.nearest[int(v / buffer.reduction), int(u / buffer.reduction)]
+                    if nearest < leaves or is_hidden_by_relief(view, relief, row, column, top):
+                        continue
+                    inside = min(u, width - u, v, image_height - v) / view.border_px
+                    sight.mask[i, j] = PAINTED
+                    sight.quality[i, j] = cosine * pixels / (distance * distance) * min(1.0, inside)
+                    sight.u[i, j], sight.v[i, j] = u, v
+                    sight.summary[0] = min(sight.summary[0], u)
+                    sight.summary[1] = max(sight.summary[1], u)
+                    sight.summary[2] = min(sight.summary[2], v)
+                    sight.summary[3] = max(sight.summary[3], v)
+                    sight.summary[4] += 1.0
+                    sight.summary[5] += column
+                    sight.summary[6] += row
+                    sight.summary[7] += depth

@@ -1,0 +1,355 @@
+"""`ortho.dsm-backward`: every cell of a wall looks up its colour in the photos that see it."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+from pydantic import Field
+
+from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Layer,
+    LayerMask,
+    Layers,
+    Photo,
+    Photos,
+    PointCloud,
+    Wall,
+    Walls,
+)
+from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.visibility_kernels import DepthBuffer
+    from orthoflow_plugins.ortho.dsm_backward_occluders import Occluders
+    from orthoflow_plugins.ortho.dsm_backward_painting import Painting, SightRule, Surface
+    from orthoflow_plugins.ortho.dsm_backward_sampling import Footprint
+
+NO_SOURCE = "no photo"
+
+
+class DsmBackward(Method):
+    """Project each cell of a wall into the photos and take the colour that is there.
+
+    A cell with a depth is a point in the world; the photo's distorted camera says where it lies in
+    the photo. It is painted unless something hides it: the wall's own relief (the ray to the
+    camera is followed over the raster), or points of the cloud that stand before the slab the
+    raster was made of (a depth buffer in the photo; single points are taken for outliers). Where
+    the photo is finer than the wall, colours are averaged over what a cell covers.
+
+    The quality of a cell is the number of photo pixels it covers: the cosine of incidence times
+    the square of cell size over photo GSD, falling to 0 at the border of the photo.
+    """
+
+    id: ClassVar[str] = "ortho.dsm-backward"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "exact"
+    citations: ClassVar[tuple[str, ...]] = (
+        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7, 4.4",
+    )
+
+    class Params(MethodParams):
+        """How colours are taken, and when a cell counts as seen."""
+
+        resampling: Literal["nearest", "bilinear", "cubic", "lanczos"] = Field(
+            default="bilinear",
+            description="Colour between pixels; nearest paints the photo's pixels untouched.",
+        )
+        antialias: bool = Field(
+            default=True,
+            description="Average over what a cell covers where the photo is finer than the wall "
+            "(not with nearest).",
+        )
+        incidence_max_deg: float = Field(
+            default=80.0, gt=0, lt=90, description="Cells seen more obliquely are not painted."
+        )
+        erosion_cells: int = Field(
+            default=1,
+            ge=0,
+            le=20,
+            description="Cells so near to a hidden one are not painted: edges smear there.",
+        )
+        tolerance_sigmas: float = Field(
+            default=3.0,
+            ge=0,
+            description="A surface hides a cell when it is above the ray by more than so many "
+            "standard deviations of depth, and tolerance_cells.",
+        )
+        tolerance_cells: float = Field(
+            default=0.5, ge=0, description="The same in cells, for what the raster cannot hold."
+        )
+        occluder_points_min: int = Field(
+            default=6,
+            ge=1,
+            description="Points of the cloud with fewer about them, themselves included, are "
+            "outliers and hide nothing.",
+        )
+        border_share: float = Field(
+            default=0.05,
+            ge=0,
+            le=0.5,
+            description="Quality falls to 0 over this share of a photo's shorter side.",
+        )
+
+    class In(Ports):
+        """The walls, the cloud they were made from, and the oriented photos."""
+
+        walls: Walls
+        photos: Photos
+        cameras: Cameras
+        cloud: PointCloud | None = None
+
+    class Out(Ports):
+        """A layer for each wall and photo that paints on it."""
+
+        layers: Layers
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Take photo by photo, and lay each onto every wall it sees."""
+        oriented = _oriented(inputs)
+        if inputs.cloud is None:
+            ctx.warn(
+                "no cloud is wired to ortho.dsm-backward: things that stand free before a wall "
+                "hide nothing, and photos paint them onto it"
+            )
+        studio = _Studio(inputs, params, ctx)
+        studio.find_occluders([camera for _, camera in oriented])
+        for place, (photo, camera) in enumerate(oriented):
+            ctx.progress(place / len(oriented), photo.name)
+            studio.lay(photo, camera)
+        layers = studio.finish()
+        return self.Out(layers=layers)
+
+
+class _Studio:
+    """Walls that are being painted, photo by photo."""
+
+    def __init__(
+        self, inputs: DsmBackward.In, params: DsmBackward.Params, ctx: StepContext
+    ) -> None:
+        from orthoflow_plugins.ortho.dsm_backward_painting import SightRule
+
+        self._inputs = inputs
+        self._params = params
+        self._ctx = ctx
+        self._rule: SightRule = SightRule(
+            resampling=params.resampling,
+            is_filtered=params.antialias,
+            incidence_max_deg=params.incidence_max_deg,
+            erosion_cells=params.erosion_cells,
+            border_share=params.border_share,
+        )
+        self._surfaces: list[Surface] = [self._surface(wall) for wall in inputs.walls.walls]
+        self._occluders: Occluders | None = None
+        self._layers: list[Layer] = []
+        self._footprints: list[Footprint] = []
+        # What photos reach of walls that none has painted so far.
+        self._reached: dict[int, NDArray[np.uint8]] = {}
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+
+    def find_occluders(self, cameras: list[Camera]) -> None:
+        """Get the cloud ready to be looked at."""
+        from orthoflow_plugins.ortho.dsm_backward_occluders import find_occluders
+
+        started = time.perf_counter()
+        if self._inputs.cloud is not None and len(self._inputs.cloud):
+            self._occluders = find_occluders(
+                self._inputs.cloud,
+                self._inputs.walls,
+                [camera.viewing() for camera in cameras],
+                n_least=self._params.occluder_points_min,
+                threads=self._ctx.cores,
+            )
+        self._seconds["occluders_s"] += time.perf_counter() - started
+
+    def lay(self, photo: Photo, camera: Camera) -> None:
+        """Lay a photo onto all walls."""
+        started = time.perf_counter()
+        pixels = decode_image(photo.encoded, photo.name)
+        _require_size(photo, camera, pixels)
+        decoded = time.perf_counter()
+        buffer = self._depth_buffer(camera)
+        looked = time.perf_counter()
+        painted = [
+            self._inputs.walls.walls[index].name
+            for index in range(len(self._surfaces))
+            if self._lay_on(index, photo, camera, pixels, buffer)
+        ]
+        self._seconds["decoding_s"] += decoded - started
+        self._seconds["occluders_s"] += looked - decoded
+        self._seconds["painting_s"] += time.perf_counter() - looked
+        self._ctx.log(f"{photo.name}: paints {', '.join(painted) or 'no wall'}")
+
+    def finish(self) -> Layers:
+        """Order the layers by wall, and add an empty one for each wall that nothing paints.
+
+        Raises:
+            MethodError: no photo paints any wall.
+        """
+        if not self._layers:
+            raise MethodError(
+                "no oriented photo sees a wall: their cameras stand behind the walls, look past "
+                "them, or something hides the walls; look at cameras.json and planes.json"
+            )
+        walls = self._inputs.walls.walls
+        painted = {layer.wall for layer in self._layers}
+        bare = [index for index in range(len(walls)) if index not in painted]
+        if bare:
+            names = ", ".join(walls[index].name for index in bare)
+            self._ctx.warn(f"no photo shows {names}: the orthoimage stays empty")
+        layers = [*self._layers, *(self._bare_layer(index) for index in bare)]
+        layers.sort(key=lambda layer: layer.wall)
+        self._report(layers)
+        return Layers(layers=tuple(layers), names=tuple(wall.name for wall in walls))
+
+    def _surface(self, wall: Wall) -> Surface:
+        from orthoflow_plugins.ortho.dsm_backward_painting import Surface
+        from orthoflow_plugins.ortho.dsm_backward_surfaces import noise_m, relief_of
+
+        tolerance_m = self._params.tolerance_sigmas * noise_m(wall)
+        return Surface(
+            frame=wall.frame,
+            relief=relief_of(wall),
+            front_m=self._inputs.walls.buffer_front_m,
+            tolerance_m=tolerance_m + self._params.tolerance_cells * wall.frame.gsd_m,
+        )
+
+    def _depth_buffer(self, camera: Camera) -> DepthBuffer:
+        from orthoflow_plugins.ortho.dsm_backward_occluders import (
+            depth_buffer,
+            nothing_in_the_way,
+        )
+
+        if self._occluders is None:
+            return nothing_in_the_way(camera.viewing())
+        return depth_buffer(self._occluders, camera.viewing())
+
+    def _lay_on(
+        self,
+        index: int,
+        photo: Photo,
+        camera: Camera,
+        pixels: NDArray[np.uint8],
+        buffer: DepthBuffer,
+    ) -> bool:
+        """Lay a photo onto one wall; say whether it painted something."""
+        from orthoflow_plugins.ortho.dsm_backward_painting import paint, view_of
+
+        def allocate(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+            return self._ctx.allocate("layers", f"{index}.{len(self._layers)}.{name}", shape, dtype)
+
+        surface = self._surfaces[index]
+        view = view_of(camera.viewing(), surface, self._rule)
+        if view.height_m <= float(surface.relief.bottoms.min()):
+            return False
+        painting = paint(
+            pixels,
+            view,
+            surface,
+            buffer,
+            self._rule,
+            allocate=allocate,
+            threads=self._ctx.cores,
+        )
+        self._footprints.extend(painting.footprints[key] for key in sorted(painting.footprints))
+        return self._keep(index, photo.name, painting)
+
+    def _keep(self, index: int, source: str, painting: Painting) -> bool:
+        is_empty = not (painting.mask == LayerMask.PAINTED).any()
+        if is_empty or painting.rgb is None or painting.quality is None:
+            if index in self._reached:
+                is_hidden = painting.mask == LayerMask.OCCLUDED
+                self._reached[index][is_hidden] = LayerMask.OCCLUDED
+            elif all(layer.wall != index for layer in self._layers):
+                self._reached[index] = painting.mask
+            return False
+        self._reached.pop(index, None)
+        self._layers.append(
+            Layer(
+                frame=self._surfaces[index].frame,
+                wall=index,
+                source=source,
+                rgb=painting.rgb,
+                mask=painting.mask,
+                quality=painting.quality,
+            )
+        )
+        return True
+
+    def _bare_layer(self, index: int) -> Layer:
+        surface = self._surfaces[index]
+        is_void = np.isnan(surface.relief.depth)
+        mask = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE).astype(np.uint8)
+        return Layer(
+            frame=surface.frame,
+            wall=index,
+            source=NO_SOURCE,
+            rgb=np.zeros((*mask.shape, 3), dtype=np.uint8),
+            mask=self._reached.get(index, mask),
+            quality=np.zeros(mask.shape, dtype=np.float32),
+        )
+
+    def _report(self, layers: list[Layer]) -> None:
+        ctx = self._ctx
+        n_surface = n_painted = n_hidden = 0
+        for index, surface in enumerate(self._surfaces):
+            masks = [layer.mask for layer in layers if layer.wall == index]
+            is_painted = np.logical_or.reduce([mask == LayerMask.PAINTED for mask in masks])
+            is_hidden = np.logical_or.reduce([mask == LayerMask.OCCLUDED for mask in masks])
+            n_surface += int(np.count_nonzero(~np.isnan(surface.relief.depth)))
+            n_painted += int(np.count_nonzero(is_painted))
+            n_hidden += int(np.count_nonzero(is_hidden & ~is_painted))
+        ctx.metric("n_layers", len(self._layers), "1")
+        ctx.metric("painted_share", n_painted / max(1, n_surface), "1")
+        ctx.metric("occluded_share", n_hidden / max(1, n_surface), "1")
+        n_cells = np.array([footprint.n_cells for footprint in self._footprints])
+        gsds = np.array([footprint.photo_gsd_m for footprint in self._footprints])
+        angles = np.array([footprint.obliquity_deg for footprint in self._footprints])
+        ctx.metric("photo_gsd_mm", 1e3 * _weighted_median(gsds, n_cells), "mm")
+        ctx.metric("obliquity_deg", _weighted_median(angles, n_cells), "deg")
+        for name, seconds in self._seconds.items():
+            ctx.metric(name, seconds, "s")
+
+
+def _oriented(inputs: DsmBackward.In) -> list[tuple[Photo, Camera]]:
+    """The photos that have a pose, with it.
+
+    Raises:
+        MethodError: there is none, there are no walls, or a camera has no photo.
+    """
+    if not inputs.walls.walls:
+        raise MethodError("there are no walls to lay photos onto: choose planes to raster")
+    photos = {photo.name: photo for photo in inputs.photos.photos}
+    cameras = [camera for camera in inputs.cameras.cameras if camera.status == "ok"]
+    if not cameras:
+        reasons = "; ".join(f"{item.photo}: {item.status}" for item in inputs.cameras.cameras)
+        raise MethodError(f"no photo is oriented, so none can be laid onto a wall: {reasons}")
+    missing = [camera.photo for camera in cameras if camera.photo not in photos]
+    if missing:
+        raise MethodError(
+            f"the cameras know {', '.join(missing)}, which the photos do not hold: wire the "
+            "photos that were oriented"
+        )
+    return [(photos[camera.photo], camera) for camera in cameras]
+
+
+def _require_size(photo: Photo, camera: Camera, pixels: NDArray[np.uint8]) -> None:
+    viewing = camera.viewing()
+    if pixels.shape[:2] != (viewing.height, viewing.width):
+        raise MethodError(
+            f"{photo.name} has {pixels.shape[1]} x {pixels.shape[0]} pixels, but its camera "
+            f"{viewing.width} x {viewing.height}: wire the photos that were oriented"
+        )
+
+
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.int64]) -> float:
+    order = np.argsort(values, kind="stable")
+    totals = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(totals, totals[-1] / 2.0)])

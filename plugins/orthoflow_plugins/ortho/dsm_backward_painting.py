@@ -1,0 +1,255 @@
+"""One photo laid onto one wall, tile by tile: which cells it sees, and their colours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import Final
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.visibility_kernels import (
+    OCCLUDED,
+    PAINTED,
+    DepthBuffer,
+    Relief,
+    Sight,
+    WallView,
+    look_at_cells,
+)
+from orthoflow_plugins.ortho.dsm_backward_sampling import (
+    Footprint,
+    Resampling,
+    footprint_of,
+    sample,
+)
+
+TILE_CELLS: Final = 512
+# cv2.remap takes images of sides below 32767.
+_CROP_MOST_PX: Final = 16_000
+
+Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SightRule:
+    """What counts as seen, and how colours are taken.
+
+    Attributes:
+        resampling: how colours between pixels are made.
+        is_filtered: average over what a cell covers where the photo is finer than the wall.
+        incidence_max_deg: cells seen more obliquely count as hidden.
+        erosion_cells: cells so near to a hidden one are not painted.
+        border_share: quality falls to 0 over this share of the photo's shorter side.
+    """
+
+    resampling: Resampling
+    is_filtered: bool
+    incidence_max_deg: float
+    erosion_cells: int
+    border_share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """A wall as it is looked at.
+
+    Attributes:
+        frame: where the cells lie.
+        relief: their depths, and what they hide.
+        front_m: up to this depth the relief holds all points there are.
+        tolerance_m: how far a surface must be above a ray to hide it.
+    """
+
+    frame: WallFrame
+    relief: Relief
+    front_m: float
+    tolerance_m: float
+
+
+@dataclass(kw_only=True)
+class Painting:
+    """What a photo painted on a wall.
+
+    Attributes:
+        mask: (rows, cols) uint8 `LayerMask`.
+        rgb: (rows, cols, 3) uint8, None when nothing was painted.
+        quality: (rows, cols) float32, None when nothing was painted.
+        footprints: of the tiles that were painted, by their first cell.
+    """
+
+    mask: NDArray[np.uint8]
+    rgb: NDArray[np.uint8] | None = None
+    quality: NDArray[np.float32] | None = None
+    footprints: dict[tuple[int, int], Footprint] = field(default_factory=dict)
+
+
+def view_of(camera: ViewingCamera, surface: Surface, rule: SightRule) -> WallView:
+    """Give a camera in the axes of a wall; survey coordinates lose nothing on the way."""
+    frame = surface.frame
+    axes = np.column_stack([frame.u_world, frame.v_world, frame.normal_world])
+    near = camera.shifted(frame.origin_world)
+    flat = near.flat.copy()
+    flat[:9] = (near.rotation @ axes).ravel()
+    centre = axes.T @ near.centre_world
+    return WallView(
+        camera=flat,
+        column=float(centre[0]) / frame.gsd_m - 0.5,
+        row=float(centre[1]) / frame.gsd_m - 0.5,
+        height_m=float(centre[2]),
+        gsd_m=float(frame.gsd_m),
+        front_m=float(surface.front_m),
+        tolerance_m=float(surface.tolerance_m),
+        cosine_least=math.cos(math.radians(rule.incidence_max_deg)),
+        border_px=max(1.0, rule.border_share * min(camera.width, camera.height)),
+    )
+
+
+def paint(
+    photo: NDArray[np.uint8],
+    view: WallView,
+    surface: Surface,
+    buffer: DepthBuffer,
+    rule: SightRule,
+    *,
+    allocate: Allocate,
+    threads: int,
+) -> Painting:
+    """Lay a photo onto a wall.
+
+    Args:
+        photo: (height, width, 3).
+        view: its camera before the wall.
+        surface: the wall.
+        buffer: what else stands before the camera.
+        rule: how.
+        allocate: gives the arrays of a layer, zeroed, once something is painted.
+        threads: how many tiles are painted at once; it does not show in the result.
+    """
+    brush = _Brush(photo, view, surface, buffer, rule, allocate)
+    rows, columns = surface.frame.shape
+    tiles = [
+        (slice(row, min(row + TILE_CELLS, rows)), slice(column, min(column + TILE_CELLS, columns)))
+        for row in range(0, rows, TILE_CELLS)
+        for column in range(0, columns, TILE_CELLS)
+    ]
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(brush.paint_tile, tiles):
+            pass
+    return brush.painting
+
+
+class _Brush:
+    """Paints the tiles of one painting, several at once."""
+
+    def __init__(
+        self,
+        photo: NDArray[np.uint8],
+        view: WallView,
+        surface: Surface,
+        buffer: DepthBuffer,
+        rule: SightRule,
+        allocate: Allocate,
+    ) -> None:
+        self.painting = Painting(mask=np.empty(surface.frame.shape, dtype=np.uint8))
+        self._photo = photo
+        self._view = view
+        self._surface = surface
+        self._buffer = buffer
+        self._rule = rule
+        self._allocate = allocate
+        self._lock = Lock()
+
+    def paint_tile(self, tile: tuple[slice, slice]) -> None:
+        import cv2
+
+        sight = self._look(tile)
+        self.painting.mask[tile] = sight.mask
+        if not sight.summary[4]:
+            return
+        if _crop_side(sight) > _CROP_MOST_PX and sight.mask.size > 1:
+            for quarter in _quarters(tile):
+                self.paint_tile(quarter)
+            return
+        footprint = footprint_of(self._view, sight)
+        rgb, quality = self._canvas()
+        is_painted = np.equal(sight.mask, PAINTED).view(np.uint8)
+        colours = sample(
+            self._photo,
+            sight,
+            footprint,
+            self._rule.resampling,
+            is_filtered=self._rule.is_filtered,
+        )
+        rgb[tile] = cv2.copyTo(colours, is_painted)
+        quality[tile] = sight.quality
+        self.painting.footprints[tile[0].start, tile[1].start] = footprint
+
+    def _look(self, tile: tuple[slice, slice]) -> Sight:
+        """See a tile, and hide what is near to hidden cells of it or beside it."""
+        import cv2
+
+        reach = self._rule.erosion_cells
+        first = [max(0, part.start - reach) for part in tile]
+        shape = tuple(
+            min(size, part.stop + reach) - start
+            for size, part, start in zip(self._surface.frame.shape, tile, first, strict=True)
+        )
+        sight = Sight(
+            u=np.zeros(shape, dtype=np.float32),
+            v=np.zeros(shape, dtype=np.float32),
+            mask=np.empty(shape, dtype=np.uint8),
+            quality=np.empty(shape, dtype=np.float32),
+            summary=np.empty(8),
+        )
+        look_at_cells(self._view, self._surface.relief, self._buffer, sight, first[0], first[1])
+        if reach and sight.summary[4]:
+            window = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
+            is_hidden = np.equal(sight.mask, OCCLUDED).view(np.uint8)
+            is_near = cv2.dilate(is_hidden, window).view(np.bool_) & (sight.mask == PAINTED)
+            sight.mask[is_near] = OCCLUDED
+            sight.quality[is_near] = 0.0
+        rows, columns = (
+            slice(part.start - start, part.stop - start)
+            for part, start in zip(tile, first, strict=True)
+        )
+        # Twelve bits tell views apart well enough, and pack to half the size.
+        sight.quality.view(np.uint32)[...] &= np.uint32(0xFFFFF000)
+        return Sight(
+            u=sight.u[rows, columns],
+            v=sight.v[rows, columns],
+            mask=sight.mask[rows, columns],
+            quality=sight.quality[rows, columns],
+            summary=sight.summary,
+        )
+
+    def _canvas(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        with self._lock:
+            painting, shape = self.painting, self._surface.frame.shape
+            if painting.rgb is None or painting.quality is None:
+                painting.rgb = np.asarray(self._allocate("rgb", (*shape, 3), np.uint8), np.uint8)
+                painting.quality = np.asarray(
+                    self._allocate("quality", shape, np.float32), np.float32
+                )
+            return painting.rgb, painting.quality
+
+
+def _crop_side(sight: Sight) -> float:
+    return float(max(sight.summary[1] - sight.summary[0], sight.summary[3] - sight.summary[2]))
+
+
+def _quarters(tile: tuple[slice, slice]) -> list[tuple[slice, slice]]:
+    halves = [_halves(part) for part in tile]
+    return [(rows, columns) for rows in halves[0] for columns in halves[1]]
+
+
+def _halves(part: slice) -> list[slice]:
+    middle = (part.start + part.stop) // 2
+    pieces = (slice(part.start, middle), slice(middle, part.stop))
+    return [piece for piece in pieces if piece.start < piece.stop]

@@ -1,0 +1,139 @@
+"""Colours of a photo at the cells of a tile: anti-aliased, in the photo's own grey levels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.camera_kernels import project_point
+from orthoflow.geometry.visibility_kernels import Sight, WallView
+
+Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
+
+# Lanczos reaches 4 pixels; more is cut off so that a tile's result does not depend on its crop.
+_REACH_PX: Final = 5
+# Below this a filter changes nothing that 8 bits could show.
+_SIGMA_LEAST_PX: Final = 0.2
+_BASE_CELLS: Final = 4.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Footprint:
+    """How a photo sees the middle of a tile.
+
+    Attributes:
+        pixels_across: photo pixels (u) that one cell covers.
+        pixels_down: photo pixels (v) that one cell covers.
+        photo_gsd_m: size of a photo pixel, square to the ray.
+        obliquity_deg: angle between the ray and the wall's normal.
+        n_cells: painted cells.
+    """
+
+    pixels_across: float
+    pixels_down: float
+    photo_gsd_m: float
+    obliquity_deg: float
+    n_cells: int
+
+
+def footprint_of(view: WallView, sight: Sight) -> Footprint:
+    """Measure the middle of the painted cells of a tile that has some."""
+    n_cells = float(sight.summary[4])
+    column, row, depth = (float(total) / n_cells for total in sight.summary[5:])
+    centre, beside, below = (
+        _project(view.camera, (column + a + 0.5) * view.gsd_m, (row + b + 0.5) * view.gsd_m, depth)
+        for a, b in ((0.0, 0.0), (_BASE_CELLS, 0.0), (0.0, _BASE_CELLS))
+    )
+    across = math.hypot(beside[0] - centre[0], below[0] - centre[0]) / _BASE_CELLS
+    down = math.hypot(beside[1] - centre[1], below[1] - centre[1]) / _BASE_CELLS
+    lift = view.height_m - depth
+    aside = view.gsd_m * math.hypot(view.column - column, view.row - row)
+    return Footprint(
+        # Not a number beyond the lens model, where a neighbour of a painted cell may lie.
+        pixels_across=across if math.isfinite(across) else 1.0,
+        pixels_down=down if math.isfinite(down) else 1.0,
+        photo_gsd_m=centre[2] / math.sqrt(view.camera[12] * view.camera[13]),
+        obliquity_deg=math.degrees(math.atan2(aside, lift)),
+        n_cells=int(n_cells),
+    )
+
+
+_project: Callable[..., tuple[float, float, float]] = project_point.py_func
+
+
+def sample(
+    photo: NDArray[np.uint8],
+    sight: Sight,
+    footprint: Footprint,
+    resampling: Resampling,
+    *,
+    is_filtered: bool,
+) -> NDArray[np.uint8]:
+    """Colours (rows, cols, 3) of a tile's cells; those of cells that are not painted mean nothing.
+
+    Args:
+        photo: (height, width, 3).
+        sight: where the cells are in the photo.
+        footprint: how many pixels a cell covers.
+        resampling: `nearest` gives the pixel's own colour and filters nothing.
+        is_filtered: average over what a cell covers where the photo is finer than the wall.
+    """
+    import cv2
+
+    if resampling == "nearest":
+        crop, corner = _crop(photo, sight, reach=0)
+        # Whole positions: the pixel that a place lies in, and nothing for OpenCV to round.
+        u, v = np.floor(sight.u), np.floor(sight.v)
+        return _remapped(crop, u - corner[0], v - corner[1], resampling)
+    sigmas = [
+        0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if is_filtered else 0.0
+        for pixels in (footprint.pixels_across, footprint.pixels_down)
+    ]
+    crop, corner = _crop(photo, sight, reach=_REACH_PX + math.ceil(4.0 * max(sigmas)))
+    if max(sigmas) > _SIGMA_LEAST_PX:
+        sizes = [2 * math.ceil(3.0 * sigma) + 1 for sigma in sigmas]
+        blurred = cv2.GaussianBlur(
+            crop,
+            (sizes[0], sizes[1]),
+            sigmaX=max(sigmas[0], 1e-3),
+            sigmaY=max(sigmas[1], 1e-3),
+            borderType=cv2.BORDER_REPLICATE,
+        )
+        crop = np.asarray(blurred, dtype=np.uint8)
+    # OpenCV has (0, 0) at the centre of the first pixel.
+    u, v = sight.u - (corner[0] + np.float32(0.5)), sight.v - (corner[1] + np.float32(0.5))
+    return _remapped(crop, u, v, resampling)
+
+
+def _remapped(
+    crop: NDArray[np.uint8],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    resampling: Resampling,
+) -> NDArray[np.uint8]:
+    import cv2
+
+    flags = {
+        "nearest": cv2.INTER_NEAREST,
+        "bilinear": cv2.INTER_LINEAR,
+        "cubic": cv2.INTER_CUBIC,
+        "lanczos": cv2.INTER_LANCZOS4,
+    }
+    return np.asarray(
+        cv2.remap(crop, u, v, flags[resampling], borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8
+    )
+
+
+def _crop(
+    photo: NDArray[np.uint8], sight: Sight, *, reach: int
+) -> tuple[NDArray[np.uint8], tuple[np.float32, np.float32]]:
+    """The part of a photo that a tile needs, and its first column and row."""
+    u_least, u_most, v_least, v_most = (math.floor(value) for value in sight.summary[:4])
+    first_column, first_row = max(0, u_least - reach), max(0, v_least - reach)
+    crop = photo[first_row : v_most + reach + 1, first_column : u_most + reach + 1]
+    return crop, (np.float32(first_column), np.float32(first_row))

@@ -1,0 +1,424 @@
+"""`ortho.dsm-backward`: which cells a photo paints, from which of its pixels, and with what."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Camera, Cameras, Layer, LayerMask, Layers, PointCloud
+from orthoflow.sdk import StepContext
+from tests import ortho_scenes as scenes
+from tests.raster_scenes import cloud_of, context
+
+
+def painted(
+    folder: Path,
+    *,
+    where: WallFrame | None = None,
+    cloud: PointCloud | None = None,
+    asides_m: tuple[float, ...] = (-0.7,),
+    depths: NDArray[np.float32] | None = None,
+    **params: object,
+) -> Layers:
+    where = where or scenes.frame()
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where, depths),
+        photos=scenes.photos(*(scenes.rendered(aside_m=aside) for aside in asides_m)),
+        cameras=scenes.cameras(*(scenes.camera(where, aside_m=aside) for aside in asides_m)),
+        cloud=cloud if cloud is not None else scenes.cloud(where),
+    )
+    return run(inputs, context(folder), **params)
+
+
+def run(inputs: DsmBackward.In, ctx: StepContext, **params: object) -> Layers:
+    return DsmBackward().run(inputs, DsmBackward.Params.model_validate(params), ctx).layers
+
+
+def places_told_by(layer: Layer) -> NDArray[np.float64]:
+    """Errors (rows, cols, 2) in cells of the places that the colours tell."""
+    rows, columns = np.mgrid[: scenes.SHAPE[0], : scenes.SHAPE[1]] + 0.5
+    told = layer.rgb[..., :2].astype(np.float64) + 0.5
+    expected = 4.0 * np.dstack([columns, rows])
+    return ((told - expected + 128.0) % 256.0 - 128.0) / 4.0
+
+
+@pytest.mark.parametrize("aside_m", [-0.7, 0.0, 0.9])
+def test_every_painted_cell_shows_its_own_place(tmp_path: Path, aside_m: float) -> None:
+    (layer,) = painted(tmp_path, asides_m=(aside_m,), resampling="nearest").layers
+    shown = layer.mask == LayerMask.PAINTED
+    blue = layer.rgb[..., 2]
+    expected = np.where(
+        scenes.depth_m() > 0.0, scenes.BLUE[scenes.RAISED], scenes.BLUE[scenes.BASE]
+    )
+    np.testing.assert_array_equal(blue[shown], expected[shown])
+    # Half a cell, and half of the quarter cell that a grey level is.
+    assert np.abs(places_told_by(layer)[shown]).max() <= 0.5 + 0.125
+
+
+@pytest.mark.parametrize("aside_m", [-0.7, 0.0, 0.9])
+def test_nothing_hidden_is_painted_and_nearly_all_that_is_seen(
+    tmp_path: Path, aside_m: float
+) -> None:
+    where = scenes.frame()
+    (layer,) = painted(tmp_path, asides_m=(aside_m,)).layers
+    seen = scenes.truth(where, scenes.camera(where, aside_m=aside_m))
+    is_visible = np.isin(seen.surface, (scenes.BASE, scenes.RAISED)).reshape(scenes.SHAPE)
+    is_behind_board = (seen.surface == scenes.BOARD).reshape(scenes.SHAPE)
+    assert is_behind_board.any()
+    assert (layer.mask[is_behind_board] == LayerMask.OCCLUDED).all()
+    assert (layer.mask[~is_visible] == LayerMask.OCCLUDED).all()
+    assert np.mean(layer.mask[is_visible] == LayerMask.PAINTED) > 0.97
+
+
+def test_the_shadow_of_a_step_is_as_wide_as_it_should_be(tmp_path: Path) -> None:
+    # The camera stands to the right of the raised part's edge: a strip to its left is hidden.
+    where = scenes.frame()
+    (layer,) = painted(tmp_path, asides_m=(0.9,), erosion_cells=0).layers
+    seen = scenes.truth(where, scenes.camera(where, aside_m=0.9))
+    is_hidden = (seen.surface == scenes.SIDE) | (seen.surface == scenes.RAISED)
+    is_hidden = is_hidden.reshape(scenes.SHAPE) & (scenes.depth_m() == 0.0)
+    assert is_hidden.sum(axis=1).min() >= 4
+    rows = slice(0, 40)  # above what the board hides
+    differs = (layer.mask == LayerMask.OCCLUDED)[rows] != is_hidden[rows]
+    assert differs.sum(axis=1).max() <= 1  # the tolerance is half a cell
+
+
+def test_without_the_cloud_the_board_is_painted_and_that_is_said(tmp_path: Path) -> None:
+    where = scenes.frame()
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=scenes.photos(scenes.rendered()),
+        cameras=scenes.cameras(scenes.camera(where)),
+    )
+    ctx = context(tmp_path)
+    (layer,) = run(inputs, ctx, resampling="nearest").layers
+    assert (layer.rgb[..., 2] == scenes.BLUE[scenes.BOARD]).sum() > 1000
+    assert any("no cloud is wired" in warning for warning in ctx.warnings)
+
+
+def test_single_points_in_the_air_hide_nothing(tmp_path: Path) -> None:
+    where = scenes.frame()
+    (tmp_path / "clean").mkdir()
+    (clean,) = painted(tmp_path / "clean").layers
+    (layer,) = painted(tmp_path, cloud=scenes.cloud(where, n_outliers=300)).layers
+    np.testing.assert_array_equal(layer.mask, clean.mask)
+
+
+def test_points_at_the_scanner_itself_hide_nothing(tmp_path: Path) -> None:
+    where = scenes.frame()
+    viewer = scenes.camera(where)
+    cloud = scenes.cloud(where)
+    # What a scanner reports from nearer than it can measure: a swarm right before the camera.
+    station = viewer.centre_world + 0.1 * viewer.rays_world(np.array([[500.0, 400.0]]))
+    swarm = station + np.random.default_rng(1).normal(0.0, 0.01, (200, 3))
+    spoilt = cloud_of(np.vstack([cloud.points_world(), swarm]))
+    layers = []
+    for name, scan in (
+        ("clean", cloud),
+        ("spoilt", spoilt),
+        ("known", dataclasses.replace(spoilt, stations=station)),
+    ):
+        (tmp_path / name).mkdir()
+        layers.append(painted(tmp_path / name, cloud=scan).layers[0])
+    clean, swarmed, known = layers
+    assert (swarmed.mask != clean.mask).any()
+    np.testing.assert_array_equal(known.mask, clean.mask)
+
+
+def test_a_sparse_board_hides_as_well_as_a_dense_one(tmp_path: Path) -> None:
+    where = scenes.frame()
+    cloud = scenes.cloud(where, spacing_cells=3.0)
+    (layer,) = painted(tmp_path, cloud=cloud, resampling="nearest").layers
+    assert not (layer.rgb[..., 2] == scenes.BLUE[scenes.BOARD]).any()
+    seen = scenes.truth(where, scenes.camera(where))
+    is_behind_board = (seen.surface == scenes.BOARD).reshape(scenes.SHAPE)
+    assert (layer.mask[is_behind_board] == LayerMask.OCCLUDED).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_and_spikes_of_the_surface_hide_little(tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    noisy = scenes.depth_m() + rng.normal(0.0, 0.002, scenes.SHAPE).astype(np.float32)
+    spikes = rng.random(scenes.SHAPE) < 0.001
+    noisy[spikes] += 0.1
+    where = scenes.frame()
+    (layer,) = painted(tmp_path, depths=noisy, resampling="nearest").layers
+    seen = scenes.truth(where, scenes.camera(where))
+    is_visible = np.isin(seen.surface, (scenes.BASE, scenes.RAISED)).reshape(scenes.SHAPE)
+    assert np.mean(layer.mask[is_visible] == LayerMask.PAINTED) > 0.96
+    is_behind_board = (seen.surface == scenes.BOARD).reshape(scenes.SHAPE)
+    assert (layer.mask[is_behind_board & ~spikes] == LayerMask.OCCLUDED).all()
+
+
+@pytest.mark.parametrize("distorted", [True, False])
+def test_nearest_paints_the_source_pixel_itself(tmp_path: Path, distorted: bool) -> None:
+    where = scenes.frame()
+    viewer = scenes.camera(where, distorted=distorted)
+    noise = np.random.default_rng(1).integers(1, 256, (viewer.height, viewer.width, 3), np.uint8)
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=scenes.photos(noise),
+        cameras=scenes.cameras(viewer),
+        cloud=scenes.cloud(where),
+    )
+    (layer,) = run(inputs, context(tmp_path), resampling="nearest").layers
+    rows, columns = np.nonzero(layer.mask == LayerMask.PAINTED)
+    points = where.world_from_wall(
+        np.column_stack([columns, rows]) + 0.5, scenes.depth_m()[rows, columns].astype(np.float64)
+    )
+    pixels = viewer.project(points)[:, :2]
+    # Within a thousandth of a pixel of its border, rounding decides which pixel it is.
+    clear = (np.abs(pixels - np.rint(pixels)) > 1e-3).all(axis=1)
+    assert clear.mean() > 0.99
+    u, v = np.floor(pixels[clear]).astype(int).T
+    np.testing.assert_array_equal(layer.rgb[rows[clear], columns[clear]], noise[v, u])
+    assert (layer.rgb[layer.mask != LayerMask.PAINTED] == 0).all()
+    assert (layer.quality[layer.mask != LayerMask.PAINTED] == 0.0).all()
+
+
+@pytest.mark.parametrize("resampling", ["bilinear", "cubic", "lanczos"])
+@pytest.mark.parametrize("kind", ["checker", "zone plate"])
+def test_what_is_finer_than_a_cell_gives_its_mean_grey(
+    tmp_path: Path, resampling: str, kind: str
+) -> None:
+    where = scenes.frame()
+    viewer = scenes.camera(where, width=2000)
+    rows, columns = np.mgrid[: viewer.height, : viewer.width]
+    if kind == "checker":
+        grey = 40 + 160 * ((rows + columns) % 2)
+    else:
+        # Chirp from the centre whose period is below two pixels of 6 per cell far out.
+        squares = (columns - 1000.0) ** 2 + (rows - 800.0) ** 2
+        grey = 120 + 80 * np.cos(np.pi * squares / 2000.0)
+    picture = np.dstack([np.rint(grey).astype(np.uint8)] * 3)
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=scenes.photos(picture),
+        cameras=scenes.cameras(viewer),
+        cloud=scenes.cloud(where),
+    )
+    (layer,) = run(inputs, context(tmp_path), resampling=resampling).layers
+    shown = layer.mask == LayerMask.PAINTED
+    if kind == "zone plate":
+        # A cell covers 3 pixels: beyond a period of 3 pixels nothing can be shown.
+        points = where.world_from_wall(
+            np.argwhere(shown)[:, ::-1] + 0.5, scenes.depth_m()[shown].astype(np.float64)
+        )
+        radius = np.hypot(*(viewer.project(points)[:, :2] - [1000.0, 800.0]).T)
+        fine = np.zeros_like(shown)
+        fine[shown] = (radius > 2000.0 / 3.0) & (radius < 1000.0)
+        shown = fine
+    assert shown.sum() > 3000
+    contrast = np.abs(layer.rgb[shown].astype(float) - 120.0)
+    assert contrast.max() < 0.1 * 80.0
+    (tmp_path / "raw").mkdir()
+    (raw,) = run(inputs, context(tmp_path / "raw"), resampling=resampling, antialias=False).layers
+    assert raw.rgb[shown].astype(float).std() > 20.0  # what it protects from
+
+
+def test_survey_coordinates_change_nothing(tmp_path: Path) -> None:
+    layers = []
+    for at_survey in (False, True):
+        folder = tmp_path / str(at_survey)
+        folder.mkdir()
+        layers.append(painted(folder, where=scenes.frame(at_survey=at_survey)).layers[0])
+    local, survey = layers
+    # Positions of 10^6 m carry 1e-10 m, so a cell in a hundred thousand may fall on the other side.
+    assert np.mean(local.mask != survey.mask) < 1e-4
+    same = (local.mask == LayerMask.PAINTED) & (survey.mask == LayerMask.PAINTED)
+    difference = local.rgb[same].astype(int) - survey.rgb[same].astype(int)
+    assert np.mean(difference != 0) < 1e-3
+    np.testing.assert_allclose(local.quality[same], survey.quality[same], rtol=2.0**-11)
+
+
+def test_threads_and_tiles_do_not_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from orthoflow_plugins.ortho import dsm_backward_painting
+
+    where = scenes.frame()
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=scenes.photos(scenes.rendered()),
+        cameras=scenes.cameras(scenes.camera(where)),
+        cloud=scenes.cloud(where),
+    )
+    found = []
+    for cores in (1, 2, 5):
+        folder = tmp_path / str(cores)
+        folder.mkdir()
+        found.append(run(inputs, context(folder, cores=cores)).layers[0])
+    folder = tmp_path / "tiles"
+    folder.mkdir()
+    monkeypatch.setattr(dsm_backward_painting, "TILE_CELLS", 50)
+    tiled = run(inputs, context(folder), resampling="nearest").layers[0]
+    for layer in found[1:]:
+        np.testing.assert_array_equal(layer.mask, found[0].mask)
+        np.testing.assert_array_equal(layer.rgb, found[0].rgb)
+        np.testing.assert_array_equal(layer.quality, found[0].quality)
+    np.testing.assert_array_equal(tiled.mask, found[0].mask)
+    np.testing.assert_array_equal(tiled.quality, found[0].quality)
+
+
+def test_erosion_takes_the_cells_beside_hidden_ones(tmp_path: Path) -> None:
+    import cv2
+
+    layers = []
+    for cells in (0, 2):
+        folder = tmp_path / str(cells)
+        folder.mkdir()
+        layers.append(painted(folder, erosion_cells=cells).layers[0])
+    plain, eroded = layers
+    hidden = (plain.mask == LayerMask.OCCLUDED).astype(np.uint8)
+    near = cv2.dilate(hidden, np.ones((5, 5), np.uint8)) > 0
+    expected = np.where(near & (plain.mask == LayerMask.PAINTED), LayerMask.OCCLUDED, plain.mask)
+    np.testing.assert_array_equal(eroded.mask, expected)
+
+
+def test_quality_is_pixels_per_cell_and_falls_off_at_the_border(tmp_path: Path) -> None:
+    where = scenes.frame()
+    viewer = scenes.camera(where)
+    (layer,) = painted(tmp_path, border_share=0.1).layers
+    rows, columns = np.nonzero(layer.mask == LayerMask.PAINTED)
+    points = where.world_from_wall(
+        np.column_stack([columns, rows]) + 0.5, scenes.depth_m()[rows, columns].astype(np.float64)
+    )
+    seen = viewer.project(points)
+    rays = viewer.centre_world - points
+    cosine = rays @ where.normal_world / np.linalg.norm(rays, axis=1)
+    photo_gsd = seen[:, 2] / np.sqrt(viewer.fx * viewer.fy)
+    border = np.min(
+        [seen[:, 0], viewer.width - seen[:, 0], seen[:, 1], viewer.height - seen[:, 1]], 0
+    )
+    falls = np.clip(border / (0.1 * viewer.height), 0.0, 1.0)
+    expected = cosine * (where.gsd_m / photo_gsd) ** 2 * falls
+    np.testing.assert_allclose(layer.quality[rows, columns], expected, rtol=2.0**-11, atol=1e-6)
+
+
+def test_cells_without_a_surface_and_outside_the_photo_say_so(tmp_path: Path) -> None:
+    where = scenes.frame()
+    depths = scenes.depth_m()
+    depths[200:220, 20:60] = np.nan
+    viewer = scenes.camera(where)
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where, depths),
+        photos=scenes.photos(scenes.rendered()[:, :500]),
+        cameras=scenes.cameras(dataclasses.replace(viewer, width=500)),
+        cloud=scenes.cloud(where),
+    )
+    (layer,) = run(inputs, context(tmp_path)).layers
+    assert (layer.mask[200:220, 20:60] == LayerMask.NO_SURFACE).all()
+    rows, columns = np.mgrid[: scenes.SHAPE[0], : scenes.SHAPE[1]] + 0.5
+    points = where.world_from_wall(
+        np.column_stack([columns.ravel(), rows.ravel()]), scenes.depth_m().ravel().astype(float)
+    )
+    u = viewer.project(points)[:, 0].reshape(scenes.SHAPE)
+    has_surface = ~np.isnan(depths)
+    np.testing.assert_array_equal(
+        (layer.mask == LayerMask.OUTSIDE)[has_surface], (u >= 500)[has_surface]
+    )
+
+
+def turned_away(viewer: ViewingCamera, where: WallFrame) -> ViewingCamera:
+    turn = np.diag([-1.0, 1.0, -1.0])
+    rotation = turn @ viewer.rotation
+    return dataclasses.replace(
+        viewer, rotation=rotation, translation=-rotation @ viewer.centre_world
+    )
+
+
+def test_photos_that_paint_nothing_are_left_out_and_walls_keep_their_index(tmp_path: Path) -> None:
+    where = scenes.frame()
+    viewer = scenes.camera(where)
+    walls = scenes.walls(where)
+    (wall,) = walls.walls
+    # A wall behind the camera that faces it, out of its sight.
+    behind = dataclasses.replace(
+        where,
+        origin_world=where.world_from_wall(np.array([[where.width, 0.0]]), 4.0)[0],
+        u_world=-where.u_world,
+        normal_world=-where.normal_world,
+    )
+    other = dataclasses.replace(wall, frame=behind, name="wall 1")
+    walls = dataclasses.replace(walls, walls=(other, wall))
+    ctx = context(tmp_path)
+    inputs = DsmBackward.In(
+        walls=walls,
+        photos=scenes.photos(scenes.rendered(), scenes.rendered(aside_m=0.0)),
+        cameras=scenes.cameras(viewer, turned_away(scenes.camera(where, aside_m=0.0), where)),
+        cloud=scenes.cloud(where),
+    )
+    layers = run(inputs, ctx)
+    # The turned camera paints the other wall: both walls have a layer.
+    assert [(layer.wall, layer.source) for layer in layers.layers] == [(0, "1.png"), (1, "0.png")]
+    assert layers.names == ("wall 1", "wall 0")
+    only = Cameras(
+        cameras=(
+            inputs.cameras.cameras[0],
+            Camera(photo="1.png", status="too few ties agree"),
+        )
+    )
+    ctx = context(tmp_path)
+    layers = run(dataclasses.replace(inputs, cameras=only), ctx)
+    assert [(layer.wall, layer.source) for layer in layers.layers] == [
+        (0, "no photo"),
+        (1, "0.png"),
+    ]
+    assert (layers.layers[0].mask == LayerMask.OUTSIDE).all()
+    assert ctx.warnings == ["no photo shows wall 1: the orthoimage stays empty"]
+
+
+def test_metrics_tell_what_was_painted_and_from_how_far(tmp_path: Path) -> None:
+    where = scenes.frame()
+    ctx = context(tmp_path)
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=scenes.photos(scenes.rendered()),
+        cameras=scenes.cameras(scenes.camera(where)),
+        cloud=scenes.cloud(where),
+    )
+    (layer,) = run(inputs, ctx).layers
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    assert metrics["n_layers"] == 1
+    assert metrics["painted_share"] == np.mean(layer.mask == LayerMask.PAINTED)
+    assert metrics["occluded_share"] == np.mean(layer.mask == LayerMask.OCCLUDED)
+    # 2.1 m along the axis, a focal length of 1505 pixels; 0.7 m aside of 2 m before the wall.
+    assert metrics["photo_gsd_mm"] == pytest.approx(1e3 * 2.1 / 1505, rel=0.02)
+    assert metrics["obliquity_deg"] == pytest.approx(np.degrees(np.arctan2(0.7, 2.0)), abs=2.0)
+
+
+def refused(cameras: Cameras, folder: Path, **changes: object) -> str:
+    where = scenes.frame()
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=scenes.photos(scenes.rendered()),
+        cameras=cameras,
+        cloud=scenes.cloud(where),
+    )
+    with pytest.raises(MethodError) as caught:
+        run(dataclasses.replace(inputs, **changes), context(folder))
+    return str(caught.value)
+
+
+def test_what_cannot_be_painted_is_refused_with_the_reason(tmp_path: Path) -> None:
+    where = scenes.frame()
+    viewer = scenes.camera(where)
+    lost = Cameras(cameras=(Camera(photo="0.png", status="only 3 ties agree"),))
+    assert "no photo is oriented" in refused(lost, tmp_path)
+    assert "0.png: only 3 ties agree" in refused(lost, tmp_path)
+    good = scenes.cameras(viewer)
+    assert "no oriented photo sees a wall" in refused(
+        scenes.cameras(turned_away(viewer, where)), tmp_path
+    )
+    renamed = Cameras(cameras=(dataclasses.replace(good.cameras[0], photo="x.png"),))
+    assert "x.png, which the photos do not hold" in refused(renamed, tmp_path)
+    small = scenes.photos(scenes.rendered()[:-1])
+    assert "0.png has 1000 x 799 pixels" in refused(good, tmp_path, photos=small)
+    none = dataclasses.replace(scenes.walls(where), walls=())
+    assert "there are no walls" in refused(good, tmp_path, walls=none)
