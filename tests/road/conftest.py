@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -35,19 +36,28 @@ class Shell:
 
     Attributes:
         folder: working directory of every command.
+        store: what `run` and `plan` use unless told otherwise; the tests of a session share it,
+            because compiling kernels anew takes longer than what they test.
         paths: import path before the installed packages.
-        environment: variables on top of the process's own.
     """
 
     folder: Path
+    store: Path
     paths: tuple[str, ...] = CHECKOUT
-    environment: Mapping[str, str] = field(default_factory=dict)
 
     def variables(self) -> dict[str, str]:
-        return {**os.environ, "PYTHONPATH": os.pathsep.join(self.paths), **self.environment}
+        return {**os.environ, "PYTHONPATH": os.pathsep.join(self.paths)}
 
     def command(self, *arguments: object) -> list[str]:
-        return [sys.executable, "-m", "orthoflow", *map(str, arguments)]
+        words = [*map(str, arguments)]
+        if words[0] in ("run", "plan") and "--store" not in words:
+            words += ["--store", str(self.store)]
+        return [sys.executable, "-m", "orthoflow", *words]
+
+    def compiled_store(self, name: str) -> str:
+        """A new store in the folder that has nothing but the session's compiled kernels."""
+        shutil.copytree(self.store / "numba", self.folder / name / "numba")
+        return name
 
     def __call__(self, *arguments: object, timeout_s: float = 300) -> Ended:
         completed = subprocess.run(
@@ -63,10 +73,21 @@ class Shell:
         return Ended(completed.returncode, completed.stdout, completed.stderr)
 
 
+@pytest.fixture(scope="session")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store in which `direct.yaml` ran once, so that its kernels are compiled."""
+    folder = tmp_path_factory.mktemp("store")
+    shell = Shell(folder, folder / "store")
+    coarse = ("--set", "room.scan_step_m=0.08", "--set", "wall.gsd_m=0.08")
+    ended = shell("run", "direct.yaml", *coarse, "-o", "warm", timeout_s=900)
+    assert ended.code == 0, ended.said
+    return folder / "store"
+
+
 @pytest.fixture
-def shell(tmp_path: Path) -> Shell:
+def shell(tmp_path: Path, store: Path) -> Shell:
     """The command line with the built-in plugins."""
-    return Shell(tmp_path)
+    return Shell(tmp_path, store)
 
 
 @pytest.fixture(scope="session")
@@ -88,9 +109,9 @@ def stranger_paths(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
 
 
 @pytest.fixture
-def with_stranger(tmp_path: Path, stranger_paths: tuple[str, ...]) -> Shell:
+def with_stranger(tmp_path: Path, store: Path, stranger_paths: tuple[str, ...]) -> Shell:
     """The command line with the stranger's plugin installed."""
-    return Shell(tmp_path, stranger_paths)
+    return Shell(tmp_path, store, stranger_paths)
 
 
 @pytest.fixture

@@ -14,16 +14,16 @@ import pytest
 import orthoflow
 from orthoflow.files.geotiff import read_raster
 from orthoflow.geometry import angle_between_deg
-from tests.road.conftest import CHECKOUT, Shell
+from tests.road.conftest import Shell
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
 SMALL = ("--set", "room.scan_step_m=0.02", "--set", "wall.gsd_m=0.03")
 
 
 @pytest.fixture(scope="module")
-def road(tmp_path_factory: pytest.TempPathFactory) -> Shell:
+def road(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
     """A folder in which `direct.yaml` ran once on the small simulated room, as `run`."""
-    shell = Shell(tmp_path_factory.mktemp("road"), CHECKOUT)
+    shell = Shell(tmp_path_factory.mktemp("road"), store)
     ended = shell("run", "direct.yaml", *SMALL, "-o", "run")
     assert ended.code == 0, ended.said
     assert str(Path("run") / "report.html") in ended.out

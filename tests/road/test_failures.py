@@ -37,12 +37,11 @@ steps:
   room: {use: simulate.room, params: {scan_step_m: 0.1}}
   bad:
     in: {cloud: room.cloud}
-    timeout: 5s
     variants:
       crash: {use: mischief.crash}
       exit: {use: mischief.exit}
       raise: {use: mischief.raise}
-      hang: {use: mischief.hang}
+      hang: {use: mischief.hang, timeout: 5s}
       fill: {use: mischief.fill}
       good: {use: mischief.good}
   wall: {use: raster.grid, in: {cloud: room.cloud, planes: bad.planes}, params: {gsd_m: 0.1}}
@@ -65,7 +64,7 @@ def test_all_errors_of_a_workflow_file_come_at_once_with_their_lines(
         "wrong.yaml:3:1",  # unknown key
         "did you mean seed",
         "wrong.yaml:5:17",  # wrong type
-        "wrong.yaml:8:17",  # unknown method
+        "wrong.yaml:8:16",  # unknown method
         "did you mean plane.hough2d",
         "wrong.yaml:9:",  # planes not wired
         "wrong.yaml:10:3",  # duplicate step

@@ -28,13 +28,14 @@ def digests(run_folder: Path) -> dict[str, str]:
 def test_killed_runs_resume_with_the_same_digests(shell: Shell) -> None:
     command = ("run", "direct.yaml", *SMALL)
     started = time.monotonic()
-    quiet = shell(*command, "-o", "quiet", "--store", "quiet-store")
+    quiet = shell(*command, "-o", "quiet", "--store", shell.compiled_store("quiet-store"))
     duration_s = time.monotonic() - started
     assert quiet.code == 0, quiet.said
     expected = digests(shell.folder / "quiet")
     rng = random.Random(20150807)
     for attempt in range(KILLS):
-        arguments = (*command, "-o", f"killed{attempt}", "--store", f"store{attempt}")
+        store = shell.compiled_store(f"store{attempt}")
+        arguments = (*command, "-o", f"killed{attempt}", "--store", store)
         _kill_after(shell, arguments, rng.uniform(0.5, duration_s))
         ended = shell(*arguments)
         finished_before = ended.code == 2 and "run.h5" in ended.said
@@ -60,7 +61,8 @@ def _kill_after(shell: Shell, arguments: tuple[str, ...], seconds: float) -> Non
 
 
 def test_ctrl_c_says_how_to_go_on(shell: Shell) -> None:
-    arguments = ("run", "direct.yaml", *SMALL, "-o", "run")
+    store = shell.compiled_store("store")
+    arguments = ("run", "direct.yaml", *SMALL, "-o", "run", "--store", store)
     process = subprocess.Popen(
         shell.command(*arguments),
         cwd=shell.folder,
@@ -85,7 +87,8 @@ def test_ctrl_c_says_how_to_go_on(shell: Shell) -> None:
 def test_both_executors_give_the_same_digests(shell: Shell) -> None:
     found = []
     for executor in ("inline", "local"):
-        options = ("--store", f"{executor}-store", "-o", executor, "--executor", executor)
+        store = shell.compiled_store(f"{executor}-store")
+        options = ("--store", store, "-o", executor, "--executor", executor)
         ended = shell("run", "direct.yaml", *SMALL, *options)
         assert ended.code == 0, ended.said
         found.append(digests(shell.folder / executor))
