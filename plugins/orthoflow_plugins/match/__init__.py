@@ -1,0 +1,1 @@
+"""Methods of the kind `match`: points of photos found on the walls."""

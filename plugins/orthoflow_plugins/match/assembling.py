@@ -1,0 +1,132 @@
+"""Ties from the pieces that photos and walls give, each piece one photo on one wall."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiePiece:
+    """Ties of one photo with one wall.
+
+    Attributes:
+        photo: index of the photo.
+        wall: index of the wall.
+        pixels_photo: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
+        points_world: (n, 3) float64 metres.
+        sigma_px: (n,) float64.
+        sigma_m: (n,) float64.
+        role: what they are good for.
+    """
+
+    photo: int
+    wall: int
+    pixels_photo: NDArray[np.float64]
+    points_world: NDArray[np.float64]
+    sigma_px: NDArray[np.float64]
+    sigma_m: NDArray[np.float64]
+    role: TieRole = TieRole.CONTROL
+
+    def __len__(self) -> int:
+        return len(self.pixels_photo)
+
+    def take(self, chosen: NDArray[np.bool_]) -> TiePiece:
+        """Give some of the ties."""
+        return TiePiece(
+            photo=self.photo,
+            wall=self.wall,
+            pixels_photo=self.pixels_photo[chosen],
+            points_world=self.points_world[chosen],
+            sigma_px=self.sigma_px[chosen],
+            sigma_m=self.sigma_m[chosen],
+            role=self.role,
+        )
+
+
+def require_photos(photos: Photos) -> None:
+    """Refuse an empty set of photos.
+
+    Raises:
+        MethodError: there are no photos.
+    """
+    if not photos.photos:
+        raise MethodError("there are no photos to match with the walls: give at least one photo")
+
+
+def ties_of(
+    pieces: Sequence[TiePiece], photos: Photos, walls: Walls, details: dict[str, JsonValue]
+) -> Ties:
+    """Join pieces into one product, in their order.
+
+    `details["walls"]` says what the orientation needs to know of the walls: cell size, normal and
+    corners.
+    """
+    counts = [len(piece) for piece in pieces]
+    total = sum(counts)
+
+    def column(values: list[int], dtype: type[np.integer]) -> NDArray[np.int32]:
+        return np.repeat(np.array(values, dtype=dtype), counts)
+
+    def joined(name: str, width: int) -> NDArray[np.float64]:
+        shape = (0, width) if width > 1 else (0,)
+        return np.concatenate([np.empty(shape), *(getattr(piece, name) for piece in pieces)])
+
+    return Ties(
+        photo_names=tuple(photo.name for photo in photos.photos),
+        photo=column([piece.photo for piece in pieces], np.int32),
+        wall=column([piece.wall for piece in pieces], np.int32),
+        pixels_photo=joined("pixels_photo", 2),
+        points_world=joined("points_world", 3),
+        sigma_px=joined("sigma_px", 1),
+        sigma_m=joined("sigma_m", 1),
+        role=np.repeat(np.array([piece.role for piece in pieces], dtype=np.uint8), counts),
+        residual_px=np.full((total, 2), np.nan),
+        details={**details, "walls": [_wall_json(walls, k) for k in range(len(walls.walls))]},
+    )
+
+
+def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
+    """Keep one of several ties that say the same: one place of a photo on overlapping walls.
+
+    Planes that lie close to each other show the same surface when the rasters reach far; twins
+    would count twice in the orientation. The one with the smallest `sigma_m` stays.
+    """
+    if len(pieces) < 2:
+        return list(pieces)
+    pixels = np.concatenate([piece.pixels_photo for piece in pieces])
+    points = np.concatenate([piece.points_world for piece in pieces])
+    sigma_m = np.concatenate([piece.sigma_m for piece in pieces])
+    # Twins share key point and surface, up to the rasters' cells.
+    order = np.lexsort((sigma_m, pixels[:, 1].round(3), pixels[:, 0].round(3)))
+    kept = np.ones(len(pixels), dtype=np.bool_)
+    first = 0
+    for here, nth in enumerate(order):
+        if np.abs(pixels[nth] - pixels[order[first]]).max() > 1e-3:
+            first = here
+            continue
+        rivals = order[first:here]
+        rivals = rivals[kept[rivals]]
+        distance = np.linalg.norm(points[rivals] - points[nth], axis=1)
+        kept[nth] = not (distance < 4.0 * (sigma_m[rivals] + sigma_m[nth])).any()
+    ends = np.cumsum([len(piece) for piece in pieces])
+    return [
+        piece.take(kept[end - len(piece) : end]) for piece, end in zip(pieces, ends, strict=True)
+    ]
+
+
+def _wall_json(walls: Walls, index: int) -> JsonValue:
+    frame = walls.walls[index].frame
+    corners: list[JsonValue] = [row.tolist() for row in frame.corners_world()]
+    return {
+        "name": walls.walls[index].name,
+        "gsd_m": frame.gsd_m,
+        "normal": frame.normal_world.tolist(),
+        "corners_world": corners,
+    }

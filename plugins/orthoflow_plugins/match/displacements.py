@@ -1,0 +1,176 @@
+"""How far two pictures of one wall are displaced at chosen places, to a fraction of a cell.
+
+First the best whole cell by correlation within a radius, then least-squares matching (Grün 1985):
+the shift, with its standard deviation, that brings both patches together.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.point_kernels import in_threads
+from orthoflow_plugins.match.channels import Channels
+from orthoflow_plugins.match.patch_kernels import Picture, match_patches, search_shifts
+
+# Patches of which less is known than this say nothing.
+_KNOWN_LEAST: Final = 0.6
+# Neighbouring residuals of smoothed pictures agree: independent ones are this much fewer.
+_CORRELATION_AREA_CELLS: Final = 6.0
+_DRIFT_MOST_CELLS: Final = 1.5
+_DISAGREEMENT_MOST_CELLS: Final = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchRule:
+    """How displacements are measured.
+
+    Attributes:
+        radius_cells: how far to search.
+        half_patch_cells: patches are (2 h + 1)^2 cells.
+        score_least: smallest correlation.
+        distinct_least: by how much the best correlation must exceed the next peak.
+        threads: patches are shared between so many.
+    """
+
+    radius_cells: int
+    half_patch_cells: int
+    score_least: float
+    distinct_least: float
+    threads: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Displacements:
+    """Measured displacements.
+
+    Attributes:
+        places: (n, 2) intp (column, row) cells of the first picture.
+        shift_cells: (n, 2) float64: what is at cell + shift in the second picture.
+        score: (n,) correlation.
+        sigma_cells: (n,) float64 standard deviation of a coordinate of the shift.
+    """
+
+    places: NDArray[np.intp]
+    shift_cells: NDArray[np.float64]
+    score: NDArray[np.float64]
+    sigma_cells: NDArray[np.float64]
+
+    def take(self, chosen: NDArray[np.bool_]) -> Displacements:
+        """Give some of them."""
+        return Displacements(
+            places=self.places[chosen],
+            shift_cells=self.shift_cells[chosen],
+            score=self.score[chosen],
+            sigma_cells=self.sigma_cells[chosen],
+        )
+
+
+def measure(
+    first: Channels, second: Channels, places: NDArray[np.intp], rule: SearchRule
+) -> Displacements:
+    """Measure displacements from the first picture to the second at cells (n, 2) of the first."""
+    places = _well_known(first, second, places, rule)
+    found = np.zeros((len(places), 4))
+    reach = (rule.half_patch_cells, rule.radius_cells)
+    in_threads(
+        [
+            partial(search_shifts, first.values, second.values, places[part], reach, found[part])
+            for part in _parts(len(places), rule.threads)
+        ]
+    )
+    kept = (found[:, 2] >= rule.score_least) & (found[:, 3] >= rule.distinct_least)
+    return _refined(first, second, (places[kept], found[kept, :2]), rule)
+
+
+def _parts(count: int, threads: int) -> list[slice]:
+    edges = np.linspace(0, count, max(1, threads) + 1).astype(int).tolist()
+    return [slice(low, high) for low, high in itertools.pairwise(edges)]
+
+
+def _well_known(
+    first: Channels, second: Channels, places: NDArray[np.intp], rule: SearchRule
+) -> NDArray[np.intp]:
+    """Places whose search stays inside the pictures and whose patches are mostly known."""
+    import cv2
+
+    reach = rule.radius_cells + rule.half_patch_cells + 2
+    rows, columns = first.known.shape
+    inside = (
+        (places[:, 0] >= reach)
+        & (places[:, 0] < columns - reach)
+        & (places[:, 1] >= reach)
+        & (places[:, 1] < rows - reach)
+    )
+    places = places[inside]
+    side = 2 * rule.half_patch_cells + 1
+    share = cv2.blur(first.known * second.known, (side, side))
+    known = share[places[:, 1], places[:, 0]] >= _KNOWN_LEAST
+    return np.ascontiguousarray(places[known])
+
+
+def _refined(
+    first: Channels,
+    second: Channels,
+    start: tuple[NDArray[np.intp], NDArray[np.float64]],
+    rule: SearchRule,
+) -> Displacements:
+    places, begun = start
+    window = _window(rule.half_patch_cells)
+    forward = _matched((first, second), (places, begun), window, rule.threads)
+    # Both ways, halved: what interpolation does to one of the pictures then cancels.
+    middle = np.rint(forward.shifts).astype(np.intp)
+    back = _matched((second, first), (places + middle, -forward.shifts), window, rule.threads)
+    shifts = 0.5 * (forward.shifts - back.shifts)
+    disagreement = np.abs(forward.shifts + back.shifts).max(axis=1, initial=0.0)
+    sigma = np.sqrt(0.5 * (forward.sigma**2 + back.sigma**2) + (0.5 * disagreement) ** 2)
+    good = (
+        (np.abs(shifts - begun).max(axis=1, initial=0.0) < _DRIFT_MOST_CELLS)
+        & (disagreement < _DISAGREEMENT_MOST_CELLS)
+        & (forward.score >= rule.score_least)
+        & np.isfinite(sigma)
+    )
+    return Displacements(
+        places=places, shift_cells=shifts, score=forward.score, sigma_cells=sigma
+    ).take(good)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Matched:
+    shifts: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    score: NDArray[np.float64]
+
+
+def _matched(
+    pictures: tuple[Channels, Channels],
+    start: tuple[NDArray[np.intp], NDArray[np.float64]],
+    window: NDArray[np.float64],
+    threads: int,
+) -> _Matched:
+    first, second = (Picture(picture.values, picture.known) for picture in pictures)
+    places = np.ascontiguousarray(start[0])
+    found = np.zeros((len(places), 4))
+    found[:, :2] = start[1]
+    in_threads(
+        [
+            partial(match_patches, first, second, places[part], window, found[part])
+            for part in _parts(len(places), threads)
+        ]
+    )
+    sigma = math.sqrt(_CORRELATION_AREA_CELLS) * found[:, 2]
+    return _Matched(shifts=found[:, :2].copy(), sigma=sigma, score=found[:, 3].copy())
+
+
+def _window(half: int) -> NDArray[np.float64]:
+    """Weights of a patch's cells: the middle counts more, the border hardly."""
+    steps = np.arange(-half, half + 1) / (0.6 * half)
+    bell = np.exp(-0.5 * steps**2)
+    window: NDArray[np.float64] = np.outer(bell, bell)
+    return window

@@ -1,0 +1,179 @@
+"""`match.guided`: photos already oriented roughly, matched where they must lie on the walls."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from orthoflow.errors import MethodError
+from orthoflow.products import Camera, Cameras, JsonValue, Photos, Ties, Walls
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of
+from orthoflow_plugins.match.pictures import photo_grey, require_intensity
+from orthoflow_plugins.match.tracing import Trace, TracingRule, target_of, trace_photo
+from orthoflow_plugins.match.versions import opencv_version
+
+
+class MatchGuided(Method):
+    """Warp each photo into the walls by its pose and measure how far it is displaced there.
+
+    Only what the photo shows of a wall is searched, within a small radius (the mask of
+    markiewicz2015 taken to its end), in oriented gradients, which survive that a laser sees another
+    colour than a camera. The pose is refitted and the photo warped again until held-out ties stop
+    improving. Photos without a pose give no ties.
+    """
+
+    id: ClassVar[str] = "match.guided"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "exact"
+    citations: ClassVar[tuple[str, ...]] = (
+        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.3",
+        "gruen1985: Adaptive least squares correlation, S. Afr. J. Photogramm. 14(3)",
+        "shi1994: Good features to track, doi:10.1109/CVPR.1994.323794",
+        "ye2019: Fast and robust matching for multimodal images, doi:10.1109/TGRS.2019.2924684",
+    )
+
+    class Params(MethodParams):
+        """Search radius, patches, and how many ties."""
+
+        search_radius_cells: int = Field(
+            default=8,
+            ge=2,
+            le=64,
+            description="How far a place is searched in the first round; halved in every next.",
+        )
+        half_patch_cells: int = Field(
+            default=10, ge=4, le=40, description="Patches are (2 h + 1) cells wide."
+        )
+        channels: Literal["auto", "gradients", "grey"] = Field(
+            default="auto",
+            description="What is compared: oriented gradients; the grey itself, which is sharper "
+            "where laser and camera see the same; or both, of which each photo keeps what its "
+            "held-out ties fit better.",
+        )
+        score_min_share: float = Field(
+            default=0.35, ge=0, lt=1, description="Smallest correlation of two patches."
+        )
+        distinct_min_share: float = Field(
+            default=0.05,
+            ge=0,
+            lt=1,
+            description="By how much the best correlation must exceed that of another place.",
+        )
+        n_ties_max: int = Field(
+            default=1200, ge=50, description="Places measured per photo, spread evenly."
+        )
+        n_rounds_max: int = Field(
+            default=4, ge=1, le=10, description="Photos are warped and measured at most so often."
+        )
+
+    class In(Ports):
+        """Photos, the rastered walls, and where the photos were taken, roughly."""
+
+        photos: Photos
+        walls: Walls
+        cameras: Cameras
+
+    class Out(Ports):
+        """Points of the photos known on the walls."""
+
+        ties: Ties
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Trace every oriented photo on the walls."""
+        import cv2
+
+        photos, walls = inputs.photos, inputs.walls
+        require_photos(photos)
+        require_intensity(walls)
+        oriented = _oriented(inputs.cameras)
+        cv2.setNumThreads(ctx.cores)
+        rule = _rule(params, ctx.cores)
+        ctx.progress(0.0, "walls")
+        targets = [target_of(wall) for wall in walls.walls]
+        pieces: list[TiePiece] = []
+        traces: dict[str, Trace] = {}
+        for index, photo in enumerate(photos.photos):
+            ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
+            if photo.name not in oriented:
+                continue
+            camera = oriented[photo.name].viewing()
+            trace = trace_photo(index, photo_grey(photo), camera, targets, rule)
+            traces[photo.name] = trace
+            pieces += trace.pieces
+            if not any(len(piece) for piece in trace.pieces):
+                ctx.warn(f"photo {photo.name}: nothing on the walls agrees with it at its pose")
+        ties = ties_of(
+            pieces,
+            photos,
+            walls,
+            {
+                "photos": {name: _note(trace) for name, trace in traces.items()},
+                "intensity_source": walls.intensity_source,
+            },
+        )
+        _report(ctx, ties, traces)
+        return self.Out(ties=ties)
+
+    @classmethod
+    def tools(cls) -> dict[str, str]:
+        """OpenCV warps and correlates."""
+        return opencv_version()
+
+
+def _oriented(cameras: Cameras) -> dict[str, Camera]:
+    """Cameras of the oriented photos by name.
+
+    Raises:
+        MethodError: no photo is oriented.
+    """
+    oriented = {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
+    if not oriented:
+        reasons = "; ".join(f"{camera.photo}: {camera.status}" for camera in cameras.cameras[:3])
+        raise MethodError(
+            "no photo is oriented, so none can be matched by its pose"
+            + (f" ({reasons})" if reasons else "")
+        )
+    return oriented
+
+
+def _rule(params: MatchGuided.Params, threads: int) -> TracingRule:
+    return TracingRule(
+        radius_cells=params.search_radius_cells,
+        half_patch_cells=params.half_patch_cells,
+        score_least=params.score_min_share,
+        distinct_least=params.distinct_min_share,
+        n_ties_most=params.n_ties_max,
+        n_rounds_most=params.n_rounds_max,
+        threads=threads,
+        contents=("gradients", "grey") if params.channels == "auto" else (params.channels,),
+    )
+
+
+def _note(trace: Trace) -> JsonValue:
+    return {
+        "n_ties": sum(len(piece) for piece in trace.pieces),
+        "n_measured": trace.n_measured,
+        "n_outliers": trace.n_outliers,
+        "channels": trace.content,
+        "held_out_px": list(trace.held_out_px),
+    }
+
+
+def _report(ctx: StepContext, ties: Ties, traces: dict[str, Trace]) -> None:
+    per_photo = np.bincount(ties.photo, minlength=len(ties.photo_names))
+    n_measured = sum(trace.n_measured for trace in traces.values())
+    n_outliers = sum(trace.n_outliers for trace in traces.values())
+    ctx.metric("n_ties", len(ties.photo), "1")
+    ctx.metric("n_photos_matched", int((per_photo > 0).sum()), "1")
+    ctx.metric("ties_per_photo_median", float(np.median(per_photo)), "1")
+    ctx.metric("rejected_share", n_outliers / max(n_measured, 1), "1")
+    held_out = [min(trace.held_out_px) for trace in traces.values() if trace.held_out_px]
+    if held_out:
+        ctx.metric("held_out_rmse_px_median", float(np.median(held_out)), "px")
+        ctx.metric("held_out_rmse_px_worst", max(held_out), "px")
+    if len(ties.photo):
+        ctx.metric("sigma_px_median", float(np.median(ties.sigma_px)), "px")

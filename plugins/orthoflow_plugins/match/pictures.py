@@ -1,0 +1,222 @@
+"""Pictures to match: photos and wall rasters as grey of even contrast, and points on the walls."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image
+from orthoflow.products import Photo, Wall, Walls
+
+_TILES: Final = 8
+_CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
+# Depths about a point that differ by more than this many cells are an edge of the relief.
+_SMOOTH_CELLS: Final = 1.0
+# A wall whose spread in depth is unknown is taken as this accurate, in cells.
+_UNKNOWN_SIGMA_CELLS: Final = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallPicture:
+    """A wall's intensity as a picture without holes.
+
+    Attributes:
+        grey: (rows, cols) uint8, void filled from around.
+        usable: (rows, cols), True where enough of the neighbourhood was measured.
+        known: (rows, cols), True where the intensity was measured.
+    """
+
+    grey: NDArray[np.uint8]
+    usable: NDArray[np.bool_]
+    known: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallPoints:
+    """World points of positions on a wall.
+
+    Attributes:
+        points_world: (n, 3) float64 metres.
+        sigma_m: (n,) float64.
+        known: (n,) whether the wall has a depth there; the rest is NaN without it.
+    """
+
+    points_world: NDArray[np.float64]
+    sigma_m: NDArray[np.float64]
+    known: NDArray[np.bool_]
+
+
+def require_intensity(walls: Walls) -> None:
+    """Refuse walls that show nothing.
+
+    Raises:
+        MethodError: there are no walls, or none has intensity or colour.
+    """
+    if not walls.walls:
+        raise MethodError("there are no walls to match photos with: choose planes to raster")
+    if all(wall.intensity is None for wall in walls.walls):
+        raise MethodError(
+            "the scan has neither intensity nor colour, so its walls show nothing that a photo "
+            "could be matched with: export the scan with intensity"
+        )
+
+
+def wall_picture(wall: Wall, *, clip_limit: float, void_margin_cells: int) -> WallPicture | None:
+    """Give a wall's intensity as a picture; None without intensity.
+
+    Args:
+        wall: the wall.
+        clip_limit: of the local equalisation; 0 only stretches the grey levels.
+        void_margin_cells: key points keep so far from the centre of larger voids.
+    """
+    import cv2
+
+    if wall.intensity is None:
+        return None
+    known = np.isfinite(wall.intensity)
+    if not known.any():
+        return None
+    low, high = np.percentile(wall.intensity[known], (0.5, 99.5))
+    scaled = (wall.intensity - low) / max(float(high - low), 1e-9)
+    filled = filled_smoothly(np.where(known, np.clip(scaled, 0.0, 1.0), np.nan))
+    grey = np.rint(filled * 255.0).astype(np.uint8)
+    side = 2 * void_margin_cells + 1
+    share = cv2.blur(known.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE)
+    return WallPicture(
+        grey=equalised(grey, clip_limit), usable=np.asarray(share > 0.7) & known, known=known
+    )
+
+
+def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Fill NaN from around, coarser the farther from what is known (push-pull)."""
+    import cv2
+
+    known = np.isfinite(values)
+    result = np.where(known, values, 0.0).astype(np.float32)
+    weight = known.astype(np.float32)
+    if known.all() or min(values.shape) < 2:
+        return result
+    size = (values.shape[1], values.shape[0])
+    half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
+    small_weight = cv2.resize(weight, half, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(result * weight, half, interpolation=cv2.INTER_AREA)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        coarse = np.where(small_weight > 0.0, small / small_weight, np.nan)
+    coarse = filled_smoothly(coarse) if min(half) >= 2 else np.nan_to_num(coarse)
+    grown = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
+    return np.where(known, result, grown).astype(np.float32)
+
+
+def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
+    """Even out contrast locally (CLAHE); 0 leaves the picture as it is."""
+    import cv2
+
+    if clip_limit == 0.0 or min(grey.shape) < 2 * _TILES:
+        return grey
+    clahe = cv2.createCLAHE(clipLimit=clip_limit, tileGridSize=(_TILES, _TILES))
+    return np.asarray(clahe.apply(grey), dtype=np.uint8)
+
+
+def photo_grey(photo: Photo) -> NDArray[np.uint8]:
+    """Give a photo's grey (Rec. 601), (height, width).
+
+    Raises:
+        InputError: the file is no image.
+        MethodError: the image has another size than the photo claims.
+    """
+    import cv2
+
+    rgb = decode_image(photo.encoded, f"photo {photo.name}")
+    if rgb.shape[:2] != (photo.height, photo.width):
+        raise MethodError(
+            f"photo {photo.name} has {rgb.shape[1]} x {rgb.shape[0]} pixels, but is listed with "
+            f"{photo.width} x {photo.height}"
+        )
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def shrunk(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+    """Shrink a picture by a factor below 1, averaging; pixel frames scale exactly by it.
+
+    The size is a whole number, so the picture is warped, not resized to the rounded size: a
+    position (u, v) lands at (u, v) x factor.
+    """
+    import cv2
+
+    if factor >= 1.0:
+        return grey
+    width, height = (max(1, int(side * factor)) for side in (grey.shape[1], grey.shape[0]))
+    # Gaussian of the width that keeps what the coarser grid can show.
+    sigma = 0.5 * np.sqrt(max(0.0, factor**-2 - 1.0))
+    soft = cv2.GaussianBlur(grey, (0, 0), sigma) if sigma > 0.1 else grey
+    shift = 0.5 / factor - 0.5
+    matrix = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(
+        cv2.warpAffine(soft, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE),
+        dtype=np.uint8,
+    )
+
+
+def points_on_wall(wall: Wall, pixels_wall: NDArray[np.float64]) -> WallPoints:
+    """Lift positions (n, 2) = (column, row) of a wall's raster onto its surface.
+
+    Between cells the depth is interpolated where the surface is smooth; at an edge of the relief
+    the nearest cell's depth holds, with the step in its standard deviation.
+    """
+    columns, rows = pixels_wall[:, 0] - 0.5, pixels_wall[:, 1] - 0.5
+    height, width = wall.frame.shape
+    centre_column = np.clip(np.rint(columns).astype(np.intp), 0, width - 1)
+    centre_row = np.clip(np.rint(rows).astype(np.intp), 0, height - 1)
+    nearest = wall.depth_m[centre_row, centre_column].astype(np.float64)
+    steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    around_rows = np.clip(centre_row[:, None] + steps[:, 0], 0, height - 1)
+    around_columns = np.clip(centre_column[:, None] + steps[:, 1], 0, width - 1)
+    around = wall.depth_m[around_rows, around_columns].astype(np.float64)
+    around = np.where(np.isfinite(around), around, nearest[:, None])
+    spread = around.max(axis=1) - around.min(axis=1)
+    smooth = spread < _SMOOTH_CELLS * wall.frame.gsd_m
+    depth = np.where(smooth, _bilinear(wall.depth_m, columns, rows), nearest)
+    depth = np.where(np.isfinite(depth), depth, nearest)
+    return WallPoints(
+        points_world=wall.frame.world_from_wall(pixels_wall, depth),
+        sigma_m=_sigma_m(wall, (centre_row, centre_column), np.where(smooth, 0.0, spread)),
+        known=np.isfinite(nearest),
+    )
+
+
+def _sigma_m(
+    wall: Wall, cell: tuple[NDArray[np.intp], NDArray[np.intp]], step_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    gsd_m = wall.frame.gsd_m
+    count = np.maximum(wall.count[cell].astype(np.float64), 1.0)
+    spread = wall.sigma_m[cell].astype(np.float64)
+    known = wall.sigma_m[np.isfinite(wall.sigma_m)]
+    usual = float(np.median(known)) if known.size else _UNKNOWN_SIGMA_CELLS * gsd_m
+    spread = np.where(np.isfinite(spread) & (count > 1.0), spread, usual)
+    # A cell's depth is a mean or median of its points, and its content lies anywhere in the cell.
+    noise = np.maximum(spread / np.sqrt(count), 0.3 * usual)
+    sigma: NDArray[np.float64] = np.sqrt(
+        noise**2 + (0.5 * _CELL_SIGMA * gsd_m) ** 2 + (step_m * _CELL_SIGMA) ** 2
+    )
+    return sigma
+
+
+def _bilinear(
+    raster: NDArray[np.float32], columns: NDArray[np.float64], rows: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    height, width = raster.shape
+    columns = np.clip(columns, 0.0, width - 1.0)
+    rows = np.clip(rows, 0.0, height - 1.0)
+    left = np.minimum(columns.astype(np.intp), max(width - 2, 0))
+    top = np.minimum(rows.astype(np.intp), max(height - 2, 0))
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    a, b = columns - left, rows - top
+    upper = (1 - a) * raster[top, left] + a * raster[top, right]
+    lower = (1 - a) * raster[bottom, left] + a * raster[bottom, right]
+    result: NDArray[np.float64] = (1 - b) * upper + b * lower
+    return result

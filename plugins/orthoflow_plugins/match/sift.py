@@ -1,0 +1,215 @@
+"""`match.sift`: points of the photos on the walls by SIFT key points (markiewicz2015, 3.5, 3.6)."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.products import JsonValue, Photos, TieRole, Ties, Wall, Walls
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of, without_twins
+from orthoflow_plugins.match.features import FeatureRule, Features, find_features
+from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo
+from orthoflow_plugins.match.pictures import (
+    photo_grey,
+    points_on_wall,
+    require_intensity,
+    wall_picture,
+)
+from orthoflow_plugins.match.versions import opencv_version
+
+# How well SIFT places a key point, in pixels of the image it was found in: for the smallest ones,
+# and growing with their size.
+_SIGMA_LEAST_PX: Final = 0.35
+_SIGMA_PER_SIZE: Final = 0.06
+_VOID_MARGIN_CELLS: Final = 3
+# At an edge of the relief a key point belongs to neither side.
+_SIGMA_MOST_CELLS: Final = 3.0
+
+
+class MatchSift(Method):
+    """Match photos with the intensity rasters of the walls: RootSIFT, mutual, ratio test.
+
+    Every photo is tried on every wall; walls on which the matches do not agree roughly with a
+    homography keep their matches as rejected. Ties carry the surface's depth, so relief counts.
+    """
+
+    id: ClassVar[str] = "match.sift"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "exact"
+    citations: ClassVar[tuple[str, ...]] = (
+        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.5, 3.6",
+        "lowe2004: Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",
+        "arandjelovic2012: Three things everyone should know, doi:10.1109/CVPR.2012.6248018",
+    )
+
+    class Params(MethodParams):
+        """Key points, their contrast, and what counts as a match."""
+
+        n_features_max: int = Field(
+            default=12_000, ge=50, description="Key points per photo and per wall, spread evenly."
+        )
+        ratio: float = Field(
+            default=0.85,
+            gt=0,
+            le=1,
+            description="Largest distance of the best match over the second best.",
+        )
+        contrast_threshold_factor: float = Field(
+            default=0.02,
+            ge=0,
+            lt=1,
+            description="Weakest key points taken, as OpenCV's contrastThreshold (0.04 there).",
+        )
+        edge_threshold_ratio: float = Field(
+            default=10.0, gt=1, description="Largest ratio of curvatures of a key point."
+        )
+        equalise_clip_factor: float = Field(
+            default=3.0,
+            ge=0,
+            description="Clip limit of the local contrast equalisation; 0 turns it off.",
+        )
+        n_verified_min: int = Field(
+            default=8,
+            ge=4,
+            description="Matches that must agree with one homography for a wall to count as "
+            "shown by a photo.",
+        )
+        longest_side_max_px: int = Field(
+            default=4000, ge=200, description="Larger photos are shrunk to this for matching."
+        )
+
+    class In(Ports):
+        """The photos and the rastered walls."""
+
+        photos: Photos
+        walls: Walls
+
+    class Out(Ports):
+        """Points of the photos known on the walls."""
+
+        ties: Ties
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Match every photo with every wall."""
+        import cv2
+
+        photos, walls = inputs.photos, inputs.walls
+        require_photos(photos)
+        require_intensity(walls)
+        cv2.setNumThreads(ctx.cores)
+        rule = _rule(params)
+        ctx.progress(0.0, "key points of the walls")
+        on_walls = [_wall_features(wall, rule) for wall in walls.walls]
+        pieces: list[TiePiece] = []
+        notes: dict[str, JsonValue] = {}
+        for index, photo in enumerate(photos.photos):
+            ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
+            pairs = pair_photo(photo_grey(photo), on_walls, rule)
+            pieces += _pieces(index, pairs, on_walls, walls)
+            notes[photo.name] = _note(ctx, photo.name, pairs, walls)
+        ties = ties_of(
+            pieces,
+            photos,
+            walls,
+            {"photos": notes, "intensity_source": walls.intensity_source},
+        )
+        _report(ctx, ties, on_walls)
+        return self.Out(ties=ties)
+
+    @classmethod
+    def tools(cls) -> dict[str, str]:
+        """OpenCV finds and describes the key points."""
+        return opencv_version()
+
+
+def _rule(params: MatchSift.Params) -> PairingRule:
+    return PairingRule(
+        features=FeatureRule(
+            n_most=params.n_features_max,
+            contrast_threshold=params.contrast_threshold_factor,
+            edge_threshold=params.edge_threshold_ratio,
+        ),
+        ratio_most=params.ratio,
+        n_verified_least=params.n_verified_min,
+        longest_side_px=params.longest_side_max_px,
+        clip_limit=params.equalise_clip_factor,
+    )
+
+
+def _wall_features(wall: Wall, rule: PairingRule) -> Features | None:
+    picture = wall_picture(wall, clip_limit=rule.clip_limit, void_margin_cells=_VOID_MARGIN_CELLS)
+    if picture is None:
+        return None
+    usable = picture.usable & np.isfinite(wall.depth_m)
+    return find_features(picture.grey, rule.features, usable)
+
+
+def _pieces(
+    photo: int, pairs: PhotoPairs, on_walls: list[Features | None], walls: Walls
+) -> list[TiePiece]:
+    shown = without_twins(
+        [_piece(photo, pairs, pair, on_walls, walls) for pair in pairs.pairs if pair.is_shown]
+    )
+    rest = [
+        _piece(photo, pairs, pair, on_walls, walls) for pair in pairs.pairs if not pair.is_shown
+    ]
+    return sorted(shown + rest, key=lambda piece: piece.wall)
+
+
+def _piece(
+    photo: int,
+    pairs: PhotoPairs,
+    pair: Pair,
+    on_walls: list[Features | None],
+    walls: Walls,
+) -> TiePiece:
+    wall, features = walls.walls[pair.wall], on_walls[pair.wall]
+    assert features is not None  # noqa: S101 - pairs are made of walls that have key points
+    in_photo, on_wall = pair.matches.first, pair.matches.second
+    points = points_on_wall(wall, features.pixels[on_wall])
+    photo_sizes = pairs.features.sizes_px[in_photo]
+    wall_sigma_m = wall.frame.gsd_m * _sigma_px(features.sizes_px[on_wall])
+    piece = TiePiece(
+        photo=photo,
+        wall=pair.wall,
+        pixels_photo=pairs.features.pixels[in_photo],
+        points_world=points.points_world,
+        sigma_px=_sigma_px(photo_sizes * pairs.scale) / pairs.scale,
+        sigma_m=np.hypot(points.sigma_m, wall_sigma_m),
+        role=TieRole.CONTROL if pair.is_shown else TieRole.REJECTED,
+    )
+    return piece.take(points.known & (piece.sigma_m < _SIGMA_MOST_CELLS * wall.frame.gsd_m))
+
+
+def _sigma_px(sizes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    sigma: NDArray[np.float64] = np.maximum(_SIGMA_LEAST_PX, _SIGMA_PER_SIZE * sizes_px)
+    return sigma
+
+
+def _note(ctx: StepContext, name: str, pairs: PhotoPairs, walls: Walls) -> JsonValue:
+    shown = [walls.walls[pair.wall].name for pair in pairs.pairs if pair.is_shown]
+    if not shown:
+        ctx.warn(f"photo {name}: no wall is recognised in it, so it gets no ties")
+    return {
+        "n_key_points": len(pairs.features),
+        "scale": pairs.scale,
+        "walls": list(shown),
+        "n_matches": sum(len(pair.matches) for pair in pairs.pairs),
+        "n_agreeing": pairs.n_verified,
+    }
+
+
+def _report(ctx: StepContext, ties: Ties, on_walls: list[Features | None]) -> None:
+    kept = ties.role != TieRole.REJECTED
+    per_photo = np.bincount(ties.photo[kept], minlength=len(ties.photo_names))
+    ctx.metric("n_ties", int(kept.sum()), "1")
+    ctx.metric("n_rejected", int((~kept).sum()), "1")
+    ctx.metric("rejected_share", float((~kept).mean()) if len(kept) else 0.0, "1")
+    ctx.metric("n_photos_matched", int((per_photo > 0).sum()), "1")
+    ctx.metric("ties_per_photo_median", float(np.median(per_photo)), "1")
+    ctx.metric("n_wall_key_points", sum(len(f) for f in on_walls if f is not None), "1")

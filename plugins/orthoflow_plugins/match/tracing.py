@@ -1,0 +1,385 @@
+"""One photo on all walls by its pose: measured, cleaned, the pose refitted, measured again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import SeenPoints, adjust, misfit
+from orthoflow.products import Wall
+from orthoflow_plugins.match.assembling import TiePiece
+from orthoflow_plugins.match.channels import Channels, gradient_channels, grey_channels
+from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
+from orthoflow_plugins.match.pictures import points_on_wall
+from orthoflow_plugins.match.places import textured_places
+from orthoflow_plugins.match.warping import Projection, project_walls, warp_photo
+
+_NEIGHBOURS: Final = 12
+_MEDIAN_TOLERANCE_CELLS: Final = 0.6
+_REJECTION: Final = 3.5
+_MEDIAN_LENGTH: Final = 1.1774
+_HELD_OUT: Final = 4
+_LEAST: Final = 12
+_SIGMA_MOST_CELLS: Final = 2.0
+# What no refinement gets below: the raster's own interpolation.
+_SIGMA_FLOOR_CELLS: Final = 0.1
+_OCCUPIED_CELLS: Final = 5.0
+_RADIUS_LEAST: Final = 2
+_TIES_SHARE_LEAST: Final = 0.6
+_CHANNELS: Final[Mapping[str, Callable[[NDArray[np.float32]], Channels]]] = {
+    "gradients": gradient_channels,
+    "grey": grey_channels,
+}
+# Held-out error has to fall by this share for another round.
+_GAIN_LEAST: Final = 0.03
+
+
+@dataclass(frozen=True, kw_only=True)
+class TracingRule:
+    """How a photo is traced on the walls.
+
+    Attributes:
+        radius_cells: first search radius; halved every round.
+        half_patch_cells: patches are (2 h + 1)^2 cells.
+        score_least: smallest correlation.
+        distinct_least: by how much the best correlation must exceed the next peak.
+        n_ties_most: per photo.
+        n_rounds_most: measured at most so often.
+        contents: what is compared, `gradients`, `grey` or both, of which the better one is kept.
+        threads: patches are shared between so many.
+    """
+
+    radius_cells: int
+    half_patch_cells: int
+    score_least: float
+    distinct_least: float
+    n_ties_most: int
+    n_rounds_most: int
+    contents: tuple[str, ...]
+    threads: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallTarget:
+    """A wall ready to be matched.
+
+    Attributes:
+        wall: the wall.
+        grey: its intensity, NaN where it has no depth; None where it shows nothing.
+        channels: of its intensity, by content, as far as they were needed.
+    """
+
+    wall: Wall
+    grey: NDArray[np.float32] | None
+    channels: dict[str, Channels] = field(default_factory=dict)
+
+    def of(self, content: str) -> Channels | None:
+        """Channels of the wall's intensity."""
+        if self.grey is None:
+            return None
+        if content not in self.channels:
+            self.channels[content] = _CHANNELS[content](self.grey)
+        return self.channels[content]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace:
+    """What tracing a photo found.
+
+    Attributes:
+        pieces: ties per wall, outliers left out.
+        n_measured: displacements measured in the last round.
+        n_outliers: of these, dropped.
+        held_out_px: RMS of a residual coordinate of held-out ties, per round.
+        content: what was compared.
+        camera: the pose the last round ended with.
+    """
+
+    pieces: tuple[TiePiece, ...]
+    n_measured: int
+    n_outliers: int
+    held_out_px: tuple[float, ...]
+    content: str
+    camera: ViewingCamera
+
+    @property
+    def n_ties(self) -> int:
+        """Ties on all walls."""
+        return sum(len(piece) for piece in self.pieces)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Round:
+    pieces: list[TiePiece]
+    n_measured: int
+    n_outliers: int
+
+
+def target_of(wall: Wall) -> WallTarget:
+    """Prepare a wall for matching."""
+    if wall.intensity is None:
+        return WallTarget(wall=wall, grey=None)
+    grey = np.where(np.isfinite(wall.depth_m), wall.intensity, np.nan).astype(np.float32)
+    return WallTarget(wall=wall, grey=grey)
+
+
+def trace_photo(
+    photo: int,
+    grey: NDArray[np.uint8],
+    camera: ViewingCamera,
+    targets: Sequence[WallTarget],
+    rule: TracingRule,
+) -> Trace:
+    """Match a photo with the walls it shows by its pose, until held-out ties stop improving.
+
+    Args:
+        photo: index of the photo.
+        grey: (height, width) of the photo.
+        camera: its pose, good to a few cells on the walls.
+        targets: all walls; any of them may hide another.
+        rule: how.
+    """
+    found: Trace | None = None
+    for content in rule.contents:
+        # What one content found out about the pose is the next one's start.
+        start = (camera, rule.radius_cells) if found is None else (found.camera, _RADIUS_LEAST)
+        tried = _traced(photo, grey, start, targets, (rule, content))
+        if found is None or _is_better(tried, found):
+            found = tried
+    assert found is not None  # noqa: S101 - there is at least one content
+    return found
+
+
+def _is_better(tried: Trace, found: Trace) -> bool:
+    """Whether another content fits better without losing most of the ties."""
+    if not (tried.held_out_px and found.held_out_px):
+        return tried.n_ties > found.n_ties
+    closer = min(tried.held_out_px) < min(found.held_out_px)
+    return closer and tried.n_ties >= _TIES_SHARE_LEAST * found.n_ties
+
+
+def _traced(
+    photo: int,
+    grey: NDArray[np.uint8],
+    start: tuple[ViewingCamera, int],
+    targets: Sequence[WallTarget],
+    how: tuple[TracingRule, str],
+) -> Trace:
+    camera, radius = start
+    rule, content = how
+    best: _Round | None = None
+    history: list[float] = []
+    for _ in range(rule.n_rounds_most):
+        found = _measured(photo, grey, camera, targets, (rule, radius, content))
+        seen = _joined(found.pieces)
+        refitted, held_out_px = _refitted(seen, camera)
+        if refitted is None:
+            # A round that finds too little does not spoil the one before.
+            best = best or found
+            break
+        improved = not history or held_out_px < (1.0 - _GAIN_LEAST) * min(history)
+        history.append(held_out_px)
+        if not history[1:] or held_out_px <= min(history):
+            best = found
+        if not improved:
+            break
+        camera, radius = refitted, max(_RADIUS_LEAST, radius // 2)
+    result = best or _Round(pieces=[], n_measured=0, n_outliers=0)
+    cleaned = _without_misfits(result.pieces, camera)
+    n_kept = sum(len(piece) for piece in cleaned)
+    return Trace(
+        pieces=tuple(cleaned),
+        n_measured=result.n_measured,
+        n_outliers=result.n_measured - n_kept,
+        held_out_px=tuple(history),
+        content=content,
+        camera=camera,
+    )
+
+
+def _measured(
+    photo: int,
+    grey: NDArray[np.uint8],
+    camera: ViewingCamera,
+    targets: Sequence[WallTarget],
+    how: tuple[TracingRule, int, str],
+) -> _Round:
+    rule, radius, content = how
+    projections = project_walls(camera, [target.wall for target in targets])
+    sizes = [_footprint(item) for item in projections]
+    occupied: set[tuple[int, int]] = set()
+    pieces: list[TiePiece] = []
+    n_measured = 0
+    # The wall that fills most of the photo first: planes close to each other show one surface.
+    for index in sorted(range(len(targets)), key=lambda k: (-sizes[k], k)):
+        projection, channels = projections[index], targets[index].of(content)
+        if projection is None or channels is None or sizes[index] == 0:
+            continue
+        share = sizes[index] / sum(sizes)
+        warped = warp_photo(grey, projection)
+        usable = (channels.known > 0.0) & np.isfinite(warped.grey)
+        places = textured_places(
+            channels,
+            usable,
+            max(50, round(rule.n_ties_most * share)),
+            half_patch_cells=rule.half_patch_cells,
+        )
+        places = _unoccupied(places, projection, occupied)
+        search = SearchRule(
+            radius_cells=radius,
+            half_patch_cells=rule.half_patch_cells,
+            score_least=rule.score_least,
+            distinct_least=rule.distinct_least,
+            threads=rule.threads,
+        )
+        moved = measure(channels, _CHANNELS[content](warped.grey), places, search)
+        n_measured += len(moved.places)
+        moved = moved.take(_agrees_around(moved))
+        pieces.append(_piece(photo, index, targets[index].wall, (moved, projection)))
+    pieces.sort(key=lambda piece: piece.wall)
+    return _Round(
+        pieces=pieces,
+        n_measured=n_measured,
+        n_outliers=n_measured - sum(len(piece) for piece in pieces),
+    )
+
+
+def _piece(photo: int, index: int, wall: Wall, found: tuple[Displacements, Projection]) -> TiePiece:
+    moved, projection = found
+    at = moved.places + moved.shift_cells
+    pixels = np.column_stack([_between(projection.u, at), _between(projection.v, at)])
+    points = points_on_wall(wall, moved.places.astype(np.float64) + 0.5)
+    sigma_cells = np.hypot(moved.sigma_cells, _SIGMA_FLOOR_CELLS)
+    piece = TiePiece(
+        photo=photo,
+        wall=index,
+        pixels_photo=pixels,
+        points_world=points.points_world,
+        sigma_px=sigma_cells * projection.pixels_per_cell,
+        sigma_m=points.sigma_m,
+    )
+    gsd_m = wall.frame.gsd_m
+    return piece.take(
+        points.known
+        & np.isfinite(pixels).all(axis=1)
+        & (points.sigma_m < _SIGMA_MOST_CELLS * gsd_m)
+    )
+
+
+def _refitted(seen: SeenPoints, camera: ViewingCamera) -> tuple[ViewingCamera | None, float]:
+    """Pose from three quarters of the ties, and how it fits the rest (RMS of a coordinate)."""
+    if len(seen) < _LEAST:
+        return None, math.inf
+    order = np.lexsort((seen.pixels_photo[:, 0], seen.pixels_photo[:, 1]))
+    held_out = np.zeros(len(seen), dtype=np.bool_)
+    held_out[order[::_HELD_OUT]] = True
+    try:
+        fitted = _fit(seen.take(~held_out), camera)
+    except GeometryError:
+        return None, math.inf
+    residuals = misfit(seen.take(held_out), fitted).residuals_px
+    lengths = np.linalg.norm(residuals, axis=1)
+    # Outliers that are left must not decide whether to go on.
+    usual = float(np.median(lengths))
+    kept = residuals[lengths <= 3.0 * usual]
+    return fitted, float(np.sqrt(np.mean(kept**2)))
+
+
+def _fit(seen: SeenPoints, camera: ViewingCamera) -> ViewingCamera:
+    for _ in range(3):
+        camera = adjust(seen, camera, soft_limit=2.0).camera
+        lengths = misfit(seen, camera).normalised
+        good = lengths <= _limit(lengths)
+        if good.all() or good.sum() < _LEAST:
+            break
+        seen = seen.take(good)
+    return camera
+
+
+def _without_misfits(pieces: list[TiePiece], camera: ViewingCamera) -> list[TiePiece]:
+    """Ties that fit one pose; displaced neighbourhoods pass the median of their neighbours."""
+    seen = _joined(pieces)
+    if len(seen) < _LEAST:
+        return pieces
+    try:
+        lengths = misfit(seen, _fit(seen, camera)).normalised
+    except GeometryError:
+        return pieces
+    good = lengths <= _limit(lengths)
+    ends = np.cumsum([len(piece) for piece in pieces])
+    return [
+        piece.take(good[end - len(piece) : end]) for piece, end in zip(pieces, ends, strict=True)
+    ]
+
+
+def _limit(lengths: NDArray[np.float64]) -> float:
+    return _REJECTION * float(np.median(lengths)) / _MEDIAN_LENGTH
+
+
+def _agrees_around(moved: Displacements) -> NDArray[np.bool_]:
+    """Displacements that agree with the median of their neighbours."""
+    from scipy.spatial import cKDTree
+
+    count = len(moved.places)
+    if count < 4:
+        return np.zeros(count, dtype=np.bool_)
+    neighbours = min(_NEIGHBOURS, count - 1)
+    places = moved.places.astype(np.float64)
+    around = np.asarray(cKDTree(places).query(places, k=neighbours + 1)[1])[:, 1:]
+    shifts = moved.shift_cells[around]
+    median = np.median(shifts, axis=1)
+    spread = 1.4826 * np.median(np.abs(shifts - median[:, None]), axis=1)
+    tolerance = np.maximum(_MEDIAN_TOLERANCE_CELLS, 3.0 * spread)
+    # Where the neighbours themselves do not agree, nothing can be told apart from chance.
+    agrees = (np.abs(moved.shift_cells - median) <= tolerance) & (spread < 2.0)
+    return np.asarray(agrees.all(axis=1))
+
+
+def _unoccupied(
+    places: NDArray[np.intp], projection: Projection, occupied: set[tuple[int, int]]
+) -> NDArray[np.intp]:
+    """Places whose part of the photo no other wall has taken; they take it."""
+    side = _OCCUPIED_CELLS * max(projection.pixels_per_cell, 1e-6)
+    u = projection.u[places[:, 1], places[:, 0]]
+    v = projection.v[places[:, 1], places[:, 0]]
+    cells = [(int(a / side), int(b / side)) for a, b in zip(u, v, strict=True)]
+    free = np.array([cell not in occupied for cell in cells], dtype=np.bool_)
+    occupied.update(cells)
+    return places[free]
+
+
+def _joined(pieces: Sequence[TiePiece]) -> SeenPoints:
+    return SeenPoints(
+        pixels_photo=np.concatenate([np.empty((0, 2)), *(p.pixels_photo for p in pieces)]),
+        points_world=np.concatenate([np.empty((0, 3)), *(p.points_world for p in pieces)]),
+        sigma_px=np.concatenate([np.empty(0), *(p.sigma_px for p in pieces)]),
+        sigma_m=np.concatenate([np.empty(0), *(p.sigma_m for p in pieces)]),
+    )
+
+
+def _between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values (n,) at fractional cell indices (n, 2) = (column, row); NaN beside unknown cells."""
+    height, width = raster.shape
+    inside = (at >= 0.0).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)
+    left = np.where(inside, at[:, 0], 0.0).astype(np.intp)
+    top = np.where(inside, at[:, 1], 0.0).astype(np.intp)
+    a, b = at[:, 0] - left, at[:, 1] - top
+    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    corners = raster[[top, top, below, below], [left, right, left, right]].astype(np.float64)
+    weights = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    values: NDArray[np.float64] = (corners * weights).sum(axis=0)
+    return np.where(inside, values, np.nan)
+
+
+def _footprint(projection: Projection | None) -> int:
+    """Visible cells of a wall, in photo pixels, so that walls of any resolution compare."""
+    if projection is None:
+        return 0
+    return int(np.isfinite(projection.u).sum() * projection.pixels_per_cell**2)

@@ -1,0 +1,141 @@
+"""A photo laid into a wall's raster by a known pose, with what hides what."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Wall
+from orthoflow_plugins.match.pictures import shrunk
+
+# A view flatter than this onto the wall shows too little to match.
+_GRAZING_COSINE: Final = 0.15
+# Side of a cell of the depth buffer, in photo pixels per wall cell; wide enough that the projected
+# cells of a surface leave no gaps between them.
+_BUFFER_CELLS: Final = 2.0
+# Surface behind what a buffer cell saw counts as hidden beyond this, in wall cells.
+_HIDDEN_CELLS: Final = 6.0
+_ROWS_AT_ONCE: Final = 256
+
+
+@dataclass(frozen=True, kw_only=True)
+class Projection:
+    """Where the cells of a wall appear in a photo.
+
+    Attributes:
+        u: (rows, cols) float32 photo pixels, NaN where the cell is not in the photo.
+        v: (rows, cols) float32.
+        distance: (rows, cols) float32 metres along the camera's axis.
+        pixels_per_cell: median over the cells in the photo.
+    """
+
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    distance: NDArray[np.float32]
+    pixels_per_cell: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class WarpedPhoto:
+    """A photo in a wall's raster.
+
+    Attributes:
+        grey: (rows, cols) float32, 0..255; NaN where the photo does not show the wall.
+        projection: where the cells are in the photo; NaN where hidden too.
+    """
+
+    grey: NDArray[np.float32]
+    projection: Projection
+
+
+def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projection | None]:
+    """Project the surfaces of all walls into a photo; None where a wall is not in it.
+
+    Cells that another surface hides, of the same wall or another one, are NaN.
+    """
+    seen = [_in_photo(camera, wall) for wall in walls]
+    shown = [(wall, item) for wall, item in zip(walls, seen, strict=True) if item is not None]
+    if not shown:
+        return list(seen)
+    step = _BUFFER_CELLS * max(1.0, *(item.pixels_per_cell for _, item in shown))
+    shape = (int(camera.height / step) + 1, int(camera.width / step) + 1)
+    nearest = np.full(shape, np.inf, dtype=np.float32)
+    for _, item in shown:
+        known = np.isfinite(item.u)
+        rows = (item.v[known] / step).astype(np.intp)
+        columns = (item.u[known] / step).astype(np.intp)
+        np.minimum.at(nearest, (rows, columns), item.distance[known])
+    for wall, item in shown:
+        known = np.isfinite(item.u)
+        rows = (item.v[known] / step).astype(np.intp)
+        columns = (item.u[known] / step).astype(np.intp)
+        limit = nearest[rows, columns] + _HIDDEN_CELLS * wall.frame.gsd_m
+        hidden = np.zeros(known.shape, dtype=np.bool_)
+        hidden[known] = item.distance[known] > limit
+        item.u[hidden] = np.nan
+        item.v[hidden] = np.nan
+    return list(seen)
+
+
+def warp_photo(grey: NDArray[np.uint8], projection: Projection) -> WarpedPhoto:
+    """Resample a photo at the cells of a wall, averaged down to the cells' size first."""
+    import cv2
+
+    factor = min(1.0, 1.0 / max(projection.pixels_per_cell, 1e-6))
+    small = shrunk(grey, factor)
+    known = np.isfinite(projection.u)
+    # OpenCV puts (0, 0) at the centre of the first pixel, ours is (0.5, 0.5).
+    map_u = np.where(known, projection.u * factor - 0.5, -10.0).astype(np.float32)
+    map_v = np.where(known, projection.v * factor - 0.5, -10.0).astype(np.float32)
+    warped = cv2.remap(
+        small.astype(np.float32), map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    grey_warped = np.where(known, warped, np.nan).astype(np.float32)
+    return WarpedPhoto(grey=grey_warped, projection=projection)
+
+
+def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
+    frame = wall.frame
+    towards = (
+        camera.centre_world
+        - frame.world_from_wall(np.array([[0.5 * frame.width, 0.5 * frame.height]]))[0]
+    )
+    if float(towards @ frame.normal_world) <= 0.0:
+        return None
+    # Around the wall: survey coordinates would cost digits.
+    near = camera.shifted(frame.origin_world)
+    shape = frame.shape
+    u, v, distance = (np.full(shape, np.nan, dtype=np.float32) for _ in range(3))
+    columns = np.arange(frame.width) + 0.5
+    for first in range(0, frame.height, _ROWS_AT_ONCE):
+        rows = slice(first, min(first + _ROWS_AT_ONCE, frame.height))
+        down = np.arange(rows.start, rows.stop) + 0.5
+        grid = np.stack(np.broadcast_arrays(columns[None, :], down[:, None]), axis=-1)
+        depth = wall.depth_m[rows].astype(np.float64).ravel()
+        points = frame.world_from_wall(grid.reshape(-1, 2), depth) - frame.origin_world
+        seen = near.project(points)
+        rays = near.centre_world - points
+        cosine = rays @ frame.normal_world / np.linalg.norm(rays, axis=1)
+        seen[~near.sees(seen[:, :2]) | ~(cosine > _GRAZING_COSINE)] = np.nan
+        for raster, values in zip((u, v, distance), seen.T, strict=True):
+            raster[rows] = values.reshape(-1, frame.width)
+    if np.isfinite(u).sum() < 100:
+        return None
+    per_cell = _pixels_per_cell(u, v)
+    if per_cell is None:
+        return None
+    return Projection(u=u, v=v, distance=distance, pixels_per_cell=per_cell)
+
+
+def _pixels_per_cell(u: NDArray[np.float32], v: NDArray[np.float32]) -> float | None:
+    with np.errstate(invalid="ignore"):
+        across = np.hypot(np.diff(u, axis=1), np.diff(v, axis=1))[:-1]
+        down = np.hypot(np.diff(u, axis=0), np.diff(v, axis=0))[:, :-1]
+        size = np.sqrt(across * down)
+    known = np.isfinite(size)
+    return float(np.median(size[known])) if known.any() else None

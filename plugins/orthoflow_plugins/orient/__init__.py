@@ -1,0 +1,1 @@
+"""Methods of the kind `orient`: where the photos were taken."""

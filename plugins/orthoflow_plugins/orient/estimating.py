@@ -1,0 +1,202 @@
+"""The pose of one photo: robust start, adjustment, and which ties agree with it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import (
+    LensFreedom,
+    Misfit,
+    Resection,
+    SeenPoints,
+    adjust,
+    misfit,
+    pixels_by_point,
+)
+from orthoflow.products import Intrinsics, Photo
+from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior, viewing
+from orthoflow_plugins.orient.robust import RobustPose, SamplingRule, robust_pose
+from orthoflow_plugins.orient.splitting import GROUPS, image_cells
+
+_ROUNDS: Final = 8
+# Median length of a two-dimensional standard normal deviation.
+_MEDIAN_LENGTH: Final = 1.1774
+_SIGMA0_RANGE: Final = (0.1, 3.0)
+# Ties that determine a lens besides a pose.
+_LEAST_FOR_LENS: Final = 25
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimationRule:
+    """How a photo is oriented.
+
+    Attributes:
+        rejection_sigma: ties beyond so many standard deviations are rejected.
+        threshold_px: of the samples; None derives it from the ties' sigmas.
+        n_trials_most: samples drawn at most.
+        seed: of the samples.
+    """
+
+    rejection_sigma: float
+    threshold_px: float | None
+    n_trials_most: int
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A photo's pose with what it was found from.
+
+    Attributes:
+        resection: the adjusted camera.
+        intrinsics: its interior orientation.
+        prior: what was known of the lens before.
+        fit: of all the photo's ties, control and check.
+        agreeing: (n,) bool, ties within the limit.
+        limit: in standard deviations, as `fit.normalised`.
+        n_sampled: control ties that agreed with the robust start.
+    """
+
+    resection: Resection
+    intrinsics: Intrinsics
+    prior: LensPrior
+    fit: Misfit
+    agreeing: NDArray[np.bool_]
+    limit: float
+    n_sampled: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Start:
+    pose: RobustPose
+    intrinsics: Intrinsics
+
+
+def estimate_pose(
+    photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
+) -> Estimate | None:
+    """Orient a photo by its control ties; None when no pose is found.
+
+    Args:
+        photo: the photo.
+        seen: its ties.
+        is_check: (n,) ties withheld from everything but the final fit.
+        rule: how.
+    """
+    prior = lens_prior(photo)
+    control = np.flatnonzero(~is_check)
+    start = _best_start(seen.take(control), prior, rule)
+    if start is None:
+        return None
+    agreeing = np.zeros(len(seen), dtype=np.bool_)
+    agreeing[control] = start.pose.agreeing
+    # Points that appear twice say nothing new to a pose of six unknowns.
+    if len(np.unique(seen.points_world[agreeing].round(4), axis=0)) < 5:
+        return None
+    cells = image_cells(seen.pixels_photo, (photo.width, photo.height), GROUPS)
+    try:
+        return _adjusted(seen, is_check, (start, prior), (agreeing, cells), rule)
+    except GeometryError:
+        return None
+
+
+def _adjusted(
+    seen: SeenPoints,
+    is_check: NDArray[np.bool_],
+    known: tuple[_Start, LensPrior],
+    chosen: tuple[NDArray[np.bool_], NDArray[np.intp]],
+    rule: EstimationRule,
+) -> Estimate:
+    """Adjust and reject in turns until the control ties stay the same."""
+    start, prior = known
+    agreeing, cells = chosen
+    camera = viewing(start.intrinsics)
+    camera = replace(
+        camera, rotation=start.pose.camera.rotation, translation=start.pose.camera.translation
+    )
+    guess, limit = camera, math.inf
+    for nth in range(_ROUNDS):
+        used = agreeing & ~is_check
+        lens = prior.freedom if used.sum() >= _LEAST_FOR_LENS else LensFreedom()
+        # The prior of the lens stays where it was, the pose starts from the last one.
+        resection = adjust(
+            seen.take(used),
+            replace(guess, rotation=camera.rotation, translation=camera.translation),
+            lens=lens,
+            groups=cells[used],
+            soft_limit=2.0 if nth < 2 else math.inf,
+        )
+        camera = resection.camera
+        fit = misfit(seen, camera)
+        limit = rule.rejection_sigma * _unit_deviation(fit.normalised[used])
+        again = fit.normalised <= limit
+        if np.array_equal(again & ~is_check, used) and nth >= 2:
+            break
+        agreeing = again
+    return Estimate(
+        resection=resection,
+        intrinsics=intrinsics_of(resection, start.intrinsics),
+        prior=prior,
+        fit=fit,
+        agreeing=again,
+        limit=limit,
+        n_sampled=int(start.pose.agreeing.sum()),
+    )
+
+
+def _best_start(seen: SeenPoints, prior: LensPrior, rule: EstimationRule) -> _Start | None:
+    best: _Start | None = None
+    for pose, intrinsics in _starts(seen, prior, rule):
+        if best is None or pose.agreeing.sum() > best.pose.agreeing.sum():
+            best = _Start(pose=pose, intrinsics=intrinsics)
+    return best
+
+
+def _starts(
+    seen: SeenPoints, prior: LensPrior, rule: EstimationRule
+) -> Iterator[tuple[RobustPose, Intrinsics]]:
+    # A lens known only roughly misplaces even right ties.
+    slack = 1.0 if prior.source not in ("exif", "none") else 2.0
+    for intrinsics in prior.guesses:
+        lens = viewing(intrinsics)
+        threshold = rule.threshold_px
+        if threshold is None:
+            threshold = slack * rule.rejection_sigma * _expected_px(seen)
+        pose = robust_pose(
+            seen.pixels_photo,
+            seen.points_world,
+            lens,
+            SamplingRule(threshold_px=threshold, n_trials_most=rule.n_trials_most, seed=rule.seed),
+        )
+        if pose is not None:
+            yield pose, intrinsics
+
+
+def _expected_px(seen: SeenPoints) -> float:
+    """Usual deviation of a tie before any pose: the photo's scale from the spread of its ties."""
+    spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
+    lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
+    per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
+    sigma = np.hypot(np.median(seen.sigma_px), per_metre * np.median(seen.sigma_m))
+    return float(sigma)
+
+
+def _unit_deviation(normalised: NDArray[np.float64]) -> float:
+    """Robust standard deviation of unit weight, kept within reason."""
+    median = float(np.median(normalised)) if normalised.size else 1.0
+    return float(np.clip(median / _MEDIAN_LENGTH, *_SIGMA0_RANGE))
+
+
+def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -> float:
+    """Size of a pixel of the photo at the points, median over them."""
+    derivatives = pixels_by_point(camera, points_world)
+    across = np.linalg.svd(derivatives, compute_uv=False)
+    return float(np.median(1.0 / np.sqrt(across[:, 0] * across[:, 1])))

@@ -1,0 +1,97 @@
+"""Pictures of an orientation: ties on the photo, and histograms of residuals (Figures 17, 18)."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.files.images import decode_image, encode_png
+from orthoflow.products import Photo, TieRole
+from orthoflow.sdk import StepContext
+
+_SIDE_PX: Final = 900
+# markiewicz2015, Figure 17: control green, rejected red, check yellow.
+_COLOURS: Final = {
+    TieRole.REJECTED: (220, 40, 40),
+    TieRole.CONTROL: (40, 200, 60),
+    TieRole.CHECK: (250, 220, 40),
+}
+_FIGURES_MOST: Final = 24
+_SUB_PIXEL_BITS: Final = 4
+
+
+def figure_name(prefix: str, photo_name: str) -> str:
+    """Name of a photo's figure: letters, digits, `-` and `_`."""
+    stem = photo_name.rpartition(".")[0] or photo_name
+    return f"{prefix}_{re.sub(r'[^A-Za-z0-9_-]', '-', stem)}"
+
+
+def draw_ties(
+    ctx: StepContext,
+    photo: Photo,
+    pixels_photo: NDArray[np.float64],
+    role: NDArray[np.uint8],
+    status: str,
+) -> None:
+    """Draw a photo's ties on it: control green, check yellow, rejected red."""
+    import cv2
+
+    if len(ctx.figures) >= _FIGURES_MOST:
+        return
+    name = figure_name("ties", photo.name)
+    if any(figure.name == name for figure in ctx.figures):
+        name = f"{name}-{len(ctx.figures)}"
+    rgb = decode_image(photo.encoded, f"photo {photo.name}")
+    scale = min(1.0, _SIDE_PX / max(rgb.shape[:2]))
+    size = (max(1, round(photo.width * scale)), max(1, round(photo.height * scale)))
+    small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    # Dimmed, so that the marks stand out.
+    canvas = np.rint(0.7 * small).astype(np.uint8)
+    unit = 1 << _SUB_PIXEL_BITS
+    for kind, colour in _COLOURS.items():
+        at = np.rint((pixels_photo[role == kind] * scale - 0.5) * unit).astype(int)
+        for u, v in at.tolist():
+            cv2.circle(canvas, (u, v), 2 * unit, colour, -1, cv2.LINE_AA, _SUB_PIXEL_BITS)
+    ctx.figure(
+        name,
+        encode_png(canvas),
+        f"Ties of {photo.name}: control green, check yellow, rejected red. {status}.",
+    )
+
+
+def draw_residuals(
+    ctx: StepContext, residuals_px: NDArray[np.float64], role: NDArray[np.uint8]
+) -> None:
+    """Draw histograms of the residuals of all oriented photos, with Gauss curves."""
+    from matplotlib.figure import Figure
+
+    kinds = [
+        kind
+        for kind in (TieRole.CONTROL, TieRole.CHECK)
+        if np.isfinite(residuals_px[role == kind]).all(axis=1).sum() > 2
+    ]
+    if not kinds:
+        return
+    figure = Figure(figsize=(7.0, 2.6 * len(kinds)), layout="constrained")
+    panels = figure.subplots(len(kinds), 2, squeeze=False)
+    for kind, row in zip(kinds, panels, strict=True):
+        values = residuals_px[role == kind]
+        values = values[np.isfinite(values).all(axis=1)]
+        for axis, (label, axes) in enumerate(zip("uv", row, strict=True)):
+            mean, deviation = values[:, axis].mean(), max(values[:, axis].std(), 1e-9)
+            axes.hist(values[:, axis], bins=40, color="#9db8d2")
+            grid = np.linspace(values[:, axis].min(), values[:, axis].max(), 200)
+            curve = np.exp(-0.5 * ((grid - mean) / deviation) ** 2)
+            width = np.ptp(values[:, axis]) / 40 or 1.0
+            area = len(values) * width / (deviation * np.sqrt(2.0 * np.pi))
+            axes.plot(grid, area * curve, color="#b03a2e", linewidth=1.0)
+            axes.set_title(
+                f"{kind.name.lower()} {label}: {len(values)} ties, SD {deviation:.2f} px",
+                fontsize=9,
+            )
+            axes.set_xlabel("observed - computed [px]", fontsize=8)
+            axes.tick_params(labelsize=7)
+    ctx.figure("residuals", figure, "Residuals of all oriented photos, with normal distributions.")

@@ -1,0 +1,262 @@
+"""Whether an orientation may be called `ok`: every gate has a reason in one sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.resection import SeenPoints
+from orthoflow.products import Photo
+from orthoflow_plugins.orient.estimating import Estimate
+from orthoflow_plugins.orient.splitting import hull_area, quadrant_counts
+from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
+
+TIES_LEAST: Final = 8
+QUADRANT_LEAST: Final = 2
+QUADRANT_RATIO: Final = 10
+# A wrong pose would pass the check points by chance once in so many photos.
+_CHANCE_MOST: Final = 1e-6
+_CHECK_AGREEMENT_LEAST: Final = 0.5
+_CHECK_RMSE_RATIO: Final = 2.0
+_PLACE_PX: Final = 8.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateRule:
+    """What an orientation must reach.
+
+    Attributes:
+        n_control_least: control ties that agree.
+        inlier_share_least: share of all ties that agree.
+        hull_ratio_least: hull of the control over the part of the photo that shows its walls.
+        sigma_wall_most_gsd: predicted error on the wall, RMS over the footprint, in cells.
+        sigma_corner_most_gsd: the same, worst place of the footprint.
+    """
+
+    n_control_least: int
+    inlier_share_least: float
+    hull_ratio_least: float
+    sigma_wall_most_gsd: float
+    sigma_corner_most_gsd: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """An orientation to judge.
+
+    Attributes:
+        photo: the photo.
+        seen: its ties.
+        is_check: (n,) withheld ties.
+        walls: index of the wall of each tie (n,).
+        estimate: the pose found.
+        known: the walls of the ties that agree.
+        error: predicted error on these walls, None when the photo shows none of them.
+        rule: what it must reach.
+    """
+
+    photo: Photo
+    seen: SeenPoints
+    is_check: NDArray[np.bool_]
+    walls: NDArray[np.int32]
+    estimate: Estimate
+    known: Sequence[KnownWall]
+    error: WallError | None
+    rule: GateRule
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the photo."""
+        return self.photo.width, self.photo.height
+
+    @property
+    def control(self) -> NDArray[np.bool_]:
+        """Control ties that agree."""
+        return self.estimate.agreeing & ~self.is_check
+
+    @property
+    def checked(self) -> NDArray[np.bool_]:
+        """Check ties that agree."""
+        return self.estimate.agreeing & self.is_check
+
+    @property
+    def hull_ratio(self) -> float:
+        """Hull of the control over the footprint of its walls in the photo; 0 without one."""
+        if self.error is None:
+            return 0.0
+        footprint = hull_area(self.error.footprint_px)
+        return hull_area(self.seen.pixels_photo[self.control]) / max(footprint, 1.0)
+
+
+def too_few(pixels_photo: NDArray[np.float64], size_px: tuple[int, int]) -> str:
+    """Say why ties are too few for an orientation; empty when they suffice (markiewicz2015)."""
+    if len(pixels_photo) < TIES_LEAST:
+        return (
+            f"{len(pixels_photo)} ties with the walls, at least {TIES_LEAST} are needed: the photo "
+            "shows none of the walls, or too differently"
+        )
+    counts = quadrant_counts(pixels_photo, size_px)
+    if counts.min() < QUADRANT_LEAST:
+        return (
+            f"a quarter of the photo has {counts.min()} ties, each needs {QUADRANT_LEAST}: the "
+            "pose would be extrapolated there"
+        )
+    return ""
+
+
+def reason_against(case: Case) -> str:
+    """Say why an orientation is not `ok`; empty when it is."""
+    for gate in _GATES:
+        reason = gate(case)
+        if reason:
+            return reason
+    return ""
+
+
+def warnings_for(case: Case) -> list[str]:
+    """Say what limits an orientation that is `ok`."""
+    notes = []
+    counts = quadrant_counts(case.seen.pixels_photo[case.estimate.agreeing], case.size_px)
+    if counts.max() > QUADRANT_RATIO * counts.min():
+        notes.append(
+            f"a quarter of the photo has {counts.max()} ties, another {counts.min()}: more than "
+            f"{QUADRANT_RATIO} times as many"
+        )
+    if case.hull_ratio < 1.5 * case.rule.hull_ratio_least:
+        notes.append(f"the control covers {case.hull_ratio:.0%} of the part that shows the walls")
+    if case.estimate.prior.source == "none":
+        notes.append("neither calibration nor EXIF says its focal length, which was estimated")
+    return notes
+
+
+def _enough_control(case: Case) -> str:
+    n_control = int(case.control.sum())
+    if n_control < case.rule.n_control_least:
+        return (
+            f"only {n_control} of {int((~case.is_check).sum())} control ties agree with one pose, "
+            f"at least {case.rule.n_control_least} must"
+        )
+    return ""
+
+
+def _enough_share(case: Case) -> str:
+    share = float(case.estimate.agreeing.mean())
+    if share < case.rule.inlier_share_least:
+        return (
+            f"only {share:.1%} of {len(case.seen)} ties agree with one pose, at least "
+            f"{case.rule.inlier_share_least:.1%} must"
+        )
+    return ""
+
+
+def _not_by_chance(case: Case) -> str:
+    """A pose fitted to wrong ties fits withheld ties by chance only."""
+    n_check, n_agree = int(case.is_check.sum()), _n_places(case.seen.pixels_photo[case.checked])
+    by_chance = _chance_probability(case)
+    if _tail(n_agree, n_check, by_chance) > _CHANCE_MOST:
+        return (
+            f"{n_agree} of {n_check} withheld ties agree with the pose, as a wrong pose could "
+            "have by chance"
+        )
+    return ""
+
+
+def _check_agrees(case: Case) -> str:
+    share_control = float(case.control.sum() / (~case.is_check).sum())
+    n_check, n_agree = int(case.is_check.sum()), int(case.checked.sum())
+    if n_agree / n_check < _CHECK_AGREEMENT_LEAST * share_control and n_check >= 5:
+        return (
+            f"{n_agree} of {n_check} withheld ties agree with the pose, but {share_control:.0%} of "
+            "the control does: the pose was fitted to chance"
+        )
+    lengths = case.estimate.fit.normalised
+    rms_control = float(np.sqrt(np.mean(lengths[case.control] ** 2)))
+    rms_check = float(np.sqrt(np.mean(lengths[case.checked] ** 2))) if n_agree else math.inf
+    if n_agree >= 5 and rms_check > _CHECK_RMSE_RATIO * rms_control:
+        return (
+            f"the check ties deviate {rms_check / rms_control:.1f} times as much as the control, "
+            f"at most {_CHECK_RMSE_RATIO:g} times is plausible"
+        )
+    return ""
+
+
+def _spread(case: Case) -> str:
+    return too_few(case.seen.pixels_photo[case.estimate.agreeing], case.size_px)
+
+
+def _in_front(case: Case) -> str:
+    centre = case.estimate.resection.camera.centre_world
+    for wall in case.known:
+        used = case.walls[case.control] == wall.index
+        if not (wall.has_side and used.sum() >= QUADRANT_LEAST * 2):
+            continue
+        if float((centre - wall.corners_world.mean(axis=0)) @ wall.normal) <= 0.0:
+            return "the pose lies behind the wall it would show, so it must be wrong"
+    return ""
+
+
+def _covered(case: Case) -> str:
+    if case.error is None:
+        return "with this pose the photo would show no wall that its ties lie on"
+    if case.hull_ratio < case.rule.hull_ratio_least:
+        return (
+            f"the control covers {case.hull_ratio:.1%} of the part of the photo that shows the "
+            f"walls, at least {case.rule.hull_ratio_least:.1%} is needed"
+        )
+    return ""
+
+
+def _accurate(case: Case) -> str:
+    gsds = [wall.gsd_m for wall in case.known if wall.gsd_m is not None]
+    if case.error is None or not gsds:
+        return ""
+    for value, most, where in (
+        (case.error.rms_m, case.rule.sigma_wall_most_gsd, "on the wall"),
+        (case.error.worst_m, case.rule.sigma_corner_most_gsd, "at the worst place of the wall"),
+    ):
+        if value > most * min(gsds):
+            return (
+                f"its predicted error {where} is {1000 * value:.1f} mm, at most {most:g} cells of "
+                f"{1000 * min(gsds):g} mm are allowed"
+            )
+    return ""
+
+
+_GATES: Final[tuple[Callable[[Case], str], ...]] = (
+    _enough_control,
+    _enough_share,
+    _not_by_chance,
+    _check_agrees,
+    _spread,
+    _in_front,
+    _covered,
+    _accurate,
+)
+
+
+def _chance_probability(case: Case) -> float:
+    """Probability that a wrong tie falls within the limit of a pose it has nothing to do with."""
+    residuals, lengths = case.estimate.fit.residuals_px, case.estimate.fit.normalised
+    inside = case.estimate.agreeing & (lengths > 0.0)
+    radius = case.estimate.limit * float(
+        np.median(np.linalg.norm(residuals[inside], axis=1) / lengths[inside])
+    )
+    # Wrong ties gather where the texture is, not all over the photo.
+    textured = max(hull_area(case.seen.pixels_photo), 1.0) / 4.0
+    return min(0.5, math.pi * radius**2 / textured)
+
+
+def _tail(n_least: int, n_all: int, probability: float) -> float:
+    """Probability of at least n_least successes in n_all trials (binomial)."""
+    from scipy.stats import binom
+
+    return float(binom.sf(n_least - 1, n_all, probability))
+
+
+def _n_places(pixels: NDArray[np.float64]) -> int:
+    return len(np.unique(np.floor(pixels / _PLACE_PX), axis=0))

@@ -1,0 +1,96 @@
+"""What is known of a photo's lens before its orientation, and how far it may move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import LensFreedom, Resection
+from orthoflow.products import Intrinsics, Photo
+
+# EXIF says the focal length to a whole number of millimetres, or of the full-frame equivalent, and
+# nothing of the focusing distance; nothing at all leaves what lenses usually are.
+_EXIF_SIGMA: Final = 0.05
+_UNKNOWN_SIGMA: Final = 0.35
+_K1_SIGMA: Final = 0.1
+_EXIF_FACTORS: Final = (1.0, 0.94, 1.06)
+_UNKNOWN_FACTORS: Final = (0.6, 0.75, 0.95, 1.2, 1.6, 2.2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensPrior:
+    """A lens to start from.
+
+    Attributes:
+        guesses: interior orientations to try, the likeliest first.
+        freedom: what the adjustment may change.
+        source: `calibration`, `exif` or `none`.
+    """
+
+    guesses: tuple[Intrinsics, ...]
+    freedom: LensFreedom
+    source: str
+
+
+def lens_prior(photo: Photo) -> LensPrior:
+    """Give what is known of a photo's lens: its calibration, else EXIF, else what is usual."""
+    if photo.intrinsics is not None:
+        return LensPrior(
+            guesses=(photo.intrinsics,), freedom=LensFreedom(), source=photo.intrinsics.source
+        )
+    if photo.exif_focal_px is not None:
+        return LensPrior(
+            guesses=tuple(_centred(photo, photo.exif_focal_px * f) for f in _EXIF_FACTORS),
+            freedom=LensFreedom(focal_sigma=_EXIF_SIGMA, k1_sigma=_K1_SIGMA),
+            source="exif",
+        )
+    longest = max(photo.width, photo.height)
+    return LensPrior(
+        guesses=tuple(_centred(photo, longest * f) for f in _UNKNOWN_FACTORS),
+        freedom=LensFreedom(focal_sigma=_UNKNOWN_SIGMA, k1_sigma=_K1_SIGMA),
+        source="none",
+    )
+
+
+def viewing(intrinsics: Intrinsics) -> ViewingCamera:
+    """Give the lens as a camera at the origin of its own axes."""
+    return ViewingCamera(
+        width=intrinsics.width,
+        height=intrinsics.height,
+        fx=intrinsics.fx,
+        fy=intrinsics.fy,
+        cx=intrinsics.cx,
+        cy=intrinsics.cy,
+        distortion=np.array(intrinsics.distortion, dtype=np.float64),
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+    )
+
+
+def intrinsics_of(resection: Resection, start: Intrinsics) -> Intrinsics:
+    """Give the interior orientation after an adjustment."""
+    if not resection.lens.sigmas.size:
+        return start
+    camera = resection.camera
+    return replace(
+        start,
+        fx=camera.fx,
+        fy=camera.fy,
+        distortion=tuple(float(value) for value in camera.distortion),
+        source="estimated",
+    )
+
+
+def _centred(photo: Photo, focal_px: float) -> Intrinsics:
+    return Intrinsics(
+        width=photo.width,
+        height=photo.height,
+        fx=focal_px,
+        fy=focal_px,
+        cx=0.5 * photo.width,
+        cy=0.5 * photo.height,
+        source="exif",
+    )

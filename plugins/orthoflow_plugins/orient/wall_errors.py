@@ -1,0 +1,150 @@
+"""What an orientation's uncertainty means on the wall: metres where its photo would be laid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import Resection, pixels_by_point, predicted_covariances
+from orthoflow.products import Ties
+
+_SIDE: Final = 15
+# A view flatter than this onto the wall paints nothing useful.
+_GRAZING_COSINE: Final = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownWall:
+    """A wall as ties describe it.
+
+    Attributes:
+        index: of the wall.
+        corners_world: (4, 3) metres: top-left, then counter-clockwise for the viewer.
+        normal: (3,) unit vector towards the viewer.
+        gsd_m: cell of its raster, or None when the ties do not say.
+        has_side: whether the normal is known to point to the viewer.
+    """
+
+    index: int
+    corners_world: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    gsd_m: float | None
+    has_side: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallError:
+    """Predicted error of a photo on the walls it shows.
+
+    Attributes:
+        rms_m: standard deviation of a coordinate in the wall's plane, RMS over the footprint.
+        worst_m: the largest one in the footprint.
+        footprint_px: (n, 2) pixels of the grid points that lie in the footprint.
+    """
+
+    rms_m: float
+    worst_m: float
+    footprint_px: NDArray[np.float64]
+
+
+def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
+    """Describe the walls of some ties: from what their matcher says, else from the points."""
+    described = ties.details.get("walls")
+    walls = []
+    for index in np.unique(ties.wall[chosen]):
+        entry = (
+            described[int(index)]
+            if isinstance(described, Sequence) and int(index) < len(described)
+            else None
+        )
+        if isinstance(entry, Mapping):
+            walls.append(_described(int(index), entry))
+        else:
+            points = ties.points_world[chosen & (ties.wall == index)]
+            if len(points) >= 3:
+                walls.append(_fitted(int(index), points))
+    return walls
+
+
+def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | None:
+    """Predict the error on the walls from the covariance; None when the photo shows no wall."""
+    parts = [_on_one_wall(resection, wall) for wall in walls]
+    variances = np.concatenate([np.empty(0), *(part[0] for part in parts)])
+    if not variances.size:
+        return None
+    return WallError(
+        rms_m=float(np.sqrt(variances.mean())),
+        worst_m=float(np.sqrt(variances.max())),
+        footprint_px=np.vstack([part[1] for part in parts]),
+    )
+
+
+def _on_one_wall(
+    resection: Resection, wall: KnownWall
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Variances (n,) in metres squared per coordinate, and pixels (n, 2), over the footprint."""
+    top_left, bottom_left, _, top_right = wall.corners_world
+    steps = (np.arange(_SIDE) + 0.5) / _SIDE
+    along, down = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    points = (
+        top_left
+        + along[:, None] * (top_right - top_left)
+        + down[:, None] * (bottom_left - top_left)
+    )
+    pixels = _seen(resection.camera, points, wall.normal)
+    points, pixels = points[np.isfinite(pixels[:, 0])], pixels[np.isfinite(pixels[:, 0])]
+    if not len(points):
+        return np.empty(0), np.empty((0, 2))
+    axes = np.vstack(
+        [
+            (top_right - top_left) / np.linalg.norm(top_right - top_left),
+            (bottom_left - top_left) / np.linalg.norm(bottom_left - top_left),
+        ]
+    )
+    plane_by_pixel = np.linalg.inv(pixels_by_point(resection.camera, points) @ axes.T)
+    covariances = plane_by_pixel @ predicted_covariances(resection, points)
+    covariances = covariances @ plane_by_pixel.transpose(0, 2, 1)
+    return 0.5 * np.trace(covariances, axis1=1, axis2=2), pixels
+
+
+def _seen(
+    camera: ViewingCamera, points: NDArray[np.float64], normal: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Pixels (n, 2) of wall points; NaN outside the image or under a grazing view."""
+    pixels = camera.project(points)[:, :2]
+    towards = camera.centre_world - points
+    cosine = np.abs(towards @ normal) / np.linalg.norm(towards, axis=1)
+    pixels[~camera.sees(pixels) | (cosine < _GRAZING_COSINE)] = np.nan
+    return pixels
+
+
+def _described(index: int, entry: Mapping[str, object]) -> KnownWall:
+    gsd_m = entry.get("gsd_m")
+    return KnownWall(
+        index=index,
+        corners_world=np.array(entry["corners_world"], dtype=np.float64),
+        normal=np.array(entry["normal"], dtype=np.float64),
+        gsd_m=float(gsd_m) if isinstance(gsd_m, int | float) else None,
+        has_side=True,
+    )
+
+
+def _fitted(index: int, points: NDArray[np.float64]) -> KnownWall:
+    """The bounding rectangle of points in their own plane, the side unknown."""
+    middle = points.mean(axis=0)
+    axes = np.linalg.svd(points - middle, full_matrices=False)[2]
+    local = (points - middle) @ axes[:2].T
+    low, high = local.min(axis=0), local.max(axis=0)
+    order = np.array([[low[0], low[1]], [low[0], high[1]], high, [high[0], low[1]]])
+    return KnownWall(
+        index=index,
+        corners_world=middle + order @ axes[:2],
+        normal=axes[2],
+        gsd_m=None,
+        has_side=False,
+    )
