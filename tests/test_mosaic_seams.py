@@ -37,9 +37,10 @@ def random_layer(seed: int, *, wall: int = 0, filled: bool = True) -> Layer:
     )
 
 
-def joined(layers: Layers, folder: Path) -> Orthoimages:
+def joined(layers: Layers, folder: Path, *, island_cells_min: int = 1) -> Orthoimages:
+    params = MosaicSeams.Params(island_cells_min=island_cells_min)
     ctx = scenes.context(folder)
-    return MosaicSeams().run(MosaicSeams.In(layers=layers), MosaicSeams.Params(), ctx).orthoimages
+    return MosaicSeams().run(MosaicSeams.In(layers=layers), params, ctx).orthoimages
 
 
 def test_a_single_layer_passes_through(tmp_path: Path) -> None:
@@ -136,8 +137,145 @@ def test_shares_of_all_states_are_reported(tmp_path: Path) -> None:
     layers = Layers(layers=(random_layer(1), random_layer(2)))
     ctx = scenes.context(tmp_path)
     inputs = MosaicSeams.In(layers=layers)
-    (image,) = MosaicSeams().run(inputs, MosaicSeams.Params(), ctx).orthoimages.images
+    params = MosaicSeams.Params(island_cells_min=1)
+    (image,) = MosaicSeams().run(inputs, params, ctx).orthoimages.images
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics.pop("n_orthoimages") == 1
+    assert metrics.pop("n_sources") == 2
+    assert metrics.pop("n_overlap_patches") == 0
+    assert 0.0 < metrics.pop("seam_share") < 1.0
     expected = {f"{state.name.lower()}_share": share(image.mask, state) for state in OrthoMask}
     assert metrics == pytest.approx(expected)
+
+
+def smooth_layer(
+    name: str, quality: NDArray[np.float32], mask: NDArray[np.uint8], *, rgb: int = 7
+) -> Layer:
+    is_painted = mask == LayerMask.PAINTED
+    return Layer(
+        frame=frame(mask.shape),
+        wall=0,
+        source=name,
+        rgb=np.where(is_painted[..., None], np.uint8(rgb), np.uint8(0)) * np.ones(3, np.uint8),
+        mask=mask,
+        quality=np.where(is_painted, quality, np.float32(0.0)),
+    )
+
+
+def two_halves() -> tuple[Layer, Layer]:
+    """The first is better on the left of 40 columns, the second on the right, both a bit noisy."""
+    shape = (30, 40)
+    columns = np.mgrid[: shape[0], : shape[1]][1].astype(np.float32)
+    noise = np.random.default_rng(3).normal(0.0, 4.0, shape).astype(np.float32)
+    whole = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
+    return (
+        smooth_layer("left", 50.0 - columns, whole, rgb=10),
+        smooth_layer("right", 11.0 + columns + noise, whole, rgb=20),
+    )
+
+
+def n_patches(source: NDArray[np.int16]) -> int:
+    import cv2
+
+    counts = [
+        cv2.connectedComponents((source == index).astype(np.uint8), connectivity=4)[0] - 1
+        for index in np.unique(source)
+    ]
+    return sum(counts)
+
+
+def test_noisy_qualities_do_not_give_specks(tmp_path: Path) -> None:
+    layers = Layers(layers=two_halves())
+    (specks,) = joined(layers, tmp_path).images
+    (calm,) = joined(layers, tmp_path, island_cells_min=100).images
+    assert n_patches(specks.source) > 10
+    assert n_patches(calm.source) == 2
+    np.testing.assert_array_equal(calm.mask, specks.mask)
+    np.testing.assert_array_equal(calm.rgb[..., 0], np.where(calm.source == 0, 10, 20))
+
+
+def test_an_island_that_only_its_own_source_sees_stays(tmp_path: Path) -> None:
+    left, right = two_halves()
+    hidden = left.mask.copy()
+    hidden[10:14, 5:9] = LayerMask.OCCLUDED
+    left = smooth_layer("left", left.quality, hidden, rgb=10)
+    (image,) = joined(Layers(layers=(left, right)), tmp_path, island_cells_min=100).images
+    assert (image.source[10:14, 5:9] == 1).all()
+    assert n_patches(image.source) == 3
+    assert (image.mask == OrthoMask.PAINTED).all()
+
+
+def test_a_filling_is_not_enlarged_over_painted_cells(tmp_path: Path) -> None:
+    left, right = two_halves()
+    filled = np.ones_like(left.mask)
+    filled[10:14, 5:9] = 0
+    left = dataclasses.replace(left, filled=filled)
+    few = np.full_like(right.mask, LayerMask.OUTSIDE)
+    few[20:24, 5:9] = LayerMask.PAINTED
+    right = smooth_layer("right", right.quality, few, rgb=20)
+    (image,) = joined(Layers(layers=(left, right)), tmp_path, island_cells_min=100).images
+    assert (image.source[20:24, 5:9] == 1).all()
+    assert (image.mask[20:24, 5:9] == OrthoMask.PAINTED).all()
+    assert (image.mask[10:14, 5:9] == OrthoMask.PAINTED).all()
+    assert np.count_nonzero(image.mask == OrthoMask.FILLED) == image.mask.size - 32
+
+
+def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) -> None:
+    mask = np.full((30, 40), LayerMask.OCCLUDED, dtype=np.uint8)
+    mask[:5], mask[5:9] = LayerMask.OUTSIDE, LayerMask.NO_SURFACE
+    layer = smooth_layer("no photo", np.zeros((30, 40), dtype=np.float32), mask)
+    ctx = scenes.context(tmp_path)
+    inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
+    (image,) = MosaicSeams().run(inputs, MosaicSeams.Params(), ctx).orthoimages.images
+    assert ctx.warnings == ["the orthoimage of west is empty: no source shows any of it"]
+    assert image.sources == ()
+    assert (image.source == -1).all()
+    assert (image.mask[:5] == OrthoMask.NONE).all()
+    assert (image.mask[5:9] == OrthoMask.NO_SURFACE).all()
+    assert (image.mask[9:] == OrthoMask.OCCLUDED).all()
+
+
+def test_a_layer_without_paint_is_no_source_but_tells_what_is_hidden(tmp_path: Path) -> None:
+    left, right = two_halves()
+    blind = smooth_layer("blind", left.quality, np.full_like(left.mask, LayerMask.OCCLUDED))
+    few = left.mask.copy()
+    few[:, 20:] = LayerMask.OUTSIDE
+    left = smooth_layer("left", left.quality, few, rgb=10)
+    del right
+    (image,) = joined(Layers(layers=(blind, left)), tmp_path).images
+    assert image.sources == ("left",)
+    assert (image.source[:, :20] == 0).all()
+    assert (image.mask[:, 20:] == OrthoMask.OCCLUDED).all()
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (2, -1), (-3, 4)], ids=str)
+def test_displacements_between_photos_are_measured(tmp_path: Path, shift: tuple[int, int]) -> None:
+    import cv2
+
+    noise = np.random.default_rng(2).integers(0, 256, (400, 400), np.uint8)
+    texture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
+    u, v = shift
+    pictures = [texture[50:350, 50:350], texture[50 - v : 350 - v, 50 - u : 350 - u]]
+    layers = [
+        dataclasses.replace(
+            smooth_layer(f"{k}", np.ones((300, 300), np.float32), np.ones((300, 300), np.uint8)),
+            rgb=np.dstack([picture] * 3),
+        )
+        for k, picture in enumerate(pictures)
+    ]
+    ctx = scenes.context(tmp_path)
+    inputs = MosaicSeams.In(layers=Layers(layers=tuple(layers)))
+    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    assert metrics["n_overlap_patches"] == 16
+    assert metrics["overlap_u_rms_cells"] == pytest.approx(abs(u), abs=0.15)
+    assert metrics["overlap_v_rms_cells"] == pytest.approx(abs(v), abs=0.15)
+
+
+def test_the_map_of_sources_names_their_colours(tmp_path: Path) -> None:
+    ctx = scenes.context(tmp_path)
+    inputs = MosaicSeams.In(layers=Layers(layers=two_halves(), names=("west",)))
+    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
+    (figure,) = ctx.figures
+    assert figure.caption == "west, by source: blue left, orange right; seams in white."
+    assert figure.path.read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,155 @@
+"""Which layer paints each cell of a wall: the best view, in patches rather than in specks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame
+from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask
+
+NOBODY: Final = -1
+# A cell takes the highest of these that a layer gives it. Occluded: no source paints it, although
+# at least one looks at it. A filled cell counts less than a painted one.
+_RANKED: Final = (
+    OrthoMask.NONE,
+    OrthoMask.NO_SURFACE,
+    OrthoMask.OCCLUDED,
+    OrthoMask.FILLED,
+    OrthoMask.PAINTED,
+)
+_MASK_OF_RANK: Final = np.array(_RANKED, dtype=np.uint8)
+_RANK_OF_LAYER_MASK: Final = np.array(
+    [_RANKED.index(OrthoMask[name]) for name in ("NONE", "PAINTED", "OCCLUDED", "NO_SURFACE")],
+    dtype=np.uint8,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """What becomes of each cell, before colours are taken.
+
+    Attributes:
+        rank: (rows, cols) uint8 position of its state in the order of states.
+        source: (rows, cols) int16 layer that paints it, `NOBODY` without one.
+    """
+
+    rank: NDArray[np.uint8]
+    source: NDArray[np.int16]
+
+
+def joined(layers: tuple[Layer, ...], name: str, *, island_cells_min: int) -> Orthoimage:
+    """Join the layers of one wall.
+
+    Args:
+        layers: all of one wall, at least one.
+        name: of the wall.
+        island_cells_min: smaller patches from one source are painted from the source around
+            them, where that one sees them too.
+
+    Raises:
+        MethodError: the layers do not share one frame.
+    """
+    first = layers[0]
+    for layer in layers[1:]:
+        if not _is_same_frame(layer.frame, first.frame):
+            raise MethodError(
+                f"the layers {first.source} and {layer.source} of {name} lie on different rasters: "
+                "all layers of a wall must come from the same walls"
+            )
+    # What paints nothing is no source; it still tells what is hidden.
+    painters = [layer for layer in layers if (layer.mask == LayerMask.PAINTED).any()]
+    others = [layer for layer in layers if all(layer is not painter for painter in painters)]
+    ordered = [*painters, *others]
+    choice = best_views(ordered)
+    if island_cells_min > 1 and len(painters) > 1:
+        choice = without_islands(choice, painters, island_cells_min)
+    rgb = np.zeros((*first.frame.shape, 3), dtype=np.uint8)
+    for index, layer in enumerate(painters):
+        is_mine = choice.source == index
+        rgb[is_mine] = layer.rgb[is_mine]
+    return Orthoimage(
+        frame=first.frame,
+        wall=first.wall,
+        name=name,
+        rgb=rgb,
+        mask=_MASK_OF_RANK[choice.rank],
+        source=choice.source,
+        sources=tuple(layer.source for layer in painters),
+    )
+
+
+def best_views(layers: Sequence[Layer]) -> Choice:
+    """Give each cell to the layer with the best quality, the first of equals."""
+    shape = layers[0].frame.shape
+    best = np.zeros(shape, dtype=np.float32)
+    rank = np.zeros(shape, dtype=np.uint8)
+    source = np.full(shape, NOBODY, dtype=np.int16)
+    for index, layer in enumerate(layers):
+        states = _ranks(layer)
+        is_painted = layer.mask == LayerMask.PAINTED
+        wins = (states > rank) | (is_painted & (states == rank) & (layer.quality > best))
+        rank[wins] = states[wins]
+        best[wins] = layer.quality[wins]
+        source[wins & is_painted] = index
+    return Choice(rank=rank, source=source)
+
+
+def without_islands(choice: Choice, layers: Sequence[Layer], cells_min: int) -> Choice:
+    """Give small patches to the source that surrounds them, where it shows them as well.
+
+    A patch is connected over sides of cells. The source with the most cells about a cell takes
+    it; what no larger patch's source shows stays as it is.
+    """
+    import cv2
+
+    is_island = np.zeros(choice.source.shape, dtype=np.bool_)
+    for index in range(len(layers)):
+        is_island |= _small_patches(choice.source == index, cells_min)
+    if not is_island.any():
+        return choice
+    source = choice.source.copy()
+    most = np.zeros(source.shape, dtype=np.float32)
+    side = 2 * math.ceil(math.sqrt(cells_min)) + 1
+    for index, layer in enumerate(layers):
+        mainland = ((choice.source == index) & ~is_island).astype(np.float32)
+        about = cv2.boxFilter(
+            mainland, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
+        takes = is_island & (_ranks(layer) == choice.rank) & (about > most)
+        source[takes] = index
+        most[takes] = about[takes]
+    return replace(choice, source=source)
+
+
+def _small_patches(is_mine: NDArray[np.bool_], cells_min: int) -> NDArray[np.bool_]:
+    import cv2
+
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(is_mine.view(np.uint8), connectivity=4)
+    is_small = stats[:, cv2.CC_STAT_AREA] < cells_min
+    is_small[0] = False
+    return np.asarray(is_small[labels], dtype=np.bool_)
+
+
+def _ranks(layer: Layer) -> NDArray[np.uint8]:
+    ranks = _RANK_OF_LAYER_MASK[layer.mask]
+    if layer.filled is not None:
+        is_filled = (layer.filled > 0) & (layer.mask == LayerMask.PAINTED)
+        ranks[is_filled] = _RANKED.index(OrthoMask.FILLED)
+    return ranks
+
+
+def _is_same_frame(frame: WallFrame, other: WallFrame) -> bool:
+    return (
+        frame.shape == other.shape
+        and frame.gsd_m == other.gsd_m
+        and np.array_equal(frame.origin_world, other.origin_world)
+        and np.array_equal(frame.u_world, other.u_world)
+        and np.array_equal(frame.v_world, other.v_world)
+    )
