@@ -44,7 +44,8 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
     """A rotation matrix (3, 3), uniform over all rotations (QR of a Gaussian matrix)."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
-    return q if np.linalg.det(q) > 0 else -q
+    rotation: NDArray[np.float64] = q if np.linalg.det(q) > 0 else -q
+    return rotation
 
 
 def rotation_about(axis: NDArray[np.float64], angle_deg: float) -> NDArray[np.float64]:
@@ -286,4 +287,7 @@ def _rectangle(
 
 def _shares(total: int, weights: NDArray[np.float64]) -> NDArray[np.int64]:
     """Cumulative counts that divide a total by weights, the last one exactly the total."""
-    return np.round(np.cumsum(weights) / weights.sum() * total).astype(np.int64)
+    counts: NDArray[np.int64] = np.round(np.cumsum(weights) / weights.sum() * total).astype(
+        np.int64
+    )
+    return counts

@@ -16,7 +16,7 @@ from orthoflow_plugins.inspect.matching import GreyImage, PatchShifts, measure_s
 # Neighbouring cells whose true depths differ by more make a step, reported apart.
 STEP_M: Final = 0.004
 STEP_BAND_CELLS: Final = 2
-# A colour so far outside of all true colours within two cells has no business there.
+# A colour so far outside of all true colours within one cell has no business there.
 GROSS_GREY: Final = 40.0
 _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 
@@ -180,11 +180,11 @@ def _shifts(image: Orthoimage, true: TrueOrthoimage, steps: NDArray[np.bool_]) -
 
 
 def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]:
-    """Cells whose colour lies outside of the range of the true colours within two cells."""
+    """Cells whose colour lies outside of the range of the true colours within one cell."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     known = (true.rectangle >= 0)[:, :, None]
-    size = (5, 5, 1)
+    size = (3, 3, 1)
     low = minimum_filter(np.where(known, true.rgb, np.float32(np.inf)), size=size)
     high = maximum_filter(np.where(known, true.rgb, np.float32(-np.inf)), size=size)
     rgb = image.rgb.astype(np.float32)

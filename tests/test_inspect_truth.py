@@ -1,0 +1,270 @@
+"""`inspect.truth` measures exactly the errors that were put in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.inspect.samples import depth_step_band
+from orthoflow_plugins.inspect.truth import InspectTruth
+from orthoflow_plugins.simulate.room import SimulateRoom
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import frame_over
+from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
+from orthoflow.products import (
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    PointLabels,
+    SurfaceMask,
+    Truth,
+    Wall,
+    Walls,
+)
+from orthoflow.sdk import StepContext
+from tests import scenes
+
+GSD_M = 0.014
+BUFFER_M = 0.15
+
+# Rendered once for all tests, by displacement.
+_RENDERED: dict[tuple[float, float], TrueOrthoimage] = {}
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    context = StepContext(
+        rng=np.random.default_rng(3), cores=2, scratch=tmp_path_factory.mktemp("room")
+    )
+    params = SimulateRoom.Params(scan_step_m=0.05, panorama_step_m=0.15)
+    return SimulateRoom().run(SimulateRoom.In(), params, context).truth
+
+
+def rendered(truth: Truth, shift_cells: tuple[float, float] = (0.0, 0.0)) -> TrueOrthoimage:
+    """The true orthoimage of the main wall, its content displaced along u and v."""
+    if shift_cells not in _RENDERED:
+        frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=GSD_M)
+        displacement = shift_cells[0] * frame.u_world + shift_cells[1] * frame.v_world
+        moved = replace(frame, origin_world=frame.origin_world - GSD_M * displacement)
+        image = render_frame(
+            truth.scene, moved, buffer_front_m=BUFFER_M, buffer_behind_m=BUFFER_M, cores=2
+        )
+        _RENDERED[shift_cells] = replace(image, frame=frame)
+    return _RENDERED[shift_cells]
+
+
+def painted(image: TrueOrthoimage) -> Orthoimage:
+    known = image.rectangle >= 0
+    return Orthoimage(
+        frame=image.frame,
+        wall=0,
+        name="main wall",
+        rgb=np.nan_to_num(image.rgb).round().astype(np.uint8),
+        mask=np.where(known, OrthoMask.PAINTED, OrthoMask.NO_SURFACE).astype(np.uint8),
+        source=np.zeros(image.frame.shape, dtype=np.int16),
+        sources=("truth",),
+    )
+
+
+def walled(image: TrueOrthoimage) -> Wall:
+    shape = image.frame.shape
+    return Wall(
+        frame=image.frame,
+        plane_index=0,
+        name="main wall",
+        depth_m=image.depth_m,
+        sigma_m=np.full(shape, 0.001, dtype=np.float32),
+        count=np.ones(shape, dtype=np.uint32),
+        mask=np.where(image.rectangle >= 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(
+            np.uint8
+        ),
+    )
+
+
+def inspect(
+    folder: Path, truth: Truth, image: Orthoimage, wall: Wall, **more: object
+) -> tuple[dict[str, float], InspectTruth.Out, StepContext]:
+    context = StepContext(rng=np.random.default_rng(0), cores=2, scratch=folder)
+    inputs = InspectTruth.In(
+        orthoimages=Orthoimages(images=(image,)),
+        walls=Walls(
+            walls=(wall,),
+            up=truth.planes.up,
+            intensity_source="laser",
+            buffer_front_m=BUFFER_M,
+            buffer_behind_m=BUFFER_M,
+        ),
+        truth=truth,
+        **more,  # type: ignore[arg-type] # planes and labels of the tests below
+    )
+    out = InspectTruth().run(inputs, InspectTruth.Params(), context)
+    return {metric.name: metric.value for metric in context.metrics}, out, context
+
+
+def test_the_true_orthoimage_has_no_error(tmp_path: Path, truth: Truth) -> None:
+    image = rendered(truth)
+    metrics, out, context = inspect(
+        tmp_path,
+        truth,
+        painted(image),
+        walled(image),
+        planes=truth.planes,
+        labels=PointLabels(plane_index=truth.labels),
+    )
+    assert metrics["plane_angle_deg"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["plane_offset_mm"] == pytest.approx(0.0, abs=1e-6)
+    assert metrics["depth_rmse_mm"] == pytest.approx(0.0, abs=1e-6)
+    assert metrics["depth_step_rmse_mm"] == pytest.approx(0.0, abs=1e-6)
+    assert metrics["depth_within_3sigma"] == 1.0
+    # Rounding to whole grey levels alone: sqrt(1 / 12).
+    assert metrics["colour_rmse_grey"] == pytest.approx(0.289, abs=0.01)
+    assert metrics["rmse_u_mm"] < 0.05 * 1e3 * GSD_M
+    assert metrics["rmse_v_mm"] < 0.05 * 1e3 * GSD_M
+    assert metrics["completeness"] == 1.0
+    assert metrics["ghost_share"] == 0.0
+    assert metrics["gross_colour_share"] == 0.0
+    assert metrics["true_planes_found"] == metrics["true_planes"] == len(truth.planes)
+    assert metrics["label_f1_mean"] == 1.0
+    assert metrics["label_iou_mean"] == 1.0
+    assert len(out.inspection.displacement_m) == metrics["n_patches"] > 20
+    assert [figure.name for figure in context.figures] == [
+        "wall_0_depth_error",
+        "wall_0_colour_error",
+    ]
+
+
+@pytest.mark.parametrize("shift", [(1.5, 0.0), (0.0, -1.0), (-0.6, 0.3)])
+def test_a_displaced_orthoimage_has_just_that_displacement(
+    tmp_path: Path, truth: Truth, shift: tuple[float, float]
+) -> None:
+    metrics, _, _ = inspect(
+        tmp_path, truth, painted(rendered(truth, shift)), walled(rendered(truth))
+    )
+    for axis, expected_cells in zip(("u", "v"), shift, strict=True):
+        # A twentieth of a cell: rosettes and lines are sharper than cells.
+        tolerance = 0.05 * 1e3 * GSD_M
+        expected = 1e3 * GSD_M * expected_cells
+        assert metrics[f"mean_{axis}_mm"] == pytest.approx(expected, abs=tolerance)
+        assert metrics[f"rmse_{axis}_mm"] == pytest.approx(abs(expected), abs=2.0 * tolerance)
+    assert metrics["displaced_share"] < 0.1
+
+
+def test_a_wall_measured_too_near_has_that_depth_error(tmp_path: Path, truth: Truth) -> None:
+    image = rendered(truth)
+    near = replace(walled(image), depth_m=image.depth_m + np.float32(0.005))
+    metrics, _, _ = inspect(tmp_path, truth, painted(image), near)
+    assert metrics["depth_median_mm"] == pytest.approx(5.0, abs=1e-3)
+    assert metrics["depth_rmse_mm"] == pytest.approx(5.0, abs=1e-3)
+    assert metrics["depth_nmad_mm"] == pytest.approx(0.0, abs=1e-3)
+    assert metrics["depth_within_3sigma"] == 0.0
+
+
+def test_a_tilted_plane_has_its_angle_and_offset(tmp_path: Path, truth: Truth) -> None:
+    image = rendered(truth)
+    frame = image.frame
+    centre = truth.planes.corners[0].mean(axis=0)
+    turn = scenes.rotation_about(frame.v_world, 0.2)
+    tilted = replace(
+        frame,
+        origin_world=centre + turn @ (frame.origin_world - centre) + 0.004 * frame.normal_world,
+        u_world=turn @ frame.u_world,
+        normal_world=turn @ frame.normal_world,
+    )
+    metrics, _, _ = inspect(
+        tmp_path, truth, replace(painted(image), frame=tilted), replace(walled(image), frame=tilted)
+    )
+    assert metrics["plane_angle_deg"] == pytest.approx(0.2, abs=1e-6)
+    assert metrics["plane_offset_mm"] == pytest.approx(4.0, abs=1e-3)
+    half_width_m = np.linalg.norm(truth.planes.corners[0][3] - truth.planes.corners[0][0]) / 2
+    corner_mm = 4.0 + 1e3 * half_width_m * np.sin(np.radians(0.2))
+    assert metrics["plane_corner_max_mm"] == pytest.approx(corner_mm, abs=0.1)
+
+
+def test_the_object_shining_through_is_a_ghost(tmp_path: Path, truth: Truth) -> None:
+    image = painted(rendered(truth))
+    front = render_frame(truth.scene, image.frame, buffer_front_m=1.2, buffer_behind_m=BUFFER_M)
+    ghost = (front.depth_m > 0.4) & (front.depth_m < 0.9)
+    assert ghost.sum() > 500
+    rgb = image.rgb.copy()
+    rgb[ghost] = front.rgb[ghost].round()
+    metrics, _, _ = inspect(tmp_path, truth, replace(image, rgb=rgb), walled(rendered(truth)))
+    ghost &= ~depth_step_band(rendered(truth).depth_m)
+    shown = ghost.sum() / np.count_nonzero(image.mask == OrthoMask.PAINTED)
+    # Some of the object's bright tiles look like the wall.
+    assert 0.6 * shown < metrics["ghost_share"] <= shown
+    assert metrics["gross_colour_share"] >= metrics["ghost_share"]
+
+
+def test_cells_left_unpainted_are_missing_and_filled_ones_are_apart(
+    tmp_path: Path, truth: Truth
+) -> None:
+    image = rendered(truth)
+    mask = painted(image).mask.copy()
+    mask[:, ::4] = OrthoMask.NONE
+    mask[:, 1::4] = OrthoMask.FILLED
+    rgb = painted(image).rgb.astype(np.int64)
+    rgb[:, 1::4] += np.where(rgb[:, 1::4] < 128, 10, -10)
+    metrics, _, _ = inspect(
+        tmp_path,
+        truth,
+        replace(painted(image), mask=mask, rgb=rgb.astype(np.uint8)),
+        walled(image),
+    )
+    assert metrics["completeness"] == pytest.approx(0.5, abs=0.01)
+    assert metrics["completeness_filled"] == pytest.approx(0.75, abs=0.01)
+    assert metrics["filled_colour_rmse_grey"] == pytest.approx(10.0, abs=0.1)
+    assert metrics["colour_rmse_grey"] < 0.3
+
+
+def test_labels_are_matched_whatever_their_numbers(tmp_path: Path, truth: Truth) -> None:
+    image = rendered(truth)
+    count = len(truth.planes)
+    labels = np.where(truth.labels >= 0, count - 1 - truth.labels, -1).astype(np.int16)
+    lost = np.flatnonzero(truth.labels == 0)[::2]
+    labels[lost] = -1
+    metrics, out, _ = inspect(
+        tmp_path, truth, painted(image), walled(image), labels=PointLabels(plane_index=labels)
+    )
+    findings = {finding.name: finding.value for finding in out.inspection.findings}
+    recall = 1.0 - len(lost) / np.count_nonzero(truth.labels == 0)
+    assert findings["label_recall[main wall]"] == pytest.approx(recall)
+    assert findings["label_precision[main wall]"] == 1.0
+    assert findings["label_f1[main wall]"] == pytest.approx(2 * recall / (1 + recall))
+    assert findings["label_iou[main wall]"] == pytest.approx(recall)
+    assert metrics["label_precision_mean"] == 1.0
+
+
+def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, truth: Truth) -> None:
+    image = rendered(truth)
+    ortho, wall = painted(image), walled(image)
+    with pytest.raises(MethodError, match=r"the labels have 3 points, but the truth has \d+"):
+        inspect(
+            tmp_path,
+            truth,
+            ortho,
+            wall,
+            labels=PointLabels(plane_index=np.zeros(3, dtype=np.int16)),
+        )
+    with pytest.raises(MethodError, match="is of wall 4, but there are 1 walls"):
+        inspect(tmp_path, truth, replace(ortho, wall=4), wall)
+    small = replace(image.frame, width=2, height=2)
+    part = {name: getattr(wall, name)[:2, :2] for name in ("depth_m", "sigma_m", "count", "mask")}
+    with pytest.raises(MethodError, match=r"but its wall has \(2, 2\)"):
+        inspect(tmp_path, truth, ortho, replace(wall, frame=small, **part))
+    empty = InspectTruth.In(
+        orthoimages=Orthoimages(images=()),
+        walls=Walls(
+            walls=(),
+            up=truth.planes.up,
+            intensity_source="none",
+            buffer_front_m=BUFFER_M,
+            buffer_behind_m=BUFFER_M,
+        ),
+        truth=truth,
+    )
+    context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    with pytest.raises(MethodError, match="there is no orthoimage to inspect"):
+        InspectTruth().run(empty, InspectTruth.Params(), context)

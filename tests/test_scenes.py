@@ -1,0 +1,225 @@
+"""Rays, colours and true orthoimages of simulated scenes, against algebra."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry import WallFrame, frame_over
+from orthoflow.geometry.scene_views import cast, colours_at, render_frame
+from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, Viewers
+from tests import scenes
+
+
+def a_scene(rows: list[dict[str, object]], holes: list[tuple[int, tuple[float, ...]]]) -> Scene:
+    """A scene of rectangles given by centre, a, b, extent and, if wanted, role and texture."""
+    count = len(rows)
+    params = np.tile([200.0, 160.0, 120.0, 0.5, 0.4, 0.3, 7.0, 0.0], (count, 1))
+    return Scene(
+        origin=np.zeros(3),
+        centre=np.array([row["centre"] for row in rows], dtype=np.float64),
+        axis_a=np.array([row["a"] for row in rows], dtype=np.float64),
+        axis_b=np.array([row["b"] for row in rows], dtype=np.float64),
+        extent=np.array([row["extent"] for row in rows], dtype=np.float64),
+        plane_index=np.full(count, -1, dtype=np.int16),
+        role=np.array([row.get("role", SurfaceRole.WALL) for row in rows], dtype=np.uint8),
+        texture=np.array([row.get("kind", TextureKind.PLAIN) for row in rows], dtype=np.int32),
+        texture_params=params,
+        hole_rectangle=np.array([index for index, _ in holes], dtype=np.int32),
+        hole_extent=np.array([hole for _, hole in holes], dtype=np.float64).reshape(-1, 4),
+    )
+
+
+def random_scene(seed: int, n_rectangles: int = 40) -> Scene:
+    rng = np.random.default_rng(seed)
+    rows: list[dict[str, object]] = []
+    for index in range(n_rectangles):
+        turn = scenes.random_rotation(rng)
+        rows.append(
+            {
+                "centre": rng.uniform(-3.0, 3.0, 3),
+                "a": turn[0],
+                "b": turn[1],
+                "extent": (-0.6, 0.5, -0.4, 0.9),
+                "kind": index % len(TextureKind),
+            }
+        )
+    return a_scene(
+        rows, [(3, (-0.1, 0.1, -0.1, 0.3)), (3, (0.2, 0.4, 0, 0.1)), (9, (0, 0.4, 0, 0.4))]
+    )
+
+
+def wall_with_screen() -> Scene:
+    """A wall in the plane y = 0 seen from y < 0, with a niche, and a screen 1 m before it."""
+    wall = {"centre": (0, 0, 0), "a": (1, 0, 0), "b": (0, 0, 1), "extent": (-2, 2, -1, 1)}
+    niche = {
+        "centre": (0, 0.2, 0),
+        "a": (1, 0, 0),
+        "b": (0, 0, 1),
+        "extent": (-1.5, -1.0, -0.5, 0.5),
+    }
+    screen = {
+        "centre": (0, -1, 0),
+        "a": (1, 0, 0),
+        "b": (0, 0, 1),
+        "extent": (0.2, 0.6, -2, 2),
+        "role": SurfaceRole.OBJECT,
+    }
+    return a_scene([wall, niche, screen], [(0, (-1.5, -1.0, -0.5, 0.5))])
+
+
+def wall_frame(gsd_m: float = 0.05) -> WallFrame:
+    corners = np.array([[-2.0, 0, 1], [-2, 0, -1], [2, 0, -1], [2, 0, 1]])
+    return frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=gsd_m)
+
+
+def cell_u(frame: WallFrame) -> NDArray[np.float64]:
+    """World x of the cells' centres, which for this wall is the direction of u."""
+    return -2.0 + frame.gsd_m * (np.arange(frame.width) + 0.5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rays_hit_what_trying_every_rectangle_says(seed: int) -> None:
+    scene = random_scene(seed)
+    rng = np.random.default_rng(seed + 100)
+    origins, directions = rng.uniform(-3, 3, (2000, 3)), rng.normal(size=(2000, 3))
+    hits = cast(scene, origins, directions, cores=2)
+    best, first = np.full(2000, np.inf), np.full(2000, -1)
+    for index in range(len(scene)):
+        normal = scene.normal[index]
+        t = ((scene.centre[index] - origins) @ normal) / (directions @ normal)
+        relative = origins + t[:, None] * directions - scene.centre[index]
+        a, b = relative @ scene.axis_a[index], relative @ scene.axis_b[index]
+        low_a, high_a, low_b, high_b = scene.extent[index]
+        meets = (t > 1e-9) & (a >= low_a) & (a <= high_a) & (b >= low_b) & (b <= high_b)
+        for hole in scene.hole_extent[scene.hole_rectangle == index]:
+            meets &= ~((a > hole[0]) & (a < hole[1]) & (b > hole[2]) & (b < hole[3]))
+        meets &= t < best
+        best[meets], first[meets] = t[meets], index
+    np.testing.assert_array_equal(hits.rectangle, first)
+    hit = first >= 0
+    assert 0.1 < hit.mean() < 0.9
+    np.testing.assert_allclose(hits.t[hit], best[hit], rtol=1e-12)
+    assert np.all(np.isinf(hits.t[~hit]))
+
+
+def test_a_shift_and_a_turn_of_the_world_change_no_colour() -> None:
+    scene = random_scene(1)
+    rng = np.random.default_rng(5)
+    rectangle = rng.integers(0, len(scene), 500).astype(np.int32)
+    in_plane = rng.uniform(-0.3, 0.3, (500, 2))
+
+    def points(of: Scene) -> NDArray[np.float64]:
+        a, b = of.axis_a[rectangle], of.axis_b[rectangle]
+        centre: NDArray[np.float64] = of.origin + of.centre[rectangle]
+        return centre + in_plane[:, :1] * a + in_plane[:, 1:] * b
+
+    moved = replace(
+        scene.turned(scenes.random_rotation(rng)),
+        origin=np.array([634512.347, 486215.781, 112.193]),
+    )
+    here = colours_at(scene, rectangle, points(scene))
+    there = colours_at(moved, rectangle, points(moved))
+    # Survey coordinates round to 1e-10 m; sharp edges may flip for single points.
+    assert np.mean(np.abs(here.rgb - there.rgb).max(axis=1) > 1e-3) < 0.01
+    assert here.rgb.std() > 10.0
+    assert here.reflectance.min() >= 0.01
+    assert here.reflectance.max() <= 1.0
+
+
+def test_the_true_orthoimage_shows_the_first_surface_within_the_buffer() -> None:
+    frame = wall_frame()
+    image = render_frame(wall_with_screen(), frame, buffer_front_m=0.5, buffer_behind_m=0.3)
+    x = cell_u(frame)
+    z = 1.0 - frame.gsd_m * (np.arange(frame.height) + 0.5)
+    in_niche = ((x > -1.5) & (x < -1.0))[None, :] & (np.abs(z) < 0.5)[:, None]
+    np.testing.assert_array_equal(image.rectangle, np.where(in_niche, 1, 0))
+    np.testing.assert_allclose(image.depth_m, np.where(in_niche, -0.2, 0.0), atol=1e-7)
+
+
+def test_surfaces_beyond_the_buffer_do_not_exist_for_the_true_orthoimage() -> None:
+    image = render_frame(wall_with_screen(), wall_frame(), buffer_front_m=1.5, buffer_behind_m=0.1)
+    x = cell_u(image.frame)
+    on_screen = (x > 0.2) & (x < 0.6)
+    assert np.all(image.rectangle[:, on_screen] == 2)
+    np.testing.assert_allclose(image.depth_m[:, on_screen], 1.0, atol=1e-6)
+    assert np.all(image.rectangle[15:25, (x > -1.5) & (x < -1.0)] == -1)
+    assert np.all(np.isnan(image.rgb[15:25, (x > -1.5) & (x < -1.0)]))
+
+
+def test_a_screen_hides_from_a_viewer_just_its_shadow() -> None:
+    viewers = Viewers(positions_world=np.array([[0.0, -2.0, 0.0]]), up=scenes.UP_Z)
+    image = render_frame(
+        wall_with_screen(), wall_frame(), buffer_front_m=0.5, buffer_behind_m=0.1, viewers=viewers
+    )
+    x = cell_u(image.frame)
+    # The screen is half way to the wall: its shadow from 0.2..0.6 is twice as far, 0.4..1.2.
+    shadow = (x > 0.4) & (x < 1.2)
+    wall_row = image.rectangle[5] == 0
+    np.testing.assert_array_equal(image.seen[5][wall_row], ~shadow[wall_row])
+    # Straight from the front the screen itself stands before 0.2..0.6.
+    hidden = shadow | ((x > 0.2) & (x < 0.6))
+    np.testing.assert_array_equal(image.behind_object[5][wall_row], hidden[wall_row])
+
+
+def test_viewers_see_only_their_elevations() -> None:
+    viewers = Viewers(
+        positions_world=np.array([[-1.8, -1.0, 0.0]]), up=scenes.UP_Z, highest_elevation_deg=30.0
+    )
+    image = render_frame(
+        wall_with_screen(), wall_frame(), buffer_front_m=0.1, buffer_behind_m=0.1, viewers=viewers
+    )
+    z = 1.0 - image.frame.gsd_m * (np.arange(image.frame.height) + 0.5)
+    column = 3  # x = -1.825, 1.0003 m from the viewer
+    limit = np.tan(np.radians(30.0)) * np.hypot(1.0, 0.025)
+    np.testing.assert_array_equal(image.seen[:, column], z < limit)
+
+
+def test_cores_change_no_bit_of_a_true_orthoimage() -> None:
+    scene = random_scene(2)
+    frame = wall_frame(0.11)
+    one, two = (
+        render_frame(scene, frame, buffer_front_m=3.0, buffer_behind_m=3.0, cores=cores)
+        for cores in (1, 2)
+    )
+    np.testing.assert_array_equal(one.rgb, two.rgb)
+    np.testing.assert_array_equal(one.depth_m, two.depth_m)
+
+
+def test_a_finer_rendering_averages_to_the_coarser_one() -> None:
+    scene = wall_with_screen()
+    coarse = render_frame(
+        scene, wall_frame(0.05), buffer_front_m=0.1, buffer_behind_m=0.3, supersample=6
+    )
+    fine = render_frame(
+        scene, wall_frame(0.0125), buffer_front_m=0.1, buffer_behind_m=0.3, supersample=2
+    )
+    mean = fine.rgb.reshape(40, 4, 80, 4, 3).mean(axis=(1, 3))
+    # Grey levels; smooth stains, so both means are good to a small part of their contrast.
+    np.testing.assert_allclose(mean, coarse.rgb, atol=0.5)
+
+
+def test_a_scene_with_arrays_that_disagree_is_refused() -> None:
+    scene = wall_with_screen()
+    with pytest.raises(GeometryError, match=r"scene.extent must have shape \(3, 4\), got \(2, 4\)"):
+        replace(scene, extent=scene.extent[:2])
+    with pytest.raises(GeometryError, match="hole_rectangle must ascend"):
+        replace(
+            scene,
+            hole_rectangle=np.array([1, 0], dtype=np.int32),
+            hole_extent=np.zeros((2, 4)),
+        )
+
+
+def test_a_part_of_a_scene_keeps_its_holes() -> None:
+    scene = random_scene(3)
+    chosen = np.arange(len(scene)) % 3 == 0
+    part = scene.only(chosen)
+    assert len(part) == chosen.sum()
+    # Rectangles 3 (two holes) and 9 (one) become 1 and 3.
+    np.testing.assert_array_equal(part.hole_rectangle, [1, 1, 3])
+    np.testing.assert_array_equal(part.hole_extent, scene.hole_extent)
