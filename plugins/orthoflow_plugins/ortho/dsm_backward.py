@@ -76,7 +76,7 @@ class DsmBackward(Method):
             le=20,
             description="Cells so near to a hidden one are not painted: edges smear there.",
         )
-        tolerance_sigmas: float = Field(
+        tolerance_sigma: float = Field(
             default=3.0,
             ge=0,
             description="A surface hides a cell when it is above the ray by more than so many "
@@ -119,6 +119,8 @@ class DsmBackward(Method):
                 "no cloud is wired to ortho.dsm-backward: things that stand free before a wall "
                 "hide nothing, and photos paint them onto it"
             )
+        else:
+            inputs.cloud.require_points(3)
         studio = _Studio(inputs, params, ctx)
         studio.find_occluders([camera for _, camera in oriented])
         for place, (photo, camera) in enumerate(oriented):
@@ -159,7 +161,7 @@ class _Studio:
         from orthoflow_plugins.ortho.dsm_backward_occluders import find_occluders
 
         started = time.perf_counter()
-        if self._inputs.cloud is not None and len(self._inputs.cloud):
+        if self._inputs.cloud is not None:
             self._occluders = find_occluders(
                 self._inputs.cloud,
                 self._inputs.walls,
@@ -213,7 +215,7 @@ class _Studio:
         from orthoflow_plugins.ortho.dsm_backward_painting import Surface
         from orthoflow_plugins.ortho.dsm_backward_surfaces import noise_m, relief_of
 
-        tolerance_m = self._params.tolerance_sigmas * noise_m(wall)
+        tolerance_m = self._params.tolerance_sigma * noise_m(wall)
         return Surface(
             frame=wall.frame,
             relief=relief_of(wall),

@@ -1,0 +1,206 @@
+"""Photos laid onto a wall: ours, with visibility, against bare cv2.remap with ready maps.
+
+    python benchmarks/ortho_backward.py [--megacells 4] [--megapixels 6] [--threads 2] [--repeat 5]
+
+Times are medians of interleaved runs, decoding left out; the peer gets its maps for nothing and
+looks for nothing in the way. `layer` is one photo on one wall with everything: relief, cloud,
+erosion, anti-aliasing, quality. `cloud` is what looking at the cloud adds per photo.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import time
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.ortho.dsm_backward_occluders import depth_buffer, find_occluders
+from orthoflow_plugins.ortho.dsm_backward_painting import (
+    SightRule,
+    Surface,
+    paint,
+    view_of,
+)
+from orthoflow_plugins.ortho.dsm_backward_surfaces import noise_m, relief_of
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.products import PointCloud, Wall, Walls
+
+GSD_M = 0.003
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def wall(megacells: float) -> Walls:
+    """A 3 : 2 wall with frames of 5 cm, 2 mm noise, one cell in a thousand void."""
+    rng = np.random.default_rng(1)
+    rows = round(math.sqrt(megacells * 1e6 / 1.5))
+    columns = round(1.5 * rows)
+    depth = rng.normal(0.0, 0.002, (rows, columns)).astype(np.float32)
+    depth += 0.05 * ((np.arange(columns) // 90) % 4 == 0)
+    depth[rng.random(depth.shape) < 0.001] = np.nan
+    frame = WallFrame(
+        origin_world=np.zeros(3),
+        u_world=np.array([1.0, 0, 0]),
+        v_world=np.array([0, 0, -1.0]),
+        normal_world=np.array([0, -1.0, 0]),
+        gsd_m=GSD_M,
+        width=columns,
+        height=rows,
+    )
+    raster = Wall(
+        frame=frame,
+        plane_index=0,
+        name="wall 0",
+        depth_m=depth,
+        sigma_m=np.full_like(depth, np.nan),
+        count=np.ones(depth.shape, dtype=np.uint32),
+        mask=np.isfinite(depth).astype(np.uint8),
+    )
+    return Walls(
+        walls=(raster,), up=UP, intensity_source="none", buffer_front_m=0.15, buffer_behind_m=0.15
+    )
+
+
+def cloud(walls: Walls) -> PointCloud:
+    """The wall's cells as points, and a tenth as many on a board before it."""
+    frame, depth = walls.walls[0].frame, walls.walls[0].depth_m
+    rows, columns = np.nonzero(np.isfinite(depth))
+    places = np.column_stack([columns, rows]) + 0.5
+    points = [frame.world_from_wall(places, depth[rows, columns].astype(np.float64))]
+    near = (rows < frame.height // 3) & (columns < frame.width // 3)
+    points.append(frame.world_from_wall(places[near], np.full(int(near.sum()), 0.6)))
+    x, y, z = (np.ascontiguousarray(a, dtype=np.float32) for a in np.vstack(points).T)
+    return PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=UP)
+
+
+def camera(frame: WallFrame, megapixels: float, oblique_deg: float) -> ViewingCamera:
+    """A distorted camera that shows the whole wall."""
+    height = round(math.sqrt(megapixels * 1e6 / 1.5))
+    width = round(1.5 * height)
+    target = frame.world_from_wall(np.array([[frame.width / 2, frame.height / 2]]))[0]
+    distance = 1.15 * frame.width * GSD_M
+    angle = math.radians(oblique_deg)
+    centre = target + distance * (
+        math.cos(angle) * frame.normal_world + math.sin(angle) * frame.u_world
+    )
+    rotation = looking_at(centre, target, UP)
+    return ViewingCamera(
+        width=width,
+        height=height,
+        fx=0.95 * width,
+        fy=0.95 * width,
+        cx=width / 2,
+        cy=height / 2,
+        distortion=np.array([-0.05, 0.01, 1e-4, -1e-4, 0.0]),
+        rotation=rotation,
+        translation=-rotation @ centre,
+    )
+
+
+def seconds(task: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    task()
+    return time.perf_counter() - started
+
+
+def maps(walls: Walls, viewer: ViewingCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    frame, depth = walls.walls[0].frame, walls.walls[0].depth_m
+    rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
+    points = frame.world_from_wall(
+        np.column_stack([columns.ravel(), rows.ravel()]),
+        np.nan_to_num(depth).ravel().astype(np.float64),
+    )
+    pixels = viewer.project(points)[:, :2].astype(np.float32) - np.float32(0.5)
+    u, v = (np.ascontiguousarray(a).reshape(frame.shape) for a in pixels.T)
+    return u, v
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--megacells", type=float, default=4.0)
+    parser.add_argument("--megapixels", type=float, default=6.0)
+    parser.add_argument("--oblique-deg", type=float, default=25.0)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeat", type=int, default=5)
+    options = parser.parse_args()
+    walls = wall(options.megacells)
+    raster = walls.walls[0]
+    viewer = camera(raster.frame, options.megapixels, options.oblique_deg)
+    points = cloud(walls)
+    rng = np.random.default_rng(0)
+    photo = rng.integers(0, 256, (viewer.height, viewer.width, 3), np.uint8)
+    occluders = find_occluders(points, walls, [viewer], n_least=6, threads=options.threads)
+    buffer = depth_buffer(occluders, viewer)
+    ready = maps(walls, viewer)
+    cv2.setNumThreads(options.threads)
+
+    def layer(resampling: str) -> Callable[[], object]:
+        params = DsmBackward.Params.model_validate({"resampling": resampling})
+        rule = SightRule(
+            resampling=params.resampling,
+            is_filtered=params.antialias,
+            incidence_max_deg=params.incidence_max_deg,
+            erosion_cells=params.erosion_cells,
+            border_share=params.border_share,
+        )
+
+        def task() -> object:
+            surface = Surface(
+                frame=raster.frame,
+                relief=relief_of(raster),
+                front_m=walls.buffer_front_m,
+                tolerance_m=3.0 * noise_m(raster) + 0.5 * GSD_M,
+            )
+            return paint(
+                photo,
+                view_of(viewer, surface, rule),
+                surface,
+                buffer,
+                rule,
+                allocate=lambda name, shape, dtype: np.zeros(shape, dtype),
+                threads=options.threads,
+            )
+
+        return task
+
+    def remap(flag: int) -> Callable[[], object]:
+        return lambda: cv2.remap(photo, *ready, flag, borderMode=cv2.BORDER_CONSTANT)
+
+    tasks = {
+        "cv2.remap bilinear": remap(cv2.INTER_LINEAR),
+        "layer bilinear": layer("bilinear"),
+        "cv2.remap cubic": remap(cv2.INTER_CUBIC),
+        "layer cubic": layer("cubic"),
+        "layer nearest": layer("nearest"),
+        "cloud": lambda: depth_buffer(occluders, viewer),
+        "count in voxels": lambda: find_occluders(
+            points, walls, [viewer], n_least=6, threads=options.threads
+        ),
+    }
+    for task in tasks.values():
+        task()
+    times: dict[str, list[float]] = {name: [] for name in tasks}
+    for _ in range(options.repeat):
+        for name, task in tasks.items():
+            times[name].append(seconds(task))
+    medians = {name: statistics.median(values) for name, values in times.items()}
+    print(
+        f"wall {raster.frame.width} x {raster.frame.height}, photo {viewer.width} x "
+        f"{viewer.height}, {len(points) / 1e6:.1f} M points, {options.oblique_deg:g} deg, "
+        f"{options.threads} threads"
+    )
+    for name, median in medians.items():
+        print(f"{name:20s} {1e3 * median:8.1f} ms  (from {1e3 * min(times[name]):.1f})")
+    for kind in ("bilinear", "cubic"):
+        ratio = medians[f"layer {kind}"] / medians[f"cv2.remap {kind}"]
+        print(f"layer / cv2.remap, {kind}: {ratio:.2f}")
+
+
+if __name__ == "__main__":
+    main()
