@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from collections.abc import Callable
+from typing import Final, NamedTuple, TypeVar, cast
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.camera_kernels import project_point
-from orthoflow.geometry.point_kernels import Offsets, compiled
+from orthoflow.geometry.point_kernels import Offsets
 
 # Side of the square blocks of cells that share one bound on how high rays have to be followed.
 BLOCK_CELLS: Final = 32
@@ -27,6 +29,14 @@ NO_SURFACE: Final = 3
 # Points nearer to the projection centre than this are the camera itself.
 _NEAREST_M: Final = 0.05
 _LARGEST_SPLAT_PX: Final = 24.0
+
+
+_Kernel = TypeVar("_Kernel", bound=Callable[..., object])
+
+
+def compiled(function: _Kernel) -> _Kernel:
+    """Compile a kernel that lets other threads run; divisions do not stop at 0, so lanes fill."""
+    return cast("_Kernel", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 class WallView(NamedTuple):
@@ -123,10 +133,11 @@ class VoxelGrid(NamedTuple):
 def count_in_voxels(points: Offsets, grid: VoxelGrid) -> None:
     """Count points in voxels, up to `COUNT_MOST`; points outside the grid are left out."""
     nx, ny, nz = grid.counts.shape
+    low_x, low_y, low_z, per_m = grid.low[0], grid.low[1], grid.low[2], 1.0 / grid.side_m
     for i in range(points.x.shape[0]):
-        a = math.floor((points.x[i] - grid.low[0]) / grid.side_m)
-        b = math.floor((points.y[i] - grid.low[1]) / grid.side_m)
-        c = math.floor((points.z[i] - grid.low[2]) / grid.side_m)
+        a = math.floor((points.x[i] - low_x) * per_m)
+        b = math.floor((points.y[i] - low_y) * per_m)
+        c = math.floor((points.z[i] - low_z) * per_m)
         if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz and grid.counts[a, b, c] < COUNT_MOST:
             grid.counts[a, b, c] += 1
 
@@ -151,12 +162,13 @@ def splat_points(
     """
     nx, ny, nz = around.counts.shape
     rows, columns = buffer.nearest.shape
+    low_x, low_y, low_z, per_m = around.low[0], around.low[1], around.low[2], 1.0 / around.side_m
     focal = math.sqrt(camera[12] * camera[13])
     for i in range(points.x.shape[0]):
         x, y, z = float(points.x[i]), float(points.y[i]), float(points.z[i])
-        a = math.floor((x - around.low[0]) / around.side_m)
-        b = math.floor((y - around.low[1]) / around.side_m)
-        c = math.floor((z - around.low[2]) / around.side_m)
+        a = math.floor((x - low_x) * per_m)
+        b = math.floor((y - low_y) * per_m)
+        c = math.floor((z - low_z) * per_m)
         if not (0 <= a < nx and 0 <= b < ny and 0 <= c < nz):
             continue
         n_around = around.counts[a, b, c]
@@ -249,6 +261,38 @@ def is_hidden_by_relief(view: WallView, relief: Relief, row: int, column: int, t
 
 
 @compiled
+def project_row(
+    view: WallView, relief: Relief, row: int, first_column: int, lanes: NDArray[np.float64]
+) -> None:
+    """Project some cells of a row; nothing here branches, so several go at once.
+
+    Args:
+        view: the camera before the wall.
+        relief: the wall.
+        row: of the cells.
+        first_column: of the first cell.
+        lanes: (5, n) filled with u, v, depth along the axis where the ray leaves the slab that
+            the raster describes, cosine of incidence, and photo pixels per cell.
+    """
+    pixels = view.camera[12] * view.camera[13] * view.gsd_m * view.gsd_m
+    down = (view.row - row) * view.gsd_m
+    for k in range(lanes.shape[1]):
+        column = first_column + k
+        depth = float(relief.depth[row, column])
+        u, v, distance = project_point(
+            view.camera, (column + 0.5) * view.gsd_m, (row + 0.5) * view.gsd_m, depth
+        )
+        lift = view.height_m - depth
+        across = (view.column - column) * view.gsd_m
+        cosine = lift / math.sqrt(lift * lift + across * across + down * down)
+        lanes[0, k] = u
+        lanes[1, k] = v
+        lanes[2, k] = distance * (view.height_m - view.front_m) / lift - view.tolerance_m
+        lanes[3, k] = cosine
+        lanes[4, k] = cosine * pixels / (distance * distance)
+
+
+@compiled
 def look_at_cells(
     view: WallView,
     relief: Relief,
@@ -269,56 +313,51 @@ def look_at_cells(
     """
     end_row, end_column = first_row + sight.mask.shape[0], first_column + sight.mask.shape[1]
     width, image_height = view.camera[21], view.camera[22]
-    pixels = view.camera[12] * view.camera[13] * view.gsd_m * view.gsd_m
-    sight.summary[0] = sight.summary[2] = math.inf
-    sight.summary[1] = sight.summary[3] = -math.inf
-    sight.summary[4:] = 0.0
+    per_pixel, per_border = 1.0 / buffer.reduction, 1.0 / view.border_px
+    u_least, u_most, v_least, v_most = math.inf, -math.inf, math.inf, -math.inf
+    n_painted, columns, rows, depths = 0, 0, 0, 0.0
+    lanes = np.empty((5, BLOCK_CELLS))
     for block_row in range(first_row // BLOCK_CELLS, (end_row - 1) // BLOCK_CELLS + 1):
         for block_column in range(first_column // BLOCK_CELLS, (end_column - 1) // BLOCK_CELLS + 1):
             top = highest_in_the_way(view, relief, block_row, block_column)
-            rows = range(
+            start = max(first_column, block_column * BLOCK_CELLS)
+            n_lanes = min(end_column, (block_column + 1) * BLOCK_CELLS) - start
+            for row in range(
                 max(first_row, block_row * BLOCK_CELLS),
                 min(end_row, (block_row + 1) * BLOCK_CELLS),
-            )
-            columns = range(
-                max(first_column, block_column * BLOCK_CELLS),
-                min(end_column, (block_column + 1) * BLOCK_CELLS),
-            )
-            for row in rows:
-                for column in columns:
+            ):
+                project_row(view, relief, row, start, lanes[:, :n_lanes])
+                for k in range(n_lanes):
+                    column = start + k
                     i, j = row - first_row, column - first_column
                     sight.quality[i, j] = 0.0
                     depth = float(relief.depth[row, column])
+                    u, v = lanes[0, k], lanes[1, k]
                     if math.isnan(depth):
                         sight.mask[i, j] = NO_SURFACE
                         continue
-                    u, v, distance = project_point(
-                        view.camera, (column + 0.5) * view.gsd_m, (row + 0.5) * view.gsd_m, depth
-                    )
                     if not (0.0 <= u < width and 0.0 <= v < image_height):
                         sight.mask[i, j] = OUTSIDE
                         continue
                     sight.mask[i, j] = OCCLUDED
-                    lift = view.height_m - depth
-                    across = (view.column - column) * view.gsd_m
-                    down = (view.row - row) * view.gsd_m
-                    cosine = lift / math.sqrt(lift * lift + across * across + down * down)
-                    if cosine <= view.cosine_least:
+                    if lanes[3, k] <= view.cosine_least:
                         continue
-                    # Where the ray leaves the slab that the raster describes.
-                    leaves = distance * (view.height_m - view.front_m) / lift - view.tolerance_m
-                    nearest = buffer.nearest[int(v / buffer.reduction), int(u / buffer.reduction)]
-                    if nearest < leaves or is_hidden_by_relief(view, relief, row, column, top):
+                    if buffer.nearest[int(v * per_pixel), int(u * per_pixel)] < lanes[2, k]:
                         continue
-                    inside = min(u, width - u, v, image_height - v) / view.border_px
+                    if depth + view.tolerance_m < top and is_hidden_by_relief(
+                        view, relief, row, column, top
+                    ):
+                        continue
+                    inside = min(u, width - u, v, image_height - v) * per_border
                     sight.mask[i, j] = PAINTED
-                    sight.quality[i, j] = cosine * pixels / (distance * distance) * min(1.0, inside)
-                    sight.u[i, j], sight.v[i, j] = u, v
-                    sight.summary[0] = min(sight.summary[0], u)
-                    sight.summary[1] = max(sight.summary[1], u)
-                    sight.summary[2] = min(sight.summary[2], v)
-                    sight.summary[3] = max(sight.summary[3], v)
-                    sight.summary[4] += 1.0
-                    sight.summary[5] += column
-                    sight.summary[6] += row
-                    sight.summary[7] += depth
+                    sight.quality[i, j] = lanes[4, k] * min(1.0, inside)
+                    sight.u[i, j] = u
+                    sight.v[i, j] = v
+                    u_least, u_most = min(u_least, u), max(u_most, u)
+                    v_least, v_most = min(v_least, v), max(v_most, v)
+                    n_painted += 1
+                    columns += column
+                    rows += row
+                    depths += depth
+    sight.summary[:4] = u_least, u_most, v_least, v_most
+    sight.summary[4:] = float(n_painted), float(columns), float(rows), depths

@@ -34,6 +34,13 @@ class Channels:
     values: NDArray[np.float32]
     known: NDArray[np.float32]
 
+    def part(self, cells: tuple[slice, slice]) -> Channels:
+        """Give some rows and columns."""
+        return Channels(
+            values=np.ascontiguousarray(self.values[cells]),
+            known=np.ascontiguousarray(self.known[cells]),
+        )
+
 
 def gradient_channels(grey: NDArray[np.float32]) -> Channels:
     """Give the oriented gradients of a picture with NaN where nothing is known."""

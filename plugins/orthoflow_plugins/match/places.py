@@ -13,17 +13,15 @@ _APART_CELLS: Final = 5
 _GRID: Final = 16
 
 
-def textured_places(
-    channels: Channels, usable: NDArray[np.bool_], n_most: int, *, half_patch_cells: int
-) -> NDArray[np.intp]:
-    """Cells (n, 2) = (column, row) whose surroundings fix a displacement in both directions.
+def texture(channels: Channels, *, half_patch_cells: int) -> NDArray[np.float32]:
+    """How well the surroundings of each cell fix a displacement in both directions.
 
-    The smaller eigenvalue of the gradients' second moments over the patch decides (Shi & Tomasi
-    1994); the best are taken in turns from a grid, so that they cover the usable part evenly.
+    The smaller eigenvalue of the gradients' second moments over the patch (Shi & Tomasi 1994),
+    (rows, cols).
     """
     import cv2
 
-    second = np.zeros((*usable.shape, 3), dtype=np.float32)
+    second = np.zeros((*channels.known.shape, 3), dtype=np.float32)
     for channel in range(channels.values.shape[2]):
         layer = np.ascontiguousarray(channels.values[:, :, channel])
         across = cv2.Scharr(layer, cv2.CV_32F, 1, 0)
@@ -31,8 +29,24 @@ def textured_places(
         second += np.stack([across * across, across * down, down * down], axis=-1)
     second = np.asarray(cv2.GaussianBlur(second, (0, 0), 0.4 * half_patch_cells), dtype=np.float32)
     a, b, c = second[:, :, 0], second[:, :, 1], second[:, :, 2]
-    response = 0.5 * (a + c) - np.sqrt(0.25 * (a - c) ** 2 + b * b)
-    response = np.where(usable, response, 0.0).astype(np.float32)
+    return np.asarray(0.5 * (a + c) - np.sqrt(0.25 * (a - c) ** 2 + b * b), dtype=np.float32)
+
+
+def textured_places(
+    strength: NDArray[np.float32], usable: NDArray[np.bool_], n_most: int
+) -> NDArray[np.intp]:
+    """Cells (n, 2) = (column, row) with the most texture around them.
+
+    The best are taken in turns from a grid, so that they cover the usable part evenly.
+
+    Args:
+        strength: (rows, cols) as `texture` gives it.
+        usable: (rows, cols), where cells may be taken.
+        n_most: at most so many.
+    """
+    import cv2
+
+    response = np.where(usable, strength, 0.0).astype(np.float32)
     kernel = np.ones((_APART_CELLS, _APART_CELLS), dtype=np.uint8)
     peak = (response >= cv2.dilate(response, kernel)) & (response > 0.0)
     rows, columns = np.nonzero(peak)

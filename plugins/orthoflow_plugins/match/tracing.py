@@ -18,7 +18,7 @@ from orthoflow_plugins.match.assembling import TiePiece
 from orthoflow_plugins.match.channels import Channels, gradient_channels, grey_channels
 from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
 from orthoflow_plugins.match.pictures import points_on_wall
-from orthoflow_plugins.match.places import textured_places
+from orthoflow_plugins.match.places import texture, textured_places
 from orthoflow_plugins.match.warping import Projection, project_walls, warp_photo
 
 _NEIGHBOURS: Final = 12
@@ -74,19 +74,21 @@ class WallTarget:
         wall: the wall.
         grey: its intensity, NaN where it has no depth; None where it shows nothing.
         channels: of its intensity, by content, as far as they were needed.
+        textures: of these channels, likewise.
     """
 
     wall: Wall
     grey: NDArray[np.float32] | None
     channels: dict[str, Channels] = field(default_factory=dict)
+    textures: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
-    def of(self, content: str) -> Channels | None:
-        """Channels of the wall's intensity."""
-        if self.grey is None:
-            return None
-        if content not in self.channels:
+    def prepare(self, content: str, half_patch_cells: int) -> None:
+        """Compute channels and texture unless that was done before."""
+        if self.grey is not None and content not in self.channels:
             self.channels[content] = _CHANNELS[content](self.grey)
-        return self.channels[content]
+            self.textures[content] = texture(
+                self.channels[content], half_patch_cells=half_patch_cells
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,18 +221,16 @@ def _measured(
     n_measured = 0
     # The wall that fills most of the photo first: planes close to each other show one surface.
     for index in sorted(range(len(targets)), key=lambda k: (-sizes[k], k)):
-        projection, channels = projections[index], targets[index].of(content)
-        if projection is None or channels is None or sizes[index] == 0:
+        projection, target = projections[index], targets[index]
+        if projection is None or target.grey is None or sizes[index] == 0:
             continue
         share = sizes[index] / sum(sizes)
         warped = warp_photo(grey, projection)
+        target.prepare(content, rule.half_patch_cells)
+        channels = target.channels[content].part(projection.part)
         usable = (channels.known > 0.0) & np.isfinite(warped.grey)
-        places = textured_places(
-            channels,
-            usable,
-            max(50, round(rule.n_ties_most * share)),
-            half_patch_cells=rule.half_patch_cells,
-        )
+        strength = target.textures[content][projection.part]
+        places = textured_places(strength, usable, max(50, round(rule.n_ties_most * share)))
         places = _unoccupied(places, projection, occupied)
         search = SearchRule(
             radius_cells=radius,
@@ -242,7 +242,7 @@ def _measured(
         moved = measure(channels, _CHANNELS[content](warped.grey), places, search)
         n_measured += len(moved.places)
         moved = moved.take(_agrees_around(moved))
-        pieces.append(_piece(photo, index, targets[index].wall, (moved, projection)))
+        pieces.append(_piece(photo, index, target.wall, (moved, projection)))
     pieces.sort(key=lambda piece: piece.wall)
     return _Round(
         pieces=pieces,
@@ -255,7 +255,7 @@ def _piece(photo: int, index: int, wall: Wall, found: tuple[Displacements, Proje
     moved, projection = found
     at = moved.places + moved.shift_cells
     pixels = np.column_stack([_between(projection.u, at), _between(projection.v, at)])
-    points = points_on_wall(wall, moved.places.astype(np.float64) + 0.5)
+    points = points_on_wall(wall, moved.places + projection.corner + np.float64(0.5))
     sigma_cells = np.hypot(moved.sigma_cells, _SIGMA_FLOOR_CELLS)
     piece = TiePiece(
         photo=photo,

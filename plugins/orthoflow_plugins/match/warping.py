@@ -21,23 +21,33 @@ _BUFFER_CELLS: Final = 2.0
 # Surface behind what a buffer cell saw counts as hidden beyond this, in wall cells.
 _HIDDEN_CELLS: Final = 6.0
 _ROWS_AT_ONCE: Final = 256
+# Which part of a wall a photo shows is found on every so many cells first.
+_COARSE: Final = 8
+_CELLS_LEAST: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
 class Projection:
-    """Where the cells of a wall appear in a photo.
+    """Where the cells of a wall appear in a photo, for the part of the wall that does.
 
     Attributes:
+        part: rows and columns of the wall's raster that the arrays cover.
         u: (rows, cols) float32 photo pixels, NaN where the cell is not in the photo.
         v: (rows, cols) float32.
         distance: (rows, cols) float32 metres along the camera's axis.
         pixels_per_cell: median over the cells in the photo.
     """
 
+    part: tuple[slice, slice]
     u: NDArray[np.float32]
     v: NDArray[np.float32]
     distance: NDArray[np.float32]
     pixels_per_cell: float
+
+    @property
+    def corner(self) -> NDArray[np.intp]:
+        """First (column, row) of the part."""
+        return np.array([self.part[1].start, self.part[0].start], dtype=np.intp)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +55,8 @@ class WarpedPhoto:
     """A photo in a wall's raster.
 
     Attributes:
-        grey: (rows, cols) float32, 0..255; NaN where the photo does not show the wall.
+        grey: (rows, cols) float32 over `projection.part`, 0..255; NaN where the photo does not show
+            the wall.
         projection: where the cells are in the photo; NaN where hidden too.
     """
 
@@ -109,27 +120,49 @@ def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:
         return None
     # Around the wall: survey coordinates would cost digits.
     near = camera.shifted(frame.origin_world)
-    shape = frame.shape
-    u, v, distance = (np.full(shape, np.nan, dtype=np.float32) for _ in range(3))
-    columns = np.arange(frame.width) + 0.5
-    for first in range(0, frame.height, _ROWS_AT_ONCE):
-        rows = slice(first, min(first + _ROWS_AT_ONCE, frame.height))
-        down = np.arange(rows.start, rows.stop) + 0.5
-        grid = np.stack(np.broadcast_arrays(columns[None, :], down[:, None]), axis=-1)
-        depth = wall.depth_m[rows].astype(np.float64).ravel()
-        points = frame.world_from_wall(grid.reshape(-1, 2), depth) - frame.origin_world
+    coarse = _project_cells(near, wall, (slice(0, frame.height), slice(0, frame.width)), _COARSE)
+    part = _part_in_photo(np.isfinite(coarse[0]), frame.shape)
+    if part is None:
+        return None
+    u, v, distance = _project_cells(near, wall, part, 1)
+    per_cell = _pixels_per_cell(u, v)
+    if np.isfinite(u).sum() < _CELLS_LEAST or per_cell is None:
+        return None
+    return Projection(part=part, u=u, v=v, distance=distance, pixels_per_cell=per_cell)
+
+
+def _part_in_photo(seen: NDArray[np.bool_], shape: tuple[int, int]) -> tuple[slice, slice] | None:
+    """Rows and columns about the coarse cells that are in the photo, a coarse cell wider."""
+    if not seen.any():
+        return None
+    spans = []
+    for axis, length in enumerate(shape):
+        hit = np.flatnonzero(seen.any(axis=1 - axis))
+        first, last = int(hit[0]) - 1, int(hit[-1]) + 2
+        spans.append(slice(max(0, first * _COARSE), min(length, last * _COARSE)))
+    return spans[0], spans[1]
+
+
+def _project_cells(
+    near: ViewingCamera, wall: Wall, part: tuple[slice, slice], step: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Pixels u and v and distance of every step-th cell of a part; the world begins at the wall."""
+    frame = wall.frame
+    rows = np.arange(part[0].start, part[0].stop, step)
+    columns = np.arange(part[1].start, part[1].stop, step)
+    u, v, distance = (np.full((rows.size, columns.size), np.nan, np.float32) for _ in range(3))
+    for first in range(0, rows.size, _ROWS_AT_ONCE):
+        some = rows[first : first + _ROWS_AT_ONCE]
+        grid = np.stack(np.meshgrid(columns + 0.5, some + 0.5), axis=-1).reshape(-1, 2)
+        depth = wall.depth_m[np.ix_(some, columns)].astype(np.float64).ravel()
+        points = frame.world_from_wall(grid, depth) - frame.origin_world
         seen = near.project(points)
         rays = near.centre_world - points
         cosine = rays @ frame.normal_world / np.linalg.norm(rays, axis=1)
         seen[~near.sees(seen[:, :2]) | ~(cosine > _GRAZING_COSINE)] = np.nan
         for raster, values in zip((u, v, distance), seen.T, strict=True):
-            raster[rows] = values.reshape(-1, frame.width)
-    if np.isfinite(u).sum() < 100:
-        return None
-    per_cell = _pixels_per_cell(u, v)
-    if per_cell is None:
-        return None
-    return Projection(u=u, v=v, distance=distance, pixels_per_cell=per_cell)
+            raster[first : first + some.size] = values.reshape(some.size, columns.size)
+    return u, v, distance
 
 
 def _pixels_per_cell(u: NDArray[np.float32], v: NDArray[np.float32]) -> float | None:

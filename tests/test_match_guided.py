@@ -1,0 +1,185 @@
+"""Guided matching: displacements to a few hundredths of a cell, from a rough pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.match.channels import gradient_channels, grey_channels
+from orthoflow_plugins.match.displacements import SearchRule, measure
+from orthoflow_plugins.match.guided import MatchGuided
+from orthoflow_plugins.match.pictures import photo_grey
+from orthoflow_plugins.match.places import texture, textured_places
+from orthoflow_plugins.match.warping import project_walls, warp_photo
+from scipy.ndimage import gaussian_filter, shift
+
+from orthoflow.errors import MethodError
+from orthoflow.products import Camera, Cameras, Photos, Ties, Walls
+from orthoflow.sdk import StepContext
+from tests import matching_scenes as ms
+
+SEARCH = SearchRule(radius_cells=6, half_patch_cells=10, score_least=0.3, distinct_least=0.05)
+# Turned by 0.3 degrees and shifted by 2 cm: about five cells on the wall.
+SCREEN_M = np.array([0.0, -0.8, 0.0])
+ROUGH = (0.004, -0.005, 0.003, 0.01, -0.02, 0.01)
+
+
+@pytest.fixture(scope="module")
+def scene() -> ms.TexturedWall:
+    return ms.textured_wall(2)
+
+
+@pytest.fixture(scope="module")
+def walls(scene: ms.TexturedWall) -> Walls:
+    return ms.walls_of(scene)
+
+
+def guided(
+    photos: Photos,
+    walls: Walls,
+    cameras: Cameras,
+    tmp_path: Path,
+    *,
+    cores: int = 2,
+    **params: object,
+) -> Ties:
+    ctx = StepContext(rng=np.random.default_rng(1), cores=cores, scratch=tmp_path)
+    inputs = MatchGuided.In(photos=photos, walls=walls, cameras=cameras)
+    return MatchGuided().run(inputs, MatchGuided.Params(**params), ctx).ties
+
+
+@pytest.mark.parametrize("moved", [(0.0, 0.0), (2.37, -1.41), (-3.5, 0.25)], ids=str)
+@pytest.mark.parametrize("channels", [gradient_channels, grey_channels])
+def test_a_known_shift_is_measured_without_bias(channels, moved: tuple[float, float]) -> None:  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(3)
+    grey = 40.0 * gaussian_filter(rng.normal(size=(240, 300)), 2.0, mode="wrap")
+    later = shift(grey, (moved[1], moved[0]), order=5, mode="grid-wrap")
+    noisy = [
+        (image + 0.1 * rng.normal(size=image.shape)).astype(np.float32) for image in (grey, later)
+    ]
+    first, second = (channels(image) for image in noisy)
+    places = textured_places(texture(first, half_patch_cells=10), first.known > 0.0, 200)
+    found = measure(first, second, places, SEARCH)
+    assert len(found.places) > 100
+    error = found.shift_cells - moved
+    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.02)
+    assert np.sqrt(np.mean(error**2)) < 0.12
+
+
+def test_inverted_contrast_is_matched_in_gradients() -> None:
+    rng = np.random.default_rng(4)
+    grey = 40.0 * gaussian_filter(rng.normal(size=(240, 300)), 2.0).astype(np.float32)
+    first, second = gradient_channels(grey), gradient_channels(100.0 - grey)
+    places = textured_places(texture(first, half_patch_cells=10), first.known > 0.0, 100)
+    found = measure(first, second, places, SEARCH)
+    assert len(found.places) > 0.9 * len(places) - 20
+    np.testing.assert_allclose(found.shift_cells, 0.0, atol=0.01)
+
+
+@pytest.mark.parametrize("contents", ["auto", "gradients", "grey"])
+def test_a_rough_pose_suffices(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path, contents: str
+) -> None:
+    camera = ms.camera_before(scene, roll=0.1)
+    start = ms.cameras(ms.oriented(ms.nudged(camera, ROUGH)))
+    ties = guided(ms.photos(ms.photo_of(scene, camera)), walls, start, tmp_path, channels=contents)
+    error = ties.pixels_photo - camera.project(ties.points_world)[:, :2]
+    assert len(error) > 200
+    assert np.linalg.norm(error, axis=1).max() < 1.5
+    # 1.9 photo pixels per cell: a tenth of a cell.
+    assert np.sqrt(np.mean(error**2)) < 0.2
+    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.05)
+
+
+def test_ties_cover_the_photo_evenly(scene: ms.TexturedWall, walls: Walls, tmp_path: Path) -> None:
+    camera = ms.camera_before(scene)
+    ties = guided(
+        ms.photos(ms.photo_of(scene, camera)), walls, ms.cameras(ms.oriented(camera)), tmp_path
+    )
+    counts = np.histogram2d(*ties.pixels_photo.T, bins=[3, 3], range=[[0, 900], [0, 640]])[0]
+    assert counts.min() > 0.25 * counts.max()
+
+
+def test_the_number_of_threads_does_not_show(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    camera = ms.camera_before(scene)
+    photos, start = ms.photos(ms.photo_of(scene, camera)), ms.cameras(ms.oriented(camera))
+    one = guided(photos, walls, start, tmp_path, cores=1)
+    three = guided(photos, walls, start, tmp_path, cores=3)
+    np.testing.assert_array_equal(one.pixels_photo, three.pixels_photo)
+    np.testing.assert_array_equal(one.sigma_px, three.sigma_px)
+
+
+def test_a_wall_hidden_by_another_is_not_seen(scene: ms.TexturedWall, walls: Walls) -> None:
+    wall = walls.walls[0]
+    frame = replace(wall.frame, origin_world=wall.frame.origin_world + SCREEN_M)
+    # Half as wide a screen, 0.8 m before the wall.
+    screen_depth = wall.depth_m.copy()
+    screen_depth[:, wall.frame.width // 2 :] = np.nan
+    screen = replace(wall, frame=frame, depth_m=screen_depth)
+    camera = ms.camera_before(scene, centre=(1.5, -2.6, 1.0))
+    alone = project_walls(camera, [wall])[0]
+    behind = project_walls(camera, [wall, screen])[0]
+    assert alone is not None
+    assert behind is not None
+    assert behind.part == alone.part
+    column, row = alone.corner
+    rows = slice(150 - row, 200 - row)
+    hidden = slice(140 - column, 200 - column)
+    assert np.isfinite(alone.u[rows, hidden]).mean() > 0.9
+    assert np.isfinite(behind.u[rows, hidden]).mean() < 0.02
+    np.testing.assert_array_equal(alone.u[rows, 330 - column :], behind.u[rows, 330 - column :])
+
+
+def test_a_wall_is_not_seen_from_behind(scene: ms.TexturedWall, walls: Walls) -> None:
+    camera = ms.camera_before(scene, centre=(1.2, 2.6, 1.1))
+    assert project_walls(camera, walls.walls) == [None]
+
+
+def test_a_warped_photo_shows_the_walls_own_grey(scene: ms.TexturedWall, walls: Walls) -> None:
+    camera = ms.camera_before(scene)
+    projection = project_walls(camera, walls.walls)[0]
+    assert projection is not None
+    warped = warp_photo(photo_grey(ms.photo_of(scene, camera)), projection).grey
+    rows, columns = np.nonzero(np.isfinite(warped))
+    at = np.column_stack([columns, rows]) + projection.corner + 0.5
+    grey = scene.grey(at[:, 0] * ms.GSD_M, at[:, 1] * ms.GSD_M)
+    # 8-bit levels, and the smoothing of the texture's finest octave.
+    assert np.std(warped[rows, columns] - 255.0 * grey) < 4.0
+
+
+def test_photos_without_a_pose_give_no_ties(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    camera = ms.camera_before(scene)
+    photos = ms.photos(*(ms.photo_of(scene, camera, name=name) for name in ("a.png", "b.png")))
+    start = ms.cameras(Camera(photo="a.png", status="too dark"), ms.oriented(camera, name="b.png"))
+    ties = guided(photos, walls, start, tmp_path)
+    assert set(ties.photo.tolist()) == {1}
+
+
+def test_a_pose_far_off_gives_hardly_any_ties(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    camera = ms.camera_before(scene)
+    off = ms.nudged(camera, (0.0, 0.15, 0.0, -0.4, 0.0, 0.0))
+    ctx = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    inputs = MatchGuided.In(
+        photos=ms.photos(ms.photo_of(scene, camera)),
+        walls=walls,
+        cameras=ms.cameras(ms.oriented(off)),
+    )
+    ties = MatchGuided().run(inputs, MatchGuided.Params(), ctx).ties
+    assert len(ties.photo) < 30
+
+
+def test_no_oriented_photo_is_refused_with_the_reasons(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    photos = ms.photos(ms.photo_of(scene, ms.camera_before(scene)))
+    refused = ms.cameras(Camera(photo="a.png", status="3 ties with the walls"))
+    with pytest.raises(MethodError, match=r"no photo is oriented.*a\.png: 3 ties with the walls"):
+        guided(photos, walls, refused, tmp_path)

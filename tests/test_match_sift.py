@@ -1,0 +1,223 @@
+"""Matching photos with walls: exact neighbours, unbiased key points, and plain refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.match.assembling import TiePiece, without_twins
+from orthoflow_plugins.match.features import FeatureRule, find_features
+from orthoflow_plugins.match.neighbours import mutual_matches
+from orthoflow_plugins.match.pictures import filled_smoothly, points_on_wall, shrunk
+from orthoflow_plugins.match.sift import MatchSift
+
+from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image, encode_png
+from orthoflow.products import Photos, TieRole, Ties, Walls
+from orthoflow.sdk import StepContext
+from tests import matching_scenes as ms
+
+RULE = FeatureRule(n_most=3000, contrast_threshold=0.02, edge_threshold=10.0)
+
+
+def context(tmp_path: Path, *, seed: int = 1, cores: int = 2) -> StepContext:
+    return StepContext(rng=np.random.default_rng(seed), cores=cores, scratch=tmp_path)
+
+
+def ties_of(photos: Photos, walls: Walls, ctx: StepContext, **params: object) -> Ties:
+    inputs = MatchSift.In(photos=photos, walls=walls)
+    return MatchSift().run(inputs, MatchSift.Params(**params), ctx).ties
+
+
+@pytest.fixture(scope="module")
+def scene() -> ms.TexturedWall:
+    return ms.textured_wall(1)
+
+
+@pytest.fixture(scope="module")
+def walls(scene: ms.TexturedWall) -> Walls:
+    return ms.walls_of(scene)
+
+
+@pytest.mark.parametrize("roll", [0.0, 1.57], ids=["level", "portrait"])
+def test_ties_lie_where_the_true_camera_sees_their_points(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path, roll: float
+) -> None:
+    camera = ms.camera_before(scene, roll=roll)
+    ties = ties_of(ms.photos(ms.photo_of(scene, camera)), walls, context(tmp_path))
+    error = ties.pixels_photo - camera.project(ties.points_world)[:, :2]
+    length = np.linalg.norm(error, axis=1)
+    right = error[length < 3.0]
+    assert len(right) > 1000
+    assert np.mean(length >= 3.0) < 0.03
+    # A quarter of a pixel is what OpenCV's default would give.
+    np.testing.assert_allclose(right.mean(axis=0), 0.0, atol=0.05)
+    # The stated deviation is that of the ties, within a factor.
+    depth = camera.project(ties.points_world)[:, 2]
+    stated = np.hypot(ties.sigma_px, ties.sigma_m * camera.fx / depth)[length < 3.0]
+    assert 0.3 < np.sqrt(np.mean((right / stated[:, None]) ** 2)) < 1.5
+
+
+def test_ties_are_the_same_with_any_number_of_threads(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    photos = ms.photos(ms.photo_of(scene, ms.camera_before(scene)))
+    (tmp_path / "one").mkdir()
+    one = ties_of(photos, walls, context(tmp_path / "one", cores=1))
+    two = ties_of(photos, walls, context(tmp_path, cores=2))
+    np.testing.assert_array_equal(one.pixels_photo, two.pixels_photo)
+    np.testing.assert_array_equal(one.points_world, two.points_world)
+
+
+def test_a_photo_of_nothing_known_is_warned_of(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    photo = ms.photo_of(scene, ms.camera_before(scene))
+    blank = encode_png(np.full((photo.height, photo.width), 128, np.uint8))
+    ctx = context(tmp_path)
+    ties = ties_of(ms.photos(replace(photo, encoded=blank)), walls, ctx)
+    assert not (ties.role != TieRole.REJECTED).any()
+    assert ctx.warnings == ["photo a.png: no wall is recognised in it, so it gets no ties"]
+
+
+def test_no_tie_lies_in_void(scene: ms.TexturedWall, walls: Walls, tmp_path: Path) -> None:
+    ties = ties_of(ms.photos(ms.photo_of(scene, ms.camera_before(scene))), walls, context(tmp_path))
+    at = walls.walls[0].frame.wall_from_world(ties.points_world)
+    in_window = (at[:, 0] > 200) & (at[:, 0] < 240) & (at[:, 1] > 120) & (at[:, 1] < 150)
+    assert not in_window.any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_neighbours_are_those_of_brute_force(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, 80, (1500, 128)).astype(np.float32)
+    second = np.vstack([first[:700] + rng.integers(-6, 7, (700, 128)), first[:300]]).astype(
+        np.float32
+    )
+    found = mutual_matches(first, second, ratio_most=0.8)
+    distance = np.sqrt(((first[:, None].astype(np.float64) - second[None]) ** 2).sum(axis=2))
+    order = np.argsort(distance, axis=1, kind="stable")
+    rows = np.arange(len(first))
+    nearest, ratio = order[:, 0], distance[rows, order[:, 0]] / distance[rows, order[:, 1]]
+    mutual = distance.argmin(axis=0)[nearest] == rows
+    expected = np.flatnonzero(mutual & (ratio <= 0.8))
+    np.testing.assert_array_equal(found.first, expected)
+    np.testing.assert_array_equal(found.second, nearest[expected])
+
+
+def test_nothing_matches_nothing() -> None:
+    empty = np.empty((0, 128), dtype=np.float32)
+    assert len(mutual_matches(empty, np.ones((3, 128), np.float32), ratio_most=0.8)) == 0
+
+
+def test_turning_an_image_turns_its_key_points(scene: ms.TexturedWall) -> None:
+    photo = ms.photo_of(scene, ms.camera_before(scene))
+    grey = decode_image(photo.encoded)[:, :, 0]
+    upright = find_features(grey, RULE)
+    turned = find_features(np.ascontiguousarray(grey[::-1, ::-1]), RULE)
+    pairs = mutual_matches(upright.descriptors, turned.descriptors, ratio_most=0.8)
+    back = np.array([photo.width, photo.height]) - turned.pixels[pairs.second]
+    error = upright.pixels[pairs.first] - back
+    error = error[np.linalg.norm(error, axis=1) < 2.0]
+    assert len(error) > 300
+    # OpenCV's own default is off by half a pixel here.
+    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.02)
+
+
+def test_tiles_find_what_the_whole_image_holds(
+    scene: ms.TexturedWall, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from orthoflow_plugins.match import features
+
+    grey = decode_image(ms.photo_of(scene, ms.camera_before(scene)).encoded)[:, :, 0]
+    whole = find_features(grey, RULE)
+    monkeypatch.setattr(features, "_TILE_PX", 320)
+    tiled = find_features(grey, RULE)
+    places = {tuple(pixel) for pixel in whole.pixels.round(1)}
+    same = [tuple(pixel) in places for pixel in tiled.pixels.round(1)]
+    assert len(tiled) == pytest.approx(len(whole), rel=0.05)
+    assert np.mean(same) > 0.9
+
+
+def test_shrinking_keeps_positions() -> None:
+    columns = np.arange(200) + 0.5
+    grey = np.rint(np.tile(columns, (60, 1))).astype(np.uint8)
+    small = shrunk(grey, 0.37)
+    expected = (np.arange(small.shape[1]) + 0.5) / 0.37
+    # Away from the border; grey counts whole levels.
+    np.testing.assert_allclose(small[10, 4:-4], expected[4:-4], atol=1.01)
+    assert abs(np.mean(small[10, 4:-4] - expected[4:-4])) < 0.5
+
+
+def test_void_is_filled_from_around_and_the_rest_is_kept() -> None:
+    values = np.tile(np.linspace(0.0, 1.0, 64), (48, 1))
+    holed = values.copy()
+    holed[10:30, 20:40] = np.nan
+    filled = filled_smoothly(holed)
+    known = np.isfinite(holed)
+    np.testing.assert_array_equal(filled[known], values[known].astype(np.float32))
+    assert np.abs(filled - values)[~known].max() < 0.25
+
+
+def test_points_on_a_smooth_wall_are_exact_and_on_an_edge_uncertain(
+    scene: ms.TexturedWall, walls: Walls
+) -> None:
+    wall = walls.walls[0]
+    depth = wall.depth_m.copy()
+    depth[:, 300:] += 0.2
+    stepped = replace(wall, depth_m=depth)
+    smooth = points_on_wall(stepped, np.array([[100.3, 80.7]]))
+    expected = scene.depth_m(np.array([100.3 * ms.GSD_M]), np.array([80.7 * ms.GSD_M]))
+    at = wall.frame.wall_from_world(smooth.points_world)[0]
+    # 1 mm of noise in the raster.
+    assert at[2] == pytest.approx(expected[0], abs=0.003)
+    edge = points_on_wall(stepped, np.array([[300.1, 80.7]]))
+    assert edge.sigma_m[0] > 0.05 > smooth.sigma_m[0]
+
+
+def test_twins_on_overlapping_walls_count_once() -> None:
+    def piece(wall: int, shift_m: float, sigma_m: float) -> TiePiece:
+        pixels = np.array([[10.0, 20.0], [30.0, 40.0]])
+        points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]) + shift_m
+        sigma = np.full(2, sigma_m)
+        return TiePiece(
+            photo=0,
+            wall=wall,
+            pixels_photo=pixels,
+            points_world=points,
+            sigma_px=np.ones(2),
+            sigma_m=sigma,
+        )
+
+    pieces = without_twins([piece(0, 0.0, 0.004), piece(1, 0.001, 0.002), piece(2, 0.5, 0.004)])
+    assert [len(item) for item in pieces] == [0, 2, 2]
+
+
+def test_no_photos_are_refused(walls: Walls, tmp_path: Path) -> None:
+    with pytest.raises(MethodError, match=r"there are no photos to match"):
+        ties_of(Photos(photos=()), walls, context(tmp_path))
+
+
+def test_no_walls_are_refused(scene: ms.TexturedWall, walls: Walls, tmp_path: Path) -> None:
+    photos = ms.photos(ms.photo_of(scene, ms.camera_before(scene)))
+    with pytest.raises(MethodError, match=r"there are no walls to match"):
+        ties_of(photos, replace(walls, walls=()), context(tmp_path))
+
+
+def test_walls_that_show_nothing_are_refused(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    photos = ms.photos(ms.photo_of(scene, ms.camera_before(scene)))
+    blind = replace(walls, walls=(replace(walls.walls[0], intensity=None),))
+    with pytest.raises(MethodError, match=r"neither intensity nor colour"):
+        ties_of(photos, blind, context(tmp_path))
+
+
+def test_a_photo_of_another_size_than_listed_is_refused(
+    scene: ms.TexturedWall, walls: Walls, tmp_path: Path
+) -> None:
+    photo = replace(ms.photo_of(scene, ms.camera_before(scene)), width=901)
+    with pytest.raises(MethodError, match=r"has 900 x 640 pixels, but is listed with 901 x 640"):
+        ties_of(ms.photos(photo), walls, context(tmp_path))

@@ -1,0 +1,443 @@
+"""Orienting photos: right and honest about it, or refused with the reason; never wrongly ok."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.match.guided import MatchGuided
+from orthoflow_plugins.match.sift import MatchSift
+from orthoflow_plugins.orient.pnp import OrientPnp
+from orthoflow_plugins.orient.splitting import hull_area, withheld
+
+from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties
+from orthoflow.sdk import StepContext
+from tests import matching_scenes as ms
+from tests.scenes import SURVEY_SHIFT_M
+
+PIXEL = Photo(
+    name="a.png",
+    encoded=ms.encode_png(np.zeros((640, 900), np.uint8)),
+    width=900,
+    height=640,
+)
+
+
+def context(tmp_path: Path, *, seed: int = 1) -> StepContext:
+    return StepContext(rng=np.random.default_rng(seed), cores=2, scratch=tmp_path)
+
+
+def known_ties(
+    camera: ViewingCamera,
+    seed: int,
+    *,
+    n: int = 200,
+    wrong_share: float = 0.0,
+    shift_m: np.ndarray | None = None,
+) -> Ties:
+    """Ties with 0.5 px of noise on the textured wall, a share of them at random places."""
+    rng = np.random.default_rng(seed)
+    scene = ms.textured_wall(0)
+    cells = rng.uniform([5, 5], [495, 328], (8 * n, 2))
+    depth = scene.depth_m(cells[:, 0] * ms.GSD_M, cells[:, 1] * ms.GSD_M)
+    points = scene.frame.world_from_wall(cells, depth)
+    pixels = camera.project(points)[:, :2]
+    chosen = np.flatnonzero(camera.sees(pixels))[:n]
+    points, pixels = points[chosen], pixels[chosen] + 0.5 * rng.normal(size=(len(chosen), 2))
+    n_wrong = round(wrong_share * len(chosen))
+    pixels[:n_wrong] = rng.uniform([0, 0], [900, 640], (n_wrong, 2))
+    shift = np.zeros(3) if shift_m is None else shift_m
+    corners = scene.frame.corners_world() + shift
+    return Ties(
+        photo_names=("a.png",),
+        photo=np.zeros(len(chosen), np.int32),
+        wall=np.zeros(len(chosen), np.int32),
+        pixels_photo=pixels,
+        points_world=points + shift,
+        sigma_px=np.full(len(chosen), 0.5),
+        sigma_m=np.full(len(chosen), 1e-4),
+        role=np.zeros(len(chosen), np.uint8),
+        residual_px=np.full((len(chosen), 2), np.nan),
+        details={
+            "walls": [
+                {
+                    "gsd_m": ms.GSD_M,
+                    "normal": [0.0, -1.0, 0.0],
+                    "corners_world": corners.tolist(),
+                }
+            ]
+        },
+    )
+
+
+def calibrated(camera: ViewingCamera) -> Photos:
+    return ms.photos(replace(PIXEL, intrinsics=ms.intrinsics_of(camera)))
+
+
+def orient(ties: Ties, photos: Photos, ctx: StepContext, **params: object) -> Cameras:
+    inputs = OrientPnp.In(ties=ties, photos=photos)
+    return OrientPnp().run(inputs, OrientPnp.Params(**params), ctx).cameras
+
+
+def status(ties: Ties, photos: Photos, tmp_path: Path) -> str:
+    return orient(ties, photos, context(tmp_path)).cameras[0].status
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_chain_orients_within_its_stated_error(tmp_path: Path, seed: int) -> None:
+    scene = ms.textured_wall(seed)
+    camera = ms.camera_before(scene, centre=(0.6 + 0.6 * seed, -2.6, 1.1), roll=0.8 * seed)
+    photos, walls = ms.photos(ms.photo_of(scene, camera)), ms.walls_of(scene)
+    ctx = context(tmp_path, seed=seed)
+    ties = MatchSift().run(MatchSift.In(photos=photos, walls=walls), MatchSift.Params(), ctx).ties
+    for folder in ("first", "second"):
+        (tmp_path / folder).mkdir()
+    first = orient(ties, photos, context(tmp_path / "first", seed=seed))
+    inputs = MatchGuided.In(photos=photos, walls=walls, cameras=first)
+    again = MatchGuided().run(inputs, MatchGuided.Params(), context(tmp_path)).ties
+    second = orient(again, photos, context(tmp_path / "second", seed=seed))
+    for cameras in (first, second):
+        found = cameras.cameras[0]
+        assert found.status == "ok"
+        assert found.sigma_wall_m is not None
+        error = ms.wall_error_m(scene, found.viewing(), camera)
+        assert error < 3.0 * found.sigma_wall_m
+        # A thirtieth of the raster's cell.
+        assert error < 0.0002
+
+
+def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path) -> None:
+    scene = ms.textured_wall(0)
+    ratios = []
+    for seed in range(16):
+        camera = ms.camera_before(scene, centre=(0.4 + 0.15 * seed, -2.5, 0.9))
+        (tmp_path / str(seed)).mkdir()
+        ctx = context(tmp_path / str(seed), seed=seed)
+        found = orient(known_ties(camera, seed, wrong_share=0.2), calibrated(camera), ctx)
+        sigma = found.cameras[0].sigma_wall_m
+        assert sigma is not None
+        ratios.append(ms.wall_error_m(scene, found.cameras[0].viewing(), camera) / sigma)
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+@pytest.mark.parametrize("wrong_share", [0.3, 0.6, 0.8])
+def test_wrong_ties_are_rejected(tmp_path: Path, wrong_share: float) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 3, n=400, wrong_share=wrong_share)
+    cameras = orient(ties, calibrated(camera), context(tmp_path))
+    assert cameras.cameras[0].status == "ok"
+    assert cameras.ties is not None
+    rejected = cameras.ties.role == TieRole.REJECTED
+    n_wrong = round(400 * wrong_share)
+    # A random tie lies within 2 px of its true place once in 45 000.
+    assert rejected[:n_wrong].mean() > 0.99
+    assert rejected[n_wrong:].mean() < 0.05
+
+
+def test_residuals_are_observed_less_computed(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    cameras = orient(known_ties(camera, 4), calibrated(camera), context(tmp_path))
+    ties, found = cameras.ties, cameras.cameras[0].viewing()
+    assert ties is not None
+    computed = found.project(ties.points_world)[:, :2]
+    np.testing.assert_allclose(ties.residual_px, ties.pixels_photo - computed, atol=1e-9)
+
+
+def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 5)
+    cameras = orient(ties, calibrated(camera), context(tmp_path))
+    assert cameras.ties is not None
+    check = cameras.ties.role == TieRole.CHECK
+    assert check.mean() >= 0.2 - 1e-9
+    # Moving check ties by a pixel leaves the pose as it is, to the last bit.
+    pixels = ties.pixels_photo.copy()
+    pixels[check] += [0.6, -0.4]
+    (tmp_path / "again").mkdir()
+    moved = replace(ties, pixels_photo=pixels)
+    again = orient(moved, calibrated(camera), context(tmp_path / "again"))
+    np.testing.assert_array_equal(
+        again.cameras[0].rotation_camera_from_world, cameras.cameras[0].rotation_camera_from_world
+    )
+
+
+def test_the_same_seed_gives_the_same_bits(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 6, wrong_share=0.5)
+    found = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        found.append(orient(ties, calibrated(camera), context(tmp_path / name)).cameras[0])
+    first, second = found
+    np.testing.assert_array_equal(
+        first.translation_camera_from_world, second.translation_camera_from_world
+    )
+    np.testing.assert_array_equal(first.covariance, second.covariance)
+
+
+def test_survey_coordinates_change_nothing(tmp_path: Path) -> None:
+    scene = ms.textured_wall(0)
+    camera = ms.camera_before(scene)
+    cameras = orient(
+        known_ties(camera, 7, shift_m=SURVEY_SHIFT_M), calibrated(camera), context(tmp_path)
+    )
+    found = cameras.cameras[0]
+    assert found.status == "ok"
+    assert found.sigma_wall_m == pytest.approx(0.0001, abs=0.0004)
+    near = found.viewing().shifted(SURVEY_SHIFT_M)
+    assert ms.wall_error_m(scene, near, camera) < 0.0005
+
+
+@pytest.mark.parametrize("factor", [0.97, 1.0, 1.03])
+def test_an_exif_focal_length_is_improved(tmp_path: Path, factor: float) -> None:
+    camera = ms.camera_before(ms.textured_wall(0), centre=(0.2, -1.8, 0.4))
+    plain = replace(camera, cx=450.0, cy=320.0, fy=camera.fx, distortion=np.zeros(5))
+    photo = replace(PIXEL, exif_focal_px=factor * plain.fx)
+    cameras = orient(known_ties(plain, 8, n=400), ms.photos(photo), context(tmp_path))
+    found = cameras.cameras[0]
+    assert found.status == "ok"
+    assert found.intrinsics is not None
+    assert found.intrinsics.source == "estimated"
+    assert found.intrinsics.fx == pytest.approx(plain.fx, rel=0.006)
+
+
+def test_nothing_known_of_the_lens_is_said(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0), centre=(0.2, -1.8, 0.4))
+    plain = replace(camera, cx=450.0, cy=320.0, fy=camera.fx, distortion=np.zeros(5))
+    ctx = context(tmp_path)
+    cameras = orient(known_ties(plain, 8, n=400), ms.photos(PIXEL), ctx)
+    assert cameras.cameras[0].status == "ok"
+    assert any("neither calibration nor EXIF" in warning for warning in ctx.warnings)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_ties_are_never_ok(tmp_path: Path, seed: int) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, seed, n=300, wrong_share=1.0)
+    assert status(ties, calibrated(camera), tmp_path) != "ok"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ties_of_a_mirrored_photo_are_never_ok(tmp_path: Path, seed: int) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, seed, n=300)
+    mirrored = replace(ties, pixels_photo=[900.0, 0.0] + ties.pixels_photo * [-1.0, 1.0])
+    assert status(mirrored, calibrated(camera), tmp_path) != "ok"
+
+
+def test_a_mirrored_photo_is_refused(tmp_path: Path) -> None:
+    scene = ms.textured_wall(1)
+    camera = ms.camera_before(scene)
+    photo = ms.photo_of(scene, camera)
+    mirrored = ms.encode_png(np.ascontiguousarray(decode_image(photo.encoded)[:, ::-1, 0]))
+    photos = ms.photos(replace(photo, encoded=mirrored))
+    inputs = MatchSift.In(photos=photos, walls=ms.walls_of(scene))
+    ties = MatchSift().run(inputs, MatchSift.Params(), context(tmp_path)).ties
+    assert status(ties, photos, tmp_path) != "ok"
+
+
+def test_few_ties_are_refused(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    reason = status(known_ties(camera, 1, n=7), calibrated(camera), tmp_path)
+    assert reason.startswith("7 ties with the walls, at least 8 are needed")
+
+
+def test_an_empty_quarter_is_refused(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 1)
+    low = (ties.pixels_photo[:, 0] > 450) & (ties.pixels_photo[:, 1] > 320)
+    emptied = replace(ties, role=np.where(low, TieRole.REJECTED, 0).astype(np.uint8))
+    reason = status(emptied, calibrated(camera), tmp_path)
+    assert reason.startswith("a quarter of the photo has 0 ties, each needs 2")
+
+
+def test_crowded_quarters_are_flagged(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 1, n=900)
+    low = np.flatnonzero((ties.pixels_photo[:, 0] > 450) & (ties.pixels_photo[:, 1] > 320))
+    role = ties.role.copy()
+    role[low[12:]] = TieRole.REJECTED
+    ctx = context(tmp_path)
+    cameras = orient(replace(ties, role=role), calibrated(camera), ctx)
+    assert cameras.cameras[0].status == "ok"
+    assert any("more than 10 times as many" in warning for warning in ctx.warnings)
+
+
+def test_control_in_the_middle_only_is_refused(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 1, n=900)
+    middle = (np.abs(ties.pixels_photo - [450.0, 320.0]) < [200.0, 150.0]).all(axis=1)
+    ties = replace(ties, role=np.where(middle, 0, TieRole.REJECTED).astype(np.uint8))
+    reason = status(ties, calibrated(camera), tmp_path)
+    assert "of the part of the photo that shows the walls" in reason
+
+
+def test_a_large_predicted_error_is_refused(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 1, n=60)
+    rng = np.random.default_rng(0)
+    noisy = replace(
+        ties,
+        pixels_photo=ties.pixels_photo + 12.0 * rng.normal(size=ties.pixels_photo.shape),
+        sigma_px=np.full(len(ties.photo), 12.0),
+    )
+    assert status(noisy, calibrated(camera), tmp_path).startswith("its predicted error")
+
+
+def test_a_pose_behind_the_wall_is_refused(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 1)
+    wall = ties.details["walls"][0]  # type: ignore[index]
+    turned = replace(ties, details={"walls": [{**wall, "normal": [0.0, 1.0, 0.0]}]})  # type: ignore[dict-item]
+    reason = status(turned, calibrated(camera), tmp_path)
+    assert reason == "the pose lies behind the wall it would show, so it must be wrong"
+
+
+def test_ties_without_a_word_on_the_walls_still_orient(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = replace(known_ties(camera, 1), details={})
+    assert status(ties, calibrated(camera), tmp_path) == "ok"
+
+
+def test_no_ties_at_all_are_refused(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    none = known_ties(camera, 1, n=0)
+    with pytest.raises(MethodError, match=r"there are no ties between photos and walls"):
+        orient(none, calibrated(camera), context(tmp_path))
+
+
+def test_no_photos_are_refused(tmp_path: Path) -> None:
+    ties = known_ties(ms.camera_before(ms.textured_wall(0)), 1)
+    with pytest.raises(MethodError, match=r"there are no photos to orient"):
+        orient(ties, Photos(photos=()), context(tmp_path))
+
+
+def test_ties_of_other_photos_are_refused(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = replace(known_ties(camera, 1), photo_names=("z.png",))
+    with pytest.raises(MethodError, match=r"photo z\.png, which is not among the photos"):
+        orient(ties, calibrated(camera), context(tmp_path))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_check_ties_come_from_all_parts_of_the_photo(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pixels = rng.random((600, 2)) * [900, 640]
+    chosen = withheld(pixels, (900, 640), 0.2, rng)
+    assert chosen.sum() == 120
+    counts = np.histogram2d(*pixels[chosen].T, bins=3, range=[[0, 900], [0, 640]])[0]
+    every = np.histogram2d(*pixels.T, bins=3, range=[[0, 900], [0, 640]])[0]
+    np.testing.assert_allclose(counts, 0.2 * every, atol=4.0)
+
+
+def test_the_hull_of_a_square_and_its_inside_is_the_square() -> None:
+    inside = np.random.default_rng(0).random((50, 2))
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    assert hull_area(np.vstack([inside, square])) == pytest.approx(1.0, abs=1e-12)
+    assert hull_area(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])) == 0.0
+
+
+def reference_camera(folder: Path, name: str) -> ViewingCamera:
+    rows = [line.split() for line in (folder / f"{name}.jpg.camera").read_text().splitlines()]
+    rotation = np.array(rows[4:7], dtype=np.float64).T
+    centre = np.array(rows[7], dtype=np.float64)
+    return ViewingCamera(
+        width=3072,
+        height=2048,
+        fx=2759.48,
+        fy=2764.16,
+        cx=1521.19,
+        cy=1007.31,
+        distortion=np.zeros(5),
+        rotation=rotation,
+        translation=-rotation @ centre,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "limit_m", "limit_deg"), [("0003", 0.02, 0.12), ("0010", 0.06, 0.7)]
+)
+def test_real_photos_of_the_fountain_are_where_the_reference_has_them(
+    shared_data: Path, tmp_path: Path, name: str, limit_m: float, limit_deg: float
+) -> None:
+    from orthoflow_plugins.plane.given import GivenPlane
+    from orthoflow_plugins.raster.grid import RasterGrid
+    from orthoflow_plugins.read.scan import ReadScan
+
+    from orthoflow.products import InputFiles
+
+    folder = shared_data / "fountain-p11"
+    camera = reference_camera(folder / "images", name)
+    ctx = context(tmp_path)
+    scan = InputFiles(name="scan", paths=(folder / "cloud_from_photos.laz",))
+    cloud = (
+        ReadScan()
+        .run(
+            ReadScan.In(files=scan),
+            ReadScan.Params(up="-z", view_from=tuple(camera.centre_world)),
+            ctx,
+        )
+        .cloud
+    )
+    planes = (
+        GivenPlane()
+        .run(
+            GivenPlane.In(cloud=cloud),
+            GivenPlane.Params(normal=(0.29790, 0.95458, -0.00649), offset_m=-15.9052, buffer_m=1.0),
+            context(tmp_path),
+        )
+        .planes
+    )
+    walls = (
+        RasterGrid()
+        .run(
+            RasterGrid.In(cloud=cloud, planes=planes),
+            RasterGrid.Params(gsd_m=0.01, buffer_m=3.0),
+            context(tmp_path),
+        )
+        .walls
+    )
+    photo = Photo(
+        name=f"{name}.jpg",
+        encoded=(folder / "images" / f"{name}.jpg").read_bytes(),
+        width=3072,
+        height=2048,
+        intrinsics=ms.intrinsics_of(camera),
+    )
+    photos = ms.photos(photo)
+    ties = (
+        MatchSift()
+        .run(MatchSift.In(photos=photos, walls=walls), MatchSift.Params(), context(tmp_path))
+        .ties
+    )
+    (tmp_path / "orient").mkdir()
+    found: Camera = orient(ties, photos, context(tmp_path / "orient")).cameras[0]
+    assert found.status == "ok"
+    viewer = found.viewing()
+    assert np.linalg.norm(viewer.centre_world - camera.centre_world) < limit_m
+    turn = viewer.rotation @ camera.rotation.T
+    angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0)))
+    assert angle < limit_deg
+
+
+@pytest.mark.slow
+def test_a_photo_of_another_place_is_refused(shared_data: Path, tmp_path: Path) -> None:
+    scene = ms.textured_wall(1)
+    path = shared_data / "cyprus-arch-photos" / "images" / "DSC_6466.JPG"
+    photo = Photo(
+        name=path.name,
+        encoded=path.read_bytes(),
+        width=1500,
+        height=1000,
+        intrinsics=Intrinsics(width=1500, height=1000, fx=1167.0, fy=1167.0, cx=750.0, cy=500.0),
+    )
+    photos = ms.photos(photo)
+    inputs = MatchSift.In(photos=photos, walls=ms.walls_of(scene))
+    ties = MatchSift().run(inputs, MatchSift.Params(), context(tmp_path)).ties
+    assert status(ties, photos, tmp_path) != "ok"

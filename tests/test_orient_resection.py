@@ -1,0 +1,170 @@
+"""The adjustment of one camera: exact for exact points, honest about noise, blind to the origin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import (
+    LensFreedom,
+    SeenPoints,
+    adjust,
+    misfit,
+    pixels_by_point,
+    predicted_covariances,
+)
+from orthoflow.geometry.rotations import rotation_from_vector
+from tests import matching_scenes as ms
+from tests.scenes import SURVEY_SHIFT_M
+
+
+def true_camera() -> ViewingCamera:
+    return ms.camera_before(ms.textured_wall(0))
+
+
+def seen_by(
+    camera: ViewingCamera, seed: int, *, noise_px: float = 0.0, noise_m: float = 0.0, n: int = 120
+) -> SeenPoints:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([0.2, -0.3, 0.2], [2.8, 0.1, 1.8], (4 * n, 3))
+    pixels = camera.project(points)[:, :2]
+    inside = np.flatnonzero(camera.sees(pixels))[:n]
+    return SeenPoints(
+        pixels_photo=pixels[inside] + noise_px * rng.normal(size=(len(inside), 2)),
+        points_world=points[inside] + noise_m * rng.normal(size=(len(inside), 3)),
+        sigma_px=np.full(len(inside), max(noise_px, 0.1)),
+        sigma_m=np.full(len(inside), noise_m),
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_exact_points_give_the_exact_camera(seed: int) -> None:
+    camera = true_camera()
+    start = ms.nudged(camera, (0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
+    found = adjust(seen_by(camera, seed), start).camera
+    np.testing.assert_allclose(found.rotation, camera.rotation, atol=1e-9)
+    np.testing.assert_allclose(found.centre_world, camera.centre_world, atol=1e-8)
+
+
+def test_exact_points_give_the_exact_focal_length_and_k1_too() -> None:
+    camera = true_camera()
+    wrong = np.array([-0.05, *camera.distortion[1:]])
+    start = replace(camera, fx=1.03 * camera.fx, fy=1.03 * camera.fy, distortion=wrong)
+    lens = LensFreedom(focal_sigma=10.0, k1_sigma=10.0)
+    found = adjust(seen_by(camera, 1), start, lens=lens).camera
+    # The prior, 10 wide, pulls by its weight of 1e-2 against that of the points.
+    assert found.fx == pytest.approx(camera.fx, rel=1e-5)
+    assert found.distortion[0] == pytest.approx(camera.distortion[0], abs=1e-5)
+
+
+def test_derivatives_are_those_of_the_projection() -> None:
+    camera = true_camera()
+    points = seen_by(camera, 2, n=20).points_world
+    step = 1e-6
+    for axis in range(3):
+        shifted = points + step * np.eye(3)[axis]
+        expected = (camera.project(shifted) - camera.project(points))[:, :2] / step
+        # Differences of second order: step * curvature, and rounding 1e-13 / step.
+        np.testing.assert_allclose(
+            pixels_by_point(camera, points)[:, :, axis], expected, rtol=1e-4, atol=1e-2
+        )
+
+
+def test_survey_coordinates_lose_nothing() -> None:
+    camera = true_camera()
+    seen = seen_by(camera, 3, noise_px=0.5)
+    near = adjust(seen, camera)
+    shifted = replace(seen, points_world=seen.points_world + SURVEY_SHIFT_M)
+    far = adjust(shifted, camera.shifted(-SURVEY_SHIFT_M))
+    np.testing.assert_allclose(
+        far.camera.centre_world - SURVEY_SHIFT_M, near.camera.centre_world, atol=2e-6
+    )
+    at = seen.points_world[:5]
+    np.testing.assert_allclose(
+        predicted_covariances(far, at + SURVEY_SHIFT_M),
+        predicted_covariances(near, at),
+        # The lever of 10^6 m costs eleven digits of sixteen; 1e-5 square pixels remain.
+        atol=1e-5,
+    )
+
+
+def test_the_stated_covariance_is_the_scatter_of_repeated_adjustments() -> None:
+    camera = true_camera()
+    at = np.array([[0.5, 0.0, 0.4], [2.5, 0.0, 1.6], [1.5, 0.0, 1.0]])
+    exact = camera.project(at)[:, :2]
+    ratios = []
+    for seed in range(60):
+        result = adjust(seen_by(camera, seed, noise_px=0.6, noise_m=0.002), camera)
+        error = result.camera.project(at)[:, :2] - exact
+        covariances = predicted_covariances(result, at)
+        ratios.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariances), error))
+    # Chi-squared with 2 degrees of freedom has mean 2; 60 runs of correlated triples leave 15 %.
+    assert np.mean(ratios) == pytest.approx(2.0, rel=0.3)
+
+
+def test_sigma0_is_one_when_the_sigmas_are_right() -> None:
+    camera = true_camera()
+    found = [adjust(seen_by(camera, s, noise_px=0.7, noise_m=0.003), camera) for s in range(10)]
+    # 10 x 234 degrees of freedom: 1.5 %.
+    assert np.mean([item.sigma0 for item in found]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_residuals_that_agree_within_groups_raise_the_variance_factor() -> None:
+    camera = true_camera()
+    seen = seen_by(camera, 5, noise_px=0.3)
+    groups = (seen.pixels_photo[:, 0] // 110).astype(np.intp)
+    pull = np.random.default_rng(0).normal(size=(groups.max() + 1, 2))
+    together = replace(seen, pixels_photo=seen.pixels_photo + pull[groups])
+    result = adjust(together, camera, groups=groups)
+    assert result.variance_factor > 2.0 * result.sigma0**2
+
+
+def test_a_soft_limit_bears_outliers() -> None:
+    camera = true_camera()
+    seen = seen_by(camera, 6, noise_px=0.3)
+    pixels = seen.pixels_photo.copy()
+    pixels[:12] += 40.0
+    spoilt = replace(seen, pixels_photo=pixels)
+    soft = adjust(spoilt, camera, soft_limit=2.0).camera
+    hard = adjust(spoilt, camera).camera
+
+    def miss(found: ViewingCamera) -> float:
+        return float(np.linalg.norm(found.centre_world - camera.centre_world))
+
+    assert miss(soft) < 0.25 * miss(hard)
+
+
+def test_misfit_counts_in_standard_deviations_and_points_behind_the_camera_fit_never() -> None:
+    camera = true_camera()
+    seen = seen_by(camera, 7, noise_px=0.5, n=100)
+    lengths = misfit(seen, camera).normalised
+    # Rayleigh: mean of squares 2.
+    assert np.mean(lengths**2) == pytest.approx(2.0, abs=0.5)
+    behind = replace(seen, points_world=seen.points_world - [0.0, 10.0, 0.0])
+    assert np.isinf(misfit(behind, camera).normalised).all()
+
+
+def test_too_few_points_are_refused() -> None:
+    camera = true_camera()
+    with pytest.raises(GeometryError, match=r"6 unknowns got only 3 points"):
+        adjust(seen_by(camera, 8).take(np.arange(3)), camera)
+
+
+def test_a_start_that_looks_away_is_refused() -> None:
+    camera = true_camera()
+    turned = ms.nudged(camera, (0.0, np.pi, 0.0, 0.0, 0.0, 0.0))
+    with pytest.raises(GeometryError, match=r"cannot see its points"):
+        adjust(seen_by(camera, 9), turned)
+
+
+def test_rotation_vectors_turn_by_their_length() -> None:
+    vector = np.array([0.3, -0.2, 0.5])
+    rotation = rotation_from_vector(vector)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(rotation @ vector, vector, atol=1e-14)
+    angle = np.arccos(0.5 * (np.trace(rotation) - 1.0))
+    assert angle == pytest.approx(np.linalg.norm(vector), abs=1e-12)
