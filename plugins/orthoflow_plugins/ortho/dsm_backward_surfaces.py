@@ -11,7 +11,7 @@ from orthoflow.geometry.visibility_kernels import BLOCK_CELLS, NOTHING_M, Relief
 from orthoflow.products import Wall
 
 _MEDIAN_TO_SIGMA: Final = 1.4826
-_NOISE_SAMPLES: Final = 2000
+_NOISE_SAMPLES: Final = 300_000
 
 
 def relief_of(wall: Wall) -> Relief:
@@ -38,7 +38,7 @@ def noise_m(wall: Wall) -> float:
     The median of second differences does not see edges; a wall without three measured neighbours
     has no noise that could be told.
     """
-    rows = wall.depth_m[:: max(1, wall.frame.height // _NOISE_SAMPLES)]
+    rows = wall.depth_m[:: max(1, wall.depth_m.size // _NOISE_SAMPLES)]
     bends = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
     known = np.abs(bends[np.isfinite(bends)])
     return float(np.median(known)) * _MEDIAN_TO_SIGMA / np.sqrt(6.0) if known.size else 0.0
