@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.scenes import Scene
+from orthoflow.products.photographs import Cameras
 from orthoflow.products.planes import Planes
 from orthoflow.products.product import JsonValue, Product, Tolerance
 
@@ -44,6 +45,7 @@ class Truth(Product):
         planes: the planes a detector should find.
         labels: (n,) int16 per point of the simulated cloud: index into `planes`, -1 for none.
         stations: (s, 3) float64 metres, where the scanner stood.
+        cameras: true orientations of the photos, or None without photos.
         details: parameters of the simulation (scan step, noise, relief ...), JSON.
     """
 
@@ -54,6 +56,7 @@ class Truth(Product):
     planes: Planes
     labels: NDArray[np.int16]
     stations: NDArray[np.float64]
+    cameras: Cameras | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
 

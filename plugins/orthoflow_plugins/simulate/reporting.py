@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +11,12 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import render_frame
-from orthoflow.products import PointCloud, Truth
+from orthoflow.products import JsonValue, Photos, PointCloud, Truth
 from orthoflow.sdk import StepContext
 
 _PICTURE_GSD_M = 0.01
 _TILE_M = 0.1
+_THUMB_PX = 300
 _CHUNK = 1 << 20
 
 
@@ -48,6 +50,42 @@ def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
         _picture(truth, ctx.cores),
         f"True orthoimage of the {truth.planes.names[0]} at {_PICTURE_GSD_M * 1000:.0f} mm.",
     )
+
+
+def report_photos(truth: Truth, photos: Photos, ctx: StepContext) -> None:
+    """Report how the photos were taken, and show them side by side; nothing without photos."""
+    if not photos.photos:
+        return
+    entries = truth.details["photos"]
+    gsds, obliquities = [], []
+    if isinstance(entries, list):
+        for entry in entries:
+            if isinstance(entry, dict):
+                gsds.append(_number(entry["gsd_mm"]))
+                obliquities.append(_number(entry["obliquity_deg"]))
+    ctx.metric("n_photos", len(photos.photos), "1")
+    ctx.metric("photo_megapixels", sum(p.width * p.height for p in photos.photos) / 1e6, "1")
+    ctx.metric("photo_gsd_mm", float(np.mean(gsds)), "mm")
+    ctx.metric("photo_obliquity_max_deg", max(obliquities), "deg")
+    ctx.figure("photos", _contact_sheet(photos), "The photos, in the order of their names.")
+
+
+def _number(value: JsonValue) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def _contact_sheet(photos: Photos) -> bytes:
+    from orthoflow.files.images import decode_image, encode_png
+
+    small = []
+    for photo in photos.photos:
+        step = max(1, photo.width // _THUMB_PX)
+        small.append(decode_image(photo.encoded, photo.name)[::step, ::step])
+    per_row = math.ceil(math.sqrt(len(small)))
+    blank = np.zeros_like(small[0])
+    small += [blank] * (-len(small) % per_row)
+    rows = [np.hstack(small[i : i + per_row]) for i in range(0, len(small), per_row)]
+    return encode_png(np.vstack(rows))
 
 
 def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> ScanStep | None:

@@ -3,39 +3,60 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.metadata import version
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import Field
 
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
-from orthoflow.products import PointCloud, Truth
+from orthoflow.products import Calibration, CheckPoints, Photos, PointCloud, Truth
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.simulate.palace import RoomPlan, build_room
+from orthoflow_plugins.simulate.palace import (
+    MOST_TEXTILE,
+    TEXTILE_BY_DESIGN,
+    Room,
+    RoomPlan,
+    build_room,
+)
 
 if TYPE_CHECKING:
+    from orthoflow_plugins.simulate.deliverables import Delivery
     from orthoflow_plugins.simulate.scan_kernels import Errors
+    from orthoflow_plugins.simulate.scanner import Scan
+    from orthoflow_plugins.simulate.viewpoints import Shot
+
+SpectralGap = Literal["none", "easy", "hard"]
+
+_PANORAMA_FACTOR: Final = 3.0
+# How much of what the laser sees is a pattern of its own.
+_SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {"none": 0.0, "easy": 0.3, "hard": 0.7}
 
 
 class SimulateRoom(Method):
-    """Scan a decorated room with relief, niche, door recess and an object before the main wall.
+    """Scan and photograph a decorated room with relief, niche, door and an object before its wall.
 
     Two scans per station: a panorama, and a detail scan of the main wall. Points come scan by
     scan, column by column, from the lowest row up. Distances are noisy by range, incidence and
     material; some points are gross outliers, and at edges the distances of two surfaces mix. All
     noise is a function of the seed and the place in the scan, so threads cannot change it.
+
+    Photos come from one free-hand camera with Brown distortion, a little aside and askew, as JPEG
+    files in the sRGB colours of the scene. `photos` is empty for `photo_layout: none`,
+    `calibration` is empty when the camera is not calibrated; a focal length as EXIF states it,
+    wrong by up to 2 %, is known in any case.
     """
 
     id: ClassVar[str] = "simulate.room"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "seeded"
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71114870 (the kind of room)",
     )
 
     class Params(MethodParams):
-        """How the room is scanned, and where in the world it lies."""
+        """How the room is scanned and photographed, and where in the world it lies."""
 
         scan_step_m: float = Field(
             0.0042,
@@ -43,11 +64,12 @@ class SimulateRoom(Method):
             le=0.5,
             description="Spacing of a station's points on the main wall, right before the station.",
         )
-        panorama_step_m: float = Field(
-            0.012,
+        panorama_step_m: float | None = Field(
+            None,
             gt=0.0,
             le=0.5,
-            description="The same for the panoramas, which cover the rest of the room.",
+            description="The same for the panoramas, which cover the rest of the room; three times "
+            "as coarse unless given.",
         )
         n_stations: int = Field(2, ge=1, le=4, description="Number of scanner stations.")
         noise_m: float = Field(
@@ -77,12 +99,40 @@ class SimulateRoom(Method):
         obstacle: bool = Field(
             default=True, description="An object stands free 0.6 m before the main wall."
         )
-        spectral_gap: float = Field(
-            0.3,
-            ge=0.0,
-            le=1.0,
-            description="0: the laser sees the painted patterns; 1: it sees other ones.",
+        spectral_gap: SpectralGap = Field(
+            "easy",
+            description="none: the laser sees the painted patterns; hard: mostly other ones.",
         )
+        textile_share: float = Field(
+            TEXTILE_BY_DESIGN,
+            ge=0.0,
+            le=MOST_TEXTILE,
+            description="Share of the main wall covered by cloth with one repeated motif.",
+        )
+        photo_layout: Literal["none", "quick", "variant1", "variant2"] = Field(
+            "none",
+            description="quick: 6 photos of the main wall; variant1: 8 photos of whole walls, 4 "
+            "walls; variant2: a block of 18 over the main wall, 70 % and 50 % overlap.",
+        )
+        photo_gsd_m: float = Field(
+            0.002, gt=0.0, le=0.1, description="Side of a photo's pixel on the wall."
+        )
+        photo_obliquity_deg: float = Field(
+            12.0,
+            ge=0.0,
+            le=45.0,
+            description="Largest intended angle between optical axis and wall normal.",
+        )
+        photo_noise_grey: float = Field(
+            1.5, ge=0.0, le=50.0, description="Standard deviation of a pixel's colour."
+        )
+        photo_vignetting: float = Field(
+            0.1, ge=0.0, le=0.9, description="Share of the light lost in the corners of a photo."
+        )
+        photo_supersample: int = Field(
+            2, ge=1, le=8, description="A pixel is the mean of so many rays squared."
+        )
+        calibrated: bool = Field(default=True, description="The camera's calibration is known.")
         up: UpDirection = Field("z", description="World direction that is up.")
         shift_world_m: tuple[float, float, float] = Field(
             (0.0, 0.0, 0.0), description="World position of the room's origin, survey coordinates."
@@ -92,47 +142,123 @@ class SimulateRoom(Method):
         """No inputs."""
 
     class Out(Ports):
-        """The scan and the truth about it."""
+        """The scan, the photos, and the truth about them."""
 
         cloud: PointCloud
+        photos: Photos
+        calibration: Calibration
+        checkpoints: CheckPoints
         truth: Truth
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
-        """Give the compiler, whose mathematical functions make the points."""
-        return {"numba": version("numba"), "numpy": version("numpy")}
+        """Give the compiler, whose mathematical functions make the points, and what writes JPEG."""
+        return {name: version(name) for name in ("numba", "numpy", "opencv-python-headless")}
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Build the room, scan it, and write down the truth."""
+        """Build the room, scan and photograph it, and write down the truth."""
         del inputs
         from orthoflow_plugins.simulate.deliverables import Delivery, cloud_of, truth_of
-        from orthoflow_plugins.simulate.reporting import report_room
-        from orthoflow_plugins.simulate.scanner import SweepPlan, planned_sweeps, scan_scene
+        from orthoflow_plugins.simulate.photographs import calibration_of
+        from orthoflow_plugins.simulate.reporting import report_photos, report_room
+        from orthoflow_plugins.simulate.viewpoints import ShotPlan, planned_shots
 
+        scan_rng, photo_rng = ctx.rng.spawn(2)
         room = build_room(
             RoomPlan(
-                relief=params.relief, obstacle=params.obstacle, spectral_gap=params.spectral_gap
+                relief=params.relief,
+                obstacle=params.obstacle,
+                spectral_gap=_SPECTRAL_GAPS[params.spectral_gap],
+                textile_share=params.textile_share,
             )
         )
-        plan = SweepPlan(
-            n_stations=params.n_stations,
-            scan_step_m=params.scan_step_m,
-            panorama_step_m=params.panorama_step_m,
-        )
-        main_wall = room.planes[0]
-        seeds = ctx.rng.integers(0, 2**62, size=2 * params.n_stations)
-        sweeps = planned_sweeps(plan, main_wall.plane, main_wall.outline, seeds)
-        scan = scan_scene(room.scene, sweeps, _errors(params), ctx)
         delivery = Delivery(
             room=room,
-            scan=scan,
+            scan=_scan(room, params, scan_rng, ctx),
             world_from_room=basis_from_up(up_vector(params.up)).T,
             shift_world_m=np.array(params.shift_world_m),
         )
+        shots = planned_shots(
+            ShotPlan(
+                layout=params.photo_layout,
+                gsd_m=params.photo_gsd_m,
+                obliquity_deg=params.photo_obliquity_deg,
+            ),
+            photo_rng,
+        )
+        calibration = calibration_of(shots, is_known=params.calibrated)
+        photos = _photos(room, shots, calibration, params, photo_rng, ctx)
         cloud = cloud_of(delivery)
-        truth = truth_of(delivery, cloud, params.model_dump(mode="json"))
+        truth = _with_cameras(
+            truth_of(delivery, cloud, params.model_dump(mode="json")), delivery, shots
+        )
         report_room(truth, cloud, ctx)
-        return self.Out(cloud=cloud, truth=truth)
+        report_photos(truth, photos, ctx)
+        return self.Out(
+            cloud=cloud,
+            photos=photos,
+            calibration=calibration,
+            checkpoints=_check_points(delivery),
+            truth=truth,
+        )
+
+
+def _scan(
+    room: Room, params: SimulateRoom.Params, rng: np.random.Generator, ctx: StepContext
+) -> Scan:
+    from orthoflow_plugins.simulate.scanner import SweepPlan, planned_sweeps, scan_scene
+
+    plan = SweepPlan(
+        n_stations=params.n_stations,
+        scan_step_m=params.scan_step_m,
+        panorama_step_m=params.panorama_step_m or _PANORAMA_FACTOR * params.scan_step_m,
+    )
+    main_wall = room.planes[0]
+    seeds = rng.integers(0, 2**62, size=2 * params.n_stations)
+    sweeps = planned_sweeps(plan, main_wall.plane, main_wall.outline, seeds)
+    return scan_scene(room.scene, sweeps, _errors(params), ctx)
+
+
+def _photos(
+    room: Room,
+    shots: tuple[Shot, ...],
+    calibration: Calibration,
+    params: SimulateRoom.Params,
+    rng: np.random.Generator,
+    ctx: StepContext,
+) -> Photos:
+    from orthoflow_plugins.simulate.photographs import Film, calibrated, take_photos
+
+    film = Film(
+        noise_grey=params.photo_noise_grey,
+        vignetting=params.photo_vignetting,
+        supersample=params.photo_supersample,
+    )
+    return calibrated(take_photos(room.scene, shots, film, ctx, rng), calibration)
+
+
+def _with_cameras(truth: Truth, delivery: Delivery, shots: tuple[Shot, ...]) -> Truth:
+    from orthoflow_plugins.simulate.photographs import shot_details, true_cameras
+
+    if not shots:
+        return truth
+    return replace(
+        truth,
+        cameras=true_cameras(shots, delivery.world_from_room, delivery.shift_world_m),
+        details={**truth.details, "photos": shot_details(shots)},
+    )
+
+
+def _check_points(delivery: Delivery) -> CheckPoints:
+    from orthoflow_plugins.simulate.marks import check_points
+
+    return check_points(
+        delivery.room.scene,
+        0,
+        np.unique(delivery.scan.stations, axis=0),
+        delivery.world_from_room,
+        delivery.shift_world_m,
+    )
 
 
 def _errors(params: SimulateRoom.Params) -> Errors:
