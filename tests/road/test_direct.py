@@ -79,7 +79,7 @@ def test_a_finished_run_folder_is_refused(road: Shell) -> None:
 
 def test_a_changed_parameter_reruns_only_what_depends_on_it(road: Shell) -> None:
     ended = road("plan", "direct.yaml", *SMALL, "--set", "ortho.inpaint_radius_px=4", "--json")
-    states = {cell["address"]: cell for cell in json.loads(ended.out)["cells"]}
+    states = {cell["address"]: cell for cell in json.loads(ended.out)}
     assert {address: cell["status"] for address, cell in states.items()} == {
         "cloud": "skipped",
         "room": "cached",
