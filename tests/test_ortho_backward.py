@@ -266,7 +266,7 @@ def test_threads_and_tiles_do_not_show(tmp_path: Path, monkeypatch: pytest.Monke
     np.testing.assert_array_equal(tiled.quality, found[0].quality)
 
 
-def test_erosion_takes_the_cells_beside_hidden_ones(tmp_path: Path) -> None:
+def test_erosion_takes_the_cells_beside_hidden_patches(tmp_path: Path) -> None:
     import cv2
 
     layers = []
@@ -276,9 +276,26 @@ def test_erosion_takes_the_cells_beside_hidden_ones(tmp_path: Path) -> None:
         layers.append(painted(folder, erosion_cells=cells).layers[0])
     plain, eroded = layers
     hidden = (plain.mask == LayerMask.OCCLUDED).astype(np.uint8)
+    # Each patch here is wide; a cell alone would not count.
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(hidden)
+    assert stats[:, cv2.CC_STAT_WIDTH].min() >= 2
+    assert labels.max() == 1
     near = cv2.dilate(hidden, np.ones((5, 5), np.uint8)) > 0
     expected = np.where(near & (plain.mask == LayerMask.PAINTED), LayerMask.OCCLUDED, plain.mask)
     np.testing.assert_array_equal(eroded.mask, expected)
+
+
+def test_a_single_cell_of_wrong_depth_hides_nothing_but_itself(tmp_path: Path) -> None:
+    pits = np.zeros(scenes.SHAPE, dtype=np.bool_)
+    pits[200:230:10, 20:120:10] = True
+    depths = scenes.depth_m()
+    depths[pits] -= 0.08
+    layers = []
+    for name, surface in (("clean", scenes.depth_m()), ("pits", depths)):
+        (tmp_path / name).mkdir()
+        layers.append(painted(tmp_path / name, depths=surface).layers[0])
+    expected = np.where(pits, LayerMask.OCCLUDED, layers[0].mask)
+    np.testing.assert_array_equal(layers[1].mask, expected)
 
 
 def test_quality_is_pixels_per_cell_and_falls_off_at_the_border(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ class DsmBackward(Method):
             default=1,
             ge=0,
             le=20,
-            description="Cells so near to a hidden one are not painted: edges smear there.",
+            description="Cells so near to a hidden patch are not painted: edges smear there.",
         )
         tolerance_sigma: float = Field(
             default=3.0,

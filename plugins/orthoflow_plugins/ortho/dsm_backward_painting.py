@@ -193,9 +193,8 @@ class _Brush:
 
     def _look(self, tile: tuple[slice, slice]) -> Sight:
         """See a tile, and hide what is near to hidden cells of it or beside it."""
-        import cv2
-
         reach = self._rule.erosion_cells
+        reach += 1 if reach else 0  # what is a patch shows one cell farther out
         first = [max(0, part.start - reach) for part in tile]
         shape = tuple(
             min(size, part.stop + reach) - start
@@ -210,9 +209,8 @@ class _Brush:
         )
         look_at_cells(self._view, self._surface.relief, self._buffer, sight, first[0], first[1])
         if reach and sight.summary[4]:
-            window = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
-            is_hidden = np.equal(sight.mask, OCCLUDED).view(np.uint8)
-            is_near = cv2.dilate(is_hidden, window).view(np.bool_) & (sight.mask == PAINTED)
+            is_near = _near_patches(sight.mask == OCCLUDED, self._rule.erosion_cells)
+            is_near &= sight.mask == PAINTED
             sight.mask[is_near] = OCCLUDED
             sight.quality[is_near] = 0.0
         rows, columns = (
@@ -238,6 +236,19 @@ class _Brush:
                     self._allocate("quality", shape, np.float32), np.float32
                 )
             return painting.rgb, painting.quality
+
+
+def _near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Cells within a reach of hidden patches of 2 x 2 cells or more.
+
+    A single hidden cell is one whose own depth is wrong; its neighbours are none the worse.
+    """
+    import cv2
+
+    square, window = np.ones((2, 2), dtype=np.uint8), np.ones((2 * reach + 1,) * 2, dtype=np.uint8)
+    lowest = cv2.erode(is_hidden.view(np.uint8), square, anchor=(0, 0))
+    patches = cv2.dilate(lowest, square, anchor=(1, 1))
+    return np.asarray(cv2.dilate(patches, window)).view(np.bool_)
 
 
 def _crop_side(sight: Sight) -> float:
