@@ -376,5 +376,8 @@ def look_at_cells(
                     columns += start + k
                     rows += row
                     depths += depth
-    sight.summary[:4] = u_least, u_most, v_least, v_most
-    sight.summary[4:] = float(n_painted), float(columns), float(rows), depths
+    # One by one: numba compiles seconds of text formatting for the errors of a tuple's assignment.
+    sight.summary[0], sight.summary[1] = u_least, u_most
+    sight.summary[2], sight.summary[3] = v_least, v_most
+    sight.summary[4], sight.summary[5] = n_painted, columns
+    sight.summary[6], sight.summary[7] = rows, depths
