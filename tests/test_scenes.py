@@ -193,14 +193,15 @@ def test_cores_change_no_bit_of_a_true_orthoimage() -> None:
 def test_a_finer_rendering_averages_to_the_coarser_one() -> None:
     scene = wall_with_screen()
     coarse = render_frame(
-        scene, wall_frame(0.05), buffer_front_m=0.1, buffer_behind_m=0.3, supersample=6
+        scene, wall_frame(0.05), buffer_front_m=0.1, buffer_behind_m=0.3, supersample=24
     )
     fine = render_frame(
-        scene, wall_frame(0.0125), buffer_front_m=0.1, buffer_behind_m=0.3, supersample=2
+        scene, wall_frame(0.0125), buffer_front_m=0.1, buffer_behind_m=0.3, supersample=6
     )
     mean = fine.rgb.reshape(40, 4, 80, 4, 3).mean(axis=(1, 3))
-    # Grey levels; smooth stains, so both means are good to a small part of their contrast.
-    np.testing.assert_allclose(mean, coarse.rgb, atol=0.5)
+    # Grey levels; rays are 2 mm apart and cracks 2 to 4 mm wide, so a mean is good to a small part
+    # of their contrast.
+    np.testing.assert_allclose(mean, coarse.rgb, atol=1.0)
 
 
 def test_a_scene_with_arrays_that_disagree_is_refused() -> None:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 DEPTH_SPAN_MM: Final = 10.0
 COLOUR_SPAN_GREY: Final = 60.0
+DISPLACEMENT_SPAN_CELLS: Final = 1.0
 _WIDEST_PX: Final = 900
 
 
@@ -28,11 +29,19 @@ def depth_error_map(depth_m: NDArray[np.float64]) -> bytes:
 
 def colour_error_map(error_grey: NDArray[np.float64]) -> bytes:
     """PNG of colour errors: bright where they are large, blue where nothing is shown."""
+    return _bright_where_large(error_grey / COLOUR_SPAN_GREY)
+
+
+def displacement_map(displacement_cells: NDArray[np.float64]) -> bytes:
+    """PNG of displacements (rows, cols): bright where they are large, blue where none is known."""
+    return _bright_where_large(displacement_cells / DISPLACEMENT_SPAN_CELLS)
+
+
+def _bright_where_large(shares: NDArray[np.float64]) -> bytes:
     import cv2
 
-    scaled = np.nan_to_num(error_grey / COLOUR_SPAN_GREY, nan=0.0)
-    grey = np.clip(255.0 * scaled, 0.0, 255.0).astype(np.uint8)
-    return _png(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), np.isnan(error_grey))
+    grey = np.clip(255.0 * np.nan_to_num(shares, nan=0.0), 0.0, 255.0).astype(np.uint8)
+    return _png(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), np.isnan(shares))
 
 
 def _png(coloured: MatLike, missing: NDArray[np.bool_]) -> bytes:

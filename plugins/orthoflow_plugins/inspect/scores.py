@@ -18,6 +18,13 @@ FOUND_OFFSET_M: Final = 0.015
 # A wall further off than this shows no true plane.
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
+_NAMES_BESIDE_TRACED: Final = {
+    "rmse_u_mm": "patch_rmse_u_mm",
+    "rmse_v_mm": "patch_rmse_v_mm",
+    "mean_u_mm": "patch_mean_u_mm",
+    "mean_v_mm": "patch_mean_v_mm",
+    "ghost_share": "ghost_colour_share",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,10 +75,17 @@ def plane_findings(distance: PlaneDistance, wall: int) -> list[Finding]:
     ]
 
 
-def sample_findings(samples: WallSamples, wall: int) -> list[Finding]:
-    """Numbers on the cells of one wall, or of all with wall -1; none for what has no samples."""
+def sample_findings(
+    samples: WallSamples, wall: int, *, sources_are_traced: bool = False
+) -> list[Finding]:
+    """Numbers on the cells of one wall, or of all with wall -1; none for what has no samples.
+
+    Displacements and ghosts bear a longer name when they are also told from the photos' cameras,
+    which says more.
+    """
+    renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
     return [
-        Finding(name=name, value=value, unit=unit, wall=wall)
+        Finding(name=renamed.get(name, name), value=value, unit=unit, wall=wall)
         for name, value, unit in (
             *_depth_numbers(samples),
             *_colour_numbers(samples),

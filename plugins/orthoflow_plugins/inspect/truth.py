@@ -1,8 +1,9 @@
-"""`inspect.truth`: orthoimages, walls, planes and labels against a simulated scene."""
+"""`inspect.truth`: orthoimages, cameras, walls, planes and labels against a simulated scene."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 from pydantic import Field
@@ -10,8 +11,10 @@ from pydantic import Field
 from orthoflow.errors import MethodError
 from orthoflow.geometry.scenes import Viewers
 from orthoflow.products import (
+    Cameras,
     Finding,
     Inspection,
+    JsonValue,
     Orthoimage,
     Orthoimages,
     Planes,
@@ -23,8 +26,13 @@ from orthoflow.products import (
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 
 if TYPE_CHECKING:
+    from orthoflow.geometry.photo_views import SceneCameras
     from orthoflow.geometry.scene_views import TrueOrthoimage
+    from orthoflow_plugins.inspect.poses import PoseError
     from orthoflow_plugins.inspect.samples import WallErrors
+    from orthoflow_plugins.inspect.sources import SourceErrors
+
+_TRACED_POINTS: Final = 4000
 
 
 class InspectTruth(Method):
@@ -35,10 +43,15 @@ class InspectTruth(Method):
     2 cells at the steps is reported apart. Displacements come from patches of 32 x 32 painted
     cells, matched to the truth by least squares. Metrics without prefix are of the first wall;
     those with `all_` are of all walls together.
+
+    With cameras, each photo's orientation is compared with the true one, and the displacement of
+    every cell that a photo painted is told exactly: its point on the found surface is projected
+    through the estimated camera, and the ray of that pixel through the true camera meets the true
+    scene at the place that the colour is of. The displacements of patches are then named `patch_`.
     """
 
     id: ClassVar[str] = "inspect.truth"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Gruen 1985, Adaptive least squares correlation (patch matching)",
@@ -60,6 +73,7 @@ class InspectTruth(Method):
         truth: Truth
         planes: Planes | None = None
         labels: PointLabels | None = None
+        cameras: Cameras | None = None
 
     class Out(Ports):
         """The verdict."""
@@ -67,30 +81,90 @@ class InspectTruth(Method):
         inspection: Inspection
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Compare wall by wall, then all together."""
+        """Compare the photos, then wall by wall, then all together."""
+        from orthoflow_plugins.inspect.poses import pose_findings
         from orthoflow_plugins.inspect.samples import pooled
         from orthoflow_plugins.inspect.scores import found_planes, label_findings, sample_findings
+        from orthoflow_plugins.inspect.sources import source_findings
 
         if not inputs.orthoimages.images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
+        views = _views(inputs, ctx.cores)
+        poses = _pose_errors(inputs, views)
+        verdicts: list[_Verdict] = []
         findings: list[Finding] = []
-        errors: list[WallErrors] = []
         for place, image in enumerate(inputs.orthoimages.images):
             ctx.progress(place / len(inputs.orthoimages.images), f"wall {image.name}")
-            wall = _wall_of(image, inputs.walls)
-            true = _true_orthoimage(image, inputs, params, ctx.cores)
-            findings += _plane_findings(image, inputs.truth)
-            errors.append(_wall_errors(image, wall, true))
-            findings += sample_findings(errors[-1].samples, image.wall)
-            _draw(image, errors[-1], ctx)
-        findings += sample_findings(pooled([item.samples for item in errors]), -1)
-        findings += _worst_planes(findings)
+            verdict = _judge(image, inputs, params, views, ctx.cores)
+            verdicts.append(verdict)
+            findings += _plane_findings(image, inputs.truth) + verdict.findings(image.wall)
+            _draw(image, verdict, ctx)
+        sources = [item.sources for item in verdicts if item.sources is not None]
+        findings += sample_findings(
+            pooled([item.errors.samples for item in verdicts]), -1, sources_are_traced=bool(sources)
+        )
+        findings += source_findings(sources, -1) + _worst_planes(findings)
+        if inputs.cameras is not None:
+            findings += pose_findings(poses)
         if inputs.planes is not None:
             findings += found_planes(inputs.planes, inputs.truth.planes)
         if inputs.labels is not None:
             findings += label_findings(inputs.labels, inputs.truth)
         _report(findings, inputs.orthoimages.images[0].wall, ctx)
-        return self.Out(inspection=_inspection(inputs.orthoimages, errors, findings))
+        return self.Out(inspection=_inspection(inputs.orthoimages, verdicts, poses, findings))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Verdict:
+    """All errors of one wall; `sources` is None where no photo painted."""
+
+    errors: WallErrors
+    sources: SourceErrors | None
+
+    def findings(self, wall: int) -> list[Finding]:
+        """The wall's numbers."""
+        from orthoflow_plugins.inspect.scores import sample_findings
+        from orthoflow_plugins.inspect.sources import source_findings
+
+        is_traced = self.sources is not None
+        numbers = sample_findings(self.errors.samples, wall, sources_are_traced=is_traced)
+        return numbers + ([] if self.sources is None else source_findings([self.sources], wall))
+
+
+def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
+    if inputs.cameras is None:
+        return None
+    from orthoflow.geometry.photo_views import SceneCameras
+
+    return SceneCameras(inputs.truth.scene, cores=cores)
+
+
+def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[PoseError, ...]:
+    if inputs.cameras is None or views is None:
+        return ()
+    from orthoflow_plugins.inspect.poses import pose_errors
+
+    return pose_errors(inputs.cameras, inputs.truth, views)
+
+
+def _judge(
+    image: Orthoimage,
+    inputs: InspectTruth.In,
+    params: InspectTruth.Params,
+    views: SceneCameras | None,
+    cores: int,
+) -> _Verdict:
+    from orthoflow_plugins.inspect.samples import wall_errors
+    from orthoflow_plugins.inspect.sources import trace_sources
+
+    wall = _wall_of(image, inputs.walls)
+    true = _true_orthoimage(image, inputs, params, cores)
+    sources = None
+    if inputs.cameras is not None and views is not None:
+        sources = trace_sources(image, wall, true, inputs.cameras, inputs.truth, views)
+    if sources is not None and not sources.traced.any():
+        sources = None
+    return _Verdict(errors=wall_errors(image, wall, true), sources=sources)
 
 
 def _wall_of(image: Orthoimage, walls: Walls) -> Wall:
@@ -136,12 +210,6 @@ def _detail_deg(truth: Truth, name: str, default: float) -> float:
     return float(value) if isinstance(value, int | float) else default
 
 
-def _wall_errors(image: Orthoimage, wall: Wall, true: TrueOrthoimage) -> WallErrors:
-    from orthoflow_plugins.inspect.samples import wall_errors
-
-    return wall_errors(image, wall, true)
-
-
 def _plane_findings(image: Orthoimage, truth: Truth) -> list[Finding]:
     from orthoflow_plugins.inspect.scores import (
         nearest_true_plane,
@@ -166,14 +234,17 @@ def _worst_planes(findings: list[Finding]) -> list[Finding]:
     return worst
 
 
-def _draw(image: Orthoimage, errors: WallErrors, ctx: StepContext) -> None:
+def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
     from orthoflow_plugins.inspect.maps import (
         COLOUR_SPAN_GREY,
         DEPTH_SPAN_MM,
+        DISPLACEMENT_SPAN_CELLS,
         colour_error_map,
         depth_error_map,
+        displacement_map,
     )
 
+    errors = verdict.errors
     ctx.figure(
         f"wall_{image.wall}_depth_error",
         depth_error_map(errors.depth_m),
@@ -185,6 +256,14 @@ def _draw(image: Orthoimage, errors: WallErrors, ctx: StepContext) -> None:
         colour_error_map(errors.grey),
         f"{image.name}: colour error, black 0 to yellow {COLOUR_SPAN_GREY:g} grey levels.",
     )
+    if verdict.sources is not None:
+        length_m = np.linalg.norm(verdict.sources.displacement_m, axis=2)
+        ctx.figure(
+            f"wall_{image.wall}_displacement",
+            displacement_map(length_m / image.frame.gsd_m),
+            f"{image.name}: true displacement of cells that photos painted, black 0 to yellow "
+            f"{DISPLACEMENT_SPAN_CELLS:g} cells of {1e3 * image.frame.gsd_m:g} mm.",
+        )
 
 
 def _report(findings: list[Finding], main: int, ctx: StepContext) -> None:
@@ -200,19 +279,37 @@ def _report(findings: list[Finding], main: int, ctx: StepContext) -> None:
 
 
 def _inspection(
-    orthoimages: Orthoimages, errors: list[WallErrors], findings: list[Finding]
+    orthoimages: Orthoimages,
+    verdicts: list[_Verdict],
+    poses: tuple[PoseError, ...],
+    findings: list[Finding],
 ) -> Inspection:
-    walls, points, shifts = [], [], []
-    for image, item in zip(orthoimages.images, errors, strict=True):
-        walls.append(np.full(len(item.patches.centre), image.wall, dtype=np.int32))
-        points.append(image.frame.world_from_wall(item.patches.centre))
-        shifts.append(item.samples.shift_m)
+    """Put together the displacements of all patches and of a few thousand painted cells."""
+    walls, points, shifts, kinds = [], [], [], []
+    for image, item in zip(orthoimages.images, verdicts, strict=True):
+        places, shift = item.errors.patches.centre, item.errors.samples.shift_m
+        kind = np.zeros(len(places), dtype=np.uint8)
+        if item.sources is not None:
+            cells = np.argwhere(np.isfinite(item.sources.displacement_m).all(axis=2))
+            cells = cells[:: max(1, len(cells) // _TRACED_POINTS)]
+            places = np.concatenate([places, cells[:, ::-1] + 0.5])
+            shift = np.concatenate([shift, item.sources.displacement_m[cells[:, 0], cells[:, 1]]])
+            kind = np.append(kind, np.ones(len(cells), dtype=np.uint8))
+        walls.append(np.full(len(places), image.wall, dtype=np.int32))
+        points.append(image.frame.world_from_wall(places))
+        shifts.append(shift)
+        kinds.append(kind)
+    details: dict[str, JsonValue] = {"patch_cells": 32}
+    if poses:
+        from orthoflow_plugins.inspect.poses import pose_details
+
+        details["poses"] = pose_details(poses)
     return Inspection(
         wall=np.concatenate(walls),
         points_world=np.concatenate(points),
         displacement_m=np.concatenate(shifts),
-        kind=np.zeros(sum(len(item) for item in walls), dtype=np.uint8),
-        kinds=("patch",),
+        kind=np.concatenate(kinds).astype(np.uint8),
+        kinds=("patch", "painted cell"),
         findings=tuple(findings),
-        details={"patch_cells": 32},
+        details=details,
     )

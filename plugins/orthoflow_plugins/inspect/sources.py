@@ -1,0 +1,179 @@
+"""The true error of painted cells: where the photo's pixel that coloured them really looks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.photo_views import SceneCameras
+from orthoflow.geometry.scene_views import TrueOrthoimage
+from orthoflow.geometry.scenes import SurfaceRole
+from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Truth, Wall
+from orthoflow_plugins.inspect.poses import true_camera
+from orthoflow_plugins.inspect.samples import depth_step_band
+
+# A cell coloured from farther away shows another place.
+FAR_CELLS: Final = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceErrors:
+    """Where the colours of a wall's painted cells come from.
+
+    Attributes:
+        frame: where the cells lie.
+        displacement_m: (rows, cols, 2) along u and v, cell - place that its colour is of; NaN
+            where no oriented photo painted or its pixel looks at nothing.
+        traced: (rows, cols) bool, cells that an oriented photo painted.
+        steps: (rows, cols) bool, within 2 cells of a true depth step.
+        ghosts: (rows, cols) bool, the pixel looks at a free-standing object.
+        n_seen_by_both: cells whose true surface a station and a photo see.
+        n_seen_painted: those of them that are painted.
+    """
+
+    frame: WallFrame
+    displacement_m: NDArray[np.float64]
+    traced: NDArray[np.bool_]
+    steps: NDArray[np.bool_]
+    ghosts: NDArray[np.bool_]
+    n_seen_by_both: int
+    n_seen_painted: int
+
+
+def trace_sources(
+    image: Orthoimage,
+    wall: Wall,
+    true: TrueOrthoimage,
+    cameras: Cameras,
+    truth: Truth,
+    views: SceneCameras,
+) -> SourceErrors:
+    """Trace every cell that a photo painted back to what its pixel really shows.
+
+    The cell's point on the found surface is projected through the estimated camera, as painting
+    did; the pixel's ray through the true camera meets the true scene somewhere, and that place in
+    the wall is compared with the cell's own.
+
+    Raises:
+        MethodError: a photo is none of the simulated ones.
+    """
+    known = {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
+    displacement = np.full((*image.frame.shape, 2), np.nan)
+    traced = np.zeros(image.frame.shape, dtype=np.bool_)
+    ghosts = np.zeros(image.frame.shape, dtype=np.bool_)
+    painted = (image.mask == OrthoMask.PAINTED) & np.isfinite(wall.depth_m)
+    for source, name in enumerate(image.sources):
+        if name not in known:
+            continue
+        rows, columns = np.nonzero(painted & (image.source == source))
+        places = np.column_stack([columns + 0.5, rows + 0.5])
+        near = _near_frame(image.frame, truth)
+        points = near.world_from_wall(places, wall.depth_m[rows, columns].astype(np.float64))
+        estimated = known[name].viewing().shifted(truth.scene.origin)
+        pixels = estimated.project(points)[:, :2]
+        seen = views.trace(true_camera(truth, name), pixels)
+        found = near.wall_from_world(seen.points)[:, :2]
+        displacement[rows, columns] = image.frame.gsd_m * (places - found)
+        traced[rows, columns] = True
+        hit = seen.rectangle >= 0
+        ghosts[rows, columns] = hit & (truth.scene.role[seen.rectangle] == SurfaceRole.OBJECT)
+    both = true.seen & _seen_by_photos(true, truth, views)
+    return SourceErrors(
+        frame=image.frame,
+        displacement_m=displacement,
+        traced=traced,
+        steps=depth_step_band(true.depth_m),
+        ghosts=ghosts,
+        n_seen_by_both=int(np.count_nonzero(both)),
+        n_seen_painted=int(np.count_nonzero(both & (image.mask == OrthoMask.PAINTED))),
+    )
+
+
+def source_findings(errors: Sequence[SourceErrors], wall: int) -> list[Finding]:
+    """Sum up one wall, or several together (wall -1); nothing when no photo painted anything.
+
+    Displacements are of all painted cells that show no free-standing object; those within 2 cells
+    of true depth steps are apart.
+    """
+    errors = [item for item in errors if item.traced.any()]
+    if not errors:
+        return []
+    n_traced = sum(int(np.count_nonzero(item.traced)) for item in errors)
+    away = 1e3 * np.concatenate([_of(item, item.traced & ~item.steps) for item in errors])
+    steps = 1e3 * np.concatenate([_of(item, item.traced & item.steps) for item in errors])
+    numbers = [("n_traced", float(n_traced), "1")]
+    for axis, name in enumerate(("u", "v")):
+        if len(away):
+            middle = float(np.median(away[:, axis]))
+            spread = 1.4826 * float(np.median(np.abs(away[:, axis] - middle)))
+            numbers += [
+                (f"rmse_{name}_mm", _rms(away[:, axis]), "mm"),
+                (f"mean_{name}_mm", float(away[:, axis].mean()), "mm"),
+                (f"nmad_{name}_mm", spread, "mm"),
+                (f"p99_{name}_mm", float(np.percentile(np.abs(away[:, axis]), 99)), "mm"),
+            ]
+        if len(steps):
+            numbers.append((f"step_rmse_{name}_mm", _rms(steps[:, axis]), "mm"))
+    n_far = sum(int(np.count_nonzero(_is_far(item))) for item in errors)
+    n_ghosts = sum(int(np.count_nonzero(item.ghosts)) for item in errors)
+    numbers += [
+        ("far_source_share", n_far / n_traced, "1"),
+        ("ghost_share", n_ghosts / n_traced, "1"),
+        ("n_ghost_cells", float(n_ghosts), "1"),
+    ]
+    n_both = sum(item.n_seen_by_both for item in errors)
+    if n_both:
+        n_painted = sum(item.n_seen_painted for item in errors)
+        numbers.append(("completeness_seen_by_both", n_painted / n_both, "1"))
+    return [Finding(name=name, value=value, unit=unit, wall=wall) for name, value, unit in numbers]
+
+
+def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:
+    """The frame seen from the scene's origin: survey coordinates would cost digits."""
+    return WallFrame(
+        origin_world=frame.origin_world - truth.scene.origin,
+        u_world=frame.u_world,
+        v_world=frame.v_world,
+        normal_world=frame.normal_world,
+        gsd_m=frame.gsd_m,
+        width=frame.width,
+        height=frame.height,
+    )
+
+
+def _seen_by_photos(true: TrueOrthoimage, truth: Truth, views: SceneCameras) -> NDArray[np.bool_]:
+    """Cells whose true surface some photo sees, whether it was oriented or not."""
+    rows, columns = np.nonzero(true.seen)
+    places = np.column_stack([columns + 0.5, rows + 0.5])
+    depths = true.depth_m[rows, columns].astype(np.float64)
+    points = _near_frame(true.frame, truth).world_from_wall(places, depths)
+    seen = np.zeros(len(points), dtype=np.bool_)
+    for camera in () if truth.cameras is None else truth.cameras.cameras:
+        left = np.flatnonzero(~seen)
+        seen[left] = views.sees(camera.viewing(), points[left])
+    mask = np.zeros(true.frame.shape, dtype=np.bool_)
+    mask[rows, columns] = seen
+    return mask
+
+
+def _of(errors: SourceErrors, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Displacements (n, 2) of the chosen cells, without ghosts and pixels that show nothing."""
+    values = errors.displacement_m[chosen & ~errors.ghosts]
+    known: NDArray[np.float64] = values[np.isfinite(values).all(axis=1)]
+    return known
+
+
+def _is_far(errors: SourceErrors) -> NDArray[np.bool_]:
+    """Cells whose colour is of a place more than 3 cells away, or of nothing."""
+    length = np.linalg.norm(errors.displacement_m, axis=2)
+    far: NDArray[np.bool_] = errors.traced & ~(length <= FAR_CELLS * errors.frame.gsd_m)
+    return far
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
