@@ -20,7 +20,9 @@ from orthoflow.geometry.scene_kernels import (
 )
 from orthoflow.geometry.texture_kernels import cell_state, uniform
 
-TILE: Final = 16
+# Pixels per side of a tile, and how many tiles' pixels in a row make a block.
+TILE: Final = 8
+BLOCK: Final = 64
 _NEWTON_STEPS: Final = 20
 
 
@@ -38,22 +40,52 @@ class Exposure(NamedTuple):
     seed: int
 
 
-class Tile(NamedTuple):
-    """A square of pixels at work.
-
-    Attributes:
-        first_row: of the photo; first_column likewise.
-        first_column: see first_row.
-        directions: (TILE + 1, TILE + 1, 3) of the pixels' corners.
-        found: (r,) int64, the first entries are the rectangles that the tile may show, ascending.
-        near: (r,) float64, how near they come.
-    """
+class Area(NamedTuple):
+    """A rectangle of pixels: first row and column, and how many."""
 
     first_row: int
     first_column: int
-    directions: NDArray[np.float64]
-    found: NDArray[np.int64]
+    n_rows: int
+    n_columns: int
+
+
+class Candidates(NamedTuple):
+    """Rectangles that some area may show.
+
+    Attributes:
+        rectangle: (r,) int64, the first `number` entries ascend.
+        near: (r,) float64 how near they come.
+        number: (1,) int64 how many there are.
+    """
+
+    rectangle: NDArray[np.int64]
     near: NDArray[np.float64]
+    number: NDArray[np.int64]
+
+
+class Workspace(NamedTuple):
+    """What one thread needs for rows of tiles.
+
+    Attributes:
+        everything: all rectangles of the scene.
+        in_block: room for those of a block of tiles.
+        in_tile: room for those of a tile.
+        directions: (TILE + 1, TILE + 1, 3) room for the corners of its pixels.
+    """
+
+    everything: Candidates
+    in_block: Candidates
+    in_tile: Candidates
+    directions: NDArray[np.float64]
+
+
+def workspace(n_rectangles: int) -> Workspace:
+    """Make room for working on a scene of so many rectangles."""
+    everything, in_block, in_tile = (
+        Candidates(np.arange(n_rectangles), np.empty(n_rectangles), np.full(1, n_rectangles))
+        for _ in range(3)
+    )
+    return Workspace(everything, in_block, in_tile, np.empty((TILE + 1, TILE + 1, 3)))
 
 
 @njit("UniTuple(f8, 3)(f8[::1], f8, f8)", cache=True)
@@ -122,25 +154,28 @@ def hit_pixels(
 
 
 @njit(cache=True)
-def _fill_directions(camera: NDArray[np.float64], tile: Tile) -> None:
-    for row in range(TILE + 1):
-        for column in range(TILE + 1):
+def _fill_directions(
+    camera: NDArray[np.float64], area: Area, directions: NDArray[np.float64]
+) -> None:
+    """Fill the directions (rows + 1, columns + 1, 3) of the corners of an area's pixels."""
+    for row in range(area.n_rows + 1):
+        for column in range(area.n_columns + 1):
             x, y, z = pixel_direction(
-                camera, float(tile.first_column + column), float(tile.first_row + row)
+                camera, float(area.first_column + column), float(area.first_row + row)
             )
-            tile.directions[row, column, 0] = x
-            tile.directions[row, column, 1] = y
-            tile.directions[row, column, 2] = z
+            directions[row, column, 0] = x
+            directions[row, column, 1] = y
+            directions[row, column, 2] = z
 
 
 @njit(cache=True)
 def _look_through_corners(
     table: CastTable, index: Index, start: Ray, ends: NDArray[np.float64]
 ) -> tuple[bool, bool, float, float]:
-    """Whether a tile may show a rectangle, whether that fills it, and from and to what distance.
+    """Whether an area may show a rectangle, whether that fills it, and from and to what distance.
 
     The rays (4, 3) through the corners meet the rectangle's plane in a quadrangle that contains
-    what the tile sees of the plane.
+    what the area sees of the plane.
     """
     r, h = table.rectangles, table.holes
     x, y, z = r[index, 0] - start.x, r[index, 1] - start.y, r[index, 2] - start.z
@@ -203,93 +238,119 @@ def _is_outside(table: CastTable, index: Index, start: Ray, sides: NDArray[np.fl
 
 
 @njit(cache=True)
-def _find_rectangles(table: CastTable, camera: NDArray[np.float64], tile: Tile) -> int:
-    """Fill the rectangles that a tile may show; give their number.
+def _find_candidates(
+    table: CastTable,
+    camera: NDArray[np.float64],
+    area: Area,
+    given: Candidates,
+    found: Candidates,
+) -> None:
+    """Choose from the given rectangles those that an area may show.
 
-    Half a pixel is added to the tile, since distortion bends its sides by a hundredth. What lies
-    behind a rectangle that fills the tile is left out.
+    Half a pixel is added to the area, since distortion bends its sides by a tenth. What lies
+    behind a rectangle that fills the area is left out.
     """
     x, y, z = _centre(camera)
     start = Ray(x, y, z, 0.0, 0.0, 0.0)
     ends = np.empty((4, 3))
     for corner in range(4):
-        u = tile.first_column + (TILE + 0.5 if corner in (1, 2) else -0.5)
-        v = tile.first_row + (TILE + 0.5 if corner in (2, 3) else -0.5)
+        u = area.first_column + (area.n_columns + 0.5 if corner in (1, 2) else -0.5)
+        v = area.first_row + (area.n_rows + 0.5 if corner in (2, 3) else -0.5)
         ends[corner, 0], ends[corner, 1], ends[corner, 2] = pixel_direction(camera, u, v)
     sides = _sides(ends)
     count, background = 0, np.inf
-    for index in range(table.rectangles.shape[0]):
+    for candidate in range(given.number[0]):
+        index = given.rectangle[candidate]
         may_show, fills, near, far = _look_through_corners(table, index, start, ends)
         if may_show and not (near == 0.0 and _is_outside(table, index, start, sides)):
-            tile.found[count], tile.near[count] = index, near
+            found.rectangle[count], found.near[count] = index, near
             count += 1
         if fills:
             background = min(background, far)
     kept = 0
     for candidate in range(count):
-        if tile.near[candidate] <= background:
-            tile.found[kept] = tile.found[candidate]
+        if found.near[candidate] <= background:
+            found.rectangle[kept], found.near[kept] = (
+                found.rectangle[candidate],
+                found.near[candidate],
+            )
             kept += 1
-    return kept
+    found.number[0] = kept
+
+
+@njit(cache=True)
+def _nearest_candidate(table: CastTable, found: Candidates, ray: Ray) -> tuple[float, Index]:
+    distance, met = np.inf, NOTHING
+    for candidate in range(found.number[0]):
+        index = found.rectangle[candidate]
+        hit = hit_distance(table, index, ray, 1e-9)
+        if 0.0 <= hit < distance:
+            distance, met = hit, index
+    return distance, met
 
 
 @njit(cache=True)
 def _expose_pixel(
-    table: CastTable, exposure: Exposure, tile: Tile, count: int, place: tuple[int, int]
+    table: CastTable,
+    exposure: Exposure,
+    found: Candidates,
+    corners: NDArray[np.float64],
+    state: np.uint64,
 ) -> tuple[float, float, float]:
     """Mean colour of the rays of a pixel; rays between those of its corners are interpolated.
 
     The lens bends them by less than 1e-5 of a pixel from that.
     """
-    row, column = place
     x, y, z = _centre(exposure.camera)
-    state = cell_state(tile.first_column + column, tile.first_row + row, exposure.seed)
-    p, q = tile.directions[row], tile.directions[row + 1]
-    e, f = column, column + 1
+    p = corners
     red, green, blue = 0.0, 0.0, 0.0
-    n_rays = exposure.n_sub * exposure.n_sub
-    for sub in range(n_rays):
-        s = (sub % exposure.n_sub + uniform(state, 2 * sub)) / exposure.n_sub
-        t = (sub // exposure.n_sub + uniform(state, 2 * sub + 1)) / exposure.n_sub
+    n_sub = exposure.n_sub
+    for sub in range(n_sub * n_sub):
+        s = (sub % n_sub + uniform(state, 2 * sub)) / n_sub
+        t = (sub // n_sub + uniform(state, 2 * sub + 1)) / n_sub
         a, b, c, d = (1.0 - s) * (1.0 - t), s * (1.0 - t), (1.0 - s) * t, s * t
         ray = Ray(
             x,
             y,
             z,
-            a * p[e, 0] + b * p[f, 0] + c * q[e, 0] + d * q[f, 0],
-            a * p[e, 1] + b * p[f, 1] + c * q[e, 1] + d * q[f, 1],
-            a * p[e, 2] + b * p[f, 2] + c * q[e, 2] + d * q[f, 2],
+            a * p[0, 0, 0] + b * p[0, 1, 0] + c * p[1, 0, 0] + d * p[1, 1, 0],
+            a * p[0, 0, 1] + b * p[0, 1, 1] + c * p[1, 0, 1] + d * p[1, 1, 1],
+            a * p[0, 0, 2] + b * p[0, 1, 2] + c * p[1, 0, 2] + d * p[1, 1, 2],
         )
-        distance, met = np.inf, NOTHING
-        for candidate in range(count):
-            index = tile.found[candidate]
-            hit = hit_distance(table, index, ray, 1e-9)
-            if 0.0 <= hit < distance:
-                distance, met = hit, index
+        distance, met = _nearest_candidate(table, found, ray)
         if met >= 0:
             shade = shade_of_hit(table, met, ray, distance)
             red += shade[0]
             green += shade[1]
             blue += shade[2]
+    n_rays = n_sub * n_sub
     return red / n_rays, green / n_rays, blue / n_rays
 
 
 @njit(cache=True, nogil=True)
 def expose_rows(
-    table: CastTable, exposure: Exposure, image: NDArray[np.float32], first_row: int
+    table: CastTable,
+    exposure: Exposure,
+    image: NDArray[np.float32],
+    first_row: int,
+    work: Workspace,
 ) -> None:
-    """Fill TILE rows of a photo (rows, columns, 3), grey 0..255; black where nothing is."""
-    n_rows, n_columns = image.shape[0], image.shape[1]
-    directions = np.empty((TILE + 1, TILE + 1, 3))
-    found = np.empty(table.rectangles.shape[0], dtype=np.int64)
-    near = np.empty(table.rectangles.shape[0])
+    """Fill TILE rows of a photo (rows, columns, 3), grey 0..255; black where nothing is.
+
+    Candidates are found for a block of tiles, then for each tile among those.
+    """
+    n_rows, n_columns = min(TILE, image.shape[0] - first_row), image.shape[1]
     for first_column in range(0, n_columns, TILE):
-        tile = Tile(first_row, first_column, directions, found, near)
-        _fill_directions(exposure.camera, tile)
-        count = _find_rectangles(table, exposure.camera, tile)
-        for row in range(min(TILE, n_rows - first_row)):
+        if first_column % BLOCK == 0:
+            block = Area(first_row, first_column, TILE, BLOCK)
+            _find_candidates(table, exposure.camera, block, work.everything, work.in_block)
+        tile = Area(first_row, first_column, TILE, TILE)
+        _find_candidates(table, exposure.camera, tile, work.in_block, work.in_tile)
+        _fill_directions(exposure.camera, tile, work.directions)
+        for row in range(n_rows):
             for column in range(min(TILE, n_columns - first_column)):
-                red, green, blue = _expose_pixel(table, exposure, tile, count, (row, column))
-                image[first_row + row, first_column + column, 0] = red
-                image[first_row + row, first_column + column, 1] = green
-                image[first_row + row, first_column + column, 2] = blue
+                state = cell_state(first_column + column, first_row + row, exposure.seed)
+                corners = work.directions[row : row + 2, column : column + 2]
+                shade = _expose_pixel(table, exposure, work.in_tile, corners, state)
+                for channel in range(3):
+                    image[first_row + row, first_column + column, channel] = shade[channel]

@@ -12,13 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.photo_kernels import TILE, Exposure, expose_rows, hit_pixels
+from orthoflow.geometry.photo_kernels import (
+    TILE,
+    Exposure,
+    expose_rows,
+    hit_pixels,
+    workspace,
+)
 from orthoflow.geometry.scene_kernels import CastTable, cast_rays
 from orthoflow.geometry.scene_trees import cast_table
-from orthoflow.geometry.scene_views import in_threads
+from orthoflow.geometry.scene_views import Hits, in_threads
 from orthoflow.geometry.scenes import Scene
 
-_PIXELS_PER_TASK: Final = 1 << 15
+_RAYS_PER_TASK: Final = 1 << 15
 # A point is seen when nothing is hit more than this share of its distance before it.
 _SEEN_WITHIN: Final = 2e-4
 
@@ -58,12 +64,12 @@ class SceneCameras:
         """
         image = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
         exposure = Exposure(self._flat(camera), supersample, seed)
-        in_threads(
-            lambda first, _: expose_rows(self._table, exposure, image, first),
-            camera.height,
-            TILE,
-            cores=self._cores,
-        )
+        n_rectangles = len(self._table.kinds)
+
+        def expose_part(first: int, _: int) -> None:
+            expose_rows(self._table, exposure, image, first, workspace(n_rectangles))
+
+        in_threads(expose_part, camera.height, TILE, cores=self._cores)
         return image
 
     def trace(self, camera: ViewingCamera, pixels_photo: NDArray[np.float64]) -> SeenPoints:
@@ -77,7 +83,7 @@ class SceneCameras:
             part = slice(first, last)
             hit_pixels(self._table, flat, pixels[part], points[part], rectangle[part])
 
-        in_threads(trace_part, len(pixels), _PIXELS_PER_TASK, cores=self._cores)
+        in_threads(trace_part, len(pixels), _RAYS_PER_TASK, cores=self._cores)
         return SeenPoints(points=points, rectangle=rectangle)
 
     def sees(self, camera: ViewingCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -89,19 +95,29 @@ class SceneCameras:
         inside = shifted.sees(shifted.project(np.nan_to_num(points, nan=np.inf))[:, :2])
         chosen = np.flatnonzero(inside & np.isfinite(points).all(axis=1))
         centre = shifted.centre_world
-        ways = points[chosen] - centre
-        starts = np.broadcast_to(centre, ways.shape).copy()
-        t = np.full(len(chosen), np.inf)
-        rectangle = np.full(len(chosen), -1, dtype=np.int32)
+        seen = np.zeros(len(points), dtype=np.bool_)
+        seen[chosen[self.cast(centre, points[chosen] - centre).t > 1.0 - _SEEN_WITHIN]] = True
+        return seen
+
+    def cast(self, starts: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
+        """Find what rays meet first.
+
+        Args:
+            starts: (n, 3) or (3,) metres from the scene's origin.
+            directions: (n, 3) of any length, the unit of the hits' distances.
+        """
+        n_rays = len(directions)
+        starts = np.ascontiguousarray(np.broadcast_to(starts, (n_rays, 3)), dtype=np.float64)
+        ways = np.ascontiguousarray(directions, dtype=np.float64)
+        t = np.full(n_rays, np.inf)
+        rectangle = np.full(n_rays, -1, dtype=np.int32)
 
         def cast_part(first: int, last: int) -> None:
             part = slice(first, last)
             cast_rays(self._table, starts[part], ways[part], t[part], rectangle[part])
 
-        in_threads(cast_part, len(chosen), _PIXELS_PER_TASK, cores=self._cores)
-        seen = np.zeros(len(points), dtype=np.bool_)
-        seen[chosen[t > 1.0 - _SEEN_WITHIN]] = True
-        return seen
+        in_threads(cast_part, n_rays, _RAYS_PER_TASK, cores=self._cores)
+        return Hits(t=t, rectangle=rectangle)
 
     def _flat(self, camera: ViewingCamera) -> NDArray[np.float64]:
         return camera.shifted(self._origin).flat

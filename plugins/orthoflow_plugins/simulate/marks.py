@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.scene_views import cast
+from orthoflow.geometry.photo_views import SceneCameras
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import CheckPoints
 
@@ -19,6 +19,8 @@ VERTICAL_EDGE: Final = "vertical edge"
 _LATTICE: Final = 0.9
 _CLEAR_M: Final = 0.04
 _MOST_OF_A_CLASS: Final = 24
+# Number of its plane in `scene.plane_index`: it is built first.
+_MAIN_WALL: Final = 0
 _INSIDE_M: Final = 0.004
 _LIFT_M: Final = 0.01
 
@@ -47,26 +49,26 @@ class _Spots:
 
 def check_points(
     scene: Scene,
-    plane: int,
+    views: SceneCameras,
     stations: NDArray[np.float64],
     world_from_room: NDArray[np.float64],
     shift_world_m: NDArray[np.float64],
 ) -> CheckPoints:
-    """Choose up to 24 check points of each class on a wall.
+    """Choose up to 24 check points of each class on the main wall.
 
     `flat` ones are crossings of the painted lines of a fresco, with 4 cm of bare wall around;
     `vertical edge` ones are front corners of mouldings. A station sees each of them.
 
     Args:
         scene: the room, in its own frame.
-        plane: number of the wall's plane in `scene.plane_index`.
+        views: the same, laid out for looking at it.
         stations: (s, 3) metres, room frame.
         world_from_room: (3, 3) rotation.
         shift_world_m: (3,) world position of the room's origin.
     """
     chosen = {
-        FLAT: _spread(_crossings(scene, plane, stations)),
-        VERTICAL_EDGE: _spread(_corners(scene, plane, stations)),
+        FLAT: _spread(_crossings(scene, views, stations)),
+        VERTICAL_EDGE: _spread(_corners(scene, views, stations)),
     }
     points = np.concatenate(list(chosen.values())) @ world_from_room.T + shift_world_m
     names = [
@@ -81,13 +83,15 @@ def check_points(
     )
 
 
-def _crossings(scene: Scene, plane: int, stations: NDArray[np.float64]) -> NDArray[np.float64]:
-    frescos = (scene.plane_index == plane) & (scene.texture == TextureKind.FRESCO)
+def _crossings(
+    scene: Scene, views: SceneCameras, stations: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    frescos = (scene.plane_index == _MAIN_WALL) & (scene.texture == TextureKind.FRESCO)
     spots = _joined([_lattice(scene, int(index)) for index in np.flatnonzero(frescos)])
     clear = np.ones(len(spots.rectangle), dtype=np.bool_)
     for right in (-_CLEAR_M, 0.0, _CLEAR_M):
         for up in (-_CLEAR_M, 0.0, _CLEAR_M):
-            clear &= _are_seen(scene, spots.moved(np.array([right, up])), stations)
+            clear &= _are_seen(scene, views, spots.moved(np.array([right, up])), stations)
     return spots.points(scene)[clear]
 
 
@@ -100,9 +104,11 @@ def _lattice(scene: Scene, index: int) -> _Spots:
     return _Spots(rectangle=np.full(len(places), index), in_rectangle=places)
 
 
-def _corners(scene: Scene, plane: int, stations: NDArray[np.float64]) -> NDArray[np.float64]:
+def _corners(
+    scene: Scene, views: SceneCameras, stations: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Front corners of mouldings parallel to the plane."""
-    walls = np.flatnonzero((scene.plane_index == plane) & (scene.role == SurfaceRole.WALL))
+    walls = np.flatnonzero((scene.plane_index == _MAIN_WALL) & (scene.role == SurfaceRole.WALL))
     normal, foot = scene.normal[walls[0]], scene.centre[walls[0]]
     heights = (scene.centre - foot) @ normal
     fronts = np.flatnonzero(
@@ -115,10 +121,10 @@ def _corners(scene: Scene, plane: int, stations: NDArray[np.float64]) -> NDArray
         rectangle=np.repeat(fronts, 4),
         in_rectangle=scene.extent[fronts][:, [[0, 2], [0, 3], [1, 2], [1, 3]]].reshape(-1, 2),
     )
-    seen = _are_seen(scene, spots.moved(_INSIDE_M * inwards), stations)
+    seen = _are_seen(scene, views, spots.moved(_INSIDE_M * inwards), stations)
     # Where bars meet, their common corner lies in the middle of a face and shows no edge.
     beside = spots.moved(_INSIDE_M * inwards * np.array([-1.0, 1.0]))
-    return spots.points(scene)[seen & ~_are_level(scene, beside)]
+    return spots.points(scene)[seen & ~_are_level(scene, views, beside)]
 
 
 def _joined(parts: Sequence[_Spots]) -> _Spots:
@@ -128,21 +134,23 @@ def _joined(parts: Sequence[_Spots]) -> _Spots:
     )
 
 
-def _are_seen(scene: Scene, spots: _Spots, stations: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _are_seen(
+    scene: Scene, views: SceneCameras, spots: _Spots, stations: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Which places (n,) any station sees."""
     points = spots.points(scene)
     seen = np.zeros(len(points), dtype=np.bool_)
     for station in stations:
-        hits = cast(scene, station, points - station)
+        hits = views.cast(station, points - station)
         seen |= (hits.rectangle == spots.rectangle) & (np.abs(hits.t - 1.0) < 1e-6)
     return seen
 
 
-def _are_level(scene: Scene, spots: _Spots) -> NDArray[np.bool_]:
+def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.bool_]:
     """Which places (n,) have a surface at their own height, whatever rectangle it belongs to."""
     points, normals = spots.points(scene), scene.normal[spots.rectangle]
     inwards = np.where(np.einsum("ij,ij->i", normals, points) > 0.0, -1.0, 1.0)[:, None] * normals
-    hits = cast(scene, points + _LIFT_M * inwards, -inwards)
+    hits = views.cast(points + _LIFT_M * inwards, -inwards)
     level: NDArray[np.bool_] = np.abs(hits.t - _LIFT_M) < 1e-4
     return level
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from orthoflow.files.images import encode_jpeg
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.photo_views import SceneCameras
-from orthoflow.geometry.scenes import Scene
 from orthoflow.products import Calibration, Camera, Cameras, Intrinsics, JsonValue, Photo, Photos
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.viewpoints import Shot
@@ -37,7 +36,7 @@ class Film:
 
 
 def take_photos(
-    scene: Scene,
+    views: SceneCameras,
     shots: tuple[Shot, ...],
     film: Film,
     ctx: StepContext,
@@ -46,13 +45,12 @@ def take_photos(
     """Take all photos of a room in its own frame; what is known of the camera is not in them."""
     if not shots:
         return Photos(photos=())
-    cameras = SceneCameras(scene, cores=ctx.cores)
     exif_focal = shots[0].camera.fx * (1.0 + rng.uniform(-_EXIF_ERROR, _EXIF_ERROR))
     photos = []
     for place, shot in enumerate(shots):
         ctx.progress(place / len(shots), f"photo {place + 1} of {len(shots)}")
         seed = int(rng.integers(0, 2**62))
-        image = cameras.expose(shot.camera, supersample=film.supersample, seed=seed)
+        image = views.expose(shot.camera, supersample=film.supersample, seed=seed)
         photos.append(
             Photo(
                 name=shot.name,

@@ -22,7 +22,9 @@ from orthoflow_plugins.simulate.palace import (
 )
 
 if TYPE_CHECKING:
+    from orthoflow.geometry.photo_views import SceneCameras
     from orthoflow_plugins.simulate.deliverables import Delivery
+    from orthoflow_plugins.simulate.photographs import Film
     from orthoflow_plugins.simulate.scan_kernels import Errors
     from orthoflow_plugins.simulate.scanner import Scan
     from orthoflow_plugins.simulate.viewpoints import Shot
@@ -158,8 +160,13 @@ class SimulateRoom(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Build the room, scan and photograph it, and write down the truth."""
         del inputs
+        from orthoflow.geometry.photo_views import SceneCameras
         from orthoflow_plugins.simulate.deliverables import Delivery, cloud_of, truth_of
-        from orthoflow_plugins.simulate.photographs import calibration_of
+        from orthoflow_plugins.simulate.photographs import (
+            calibrated,
+            calibration_of,
+            take_photos,
+        )
         from orthoflow_plugins.simulate.reporting import report_photos, report_room
         from orthoflow_plugins.simulate.viewpoints import ShotPlan, planned_shots
 
@@ -187,7 +194,8 @@ class SimulateRoom(Method):
             photo_rng,
         )
         calibration = calibration_of(shots, is_known=params.calibrated)
-        photos = _photos(room, shots, calibration, params, photo_rng, ctx)
+        views = SceneCameras(room.scene, cores=ctx.cores)
+        photos = take_photos(views, shots, _film(params), ctx, photo_rng)
         cloud = cloud_of(delivery)
         truth = _with_cameras(
             truth_of(delivery, cloud, params.model_dump(mode="json")), delivery, shots
@@ -196,9 +204,9 @@ class SimulateRoom(Method):
         report_photos(truth, photos, ctx)
         return self.Out(
             cloud=cloud,
-            photos=photos,
+            photos=calibrated(photos, calibration),
             calibration=calibration,
-            checkpoints=_check_points(delivery),
+            checkpoints=_check_points(delivery, views),
             truth=truth,
         )
 
@@ -219,22 +227,14 @@ def _scan(
     return scan_scene(room.scene, sweeps, _errors(params), ctx)
 
 
-def _photos(
-    room: Room,
-    shots: tuple[Shot, ...],
-    calibration: Calibration,
-    params: SimulateRoom.Params,
-    rng: np.random.Generator,
-    ctx: StepContext,
-) -> Photos:
-    from orthoflow_plugins.simulate.photographs import Film, calibrated, take_photos
+def _film(params: SimulateRoom.Params) -> Film:
+    from orthoflow_plugins.simulate.photographs import Film
 
-    film = Film(
+    return Film(
         noise_grey=params.photo_noise_grey,
         vignetting=params.photo_vignetting,
         supersample=params.photo_supersample,
     )
-    return calibrated(take_photos(room.scene, shots, film, ctx, rng), calibration)
 
 
 def _with_cameras(truth: Truth, delivery: Delivery, shots: tuple[Shot, ...]) -> Truth:
@@ -249,12 +249,12 @@ def _with_cameras(truth: Truth, delivery: Delivery, shots: tuple[Shot, ...]) -> 
     )
 
 
-def _check_points(delivery: Delivery) -> CheckPoints:
+def _check_points(delivery: Delivery, views: SceneCameras) -> CheckPoints:
     from orthoflow_plugins.simulate.marks import check_points
 
     return check_points(
         delivery.room.scene,
-        0,
+        views,
         np.unique(delivery.scan.stations, axis=0),
         delivery.world_from_room,
         delivery.shift_world_m,
