@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.photo_views import SceneCameras
+from orthoflow.geometry.photo_views import SceneCameras, SeenPoints
 from orthoflow.geometry.scenes import Scene
-from orthoflow.products import Camera, Cameras, Finding, JsonValue, Truth
+from orthoflow.products import Camera, Cameras, Finding, JsonValue, Truth, Walls
 
 _GRID: Final = (24, 18)
-# Surfaces seen at a flatter angle than 78 deg are left out: any error on them is large.
-_LEAST_COSINE: Final = 0.2
+# Surfaces that face another way than the wall, such as the sides of mouldings, are left out.
+_LEAST_COSINE: Final = 0.9
 # An orientation called `ok` that is off by more of its stated deviations is wrong.
 _WRONG_SIGMAS: Final = 5.0
 
@@ -32,8 +32,8 @@ class PoseError:
         status: `ok`, or why it has no orientation; then the rest is None.
         centre_m: distance of the projection centres.
         rotation_deg: angle between the orientations.
-        wall_m: error of one coordinate on the room's walls, RMS over what the photo shows of them;
-            None when the estimated camera does not even look there.
+        wall_m: error of one coordinate on the walls, RMS over what the photo shows of them; None
+            when it shows none of them, infinite when the estimated camera does not look there.
         sigma_wall_m: what the estimate states for that, or None.
     """
 
@@ -47,11 +47,10 @@ class PoseError:
     @property
     def is_wrong(self) -> bool:
         """Whether it is called `ok`, but off by more than 5 stated standard deviations."""
-        if self.status != "ok":
+        if self.status != "ok" or self.wall_m is None:
             return False
-        if self.wall_m is None:
-            return True
-        return self.sigma_wall_m is not None and self.wall_m > _WRONG_SIGMAS * self.sigma_wall_m
+        stated = math.inf if self.sigma_wall_m is None else self.sigma_wall_m
+        return math.isinf(self.wall_m) or self.wall_m > _WRONG_SIGMAS * stated
 
 
 def true_camera(truth: Truth, photo: str) -> ViewingCamera:
@@ -70,14 +69,18 @@ def true_camera(truth: Truth, photo: str) -> ViewingCamera:
     )
 
 
-def pose_errors(cameras: Cameras, truth: Truth, views: SceneCameras) -> tuple[PoseError, ...]:
-    """Compare each photo's orientation with the truth.
+def pose_errors(
+    cameras: Cameras, walls: Walls, truth: Truth, views: SceneCameras
+) -> tuple[PoseError, ...]:
+    """Compare each photo's orientation with the truth, on the walls and within their buffer.
 
     Raises:
         MethodError: a photo is none of the simulated ones.
     """
     return tuple(
-        _pose_error(camera, true_camera(truth, camera.photo), truth.scene, views)
+        PoseError(photo=camera.photo, status=camera.status)
+        if camera.status != "ok"
+        else _pose_error(camera, true_camera(truth, camera.photo), walls, truth.scene, views)
         for camera in cameras.cameras
     )
 
@@ -87,10 +90,11 @@ def pose_findings(errors: Sequence[PoseError]) -> list[Finding]:
     good = [error for error in errors if error.status == "ok"]
     centres = [1e3 * error.centre_m for error in good if error.centre_m is not None]
     angles = [error.rotation_deg for error in good if error.rotation_deg is not None]
-    on_wall = [1e3 * error.wall_m for error in good if error.wall_m is not None]
+    known = [error for error in good if error.wall_m is not None and math.isfinite(error.wall_m)]
+    on_wall = [1e3 * error.wall_m for error in known if error.wall_m is not None]
     ratios = [
         error.wall_m / error.sigma_wall_m
-        for error in good
+        for error in known
         if error.wall_m is not None and error.sigma_wall_m
     ]
     findings = [
@@ -131,17 +135,15 @@ def pose_details(errors: Sequence[PoseError]) -> list[JsonValue]:
 
 
 def _pose_error(
-    camera: Camera, true: ViewingCamera, scene: Scene, views: SceneCameras
+    camera: Camera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> PoseError:
-    if camera.status != "ok":
-        return PoseError(photo=camera.photo, status=camera.status)
     found = camera.viewing()
     return PoseError(
         photo=camera.photo,
         status=camera.status,
         centre_m=float(np.linalg.norm(found.centre_world - true.centre_world)),
         rotation_deg=_angle_deg(found.rotation @ true.rotation.T),
-        wall_m=_error_on_walls(found, true, scene, views),
+        wall_m=_error_on_walls(found, true, walls, scene, views),
         sigma_wall_m=camera.sigma_wall_m,
     )
 
@@ -159,32 +161,54 @@ def _angle_deg(rotation: NDArray[np.float64]) -> float:
 
 
 def _error_on_walls(
-    found: ViewingCamera, true: ViewingCamera, scene: Scene, views: SceneCameras
+    found: ViewingCamera, true: ViewingCamera, walls: Walls, scene: Scene, views: SceneCameras
 ) -> float | None:
     """Where the two cameras place a grid of pixels on the surfaces that the true one sees."""
     columns, rows = ((np.arange(n) + 0.5) / n for n in _GRID)
     grid = np.stack(np.meshgrid(columns * true.width, rows * true.height), axis=-1).reshape(-1, 2)
     seen = views.trace(true, grid)
-    chosen = (seen.rectangle >= 0) & (scene.plane_index[seen.rectangle] >= 0)
+    chosen = _on_walls(seen, walls, scene)
+    if not chosen.any():
+        return None
     points, normal = seen.points[chosen], scene.normal[seen.rectangle[chosen]]
     camera = found.shifted(scene.origin)
     try:
         rays = camera.rays_world(grid[chosen])
     except GeometryError:
-        return None
+        return math.inf
     facing = np.einsum("ij,ij->i", normal, rays)
     ahead = np.einsum("ij,ij->i", normal, points - camera.centre_world)
-    straight = np.abs(facing) > _LEAST_COSINE
-    if not straight.any() or np.any(facing[straight] * ahead[straight] <= 0.0):
-        return None
-    distance = ahead[straight] / facing[straight]
-    off = camera.centre_world + distance[:, None] * rays[straight] - points[straight]
+    if np.any(facing * ahead <= 0.0):
+        return math.inf
+    off = camera.centre_world + (ahead / facing)[:, None] * rays - points
     # Two coordinates in each surface: half of the squared length is the square of one.
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)) / 2.0))
 
 
+def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]:
+    """Which points lie on a wall: within its raster and buffer, on a surface that faces as it."""
+    on_walls = np.zeros(len(seen.points), dtype=np.bool_)
+    hit = seen.rectangle >= 0
+    for wall in walls.walls:
+        frame = wall.frame
+        relative = seen.points[hit] - (frame.origin_world - scene.origin)
+        columns, rows = relative @ frame.u_world, relative @ frame.v_world
+        depths = relative @ frame.normal_world
+        facing = np.abs(scene.normal[seen.rectangle[hit]] @ frame.normal_world)
+        on_walls[hit] |= (
+            (facing > _LEAST_COSINE)
+            & (columns > 0.0)
+            & (columns < frame.gsd_m * frame.width)
+            & (rows > 0.0)
+            & (rows < frame.gsd_m * frame.height)
+            & (depths < walls.buffer_front_m)
+            & (depths > -walls.buffer_behind_m)
+        )
+    return on_walls
+
+
 def _scaled(metres: float | None) -> float | None:
-    return None if metres is None else 1e3 * metres
+    return None if metres is None or math.isinf(metres) else 1e3 * metres
 
 
 def _rms(values: Sequence[float]) -> float:

@@ -144,7 +144,7 @@ def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[P
         return ()
     from orthoflow_plugins.inspect.poses import pose_errors
 
-    return pose_errors(inputs.cameras, inputs.truth, views)
+    return pose_errors(inputs.cameras, inputs.walls, inputs.truth, views)
 
 
 def _judge(

@@ -1,0 +1,288 @@
+"""The photos of `simulate.room` show what the truth says, where its cameras say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.inspect.matching import GreyImage, measure_shifts
+from orthoflow_plugins.simulate.palace import RoomPlan, build_room
+from orthoflow_plugins.simulate.room import SimulateRoom
+from orthoflow_plugins.simulate.viewpoints import PhotoLayout, ShotPlan, planned_shots
+
+from orthoflow.files.images import decode_image
+from orthoflow.geometry import frame_over
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.photo_views import SceneCameras
+from orthoflow.geometry.scene_views import cast, colours_at, render_frame
+from orthoflow.geometry.scenes import SurfaceRole
+from orthoflow.products import Truth
+from orthoflow.sdk import StepContext
+from tests import scenes
+
+COARSE = {"scan_step_m": 0.1, "photo_layout": "quick", "photo_gsd_m": 0.008}
+GREY = np.array([0.299, 0.587, 0.114])
+
+
+def simulate(folder: Path, *, seed: int = 1, cores: int = 2, **params: object) -> SimulateRoom.Out:
+    folder.mkdir(parents=True, exist_ok=True)
+    context = StepContext(rng=np.random.default_rng(seed), cores=cores, scratch=folder)
+    chosen = SimulateRoom.Params.model_validate({**COARSE, **params})
+    return SimulateRoom().run(SimulateRoom.In(), chosen, context)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
+    """Six photos of 600 x 450 pixels of 4 mm, all but free of noise."""
+    return simulate(
+        tmp_path_factory.mktemp("room"),
+        photo_gsd_m=0.004,
+        photo_noise_grey=0.0,
+        photo_vignetting=0.0,
+        photo_supersample=3,
+    )
+
+
+def cameras_of(truth: Truth) -> tuple[ViewingCamera, ...]:
+    assert truth.cameras is not None
+    return tuple(camera.viewing() for camera in truth.cameras.cameras)
+
+
+def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Grey levels at pixels (n, 2) whose first centre is at (0.5, 0.5)."""
+    at = pixels - 0.5
+    low = np.floor(at).astype(int)
+    s, t = (at - low).T
+    (u, v), values = low.T, image
+    return (
+        (1 - s) * (1 - t) * values[v, u]
+        + s * (1 - t) * values[v, u + 1]
+        + (1 - s) * t * values[v + 1, u]
+        + s * t * values[v + 1, u + 1]
+    )
+
+
+@pytest.mark.parametrize("place", range(6))
+def test_a_photo_shows_the_wall_where_its_true_camera_projects_it(
+    room: SimulateRoom.Out, place: int
+) -> None:
+    truth, photo = room.truth, room.photos.photos[place]
+    camera = cameras_of(truth)[place]
+    image = decode_image(photo.encoded, photo.name) @ GREY
+    frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=0.004)
+    true = render_frame(truth.scene, frame, buffer_front_m=0.02, buffer_behind_m=0.02, cores=2)
+    rows, columns = np.nonzero(true.rectangle >= 0)
+    cells = np.column_stack([columns + 0.5, rows + 0.5])
+    points = frame.world_from_wall(cells, true.depth_m[rows, columns].astype(np.float64))
+    pixels = camera.project(points)[:, :2]
+    margin = np.array([1.0, 1.0])
+    limit = np.array([camera.width, camera.height]) - margin
+    shown = np.all((pixels > margin) & (pixels < limit), axis=1)
+    shown[shown] = SceneCameras(truth.scene).sees(camera, points[shown])
+    on_wall = np.zeros(frame.shape, dtype=bool)
+    on_wall[rows[shown], columns[shown]] = True
+    grey = np.zeros(frame.shape)
+    grey[on_wall] = bilinear(image, pixels[shown])
+    expected = np.nan_to_num(true.rgb).astype(np.float64) @ GREY
+    shifts = measure_shifts(
+        GreyImage(grey=grey, valid=on_wall, region=on_wall),
+        GreyImage(grey=expected, valid=on_wall, region=on_wall),
+        reach_cells=2,
+    )
+    assert len(shifts.centre) > 15
+    # Cells, which are as large as pixels: patches of 32 x 32 are good to a few hundredths.
+    assert np.abs(np.median(shifts.shift, axis=0)).max() < 0.02
+    assert np.abs(shifts.shift).max() < 0.3
+
+
+def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> None:
+    truth = room.truth
+    camera = cameras_of(truth)[1]
+    views = SceneCameras(truth.scene, cores=2)
+    image = views.expose(camera, supersample=8)
+    rng = np.random.default_rng(5)
+    chosen = np.column_stack(
+        [rng.integers(0, camera.width, 200), rng.integers(0, camera.height, 200)]
+    )
+    inside = (np.stack(np.meshgrid(np.arange(16), np.arange(16)), -1).reshape(-1, 2) + 0.5) / 16
+    pixels = (chosen[:, None, :] + inside).reshape(-1, 2)
+    rays = camera.rays_world(pixels)
+    hits = cast(truth.scene, camera.centre_world, rays)
+    points = camera.centre_world + hits.t[:, None] * rays
+    means = colours_at(truth.scene, hits.rectangle, points).rgb.reshape(200, 256, 3).mean(axis=1)
+    # Grey levels; the means of 64 and of 256 rays over edges differ by a small part of 255.
+    differences = np.abs(image[chosen[:, 1], chosen[:, 0]] - means)
+    assert differences.mean() < 0.5
+    assert differences.max() < 15.0
+
+
+def test_check_points_are_on_their_marks(room: SimulateRoom.Out) -> None:
+    points, truth = room.checkpoints, room.truth
+    classes = np.array(points.classes)
+    assert len(points.names) == len(set(points.names)) == len(classes)
+    assert np.count_nonzero(classes == "flat") >= 20
+    assert np.count_nonzero(classes == "vertical edge") >= 12
+    near = [np.abs(cast(truth.scene, s, points.points_world - s).t - 1.0) for s in truth.stations]
+    # Flat marks are seen in the middle of a face, others at its very corner.
+    assert np.min(near, axis=0)[classes == "flat"].max() < 1e-9
+    wall = truth.planes.plane(0).distances_m(points.points_world)
+    np.testing.assert_allclose(wall[classes == "flat"], 0.0, atol=1e-9)
+    assert np.all(wall[classes == "vertical edge"] > 0.005)
+
+
+def test_flat_check_points_are_crossings_of_painted_lines(room: SimulateRoom.Out) -> None:
+    truth, points = room.truth, room.checkpoints
+    flat = points.points_world[np.array(points.classes) == "flat"]
+    frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=0.001)
+    scene = truth.scene
+    on_wall = (scene.plane_index == 0) & (scene.role == SurfaceRole.WALL) & (scene.texture == 1)
+    rectangle = np.full(len(flat), np.flatnonzero(on_wall)[0], dtype=np.int32)
+
+    def warmth(step_mm: float, axis: np.ndarray) -> np.ndarray:
+        """Red minus blue, which tells the paint of the lines from the plaster."""
+        rgb = colours_at(scene, rectangle, flat + 1e-3 * step_mm * axis).rgb
+        return rgb[:, 0] - rgb[:, 2]
+
+    beside = np.median([warmth(s, frame.u_world + frame.v_world) for s in (-9.0, 9.0)], axis=0)
+    for axis in (frame.u_world, frame.v_world):
+        for step in (-3.0, 0.0, 3.0):
+            # Along either line, 3 mm from the crossing, there is still paint.
+            assert np.median(np.abs(warmth(step, axis) - beside)) > 5.0
+
+
+@pytest.mark.parametrize(("layout", "n_photos"), [("none", 0), ("quick", 6), ("variant2", 18)])
+def test_a_layout_has_its_photos(tmp_path: Path, layout: str, n_photos: int) -> None:
+    out = simulate(tmp_path, photo_layout=layout, photo_gsd_m=0.03)
+    names = [photo.name for photo in out.photos.photos]
+    assert len(names) == n_photos
+    assert names == sorted(names)
+    if n_photos:
+        assert out.truth.cameras is not None
+        assert [camera.photo for camera in out.truth.cameras.cameras] == names
+    else:
+        assert out.truth.cameras is None
+
+
+def test_variant_one_holds_each_wall_whole_in_two_photos(tmp_path: Path) -> None:
+    truth = simulate(tmp_path, photo_layout="variant1", photo_gsd_m=0.03).truth
+    names = ["main wall", "opposite wall", "right wall", "left wall"]
+    views = SceneCameras(truth.scene)
+    for place, camera in enumerate(cameras_of(truth)):
+        plane = truth.planes.names.index(names[place // 2])
+        # A little inside the corners, which others than this wall touch too.
+        corners = truth.planes.corners[plane]
+        corners = corners.mean(axis=0) + 0.85 * (corners - corners.mean(axis=0))
+        assert camera.sees(camera.project(corners)[:, :2]).all(), names[place // 2]
+        centre = np.array([[camera.width / 2, camera.height / 2]])
+        assert views.trace(camera, centre).rectangle[0] >= 0
+
+
+def test_a_block_overlaps_by_seventy_and_fifty_percent(tmp_path: Path) -> None:
+    truth = simulate(
+        tmp_path, photo_layout="variant2", photo_gsd_m=0.03, photo_obliquity_deg=0.0
+    ).truth
+    frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=1.0)
+    aims = []
+    for camera in cameras_of(truth):
+        ray = camera.rays_world(np.array([[camera.cx, camera.cy]]))[0]
+        t = (frame.plane.offset_m - frame.normal_world @ camera.centre_world) / (
+            frame.normal_world @ ray
+        )
+        aims.append(frame.wall_from_world((camera.centre_world + t * ray)[None])[0, :2])
+    grid = np.array(aims).reshape(3, 6, 2)
+    # The footprint is 2.4 m x 1.8 m; a hand aims to 2 %.
+    along = 1.0 - np.diff(grid[:, :, 0], axis=1) / 2.4
+    across = 1.0 - np.abs(np.diff(grid[:, :, 1], axis=0)) / 1.8
+    np.testing.assert_allclose(along, 0.7, atol=0.05)
+    np.testing.assert_allclose(across, 0.5, atol=0.05)
+
+
+@pytest.mark.parametrize("layout", ["quick", "variant1", "variant2"])
+@pytest.mark.parametrize("seed", range(4))
+def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int) -> None:
+    plan = ShotPlan(layout=layout, gsd_m=0.01, obliquity_deg=30.0)
+    scene = build_room(RoomPlan()).scene
+    views = SceneCameras(scene)
+    ways = np.random.default_rng(0).normal(size=(500, 3))
+    ways[0] = (0.0, 0.0, 1.0)
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    for shot in planned_shots(plan, np.random.default_rng(seed)):
+        hits = views.cast(shot.camera.centre_world, ways)
+        assert hits.t.min() > 0.1, shot.name
+        # Straight up there is the ceiling or a moulding, not the inside of a box.
+        assert scene.role[hits.rectangle[0]] != SurfaceRole.OBJECT, shot.name
+
+
+def test_survey_coordinates_and_another_up_change_no_byte_of_a_photo(tmp_path: Path) -> None:
+    near = simulate(tmp_path / "near")
+    far = simulate(tmp_path / "far", shift_world_m=tuple(scenes.SURVEY_SHIFT_M), up="-y")
+    assert [photo.encoded for photo in near.photos.photos] == [
+        photo.encoded for photo in far.photos.photos
+    ]
+    for one, other in zip(cameras_of(near.truth), cameras_of(far.truth), strict=True):
+        marks_near = one.project(near.checkpoints.points_world)
+        marks_far = other.project(far.checkpoints.points_world)
+        # Pixels; 800 km from the origin the camera's own translation steps by 1e-10 m.
+        np.testing.assert_allclose(marks_near, marks_far, atol=1e-5)
+
+
+def test_threads_change_no_byte_and_seeds_move_the_cameras(tmp_path: Path) -> None:
+    one = simulate(tmp_path / "one", cores=1)
+    two = simulate(tmp_path / "two", cores=2)
+    other = simulate(tmp_path / "other", seed=2)
+    assert one.photos == two.photos
+    for first, second in zip(cameras_of(one.truth), cameras_of(other.truth), strict=True):
+        assert np.linalg.norm(first.centre_world - second.centre_world) > 0.01
+
+
+def test_calibration_is_told_only_when_it_is_known(tmp_path: Path) -> None:
+    known = simulate(tmp_path / "known")
+    unknown = simulate(tmp_path / "unknown", calibrated=False)
+    camera = cameras_of(known.truth)[0]
+    assert known.calibration.patterns == ("*",)
+    assert known.calibration.intrinsics[0].fx == camera.fx
+    assert -0.095 < known.calibration.intrinsics[0].distortion[0] < -0.065
+    assert known.photos.photos[0].intrinsics == known.calibration.intrinsics[0]
+    assert unknown.calibration.patterns == ()
+    assert unknown.photos.photos[0].intrinsics is None
+    assert unknown.photos.photos[0].exif_focal_px == pytest.approx(camera.fx, rel=0.02)
+    assert [p.encoded for p in known.photos.photos] == [p.encoded for p in unknown.photos.photos]
+
+
+@pytest.mark.parametrize(("gap", "least", "most"), [("none", 0.95, 1.0), ("hard", -0.5, 0.75)])
+def test_the_spectral_gap_parts_laser_and_photos(
+    tmp_path: Path, gap: str, least: float, most: float
+) -> None:
+    truth = simulate(tmp_path, spectral_gap=gap, photo_layout="none").truth
+    scene = truth.scene
+    fresco = np.flatnonzero((scene.plane_index == 0) & (scene.texture == 1))[0]
+    rng = np.random.default_rng(1)
+    at = rng.uniform(-1.0, 1.0, (4000, 2))
+    points = (
+        scene.centre[fresco] + at[:, :1] * scene.axis_a[fresco] + at[:, 1:] * scene.axis_b[fresco]
+    )
+    colours = colours_at(scene, np.full(4000, fresco, dtype=np.int32), points)
+    correlation = np.corrcoef(colours.rgb @ GREY, colours.reflectance)[0, 1]
+    assert least < correlation < most
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.2, 0.33])
+def test_the_textile_covers_its_share_of_the_main_wall(tmp_path: Path, share: float) -> None:
+    truth = simulate(tmp_path, textile_share=share, photo_layout="none").truth
+    scene = truth.scene
+    cloth = (scene.plane_index == 0) & (scene.texture == 2)
+    a0, a1, b0, b1 = scene.extent[cloth].T
+    assert np.sum((a1 - a0) * (b1 - b0)) == pytest.approx(16.7 * share, abs=0.01)
+
+
+def test_what_the_photos_were_taken_with_is_in_the_truth(room: SimulateRoom.Out) -> None:
+    details = room.truth.details
+    assert isinstance(details["photos"], list)
+    assert len(details["photos"]) == 6
+    for entry in details["photos"]:
+        assert isinstance(entry, dict)
+        assert entry["gsd_mm"] == pytest.approx(4.0, rel=0.1)
+        assert 0.0 < entry["obliquity_deg"] < 15.0
+    assert isinstance(details["parameters"], dict)
+    assert details["parameters"]["scan_step_m"] == 0.1
