@@ -256,6 +256,26 @@ def test_an_empty_quarter_is_refused(tmp_path: Path) -> None:
     assert reason.startswith("a quarter of the photo has 0 ties, each needs 2")
 
 
+def test_an_empty_quarter_is_left_to_the_predicted_error_when_asked(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties = known_ties(camera, 1, n=400)
+    low = (ties.pixels_photo[:, 0] > 450) & (ties.pixels_photo[:, 1] > 320)
+    emptied = replace(ties, role=np.where(low, TieRole.REJECTED, 0).astype(np.uint8))
+    found = orient(emptied, calibrated(camera), context(tmp_path), n_quadrant_min=0)
+    assert found.cameras[0].status == "ok"
+
+
+def test_ties_searched_within_a_small_radius_prove_less(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    rng = np.random.default_rng(0)
+    ties = known_ties(camera, 1, n=120)
+    # Wrong everywhere, but within the 12 px that the matcher looked around a wrong place.
+    jitter = rng.uniform(-12.0, 12.0, ties.pixels_photo.shape)
+    details = {**ties.details, "photos": {"a.png": {"search_radius_px": 12.0}}}
+    guessed = replace(ties, pixels_photo=ties.pixels_photo + jitter, details=details)
+    assert status(guessed, calibrated(camera), tmp_path) != "ok"
+
+
 def test_crowded_quarters_are_flagged(tmp_path: Path) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
     ties = known_ties(camera, 1, n=900)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.covariances import honest_covariance
 from orthoflow.geometry.rotations import cross_matrices, cross_matrix, rotation_from_vector
 
 _POSE_PARAMETERS: Final = 6
@@ -79,10 +80,11 @@ class Resection:
     Attributes:
         camera: the camera.
         covariance: (p, p) float64 of rotation vector (left of camera_from_world), translation,
-            then ln(focal length) and k1 where they were free; scaled by the variance factor.
+            then ln(focal length) and k1 where they were free; as large as the residuals say.
         sigma0: standard deviation of unit weight: 1 where the sigmas of the points were right.
-        variance_factor: what `covariance` was scaled by: sigma0 squared, or more where residuals
-            of neighbouring points agree, so that the points are not independent.
+        variance_factor: how much larger `covariance` is than for sigmas taken as they are, mean
+            over its axes: sigma0 squared, or more where residuals of neighbouring points agree, so
+            that the points are not independent.
         lens: what was free.
     """
 
@@ -153,12 +155,15 @@ def adjust(
         cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError as error:
         raise GeometryError("the points of a photo do not determine its pose") from error
-    factor = max(sigma0**2, _correlated_factor(errors, cofactors, groups))
+    covariance = honest_covariance(
+        errors.jacobian, errors.residuals, cofactors, groups, sigma0=sigma0
+    )
+    factor = float(np.trace(np.linalg.solve(cofactors, covariance))) / n_free
     camera = camera.shifted(-middle)
     to_world = _moved_origin(camera, middle, n_free)
     return Resection(
         camera=camera,
-        covariance=factor * to_world @ cofactors @ to_world.T,
+        covariance=to_world @ covariance @ to_world.T,
         sigma0=sigma0,
         variance_factor=factor,
         lens=lens,
@@ -360,22 +365,6 @@ def _whiten(covariances: NDArray[np.float64], columns: NDArray[np.float64]) -> N
     whitened[:, 0] = columns[:, 0] / first[:, None]
     whitened[:, 1] = (columns[:, 1] - mixed[:, None] * whitened[:, 0]) / second[:, None]
     return whitened
-
-
-def _correlated_factor(
-    errors: _Whitened, cofactors: NDArray[np.float64], groups: NDArray[np.intp] | None
-) -> float:
-    """Variance factor when points of a group err together (cluster-robust, Liang & Zeger 1986)."""
-    if groups is None:
-        return 0.0
-    names, group = np.unique(groups, return_inverse=True)
-    n_groups, n_free = names.size, len(cofactors)
-    if n_groups <= n_free:
-        return 0.0
-    pulls = np.zeros((n_groups, n_free))
-    np.add.at(pulls, group, np.einsum("nij,ni->nj", errors.jacobian, errors.residuals))
-    spread = float(np.trace(cofactors @ (pulls.T @ pulls))) / n_free
-    return spread * n_groups / (n_groups - 1)
 
 
 def _moved_origin(

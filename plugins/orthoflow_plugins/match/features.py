@@ -6,7 +6,7 @@ OpenCV's SIFT moves every key point by a quarter of a pixel unless its precise u
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -59,6 +59,16 @@ class Features:
             angles_deg=self.angles_deg,
             descriptors=self.descriptors,
         )
+
+    def mirrored(self) -> Features:
+        """Give the key points as they would be described had the image been mirrored.
+
+        Mirroring along the main direction keeps that direction: rows of the 4 x 4 fields of 8
+        directions swap, and directions turn the other way.
+        """
+        fields = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
+        turned = fields[..., (8 - np.arange(8)) % 8]
+        return replace(self, descriptors=np.ascontiguousarray(turned.reshape(-1, 128)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,8 +37,52 @@ class Matches:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Which pairs are possible at all, from what is roughly known of the geometry.
+
+    Attributes:
+        first: (n, 2) positions of the first set.
+        second: (m, 2) positions of the second set, where they are expected in the first's frame.
+        radius: largest distance of a pair.
+        first_log_size: (n,) float32 log2 of the sizes.
+        second_log_size: (m,) float32, as expected in the first's frame.
+        first_angle_deg: (n,) float32.
+        second_angle_deg: (m,) float32, as expected in the first's frame.
+        log_size_most: largest difference of log2 sizes.
+        angle_most_deg: largest difference of angles.
+    """
+
+    first: NDArray[np.float32]
+    second: NDArray[np.float32]
+    radius: float
+    first_log_size: NDArray[np.float32]
+    second_log_size: NDArray[np.float32]
+    first_angle_deg: NDArray[np.float32]
+    second_angle_deg: NDArray[np.float32]
+    log_size_most: float
+    angle_most_deg: float
+
+    def allows(self, rows: slice) -> NDArray[np.bool_]:
+        """Which of the second set (columns) some of the first set (rows) may be paired with."""
+        possible = np.abs(self.first[rows, None, 0] - self.second[:, 0]) <= self.radius
+        possible &= np.abs(self.first[rows, None, 1] - self.second[:, 1]) <= self.radius
+        # The rest only for the few that are near.
+        i, j = np.nonzero(possible)
+        start = rows.start
+        log_size = np.abs(self.first_log_size[start + i] - self.second_log_size[j])
+        turn = np.abs(self.first_angle_deg[start + i] - self.second_angle_deg[j]) % 360.0
+        turn = np.minimum(turn, 360.0 - turn)
+        possible[i, j] = (log_size <= self.log_size_most) & (turn <= self.angle_most_deg)
+        return np.asarray(possible)
+
+
 def mutual_matches(
-    first: NDArray[np.float32], second: NDArray[np.float32], *, ratio_most: float
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    *,
+    ratio_most: float,
+    window: Window | None = None,
 ) -> Matches:
     """Pair descriptors that are each other's nearest and clearly nearer than the next.
 
@@ -46,6 +90,7 @@ def mutual_matches(
         first: (n, d) whole numbers, small enough that products are exact in float32.
         second: (m, d) likewise.
         ratio_most: largest distance of the best over the distance of the second best (Lowe 2004).
+        window: only pairs inside it count, also as second best.
     """
     if not (len(first) and len(second)):
         nothing = np.empty(0, dtype=np.intp)
@@ -65,6 +110,8 @@ def mutual_matches(
         distances *= -2.0
         distances += squares_second
         distances += squares_first[rows, None]
+        if window is not None:
+            distances[~window.allows(rows)] = np.inf
         lowest = distances.min(axis=0)
         better = lowest < back_best
         back_best[better] = lowest[better]
@@ -75,7 +122,10 @@ def mutual_matches(
         if n_second > 1:
             distances[own, index] = np.inf
             next_best[rows] = distances.min(axis=1)
-    ratio = np.sqrt(np.maximum(best, 0.0) / np.maximum(next_best, 1e-12)).astype(np.float64)
-    ratio[~np.isfinite(next_best)] = 1.0
+    with np.errstate(invalid="ignore"):
+        ratio = np.sqrt(np.maximum(best, 0.0) / np.maximum(next_best, 1e-12)).astype(np.float64)
+    # The only candidate is distinct from nothing, and of two equal ones none is.
+    ratio[~np.isfinite(next_best) | (next_best <= 0.0)] = 1.0
+    ratio[~np.isfinite(best)] = np.inf
     kept = np.flatnonzero((back[nearest] == np.arange(n_first)) & (ratio <= ratio_most))
     return Matches(first=kept, second=nearest[kept], ratio=ratio[kept])

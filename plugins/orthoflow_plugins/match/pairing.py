@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.match.features import FeatureRule, Features, find_features
 from orthoflow_plugins.match.neighbours import Matches, mutual_matches
 from orthoflow_plugins.match.pictures import equalised, shrunk
+from orthoflow_plugins.match.rematching import Expectation, rematched
 
 # A photo is tried at this size first, then at twice, until a wall is recognised.
 _FIRST_SIDE_PX: Final = 1000
@@ -49,12 +50,14 @@ class Pair:
         matches: first = key points of the photo, second = of the wall.
         agreeing: (n,) bool, which agree with one homography, roughly.
         is_shown: enough agree, and the wall is not seen from behind.
+        homography: (3, 3) photo pixels from wall pixels, roughly, of a wall that is shown.
     """
 
     wall: int
     matches: Matches
     agreeing: NDArray[np.bool_]
     is_shown: bool
+    homography: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,11 +68,16 @@ class PhotoPairs:
         features: key points of the photo, pixels of the full image.
         scale: the photo was matched shrunk by this.
         pairs: one per wall that had matches.
+        radius_px: matches were also searched so far from where a homography puts them; a wrong
+            one's matches lie evenly within this.
+        is_mirrored: the walls recognise the mirrored photo better; then none counts as shown.
     """
 
     features: Features
     scale: float
     pairs: tuple[Pair, ...]
+    radius_px: float
+    is_mirrored: bool = False
 
     @property
     def n_verified(self) -> int:
@@ -104,7 +112,10 @@ def pair_photo(
         tried = _pairs_at(grey, wanted, walls, rule)
         if tried.n_verified > best.n_verified:
             best = tried
-    return best
+    if best.n_verified and _n_verified_mirrored(best, walls, rule) > best.n_verified:
+        refused = tuple(replace(pair, is_shown=False, homography=None) for pair in best.pairs)
+        return replace(best, pairs=refused, is_mirrored=True)
+    return _completed(best, walls, rule)
 
 
 def _pairs_at(
@@ -120,7 +131,27 @@ def _pairs_at(
         matches = mutual_matches(features.descriptors, wall.descriptors, ratio_most=rule.ratio_most)
         if len(matches):
             pairs.append(_verified(index, matches, features, wall, (loose_px, rule)))
-    return PhotoPairs(features=features, scale=scale, pairs=tuple(pairs))
+    return PhotoPairs(features=features, scale=scale, pairs=tuple(pairs), radius_px=loose_px)
+
+
+def _n_verified_mirrored(
+    pairs: PhotoPairs, walls: Sequence[Features | None], rule: PairingRule
+) -> int:
+    """Matches that would agree, over the walls shown, had the photo been mirrored.
+
+    A front that is symmetric matches its own mirror image in part, and the pose found would look
+    right where it is.
+    """
+    mirrored = pairs.features.mirrored()
+    total = 0
+    for index, wall in enumerate(walls):
+        if wall is None:
+            continue
+        matches = mutual_matches(mirrored.descriptors, wall.descriptors, ratio_most=rule.ratio_most)
+        limits = (pairs.radius_px, rule)
+        pair = _verified(index, matches, mirrored, wall, limits, is_mirrored=True)
+        total += int(pair.agreeing.sum()) if pair.is_shown else 0
+    return total
 
 
 def _verified(
@@ -129,6 +160,8 @@ def _verified(
     features: Features,
     wall: Features,
     limits: tuple[float, PairingRule],
+    *,
+    is_mirrored: bool = False,
 ) -> Pair:
     loose_px, rule = limits
     source, target = wall.pixels[matches.second], features.pixels[matches.first]
@@ -141,12 +174,38 @@ def _verified(
             agreeing = np.hypot(*(_mapped(homography, source) - target).T) < loose_px
     # Many key points of a texture may fall on one place of the other image: count places.
     n_places = min(_n_places(source[agreeing], 2.0), _n_places(target[agreeing], 2.0))
-    is_shown = (
-        homography is not None
-        and n_places >= rule.n_verified_least
-        and _is_from_the_front(homography, source[agreeing].mean(axis=0))
+    if (
+        homography is None
+        or n_places < rule.n_verified_least
+        or _is_from_the_front(homography, source[agreeing].mean(axis=0)) == is_mirrored
+    ):
+        return Pair(wall=index, matches=matches, agreeing=agreeing, is_shown=False)
+    return Pair(
+        wall=index, matches=matches, agreeing=agreeing, is_shown=True, homography=homography
     )
-    return Pair(wall=index, matches=matches, agreeing=agreeing, is_shown=is_shown)
+
+
+def _completed(
+    pairs: PhotoPairs, walls: Sequence[Features | None], rule: PairingRule
+) -> PhotoPairs:
+    """Add what a second look finds, each key point only where the homography roughly puts it."""
+    completed = []
+    for pair in pairs.pairs:
+        wall = walls[pair.wall]
+        if pair.homography is None or wall is None:
+            completed.append(pair)
+            continue
+        expected = _mapped(pair.homography, wall.pixels)
+        matches = rematched(
+            pair.matches,
+            (pairs.features, wall),
+            Expectation(pixels=expected, agreeing=pair.agreeing, radius_px=pairs.radius_px),
+            ratio_most=rule.ratio_most,
+        )
+        offsets = expected[matches.second] - pairs.features.pixels[matches.first]
+        agreeing = np.hypot(*offsets.T) < pairs.radius_px
+        completed.append(replace(pair, matches=matches, agreeing=agreeing))
+    return replace(pairs, pairs=tuple(completed))
 
 
 def _homography(

@@ -83,7 +83,8 @@ def wall_picture(wall: Wall, *, clip_limit: float, void_margin_cells: int) -> Wa
     low, high = np.percentile(wall.intensity[known], (0.5, 99.5))
     scaled = (wall.intensity - low) / max(float(high - low), 1e-9)
     filled = filled_smoothly(np.where(known, np.clip(scaled, 0.0, 1.0), np.nan))
-    grey = np.rint(filled * 255.0).astype(np.uint8)
+    # Cells hold single points of a scan: their speckle hides the texture from key points.
+    grey = np.asarray(cv2.medianBlur(np.rint(filled * 255.0).astype(np.uint8), 3), dtype=np.uint8)
     side = 2 * void_margin_cells + 1
     share = cv2.blur(known.astype(np.float32), (side, side), borderType=cv2.BORDER_REPLICATE)
     return WallPicture(

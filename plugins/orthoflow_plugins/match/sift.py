@@ -193,7 +193,9 @@ def _sigma_px(sizes_px: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _note(ctx: StepContext, name: str, pairs: PhotoPairs, walls: Walls) -> JsonValue:
     shown = [walls.walls[pair.wall].name for pair in pairs.pairs if pair.is_shown]
-    if not shown:
+    if pairs.is_mirrored:
+        ctx.warn(f"photo {name}: the walls show it mirrored, so it gets no ties: turn it back")
+    elif not shown:
         ctx.warn(f"photo {name}: no wall is recognised in it, so it gets no ties")
     return {
         "n_key_points": len(pairs.features),
@@ -201,6 +203,7 @@ def _note(ctx: StepContext, name: str, pairs: PhotoPairs, walls: Walls) -> JsonV
         "walls": list(shown),
         "n_matches": sum(len(pair.matches) for pair in pairs.pairs),
         "n_agreeing": pairs.n_verified,
+        "search_radius_px": pairs.radius_px,
     }
 
 

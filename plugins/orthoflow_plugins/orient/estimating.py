@@ -30,6 +30,11 @@ _ROUNDS: Final = 8
 # Median length of a two-dimensional standard normal deviation.
 _MEDIAN_LENGTH: Final = 1.1774
 _SIGMA0_RANGE: Final = (0.1, 3.0)
+_CHANCE_SHARE_MOST: Final = 0.1
+_TIGHTENING: Final = 0.8
+_TIGHTENED_MOST: Final = 7
+# Residuals beyond so many standard deviations pull less (Huber).
+_SOFT_LIMIT: Final = 2.0
 # Ties that determine a lens besides a pose.
 _LEAST_FOR_LENS: Final = 25
 
@@ -122,7 +127,7 @@ def _adjusted(
     camera = replace(
         camera, rotation=start.pose.camera.rotation, translation=start.pose.camera.translation
     )
-    guess, limit = camera, math.inf
+    guess, limit, unit = camera, math.inf, 1.0
     for nth in range(_ROUNDS):
         used = agreeing & ~is_check
         lens = prior.freedom if used.sum() >= _LEAST_FOR_LENS else LensFreedom()
@@ -132,11 +137,13 @@ def _adjusted(
             replace(guess, rotation=camera.rotation, translation=camera.translation),
             lens=lens,
             groups=cells[used],
-            soft_limit=2.0 if nth < 2 else math.inf,
+            soft_limit=_SOFT_LIMIT * unit,
         )
         camera = resection.camera
         fit = misfit(seen, camera)
-        limit = rule.rejection_sigma * _unit_deviation(fit.normalised[used])
+        unit = _unit_deviation(fit.normalised[used])
+        limit = rule.rejection_sigma * unit
+        limit = _without_chance(fit.normalised[~is_check], limit)
         again = fit.normalised <= limit
         if np.array_equal(again & ~is_check, used) and nth >= 2:
             break
@@ -187,6 +194,20 @@ def _expected_px(seen: SeenPoints) -> float:
     per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
     sigma = np.hypot(np.median(seen.sigma_px), per_metre * np.median(seen.sigma_m))
     return float(sigma)
+
+
+def _without_chance(normalised: NDArray[np.float64], limit: float) -> float:
+    """Tighten a limit until hardly any wrong tie lies within it by chance.
+
+    Wrong ties near a pose lie evenly around where they should be: the ring from one to three
+    times the limit has eight times the area within it and tells how many to expect.
+    """
+    lengths = np.sort(normalised[np.isfinite(normalised)])
+    for tightened in limit * _TIGHTENING ** np.arange(_TIGHTENED_MOST):
+        inside, around = np.searchsorted(lengths, [tightened, 3.0 * tightened], side="right")
+        if (around - inside) / 8.0 <= _CHANCE_SHARE_MOST * inside:
+            return float(tightened)
+    return float(tightened)
 
 
 def _unit_deviation(normalised: NDArray[np.float64]) -> float:

@@ -17,10 +17,12 @@ from orthoflow_plugins.orient.splitting import hull_area, quadrant_counts
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
 
 TIES_LEAST: Final = 8
-QUADRANT_LEAST: Final = 2
+_SIDE_CHECK_LEAST: Final = 4
 QUADRANT_RATIO: Final = 10
-# A wrong pose would pass the check points by chance once in so many photos.
-_CHANCE_MOST: Final = 1e-6
+# Probability that the check points of a wrong pose agree by chance. Right ties gather close to
+# where they should be, wrong ones do not: several shares of the limit are tried.
+_CHANCE_MOST: Final = 1e-5
+_CHANCE_RADII: Final = (0.2, 0.35, 0.6, 1.0)
 _CHECK_AGREEMENT_LEAST: Final = 0.5
 _CHECK_RMSE_RATIO: Final = 2.0
 _PLACE_PX: Final = 8.0
@@ -32,6 +34,7 @@ class GateRule:
 
     Attributes:
         n_control_least: control ties that agree.
+        n_quadrant_least: ties that agree in each quarter of the photo.
         inlier_share_least: share of all ties that agree.
         hull_ratio_least: hull of the control over the part of the photo that shows its walls.
         sigma_wall_most_gsd: predicted error on the wall, RMS over the footprint, in cells.
@@ -39,6 +42,7 @@ class GateRule:
     """
 
     n_control_least: int
+    n_quadrant_least: int
     inlier_share_least: float
     hull_ratio_least: float
     sigma_wall_most_gsd: float
@@ -58,6 +62,8 @@ class Case:
         known: the walls of the ties that agree.
         error: predicted error on these walls, None when the photo shows none of them.
         rule: what it must reach.
+        search_radius_px: the matcher looked for ties so far from where it expected them, so that
+            wrong ones lie within this, too; inf when it looked everywhere.
     """
 
     photo: Photo
@@ -68,6 +74,7 @@ class Case:
     known: Sequence[KnownWall]
     error: WallError | None
     rule: GateRule
+    search_radius_px: float = math.inf
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -93,7 +100,9 @@ class Case:
         return hull_area(self.seen.pixels_photo[self.control]) / max(footprint, 1.0)
 
 
-def too_few(pixels_photo: NDArray[np.float64], size_px: tuple[int, int]) -> str:
+def too_few(
+    pixels_photo: NDArray[np.float64], size_px: tuple[int, int], n_quadrant_least: int
+) -> str:
     """Say why ties are too few for an orientation; empty when they suffice (markiewicz2015)."""
     if len(pixels_photo) < TIES_LEAST:
         return (
@@ -101,9 +110,9 @@ def too_few(pixels_photo: NDArray[np.float64], size_px: tuple[int, int]) -> str:
             "shows none of the walls, or too differently"
         )
     counts = quadrant_counts(pixels_photo, size_px)
-    if counts.min() < QUADRANT_LEAST:
+    if counts.min() < n_quadrant_least:
         return (
-            f"a quarter of the photo has {counts.min()} ties, each needs {QUADRANT_LEAST}: the "
+            f"a quarter of the photo has {counts.min()} ties, each needs {n_quadrant_least}: the "
             "pose would be extrapolated there"
         )
     return ""
@@ -156,9 +165,15 @@ def _enough_share(case: Case) -> str:
 
 def _not_by_chance(case: Case) -> str:
     """A pose fitted to wrong ties fits withheld ties by chance only."""
-    n_check, n_agree = int(case.is_check.sum()), _n_places(case.seen.pixels_photo[case.checked])
-    by_chance = _chance_probability(case)
-    if _tail(n_agree, n_check, by_chance) > _CHANCE_MOST:
+    n_check, n_agree = int(case.is_check.sum()), int(case.checked.sum())
+    lengths = case.estimate.fit.normalised / case.estimate.limit
+    probabilities = []
+    for share in _CHANCE_RADII:
+        near = case.checked & (lengths <= share)
+        by_chance = _chance_probability(case, share * case.estimate.limit)
+        n_places = _n_places(case.seen.pixels_photo[near])
+        probabilities.append(_tail(n_places, n_check, by_chance))
+    if len(_CHANCE_RADII) * min(probabilities) > _CHANCE_MOST:
         return (
             f"{n_agree} of {n_check} withheld ties agree with the pose, as a wrong pose could "
             "have by chance"
@@ -186,14 +201,15 @@ def _check_agrees(case: Case) -> str:
 
 
 def _spread(case: Case) -> str:
-    return too_few(case.seen.pixels_photo[case.estimate.agreeing], case.size_px)
+    agreeing = case.seen.pixels_photo[case.estimate.agreeing]
+    return too_few(agreeing, case.size_px, case.rule.n_quadrant_least)
 
 
 def _in_front(case: Case) -> str:
     centre = case.estimate.resection.camera.centre_world
     for wall in case.known:
         used = case.walls[case.control] == wall.index
-        if not (wall.has_side and used.sum() >= QUADRANT_LEAST * 2):
+        if not (wall.has_side and used.sum() >= _SIDE_CHECK_LEAST):
             continue
         if float((centre - wall.corners_world.mean(axis=0)) @ wall.normal) <= 0.0:
             return "the pose lies behind the wall it would show, so it must be wrong"
@@ -239,16 +255,15 @@ _GATES: Final[tuple[Callable[[Case], str], ...]] = (
 )
 
 
-def _chance_probability(case: Case) -> float:
-    """Probability that a wrong tie falls within the limit of a pose it has nothing to do with."""
+def _chance_probability(case: Case, limit: float) -> float:
+    """Probability that a wrong tie falls within a limit of a pose it has nothing to do with."""
     residuals, lengths = case.estimate.fit.residuals_px, case.estimate.fit.normalised
     inside = case.estimate.agreeing & (lengths > 0.0)
-    radius = case.estimate.limit * float(
-        np.median(np.linalg.norm(residuals[inside], axis=1) / lengths[inside])
-    )
+    radius = limit * float(np.median(np.linalg.norm(residuals[inside], axis=1) / lengths[inside]))
     # Wrong ties gather where the texture is, not all over the photo.
     textured = max(hull_area(case.seen.pixels_photo), 1.0) / 4.0
-    return min(0.5, math.pi * radius**2 / textured)
+    searched = (2.0 * case.search_radius_px) ** 2
+    return min(0.5, math.pi * radius**2 / min(textured, searched))
 
 
 def _tail(n_least: int, n_all: int, probability: float) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import ClassVar
@@ -97,6 +99,12 @@ class OrientPnp(Method):
         )
         n_control_min: int = Field(
             default=12, ge=6, description="Control ties that must agree with the pose."
+        )
+        n_quadrant_min: int = Field(
+            default=2,
+            ge=0,
+            description="Ties that must agree in each quarter of a photo (markiewicz2015: 2); 0 "
+            "leaves photos with a large obstacle to the predicted error.",
         )
         inlier_min_share: float = Field(
             default=0.04,
@@ -216,7 +224,7 @@ def _orient(
     # Drawn for every photo, so that one photo's ties do not change the luck of the next.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
     size_px = (photo.width, photo.height)
-    reason = too_few(ties.pixels_photo[chosen], size_px)
+    reason = too_few(ties.pixels_photo[chosen], size_px, params.n_quadrant_min)
     if reason:
         return _refused(photo, reason, len(chosen))
     seen = SeenPoints(
@@ -247,8 +255,17 @@ def _orient(
         known=known,
         error=wall_error(estimate.resection, known),
         rule=_gates(params),
+        search_radius_px=_search_radius_px(ties, photo.name),
     )
     return _judged(case)
+
+
+def _search_radius_px(ties: Ties, name: str) -> float:
+    """What the matcher says of how far it looked for the ties of a photo."""
+    photos = ties.details.get("photos")
+    entry = photos.get(name) if isinstance(photos, Mapping) else None
+    radius = entry.get("search_radius_px") if isinstance(entry, Mapping) else None
+    return float(radius) if isinstance(radius, int | float) else math.inf
 
 
 def _judged(case: Case) -> _Oriented:
@@ -291,6 +308,7 @@ def _refused(photo: Photo, reason: str, n_ties: int) -> _Oriented:
 def _gates(params: OrientPnp.Params) -> GateRule:
     return GateRule(
         n_control_least=params.n_control_min,
+        n_quadrant_least=params.n_quadrant_min,
         inlier_share_least=params.inlier_min_share,
         hull_ratio_least=params.hull_min_ratio,
         sigma_wall_most_gsd=params.sigma_wall_max_cells,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 STRATA: Final = 6
-GROUPS: Final = 8
+GROUPS: Final = 6
 
 
 def image_cells(
