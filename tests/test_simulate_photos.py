@@ -15,7 +15,7 @@ from orthoflow.files.images import decode_image
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.photo_views import SceneCameras
-from orthoflow.geometry.scene_views import cast, colours_at, render_frame
+from orthoflow.geometry.scene_views import TrueOrthoimage, cast, colours_at, render_frame
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Truth
 from orthoflow.sdk import StepContext
@@ -44,6 +44,14 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
     )
 
 
+@pytest.fixture(scope="module")
+def wall(room: SimulateRoom.Out) -> TrueOrthoimage:
+    """The main wall as it is, in cells as large as pixels."""
+    planes = room.truth.planes
+    frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=0.004)
+    return render_frame(room.truth.scene, frame, buffer_front_m=0.02, buffer_behind_m=0.02, cores=2)
+
+
 def cameras_of(truth: Truth) -> tuple[ViewingCamera, ...]:
     assert truth.cameras is not None
     return tuple(camera.viewing() for camera in truth.cameras.cameras)
@@ -65,13 +73,12 @@ def bilinear(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("place", range(6))
 def test_a_photo_shows_the_wall_where_its_true_camera_projects_it(
-    room: SimulateRoom.Out, place: int
+    room: SimulateRoom.Out, wall: TrueOrthoimage, place: int
 ) -> None:
     truth, photo = room.truth, room.photos.photos[place]
     camera = cameras_of(truth)[place]
     image = decode_image(photo.encoded, photo.name) @ GREY
-    frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=0.004)
-    true = render_frame(truth.scene, frame, buffer_front_m=0.02, buffer_behind_m=0.02, cores=2)
+    true, frame = wall, wall.frame
     rows, columns = np.nonzero(true.rectangle >= 0)
     cells = np.column_stack([columns + 0.5, rows + 0.5])
     points = frame.world_from_wall(cells, true.depth_m[rows, columns].astype(np.float64))
