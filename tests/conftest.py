@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import tempfile
 from pathlib import Path
 
 import pytest
+
+_ROOT = Path(__file__).resolve().parents[1]
+
+
+def _sources_digest() -> str:
+    sources = sorted(_ROOT.glob("*/**/*_kernels.py"))
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+
+
+# Numba's own cache does not notice edits of kernels that a kernel calls: a folder per state of all
+# of them does. Set before anything imports numba.
+os.environ.setdefault(
+    "NUMBA_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"orthoflow-kernels-{_sources_digest()}")
+)
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

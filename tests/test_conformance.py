@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
 
@@ -10,9 +12,9 @@ import pytest
 
 from orthoflow.catalog import discover_catalog
 from orthoflow.files.images import encode_jpeg
-from orthoflow.products import InputFiles
-from orthoflow.testing import ConformanceCase, conformance_cases
-from tests import photo_files
+from orthoflow.products import InputFiles, Product
+from orthoflow.testing import ConformanceCase, Trial, conformance_cases, run_trial
+from tests import matching_scenes, photo_files
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
 QUICK: dict[str, dict[str, object]] = {
@@ -23,32 +25,55 @@ QUICK: dict[str, dict[str, object]] = {
 
 # What a source reads where the suite's own example, a scan, does not fit.
 FILES: dict[str, str] = {"read.photos": "photo.jpg", "read.checkpoints": "points.csv"}
+# Photographs fit only walls of their own; `test_ortho_backward_conformance.py` has more of them.
+ELSEWHERE = {"ortho.dsm-backward"}
 
 
-def inputs(method_id: str) -> Mapping[str, InputFiles] | None:
-    if method_id not in FILES:
-        return None
+def inputs(method_id: str) -> Mapping[str, Product | InputFiles] | None:
+    if method_id in FILES:
+        return {"files": example_files(FILES[method_id])}
+    if method_id.startswith(("match.", "orient.")):
+        return photographed_wall(method_id)
+    return None
+
+
+def example_files(name: str) -> InputFiles:
     contents = {
         "photo.jpg": encode_jpeg(photo_files.picture()),
         "points.csv": b"name,x,y,z\nA,1,2,3\nB,4,5,6\n",
     }
-    name = FILES[method_id]
     folder = Path(mkdtemp(prefix="orthoflow-conformance-"))
     paths = photo_files.write(folder, {name: contents[name]})
-    return {"files": InputFiles(name="files", paths=paths)}
+    return InputFiles(name="files", paths=paths)
+
+
+@cache
+def photographed_wall(method_id: str) -> Mapping[str, Product | InputFiles]:
+    """A textured wall, a photo of it, and what the method asked for needs besides."""
+    scene = matching_scenes.textured_wall(1)
+    camera = matching_scenes.camera_before(scene)
+    photos = matching_scenes.photos(matching_scenes.photo_of(scene, camera))
+    walls = matching_scenes.walls_of(scene)
+    if method_id == "match.sift":
+        return {"photos": photos, "walls": walls}
+    cameras = matching_scenes.cameras(matching_scenes.oriented(camera))
+    if method_id == "match.guided":
+        return {"photos": photos, "walls": walls, "cameras": cameras}
+    guided = discover_catalog().method("match.guided").load()
+    trial = Trial(method=guided, inputs={"photos": photos, "walls": walls, "cameras": cameras})
+    scratch = Path(mkdtemp(prefix="orthoflow-conformance-"))
+    return {"photos": photos, "ties": run_trial(trial, scratch).outputs["ties"]}
 
 
 def cases() -> list[ConformanceCase]:
     return [
         case
         for method_id, entry in sorted(discover_catalog().methods.items())
-        if entry.distribution.name == "orthoflow-tls"
-        for case in conformance_cases(
-            method_id, inputs=inputs(method_id), params=QUICK.get(method_id)
-        )
+        if entry.distribution.name == "orthoflow-tls" and method_id not in ELSEWHERE
+        for case in conformance_cases(method_id, params=QUICK.get(method_id))
     ]
 
 
 @pytest.mark.parametrize("case", cases(), ids=str)
 def test_our_methods_conform(case: ConformanceCase) -> None:
-    case.run()
+    replace(case, inputs=inputs(case.method_id) or {}).run()

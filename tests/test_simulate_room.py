@@ -164,7 +164,7 @@ def test_the_obstacle_can_be_left_away(tmp_path: Path) -> None:
 
 def test_relief_scales_what_stands_out_of_the_walls(tmp_path: Path) -> None:
     rough = simulate(tmp_path / "rough", **CLEAN)
-    flat = simulate(tmp_path / "flat", **CLEAN, relief=0.0)
+    flat = simulate(tmp_path / "flat", **CLEAN, relief_scale=0.0)
     name = "main wall"
     places = [out.truth.planes.names.index(name) for out in (rough, flat)]
     points = [

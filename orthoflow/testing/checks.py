@@ -23,7 +23,7 @@ from orthoflow.testing.trials import Trial, TrialRun, run_trial
 # What a float parameter's name ends with: its unit, or a word that says it has none.
 UNIT_SUFFIXES: Final = (
     *("m", "mm", "m2", "px", "deg", "rad", "s", "cells", "sigma"),
-    *("share", "ratio", "factor", "scale", "exponent", "power", "probability", "world"),
+    *("grey", "share", "ratio", "factor", "scale", "exponent", "power", "probability", "world"),
     "intensity",
 )
 

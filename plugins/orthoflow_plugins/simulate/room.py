@@ -92,7 +92,7 @@ class SimulateRoom(Method):
             le=0.05,
             description="Diameter of the laser spot; distances mix at edges. 0 mixes none.",
         )
-        relief: float = Field(
+        relief_scale: float = Field(
             1.0,
             ge=0.0,
             le=2.0,
@@ -173,7 +173,7 @@ class SimulateRoom(Method):
         scan_rng, photo_rng = ctx.rng.spawn(2)
         room = build_room(
             RoomPlan(
-                relief=params.relief,
+                relief=params.relief_scale,
                 obstacle=params.obstacle,
                 spectral_gap=_SPECTRAL_GAPS[params.spectral_gap],
                 textile_share=params.textile_share,
