@@ -39,7 +39,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
         tmp_path_factory.mktemp("room"),
         photo_gsd_m=0.004,
         photo_noise_grey=0.0,
-        photo_vignetting=0.0,
+        photo_vignetting_share=0.0,
         photo_supersample=3,
     )
 

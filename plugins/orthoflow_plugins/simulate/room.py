@@ -128,7 +128,7 @@ class SimulateRoom(Method):
         photo_noise_grey: float = Field(
             1.5, ge=0.0, le=50.0, description="Standard deviation of a pixel's colour."
         )
-        photo_vignetting: float = Field(
+        photo_vignetting_share: float = Field(
             0.1, ge=0.0, le=0.9, description="Share of the light lost in the corners of a photo."
         )
         photo_supersample: int = Field(
@@ -232,7 +232,7 @@ def _film(params: SimulateRoom.Params) -> Film:
 
     return Film(
         noise_grey=params.photo_noise_grey,
-        vignetting=params.photo_vignetting,
+        vignetting=params.photo_vignetting_share,
         supersample=params.photo_supersample,
     )
 
