@@ -68,7 +68,7 @@ class WallFrame:
     def world_from_wall(
         self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:
-        """World points (n, 3) in metres of wall positions (n, 2) = (column, row) and depths (n,)."""
+        """World points (n, 3), metres, of wall positions (n, 2) = (column, row) and depths (n,)."""
         in_plane = self.gsd_m * (
             pixels_wall[:, :1] * self.u_world + pixels_wall[:, 1:2] * self.v_world
         )

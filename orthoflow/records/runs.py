@@ -12,7 +12,7 @@ from typing import Final
 
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord
-from orthoflow_provenance.reader import open_record, read_record
+from orthoflow_provenance.reader import read_output, read_record
 
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
 from orthoflow.products.product import Payload, Product
@@ -94,8 +94,8 @@ class Run:
                 f"{self.path} names {address}.{port} only by its digest; run the workflow with "
                 "--embed to put every product into the record"
             )
-        with record_errors(self.path), open_record(self.path) as opened:
-            stored = opened.payload(address, port)
+        with record_errors(self.path):
+            stored = read_output(self.path, address, port)
             return Payload(
                 type_name=stored.type_name,
                 encoding_version=stored.encoding_version,

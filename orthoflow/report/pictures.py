@@ -15,7 +15,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.products import Orthoimages, OrthoMask, SurfaceMask, Walls
 from orthoflow.records import Run
 
-LONGEST_SIDE_PX: Final = 1200
+LONGEST_SIDE_PX: Final = 1000
 
 # From blue (behind the plane) over white (on it) to red (in front): readable in grey and with
 # red-green blindness. Colours of the classes RdBu, Brewer 2003.

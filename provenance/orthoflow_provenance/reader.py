@@ -69,10 +69,19 @@ class OpenRecord:
                 f"the record names the output {port} of {address} ({output.type_name}) by its "
                 f"digest only, {output.digest}: it is in the store, or run again with --embed"
             )
-        outputs = open_group(
-            open_group(open_group(self.file, layout.CELLS), address), layout.CELL_OUTPUTS
-        )
-        return read_payload(open_group(outputs, port), map_arrays=True)
+        return _payload(self.file, address, port)
+
+
+def read_output(path: Path, address: str, port: str) -> StoredPayload:
+    """Read an embedded output of a cell without reading the rest of the record.
+
+    Raises:
+        RecordFormatError: the file is no record, or it has no such output, or it is damaged.
+        OSError: the file cannot be opened.
+    """
+    with safe_open(path) as file:
+        check_format(file, layout.RUN_FORMAT, layout.RUN_FORMAT_VERSION)
+        return _payload(file, address, port)
 
 
 def read_record(path: Path) -> RunRecord:
@@ -99,6 +108,11 @@ def open_record(path: Path) -> Iterator[OpenRecord]:
         yield OpenRecord(
             record=record_of(file), content_sha256=text_attribute(file, SEAL_ATTRIBUTE), file=file
         )
+
+
+def _payload(file: h5py.File, address: str, port: str) -> StoredPayload:
+    cell = open_group(open_group(file, layout.CELLS), address)
+    return read_payload(open_group(open_group(cell, layout.CELL_OUTPUTS), port), map_arrays=True)
 
 
 def record_of(file: h5py.File) -> RunRecord:
