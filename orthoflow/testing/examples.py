@@ -144,7 +144,8 @@ def _corners(
     u, v = wall_axes(normal, up_vector("z"))
     half_u, half_v = 0.5 * sides_m[0] * u, 0.5 * sides_m[1] * v
     steps = [-half_u - half_v, -half_u + half_v, half_u + half_v, half_u - half_v]
-    return offset_m * normal + np.array(steps)
+    corners: NDArray[np.float64] = offset_m * normal + np.array(steps)
+    return corners
 
 
 def _example_files() -> InputFiles:
