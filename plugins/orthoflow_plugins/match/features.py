@@ -6,7 +6,7 @@ OpenCV's SIFT moves every key point by a quarter of a pixel unless its precise u
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -60,15 +60,20 @@ class Features:
             descriptors=self.descriptors,
         )
 
-    def mirrored(self) -> Features:
-        """Give the key points as they would be described had the image been mirrored.
+    def mirrored(self, width_px: float) -> Features:
+        """Give the key points as they would be in the image of this width, left and right swapped.
 
-        Mirroring along the main direction keeps that direction: rows of the 4 x 4 fields of 8
-        directions swap, and directions turn the other way.
+        Mirroring keeps the main direction of a key point as its own: along it, the rows of the
+        4 x 4 fields of 8 directions swap, and directions turn the other way.
         """
         fields = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1]
         turned = fields[..., (8 - np.arange(8)) % 8]
-        return replace(self, descriptors=np.ascontiguousarray(turned.reshape(-1, 128)))
+        return Features(
+            pixels=np.array([width_px, 0.0]) + self.pixels * np.array([-1.0, 1.0]),
+            sizes_px=self.sizes_px,
+            angles_deg=(180.0 - self.angles_deg) % 360.0,
+            descriptors=np.ascontiguousarray(turned.reshape(-1, 128)),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -112,7 +112,7 @@ def pair_photo(
         tried = _pairs_at(grey, wanted, walls, rule)
         if tried.n_verified > best.n_verified:
             best = tried
-    if best.n_verified and _n_verified_mirrored(best, walls, rule) > best.n_verified:
+    if best.n_verified and _n_verified_mirrored(best, grey.shape[1], walls, rule) > best.n_verified:
         refused = tuple(replace(pair, is_shown=False, homography=None) for pair in best.pairs)
         return replace(best, pairs=refused, is_mirrored=True)
     return _completed(best, walls, rule)
@@ -135,21 +135,21 @@ def _pairs_at(
 
 
 def _n_verified_mirrored(
-    pairs: PhotoPairs, walls: Sequence[Features | None], rule: PairingRule
+    pairs: PhotoPairs, width_px: int, walls: Sequence[Features | None], rule: PairingRule
 ) -> int:
     """Matches that would agree, over the walls shown, had the photo been mirrored.
 
     A front that is symmetric matches its own mirror image in part, and the pose found would look
     right where it is.
     """
-    mirrored = pairs.features.mirrored()
+    mirrored = pairs.features.mirrored(width_px)
     total = 0
     for index, wall in enumerate(walls):
         if wall is None:
             continue
         matches = mutual_matches(mirrored.descriptors, wall.descriptors, ratio_most=rule.ratio_most)
         limits = (pairs.radius_px, rule)
-        pair = _verified(index, matches, mirrored, wall, limits, is_mirrored=True)
+        pair = _verified(index, matches, mirrored, wall, limits)
         total += int(pair.agreeing.sum()) if pair.is_shown else 0
     return total
 
@@ -160,8 +160,6 @@ def _verified(
     features: Features,
     wall: Features,
     limits: tuple[float, PairingRule],
-    *,
-    is_mirrored: bool = False,
 ) -> Pair:
     loose_px, rule = limits
     source, target = wall.pixels[matches.second], features.pixels[matches.first]
@@ -177,7 +175,7 @@ def _verified(
     if (
         homography is None
         or n_places < rule.n_verified_least
-        or _is_from_the_front(homography, source[agreeing].mean(axis=0)) == is_mirrored
+        or not _is_from_the_front(homography, source[agreeing].mean(axis=0))
     ):
         return Pair(wall=index, matches=matches, agreeing=agreeing, is_shown=False)
     return Pair(
