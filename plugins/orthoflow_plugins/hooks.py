@@ -165,7 +165,7 @@ def orthoflow_methods() -> list[MethodSpec]:
         MethodSpec(
             id="simulate.room",
             target="orthoflow_plugins.simulate.room:SimulateRoom",
-            summary="a scanned room with relief, niche and obstacle, and its truth",
+            summary="a scanned and photographed room with relief and obstacle, and its truth",
         ),
         MethodSpec(
             id="plane.hough2d",
