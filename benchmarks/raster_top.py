@@ -23,7 +23,8 @@ from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.raster_kernels import NO_POINT
-from orthoflow.geometry.rastering import OffsetPoints, Slab, topmost_points
+from orthoflow.geometry.rastering import topmost_points
+from orthoflow.geometry.slabs import OffsetPoints, Slab
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
 

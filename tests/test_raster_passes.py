@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.raster_kernels import NO_POINT
 from orthoflow.geometry.rastering import (
-    OffsetPoints,
-    Slab,
     disc_offsets,
     lenders_in_gaps,
     topmost_points,
     wall_from_offset,
 )
+from orthoflow.geometry.slabs import OffsetPoints, Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes
 

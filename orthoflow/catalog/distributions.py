@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import Distribution, EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
@@ -78,8 +79,12 @@ def package_path(module: str) -> Path | None:
         name = f"{name}.{head}"
 
 
+@cache
 def source_files(paths: tuple[Path | None, ...]) -> tuple[Path, ...]:
-    """All Python files in packages and single modules, sorted, each once."""
+    """All Python files in packages and single modules, sorted, each once.
+
+    The folders are walked once per process: a plan asks for every method.
+    """
     files: set[Path] = set()
     for path in paths:
         if path is not None:

@@ -38,6 +38,7 @@ def framework_tag() -> str:
     return files_digest(framework_files())
 
 
+@cache
 def framework_files() -> tuple[Path, ...]:
     """The framework's code that methods use."""
     parts = [_ROOT / part for part in _FRAMEWORK_PARTS]

@@ -1,13 +1,12 @@
 """Laying a cloud into the raster of a wall: streams the points, gives arrays per cell.
 
-Loads numba through `raster_kernels`; import it in method modules only.
+Loads numba through `raster_kernels`: methods import it where they run.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -19,47 +18,11 @@ from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.point_kernels import Offsets, in_threads, read_only
 from orthoflow.geometry.raster_kernels import WINNER, Entries, Target
+from orthoflow.geometry.slabs import OffsetPoints, Slab
 
 # 2^20 points: their entries (16 MB) stay in the processor's cache between the passes, and threads
 # wait for each other seldom.
 _CHUNK: Final = 1 << 20
-
-
-@dataclass(frozen=True, kw_only=True)
-class OffsetPoints:
-    """Points as a cloud keeps them.
-
-    Attributes:
-        origin: (3,) float64 metres.
-        x: (n,) float32 metres from the origin; y and z alike.
-        y: see x.
-        z: see x.
-    """
-
-    origin: NDArray[np.float64]
-    x: NDArray[np.float32]
-    y: NDArray[np.float32]
-    z: NDArray[np.float32]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Slab:
-    """The raster of a wall and how far in front of and behind its plane points count.
-
-    Attributes:
-        frame: where the cells lie.
-        front_m: reach towards the viewer, measured from the plane.
-        behind_m: reach away from the viewer, positive.
-    """
-
-    frame: WallFrame
-    front_m: float
-    behind_m: float
-
-    @property
-    def n_cells(self) -> int:
-        """Number of cells."""
-        return self.frame.width * self.frame.height
 
 
 def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import preview_webp, stretch_to_grey
 from orthoflow.geometry import WallFrame
-from orthoflow.products import Orthoimages, OrthoMask, SurfaceMask, Walls
+from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
 from orthoflow.records import Run
 
 LONGEST_SIDE_PX: Final = 1000
@@ -23,6 +25,12 @@ _DIVERGING: Final = np.array(
     [[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]],
     dtype=np.float64,
 )
+# Classes between the middle and either end; the middle itself is one, so that 0 is white.
+_STEPS: Final = 127
+_PLACES: Final = np.linspace(0.0, 4.0, 2 * _STEPS + 1)
+_DIVERGING_TABLE: Final = np.rint(
+    np.column_stack([np.interp(_PLACES, np.arange(5), channel) for channel in _DIVERGING.T])
+).astype(np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,71 +59,101 @@ def orthoimage_pictures(run: Run) -> Iterator[Picture]:
     """Every orthoimage that the record holds."""
     for address, port in _embedded(run, "orthoimages"):
         product = Orthoimages.from_payload(run.payload(address, port))
-        for index, image in enumerate(product.images):
-            shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
-            filled = float(np.mean(image.mask == OrthoMask.FILLED))
-            caption = (
-                f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells show "
-                f"something, {_percent(filled)} of them filled from neighbours"
-                if filled
-                else f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells painted"
-            )
-            yield Picture(
-                uri=data_uri(
-                    preview_webp(image.rgb, shown, longest_side_px=LONGEST_SIDE_PX), "image/webp"
-                ),
-                title=_title(image.name, address),
-                caption=caption,
-                file=_published(run, address, f"wall_{index}_ortho.tif"),
-            )
+        yield from _drawn(
+            [_orthoimage(run, address, index, image) for index, image in enumerate(product.images)]
+        )
 
 
 def wall_pictures(run: Run) -> Iterator[Picture]:
     """Depth and intensity of every wall raster that the record holds."""
     for address, port in _embedded(run, "walls"):
         product = Walls.from_payload(run.payload(address, port))
+        drawings: list[_Drawing] = []
         for index, wall in enumerate(product.walls):
-            known = wall.mask != SurfaceMask.VOID
-            limit_m = _depth_limit_m(wall.depth_m)
-            yield Picture(
-                uri=data_uri(
-                    preview_webp(
-                        depth_colours(wall.depth_m, limit_m), known, longest_side_px=LONGEST_SIDE_PX
-                    ),
-                    "image/webp",
-                ),
-                title=_title(f"{wall.name}, depth", address),
-                caption=(
-                    f"blue {1000 * limit_m:.0f} mm behind the plane, white on it, red "
-                    f"{1000 * limit_m:.0f} mm in front; {_percent(known.mean())} of the cells known"
-                ),
-                file=_published(run, address, f"wall_{index}_depth.tif"),
-            )
+            drawings.append(_depth(run, address, index, wall))
             if wall.intensity is not None:
-                grey = stretch_to_grey(wall.intensity)
-                yield Picture(
-                    uri=data_uri(
-                        preview_webp(
-                            grey, np.isfinite(wall.intensity), longest_side_px=LONGEST_SIDE_PX
-                        ),
-                        "image/webp",
-                    ),
-                    title=_title(f"{wall.name}, intensity", address),
-                    caption={
-                        "laser": "laser intensity",
-                        "luminance": "no laser intensity in the scan: grey of its colours instead",
-                    }.get(product.intensity_source, product.intensity_source),
-                    file=_published(run, address, f"wall_{index}_intensity.tif"),
-                )
+                source = product.intensity_source
+                drawings.append(_intensity(run, address, index, wall, wall.intensity, source))
+        yield from _drawn(drawings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Drawing:
+    """A picture that is still to be drawn."""
+
+    draw: Callable[[], bytes]
+    title: str
+    caption: str
+    file: str
+
+
+def _drawn(drawings: Sequence[_Drawing]) -> Iterator[Picture]:
+    """Draw pictures side by side; encoding takes most of a report's time."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        contents = pool.map(lambda drawing: drawing.draw(), drawings)
+        for drawing, content in zip(drawings, contents, strict=True):
+            yield Picture(
+                uri=data_uri(content, "image/webp"),
+                title=drawing.title,
+                caption=drawing.caption,
+                file=drawing.file,
+            )
+
+
+def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawing:
+    shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
+    filled = float(np.mean(image.mask == OrthoMask.FILLED))
+    return _Drawing(
+        draw=lambda: preview_webp(image.rgb, shown, longest_side_px=LONGEST_SIDE_PX),
+        title=_title(image.name, address),
+        caption=(
+            f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells show something, "
+            f"{_percent(filled)} of them filled from neighbours"
+            if filled
+            else f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells painted"
+        ),
+        file=_published(run, address, f"wall_{index}_ortho.tif"),
+    )
+
+
+def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
+    known = wall.mask != SurfaceMask.VOID
+    limit_m = _depth_limit_m(wall.depth_m)
+    return _Drawing(
+        draw=lambda: preview_webp(
+            depth_colours(wall.depth_m, limit_m), known, longest_side_px=LONGEST_SIDE_PX
+        ),
+        title=_title(f"{wall.name}, depth", address),
+        caption=(
+            f"blue {1000 * limit_m:.0f} mm behind the plane, white on it, red "
+            f"{1000 * limit_m:.0f} mm in front; {_percent(known.mean())} of the cells known"
+        ),
+        file=_published(run, address, f"wall_{index}_depth.tif"),
+    )
+
+
+def _intensity(
+    run: Run, address: str, index: int, wall: Wall, intensity: NDArray[np.float32], source: str
+) -> _Drawing:
+    return _Drawing(
+        draw=lambda: preview_webp(
+            stretch_to_grey(intensity), np.isfinite(intensity), longest_side_px=LONGEST_SIDE_PX
+        ),
+        title=_title(f"{wall.name}, intensity", address),
+        caption={
+            "laser": "laser intensity",
+            "luminance": "no laser intensity in the scan: grey of its colours instead",
+        }.get(source, source),
+        file=_published(run, address, f"wall_{index}_intensity.tif"),
+    )
 
 
 def depth_colours(depth_m: NDArray[np.float32], limit_m: float) -> NDArray[np.uint8]:
     """Colour depths from blue (-limit) over white (0) to red (+limit); NaN is white."""
-    place = np.nan_to_num(np.clip(depth_m / limit_m, -1.0, 1.0)) * 2.0 + 2.0
-    low = np.clip(np.floor(place).astype(np.int64), 0, 3)
-    share = (place - low)[..., None]
-    mixed: NDArray[np.float64] = (1.0 - share) * _DIVERGING[low] + share * _DIVERGING[low + 1]
-    return np.rint(mixed).astype(np.uint8)
+    place = np.clip(np.asarray(depth_m, dtype=np.float32) / np.float32(limit_m), -1.0, 1.0)
+    # One table look-up per cell: mixing colours cell by cell takes ten times as long.
+    index = np.rint(np.nan_to_num(place) * _STEPS + _STEPS).astype(np.int16)
+    return _DIVERGING_TABLE[index]
 
 
 def frame_words(frame: WallFrame) -> str:

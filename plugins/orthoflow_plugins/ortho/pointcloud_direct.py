@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.raster_kernels import NO_POINT
-from orthoflow.geometry.rastering import OffsetPoints, Slab, topmost_points
+from orthoflow.geometry.slabs import OffsetPoints, Slab
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
@@ -116,6 +115,9 @@ def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
 def _project(
     inputs: PointcloudDirect.In, colours: NDArray[np.uint8], wall: Wall, *, threads: int
 ) -> _Projection:
+    from orthoflow.geometry.raster_kernels import NO_POINT
+    from orthoflow.geometry.rastering import topmost_points
+
     cloud, walls = inputs.cloud, inputs.walls
     points = OffsetPoints(origin=cloud.origin, x=cloud.x, y=cloud.y, z=cloud.z)
     slab = Slab(frame=wall.frame, front_m=walls.buffer_front_m, behind_m=walls.buffer_behind_m)

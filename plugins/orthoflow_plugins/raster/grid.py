@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,16 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.rastering import Slab, lenders_in_gaps
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.previews import depth_preview
+from orthoflow_plugins.raster.rules import Surface, SurfaceRule
 from orthoflow_plugins.raster.selection import Constraint, WallChoice, chosen_planes, frame_of
-from orthoflow_plugins.raster.surfaces import CellSurface, Surface, SurfaceRule, surface_of
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.raster.surfaces import CellSurface
 
 # Rec. 601 luma on the sRGB values as they are: the grey of cv2.cvtColor.
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
@@ -191,6 +194,9 @@ def _raster(
     threads: int,
     plane: tuple[Planes, int],
 ) -> _Raster:
+    from orthoflow.geometry.rastering import lenders_in_gaps
+    from orthoflow_plugins.raster.surfaces import surface_of
+
     rule = SurfaceRule(surface=params.surface, layer_m=params.layer_m, threads=threads)
     surface = surface_of(cloud, slab, rule)
     mask = np.where(surface.count > 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8)

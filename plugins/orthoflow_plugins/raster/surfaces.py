@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,32 +11,15 @@ from numpy.typing import NDArray
 from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.raster_kernels import NO_POINT
 from orthoflow.geometry.rastering import (
-    OffsetPoints,
-    Slab,
     empty_winners,
     entries_inside,
     in_parts,
     share_cells,
     spread_m,
 )
+from orthoflow.geometry.slabs import OffsetPoints, Slab
 from orthoflow.products import PointCloud
-
-Surface = Literal["median", "nearest", "topmost", "mean"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurfaceRule:
-    """How the depth of a cell follows from its points.
-
-    Attributes:
-        surface: name of the rule.
-        layer_m: depth step that separates two layers within a cell; for `median`.
-        threads: how many threads work.
-    """
-
-    surface: Surface
-    layer_m: float
-    threads: int
+from orthoflow_plugins.raster.rules import SurfaceRule
 
 
 @dataclass(frozen=True, kw_only=True)
