@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 # Layout of a camera as a flat float64 array, so that kernels take one argument:
@@ -36,16 +36,6 @@ def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba inf
     ad = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
     bd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
     return camera[12] * ad + camera[14], camera[13] * bd + camera[15], zc
-
-
-@njit(cache=True, parallel=True)
-def project_points(camera, points, pixels, depths):  # type: ignore[no-untyped-def]
-    """Project points (n, 3) into pixels (n, 2) and depths (n,), both filled in place."""
-    for i in prange(points.shape[0]):
-        u, v, depth = project_point(camera, points[i, 0], points[i, 1], points[i, 2])
-        pixels[i, 0] = u
-        pixels[i, 1] = v
-        depths[i] = depth
 
 
 def largest_radius(distortion: NDArray[np.float64], *, limit: float = 10.0) -> float:

@@ -13,6 +13,9 @@ from orthoflow.errors import GeometryError
 
 _ITERATIONS: Final = 30
 _CONVERGED: Final = 1e-12
+# What lies no farther before the projection centre counts as behind the camera.
+_NEAREST_M: Final = 1e-9
+_PROJECTED_AT_ONCE: Final = 1 << 15
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +86,31 @@ class ViewingCamera:
         u and v are NaN for points behind the camera or beyond the lens model; points outside the
         image have pixels outside it.
         """
-        from orthoflow.geometry.camera_kernels import project_points  # noqa: PLC0415 - numba
+        points = np.asarray(points_world, dtype=np.float64)
+        projected = np.empty((len(points), 3))
+        for start in range(0, len(points), _PROJECTED_AT_ONCE):
+            part = slice(start, start + _PROJECTED_AT_ONCE)
+            projected[part] = self._project(points[part].T)
+        return projected
 
-        points = np.ascontiguousarray(points_world, dtype=np.float64)
-        pixels = np.empty((len(points), 2))
-        depths = np.empty(len(points))
-        project_points(self.flat, points, pixels, depths)
-        return np.column_stack([pixels, depths])
+    def _project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Project points (3, n); the formula of `camera_kernels.project_point`."""
+        k1, k2, p1, p2, k3 = self.distortion
+        # Infinite and missing points end as NaN, without a word.
+        with np.errstate(all="ignore"):
+            x, y, z = (
+                row[0] * points[0] + row[1] * points[1] + row[2] * points[2] + shift
+                for row, shift in zip(self.rotation, self.translation, strict=True)
+            )
+            a, b = x / z, y / z
+            r2 = a * a + b * b
+            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            u = self.fx * (a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)) + self.cx
+            v = self.fy * (b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b) + self.cy
+            hidden = ~(z > _NEAREST_M) | (r2 > self.flat[23] ** 2)
+        u[hidden] = np.nan
+        v[hidden] = np.nan
+        return np.column_stack([u, v, z])
 
     def sees(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which pixels (n, 2) lie inside the image; NaN does not."""
@@ -104,22 +125,15 @@ class ViewingCamera:
             GeometryError: the distortion cannot be undone there, e.g. beyond the fold of the lens
                 model.
         """
-        centre, focal = np.array([self.cx, self.cy]), np.array([self.fx, self.fy])
-        wanted = np.asarray((pixels_photo - centre) / focal, dtype=np.float64)
-        found = wanted.copy()
-        step = np.zeros_like(found)
-        for _ in range(_ITERATIONS):
-            error, jacobian = self._distortion_error(found, wanted)
-            step[:] = np.linalg.solve(jacobian, error[:, :, None])[:, :, 0]
-            found = np.asarray(found - step, dtype=np.float64)
-            if not step.size or np.abs(step).max() < _CONVERGED:
-                break
-        if step.size and not np.abs(step).max() < 1e-9:
+        wanted_a = (np.asarray(pixels_photo[:, 0], dtype=np.float64) - self.cx) / self.fx
+        wanted_b = (np.asarray(pixels_photo[:, 1], dtype=np.float64) - self.cy) / self.fy
+        found = undistorted(wanted_a, wanted_b, self.distortion)
+        if found.size and not np.abs(found[2]).max() < 1e-9:
             raise GeometryError(
                 "the lens distortion cannot be undone at the border of the image: the calibration "
                 f"{self.distortion.tolist()} folds back inside it"
             )
-        return np.column_stack([found, np.ones(len(found))])
+        return np.column_stack([found[0], found[1], np.ones(found.shape[1])])
 
     def rays_world(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit directions (n, 3) in world axes of pixels (n, 2)."""
@@ -127,26 +141,44 @@ class ViewingCamera:
         unit: NDArray[np.float64] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         return unit
 
-    def _distortion_error(
-        self, found: NDArray[np.float64], wanted: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        k1, k2, p1, p2, k3 = self.distortion
-        a, b = found[:, 0], found[:, 1]
-        r2 = a * a + b * b
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))  # d radial / d r2, times 2
-        error = np.column_stack(
-            [
-                a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a) - wanted[:, 0],
-                b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b - wanted[:, 1],
-            ]
-        )
-        jacobian = np.empty((len(found), 2, 2))
-        jacobian[:, 0, 0] = radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
-        jacobian[:, 0, 1] = a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
-        jacobian[:, 1, 0] = jacobian[:, 0, 1]
-        jacobian[:, 1, 1] = radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
-        return error, jacobian
+
+def undistorted(
+    wanted_a: NDArray[np.float64], wanted_b: NDArray[np.float64], distortion: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Undo a distortion by Newton steps.
+
+    Args:
+        wanted_a: (n,) distorted x / z, NaN where there is none.
+        wanted_b: (n,) distorted y / z.
+        distortion: (5,) k1, k2, p1, p2, k3.
+
+    Returns:
+        (3, n) rows: x / z, y / z, and the last step, which is not small where there is no way back.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    found = np.empty((3, len(wanted_a)))
+    a, b, last_step = found
+    a[:], b[:], last_step[:] = wanted_a, wanted_b, 0.0
+    with np.errstate(all="ignore"):
+        for _ in range(_ITERATIONS):
+            aa, ab, bb = a * a, a * b, b * b
+            r2 = aa + bb
+            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))  # d radial / d r2, times 2
+            error_a = a * radial + 2.0 * p1 * ab + p2 * (r2 + 2.0 * aa) - wanted_a
+            error_b = b * radial + p1 * (r2 + 2.0 * bb) + 2.0 * p2 * ab - wanted_b
+            slope_a = radial + aa * slope + 2.0 * p1 * b + 6.0 * p2 * a
+            slope_b = radial + bb * slope + 6.0 * p1 * b + 2.0 * p2 * a
+            mixed = ab * slope + 2.0 * p1 * a + 2.0 * p2 * b
+            determinant = slope_a * slope_b - mixed * mixed
+            step_a = (slope_b * error_a - mixed * error_b) / determinant
+            step_b = (slope_a * error_b - mixed * error_a) / determinant
+            a -= step_a
+            b -= step_b
+            np.maximum(np.abs(step_a), np.abs(step_b), out=last_step)
+            if not np.any(last_step >= _CONVERGED):
+                break
+    return found
 
 
 def looking_at(
