@@ -153,7 +153,8 @@ def depth_colours(depth_m: NDArray[np.float32], limit_m: float) -> NDArray[np.ui
     place = np.clip(np.asarray(depth_m, dtype=np.float32) / np.float32(limit_m), -1.0, 1.0)
     # One table look-up per cell: mixing colours cell by cell takes ten times as long.
     index = np.rint(np.nan_to_num(place) * _STEPS + _STEPS).astype(np.int16)
-    return _DIVERGING_TABLE[index]
+    coloured: NDArray[np.uint8] = _DIVERGING_TABLE[index]
+    return coloured
 
 
 def frame_words(frame: WallFrame) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,6 +14,10 @@ from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.checks import CHECKS, Check, Subject
 from orthoflow.testing.examples import example
+from orthoflow.testing.trials import Trial
+from orthoflow.testing.witnesses import Witness
+
+Inputs = Mapping[str, Product | InputFiles]
 
 
 class ConformanceError(AssertionError):
@@ -26,15 +31,13 @@ class ConformanceCase:
     Attributes:
         method_id: id of the method.
         check: what is checked.
-        inputs: port -> product, where the suite's own examples do not fit.
-        params: parameters that differ from the defaults.
+        witness: gives the runs of the method, which its cases share.
         expected_failure: why the check is known to fail; empty when it must pass.
     """
 
     method_id: str
     check: Check
-    inputs: Mapping[str, Product | InputFiles] = field(default_factory=dict)
-    params: Mapping[str, object] = field(default_factory=dict)
+    witness: Callable[[], Witness]
     expected_failure: str = ""
 
     def __str__(self) -> str:
@@ -59,25 +62,16 @@ class ConformanceCase:
     def _problem(self) -> str:
         with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
             try:
-                self.check.run(self._subject(Path(folder)))
+                self.check.run(Subject(witness=self.witness(), folder=Path(folder)))
             except AssertionError as error:
                 return str(error)
         return ""
-
-    def _subject(self, folder: Path) -> Subject:
-        method = discover_catalog().method(self.method_id).load()
-        inputs = {
-            name: self.inputs.get(name) or example(port.type_name)
-            for name, port in port_specs(method.In).items()
-            if name in self.inputs or port.required or port.type_name == "truth"
-        }
-        return Subject(method=method, inputs=inputs, params=self.params, folder=folder)
 
 
 def conformance_cases(
     method_id: str,
     *,
-    inputs: Mapping[str, Product | InputFiles] | None = None,
+    inputs: Inputs | Callable[[], Inputs] | None = None,
     params: Mapping[str, object] | None = None,
     expected_failures: Mapping[str, str] | None = None,
 ) -> tuple[ConformanceCase, ...]:
@@ -85,7 +79,8 @@ def conformance_cases(
 
     Args:
         method_id: e.g. `plane.flat`; found through the installed entry points.
-        inputs: port -> product for ports the suite has no fitting example of.
+        inputs: port -> product for ports the suite has no fitting example of, or what gives them
+            when the first case runs.
         params: parameters that differ from the defaults, for a quick run.
         expected_failures: check name -> why the method cannot pass it.
 
@@ -102,12 +97,22 @@ def conformance_cases(
                 f"expected_failures needs the name of a check and a reason, got {name!r}: "
                 f"{reason!r}; the checks are {', '.join(check.name for check in CHECKS)}"
             )
+
+    @cache
+    def witness() -> Witness:
+        given = inputs() if callable(inputs) else inputs or {}
+        filled = {
+            name: given.get(name) or example(port.type_name)
+            for name, port in port_specs(method.In).items()
+            if name in given or port.required or port.type_name == "truth"
+        }
+        return Witness(Trial(method=method, inputs=filled, params=dict(params or {})))
+
     return tuple(
         ConformanceCase(
             method_id=method_id,
             check=check,
-            inputs=dict(inputs or {}),
-            params=dict(params or {}),
+            witness=witness,
             expected_failure=expected.get(check.name, ""),
         )
         for check in CHECKS

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,11 +14,11 @@ from pydantic import ValidationError
 
 from orthoflow.engine.store import digest_of
 from orthoflow.errors import OrthoflowError
-from orthoflow.products import InputFiles, Planes, PointCloud, Product
+from orthoflow.products import Planes, PointCloud, Product
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.examples import example_room, few_points
-from orthoflow.testing.isolation import run_elsewhere
-from orthoflow.testing.trials import Trial, TrialRun, run_trial
+from orthoflow.testing.trials import TrialRun, run_trial
+from orthoflow.testing.witnesses import Witness
 
 # What a float parameter's name ends with: its unit, or a word that says it has none.
 UNIT_SUFFIXES: Final = (
@@ -33,30 +33,23 @@ class Subject:
     """A method with what to try it on.
 
     Attributes:
-        method: the class.
-        inputs: port -> product.
-        params: parameters that differ from the defaults.
-        folder: empty, for the check to use.
+        witness: runs of the method on its inputs.
+        folder: empty, for further runs.
     """
 
-    method: type[Method]
-    inputs: Mapping[str, Product | InputFiles]
-    params: Mapping[str, object]
+    witness: Witness
     folder: Path
 
-    def trial(self, **changes: object) -> Trial:
-        """Give the run of the method on the subject's inputs, with changes."""
-        wanted: dict[str, object] = {
-            "method": self.method,
-            "inputs": self.inputs,
-            "params": self.params,
-            **changes,
-        }
-        return Trial(**wanted)  # type: ignore[arg-type]  # names and types are those of Trial
+    @property
+    def method(self) -> type[Method]:
+        """The class."""
+        return self.witness.trial.method
 
-    def run(self, name: str = "scratch", **changes: object) -> TrialRun:
-        """Run it in a scratch folder of the given name."""
-        return run_trial(self.trial(**changes), self.folder / name)
+    def run_on(self, name: str, **inputs: Product) -> TrialRun:
+        """Run the method with other inputs on some ports, in a scratch folder of that name."""
+        trial = self.witness.trial
+        changed = replace(trial, inputs={**trial.inputs, **inputs})
+        return run_trial(changed, self.folder / name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +90,7 @@ def parameters_are_documented(subject: Subject) -> None:
 def parameters_round_trip(subject: Subject) -> None:
     """Parameters survive JSON, are frozen, and unknown keys are refused."""
     model = subject.method.Params
-    params = model(**subject.params)
+    params = model(**subject.witness.trial.params)
     text = json.dumps(params.model_dump(mode="json"), allow_nan=False)
     _require(model.model_validate_json(text) == params, f"parameters change through JSON: {text}")
     _require(model.model_config.get("frozen"), "parameters are not frozen")
@@ -110,7 +103,7 @@ def parameters_round_trip(subject: Subject) -> None:
 
 def outputs_are_valid(subject: Subject) -> None:
     """Outputs have the declared types and survive storing; metrics carry units."""
-    run = subject.run()
+    run = subject.witness.first.run
     for name, port in port_specs(subject.method.Out).items():
         product = run.outputs.get(name)
         _require(product is not None or not port.required, f"output {name} is missing")
@@ -128,27 +121,22 @@ def outputs_are_valid(subject: Subject) -> None:
 
 def inputs_stay_untouched(subject: Subject) -> None:
     """No array of an input is written to."""
-    before = _input_digests(subject)
-    subject.run()
-    for name, digest in _input_digests(subject).items():
-        _require(digest == before[name], f"input {name} was changed")
+    for name in subject.witness.first.changed_inputs:
+        raise AssertionError(f"input {name} was changed")
 
 
 def global_state_stays_untouched(subject: Subject) -> None:
     """Numpy's global generator is not used."""
-    before = repr(np.random.get_state())  # noqa: NPY002 - it is the global one that is watched
-    subject.run()
-    after = repr(np.random.get_state())  # noqa: NPY002
-    _require(before == after, "the method draws from numpy's global generator, not from ctx.rng")
+    _require(
+        not subject.witness.first.drew_globally,
+        "the method draws from numpy's global generator, not from ctx.rng",
+    )
 
 
 def nothing_is_written_outside_scratch(subject: Subject) -> None:
     """Working directory, home and temporary folder stay empty."""
-    elsewhere = run_elsewhere(subject.trial(), subject.folder)
-    _require(
-        not elsewhere.strays,
-        f"files were written outside the scratch folder: {', '.join(elsewhere.strays)}",
-    )
+    strays = subject.witness.elsewhere.strays
+    _require(not strays, f"files were written outside the scratch folder: {', '.join(strays)}")
 
 
 def results_repeat(subject: Subject) -> None:
@@ -156,9 +144,8 @@ def results_repeat(subject: Subject) -> None:
 
     With determinism `loose` only the types of the outputs have to agree.
     """
-    first = subject.run("first")
-    second = subject.run("second")
-    elsewhere = run_elsewhere(subject.trial(), subject.folder)
+    witness = subject.witness
+    first, second, elsewhere = witness.first.run, witness.again, witness.elsewhere
     exact = subject.method.determinism != "loose"
     for name, digest in first.digests.items():
         _require(
@@ -173,8 +160,7 @@ def results_repeat(subject: Subject) -> None:
 
 def threads_do_not_show(subject: Subject) -> None:
     """One core or two give the same digest."""
-    one = subject.run("one", cores=1)
-    two = subject.run("two", cores=2)
+    one, two = subject.witness.first.run, subject.witness.on_two_cores
     for name, digest in one.digests.items():
         _require(two.digests[name] == digest, f"output {name} depends on the number of cores")
 
@@ -186,7 +172,7 @@ def _cloud_ports(method: type[Method]) -> Iterator[str]:
 def _refuses(subject: Subject, cloud: PointCloud, what: str) -> None:
     for port in _cloud_ports(subject.method):
         try:
-            subject.run(f"{port}-{what}", inputs={**subject.inputs, port: cloud})
+            subject.run_on(f"{port}-{what}", **{port: cloud})
         except OrthoflowError as error:
             _require(str(error).strip(), f"a cloud with {what} is refused without a word")
         except Exception as error:
@@ -226,7 +212,7 @@ def planes_follow_a_rigid_motion(subject: Subject) -> None:
     shift = np.array([634512.347, 486215.781, 112.193])
     for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
         cloud, truth = example_room(turned_deg=turned_deg, shift_m=moved_by)
-        run = subject.run(f"turned{turned_deg}{moved_by[0]}", inputs={"cloud": cloud})
+        run = subject.run_on(f"turned{turned_deg}{moved_by[0]}", cloud=cloud)
         planes = run.outputs["planes"]
         _require(isinstance(planes, Planes) and len(planes) > 0, "no plane was found")
         if isinstance(planes, Planes):
@@ -245,14 +231,6 @@ def _match_planes(found: Planes, truth: Planes) -> None:
             f"plane {index} of a moved room is {angles_deg.min():.3f} deg and "
             f"{1000 * gaps_m[np.argmin(angles_deg)]:.2f} mm from the nearest true plane",
         )
-
-
-def _input_digests(subject: Subject) -> dict[str, str]:
-    return {
-        name: digest_of(product)
-        for name, product in subject.inputs.items()
-        if isinstance(product, Product)
-    }
 
 
 def _always(method: type[Method]) -> bool:

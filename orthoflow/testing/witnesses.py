@@ -1,0 +1,84 @@
+"""Runs of one method that several checks look at, each made once and only when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from orthoflow.engine.store import digest_of
+from orthoflow.products import Product
+from orthoflow.testing.isolation import ElsewhereRun, run_elsewhere
+from orthoflow.testing.trials import Trial, TrialRun, run_trial
+
+
+@dataclass(frozen=True, kw_only=True)
+class WatchedRun:
+    """A run, and what it changed around itself.
+
+    Attributes:
+        run: what came out.
+        changed_inputs: names of inputs whose digest is another one afterwards.
+        drew_globally: whether the state of numpy's global generator is another one afterwards.
+    """
+
+    run: TrialRun
+    changed_inputs: tuple[str, ...]
+    drew_globally: bool
+
+
+class Witness:
+    """Runs a trial in the ways that checks compare.
+
+    Args:
+        trial: on one core.
+    """
+
+    def __init__(self, trial: Trial) -> None:
+        self.trial = trial
+
+    @cached_property
+    def first(self) -> WatchedRun:
+        """The run, watched."""
+        inputs, state = _digests(self.trial.inputs), _global_state()
+        run = _run(self.trial)
+        after = _digests(self.trial.inputs)
+        return WatchedRun(
+            run=run,
+            changed_inputs=tuple(name for name in inputs if inputs[name] != after[name]),
+            drew_globally=state != _global_state(),
+        )
+
+    @cached_property
+    def again(self) -> TrialRun:
+        """The same in the same process."""
+        return _run(self.trial)
+
+    @cached_property
+    def on_two_cores(self) -> TrialRun:
+        """The same on two cores."""
+        return _run(replace(self.trial, cores=2))
+
+    @cached_property
+    def elsewhere(self) -> ElsewhereRun:
+        """The same in a new process, in an empty world."""
+        with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
+            return run_elsewhere(self.trial, Path(folder))
+
+
+def _run(trial: Trial) -> TrialRun:
+    # Outputs may be files mapped from the scratch folder: they stay readable when it is gone.
+    with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
+        return run_trial(trial, Path(folder))
+
+
+def _digests(inputs: Mapping[str, object]) -> dict[str, str]:
+    return {name: digest_of(given) for name, given in inputs.items() if isinstance(given, Product)}
+
+
+def _global_state() -> str:
+    return repr(np.random.get_state())  # noqa: NPY002 - it is the global one that is watched
