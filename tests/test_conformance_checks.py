@@ -1,0 +1,238 @@
+"""The conformance suite notices every kind of broken rule, and says which."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from orthoflow.testing import ConformanceCase, ConformanceError, conformance_cases
+from tests.laboratories import write_distribution
+
+HONEST = """
+from __future__ import annotations
+
+import os
+import pathlib
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from orthoflow.products import Planes, PointCloud, PointLabels
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+
+
+class Floor(Method):
+    '''The horizontal plane through the lowest points: a method that keeps every rule.'''
+
+    id = "plane.floor"
+
+    class Params(MethodParams):
+        lift_m: float = Field(0.0, description="Raises the plane.")
+
+    class In(Ports):
+        cloud: PointCloud
+
+    class Out(Ports):
+        planes: Planes
+        labels: PointLabels
+
+    def run(self, inputs, params, ctx):
+        cloud = inputs.cloud
+        self.look_at(cloud)
+        x, y = (float(np.nanmin(a)) for a in (cloud.x, cloud.y))
+        lowest = cloud.z[cloud.z < np.quantile(cloud.z, 0.01) + 0.02]
+        z = float(np.median(lowest)) + params.lift_m + self.lift_m(cloud, ctx)
+        square = np.array([[x, y + 1, z], [x, y, z], [x + 1, y, z], [x + 1, y + 1, z]])
+        planes = Planes(
+            normal=np.array([[0.0, 0.0, 1.0]]), offset=np.array([z]) + cloud.origin[2],
+            corners=(square + cloud.origin)[np.newaxis], covariance=np.zeros((1, 4, 4)),
+            n_points=np.array([len(cloud)], dtype=np.int64), rms_m=np.zeros(1),
+            names=("plane 0",), up=np.array([0.0, 0.0, 1.0]),
+        )
+        return self.Out(
+            planes=planes, labels=PointLabels(plane_index=np.zeros(len(cloud), dtype=np.int16))
+        )
+
+    def look_at(self, cloud):
+        cloud.require_points(3)
+
+    def lift_m(self, cloud, ctx):
+        return 0.0
+"""
+# Name of the cheat -> the check that must notice it, its sentence, and how the cheat cheats.
+CHEATS: dict[str, tuple[str, str, str]] = {
+    "unitless": (
+        "parameters-are-documented",
+        "parameter tolerance does not say its unit",
+        """
+        class Params(MethodParams):
+            tolerance: float = Field(0.1, description="Near enough.")
+            lift_m: float = Field(0.0, description="Raises the plane.")
+        """,
+    ),
+    "undescribed": (
+        "parameters-are-documented",
+        "parameter lift_m has no description",
+        """
+        class Params(MethodParams):
+            lift_m: float = 0.0
+        """,
+    ),
+    "lenient": (
+        "parameters-round-trip",
+        "an unknown parameter is accepted in silence",
+        """
+        class Params(MethodParams):
+            model_config = ConfigDict(extra="ignore", frozen=True)
+            lift_m: float = Field(0.0, description="Raises the plane.")
+        """,
+    ),
+    "unmeasured": (
+        "outputs-are-valid",
+        "metric height has no unit",
+        """
+        def lift_m(self, cloud, ctx):
+            ctx.metric("height", 1.0, "")
+            return 0.0
+        """,
+    ),
+    "meddling": (
+        "inputs-stay-untouched",
+        "input cloud was changed",
+        """
+        def lift_m(self, cloud, ctx):
+            cloud.x.flags.writeable = True
+            cloud.x[0] += 1.0
+            return 0.0
+        """,
+    ),
+    "global_dice": (
+        "global-state-stays-untouched",
+        "draws from numpy's global generator",
+        """
+        def lift_m(self, cloud, ctx):
+            np.random.rand()
+            return 0.0
+        """,
+    ),
+    "littering": (
+        "nothing-is-written-outside-scratch",
+        "files were written outside the scratch folder: cwd/notes.txt, home/.floor",
+        """
+        def lift_m(self, cloud, ctx):
+            pathlib.Path("notes.txt").write_text("here")
+            (pathlib.Path.home() / ".floor").write_text("and here")
+            return 0.0
+        """,
+    ),
+    "unseeded": (
+        "results-repeat",
+        "differs between two runs with one seed in one process",
+        """
+        def lift_m(self, cloud, ctx):
+            return float(np.random.default_rng().random())
+        """,
+    ),
+    "hashing": (
+        "results-repeat",
+        "differs in a new process",
+        """
+        def lift_m(self, cloud, ctx):
+            return hash("floor") % 1000 / 1000.0
+        """,
+    ),
+    "counting_cores": (
+        "threads-do-not-show",
+        "depends on the number of cores",
+        """
+        def lift_m(self, cloud, ctx):
+            return ctx.cores / 1000.0
+        """,
+    ),
+    "careless": (
+        "empty-cloud-is-refused",
+        "a cloud with no points ends in IndexError, not in an OrthoflowError",
+        """
+        def look_at(self, cloud):
+            cloud.x[0]
+        """,
+    ),
+    "rounding": (
+        "planes-follow-a-rigid-motion",
+        "from the nearest true plane",
+        """
+        def lift_m(self, cloud, ctx):
+            return float(np.float32(cloud.origin[2])) - float(cloud.origin[2]) + 0.01
+        """,
+    ),
+    "trusting": (
+        "nan-is-refused",
+        "a cloud with NaN coordinates is accepted in silence",
+        """
+        def look_at(self, cloud):
+            pass
+        """,
+    ),
+}
+
+
+@pytest.fixture
+def cheats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Install a method that keeps the rules and one for every way to break them."""
+    classes = "".join(
+        f'\n\nclass {name.title().replace("_", "")}(Floor):\n    id = "plane.{name}"\n'
+        + textwrap.indent(textwrap.dedent(body), "    ")
+        for name, (_, _, body) in CHEATS.items()
+    )
+    listing = ", ".join(
+        f'MethodSpec(id="plane.{name}", target="floors:{name.title().replace("_", "")}", '
+        f'summary="For a test.")'
+        for name in ("floor", *CHEATS)
+    )
+    hooks = (
+        "from orthoflow.sdk.hooks import MethodSpec, hookimpl\n\n\n"
+        f"@hookimpl\ndef orthoflow_methods():\n    return [{listing}]\n"
+    )
+    folder = write_distribution(
+        tmp_path / "site", "cheats", {"floors.py": HONEST + classes, "cheats_hooks.py": hooks}
+    )
+    monkeypatch.syspath_prepend(folder)
+    # A cheat that litters does so here too, where it runs in this process.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+
+
+def case_of(method_id: str, check: str) -> ConformanceCase:
+    (case,) = (case for case in conformance_cases(method_id) if case.check.name == check)
+    return case
+
+
+@pytest.mark.usefixtures("cheats")
+@pytest.mark.parametrize("cheat", CHEATS)
+def test_a_broken_rule_is_noticed_and_named(cheat: str) -> None:
+    check, sentence, _ = CHEATS[cheat]
+    with pytest.raises(ConformanceError) as caught:
+        case_of(f"plane.{cheat}", check).run()
+    assert str(caught.value).startswith(f"plane.{cheat}-{check}: ")
+    assert sentence in str(caught.value)
+
+
+@pytest.mark.usefixtures("cheats")
+@pytest.mark.parametrize("check", sorted({check for check, _, _ in CHEATS.values()}))
+def test_a_method_that_keeps_the_rules_passes(check: str) -> None:
+    case_of("plane.floor", check).run()
+
+
+@pytest.mark.usefixtures("cheats")
+def test_an_expected_failure_that_passes_is_reported() -> None:
+    (case,) = (
+        case
+        for case in conformance_cases(
+            "plane.floor", expected_failures={"threads-do-not-show": "counts its cores"}
+        )
+        if case.check.name == "threads-do-not-show"
+    )
+    with pytest.raises(ConformanceError, match="passes, although it was expected to fail"):
+        case.run()
