@@ -34,6 +34,9 @@ _CROWDED_LEAST: Final = 0.5
 # Surfaces rounder than this radius are no planes, when the rounding is what shows in their cells.
 _RADIUS_LEAST_M: Final = 5.0
 _BENT_SHARE: Final = 0.5
+# Parts are of one plane when the common fit lies not much worse in the largest than its own.
+_ASKEW: Final = 1.5
+_SAME_M: Final = 2e-4
 # Passes over all points that one plane may take, and the share of the fit tolerance by which a fit
 # may move without asking for another.
 _LOOKS_MOST: Final = 3
@@ -181,14 +184,52 @@ def _refine_on_sample(
     least = _SAMPLE_CAUTION * rules.least_share * len(sample.index)
     if place is None or place.n_points < least:
         return None
-    on_plane = near[_inside(near, raster, place.cells)]
-    for tolerance_m in (first, *rest):
-        plane = refine_plane(on_plane, plane, tolerance_m, freedom=freedom, up=remainder.up)
-        if plane is None:
-            return None
+    plane = _fitted_to_parts(plane, near, raster, place, (first, *rest), freedom, remainder.up)
+    if plane is None:
+        return None
     n_represented = float(sums.n_find[place.cells].sum()) * sample.n_represented
     area_m2 = float(place.cells.sum()) * raster.cell_m**2
     return _Refined(plane=plane, cell_m=cell_for(n_represented, area_m2))
+
+
+def _fitted_to_parts(
+    plane: Plane,
+    near: NDArray[np.float64],
+    raster: SurfaceRaster,
+    place: Footprint,
+    tolerances_m: tuple[float, ...],
+    freedom: Freedom,
+    up: NDArray[np.float64],
+) -> Plane | None:
+    """Fit a plane to all its parts, or to the largest alone when the others pull it askew.
+
+    A door and a niche in one wall, at different depths, both lie near one plane that leans by some
+    degrees and runs through them askew; fitted alone, each shows that it does not.
+    """
+    on_plane = near[_inside(near, raster, place.cells)]
+    together = _shrunk(on_plane, plane, tolerances_m, freedom, up)
+    if len(place.parts_m) < 2:
+        return together
+    largest = near[_inside(near, raster, place.cells & (place.part_of_cell == 0))]
+    alone = _shrunk(largest, plane, tolerances_m, freedom, up)
+    if together is None or alone is None:
+        return alone
+    apart_m, joint_m = (float(np.median(np.abs(p.distances_m(largest)))) for p in (alone, together))
+    return together if joint_m <= _ASKEW * apart_m + _SAME_M else alone
+
+
+def _shrunk(
+    points: NDArray[np.float64],
+    start: Plane,
+    tolerances_m: tuple[float, ...],
+    freedom: Freedom,
+    up: NDArray[np.float64],
+) -> Plane | None:
+    plane: Plane | None = start
+    for tolerance_m in tolerances_m:
+        if plane is not None:
+            plane = refine_plane(points, plane, tolerance_m, freedom=freedom, up=up)
+    return plane
 
 
 def _sample_cells(

@@ -95,12 +95,15 @@ class Footprint:
 
     Attributes:
         cells: (rows, columns) bool.
-        parts_m: (p, 4) smallest u, largest u, smallest v, largest v of each connected part.
+        part_of_cell: (rows, columns) int32, which part a cell belongs to, -1 for none.
+        parts_m: (p, 4) smallest u, largest u, smallest v, largest v of each connected part, the
+            part with most points first.
         bounds_m: (4,) the same of all parts together.
         n_points: points within the find tolerance in those cells.
     """
 
     cells: NDArray[np.bool_]
+    part_of_cell: NDArray[np.int32]
     parts_m: NDArray[np.float64]
     bounds_m: NDArray[np.float64]
     n_points: int
@@ -211,11 +214,16 @@ def footprint(
     names, n_parts = ndimage.label(joined | belongs, np.ones((3, 3), dtype=int))
     sizes = np.bincount(names[belongs], minlength=n_parts + 1)
     kept = np.flatnonzero(sizes >= _PART_SHARE * belongs.sum())
-    kept = kept[np.argsort(-sizes[kept], kind="stable")]
-    cells = belongs & np.isin(names, kept)
-    parts_m = np.array([_bounds(raster, belongs & (names == name)) for name in kept])
+    n_points = np.bincount(names[belongs], sums.n_find[belongs], minlength=n_parts + 1)
+    kept = kept[np.argsort(-n_points[kept], kind="stable")]
+    part_of_name = np.full(n_parts + 1, -1, dtype=np.int32)
+    part_of_name[kept] = np.arange(len(kept), dtype=np.int32)
+    part_of_cell = np.where(belongs, part_of_name[names], np.int32(-1))
+    cells = part_of_cell >= 0
+    parts_m = np.array([_bounds(raster, part_of_cell == part) for part in range(len(kept))])
     return Footprint(
         cells=cells,
+        part_of_cell=part_of_cell,
         parts_m=parts_m,
         bounds_m=_bounds(raster, cells),
         n_points=int(sums.n_find[cells].sum()),
