@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry import WallFrame, frame_over
-from orthoflow.geometry.scene_views import cast, colours_at, render_frame
+from orthoflow.geometry.scene_views import Rendering, cast, colours_at, render, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, Viewers
 from tests import scenes
 
@@ -188,6 +188,26 @@ def test_cores_change_no_bit_of_a_true_orthoimage() -> None:
     )
     np.testing.assert_array_equal(one.rgb, two.rgb)
     np.testing.assert_array_equal(one.depth_m, two.depth_m)
+
+
+def test_a_part_of_a_true_orthoimage_is_that_part_of_the_whole() -> None:
+    viewers = Viewers(positions_world=np.array([[0.0, -2.0, 0.0]]), up=scenes.UP_Z)
+    scene, frame = wall_with_screen(), wall_frame()
+    rng = np.random.default_rng(4)
+    coloured, judged = rng.random((2, *frame.shape)) < 0.4
+    whole, part = (
+        render(
+            scene,
+            frame,
+            Rendering(buffer_front_m=0.5, buffer_behind_m=0.3, viewers=viewers, **masks),
+        )
+        for masks in ({}, {"coloured": coloured, "judged": judged})
+    )
+    np.testing.assert_array_equal(part.depth_m, whole.depth_m)
+    np.testing.assert_array_equal(part.rgb, np.where(coloured[:, :, None], whole.rgb, np.nan))
+    np.testing.assert_array_equal(part.seen, whole.seen & judged)
+    np.testing.assert_array_equal(part.behind_object, whole.behind_object & judged)
+    assert 0 < np.count_nonzero(part.behind_object) < np.count_nonzero(whole.behind_object)
 
 
 def test_a_finer_rendering_averages_to_the_coarser_one() -> None:

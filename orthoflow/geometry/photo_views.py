@@ -11,20 +11,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.photo_kernels import (
-    TILE,
-    Exposure,
-    expose_rows,
-    hit_pixels,
-    workspace,
-)
-from orthoflow.geometry.scene_kernels import CastTable, cast_rays
-from orthoflow.geometry.scene_trees import cast_table
-from orthoflow.geometry.scene_views import Hits, in_threads
+from orthoflow.geometry.cameras import ViewingCamera, undistorted
+from orthoflow.geometry.hashed_numbers import cell_states, uniforms
+from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, in_threads, points_on
 from orthoflow.geometry.scenes import Scene
 
-_RAYS_PER_TASK: Final = 1 << 15
 # A point is seen when nothing is hit more than this share of its distance before it.
 _SEEN_WITHIN: Final = 2e-4
 
@@ -51,7 +42,7 @@ class SceneCameras:
     """
 
     def __init__(self, scene: Scene, *, cores: int = 1) -> None:
-        self._table: CastTable = cast_table(scene)
+        self._rays = SceneRays(scene)
         self._origin = scene.origin
         self._cores = cores
 
@@ -62,28 +53,34 @@ class SceneCameras:
 
         Colours are means of supersample^2 rays per pixel, at random places that hang on the seed.
         """
-        image = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
-        exposure = Exposure(self._flat(camera), supersample, seed)
-        n_rectangles = len(self._table.kinds)
+        image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
+        near = camera.shifted(self._origin)
 
-        def expose_part(first: int, _: int) -> None:
-            expose_rows(self._table, exposure, image, first, workspace(n_rectangles))
+        def expose_rows(first: int, last: int) -> None:
+            image[first:last] = _exposed(self._rays, near, (first, last), supersample, seed)
 
-        in_threads(expose_part, camera.height, TILE, cores=self._cores)
+        in_threads(
+            expose_rows, camera.height, max(1, RAYS_AT_ONCE // camera.width), cores=self._cores
+        )
         return image
 
     def trace(self, camera: ViewingCamera, pixels_photo: NDArray[np.float64]) -> SeenPoints:
         """Find what pixels (n, 2) look at; they may lie outside the image, NaN sees nothing."""
-        pixels = np.ascontiguousarray(pixels_photo, dtype=np.float64)
+        pixels = np.asarray(pixels_photo, dtype=np.float64)
         points = np.full((len(pixels), 3), np.nan)
         rectangle = np.full(len(pixels), -1, dtype=np.int32)
-        flat = self._flat(camera)
+        near = camera.shifted(self._origin)
+        centre = near.centre_world[:, None]
 
         def trace_part(first: int, last: int) -> None:
-            part = slice(first, last)
-            hit_pixels(self._table, flat, pixels[part], points[part], rectangle[part])
+            chosen = first + np.flatnonzero(np.isfinite(pixels[first:last]).all(axis=1))
+            ways = pixel_directions(near, pixels[chosen, 0], pixels[chosen, 1])
+            hits = self._rays.cast(centre, ways)
+            hit = hits.rectangle >= 0
+            rectangle[chosen] = hits.rectangle
+            points[chosen[hit]] = points_on(centre, ways, hits)[:, hit].T
 
-        in_threads(trace_part, len(pixels), _RAYS_PER_TASK, cores=self._cores)
+        in_threads(trace_part, len(pixels), RAYS_AT_ONCE, cores=self._cores)
         return SeenPoints(points=points, rectangle=rectangle)
 
     def sees(self, camera: ViewingCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -107,17 +104,63 @@ class SceneCameras:
             directions: (n, 3) of any length, the unit of the hits' distances.
         """
         n_rays = len(directions)
-        starts = np.ascontiguousarray(np.broadcast_to(starts, (n_rays, 3)), dtype=np.float64)
-        ways = np.ascontiguousarray(directions, dtype=np.float64)
-        t = np.full(n_rays, np.inf)
-        rectangle = np.full(n_rays, -1, dtype=np.int32)
+        starts = np.broadcast_to(starts, (n_rays, 3))
+        t = np.empty(n_rays)
+        rectangle = np.empty(n_rays, dtype=np.int32)
 
         def cast_part(first: int, last: int) -> None:
             part = slice(first, last)
-            cast_rays(self._table, starts[part], ways[part], t[part], rectangle[part])
+            hits = self._rays.cast(starts[part].T, directions[part].T)
+            t[part], rectangle[part] = hits.t, hits.rectangle
 
-        in_threads(cast_part, n_rays, _RAYS_PER_TASK, cores=self._cores)
+        in_threads(cast_part, n_rays, RAYS_AT_ONCE, cores=self._cores)
         return Hits(t=t, rectangle=rectangle)
 
-    def _flat(self, camera: ViewingCamera) -> NDArray[np.float64]:
-        return camera.shifted(self._origin).flat
+
+def pixel_directions(
+    camera: ViewingCamera, u: NDArray[np.float64], v: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Directions (3, n) in world axes, one metre deep along the optical axis, of pixels."""
+    found = undistorted((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, camera.distortion)
+    rotation = camera.rotation
+    ways = np.empty((3, len(u)))
+    for axis in range(3):
+        ways[axis] = rotation[0, axis] * found[0] + rotation[1, axis] * found[1] + rotation[2, axis]
+    return ways
+
+
+def _exposed(
+    rays: SceneRays, camera: ViewingCamera, rows: tuple[int, int], n_sub: int, seed: int
+) -> NDArray[np.float32]:
+    """Mean colours (rows, columns, 3) of the rays of some rows of pixels."""
+    first, last = rows
+    shape = (last - first, camera.width)
+    columns, lines = np.arange(camera.width), np.arange(first, last)
+    base, right, down, twist = _pixel_ways(camera, first, last)
+    states = cell_states(columns, lines[:, None], seed)
+    centre = camera.centre_world[:, None]
+    total = np.zeros((3, states.size), dtype=np.float32)
+    for sub in range(n_sub * n_sub):
+        s = (sub % n_sub + uniforms(states, 2 * sub)) / n_sub
+        t = (sub // n_sub + uniforms(states, 2 * sub + 1)) / n_sub
+        ways = (base + s * right + t * down + (s * t) * twist).reshape(3, -1)
+        hits = rays.cast(centre, ways)
+        total += rays.colours(hits.rectangle, points_on(centre, ways, hits))[:3]
+    mean: NDArray[np.float32] = (total / np.float32(n_sub * n_sub)).T.reshape(*shape, 3)
+    return mean
+
+
+def _pixel_ways(camera: ViewingCamera, first: int, last: int) -> tuple[NDArray[np.float64], ...]:
+    """Direction of the first corner of each pixel of some rows, and how it changes inside it.
+
+    A ray at (s, t) of a pixel has the direction base + s right + t down + s t twist, (3, rows,
+    columns) each: those of the corners are exact, and the lens bends the rays between by less than
+    1e-5 of a pixel from that.
+    """
+    u, v = np.meshgrid(
+        np.arange(camera.width + 1, dtype=np.float64), np.arange(first, last + 1, dtype=np.float64)
+    )
+    corners = pixel_directions(camera, u.ravel(), v.ravel()).reshape(3, *u.shape)
+    base = corners[:, :-1, :-1]
+    right, down = corners[:, :-1, 1:] - base, corners[:, 1:, :-1] - base
+    return base, right, down, corners[:, 1:, 1:] - base - right - down

@@ -12,18 +12,25 @@ from orthoflow.geometry.scenes import Scene
 def cast_table(scene: Scene) -> CastTable:
     """Lay a scene out for ray casting, with its tree of bounding boxes."""
     tree = _BoxTree(scene)
-    first_hole = np.searchsorted(scene.hole_rectangle, np.arange(len(scene) + 1))
+    holes = np.searchsorted(scene.hole_rectangle, np.arange(len(scene) + 1))
+    turned = scene.turned(tree.axes)
     return CastTable(
-        rectangles=np.ascontiguousarray(
-            np.hstack([scene.centre, scene.axis_a, scene.axis_b, scene.normal, scene.extent])
+        axes=np.ascontiguousarray(tree.axes),
+        rectangles=np.column_stack(
+            [
+                turned.centre,
+                turned.axis_a,
+                turned.axis_b,
+                turned.normal,
+                turned.extent,
+                holes[:-1],
+                holes[1:],
+            ]
         ),
-        kinds=np.array(scene.texture),
-        params=np.array(scene.texture_params),
         holes=np.array(scene.hole_extent),
-        first_hole=first_hole.astype(np.int64),
-        box_axes=tree.axes,
-        boxes=np.array(tree.boxes).reshape(-1, 6),
-        links=np.array(tree.links, dtype=np.int64).reshape(-1, 3),
+        nodes=np.column_stack(
+            [np.array(tree.boxes).reshape(-1, 6), np.array(tree.links).reshape(-1, 3)]
+        ).astype(np.float64),
         order=np.array(tree.order, dtype=np.int64),
     )
 

@@ -12,8 +12,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from orthoflow.geometry.compiling import kernel_part, typed_kernel_part
+from orthoflow.geometry.point_kernels import compiled
 
 # The small functions carry explicit types: otherwise each constant they are called with would
 # compile a version of its own, which costs seconds at the first run.
@@ -26,6 +28,20 @@ class Shade(NamedTuple):
     green: float
     blue: float
     reflectance: float
+
+
+class PaintTable(NamedTuple):
+    """The textures of a scene.
+
+    Attributes:
+        frames: (r, 9) float64: centre, axis a, axis b of each rectangle, as `Scene` has them.
+        kinds: (r,) int32 `TextureKind`.
+        params: (r, 8) float64 texture parameters.
+    """
+
+    frames: NDArray[np.float64]
+    kinds: NDArray[np.int32]
+    params: NDArray[np.float64]
 
 
 class Pattern(NamedTuple):
@@ -46,7 +62,7 @@ class Pattern(NamedTuple):
     other: float
 
 
-@njit("u8(u8)", cache=True)
+@typed_kernel_part("u8(u8)")
 def mixed_bits(value: np.uint64) -> np.uint64:
     """Scramble 64 bits (splitmix64's finaliser); neighbouring inputs give unrelated outputs."""
     bits = np.uint64(value)
@@ -55,32 +71,32 @@ def mixed_bits(value: np.uint64) -> np.uint64:
     return bits ^ (bits >> np.uint64(31))
 
 
-@njit("f8(u8, i8)", cache=True)
+@typed_kernel_part("f8(u8, i8)")
 def uniform(state: np.uint64, draw: int) -> float:
     """Number in [0, 1) that depends on the 64-bit state and the number of the draw only."""
     bits = mixed_bits(np.uint64(state) + np.uint64(draw + 1) * np.uint64(0x9E3779B97F4A7C15))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit("u8(i8, i8)", cache=True)
+@typed_kernel_part("u8(i8, i8)")
 def _column_state(i: int, seed: int) -> np.uint64:
     return mixed_bits(np.uint64(i) * np.uint64(0xD1B54A32D192ED03) + np.uint64(seed))
 
 
-@njit("u8(i8, i8, i8)", cache=True)
+@typed_kernel_part("u8(i8, i8, i8)")
 def cell_state(i: int, j: int, seed: int) -> np.uint64:
     """Random state (64 bits) of the lattice cell (i, j)."""
     return mixed_bits(_column_state(i, seed) ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
 
 
-@njit("f8(u8, i8)", cache=True)
+@typed_kernel_part("f8(u8, i8)")
 def _lattice_value(column: np.uint64, j: int) -> float:
     """Number in [0, 1) of the lattice point j of a column."""
     bits = mixed_bits(column ^ (np.uint64(j) * np.uint64(0x8CB92BA72F3D8DD7)))
     return float(bits >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit("f8(f8, f8, i8)", cache=True)
+@typed_kernel_part("f8(f8, f8, i8)")
 def _value_noise(a: float, b: float, seed: int) -> float:
     """Smooth noise -1..1 on the unit lattice."""
     i, j = math.floor(a), math.floor(b)
@@ -93,7 +109,7 @@ def _value_noise(a: float, b: float, seed: int) -> float:
     return 2.0 * ((1.0 - t) * low + t * high) - 1.0
 
 
-@njit("f8(f8, f8, f8, i8)", cache=True)
+@typed_kernel_part("f8(f8, f8, f8, i8)")
 def _stains(a: float, b: float, period: float, seed: int) -> float:
     """Three octaves of noise, about -1..1; the finest lattice is a sixth of the period."""
     return (
@@ -103,7 +119,7 @@ def _stains(a: float, b: float, period: float, seed: int) -> float:
     )
 
 
-@njit("f8(f8, f8, i8)", cache=True)
+@typed_kernel_part("f8(f8, f8, i8)")
 def _wear(a: float, b: float, seed: int) -> float:
     """Fine detail of every surface: grain on a lattice of 11 mm, and cracks 2 to 4 mm wide."""
     grain = 0.3 * _value_noise(a / 0.011, b / 0.011, seed)
@@ -111,7 +127,7 @@ def _wear(a: float, b: float, seed: int) -> float:
     return grain - 0.8 * max(0.0, 1.0 - crack / 0.03)
 
 
-@njit("UniTuple(f8, 2)(f8, f8, f8, i8)", cache=True)
+@typed_kernel_part("UniTuple(f8, 2)(f8, f8, f8, i8)")
 def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float]:
     """Ornament of the lattice cell at (a, b): (how much paint 0 or 1, its hue 0..1).
 
@@ -139,7 +155,7 @@ def _rosette(a: float, b: float, period: float, seed: int) -> tuple[float, float
     return 0.0, 0.0
 
 
-@njit("f8(f8, f8, f8)", cache=True)
+@typed_kernel_part("f8(f8, f8, f8)")
 def _motif(a: float, b: float, period: float) -> float:
     """Damask motif, exactly periodic in both directions, every other column half a step down."""
     i = math.floor(a / period)
@@ -152,7 +168,7 @@ def _motif(a: float, b: float, period: float) -> float:
     return 0.6 if abs(x) > 0.94 else 0.0
 
 
-@njit("f8(f8, f8, f8, i8)", cache=True)
+@typed_kernel_part("f8(f8, f8, f8, i8)")
 def _grain(a: float, b: float, period: float, seed: int) -> float:
     """Wood grain -1..1 along b."""
     bend = 0.35 * _value_noise(a / period, 0.25 * b / period, seed)
@@ -161,7 +177,7 @@ def _grain(a: float, b: float, period: float, seed: int) -> float:
     )
 
 
-@njit(cache=True)
+@kernel_part
 def _pattern(kind: int, params: NDArray[np.float64], a: float, b: float) -> Pattern:
     """What is painted at (a, b)."""
     period, seed = params[5], int(params[6])
@@ -191,7 +207,7 @@ def _pattern(kind: int, params: NDArray[np.float64], a: float, b: float) -> Patt
     return Pattern(light + wear, warmth, paint, hue, other + 0.5 * wear)
 
 
-@njit(cache=True)
+@kernel_part
 def colour_at(kind: int, params: NDArray[np.float64], a: float, b: float) -> Shade:
     """Colour and reflectance at (a, b) of a texture: `TextureKind` and its 8 parameters."""
     light, warmth, paint, hue, other = _pattern(kind, params, a, b)
@@ -217,26 +233,29 @@ def colour_at(kind: int, params: NDArray[np.float64], a: float, b: float) -> Sha
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def paint_points(
-    kinds: NDArray[np.int32],
-    params: NDArray[np.float64],
+    table: PaintTable,
     rectangle: NDArray[np.int32],
-    in_rectangle: NDArray[np.float64],
-    painted: NDArray[np.float64],
+    points: NDArray[np.float64],
+    painted: NDArray[np.float32],
 ) -> None:
-    """Fill `painted` (n, 4) = red, green, blue, reflectance of points (n, 2) = (a, b).
+    """Fill `painted` (4, n) = red, green, blue 0..255, reflectance 0..1 of points (3, n).
 
-    Points on rectangle -1 are left as they are.
+    Points on rectangle -1 are left as they are; one off its rectangle gets the colour of its foot.
     """
-    for point in range(rectangle.shape[0]):
-        index = rectangle[point]
+    frames = table.frames
+    for i in range(rectangle.shape[0]):
+        index = rectangle[i]
         if index < 0:
             continue
-        shade = colour_at(
-            kinds[index], params[index], in_rectangle[point, 0], in_rectangle[point, 1]
-        )
-        painted[point, 0] = shade.red
-        painted[point, 1] = shade.green
-        painted[point, 2] = shade.blue
-        painted[point, 3] = shade.reflectance
+        a, b = 0.0, 0.0
+        for axis in range(3):
+            offset = points[axis, i] - frames[index, axis]
+            a += offset * frames[index, 3 + axis]
+            b += offset * frames[index, 6 + axis]
+        shade = colour_at(table.kinds[index], table.params[index], a, b)
+        painted[0, i] = shade.red
+        painted[1, i] = shade.green
+        painted[2, i] = shade.blue
+        painted[3, i] = shade.reflectance

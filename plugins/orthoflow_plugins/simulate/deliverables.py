@@ -12,8 +12,8 @@ from orthoflow.geometry import Plane, wall_axes
 from orthoflow.products import JsonValue, Planes, PointCloud, Truth
 from orthoflow_plugins.simulate.building import TruePlane
 from orthoflow_plugins.simulate.palace import Room
-from orthoflow_plugins.simulate.scan_kernels import SPOILT
 from orthoflow_plugins.simulate.scanner import HIGHEST_ELEVATION_DEG, LOWEST_ELEVATION_DEG, Scan
+from orthoflow_plugins.simulate.sweeping import SPOILT
 
 _CHUNK = 1 << 20
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from orthoflow.geometry.photo_views import SceneCameras
     from orthoflow_plugins.simulate.deliverables import Delivery
     from orthoflow_plugins.simulate.photographs import Film
-    from orthoflow_plugins.simulate.scan_kernels import Errors
     from orthoflow_plugins.simulate.scanner import Scan
+    from orthoflow_plugins.simulate.sweeping import Errors
     from orthoflow_plugins.simulate.viewpoints import Shot
 
 SpectralGap = Literal["none", "easy", "hard"]
@@ -262,7 +262,7 @@ def _check_points(delivery: Delivery, views: SceneCameras) -> CheckPoints:
 
 
 def _errors(params: SimulateRoom.Params) -> Errors:
-    from orthoflow_plugins.simulate.scan_kernels import Errors
+    from orthoflow_plugins.simulate.sweeping import Errors
 
     return Errors(
         noise_m=params.noise_m,

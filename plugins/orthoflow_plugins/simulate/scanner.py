@@ -11,25 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.scene_kernels import CastTable
-from orthoflow.geometry.scene_trees import cast_table
-from orthoflow.geometry.scene_views import in_threads
+from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, in_threads
 from orthoflow.geometry.scenes import Scene
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.palace import main_wall_axes
-from orthoflow_plugins.simulate.scan_kernels import (
-    MISSED,
-    Columns,
-    Errors,
-    Scanned,
-    Sweep,
-    sweep_columns,
-)
+from orthoflow_plugins.simulate.sweeping import MISSED, Errors, Scanned, Scanner, Sweep
 
 # No scan of the zenith: its points would crowd the ceiling over the station.
 LOWEST_ELEVATION_DEG: Final = -62.0
 HIGHEST_ELEVATION_DEG: Final = 62.0
-_COLUMNS_PER_TASK: Final = 16
 
 # Along the main wall, towards it, and over the origin, metres; clear of everything in the room.
 _PLACES_M: Final = (
@@ -106,7 +96,7 @@ def planned_sweeps(
 
 def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepContext) -> Scan:
     """Scan a scene whose origin is the room's."""
-    table = cast_table(scene)
+    scanner = Scanner(scene, errors)
     sizes = [sweep.n_columns * sweep.n_rows for sweep in sweeps]
     starts = np.concatenate([[0], np.cumsum(sizes)])
     points = _allocated(int(starts[-1]), ctx)
@@ -116,11 +106,10 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
     for index, sweep in enumerate(sweeps):
         ctx.progress(index / len(sweeps), f"scan {index + 1} of {len(sweeps)}")
         span = slice(int(starts[index]), int(starts[index + 1]))
-        part = part_of(points, span)
         in_threads(
-            partial(_sweep, table, sweep, errors, part),
+            partial(_sweep, scanner, sweep, points.part(span)),
             sweep.n_columns,
-            _COLUMNS_PER_TASK,
+            max(1, RAYS_AT_ONCE // sweep.n_rows),
             cores=ctx.cores,
         )
         scan[span] = index
@@ -130,22 +119,10 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
     return _only_hits(Scan(points=points, scan=scan, row=row, column=column, stations=stations))
 
 
-def part_of(points: Scanned, part: slice | NDArray[np.bool_]) -> Scanned:
-    """Give some of the entries; a view for a slice."""
-    return Scanned(
-        x=points.x[part],
-        y=points.y[part],
-        z=points.z[part],
-        intensity=points.intensity[part],
-        rgb=points.rgb[part],
-        rectangle=points.rectangle[part],
-    )
-
-
 def _sweep(  # the range comes last, as `in_threads` gives it
-    table: CastTable, sweep: Sweep, errors: Errors, scanned: Scanned, first: int, last: int
+    scanner: Scanner, sweep: Sweep, scanned: Scanned, first: int, last: int
 ) -> None:
-    sweep_columns(table, sweep, errors, scanned, Columns(first, last))
+    scanner.sweep(sweep, first, last, scanned)
 
 
 def _allocated(n_points: int, ctx: StepContext) -> Scanned:
@@ -168,7 +145,7 @@ def _only_hits(scan: Scan) -> Scan:
     if bool(hit.all()):
         return scan
     return Scan(
-        points=part_of(scan.points, hit),
+        points=scan.points.part(hit),
         scan=scan.scan[hit],
         row=scan.row[hit],
         column=scan.column[hit],

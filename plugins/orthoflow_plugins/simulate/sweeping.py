@@ -1,0 +1,234 @@
+"""One scan: rays over a grid of angles; noise hangs on the place in the grid only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.hashed_numbers import cell_states, normals, uniforms
+from orthoflow.geometry.scene_rays import Hits, SceneRays, points_on
+from orthoflow.geometry.scenes import Scene, TextureKind
+
+# `Scanned.rectangle` of a ray that met nothing, and of a gross outlier or a mixed distance.
+MISSED: Final = -1
+SPOILT: Final = -2
+_TURN: Final = 2.0 * np.pi
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """One scan: a station and the angles it looks along, in the room frame.
+
+    Attributes:
+        station: (3,) metres.
+        azimuth: of column 0, radians from x towards y.
+        elevation: of row 0, radians over the horizon.
+        step: between columns and between rows, radians.
+        n_columns: number of columns.
+        n_rows: number of rows.
+        seed: for all noise of this scan.
+    """
+
+    station: NDArray[np.float64]
+    azimuth: float
+    elevation: float
+    step: float
+    n_columns: int
+    n_rows: int
+    seed: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Errors:
+    """How wrong the scanner is.
+
+    Attributes:
+        noise_m: standard deviation of a distance at 3 m, square onto a plain wall.
+        outlier_share: share of points at a random distance.
+        beam_m: diameter of the spot; where it falls on two surfaces the distance mixes.
+        colour_noise: standard deviation of a colour, grey levels.
+    """
+
+    noise_m: float
+    outlier_share: float
+    beam_m: float
+    colour_noise: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scanned:
+    """What a scan gives, one entry per ray, column by column.
+
+    Attributes:
+        x: float32 metres from the room's origin; y and z alike.
+        y: see x.
+        z: see x.
+        intensity: float32 0..1.
+        rgb: (n, 3) uint8.
+        rectangle: int32 rectangle hit, `SPOILT` or `MISSED`.
+    """
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    rectangle: NDArray[np.int32]
+
+    def part(self, part: slice | NDArray[np.bool_]) -> Scanned:
+        """Give some of the entries; a view for a slice."""
+        return Scanned(
+            x=self.x[part],
+            y=self.y[part],
+            z=self.z[part],
+            intensity=self.intensity[part],
+            rgb=self.rgb[part],
+            rectangle=self.rectangle[part],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Echoes:
+    """The rays of some columns and what they meet, one entry per ray.
+
+    Attributes:
+        azimuth: radians; elevation likewise.
+        elevation: see azimuth.
+        ways: (3, n) unit directions.
+        hits: what they meet.
+        states: random states of their places in the grid.
+        distance: metres to what they meet, some where they meet nothing.
+        cosine: of the angle of incidence.
+    """
+
+    azimuth: NDArray[np.float64]
+    elevation: NDArray[np.float64]
+    ways: NDArray[np.float64]
+    hits: Hits
+    states: NDArray[np.uint64]
+    distance: NDArray[np.float64]
+    cosine: NDArray[np.float64]
+
+
+class Scanner:
+    """Scans a scene.
+
+    Args:
+        scene: the scene, its origin at (0, 0, 0).
+        errors: how wrong the scanner is.
+    """
+
+    def __init__(self, scene: Scene, errors: Errors) -> None:
+        self._rays = SceneRays(scene)
+        self._normal = scene.normal
+        self._is_cloth = scene.texture == TextureKind.TEXTILE
+        self._errors = errors
+
+    def sweep(self, sweep: Sweep, first: int, last: int, scanned: Scanned) -> None:
+        """Scan some columns; every ray's noise is a function of seed, column and row alone.
+
+        Args:
+            sweep: the scan.
+            first: column.
+            last: column, not included.
+            scanned: filled, entries of the whole scan.
+        """
+        echoes = self._echoes(sweep, first, last)
+        into = scanned.part(slice(first * sweep.n_rows, last * sweep.n_rows))
+        start = sweep.station[:, None]
+        into.rectangle[:] = echoes.hits.rectangle
+        measured = self._measured(sweep, echoes, into.rectangle)
+        for coordinate, along in zip((into.x, into.y, into.z), range(3), strict=True):
+            coordinate[:] = sweep.station[along] + measured * echoes.ways[along]
+        colours = self._rays.colours(
+            echoes.hits.rectangle, points_on(start, echoes.ways, echoes.hits)
+        )
+        bright = colours[3] * echoes.cosine**0.7
+        bright *= np.sqrt(2.0 / np.maximum(1.0, echoes.distance))
+        bright *= 1.0 + 0.03 * normals(echoes.states, 12)
+        into.intensity[:] = np.clip(bright, 0.0, 1.0)
+        for channel in range(3):
+            noise = self._errors.colour_noise * normals(echoes.states, 14 + 2 * channel)
+            into.rgb[:, channel] = np.clip(np.floor(colours[channel] + noise + 0.5), 0.0, 255.0)
+
+    def _echoes(self, sweep: Sweep, first: int, last: int) -> _Echoes:
+        columns, rows = np.arange(first, last), np.arange(sweep.n_rows)
+        shape = (len(columns), len(rows))
+        azimuth = np.broadcast_to((sweep.azimuth + columns * sweep.step)[:, None], shape).ravel()
+        elevation = np.broadcast_to(sweep.elevation + rows * sweep.step, shape).ravel()
+        ways = _directions(azimuth, elevation)
+        hits = self._rays.cast(sweep.station[:, None], ways)
+        normal = self._normal[hits.rectangle]
+        return _Echoes(
+            azimuth=azimuth,
+            elevation=elevation,
+            ways=ways,
+            hits=hits,
+            states=cell_states(columns[:, None], rows, sweep.seed).ravel(),
+            distance=np.where(hits.rectangle < 0, 1.0, hits.t),
+            cosine=np.abs(np.einsum("ni,in->n", normal, ways)),
+        )
+
+    def _measured(
+        self, sweep: Sweep, echoes: _Echoes, rectangle: NDArray[np.int32]
+    ) -> NDArray[np.float64]:
+        """Distances as measured; marks gross outliers and mixed distances as spoilt."""
+        states, distance = echoes.states, echoes.distance
+        sigma = _range_sigma(
+            distance, echoes.cosine, self._is_cloth[rectangle], self._errors.noise_m
+        )
+        measured = distance + sigma * normals(states, 10)
+        is_hit = rectangle >= 0
+        if self._errors.beam_m > 0.0:
+            mixed = self._mixed(sweep, echoes)
+            is_mixed = np.isfinite(mixed) & is_hit
+            measured[is_mixed] = mixed[is_mixed]
+            rectangle[is_mixed] = SPOILT
+        is_gross = (uniforms(states, 0) < self._errors.outlier_share) & is_hit
+        measured[is_gross] = _gross(states[is_gross], distance[is_gross])
+        rectangle[is_gross] = SPOILT
+        return measured
+
+    def _mixed(self, sweep: Sweep, echoes: _Echoes) -> NDArray[np.float64]:
+        """Mixed distances where the rim of the spot, at a hashed side, meets another depth."""
+        states, distance = echoes.states, echoes.distance
+        turn, reach = _TURN * uniforms(states, 3), 0.5 * self._errors.beam_m / distance
+        aside = reach * np.cos(turn) / np.maximum(0.05, np.cos(echoes.elevation))
+        rims = _directions(echoes.azimuth + aside, echoes.elevation + reach * np.sin(turn))
+        other = self._rays.cast(sweep.station[:, None], rims).t
+        mixed = np.full(len(distance), np.nan)
+        apart = np.abs(other - distance)
+        beside = np.flatnonzero(np.isfinite(other) & (apart > 0.02 + 0.02 * distance))
+        share = 0.5 * uniforms(states[beside], 4)
+        mixed[beside] = (1.0 - share) * distance[beside] + share * other[beside]
+        return mixed
+
+
+def _directions(
+    azimuth: NDArray[np.float64], elevation: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+
+
+def _range_sigma(
+    distance: NDArray[np.float64],
+    cosine: NDArray[np.float64],
+    is_cloth: NDArray[np.bool_],
+    noise_m: float,
+) -> NDArray[np.float64]:
+    """Standard deviation of a distance: grows with range and slope, and on cloth."""
+    slope = 1.0 + 0.45 * np.minimum(1.0 / np.maximum(cosine, 0.05) - 1.0, 4.0)
+    cloth = np.where(is_cloth, 1.4, 1.0)
+    sigma: NDArray[np.float64] = noise_m * slope * cloth * np.sqrt(0.5 + (distance / 3.0) ** 2 / 2)
+    return sigma
+
+
+def _gross(states: NDArray[np.uint64], distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances of gross outliers: most fall short, some go far."""
+    short = distance * (0.3 + 0.68 * uniforms(states, 2))
+    far = distance + 2.0 * uniforms(states, 2)
+    return np.where(uniforms(states, 1) < 0.8, short, far)
