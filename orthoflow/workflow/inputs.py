@@ -53,19 +53,21 @@ def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:
 
 def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     path = spec.folder / pattern
+    where = " in the working directory" if spec.is_given else f" beside the workflow ({path})"
+    if Path(pattern).is_absolute():
+        where = ""
     if path.is_dir():
         files = [item for item in path.iterdir() if item.is_file() and item.name[0] != "."]
-        missing = f"the folder {pattern} holds no files"
+        missing = f"the folder {pattern}{where} holds no files"
     elif path.exists():
         files, missing = [path], ""
     elif glob.has_magic(pattern):
         # Names may themselves hold brackets; only what is no existing path is taken as a pattern.
         matches = glob.glob(str(path), recursive=True)  # noqa: PTH207 - pathlib refuses absolute ones
         files = [Path(match) for match in matches if Path(match).is_file()]
-        missing = f"no file matches {pattern}"
+        missing = f"no file matches {pattern}{where}"
     else:
-        files, missing = [], f"there is no file {pattern}"
+        files, missing = [], f"there is no file {pattern}{where}"
     if not files:
-        where = "in the working directory" if spec.is_given else f"beside the workflow ({path})"
-        raise InputError(f"input {spec.name}: {missing} {where}")
+        raise InputError(f"input {spec.name}: {missing}")
     return [item.absolute() for item in files]
