@@ -136,6 +136,7 @@ def test_an_interrupted_run_says_so(world: World, number: signal.Signals) -> Non
 def test_an_inline_run_can_be_interrupted_too(world: World) -> None:
     steps = STEPS.replace("steps: 6", "steps: 2000")
     plan = world.plan(steps, executor="inline")
+    before = signal.getsignal(signal.SIGINT)
 
     def interrupt(event: object) -> None:
         if type(event).__name__ == "CellProgress":
@@ -147,7 +148,7 @@ def test_an_inline_run_can_be_interrupted_too(world: World) -> None:
     with pytest.raises(CancelledStepError, match="the run was interrupted"):
         execute(plan, world.folder / "run", world.store, interrupt)
     assert events(world, "run")[-1]["event"] == "interrupted"
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_two_runs_share_a_store_at_once(world: World, quiet: list[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from orthoflow.engine.environment import environment
 from orthoflow.engine.events import CellFinished, CellLogged, CellProgress, CellStarted, CellWarned
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.task_making import log_name
+from orthoflow.engine.threads import compiled_code_in
 from orthoflow.errors import ArgumentError, InputError, StoreError
 from tests.engine_world import World, toy_world
 
@@ -325,3 +327,12 @@ def test_long_addresses_become_file_names() -> None:
     assert len(log_name(address)) == 200
     assert log_name(address) != log_name(address + "x")
     assert log_name("a@b=c,d=e#2") == "a@b=c,d=e#2"
+
+
+def test_a_step_in_this_process_keeps_compiled_code_where_it_is_told(tmp_path: Path) -> None:
+    from numba.core import config
+
+    before = os.environ.get("NUMBA_CACHE_DIR"), config.CACHE_DIR
+    with compiled_code_in(str(tmp_path)):
+        assert str(tmp_path) == config.CACHE_DIR
+    assert (os.environ.get("NUMBA_CACHE_DIR"), config.CACHE_DIR) == before

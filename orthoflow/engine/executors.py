@@ -13,6 +13,7 @@ from orthoflow.engine.durability import write_whole
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.running import failed_result, run_task
 from orthoflow.engine.tasks import Task
+from orthoflow.engine.threads import compiled_code_in
 from orthoflow.errors import CancelledStepError
 from orthoflow.sdk.context import StepEvent
 
@@ -93,7 +94,8 @@ class InlineExecutor:
                 log.append(event.text)
             self._tell(task.address, event)
 
-        result = run_task(task, listen, self._is_interrupted)
+        with compiled_code_in(task.numba_folder):
+            result = run_task(task, listen, self._is_interrupted)
         text = "".join(f"{line}\n" for line in log)
         write_whole(Path(task.log), text.encode())
         return (TaskEnd(address=task.address, result=dataclasses.replace(result, log=text)),)

@@ -1,9 +1,11 @@
-"""The environment of a step's process: thread counts fixed before any library loads."""
+"""The environment of a step: thread counts fixed before any library loads, compiled code kept."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +24,7 @@ _THREAD_VARIABLES: Final = (
     "RAYON_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
+_COMPILED: Final = "NUMBA_CACHE_DIR"
 
 
 def child_environment(task: Task) -> dict[str, str]:
@@ -34,8 +37,32 @@ def child_environment(task: Task) -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)),
         "PYTHONHASHSEED": "0",
         "PYTHONUNBUFFERED": "1",
-        "NUMBA_CACHE_DIR": task.numba_folder,
+        _COMPILED: task.numba_folder,
         "MPLBACKEND": "Agg",
         "MPLCONFIGDIR": str(Path(task.store) / "matplotlib"),
         "TMPDIR": str(task.scratch),
     }
+
+
+@contextmanager
+def compiled_code_in(folder: str) -> Iterator[None]:
+    """Let numba keep what it compiles in a folder, in this process, for as long as a step runs."""
+    before = os.environ.get(_COMPILED)
+    os.environ[_COMPILED] = folder
+    _tell_numba()
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_COMPILED]
+        else:
+            os.environ[_COMPILED] = before
+        _tell_numba()
+
+
+def _tell_numba() -> None:
+    # It reads the environment once, when it is imported.
+    if "numba" in sys.modules:
+        from numba.core import config  # noqa: PLC0415 - only where it is loaded anyway
+
+        config.reload_config()  # type: ignore[no-untyped-call]

@@ -13,7 +13,7 @@ import orthoflow
 from tests.road.conftest import Shell
 
 SMALL = ("--set", "room.scan_step_m=0.05", "--set", "wall.gsd_m=0.05")
-KILLS = 10 if os.environ.get("ORTHOFLOW_LONG_TESTS") == "1" else 3
+KILLS = 10 if os.environ.get("ORTHOFLOW_LONG_TESTS") == "1" else 2
 
 
 def digests(run_folder: Path) -> dict[str, str]:
