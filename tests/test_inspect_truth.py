@@ -85,7 +85,12 @@ def walled(image: TrueOrthoimage) -> Wall:
 
 
 def inspect(
-    folder: Path, truth: Truth, image: Orthoimage, wall: Wall, **more: object
+    folder: Path,
+    truth: Truth,
+    image: Orthoimage,
+    wall: Wall,
+    params: InspectTruth.Params | None = None,
+    **more: object,
 ) -> tuple[dict[str, float], InspectTruth.Out, StepContext]:
     context = StepContext(rng=np.random.default_rng(0), cores=2, scratch=folder)
     inputs = InspectTruth.In(
@@ -100,7 +105,7 @@ def inspect(
         truth=truth,
         **more,  # type: ignore[arg-type] # planes and labels of the tests below
     )
-    out = InspectTruth().run(inputs, InspectTruth.Params(), context)
+    out = InspectTruth().run(inputs, params or InspectTruth.Params(), context)
     return {metric.name: metric.value for metric in context.metrics}, out, context
 
 
@@ -150,6 +155,25 @@ def test_a_displaced_orthoimage_has_just_that_displacement(
         assert metrics[f"mean_{axis}_mm"] == pytest.approx(expected, abs=tolerance)
         assert metrics[f"rmse_{axis}_mm"] == pytest.approx(abs(expected), abs=2.0 * tolerance)
     assert metrics["displaced_share"] < 0.1
+
+
+def test_a_part_of_a_wall_says_what_the_whole_does(tmp_path: Path, truth: Truth) -> None:
+    true = rendered(truth, (1.0, 0.0))
+    mask = painted(true).mask.copy()
+    mask[:, : mask.shape[1] // 3] = OrthoMask.NONE
+    image = replace(painted(true), mask=mask)
+    whole, part = (
+        inspect(tmp_path, truth, image, walled(rendered(truth)), params)[0]
+        for params in (None, InspectTruth.Params(colour_cells_most=30_000, seen_cells_most=10_000))
+    )
+    assert part["n_patches"] < 0.7 * whole["n_patches"]
+    assert part["mean_u_mm"] == pytest.approx(whole["mean_u_mm"], abs=0.05 * 1e3 * GSD_M)
+    assert part["mean_v_mm"] == pytest.approx(0.0, abs=0.05 * 1e3 * GSD_M)
+    assert part["completeness"] == pytest.approx(whole["completeness"], abs=0.01)
+    assert part["colour_rmse_grey"] == pytest.approx(whole["colour_rmse_grey"], rel=0.15)
+    assert part["gross_colour_share"] == pytest.approx(whole["gross_colour_share"], abs=0.03)
+    # Depths are compared everywhere.
+    assert part["depth_rmse_mm"] == whole["depth_rmse_mm"]
 
 
 def test_a_wall_measured_too_near_has_that_depth_error(tmp_path: Path, truth: Truth) -> None:

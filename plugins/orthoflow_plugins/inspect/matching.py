@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,46 +101,58 @@ def _gauss(values: NDArray[np.float64] | NDArray[np.bool_]) -> NDArray[np.float6
 
 
 def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchShifts:
-    n_rows, n_columns = (size // _PATCH for size in shown.grey.shape)
-    best = np.full((n_rows, n_columns), np.inf)
-    shift = np.zeros((n_rows, n_columns, 2))
+    """Find each patch to a whole cell, among those that have enough valid cells."""
+    row, column = np.nonzero(_patch_counts(shown.valid) >= _LEAST_SHARE * _PATCH**2)
+    grey = _windows(shown.grey, row, column, 0)
+    valid = _windows(shown.valid, row, column, 0)
+    # What comes in from beyond the border is not valid.
+    true_grey = _windows(np.pad(true.grey, reach), row, column, reach)
+    true_valid = _windows(np.pad(true.valid, reach), row, column, reach)
+    best, shift = np.full(len(row), np.inf), np.zeros((len(row), 2))
     for down in range(-reach, reach + 1):
         for right in range(-reach, reach + 1):
-            moved = np.roll(true.grey, (down, right), axis=(0, 1))
-            valid = shown.valid & _moved_mask(true.valid, down, right)
-            counts = _patch_sums(valid.astype(np.float64))
-            squares = _patch_sums(np.where(valid, shown.grey - moved, 0.0) ** 2)
+            part = (
+                slice(None),
+                slice(reach - down, reach - down + _PATCH),
+                slice(reach - right, reach - right + _PATCH),
+            )
+            both = valid & true_valid[part]
+            counts = np.count_nonzero(both, axis=(1, 2))
+            squares = np.einsum("pij,pij->p", both, (grey - true_grey[part]) ** 2)
             mean = np.where(
-                counts >= _LEAST_SHARE * _PATCH**2, squares / np.maximum(counts, 1.0), np.inf
+                counts >= _LEAST_SHARE * _PATCH**2, squares / np.maximum(counts, 1), np.inf
             )
             better = mean < best
             best[better] = mean[better]
             shift[better] = (right, down)
-    row, column = np.nonzero(np.isfinite(best))
+    found = np.isfinite(best)
     return PatchShifts(
-        centre=np.column_stack([column + 0.5, row + 0.5]) * _PATCH,
-        shift=shift[row, column],
-        sigma=np.ones((len(row), 2)),
+        centre=np.column_stack([column + 0.5, row + 0.5])[found] * _PATCH,
+        shift=shift[found],
+        sigma=np.ones((np.count_nonzero(found), 2)),
     )
 
 
-def _moved_mask(mask: NDArray[np.bool_], down: int, right: int) -> NDArray[np.bool_]:
-    """Shift a mask; what comes in from beyond the border is not valid."""
-    moved = np.zeros_like(mask)
-    rows, columns = mask.shape
-    source = mask[
-        max(0, -down) : min(rows, rows - down), max(0, -right) : min(columns, columns - right)
-    ]
-    top, left = max(0, down), max(0, right)
-    moved[top : top + source.shape[0], left : left + source.shape[1]] = source
-    return moved
+def _patch_counts(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    n_rows, n_columns = (size // _PATCH for size in mask.shape)
+    tiles = mask[: n_rows * _PATCH, : n_columns * _PATCH]
+    counts: NDArray[np.int64] = tiles.reshape(n_rows, _PATCH, n_columns, _PATCH).sum(axis=(1, 3))
+    return counts
 
 
-def _patch_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    n_rows, n_columns = (size // _PATCH for size in values.shape)
-    tiles = values[: n_rows * _PATCH, : n_columns * _PATCH]
-    sums: NDArray[np.float64] = tiles.reshape(n_rows, _PATCH, n_columns, _PATCH).sum(axis=(1, 3))
-    return sums
+_Value = TypeVar("_Value", bound=np.generic)
+
+
+def _windows(
+    values: NDArray[_Value], row: NDArray[np.int64], column: NDArray[np.int64], rim: int
+) -> NDArray[_Value]:
+    """Patches (p, n, n) with a rim round each; `values` has the rim round it."""
+    side = _PATCH + 2 * rim
+    cells = np.arange(side)
+    rows = row[:, None, None] * _PATCH + cells[:, None]
+    columns = column[:, None, None] * _PATCH + cells
+    windows: NDArray[_Value] = values[rows, columns]
+    return windows
 
 
 def _cut_patches(shown: GreyImage, centre: NDArray[np.float64]) -> _Patches:

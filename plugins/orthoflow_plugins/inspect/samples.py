@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.scene_views import TrueOrthoimage
 from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask, Wall
 from orthoflow_plugins.inspect.matching import GreyImage, PatchShifts, measure_shifts
+from orthoflow_plugins.inspect.sampling import Sampling
 
 # Neighbouring cells whose true depths differ by more make a step, reported apart.
 STEP_M: Final = 0.004
@@ -34,12 +35,13 @@ class WallSamples:
         step_colour: (s,) the same for painted cells at steps.
         shift_m: (p, 2) displacement of patches along u and v, shown - true.
         shift_cells: (p, 2) the same in cells.
-        n_painted: painted cells.
-        n_seen: cells whose true surface a viewer sees.
+        n_painted: painted cells of those of which is asked who sees them.
+        n_seen: of these cells, those whose true surface a viewer sees.
         n_seen_painted: those of them that are painted.
         n_seen_shown: those of them that are painted or filled.
         n_unseen_painted: painted cells whose true surface no viewer sees, away from steps.
-        n_gross: painted cells of a colour that is nowhere near in the truth, away from steps.
+        n_coloured: painted cells whose colour is compared with those around.
+        n_gross: those of them of a colour that is nowhere near in the truth, away from steps.
         n_ghost: those of them where an object stands in the way.
     """
 
@@ -56,6 +58,7 @@ class WallSamples:
     n_seen_painted: int
     n_seen_shown: int
     n_unseen_painted: int
+    n_coloured: int
     n_gross: int
     n_ghost: int
 
@@ -68,7 +71,7 @@ class WallErrors:
         samples: the errors as numbers.
         patches: where displacements were measured.
         depth_m: (rows, cols) measured - true depth, NaN where either is missing.
-        grey: (rows, cols) root mean square colour error, NaN where nothing is shown.
+        grey: (rows, cols) root mean square colour error, NaN where none is told.
     """
 
     samples: WallSamples
@@ -77,42 +80,46 @@ class WallErrors:
     grey: NDArray[np.float64]
 
 
-def wall_errors(image: Orthoimage, wall: Wall, true: TrueOrthoimage) -> WallErrors:
-    """Compare an orthoimage and its wall, both on the frame of `true`, with the truth."""
+def wall_errors(
+    image: Orthoimage, wall: Wall, true: TrueOrthoimage, chosen: Sampling
+) -> WallErrors:
+    """Compare an orthoimage and its wall, both on the frame of `true`, with the truth.
+
+    Depths are compared everywhere, the rest on the chosen cells.
+    """
     known = true.rectangle >= 0
     steps = depth_step_band(true.depth_m)
     painted = (image.mask == OrthoMask.PAINTED) & known
     filled = (image.mask == OrthoMask.FILLED) & known
-    square = np.mean((image.rgb.astype(np.float64) - true.rgb) ** 2, axis=2)
+    square = _square_errors(image, true, chosen.coloured & (painted | filled))
     depth = np.where(
         (wall.mask == SurfaceMask.MEASURED) & known, wall.depth_m.astype(np.float64), np.nan
     ) - true.depth_m.astype(np.float64)
-    patches = _shifts(image, true, steps)
-    gross = _gross_colours(image, true) & painted & ~steps
+    patches = _shifts(image, true, chosen.coloured & known & ~steps)
+    compared = painted & _inner(chosen.coloured, known)
+    gross = _gross_colours(image, true) & compared & ~steps
     measured = np.isfinite(depth)
+    compares = np.isfinite(square)
+    asked, seen = painted & chosen.lattice, true.seen & chosen.lattice
     samples = WallSamples(
         depth_m=depth[measured & ~steps],
         sigma_m=wall.sigma_m[measured & ~steps].astype(np.float64),
         step_depth_m=depth[measured & steps],
-        colour=square[painted & ~steps],
-        filled_colour=square[filled & ~steps],
-        step_colour=square[painted & steps],
+        colour=square[compares & painted & ~steps],
+        filled_colour=square[compares & filled & ~steps],
+        step_colour=square[compares & painted & steps],
         shift_m=patches.shift * true.frame.gsd_m,
         shift_cells=patches.shift,
-        n_painted=_count(painted),
-        n_seen=_count(true.seen),
-        n_seen_painted=_count(true.seen & painted),
-        n_seen_shown=_count(true.seen & (painted | filled)),
-        n_unseen_painted=_count(painted & ~true.seen & ~steps),
+        n_painted=_count(asked),
+        n_seen=_count(seen),
+        n_seen_painted=_count(seen & painted),
+        n_seen_shown=_count(seen & (painted | filled)),
+        n_unseen_painted=_count(asked & ~seen & ~steps),
+        n_coloured=_count(compared),
         n_gross=_count(gross),
         n_ghost=_count(gross & true.behind_object),
     )
-    return WallErrors(
-        samples=samples,
-        patches=patches,
-        depth_m=depth,
-        grey=np.sqrt(np.where(painted | filled, square, np.nan)),
-    )
+    return WallErrors(samples=samples, patches=patches, depth_m=depth, grey=np.sqrt(square))
 
 
 def pooled(samples: Sequence[WallSamples]) -> WallSamples:
@@ -138,6 +145,7 @@ def pooled(samples: Sequence[WallSamples]) -> WallSamples:
         n_seen_painted=added("n_seen_painted"),
         n_seen_shown=added("n_seen_shown"),
         n_unseen_painted=added("n_unseen_painted"),
+        n_coloured=added("n_coloured"),
         n_gross=added("n_gross"),
         n_ghost=added("n_ghost"),
     )
@@ -145,53 +153,70 @@ def pooled(samples: Sequence[WallSamples]) -> WallSamples:
 
 def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Cells within 2 cells of a true depth step or of the rim of the surface."""
-    from scipy.ndimage import binary_dilation, generate_binary_structure
+    import cv2
 
     # Far away instead of missing, so that the rim of the surface is a step too.
-    depth = np.where(np.isfinite(depth_m), depth_m, 1e3)
-    edge = np.zeros(depth.shape, dtype=np.bool_)
-    for axis in (0, 1):
-        jump = np.abs(np.diff(depth, axis=axis)) > STEP_M
-        edge |= np.pad(jump, [(0, int(axis == 0)), (0, int(axis == 1))])
-        edge |= np.pad(jump, [(int(axis == 0), 0), (int(axis == 1), 0)])
+    depth = np.where(np.isfinite(depth_m), depth_m, np.float32(1e3))
+    edge = np.zeros(depth.shape, dtype=np.uint8)
+    down = np.abs(np.diff(depth, axis=0)) > STEP_M
+    right = np.abs(np.diff(depth, axis=1)) > STEP_M
     # The cells beside the edge are its first cells on each side.
-    square = generate_binary_structure(2, 2)
-    band: NDArray[np.bool_] = binary_dilation(edge, square, iterations=STEP_BAND_CELLS - 1)
-    return band
+    edge[1:] |= down
+    edge[:-1] |= down
+    edge[:, 1:] |= right
+    edge[:, :-1] |= right
+    window = np.ones((2 * STEP_BAND_CELLS - 1,) * 2, dtype=np.uint8)
+    return np.asarray(cv2.dilate(edge, window), dtype=np.bool_)
 
 
-def _shifts(image: Orthoimage, true: TrueOrthoimage, steps: NDArray[np.bool_]) -> PatchShifts:
-    known = (true.rectangle >= 0) & ~steps
+def _square_errors(
+    image: Orthoimage, true: TrueOrthoimage, chosen: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Mean square error (rows, cols) over the channels of the chosen cells; NaN elsewhere."""
+    square = np.full(chosen.shape, np.nan)
+    difference = image.rgb[chosen].astype(np.float64) - true.rgb[chosen]
+    square[chosen] = np.mean(difference**2, axis=1)
+    return square
+
+
+def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -> PatchShifts:
+    """Displacements of patches, told from known cells away from steps."""
     painted = image.mask == OrthoMask.PAINTED
     filled = image.mask == OrthoMask.FILLED
     # Two centimetres is far beyond any fair error; further off is reported as gross colour.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
+    greys = np.zeros((2, *known.shape))
+    greys[0][known] = image.rgb[known] @ _LUMINANCE
+    greys[1][known] = true.rgb[known].astype(np.float64) @ _LUMINANCE
     return measure_shifts(
-        GreyImage(
-            grey=image.rgb @ _LUMINANCE, valid=painted & known, region=(painted | filled) & known
-        ),
-        GreyImage(
-            grey=np.where(known, np.nan_to_num(true.rgb).astype(np.float64) @ _LUMINANCE, 0.0),
-            valid=known,
-            region=known,
-        ),
+        GreyImage(grey=greys[0], valid=painted & known, region=(painted | filled) & known),
+        GreyImage(grey=greys[1], valid=known, region=known),
         reach_cells=reach,
     )
 
 
 def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]:
     """Cells whose colour lies outside of the range of the true colours within one cell."""
-    from scipy.ndimage import maximum_filter, minimum_filter
+    import cv2
 
-    known = (true.rectangle >= 0)[:, :, None]
-    size = (3, 3, 1)
-    low = minimum_filter(np.where(known, true.rgb, np.float32(np.inf)), size=size)
-    high = maximum_filter(np.where(known, true.rgb, np.float32(-np.inf)), size=size)
-    rgb = image.rgb.astype(np.float32)
+    # NaN where no colour is known.
+    missing = np.isnan(true.rgb)
+    window = np.ones((3, 3), dtype=np.uint8)
+    low = cv2.erode(np.where(missing, np.float32(np.inf), true.rgb), window)
+    high = cv2.dilate(np.where(missing, np.float32(-np.inf), true.rgb), window)
     outside: NDArray[np.bool_] = np.any(
-        (rgb < low - GROSS_GREY) | (rgb > high + GROSS_GREY), axis=2
+        (image.rgb < low - np.float32(GROSS_GREY)) | (image.rgb > high + np.float32(GROSS_GREY)),
+        axis=2,
     )
     return outside
+
+
+def _inner(coloured: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells whose colour is compared and so are those of all surfaces within one cell."""
+    import cv2
+
+    whole = cv2.erode((coloured | ~known).view(np.uint8), np.ones((3, 3), dtype=np.uint8))
+    return coloured & np.asarray(whole, dtype=np.bool_)
 
 
 def _count(mask: NDArray[np.bool_]) -> int:

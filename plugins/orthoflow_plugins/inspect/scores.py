@@ -228,8 +228,11 @@ def _share_numbers(samples: WallSamples) -> list[Number]:
     if samples.n_painted:
         numbers += [
             ("unseen_painted_share", samples.n_unseen_painted / samples.n_painted, "1"),
-            ("gross_colour_share", samples.n_gross / samples.n_painted, "1"),
-            ("ghost_share", samples.n_ghost / samples.n_painted, "1"),
+        ]
+    if samples.n_coloured:
+        numbers += [
+            ("gross_colour_share", samples.n_gross / samples.n_coloured, "1"),
+            ("ghost_share", samples.n_ghost / samples.n_coloured, "1"),
         ]
     return numbers
 

@@ -32,7 +32,8 @@ class SourceErrors:
         traced: (rows, cols) bool, cells that an oriented photo painted.
         steps: (rows, cols) bool, within 2 cells of a true depth step.
         ghosts: (rows, cols) bool, the pixel looks at a free-standing object.
-        n_seen_by_both: cells whose true surface a station and a photo see.
+        n_seen_by_both: cells of those of which is asked who sees them, whose true surface a
+            station and a photo see.
         n_seen_painted: those of them that are painted.
     """
 
@@ -49,6 +50,7 @@ def trace_sources(
     image: Orthoimage,
     wall: Wall,
     true: TrueOrthoimage,
+    lattice: NDArray[np.bool_],
     cameras: Cameras,
     truth: Truth,
     views: SceneCameras,
@@ -58,6 +60,15 @@ def trace_sources(
     The cell's point on the found surface is projected through the estimated camera, as painting
     did; the pixel's ray through the true camera meets the true scene somewhere, and that place in
     the wall is compared with the cell's own.
+
+    Args:
+        image: the orthoimage.
+        wall: the wall it is of.
+        true: its truth.
+        lattice: (rows, cols) cells of which is asked who sees them.
+        cameras: the estimated ones.
+        truth: the simulated room.
+        views: its scene, for many rays.
 
     Raises:
         MethodError: a photo is none of the simulated ones.
@@ -82,7 +93,7 @@ def trace_sources(
         traced[rows, columns] = True
         hit = seen.rectangle >= 0
         ghosts[rows, columns] = hit & (truth.scene.role[seen.rectangle] == SurfaceRole.OBJECT)
-    both = true.seen & _seen_by_photos(true, truth, views)
+    both = _seen_by_photos(true, true.seen & lattice, truth, views)
     return SourceErrors(
         frame=image.frame,
         displacement_m=displacement,
@@ -146,9 +157,11 @@ def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:
     )
 
 
-def _seen_by_photos(true: TrueOrthoimage, truth: Truth, views: SceneCameras) -> NDArray[np.bool_]:
-    """Cells whose true surface some photo sees, whether it was oriented or not."""
-    rows, columns = np.nonzero(true.seen)
+def _seen_by_photos(
+    true: TrueOrthoimage, asked: NDArray[np.bool_], truth: Truth, views: SceneCameras
+) -> NDArray[np.bool_]:
+    """Those of the asked cells whose true surface some photo sees, oriented or not."""
+    rows, columns = np.nonzero(asked)
     places = np.column_stack([columns + 0.5, rows + 0.5])
     depths = true.depth_m[rows, columns].astype(np.float64)
     points = _near_frame(true.frame, truth).world_from_wall(places, depths)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
     from orthoflow_plugins.inspect.poses import PoseError
     from orthoflow_plugins.inspect.samples import WallErrors
+    from orthoflow_plugins.inspect.sampling import Sampling, SamplingRule
     from orthoflow_plugins.inspect.sources import SourceErrors
 
 _TRACED_POINTS: Final = 4000
@@ -42,7 +43,9 @@ class InspectTruth(Method):
     seen square to the wall. Depths and colours are compared away from true depth steps; a band of
     2 cells at the steps is reported apart. Displacements come from patches of 32 x 32 painted
     cells, matched to the truth by least squares. Metrics without prefix are of the first wall;
-    those with `all_` are of all walls together.
+    those with `all_` are of all walls together. Of large walls, colours and patches are compared
+    in whole blocks of 96 x 96 cells, and who sees a cell is asked on a lattice, both spread evenly;
+    depths, and displacements told from cameras, are compared in every cell.
 
     With cameras, each photo's orientation is compared with the true one, and the displacement of
     every cell that a photo painted is told exactly: its point on the found surface is projected
@@ -59,10 +62,21 @@ class InspectTruth(Method):
     )
 
     class Params(MethodParams):
-        """How finely the truth is rendered."""
+        """How finely the truth is rendered, and how much of it."""
 
         supersample: int = Field(
             3, ge=1, le=8, description="True colours are means of so many rays squared per cell."
+        )
+        colour_cells_most: int = Field(
+            250_000,
+            ge=1,
+            description="Colours are compared in blocks of about so many cells of all walls.",
+        )
+        seen_cells_most: int = Field(
+            600_000,
+            ge=1,
+            description="Completeness is counted on every nth row and column, about so many cells "
+            "of all walls.",
         )
 
     class In(Ports):
@@ -84,18 +98,25 @@ class InspectTruth(Method):
         """Compare the photos, then wall by wall, then all together."""
         from orthoflow_plugins.inspect.poses import pose_findings
         from orthoflow_plugins.inspect.samples import pooled
+        from orthoflow_plugins.inspect.sampling import sampling_rule
         from orthoflow_plugins.inspect.scores import found_planes, label_findings, sample_findings
         from orthoflow_plugins.inspect.sources import source_findings
 
         if not inputs.orthoimages.images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
+        rule = sampling_rule(
+            inputs.orthoimages.images,
+            colour_cells_most=params.colour_cells_most,
+            seen_cells_most=params.seen_cells_most,
+        )
         views = _views(inputs, ctx.cores)
         poses = _pose_errors(inputs, views)
+        truth = _Truth(inputs=inputs, params=params, rule=rule, views=views, cores=ctx.cores)
         verdicts: list[_Verdict] = []
         findings: list[Finding] = []
         for place, image in enumerate(inputs.orthoimages.images):
             ctx.progress(place / len(inputs.orthoimages.images), f"wall {image.name}")
-            verdict = _judge(image, inputs, params, views, ctx.cores)
+            verdict = truth.judge(image)
             verdicts.append(verdict)
             findings += _plane_findings(image, inputs.truth) + verdict.findings(image.wall)
             _draw(image, verdict, ctx)
@@ -111,7 +132,14 @@ class InspectTruth(Method):
         if inputs.labels is not None:
             findings += label_findings(inputs.labels, inputs.truth)
         _report(findings, inputs.orthoimages.images[0].wall, ctx)
-        return self.Out(inspection=_inspection(inputs.orthoimages, verdicts, poses, findings))
+        details: dict[str, JsonValue] = {
+            "patch_cells": 32,
+            "colour_share_compared": rule.colour_share,
+            "seen_lattice_cells": rule.lattice_step,
+        }
+        return self.Out(
+            inspection=_inspection(inputs.orthoimages, verdicts, poses, findings, details)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,24 +175,55 @@ def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[P
     return pose_errors(inputs.cameras, inputs.walls, inputs.truth, views)
 
 
-def _judge(
-    image: Orthoimage,
-    inputs: InspectTruth.In,
-    params: InspectTruth.Params,
-    views: SceneCameras | None,
-    cores: int,
-) -> _Verdict:
-    from orthoflow_plugins.inspect.samples import wall_errors
-    from orthoflow_plugins.inspect.sources import trace_sources
+@dataclass(frozen=True, kw_only=True)
+class _Truth:
+    """What walls are judged by; `views` is None without cameras."""
 
-    wall = _wall_of(image, inputs.walls)
-    true = _true_orthoimage(image, inputs, params, cores)
-    sources = None
-    if inputs.cameras is not None and views is not None:
-        sources = trace_sources(image, wall, true, inputs.cameras, inputs.truth, views)
-    if sources is not None and not sources.traced.any():
+    inputs: InspectTruth.In
+    params: InspectTruth.Params
+    rule: SamplingRule
+    views: SceneCameras | None
+    cores: int
+
+    def judge(self, image: Orthoimage) -> _Verdict:
+        """Compare one wall."""
+        from orthoflow_plugins.inspect.samples import wall_errors
+        from orthoflow_plugins.inspect.sampling import sampling
+        from orthoflow_plugins.inspect.sources import trace_sources
+
+        inputs = self.inputs
+        wall = _wall_of(image, inputs.walls)
+        chosen = sampling(image, self.rule)
+        true = self._true_orthoimage(image, chosen)
         sources = None
-    return _Verdict(errors=wall_errors(image, wall, true), sources=sources)
+        if inputs.cameras is not None and self.views is not None:
+            sources = trace_sources(
+                image, wall, true, chosen.lattice, inputs.cameras, inputs.truth, self.views
+            )
+        if sources is not None and not sources.traced.any():
+            sources = None
+        return _Verdict(errors=wall_errors(image, wall, true, chosen), sources=sources)
+
+    def _true_orthoimage(self, image: Orthoimage, chosen: Sampling) -> TrueOrthoimage:
+        from orthoflow.geometry.scene_views import Rendering, render
+
+        truth = self.inputs.truth
+        viewers = Viewers(
+            positions_world=np.unique(truth.stations, axis=0),
+            up=truth.planes.up,
+            lowest_elevation_deg=_detail_deg(truth, "lowest_elevation_deg", -90.0),
+            highest_elevation_deg=_detail_deg(truth, "highest_elevation_deg", 90.0),
+        )
+        rendering = Rendering(
+            buffer_front_m=self.inputs.walls.buffer_front_m,
+            buffer_behind_m=self.inputs.walls.buffer_behind_m,
+            viewers=viewers,
+            supersample=self.params.supersample,
+            coloured=chosen.coloured,
+            judged=chosen.coloured | chosen.lattice,
+            cores=self.cores,
+        )
+        return render(truth.scene, image.frame, rendering)
 
 
 def _wall_of(image: Orthoimage, walls: Walls) -> Wall:
@@ -180,29 +239,6 @@ def _wall_of(image: Orthoimage, walls: Walls) -> Wall:
             f"{wall.frame.shape}: wire the walls that the orthoimages were made from"
         )
     return wall
-
-
-def _true_orthoimage(
-    image: Orthoimage, inputs: InspectTruth.In, params: InspectTruth.Params, cores: int
-) -> TrueOrthoimage:
-    from orthoflow.geometry.scene_views import render_frame
-
-    truth = inputs.truth
-    viewers = Viewers(
-        positions_world=np.unique(truth.stations, axis=0),
-        up=truth.planes.up,
-        lowest_elevation_deg=_detail_deg(truth, "lowest_elevation_deg", -90.0),
-        highest_elevation_deg=_detail_deg(truth, "highest_elevation_deg", 90.0),
-    )
-    return render_frame(
-        truth.scene,
-        image.frame,
-        buffer_front_m=inputs.walls.buffer_front_m,
-        buffer_behind_m=inputs.walls.buffer_behind_m,
-        viewers=viewers,
-        supersample=params.supersample,
-        cores=cores,
-    )
 
 
 def _detail_deg(truth: Truth, name: str, default: float) -> float:
@@ -283,6 +319,7 @@ def _inspection(
     verdicts: list[_Verdict],
     poses: tuple[PoseError, ...],
     findings: list[Finding],
+    details: dict[str, JsonValue],
 ) -> Inspection:
     """Put together the displacements of all patches and of a few thousand painted cells."""
     walls, points, shifts, kinds = [], [], [], []
@@ -299,7 +336,6 @@ def _inspection(
         points.append(image.frame.world_from_wall(places))
         shifts.append(shift)
         kinds.append(kind)
-    details: dict[str, JsonValue] = {"patch_cells": 32}
     if poses:
         from orthoflow_plugins.inspect.poses import pose_details
 
