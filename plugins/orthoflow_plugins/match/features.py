@@ -25,7 +25,7 @@ _QUANTA: Final = 512.0
 
 @dataclass(frozen=True, kw_only=True)
 class Features:
-    """Key points of an image.
+    """Key points of an image: the first n of them are the n strongest, spread over the image.
 
     Attributes:
         pixels: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
@@ -49,6 +49,15 @@ class Features:
             sizes_px=self.sizes_px[chosen],
             angles_deg=self.angles_deg[chosen],
             descriptors=self.descriptors[chosen],
+        )
+
+    def strongest(self, n_most: int) -> Features:
+        """Give the first ones, without copying them."""
+        return Features(
+            pixels=self.pixels[:n_most],
+            sizes_px=self.sizes_px[:n_most],
+            angles_deg=self.angles_deg[:n_most],
+            descriptors=self.descriptors[:n_most],
         )
 
     def scaled(self, factor: float) -> Features:
@@ -114,12 +123,11 @@ def find_features(
     points = np.vstack([part[0] for part in parts])
     raw = np.vstack([part[1] for part in parts])
     pixels = points[:, :2] + _SHIFT_FROM_OPENCV_PX
-    chosen = np.arange(len(points))
-    if usable is not None:
-        chosen = chosen[usable[_cell_of(pixels, usable.shape)]]
-    chosen = chosen[_spread(pixels[chosen], points[chosen, 4], picture.shape, rule.n_most)]
     # Threads find key points in any order; the image alone orders them.
-    chosen = chosen[np.lexsort(points[chosen, :4].T)]
+    chosen = np.lexsort(points[:, :4].T)
+    if usable is not None:
+        chosen = chosen[usable[_cell_of(pixels[chosen], usable.shape)]]
+    chosen = chosen[_spread(pixels[chosen], points[chosen, 4], picture.shape, rule.n_most)]
     return Features(
         pixels=pixels[chosen],
         sizes_px=points[chosen, 2],
@@ -172,8 +180,6 @@ def _spread(
     n_most: int,
 ) -> NDArray[np.intp]:
     """Positions of the strongest points, taken in turns from the cells of a coarse grid."""
-    if len(pixels) <= n_most:
-        return np.arange(len(pixels))
     scale = _SPREAD_CELLS / np.array([shape[1], shape[0]])
     cells = np.minimum((pixels * scale).astype(np.intp), _SPREAD_CELLS - 1)
     cell = cells[:, 1] * _SPREAD_CELLS + cells[:, 0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,8 +13,11 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of
 from orthoflow_plugins.match.pictures import photo_grey, require_intensity
-from orthoflow_plugins.match.tracing import Trace, TracingRule, target_of, trace_photo
 from orthoflow_plugins.match.versions import opencv_version
+from orthoflow_plugins.match.workers import in_order
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.match.tracing import Trace, TracingRule
 
 
 class MatchGuided(Method):
@@ -84,28 +87,34 @@ class MatchGuided(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Trace every oriented photo on the walls."""
-        import cv2
+        from orthoflow_plugins.match.targets import target_of
+        from orthoflow_plugins.match.tracing import trace_photo
 
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         require_intensity(walls)
         oriented = _oriented(inputs.cameras)
-        cv2.setNumThreads(ctx.cores)
-        rule = _rule(params, ctx.cores)
         ctx.progress(0.0, "walls")
         targets = [target_of(wall) for wall in walls.walls]
+        indices = [k for k, photo in enumerate(photos.photos) if photo.name in oriented]
+        rule = _rule(params, max(1, ctx.cores // len(indices)))
+
+        def trace(index: int) -> Trace:
+            photo = photos.photos[index]
+            camera = oriented[photo.name].viewing()
+            return trace_photo(index, photo_grey(photo), camera, targets, rule)
+
         pieces: list[TiePiece] = []
         traces: dict[str, Trace] = {}
-        for index, photo in enumerate(photos.photos):
-            ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
-            if photo.name not in oriented:
-                continue
-            camera = oriented[photo.name].viewing()
-            trace = trace_photo(index, photo_grey(photo), camera, targets, rule)
-            traces[photo.name] = trace
-            pieces += trace.pieces
-            if not any(len(piece) for piece in trace.pieces):
-                ctx.warn(f"photo {photo.name}: nothing on the walls agrees with it at its pose")
+        for nth, (index, found) in enumerate(
+            zip(indices, in_order(trace, indices, ctx.cores), strict=True)
+        ):
+            name = photos.photos[index].name
+            ctx.progress((nth + 1) / (len(indices) + 1), name)
+            traces[name] = found
+            pieces += found.pieces
+            if not any(len(piece) for piece in found.pieces):
+                ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
         ties = ties_of(
             pieces,
             photos,
@@ -141,6 +150,8 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
 
 
 def _rule(params: MatchGuided.Params, threads: int) -> TracingRule:
+    from orthoflow_plugins.match.tracing import TracingRule
+
     return TracingRule(
         radius_cells=params.search_radius_cells,
         half_patch_cells=params.half_patch_cells,

@@ -8,8 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-# Rows per block: its products with 20 000 descriptors take 80 MB.
-_BLOCK: Final = 1024
+# Entries of a block of distances: 12 MB, which a processor's cache holds while they are searched.
+_BLOCK_ENTRIES: Final = 3_000_000
+# Pairs whose descriptors are gathered at once: 2 x 32 MB.
+_PAIRS_AT_ONCE: Final = 65_536
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +46,7 @@ class Window:
     Attributes:
         first: (n, 2) positions of the first set.
         second: (m, 2) positions of the second set, where they are expected in the first's frame.
-        radius: largest distance of a pair.
+        radius: largest difference of a pair's coordinates.
         first_log_size: (n,) float32 log2 of the sizes.
         second_log_size: (m,) float32, as expected in the first's frame.
         first_angle_deg: (n,) float32.
@@ -63,26 +65,23 @@ class Window:
     log_size_most: float
     angle_most_deg: float
 
-    def allows(self, rows: slice) -> NDArray[np.bool_]:
-        """Which of the second set (columns) some of the first set (rows) may be paired with."""
-        possible = np.abs(self.first[rows, None, 0] - self.second[:, 0]) <= self.radius
-        possible &= np.abs(self.first[rows, None, 1] - self.second[:, 1]) <= self.radius
-        # The rest only for the few that are near.
-        i, j = np.nonzero(possible)
-        start = rows.start
-        log_size = np.abs(self.first_log_size[start + i] - self.second_log_size[j])
-        turn = np.abs(self.first_angle_deg[start + i] - self.second_angle_deg[j]) % 360.0
+    def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Possible pairs: indices into the first set and into the second."""
+        from scipy.spatial import cKDTree
+
+        near = cKDTree(self.first).sparse_distance_matrix(
+            cKDTree(self.second), self.radius, p=np.inf, output_type="ndarray"
+        )
+        i, j = near["i"].astype(np.intp), near["j"].astype(np.intp)
+        log_size = np.abs(self.first_log_size[i] - self.second_log_size[j])
+        turn = np.abs(self.first_angle_deg[i] - self.second_angle_deg[j]) % 360.0
         turn = np.minimum(turn, 360.0 - turn)
-        possible[i, j] = (log_size <= self.log_size_most) & (turn <= self.angle_most_deg)
-        return np.asarray(possible)
+        possible = (log_size <= self.log_size_most) & (turn <= self.angle_most_deg)
+        return i[possible], j[possible]
 
 
 def mutual_matches(
-    first: NDArray[np.float32],
-    second: NDArray[np.float32],
-    *,
-    ratio_most: float,
-    window: Window | None = None,
+    first: NDArray[np.float32], second: NDArray[np.float32], *, ratio_most: float
 ) -> Matches:
     """Pair descriptors that are each other's nearest and clearly nearer than the next.
 
@@ -90,42 +89,108 @@ def mutual_matches(
         first: (n, d) whole numbers, small enough that products are exact in float32.
         second: (m, d) likewise.
         ratio_most: largest distance of the best over the distance of the second best (Lowe 2004).
-        window: only pairs inside it count, also as second best.
     """
     if not (len(first) and len(second)):
-        nothing = np.empty(0, dtype=np.intp)
-        return Matches(first=nothing, second=nothing, ratio=np.empty(0))
-    squares_first = (first * first).sum(axis=1)
-    squares_second = (second * second).sum(axis=1)
-    transposed = np.ascontiguousarray(second.T)
-    n_first, n_second = len(first), len(second)
-    nearest = np.empty(n_first, dtype=np.intp)
-    best = np.empty(n_first, dtype=np.float32)
-    next_best = np.full(n_first, np.inf, dtype=np.float32)
-    back = np.zeros(n_second, dtype=np.intp)
-    back_best = np.full(n_second, np.inf, dtype=np.float32)
-    for start in range(0, n_first, _BLOCK):
-        rows = slice(start, min(start + _BLOCK, n_first))
-        distances = first[rows] @ transposed
-        distances *= -2.0
-        distances += squares_second
-        distances += squares_first[rows, None]
-        if window is not None:
-            distances[~window.allows(rows)] = np.inf
-        lowest = distances.min(axis=0)
-        better = lowest < back_best
-        back_best[better] = lowest[better]
-        back[better] = start + distances[:, better].argmin(axis=0)
+        return _nothing()
+    left, right = _left(first), _right(second)
+    nearest = np.empty(len(first), dtype=np.intp)
+    best = np.empty(len(first), dtype=np.float32)
+    next_best = np.full(len(first), np.inf, dtype=np.float32)
+    for rows in _blocks(len(first), len(second)):
+        distances = left[rows] @ right
         index = distances.argmin(axis=1)
         own = np.arange(len(index))
         nearest[rows], best[rows] = index, distances[own, index]
-        if n_second > 1:
+        if len(second) > 1:
             distances[own, index] = np.inf
             next_best[rows] = distances.min(axis=1)
-    with np.errstate(invalid="ignore"):
-        ratio = np.sqrt(np.maximum(best, 0.0) / np.maximum(next_best, 1e-12)).astype(np.float64)
+    ratio = _ratio(best, next_best)
+    # Few are distinct, so that only they are looked up backwards.
+    distinct = np.flatnonzero(ratio <= ratio_most)
+    asked, place = np.unique(nearest[distinct], return_inverse=True)
+    back = _nearest(second[asked], first)[place]
+    kept = distinct[back == distinct]
+    return Matches(first=kept, second=nearest[kept], ratio=ratio[kept])
+
+
+def mutual_matches_within(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    window: Window,
+    *,
+    ratio_most: float,
+) -> Matches:
+    """Pair descriptors as `mutual_matches` does, as if there were no pairs but the possible ones.
+
+    Args:
+        first: (n, d) whole numbers, small enough that products are exact in float32.
+        second: (m, d) likewise.
+        window: only pairs inside it count, also as second best.
+        ratio_most: largest distance of the best over the distance of the second best.
+    """
+    if not (len(first) and len(second)):
+        return _nothing()
+    i, j = window.pairs()
+    distances = _distances(first, second, i, j)
+    order = np.lexsort((j, distances, i))
+    starts = np.flatnonzero(np.diff(i[order], prepend=-1))
+    best, following = order[starts], starts + 1
+    has_next = np.append(starts[1:], len(order)) > following
+    next_best = np.full(len(best), np.inf, dtype=np.float32)
+    next_best[has_next] = distances[order[following[has_next]]]
+    ratio = _ratio(distances[best], next_best)
+    backwards = np.lexsort((i, distances, j))
+    back = backwards[np.flatnonzero(np.diff(j[backwards], prepend=-1))]
+    is_back = np.zeros(len(i), dtype=np.bool_)
+    is_back[back] = True
+    kept = is_back[best] & (ratio <= ratio_most)
+    return Matches(first=i[best[kept]], second=j[best[kept]], ratio=ratio[kept])
+
+
+def _nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> NDArray[np.intp]:
+    left, right = _left(asked), _right(among)
+    parts = [(left[rows] @ right).argmin(axis=1) for rows in _blocks(len(asked), len(among))]
+    return np.concatenate([np.empty(0, dtype=np.intp), *parts])
+
+
+def _left(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Rows whose product with `_right` is the squared distance: (-2 a, |a|^2, 1) (b, 1, |b|^2)."""
+    squares = (descriptors * descriptors).sum(axis=1)
+    return np.column_stack([-2.0 * descriptors, squares, np.ones_like(squares)])
+
+
+def _right(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    squares = (descriptors * descriptors).sum(axis=1)
+    return np.vstack([descriptors.T, np.ones_like(squares), squares])
+
+
+def _blocks(n_rows: int, n_columns: int) -> list[slice]:
+    rows = max(1, _BLOCK_ENTRIES // n_columns)
+    return [slice(start, min(start + rows, n_rows)) for start in range(0, n_rows, rows)]
+
+
+def _distances(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    i: NDArray[np.intp],
+    j: NDArray[np.intp],
+) -> NDArray[np.float32]:
+    """Squared distances of pairs."""
+    distances = np.empty(len(i), dtype=np.float32)
+    for start in range(0, len(i), _PAIRS_AT_ONCE):
+        some = slice(start, start + _PAIRS_AT_ONCE)
+        apart = first[i[some]] - second[j[some]]
+        distances[some] = np.einsum("ij,ij->i", apart, apart)
+    return distances
+
+
+def _ratio(best: NDArray[np.float32], next_best: NDArray[np.float32]) -> NDArray[np.float64]:
+    ratio = np.sqrt(np.maximum(best, 0.0) / np.maximum(next_best, 1e-12)).astype(np.float64)
     # The only candidate is distinct from nothing, and of two equal ones none is.
     ratio[~np.isfinite(next_best) | (next_best <= 0.0)] = 1.0
-    ratio[~np.isfinite(best)] = np.inf
-    kept = np.flatnonzero((back[nearest] == np.arange(n_first)) & (ratio <= ratio_most))
-    return Matches(first=kept, second=nearest[kept], ratio=ratio[kept])
+    return ratio
+
+
+def _nothing() -> Matches:
+    nothing = np.empty(0, dtype=np.intp)
+    return Matches(first=nothing, second=nothing, ratio=np.empty(0))

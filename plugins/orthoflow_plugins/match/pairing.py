@@ -1,4 +1,4 @@
-"""Candidates of one photo on the walls: which walls it shows, at which scale it is matched best."""
+"""What a photo shares with walls: first which of them it shows, then all key points they share."""
 
 from __future__ import annotations
 
@@ -16,9 +16,14 @@ from orthoflow_plugins.match.pictures import equalised, shrunk
 from orthoflow_plugins.match.rematching import Expectation, rematched
 
 # A photo is tried at this size first, then at twice, until a wall is recognised.
-_FIRST_SIDE_PX: Final = 1000
+_FIRST_SIDE_PX: Final = 800
+# So many key points of a photo and of each wall suffice to tell which walls a photo shows.
+_FIRST_IN_PHOTO: Final = 3000
+_FIRST_ON_WALL: Final = 4000
 # The homography of a wall with relief is only roughly right: share of the photo's diagonal.
 _LOOSE_SHARE: Final = 0.02
+# A factor of 1.4 between pixels and cells is nothing to key points that have a size of their own.
+_LOG_SCALE_APART: Final = 0.35
 _SEED: Final = 1
 
 
@@ -88,7 +93,7 @@ class PhotoPairs:
 def pair_photo(
     grey: NDArray[np.uint8], walls: Sequence[Features | None], rule: PairingRule
 ) -> PhotoPairs:
-    """Match a photo with walls, coarse to fine, then once more at the walls' own resolution.
+    """Recognise the walls in a photo, coarse to fine, then match these at their own resolution.
 
     Key points of a photo much finer than the raster find no partner there, but many false ones;
     at one cell per pixel both show the same detail (domain measurements: 2 to 5 times the ties).
@@ -98,70 +103,108 @@ def pair_photo(
         walls: key points per wall, None where it shows nothing.
         rule: how.
     """
-    longest = max(grey.shape)
-    finest = min(1.0, rule.longest_side_px / longest)
-    scale = min(finest, _FIRST_SIDE_PX / longest)
-    best = _pairs_at(grey, scale, walls, rule)
-    while best.n_verified < rule.n_verified_least and scale < finest:
-        scale = min(finest, 2.0 * scale)
-        tried = _pairs_at(grey, scale, walls, rule)
-        if tried.n_verified >= best.n_verified:
-            best = tried
-    wanted = min(finest, best.scale * _cells_per_pixel(best, walls))
-    if best.n_verified and abs(math.log(wanted / best.scale)) > 0.15:
-        tried = _pairs_at(grey, wanted, walls, rule)
-        if tried.n_verified > best.n_verified:
-            best = tried
-    if best.n_verified and _n_verified_mirrored(best, grey.shape[1], walls, rule) > best.n_verified:
-        refused = tuple(replace(pair, is_shown=False, homography=None) for pair in best.pairs)
-        return replace(best, pairs=refused, is_mirrored=True)
+    seeker = _Seeker(grey=grey, rule=rule)
+    first, key_points = seeker.first_look(walls)
+    if not first.n_verified:
+        return first
+    if seeker.n_verified_mirrored(first, walls) > first.n_verified:
+        refused = tuple(replace(pair, is_shown=False, homography=None) for pair in first.pairs)
+        return replace(first, pairs=refused, is_mirrored=True)
+    wanted = min(seeker.finest, first.scale * _cells_per_pixel(first, walls))
+    if abs(math.log(wanted / first.scale)) > _LOG_SCALE_APART:
+        key_points = seeker.key_points(wanted)
+    second = seeker.pairs(key_points, _shown(first, walls))
+    best = second if second.n_verified > first.n_verified else first
     return _completed(best, walls, rule)
 
 
-def _pairs_at(
-    grey: NDArray[np.uint8], scale: float, walls: Sequence[Features | None], rule: PairingRule
-) -> PhotoPairs:
-    small = equalised(shrunk(grey, scale), rule.clip_limit)
-    features = find_features(small, rule.features).scaled(1.0 / scale)
-    loose_px = _LOOSE_SHARE * math.hypot(*grey.shape)
-    pairs = []
-    for index, wall in enumerate(walls):
-        if wall is None:
-            continue
-        matches = mutual_matches(features.descriptors, wall.descriptors, ratio_most=rule.ratio_most)
-        if len(matches):
-            pairs.append(_verified(index, matches, features, wall, (loose_px, rule)))
-    return PhotoPairs(features=features, scale=scale, pairs=tuple(pairs), radius_px=loose_px)
+@dataclass(frozen=True, kw_only=True)
+class _KeyPoints:
+    """Key points of a photo shrunk by a scale, in pixels of the full photo."""
+
+    features: Features
+    scale: float
 
 
-def _n_verified_mirrored(
-    pairs: PhotoPairs, width_px: int, walls: Sequence[Features | None], rule: PairingRule
-) -> int:
-    """Matches that would agree, over the walls shown, had the photo been mirrored.
+@dataclass(frozen=True, kw_only=True)
+class _Seeker:
+    """Looks for walls in one photo."""
 
-    A front that is symmetric matches its own mirror image in part, and the pose found would look
-    right where it is.
-    """
-    mirrored = pairs.features.mirrored(width_px)
-    total = 0
-    for index, wall in enumerate(walls):
-        if wall is None:
-            continue
-        matches = mutual_matches(mirrored.descriptors, wall.descriptors, ratio_most=rule.ratio_most)
-        limits = (pairs.radius_px, rule)
-        pair = _verified(index, matches, mirrored, wall, limits)
-        total += int(pair.agreeing.sum()) if pair.is_shown else 0
-    return total
+    grey: NDArray[np.uint8]
+    rule: PairingRule
+
+    @property
+    def finest(self) -> float:
+        """Largest scale the photo is matched at."""
+        return min(1.0, self.rule.longest_side_px / float(max(self.grey.shape)))
+
+    def key_points(self, scale: float) -> _KeyPoints:
+        small = equalised(shrunk(self.grey, scale), self.rule.clip_limit)
+        features = find_features(small, self.rule.features)
+        return _KeyPoints(features=features.scaled(1.0 / scale), scale=scale)
+
+    def first_look(self, walls: Sequence[Features | None]) -> tuple[PhotoPairs, _KeyPoints]:
+        """Recognise walls at growing scales, by the strongest key points, or else by all."""
+        scale = min(self.finest, _FIRST_SIDE_PX / max(self.grey.shape))
+        found: tuple[PhotoPairs, _KeyPoints] | None = None
+        while True:
+            key_points = self.key_points(scale)
+            few = replace(key_points, features=key_points.features.strongest(_FIRST_IN_PHOTO))
+            pairs = self.pairs(few, _strongest(walls))
+            if pairs.n_verified < self.rule.n_verified_least:
+                pairs = self.pairs(key_points, walls)
+            if found is None or pairs.n_verified >= found[0].n_verified:
+                found = pairs, key_points
+            if found[0].n_verified >= self.rule.n_verified_least or scale >= self.finest:
+                return found
+            scale = min(self.finest, 2.0 * scale)
+
+    def pairs(self, key_points: _KeyPoints, walls: Sequence[Features | None]) -> PhotoPairs:
+        """Match key points with walls, all that are not None."""
+        radius_px = _LOOSE_SHARE * math.hypot(*self.grey.shape)
+        pairs = []
+        for index, wall in enumerate(walls):
+            if wall is None:
+                continue
+            matches = mutual_matches(
+                key_points.features.descriptors, wall.descriptors, ratio_most=self.rule.ratio_most
+            )
+            if len(matches):
+                sets = (key_points.features, wall)
+                pairs.append(_verified(index, matches, sets, (radius_px, self.rule)))
+        return PhotoPairs(
+            features=key_points.features,
+            scale=key_points.scale,
+            pairs=tuple(pairs),
+            radius_px=radius_px,
+        )
+
+    def n_verified_mirrored(self, first: PhotoPairs, walls: Sequence[Features | None]) -> int:
+        """Matches that would agree, over the walls shown, had the photo been mirrored.
+
+        A front that is symmetric matches its own mirror image in part, and the pose found would
+        look right where it is.
+        """
+        mirrored = first.features.mirrored(self.grey.shape[1])
+        few = len(mirrored) <= _FIRST_IN_PHOTO
+        shown = _shown(first, _strongest(walls) if few else walls)
+        return self.pairs(_KeyPoints(features=mirrored, scale=first.scale), shown).n_verified
+
+
+def _strongest(walls: Sequence[Features | None]) -> list[Features | None]:
+    return [None if wall is None else wall.strongest(_FIRST_ON_WALL) for wall in walls]
+
+
+def _shown(pairs: PhotoPairs, walls: Sequence[Features | None]) -> list[Features | None]:
+    """Only the walls that a photo shows."""
+    shown = {pair.wall for pair in pairs.pairs if pair.is_shown}
+    return [wall if index in shown else None for index, wall in enumerate(walls)]
 
 
 def _verified(
-    index: int,
-    matches: Matches,
-    features: Features,
-    wall: Features,
-    limits: tuple[float, PairingRule],
+    index: int, matches: Matches, sets: tuple[Features, Features], limits: tuple[float, PairingRule]
 ) -> Pair:
-    loose_px, rule = limits
+    (features, wall), (loose_px, rule) = sets, limits
     source, target = wall.pixels[matches.second], features.pixels[matches.first]
     agreeing = np.zeros(len(matches), dtype=np.bool_)
     homography = None

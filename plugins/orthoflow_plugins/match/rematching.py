@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow_plugins.match.features import Features
-from orthoflow_plugins.match.neighbours import Matches, Window, mutual_matches
+from orthoflow_plugins.match.neighbours import Matches, Window, mutual_matches_within
 
 _LOG_SIZE_MOST: Final = 0.7
 _ANGLE_MOST_DEG: Final = 30.0
@@ -67,8 +67,8 @@ def rematched(
         log_size_most=_LOG_SIZE_MOST,
         angle_most_deg=_ANGLE_MOST_DEG,
     )
-    found = mutual_matches(
-        photo.descriptors, wall.descriptors[near], ratio_most=ratio_most, window=window
+    found = mutual_matches_within(
+        photo.descriptors, wall.descriptors[near], window, ratio_most=ratio_most
     )
     new = ~np.isin(found.first, matches.first)
     return Matches(

@@ -21,6 +21,7 @@ from orthoflow_plugins.match.pictures import (
     wall_picture,
 )
 from orthoflow_plugins.match.versions import opencv_version
+from orthoflow_plugins.match.workers import in_order
 
 # How well SIFT places a key point, in pixels of the image it was found in: for the smallest ones,
 # and growing with their size.
@@ -51,7 +52,7 @@ class MatchSift(Method):
         """Key points, their contrast, and what counts as a match."""
 
         n_features_max: int = Field(
-            default=12_000, ge=50, description="Key points per photo and per wall, spread evenly."
+            default=6000, ge=50, description="Key points per photo and per wall, spread evenly."
         )
         ratio: float = Field(
             default=0.85,
@@ -96,20 +97,19 @@ class MatchSift(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Match every photo with every wall."""
-        import cv2
-
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         require_intensity(walls)
-        cv2.setNumThreads(ctx.cores)
         rule = _rule(params)
         ctx.progress(0.0, "key points of the walls")
-        on_walls = [_wall_features(wall, rule) for wall in walls.walls]
+        on_walls = list(in_order(lambda wall: _wall_features(wall, rule), walls.walls, ctx.cores))
         pieces: list[TiePiece] = []
         notes: dict[str, JsonValue] = {}
-        for index, photo in enumerate(photos.photos):
+        paired = in_order(
+            lambda photo: pair_photo(photo_grey(photo), on_walls, rule), photos.photos, ctx.cores
+        )
+        for index, (photo, pairs) in enumerate(zip(photos.photos, paired, strict=True)):
             ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
-            pairs = pair_photo(photo_grey(photo), on_walls, rule)
             pieces += _pieces(index, pairs, on_walls, walls)
             notes[photo.name] = _note(ctx, photo.name, pairs, walls)
         ties = ties_of(

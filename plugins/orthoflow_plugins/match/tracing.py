@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -15,11 +15,11 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.products import Wall
 from orthoflow_plugins.match.assembling import TiePiece
-from orthoflow_plugins.match.channels import Channels, gradient_channels, grey_channels
 from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
 from orthoflow_plugins.match.pictures import points_on_wall
-from orthoflow_plugins.match.places import texture, textured_places
-from orthoflow_plugins.match.warping import Projection, project_walls, warp_photo
+from orthoflow_plugins.match.places import textured_places
+from orthoflow_plugins.match.targets import CHANNELS, WallTarget
+from orthoflow_plugins.match.warping import Projection, View, project_walls
 
 _NEIGHBOURS: Final = 12
 _MEDIAN_TOLERANCE_CELLS: Final = 0.6
@@ -33,10 +33,8 @@ _SIGMA_FLOOR_CELLS: Final = 0.1
 _OCCUPIED_CELLS: Final = 5.0
 _RADIUS_LEAST: Final = 2
 _TIES_SHARE_LEAST: Final = 0.6
-_CHANNELS: Final[Mapping[str, Callable[[NDArray[np.float32]], Channels]]] = {
-    "gradients": gradient_channels,
-    "grey": grey_channels,
-}
+# Warping again by a pose that moves the photo less than this on the walls changes nothing.
+_SETTLED_CELLS: Final = 0.3
 # Held-out error has to fall by this share for another round.
 _GAIN_LEAST: Final = 0.03
 
@@ -67,31 +65,6 @@ class TracingRule:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WallTarget:
-    """A wall ready to be matched.
-
-    Attributes:
-        wall: the wall.
-        grey: its intensity, NaN where it has no depth; None where it shows nothing.
-        channels: of its intensity, by content, as far as they were needed.
-        textures: of these channels, likewise.
-    """
-
-    wall: Wall
-    grey: NDArray[np.float32] | None
-    channels: dict[str, Channels] = field(default_factory=dict)
-    textures: dict[str, NDArray[np.float32]] = field(default_factory=dict)
-
-    def prepare(self, content: str, half_patch_cells: int) -> None:
-        """Compute channels and texture unless that was done before."""
-        if self.grey is not None and content not in self.channels:
-            self.channels[content] = _CHANNELS[content](self.grey)
-            self.textures[content] = texture(
-                self.channels[content], half_patch_cells=half_patch_cells
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
 class Trace:
     """What tracing a photo found.
 
@@ -101,7 +74,7 @@ class Trace:
         n_outliers: of these, dropped.
         held_out_px: RMS of a residual coordinate of held-out ties, per round.
         content: what was compared.
-        camera: the pose the last round ended with.
+        view: how the photo lay on the walls in the end.
     """
 
     pieces: tuple[TiePiece, ...]
@@ -109,7 +82,7 @@ class Trace:
     n_outliers: int
     held_out_px: tuple[float, ...]
     content: str
-    camera: ViewingCamera
+    view: View
 
     @property
     def n_ties(self) -> int:
@@ -122,14 +95,6 @@ class _Round:
     pieces: list[TiePiece]
     n_measured: int
     n_outliers: int
-
-
-def target_of(wall: Wall) -> WallTarget:
-    """Prepare a wall for matching."""
-    if wall.intensity is None:
-        return WallTarget(wall=wall, grey=None)
-    grey = np.where(np.isfinite(wall.depth_m), wall.intensity, np.nan).astype(np.float32)
-    return WallTarget(wall=wall, grey=grey)
 
 
 def trace_photo(
@@ -148,11 +113,13 @@ def trace_photo(
         targets: all walls; any of them may hide another.
         rule: how.
     """
+    walls = [target.wall for target in targets]
+    view = View(photo=photo, grey=grey, camera=camera, projections=project_walls(camera, walls))
     found: Trace | None = None
     for content in rule.contents:
         # What one content found out about the pose is the next one's start.
-        start = (camera, rule.radius_cells) if found is None else (found.camera, _RADIUS_LEAST)
-        tried = _traced(photo, grey, start, targets, (rule, content))
+        start = (view, rule.radius_cells) if found is None else (found.view, _RADIUS_LEAST)
+        tried = _traced(start, targets, rule, content)
         if found is None or _is_better(tried, found):
             found = tried
     assert found is not None  # noqa: S101 - there is at least one content
@@ -168,33 +135,29 @@ def _is_better(tried: Trace, found: Trace) -> bool:
 
 
 def _traced(
-    photo: int,
-    grey: NDArray[np.uint8],
-    start: tuple[ViewingCamera, int],
-    targets: Sequence[WallTarget],
-    how: tuple[TracingRule, str],
+    start: tuple[View, int], targets: Sequence[WallTarget], rule: TracingRule, content: str
 ) -> Trace:
-    camera, radius = start
-    rule, content = how
+    view, radius = start
     best: _Round | None = None
     history: list[float] = []
     for _ in range(rule.n_rounds_most):
-        found = _measured(photo, grey, camera, targets, (rule, radius, content))
-        seen = _joined(found.pieces)
-        refitted, held_out_px = _refitted(seen, camera)
+        found = _measured(view, targets, (rule, radius, content))
+        refitted, held_out_px = _refitted(_joined(found.pieces), view.camera)
         if refitted is None:
             # A round that finds too little does not spoil the one before.
             best = best or found
             break
         improved = not history or held_out_px < (1.0 - _GAIN_LEAST) * min(history)
         history.append(held_out_px)
-        if not history[1:] or held_out_px <= min(history):
+        if held_out_px <= min(history):
             best = found
-        if not improved:
+        if not improved or _moved_cells(found, view, refitted) < _SETTLED_CELLS:
             break
-        camera, radius = refitted, max(_RADIUS_LEAST, radius // 2)
+        projections = project_walls(refitted, [target.wall for target in targets])
+        view = View(photo=view.photo, grey=view.grey, camera=refitted, projections=projections)
+        radius = max(_RADIUS_LEAST, radius // 2)
     result = best or _Round(pieces=[], n_measured=0, n_outliers=0)
-    cleaned = _without_misfits(result.pieces, camera)
+    cleaned = _without_misfits(result.pieces, view.camera)
     n_kept = sum(len(piece) for piece in cleaned)
     return Trace(
         pieces=tuple(cleaned),
@@ -202,33 +165,42 @@ def _traced(
         n_outliers=result.n_measured - n_kept,
         held_out_px=tuple(history),
         content=content,
-        camera=camera,
+        view=view,
     )
 
 
+def _moved_cells(found: _Round, view: View, refitted: ViewingCamera) -> float:
+    """How far another pose moves the photo on the walls, at the ties (RMS)."""
+    squares = []
+    for piece in found.pieces:
+        projection = view.projections[piece.wall]
+        if projection is None:
+            continue
+        before, after = (
+            camera.project(piece.points_world)[:, :2] for camera in (view.camera, refitted)
+        )
+        squares.append(((after - before) ** 2).sum(axis=1) / projection.pixels_per_cell**2)
+    return float(np.sqrt(np.concatenate(squares).mean()))
+
+
 def _measured(
-    photo: int,
-    grey: NDArray[np.uint8],
-    camera: ViewingCamera,
-    targets: Sequence[WallTarget],
-    how: tuple[TracingRule, int, str],
+    view: View, targets: Sequence[WallTarget], how: tuple[TracingRule, int, str]
 ) -> _Round:
     rule, radius, content = how
-    projections = project_walls(camera, [target.wall for target in targets])
-    sizes = [_footprint(item) for item in projections]
+    sizes = [_footprint(item) for item in view.projections]
     occupied: set[tuple[int, int]] = set()
     pieces: list[TiePiece] = []
     n_measured = 0
     # The wall that fills most of the photo first: planes close to each other show one surface.
     for index in sorted(range(len(targets)), key=lambda k: (-sizes[k], k)):
-        projection, target = projections[index], targets[index]
+        projection, target = view.projections[index], targets[index]
         if projection is None or target.grey is None or sizes[index] == 0:
             continue
         share = sizes[index] / sum(sizes)
-        warped = warp_photo(grey, projection)
+        grey = view.on_wall(index, projection)
         target.prepare(content, rule.half_patch_cells)
         channels = target.channels[content].part(projection.part)
-        usable = (channels.known > 0.0) & np.isfinite(warped.grey)
+        usable = (channels.known > 0.0) & np.isfinite(grey)
         strength = target.textures[content][projection.part]
         places = textured_places(strength, usable, max(50, round(rule.n_ties_most * share)))
         places = _unoccupied(places, projection, occupied)
@@ -239,10 +211,10 @@ def _measured(
             distinct_least=rule.distinct_least,
             threads=rule.threads,
         )
-        moved = measure(channels, _CHANNELS[content](warped.grey), places, search)
+        moved = measure(channels, CHANNELS[content](grey), places, search)
         n_measured += len(moved.places)
         moved = moved.take(_agrees_around(moved))
-        pieces.append(_piece(photo, index, target.wall, (moved, projection)))
+        pieces.append(_piece(view.photo, index, target.wall, (moved, projection)))
     pieces.sort(key=lambda piece: piece.wall)
     return _Round(
         pieces=pieces,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -62,6 +62,31 @@ class WarpedPhoto:
 
     grey: NDArray[np.float32]
     projection: Projection
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """A photo laid onto the walls by a pose.
+
+    Attributes:
+        photo: index of the photo.
+        grey: (height, width) of the photo.
+        camera: the pose.
+        projections: of each wall, None where the photo does not show it.
+        warped: the photo in the raster of each wall, as far as it was needed.
+    """
+
+    photo: int
+    grey: NDArray[np.uint8]
+    camera: ViewingCamera
+    projections: Sequence[Projection | None]
+    warped: dict[int, WarpedPhoto] = field(default_factory=dict)
+
+    def on_wall(self, index: int, projection: Projection) -> NDArray[np.float32]:
+        """Give the photo's grey in the raster of a wall."""
+        if index not in self.warped:
+            self.warped[index] = warp_photo(self.grey, projection)
+        return self.warped[index].grey
 
 
 def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projection | None]:
