@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SimulateRoom.Out:
         photo_gsd_m=0.004,
         photo_noise_grey=0.0,
         photo_vignetting_share=0.0,
-        photo_supersample=3,
+        photo_supersample=2,
     )
 
 
@@ -49,7 +50,14 @@ def wall(room: SimulateRoom.Out) -> TrueOrthoimage:
     """The main wall as it is, in cells as large as pixels."""
     planes = room.truth.planes
     frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=0.004)
-    return render_frame(room.truth.scene, frame, buffer_front_m=0.02, buffer_behind_m=0.02, cores=2)
+    return render_frame(
+        room.truth.scene,
+        frame,
+        buffer_front_m=0.02,
+        buffer_behind_m=0.02,
+        supersample=2,
+        cores=2,
+    )
 
 
 def cameras_of(truth: Truth) -> tuple[ViewingCamera, ...]:
@@ -105,7 +113,9 @@ def test_a_photo_shows_the_wall_where_its_true_camera_projects_it(
 
 def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> None:
     truth = room.truth
-    camera = cameras_of(truth)[1]
+    whole = cameras_of(truth)[1]
+    # A window of the photo, of the object and its edges among other things.
+    camera = replace(whole, width=160, height=120, cx=whole.cx - 200.0, cy=whole.cy - 20.0)
     views = SceneCameras(truth.scene, cores=2)
     image = views.expose(camera, supersample=8)
     rng = np.random.default_rng(5)
@@ -122,6 +132,9 @@ def test_a_pixel_is_the_mean_of_what_lies_behind_it(room: SimulateRoom.Out) -> N
     differences = np.abs(image[chosen[:, 1], chosen[:, 0]] - means)
     assert differences.mean() < 0.5
     assert differences.max() < 15.0
+    # Neither of one colour nor of one rectangle.
+    assert means.std() > 10.0
+    assert {SurfaceRole.OBJECT, SurfaceRole.WALL} <= set(truth.scene.role[hits.rectangle])
 
 
 def test_check_points_are_on_their_marks(room: SimulateRoom.Out) -> None:
@@ -222,8 +235,10 @@ def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int)
 
 
 def test_survey_coordinates_and_another_up_change_no_byte_of_a_photo(tmp_path: Path) -> None:
-    near = simulate(tmp_path / "near")
-    far = simulate(tmp_path / "far", shift_world_m=tuple(scenes.SURVEY_SHIFT_M), up="-y")
+    near = simulate(tmp_path / "near", photo_gsd_m=0.016)
+    far = simulate(
+        tmp_path / "far", photo_gsd_m=0.016, shift_world_m=tuple(scenes.SURVEY_SHIFT_M), up="-y"
+    )
     assert [photo.encoded for photo in near.photos.photos] == [
         photo.encoded for photo in far.photos.photos
     ]
@@ -244,8 +259,8 @@ def test_threads_change_no_byte_and_seeds_move_the_cameras(tmp_path: Path) -> No
 
 
 def test_calibration_is_told_only_when_it_is_known(tmp_path: Path) -> None:
-    known = simulate(tmp_path / "known")
-    unknown = simulate(tmp_path / "unknown", calibrated=False)
+    known = simulate(tmp_path / "known", photo_gsd_m=0.03)
+    unknown = simulate(tmp_path / "unknown", photo_gsd_m=0.03, calibrated=False)
     camera = cameras_of(known.truth)[0]
     assert known.calibration.patterns == ("*",)
     assert known.calibration.intrinsics[0].fx == camera.fx

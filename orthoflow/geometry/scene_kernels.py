@@ -146,10 +146,10 @@ def cast_rays(
             distance = _hit_distance(rectangles, holes, guess, ray)
             if distance < best_t:
                 best_t, best = distance, guess
-        node = 0
+        node = np.int64(0)
         while node < nodes.shape[0]:
             if _misses_box(nodes, node, inverse, best_t):
-                node = int(nodes[node, 6])
+                node = np.int64(nodes[node, 6])
                 continue
             for place in range(int(nodes[node, 7]), int(nodes[node, 8])):
                 index = table.order[place]
