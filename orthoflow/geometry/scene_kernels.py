@@ -83,7 +83,7 @@ def _hit_distance(
 
 
 @kernel_part
-def _misses_box(nodes: NDArray[np.float64], node: int, ray: Ray, t_max: float) -> bool:
+def _misses_box(nodes: NDArray[np.float64], node: Index, ray: Ray, t_max: float) -> bool:
     """Whether a ray, given by its start and the inverse of its direction, stays out of a box."""
     near, far = (nodes[node, 0] - ray.x) * ray.dx, (nodes[node, 3] - ray.x) * ray.dx
     low, high = min(near, far), max(near, far)
