@@ -197,8 +197,8 @@ def test_floor_and_ceiling_alone_leave_no_smeared_wall(tmp_path: Path) -> None:
     assert sorted(planes.names) == ["ceiling", "floor"]
 
 
-def test_without_horizontal_only_walls_are_found(tmp_path: Path) -> None:
-    planes = detect(cloud_of(sampled(), stations=STATION), tmp_path, horizontal=False).planes
+def test_the_vertical_constraint_finds_walls_only(tmp_path: Path) -> None:
+    planes = detect(cloud_of(sampled(), stations=STATION), tmp_path, constraint="vertical").planes
     assert len(planes) == 4
     assert all(name.startswith("wall") for name in planes.names)
 
@@ -228,7 +228,7 @@ def test_no_more_planes_than_allowed(tmp_path: Path) -> None:
 
 
 def test_exact_walls_are_exactly_vertical_and_floors_exactly_level(tmp_path: Path) -> None:
-    planes = detect(cloud_of(sampled(), stations=STATION), tmp_path, constraint="exact").planes
+    planes = detect(cloud_of(sampled(), stations=STATION), tmp_path, exact=True).planes
     rises = np.abs(planes.normal @ planes.up)
     assert (np.minimum(rises, 1.0 - rises) < 1e-12).all()
 

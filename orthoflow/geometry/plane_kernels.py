@@ -58,6 +58,44 @@ def vote_lines(
 
 
 @compiled
+def vote_points(
+    points: BlockedPoints,
+    claims: NDArray[np.int8],
+    plan: NDArray[np.float64],
+    angles_rad: NDArray[np.float64],
+    low_m: float,
+    bin_m: float,
+    votes: NDArray[np.int64],
+) -> None:
+    """Let each unclaimed point vote with its own coordinates; otherwise as `vote_lines`.
+
+    Args:
+        points: (n,) offsets in blocks.
+        claims: (n,) plane of each point, negative for none.
+        plan: (2, 4) e1 and e2, each with the position of the plan's centre along it.
+        angles_rad: (a,) directions of the lines' normals.
+        low_m: distance of the first bin's lower edge.
+        bin_m: width of a bin.
+        votes: (a, bins) table, added to.
+    """
+    x, y, z = points.x, points.y, points.z
+    n_bins = votes.shape[1]
+    for angle in range(angles_rad.size):
+        cosine = math.cos(angles_rad[angle]) / bin_m
+        sine = math.sin(angles_rad[angle]) / bin_m
+        a = cosine * plan[0, 0] + sine * plan[1, 0]
+        b = cosine * plan[0, 1] + sine * plan[1, 1]
+        c = cosine * plan[0, 2] + sine * plan[1, 2]
+        start = low_m / bin_m + cosine * plan[0, 3] + sine * plan[1, 3]
+        for i in range(x.size):
+            if claims[i] >= 0:
+                continue
+            position = a * x[i] + b * y[i] + c * z[i] - start
+            if 0.0 <= position < n_bins:
+                votes[angle, int(position)] += 1
+
+
+@compiled
 def robust_moments(
     points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float
 ) -> NDArray[np.float64]:

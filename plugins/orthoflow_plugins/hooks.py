@@ -173,6 +173,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="Hough transform of the plan, cells weighted by their points",
         ),
         MethodSpec(
+            id="plane.ransac",
+            target="orthoflow_plugins.plane.ransac:Ransac",
+            summary="random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or the plan",
+        ),
+        MethodSpec(
             id="plane.given",
             target="orthoflow_plugins.plane.given:GivenPlane",
             summary="a reference plane that the user gives",

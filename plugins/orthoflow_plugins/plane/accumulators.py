@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.plane_kernels import vote_lines
+from orthoflow.geometry.plane_kernels import vote_lines, vote_points
 from orthoflow.geometry.point_kernels import PlanGrid, in_threads
-from orthoflow_plugins.plane.examining import Candidate
+from orthoflow_plugins.plane.candidates import Candidate
 from orthoflow_plugins.plane.remainders import Remainder
+from orthoflow_plugins.plane.voters import Accumulation, plan_centre_m, voters
 
 # A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
 # several bins until it is refined.
@@ -47,6 +48,27 @@ class Accumulator:
     votes: NDArray[np.int64]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Voting:
+    """How a plan votes.
+
+    Attributes:
+        angle_step_deg: step between the directions that are voted for.
+        least_points: points that a plane needs.
+        walls: propose lines of the plan.
+        levels: propose heights.
+        accumulator: how loud a cell is.
+        is_raw: every point votes with its own coordinates instead of its cell.
+    """
+
+    angle_step_deg: float
+    least_points: float
+    walls: bool = True
+    levels: bool = True
+    accumulator: Accumulation = "counts"
+    is_raw: bool = False
+
+
 class PlanProposer:
     """Proposes walls from the maxima of the accumulator and levels from those of the heights.
 
@@ -54,14 +76,12 @@ class PlanProposer:
         first: the accumulator of the untouched cloud.
     """
 
-    def __init__(
-        self, grid: PlanGrid, *, angle_step_deg: float, least_points: float, with_levels: bool
-    ) -> None:
-        """Get ready to propose; a candidate needs about `least_points` points."""
+    def __init__(self, grid: PlanGrid, voting: Voting) -> None:
+        """Get ready to propose."""
         self._grid = grid
-        self._with_levels = with_levels
-        self._least_votes = _VOTE_CAUTION * least_points
-        n_angles = max(4, round(180.0 / angle_step_deg))
+        self._voting = voting
+        self._least_votes = _VOTE_CAUTION * voting.least_points
+        n_angles = max(4, round(180.0 / voting.angle_step_deg))
         self._angles_rad = np.arange(n_angles, dtype=np.float64) * (math.pi / n_angles)
         half_m = 0.5 * grid.cell_m * math.hypot(grid.shape[0], grid.shape[1])
         self._reach_bins = math.ceil(half_m / grid.cell_m) + 1
@@ -77,13 +97,16 @@ class PlanProposer:
 
     def propose(self, remainder: Remainder) -> Candidate | None:
         """Name the better of the best line and the best height."""
-        self._vote(remainder)
-        scores = np.where(self._barred, -np.inf, self._scores)
-        angle, place = np.unravel_index(int(np.argmax(scores)), scores.shape)
-        line_score = float(scores[angle, place])
+        line_score, angle, place = -math.inf, -1, -1
+        if self._voting.walls:
+            self._vote(remainder)
+            scores = np.where(self._barred, -np.inf, self._scores)
+            best = np.unravel_index(int(np.argmax(scores)), scores.shape)
+            angle, place = int(best[0]), int(best[1])
+            line_score = float(scores[angle, place])
         height_score, storey = -math.inf, -1
-        if self._with_levels:
-            heights = _contrast(remainder.heights[None, :], 1)[0]
+        if self._voting.levels:
+            heights = contrast(remainder.heights[None, :], 1)[0]
             heights = np.where(self._barred_heights, -np.inf, heights)
             storey = int(np.argmax(heights))
             height_score = float(heights[storey])
@@ -92,8 +115,8 @@ class PlanProposer:
         if height_score > line_score:
             self._last = (-1, storey)
             return self._level(storey, height_score)
-        self._last = (int(angle), int(place))
-        return self._wall(remainder, int(angle), int(place), line_score)
+        self._last = (angle, place)
+        return self._wall(remainder, angle, place, line_score)
 
     def reject(self, candidate: Candidate) -> None:
         """Bar the surroundings of the last maximum."""
@@ -113,7 +136,6 @@ class PlanProposer:
     def _vote(self, remainder: Remainder) -> None:
         if self._voted_for == remainder.n_unclaimed:
             return
-        cells, weights, centre_m = _occupied(self._grid, remainder.cells)
         bin_m = self._grid.cell_m
         low_m = -self._reach_bins * bin_m
         votes = np.zeros((len(self._angles_rad), 2 * self._reach_bins), dtype=np.int64)
@@ -122,23 +144,44 @@ class PlanProposer:
             np.array_split(votes, remainder.parts),
             strict=True,
         )
-        in_threads(
-            [
-                partial(vote_lines, cells, weights, angles, low_m, bin_m, table)
+        if self._voting.is_raw:
+            plan = np.column_stack([self._grid.basis[:2], plan_centre_m(self._grid)])
+            tasks = [
+                partial(
+                    vote_points,
+                    remainder.points,
+                    remainder.claims,
+                    plan,
+                    angles,
+                    low_m,
+                    bin_m,
+                    part,
+                )
+                for angles, part in shares
+            ]
+        else:
+            cells = voters(self._grid, remainder.cells, self._voting.accumulator)
+            tasks = [
+                partial(vote_lines, cells.places_m, cells.votes, angles, low_m, bin_m, table)
                 for angles, table in shares
             ]
-        )
+        in_threads(tasks)
         self._accumulator = Accumulator(
-            angles_rad=self._angles_rad, low_m=low_m, bin_m=bin_m, centre_m=centre_m, votes=votes
+            angles_rad=self._angles_rad,
+            low_m=low_m,
+            bin_m=bin_m,
+            centre_m=plan_centre_m(self._grid),
+            votes=votes,
         )
         if self.first is None:
             self.first = self._accumulator
-        self._scores = _contrast(votes, self._smear_bins)
+        self._scores = contrast(votes, self._smear_bins)
         self._voted_for = remainder.n_unclaimed
 
     def _wall(self, remainder: Remainder, angle: int, place: int, score: float) -> Candidate:
         """Look around a maximum with finer angles and half-cell bins."""
-        cells, weights, centre_m = _occupied(self._grid, remainder.cells)
+        cells = voters(self._grid, remainder.cells, self._voting.accumulator)
+        places_m = cells.places_m
         bin_m = self._grid.cell_m
         distance_m = (place + 0.5 - self._reach_bins) * bin_m
         step = math.pi / len(self._angles_rad)
@@ -150,18 +193,20 @@ class PlanProposer:
         # A point moves by up to half the plan times a step; cells further off cannot matter.
         direction = np.array([math.cos(self._angles_rad[angle]), math.sin(self._angles_rad[angle])])
         near_m = reach_m + step * self._reach_bins * bin_m
-        near = np.abs(cells @ direction - distance_m) < near_m
+        near = np.abs(places_m @ direction - distance_m) < near_m
         low_m = distance_m - reach_m
-        vote_lines(cells[near], weights[near], angles, low_m, 0.5 * bin_m, fine)
-        scores = _contrast(fine, 1)
+        vote_lines(places_m[near], cells.votes[near], angles, low_m, 0.5 * bin_m, fine)
+        scores = contrast(fine, 1)
         best, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
-        shift = _parabola(scores[best], int(column))
+        shift = parabola(scores[best], int(column))
         normal_plan = np.array([math.cos(angles[best]), math.sin(angles[best])])
-        offset_m = low_m + (column + 0.5 + shift) * 0.5 * bin_m + float(normal_plan @ centre_m)
+        offset_m = (
+            low_m + (column + 0.5 + shift) * 0.5 * bin_m + float(normal_plan @ cells.centre_m)
+        )
         normal = normal_plan @ self._grid.basis[:2]
         return Candidate(
             plane=Plane(normal=normal / np.linalg.norm(normal), offset_m=offset_m),
-            is_level=False,
+            family="wall",
             support=score,
         )
 
@@ -169,25 +214,10 @@ class PlanProposer:
         height_m = self._grid.low_m[2] + (storey + 0.5) * self._grid.cell_m
         up = self._grid.basis[2]
         plane = Plane(normal=up / np.linalg.norm(up), offset_m=float(height_m))
-        return Candidate(plane=plane, is_level=True, support=score)
+        return Candidate(plane=plane, family="level", support=score)
 
 
-def _occupied(
-    grid: PlanGrid, counts: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float64]]:
-    """Centres (m, 2) and points (m,) of occupied cells, centres relative to the plan's centre."""
-    first, second = np.nonzero(counts > 0)
-    centre_m = grid.low_m[:2] + 0.5 * grid.cell_m * np.array(grid.shape[:2])
-    cells = np.column_stack(
-        [
-            (first + 0.5 - 0.5 * grid.shape[0]) * grid.cell_m,
-            (second + 0.5 - 0.5 * grid.shape[1]) * grid.cell_m,
-        ]
-    ).astype(np.float32)
-    return cells, counts[first, second], centre_m
-
-
-def _contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
+def contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
     """Votes in a window of 2 half + 1 bins above those of the emptier neighbouring window."""
     width = 2 * half + 1
     gap = width + 1
@@ -201,8 +231,8 @@ def _contrast(votes: NDArray[np.int64], half: int) -> NDArray[np.float64]:
     return contrast
 
 
-def _parabola(values: NDArray[np.float64], place: int) -> float:
-    """Where between bins a maximum lies, -0.5..0.5."""
+def parabola(values: NDArray[np.float64], place: int) -> float:
+    """Say where between bins a maximum lies, -0.5..0.5."""
     if not 0 < place < len(values) - 1:
         return 0.0
     before, here, after = values[place - 1 : place + 2]

@@ -156,17 +156,20 @@ def _solve(
 
 def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[float, float]:
     """Curvature of the cells' heights, and the share of their variance that it explains."""
-    u, v = design[:, 1], design[:, 2]
-    curved = np.column_stack([design, u * u, u * v, v * v])
-    flat_residuals = heights_m - design @ np.linalg.lstsq(design, heights_m)[0]
-    terms = np.linalg.lstsq(curved, heights_m)[0]
-    curved_residuals = heights_m - curved @ terms
-    variance = float(flat_residuals @ flat_residuals)
+    reach_m = max(float(np.abs(design[:, 1:]).max()), _FLATTEST_M)
+    # In units of the reach, so that the normal equations are well conditioned.
+    u, v = design[:, 1] / reach_m, design[:, 2] / reach_m
+    curved = np.column_stack([np.ones(len(u)), u, v, u * u, u * v, v * v])
+    normal_matrix, right = curved.T @ curved, curved.T @ heights_m
+    squares = float(heights_m @ heights_m)
+    flat = np.linalg.lstsq(normal_matrix[:3, :3], right[:3])[0]
+    terms = np.linalg.lstsq(normal_matrix, right)[0]
+    variance = squares - float(flat @ right[:3])
     if variance < len(heights_m) * _FLATTEST_M**2:
         return 0.0, 0.0
-    hessian = np.array([[2.0 * terms[3], terms[4]], [terms[4], 2.0 * terms[5]]])
+    hessian = np.array([[2.0 * terms[3], terms[4]], [terms[4], 2.0 * terms[5]]]) / reach_m**2
     strongest = float(np.abs(np.linalg.eigvalsh(hessian)).max())
-    return strongest, 1.0 - float(curved_residuals @ curved_residuals) / variance
+    return strongest, 1.0 - max(0.0, squares - float(terms @ right)) / variance
 
 
 def _tile_covariance(
@@ -186,8 +189,7 @@ def _tile_covariance(
         n_tiles = int(member.max()) + 1
         if n_tiles < _TILES_LEAST and reach >= 0.0:
             break
-        tile_scores = np.zeros((n_tiles, design.shape[1]))
-        np.add.at(tile_scores, member, scores)
+        tile_scores = np.column_stack([np.bincount(member, column) for column in scores.T])
         correction = n_tiles / max(1, n_tiles - design.shape[1])
         covariance: NDArray[np.float64] = (
             inverse @ (tile_scores.T @ tile_scores) @ inverse * correction

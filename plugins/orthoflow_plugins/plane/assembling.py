@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
-from orthoflow.products import Planes, PointCloud
+from orthoflow.products import JsonValue, Planes, PointCloud
+from orthoflow_plugins.plane.candidates import Candidate, FoundPlane
 from orthoflow_plugins.plane.deviations import Deviations
-from orthoflow_plugins.plane.examining import FoundPlane
 from orthoflow_plugins.plane.facing import (
     Viewpoint,
     known_viewpoint,
@@ -36,12 +36,14 @@ class Assembly:
         labels_from_claims: (k + 1,) int16 label of each claim; the last entry is for -1.
         deviations: of the planes in their final order.
         n_guessed: planes whose side was guessed.
+        own_tolerances_m: of each plane the tolerance that the detector found itself, or None.
     """
 
     planes: Planes
     labels_from_claims: NDArray[np.int16]
     deviations: Deviations
     n_guessed: int
+    own_tolerances_m: tuple[float | None, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +99,9 @@ def assemble(
             "fit_rms_m": [float(value) for value in ordered.rms_fit_m],
             "find_tolerance_m": ordered.find_m,
             "fit_tolerance_m": ordered.fit_m,
+            "raw": [
+                _raw(found[i].candidate, item, cloud) for i, item in zip(order, faced, strict=True)
+            ],
             "guessed_sides": [index for index, item in enumerate(faced) if item.is_guessed],
         },
     )
@@ -107,6 +112,7 @@ def assemble(
         labels_from_claims=labels,
         deviations=ordered,
         n_guessed=sum(item.is_guessed for item in faced),
+        own_tolerances_m=tuple(found[i].candidate.own_tolerance_m for i in order),
     )
 
 
@@ -209,6 +215,19 @@ def _faced(
         part_corners_m=np.array([enclosing(part, plane, turned) for part in parts_m]),
         is_guessed=is_guessed,
     )
+
+
+def _raw(candidate: Candidate, faced: _Faced, cloud: PointCloud) -> dict[str, JsonValue]:
+    """What the detector itself said about a plane, before the common fit; world."""
+    plane = candidate.plane
+    if float(plane.normal @ faced.plane.normal) < 0.0:
+        plane = plane.flipped()
+    return {
+        "normal": [float(value) for value in plane.normal],
+        "offset_m": _world_offset(plane, cloud),
+        "support": float(candidate.support),
+        "own_tolerance_m": candidate.own_tolerance_m,
+    }
 
 
 def _world_offset(plane: Plane, cloud: PointCloud) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -51,21 +52,29 @@ def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class VotePicture:
+    """What a plan looked like before any plane was taken from it.
+
+    Attributes:
+        grid: where the cells of the plan lie.
+        plan: (e1, e2) points per cell.
+        accumulator: votes of that plan.
+    """
+
+    grid: PlanGrid
+    plan: NDArray[np.int64]
+    accumulator: Accumulator
+
+
 def draw_accumulator(
-    ctx: StepContext,
-    grid: PlanGrid,
-    plan: NDArray[np.int64],
-    accumulator: Accumulator,
-    planes: Planes,
-    cloud: PointCloud,
+    ctx: StepContext, picture: VotePicture, planes: Planes, cloud: PointCloud
 ) -> None:
     """Draw the plan with the walls found, and the parameter space with their maxima.
 
     Args:
         ctx: takes the figure.
-        grid: where the cells of the plan lie.
-        plan: (e1, e2) points per cell before any plane was taken.
-        accumulator: votes of that plan.
+        picture: the plan and its votes.
         planes: the planes, world.
         cloud: where they are from.
     """
@@ -74,9 +83,10 @@ def draw_accumulator(
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     basis = basis_from_up(planes.up)
+    grid, accumulator = picture.grid, picture.accumulator
     low = grid.low_m[:2]
     high = low + grid.cell_m * np.array(grid.shape[:2])
-    image = np.log1p(_thinned_sum(plan))
+    image = np.log1p(_thinned_sum(picture.plan))
     left.imshow(image.T, origin="lower", cmap="gray_r", extent=(low[0], high[0], low[1], high[1]))
     votes = _thinned_sum(accumulator.votes)
     reach_m = -accumulator.low_m

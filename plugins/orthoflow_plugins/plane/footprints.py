@@ -195,12 +195,17 @@ def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
 
 
 def footprint(
-    raster: SurfaceRaster, belongs: NDArray[np.bool_], sums: CellSums
+    raster: SurfaceRaster,
+    belongs: NDArray[np.bool_],
+    sums: CellSums,
+    *,
+    joins_parts: bool = True,
 ) -> Footprint | None:
     """Join cells into parts and put rectangles about them.
 
     Parts are connected over gaps of up to four cells. Every part with a fair share of the cells
-    counts, so that the rectangle holds the entire wall, also where a pilaster cuts it in two.
+    counts, so that the rectangle holds the entire wall, also where a pilaster cuts it in two;
+    without `joins_parts` only the one with most points.
 
     Returns:
         The footprint, or None where no cell belongs.
@@ -216,6 +221,7 @@ def footprint(
     kept = np.flatnonzero(sizes >= _PART_SHARE * belongs.sum())
     n_points = np.bincount(names[belongs], sums.n_find[belongs], minlength=n_parts + 1)
     kept = kept[np.argsort(-n_points[kept], kind="stable")]
+    kept = kept if joins_parts else kept[:1]
     part_of_name = np.full(n_parts + 1, -1, dtype=np.int32)
     part_of_name[kept] = np.arange(len(kept), dtype=np.int32)
     part_of_cell = np.where(belongs, part_of_name[names], np.int32(-1))

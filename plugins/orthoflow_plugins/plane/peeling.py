@@ -13,10 +13,11 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from orthoflow_plugins.plane.examining import Candidate, FoundPlane, Rules, examine
+from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, Rules
+from orthoflow_plugins.plane.examining import examine
 from orthoflow_plugins.plane.remainders import Remainder
 
-# Candidates that turned out to be smears, after which the search gives up.
+# Candidates in a row that turned out to be none, after which the search gives up.
 _REJECTED_MOST: Final = 40
 
 
@@ -63,7 +64,10 @@ def find_planes(
             proposer.reject(candidate)
             n_rejected += 1
             continue
+        if plane.footprint.n_points < rules.stop_rest_share * remainder.n_unclaimed:
+            break
         found.append(plane)
+        n_rejected = 0
         slabs = np.array([item.raster.slab() for item in found])
         remainder.claim(slabs, plane.label_bounds(rules.find_m))
         report(len(found) / rules.n_planes_most, f"plane {len(found)}")

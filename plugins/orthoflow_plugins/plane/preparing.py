@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.point_kernels import blocked, count_over_plan, read_only
+from orthoflow.geometry.point_kernels import Offsets, blocked, count_over_plan, read_only
 from orthoflow.products import PointCloud
 from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.sampling import draw_sample, plan_grid
@@ -17,6 +18,25 @@ from orthoflow_plugins.plane.sampling import draw_sample, plan_grid
 _PARTS_MOST: Final = 8
 # Clouds thinner than this in two directions are a line or a point.
 _THINNEST_M: Final = 1e-4
+
+
+def sample_alone(remainder: Remainder) -> Remainder:
+    """Give the sample as a remainder of its own, nothing claimed: every point of it is asked."""
+    sample = remainder.sample
+    counts = count_over_plan(
+        Offsets(sample.points.x, sample.points.y, sample.points.z), remainder.grid, parts=1
+    )
+    count = len(sample.index)
+    return Remainder(
+        points=sample.points,
+        sample=replace(sample, index=np.arange(count), n_represented=1.0),
+        grid=remainder.grid,
+        up=remainder.up,
+        parts=remainder.parts,
+        claims=np.full(count, -1, dtype=np.int8),
+        cells=counts.cells,
+        heights=counts.heights,
+    )
 
 
 def prepare(

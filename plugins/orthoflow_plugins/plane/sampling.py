@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -56,11 +56,7 @@ def draw_sample(cloud: PointCloud, *, n_most: int = SAMPLE_POINTS) -> Sample:
     """
     if len(cloud) < 3:
         cloud.require_points(3)
-    count = min(n_most, len(cloud))
-    stretch = len(cloud) / count
-    ordinal = np.arange(count)
-    within = np.modf(ordinal * _GOLDEN)[0] if stretch > 1.0 else np.zeros(count)
-    index = np.minimum((ordinal + within) * stretch, len(cloud) - 1).astype(np.int64)
+    index = _spread_index(len(cloud), min(n_most, len(cloud)))
     offsets = read_only(cloud.x[index], cloud.y[index], cloud.z[index])
     offsets_m = np.column_stack(offsets).astype(np.float64)
     if not np.isfinite(offsets_m).all():
@@ -69,8 +65,37 @@ def draw_sample(cloud: PointCloud, *, n_most: int = SAMPLE_POINTS) -> Sample:
         index=index,
         offsets_m=offsets_m,
         points=blocked(offsets, _boxes(offsets)),
-        n_represented=stretch,
+        n_represented=len(cloud) / len(index),
     )
+
+
+def thinned(cloud: PointCloud, every: int) -> PointCloud:
+    """Keep every n-th point, spread as those of a sample; at least three if there are any."""
+    if every == 1:
+        return cloud
+    return picked(cloud, _spread_index(len(cloud), min(len(cloud), max(3, len(cloud) // every))))
+
+
+def picked(cloud: PointCloud, index: NDArray[np.int64]) -> PointCloud:
+    """Give some of the points, without intensity, colour and place in the scan."""
+    return replace(
+        cloud,
+        x=cloud.x[index],
+        y=cloud.y[index],
+        z=cloud.z[index],
+        scan=None if cloud.scan is None else cloud.scan[index],
+        intensity=None,
+        rgb=None,
+        row=None,
+        column=None,
+    )
+
+
+def _spread_index(n_points: int, count: int) -> NDArray[np.int64]:
+    stretch = n_points / max(count, 1)
+    ordinal = np.arange(count)
+    within = np.modf(ordinal * _GOLDEN)[0] if stretch > 1.0 else np.zeros(count)
+    return np.minimum((ordinal + within) * stretch, n_points - 1).astype(np.int64)
 
 
 def _boxes(offsets: Offsets) -> NDArray[np.float32]:

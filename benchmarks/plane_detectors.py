@@ -1,11 +1,12 @@
-"""Time and accuracy of `plane.hough2d`: first plane, all planes, statistics, in memory passes.
+"""Time and accuracy of the plane detectors: first plane, all planes, statistics, in memory passes.
 
-    python benchmarks/plane_hough2d.py                          # a room of 10 million points
-    python benchmarks/plane_hough2d.py --points 48000000
-    python benchmarks/plane_hough2d.py --npy room.npy --truth truth.json
+    python benchmarks/plane_detectors.py                          # a room of 10 million points
+    python benchmarks/plane_detectors.py --points 48000000 --method ransac
+    python benchmarks/plane_detectors.py --npy room.npy --truth truth.json
 
 F is one pass over separate x, y, z arrays at memory speed, measured in the same run: seconds of
-different machines do not compare, seconds over F do. Code is warm, points are in memory.
+different machines do not compare, seconds over F do. Code is warm, points are in memory. Detection
+and labels are measured, statistics apart; figures and files are not.
 """
 
 from __future__ import annotations
@@ -16,22 +17,28 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.accumulators import PlanProposer
+from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
+from orthoflow_plugins.plane.candidates import FoundPlane
+from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
+from orthoflow_plugins.plane.detecting import rules_of, search_sample
 from orthoflow_plugins.plane.deviations import measure_planes
-from orthoflow_plugins.plane.examining import FoundPlane, Rules
+from orthoflow_plugins.plane.parameters import DetectorParams
 from orthoflow_plugins.plane.peeling import find_planes
 from orthoflow_plugins.plane.preparing import prepare
 from orthoflow_plugins.plane.remainders import Remainder
+from orthoflow_plugins.plane.settling import name_points
 
 from orthoflow.geometry import basis_from_up
 from orthoflow.products import PointCloud
 
 CELL_M, SHARE = 0.02, 0.005
+METHODS = ("hough2d", "ransac")
 
 
 @numba.njit(nogil=True)
@@ -85,29 +92,46 @@ def median_s(task: Callable[[], object], repeats: int) -> tuple[float, float, fl
     return statistics.median(times), min(times), max(times)
 
 
-def detect(cloud: PointCloud, *, most: int, cores: int) -> tuple[Remainder, list[FoundPlane]]:
-    """What the method does, without statistics, labels file and figures."""
-    basis = basis_from_up(cloud.up)
-    remainder = prepare(cloud, basis, cell_m=CELL_M, least_share=SHARE, parts=cores)
-    proposer = PlanProposer(
-        remainder.grid, angle_step_deg=1.0, least_points=SHARE * len(cloud), with_levels=True
+def detect(
+    method: str, cloud: PointCloud, *, most: int, cores: int
+) -> tuple[Remainder, list[FoundPlane]]:
+    """What a method does up to its labels, without statistics, files and figures."""
+    rules = replace(rules_of(DetectorParams()), n_planes_most=most, least_share=SHARE)
+    cell_m = CELL_M if method == "hough2d" else 0.5
+    remainder = prepare(
+        cloud, basis_from_up(cloud.up), cell_m=cell_m, least_share=SHARE, parts=cores
     )
-    rules = Rules(
-        find_m=0.05,
-        fit_m=0.015,
-        n_planes_most=most,
-        least_share=SHARE,
-        stop_unclassified_share=0.1,
-        tilt_most_deg=10.0,
-        is_exact=False,
-    )
-    return remainder, find_planes(remainder, proposer, rules, lambda _part, _text: None)
+    if method == "ransac":
+        search = Search(
+            model="3d",
+            scoring="msac",
+            n_hypotheses=1000,
+            find_m=rules.find_m,
+            family="any",
+            tilt_most_deg=rules.tilt_most_deg,
+            least_share=SHARE,
+        )
+        rng = np.random.default_rng(0)
+        found = search_sample(
+            remainder, rules, _listen, lambda sample: ConsensusProposer(sample, search, rng)
+        )
+    else:
+        voting = Voting(angle_step_deg=1.0, least_points=SHARE * len(cloud))
+        found = find_planes(remainder, PlanProposer(remainder.grid, voting), rules, _listen)
+    labels = np.empty(len(cloud), dtype=np.int16)
+    name_points(remainder, np.arange(len(found) + 1, dtype=np.int16), labels)
+    return remainder, found
+
+
+def _listen(_part: float, _text: str) -> None:
+    """Hear progress and say nothing."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
+    parser.add_argument("--method", choices=METHODS, action="append")
     parser.add_argument("--points", type=int, default=10_000_000)
     parser.add_argument("--npy", type=Path, help="(n, 3) float32 points instead of the room")
     parser.add_argument("--truth", type=Path, help="JSON with planes: {name: {n: [3], R}}")
@@ -123,29 +147,44 @@ def main() -> None:
     x, y, z = (np.ascontiguousarray(points[:, axis]) for axis in range(3))
     cloud = PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]))
     del points
-    detect(cloud, most=2, cores=options.cores)  # warm
     _pass(x, y, z)
+    floor_s = min(median_s(lambda: _pass(x, y, z), 5)[1] for _ in range(3))
+    print(f"{len(cloud)} points, {options.cores} threads, F = {1000 * floor_s:.1f} ms")
+    for method in options.method or METHODS:
+        report_method(method, cloud, floor_s, options)
+        _, found = detect(method, cloud, most=16, cores=options.cores)
+        for name, normal, offset in truth:
+            report_nearest(name, normal, offset, found)
+
+
+def report_method(
+    method: str, cloud: PointCloud, floor_s: float, options: argparse.Namespace
+) -> None:
+    """Print times and memory of a method."""
+    cores = options.cores
+    detect(method, cloud, most=2, cores=cores)  # warm
     before_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    floor_s, *_ = median_s(lambda: _pass(x, y, z), 5)
-    remainder, found = detect(cloud, most=16, cores=options.cores)
+    remainder, found = detect(method, cloud, most=16, cores=cores)
     slabs = np.array([item.raster.slab() for item in found])
     bounds = np.array([item.footprint.bounds_m for item in found])
-    print(f"{len(cloud)} points, {options.cores} threads, F = {1000 * floor_s:.1f} ms")
+    print(method)
     for name, task in (
-        ("first plane", lambda: detect(cloud, most=1, cores=options.cores)),
-        (f"{len(found)} planes", lambda: detect(cloud, most=16, cores=options.cores)),
+        ("first plane", lambda: detect(method, cloud, most=1, cores=cores)),
+        (f"{len(found)} planes", lambda: detect(method, cloud, most=16, cores=cores)),
         ("statistics", lambda: measure_planes(remainder, slabs, bounds, find_m=0.05, fit_m=0.015)),
     ):
+        cpu_s = time.process_time()
         median, fastest, slowest = median_s(task, options.repeats)
+        cpu_s = (time.process_time() - cpu_s) / options.repeats
         print(
-            f"{name:12} {median:.3f} s ({fastest:.3f}..{slowest:.3f}) = {median / floor_s:.1f} F, "
-            f"fastest {fastest / floor_s:.1f} F"
+            f"  {name:12} {median:.3f} s ({fastest:.3f}..{slowest:.3f}) = {median / floor_s:.1f} F,"
+            f" fastest {fastest / floor_s:.1f} F; processor {cpu_s:.3f} s = {cpu_s / floor_s:.1f} F"
         )
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     input_mib = 12 * len(cloud) / 2**20
-    print(f"input {input_mib:.0f} MiB, peak grew by {peak_mib - before_mib:.0f} MiB after warming")
-    for name, normal, offset in truth:
-        report_nearest(name, normal, offset, found)
+    print(
+        f"  input {input_mib:.0f} MiB, peak grew by {peak_mib - before_mib:.0f} MiB after warming"
+    )
 
 
 def report_nearest(
@@ -165,7 +204,7 @@ def report_nearest(
         miss_mm = 1000.0 * (float(normal @ middle) - offset)
         if angle < 1.0 and abs(miss_mm) < 15.0 and (best is None or angle < best[0]):
             best = (angle, miss_mm)
-    print(f"truth {name:9}", "missed" if best is None else f"{best[0]:.4f} deg {best[1]:+.2f} mm")
+    print(f"  truth {name:9}", "missed" if best is None else f"{best[0]:.4f} deg {best[1]:+.2f} mm")
 
 
 if __name__ == "__main__":

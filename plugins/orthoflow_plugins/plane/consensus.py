@@ -1,0 +1,293 @@
+"""Proposes the plane that most of the remaining points of a sample agree on, of many drawn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane
+from orthoflow.geometry.consensus_kernels import distance_histograms
+from orthoflow.geometry.point_kernels import in_threads
+from orthoflow_plugins.plane.candidates import Candidate, Family
+from orthoflow_plugins.plane.hypotheses import (
+    Hypotheses,
+    Model,
+    curve_order,
+    draw_hypotheses,
+)
+from orthoflow_plugins.plane.remainders import Remainder
+from orthoflow_plugins.plane.scores import MODEL_POINTS, Scores, Scoring, scores_of
+
+_BINS: Final = 100
+# Points of the sample that hypotheses are drawn from, and that they are scored on, at most.
+_DRAWN_MOST: Final = 50_000
+_ASKED_MOST: Final = 150_000
+# Points that all hypotheses are scored on, and those that the better ones are scored on again.
+_FIRST_POINTS: Final = 2_000
+_SECOND_POINTS: Final = 20_000
+_SECOND_SHARE: Final = 0.1
+_SECOND_LEAST: Final = 50
+# A hypothesis this near to one that turned out to be none is not proposed again.
+_BARRED_DEG: Final = 2.0
+_BARRED_TOLERANCES: Final = 1.0
+# Few points fix a plane badly: it may lean by this much more than what is looked for.
+_LEAN_CAUTION_DEG: Final = 5.0
+# Points within the tolerance may fall short of what a plane needs: the hypothesis is rough.
+_SUPPORT_CAUTION: Final = 0.4
+_POLISHED: Final = 4
+# So many hypotheses near each other are scored again; the best of them fits better than any one.
+_ALIKE_MOST: Final = 5
+# Fresh draws after all hypotheses turned out to be none.
+_REDRAWS: Final = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """What consensus is looked for.
+
+    Attributes:
+        model: planes through three points, or upright ones through two.
+        scoring: what a hypothesis is worth.
+        n_hypotheses: drawn for the first plane; for each further one half of them.
+        find_m: tolerance.
+        family: which planes are looked for.
+        tilt_most_deg: how far they may be off vertical or level.
+        least_share: share of the sample that a plane needs.
+    """
+
+    model: Model
+    scoring: Scoring
+    n_hypotheses: int
+    find_m: float
+    family: Family
+    tilt_most_deg: float
+    least_share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pool:
+    """Hypotheses with what they are worth, the best first."""
+
+    hypotheses: Hypotheses
+    scores: Scores
+
+
+class ConsensusProposer:
+    """Proposes planes that many points of a sample lie on.
+
+    Hypotheses that were good stay for the next plane and are scored anew on what remains.
+    """
+
+    def __init__(self, sample: Remainder, search: Search, rng: np.random.Generator) -> None:
+        """Get ready to propose.
+
+        Args:
+            sample: the sample as a cloud of its own.
+            search: what is looked for.
+            rng: source of chance.
+        """
+        self._search = search
+        self._rng = rng
+        points_m = sample.sample.offsets_m
+        self._centre_m = np.median(points_m, axis=0)
+        # Shuffled once, so that any first part of the free points is an even choice of them.
+        self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
+        drawn = self._shuffled[:_DRAWN_MOST]
+        self._order = drawn[curve_order(points_m[drawn])]
+        corners = sample.box_corners()
+        self._box_m = corners.max(axis=0) - corners.min(axis=0)
+        self._drawn_for = -1
+        self._pool: _Pool | None = None
+        self._barred: list[Hypotheses] = []
+
+    def propose(self, remainder: Remainder) -> Candidate | None:
+        """Name the best hypothesis about the points that remain."""
+        if self._drawn_for != remainder.n_unclaimed:
+            # What was no plane among other points may be one among those that remain.
+            self._barred.clear()
+            self._drawn_for = remainder.n_unclaimed
+            self._draw(remainder)
+        for _ in range(_REDRAWS):
+            candidate = self._best(remainder)
+            if candidate is not None:
+                return candidate
+            self._draw(remainder)
+        return self._best(remainder)
+
+    def _best(self, remainder: Remainder) -> Candidate | None:
+        pool = self._pool
+        if pool is None:
+            return None
+        for place in range(len(pool.hypotheses)):
+            hypothesis = pool.hypotheses.chosen(np.array([place]))
+            if self._is_worth_it(pool.scores, place, remainder) and not self._is_barred(hypothesis):
+                return self._candidate(hypothesis, pool.scores, place, remainder)
+        return None
+
+    def reject(self, candidate: Candidate) -> None:
+        """Bar the surroundings of a hypothesis that turned out to be no plane."""
+        plane = candidate.plane
+        offset_m = plane.offset_m - float(plane.normal @ self._centre_m)
+        self._barred.append(Hypotheses(normals=plane.normal[None], offsets_m=np.array([offset_m])))
+
+    def _draw(self, remainder: Remainder) -> None:
+        claims = remainder.sample_claims
+        points_m = remainder.sample.offsets_m
+        free = self._order[claims[self._order] < 0]
+        earlier = self._pool
+        self._pool = None
+        if len(free) < 3:
+            return
+        count = self._search.n_hypotheses if earlier is None else self._search.n_hypotheses // 2
+        drawn = draw_hypotheses(
+            points_m[free] - self._centre_m, count, self._search.model, remainder.up, self._rng
+        )
+        hypotheses = _joined(drawn, None if earlier is None else earlier.hypotheses)
+        hypotheses = hypotheses.chosen(self._leans_well(hypotheses, remainder.up))
+        for barred in self._barred:
+            hypotheses = hypotheses.chosen(~self._near(hypotheses, barred))
+        if len(hypotheses) == 0:
+            return
+        asked = self._shuffled[claims[self._shuffled] < 0]
+        parts = remainder.parts
+        first = self._score(hypotheses, points_m[asked[:_FIRST_POINTS]] - self._centre_m, parts)
+        n_kept = max(_SECOND_LEAST, round(_SECOND_SHARE * len(hypotheses)))
+        kept = self._distinct(hypotheses, np.argsort(-first.value, kind="stable"), n_kept)
+        hypotheses = hypotheses.chosen(kept)
+        second = self._score(hypotheses, points_m[asked[:_SECOND_POINTS]] - self._centre_m, parts)
+        ranked = np.argsort(-second.value, kind="stable")
+        self._pool = _Pool(
+            hypotheses=hypotheses.chosen(ranked),
+            scores=Scores(
+                value=second.value[ranked],
+                tolerance_m=second.tolerance_m[ranked],
+                n_points=second.n_points[ranked],
+            ),
+        )
+
+    def _score(self, hypotheses: Hypotheses, points_m: NDArray[np.float64], parts: int) -> Scores:
+        columns = np.ascontiguousarray(points_m.T, dtype=np.float32)
+        rows = hypotheses.rows()
+        histograms = np.zeros((len(rows), _BINS), dtype=np.int32)
+        pieces = zip(np.array_split(rows, parts), np.array_split(histograms, parts), strict=True)
+        in_threads(
+            [
+                partial(distance_histograms, columns, planes, self._search.find_m, table)
+                for planes, table in pieces
+            ]
+        )
+        return scores_of(
+            histograms,
+            self._search.scoring,
+            reach_m=self._search.find_m,
+            n_points=len(points_m),
+            extents_m=np.abs(hypotheses.normals) @ self._box_m,
+            model_points=MODEL_POINTS[self._search.model],
+        )
+
+    def _leans_well(self, hypotheses: Hypotheses, up: NDArray[np.float64]) -> NDArray[np.bool_]:
+        tilts_deg = np.degrees(np.arcsin(np.clip(np.abs(hypotheses.normals @ up), 0.0, 1.0)))
+        limit_deg = self._search.tilt_most_deg + _LEAN_CAUTION_DEG
+        if self._search.family == "any":
+            return np.ones(len(hypotheses), dtype=bool)
+        wall = self._search.family == "wall"
+        leans: NDArray[np.bool_] = tilts_deg <= limit_deg if wall else tilts_deg >= 90 - limit_deg
+        return leans
+
+    def _is_barred(self, hypothesis: Hypotheses) -> bool:
+        return any(bool(self._near(hypothesis, barred)[0]) for barred in self._barred)
+
+    def _near(self, hypotheses: Hypotheses, one: Hypotheses) -> NDArray[np.bool_]:
+        """(h,) whether hypotheses are much the same as one of them."""
+        cosines = hypotheses.normals @ one.normals[0]
+        apart_m = np.abs(hypotheses.offsets_m - np.copysign(1.0, cosines) * one.offsets_m[0])
+        near: NDArray[np.bool_] = (np.abs(cosines) > math.cos(math.radians(_BARRED_DEG))) & (
+            apart_m < _BARRED_TOLERANCES * self._search.find_m
+        )
+        return near
+
+    def _distinct(
+        self, hypotheses: Hypotheses, ranked: NDArray[np.intp], n_most: int
+    ) -> NDArray[np.intp]:
+        """The best of some ranked hypotheses, no more than `_ALIKE_MOST` of them much the same."""
+        kept: list[np.intp] = []
+        alike = np.zeros(len(hypotheses), dtype=np.int64)
+        for index in ranked:
+            if alike[index] < _ALIKE_MOST:
+                kept.append(index)
+                alike += self._near(hypotheses, hypotheses.chosen(np.array([index])))
+                if len(kept) == n_most:
+                    break
+        return np.array(kept, dtype=np.intp)
+
+    def _is_worth_it(self, scores: Scores, place: int, remainder: Remainder) -> bool:
+        if self._search.scoring == "a-contrario" and scores.value[place] <= 0.0:
+            return False
+        asked = min(_SECOND_POINTS, remainder.n_unclaimed)
+        share = scores.n_points[place] / max(1, asked)
+        n_points = share * remainder.n_unclaimed
+        return bool(n_points >= _SUPPORT_CAUTION * self._search.least_share * len(remainder.claims))
+
+    def _candidate(
+        self, hypothesis: Hypotheses, scores: Scores, place: int, remainder: Remainder
+    ) -> Candidate:
+        own_m = None
+        if self._search.scoring == "a-contrario":
+            hypothesis, own_m = self._polished(hypothesis, scores, place, remainder)
+        normal = hypothesis.normals[0] / np.linalg.norm(hypothesis.normals[0])
+        offset_m = float(hypothesis.offsets_m[0]) + float(normal @ self._centre_m)
+        return Candidate(
+            plane=Plane(normal=normal, offset_m=offset_m),
+            family="wall" if self._search.model == "2d" else self._search.family,
+            support=float(scores.value[place]),
+            own_tolerance_m=own_m,
+        )
+
+    def _polished(
+        self, hypothesis: Hypotheses, scores: Scores, place: int, remainder: Remainder
+    ) -> tuple[Hypotheses, float]:
+        """Fit to the points within the own tolerance, find that anew, while it gets better."""
+        relative_m = (remainder.sample.offsets_m - self._centre_m)[remainder.sample_claims < 0]
+        best = self._score(hypothesis, relative_m, 1)
+        for _ in range(_POLISHED):
+            distances_m = relative_m @ hypothesis.normals[0] - hypothesis.offsets_m[0]
+            near_m = relative_m[np.abs(distances_m) <= best.tolerance_m[0]]
+            fitted = _fitted(near_m, self._search.model, remainder.up)
+            if fitted is None:
+                break
+            score = self._score(fitted, relative_m, 1)
+            if score.value[0] <= best.value[0]:
+                break
+            hypothesis, best = fitted, score
+        return hypothesis, float(best.tolerance_m[0])
+
+
+def _joined(first: Hypotheses, second: Hypotheses | None) -> Hypotheses:
+    if second is None:
+        return first
+    return Hypotheses(
+        normals=np.concatenate([first.normals, second.normals]),
+        offsets_m=np.concatenate([first.offsets_m, second.offsets_m]),
+    )
+
+
+def _fitted(
+    points_m: NDArray[np.float64], model: Model, up: NDArray[np.float64]
+) -> Hypotheses | None:
+    """Plane of least squared distances, upright for the 2D model."""
+    if len(points_m) < 4:
+        return None
+    mean = points_m.mean(axis=0)
+    centred = points_m - mean
+    if model == "2d":
+        centred = centred - np.outer(centred @ up, up)
+    values, directions = np.linalg.eigh(centred.T @ centred)
+    normal = directions[:, 1 if model == "2d" else 0]
+    if values[1] <= 0.0 or abs(float(normal @ up)) > 1.0:
+        return None
+    return Hypotheses(normals=normal[None], offsets_m=np.array([float(normal @ mean)]))

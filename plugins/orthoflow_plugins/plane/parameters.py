@@ -1,0 +1,71 @@
+"""What may be set for every detector: tolerances, constraint, stop rules, thinning, joining."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from orthoflow.sdk import MethodParams
+
+
+class DetectorParams(MethodParams):
+    """What every detector takes; the defaults suit rooms and facades scanned at millimetres."""
+
+    tolerance_m: float = Field(
+        0.05, gt=0.0, description="Points this near to a plane belong to it."
+    )
+    fit_tolerance_m: float = Field(
+        0.015, gt=0.0, description="Points this near to a plane take part in its final fit."
+    )
+    constraint: Literal["any", "vertical", "horizontal"] = Field(
+        "any", description="Which planes are looked for, within `max_tilt_deg`."
+    )
+    max_tilt_deg: float = Field(
+        10.0,
+        gt=0.0,
+        le=45.0,
+        description="Vertical planes may be off vertical, and horizontal ones off level, by this.",
+    )
+    exact: bool = Field(
+        default=False,
+        description="Keep walls exactly vertical and levels exactly level instead of letting each "
+        "plane lean as its points say.",
+    )
+    n_planes_max: int = Field(16, ge=1, le=100, description="Stop after so many planes.")
+    min_share: float = Field(
+        0.005, gt=0.0, lt=1.0, description="Share of all points that a plane must hold."
+    )
+    stop_unclassified_share: float = Field(
+        0.05,
+        ge=0.0,
+        lt=1.0,
+        description="Stop when a smaller share of the points is on no plane yet; markiewicz2015 "
+        "takes 0.1, at which mirror ghosts can end the search before a small wall.",
+    )
+    stop_rest_share: float = Field(
+        0.0,
+        ge=0.0,
+        lt=1.0,
+        description="Stop at a plane that holds a smaller share of the points that were left for "
+        "it: the other reading of the 10 % in markiewicz2015. 0 never stops.",
+    )
+    thinning: int = Field(
+        1,
+        ge=1,
+        le=10_000,
+        description="Find and fit planes on every n-th point only; all points are labelled.",
+    )
+    join_parts: bool = Field(
+        default=True,
+        description="Parts of one plane that do not touch are one plane; else each is its own.",
+    )
+
+    @model_validator(mode="after")
+    def _fit_lies_within_find(self) -> Self:
+        if self.fit_tolerance_m > self.tolerance_m and "fit_tolerance_m" in self.model_fields_set:
+            raise ValueError(
+                f"fit_tolerance_m must be at most tolerance_m = {self.tolerance_m:g}, "
+                f"got {self.fit_tolerance_m:g}"
+            )
+        return self

@@ -1,0 +1,363 @@
+"""What every detector of planes must do: truth, invariances, options, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.plane.hough2d import Hough2d
+from orthoflow_plugins.plane.ransac import Ransac
+from pydantic import ValidationError
+
+from orthoflow.errors import MethodError, ProductError
+from orthoflow.geometry import angle_between_deg
+from orthoflow.products import Planes, PointCloud
+from orthoflow.sdk import Method, StepContext
+from tests.plane_scenes import ROOM, Rectangle, cloud_of, sampled, turned
+
+DETECTORS: dict[str, tuple[type[Method], dict[str, Any]]] = {
+    "hough2d": (Hough2d, {}),
+    "ransac-msac": (Ransac, {}),
+    "ransac-count": (Ransac, {"scoring": "count"}),
+    "ransac-a-contrario": (Ransac, {"scoring": "a-contrario"}),
+}
+STATION = np.array([[0.3, -0.2, 0.1]])
+SURVEY = (634512.347, 486215.781, 112.193)
+# Finds the table too, which holds 3 % of the points.
+TO_THE_END = {"stop_unclassified_share": 0.0}
+
+every_detector = pytest.mark.parametrize("detector", DETECTORS)
+
+
+def detect(
+    detector: str, cloud: PointCloud, folder: Path, *, seed: int = 0, **params: Any
+) -> tuple[Any, StepContext]:
+    method, options = DETECTORS[detector]
+    folder.mkdir(parents=True, exist_ok=True)
+    ctx = StepContext(rng=np.random.default_rng(seed), cores=2, scratch=folder)
+    inputs = method.In(cloud=cloud)
+    return method().run(inputs, method.Params(**{**options, **params}), ctx), ctx
+
+
+def nearest(planes: Planes, normal: NDArray[np.float64], centre: NDArray[np.float64]) -> int:
+    """The plane that passes nearest to a true one's centre among those with its direction."""
+    parallel = np.abs(planes.normal @ normal) > np.cos(np.radians(1.0))
+    return int(np.argmin(np.abs(planes.normal @ centre - planes.offset) + 1e6 * ~parallel))
+
+
+def errors(planes: Planes, truth: Rectangle, turn: NDArray[np.float64]) -> tuple[float, float]:
+    """Angle in degrees and offset at the true centre in metres, of the plane nearest to it."""
+    normal, centre = turn @ truth.normal, turn @ truth.centre
+    found = planes.plane(nearest(planes, normal, centre))
+    angle = angle_between_deg(found.normal, normal)
+    return min(angle, 180.0 - angle), abs(float(found.distances_m(centre[None])[0]))
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    cloud = cloud_of(sampled(), stations=STATION)
+    return {
+        name: detect(name, cloud, tmp_path_factory.mktemp(name), **TO_THE_END)[0]
+        for name in DETECTORS
+    }
+
+
+def same_planes(planes: Planes, expected: Planes, turn: NDArray[np.float64]) -> None:
+    """Each plane within 0.002 degrees and 0.1 mm (at its own middle) of the expected one."""
+    assert len(planes) == len(expected)
+    for normal, corners in zip(expected.normal, expected.corners, strict=True):
+        middle = turn @ corners.mean(axis=0)
+        index = nearest(planes, turn @ normal, middle)
+        assert abs(planes.normal[index] @ middle - planes.offset[index]) < 1e-4
+        # The table has 2 500 points of 2 mm noise over a metre: other cells, other weights.
+        limit_deg = 0.002 if planes.n_points[index] > 5_000 else 0.02
+        assert angle_between_deg(planes.normal[index], turn @ normal) < limit_deg
+
+
+@every_detector
+@pytest.mark.parametrize("truth", ROOM, ids=lambda truth: truth.name)
+def test_every_surface_of_a_room_is_found(
+    detector: str, truth: Rectangle, rooms: dict[str, Any]
+) -> None:
+    angle_deg, miss_m = errors(rooms[detector].planes, truth, np.eye(3))
+    assert angle_deg < 0.02
+    assert miss_m < 2e-4  # 2 mm noise over thousands of points
+
+
+@every_detector
+def test_there_is_no_plane_more_than_the_room_has(detector: str, rooms: dict[str, Any]) -> None:
+    assert len(rooms[detector].planes) == len(ROOM)
+
+
+@every_detector
+def test_labels_name_the_plane_each_point_lies_on(detector: str, rooms: dict[str, Any]) -> None:
+    out, start = rooms[detector], 0
+    for truth in ROOM:
+        index = nearest(out.planes, truth.normal, np.array(truth.centre))
+        own = out.labels.plane_index[start : start + truth.n_points]
+        # Points in a corner belong to either surface; a strip of some millimetres along the edges.
+        assert np.mean(own == index) > 0.98
+        start += truth.n_points
+    labels = out.labels.plane_index
+    counts = np.bincount(labels[labels >= 0], minlength=len(out.planes))
+    np.testing.assert_array_equal(counts, out.planes.n_points)
+
+
+@every_detector
+def test_labelled_points_lie_within_the_find_tolerance(
+    detector: str, rooms: dict[str, Any]
+) -> None:
+    out, points = rooms[detector], sampled()
+    labels = out.labels.plane_index
+    distances = np.einsum("ij,ij->i", points, out.planes.normal[labels]) - out.planes.offset[labels]
+    assert np.abs(distances[labels >= 0]).max() < 0.05 + 1e-6
+
+
+@every_detector
+def test_shuffled_points_give_the_same_planes(
+    detector: str, rooms: dict[str, Any], tmp_path: Path
+) -> None:
+    order = np.random.default_rng(7).permutation(len(sampled()))
+    cloud = cloud_of(sampled()[order], stations=STATION)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    same_planes(out.planes, rooms[detector].planes, np.eye(3))
+
+
+@every_detector
+def test_survey_coordinates_of_a_million_metres_lose_nothing(
+    detector: str, rooms: dict[str, Any], tmp_path: Path
+) -> None:
+    cloud = cloud_of(sampled(), stations=STATION, origin=SURVEY)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    expected = rooms[detector].planes
+    np.testing.assert_array_equal(out.planes.normal, expected.normal)
+    np.testing.assert_allclose(
+        out.planes.offset, expected.offset + expected.normal @ np.array(SURVEY), atol=1e-8
+    )
+
+
+@every_detector
+@pytest.mark.parametrize("angle_deg", [33.3, 90.0])
+def test_a_turned_room_gives_the_turned_planes(
+    detector: str, angle_deg: float, rooms: dict[str, Any], tmp_path: Path
+) -> None:
+    turn = turned(angle_deg)
+    cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    same_planes(out.planes, rooms[detector].planes, turn)
+
+
+@every_detector
+def test_half_of_the_points_give_the_same_planes_within_three_sigma(
+    detector: str, rooms: dict[str, Any], tmp_path: Path
+) -> None:
+    expected = rooms[detector].planes
+    out, _ = detect(detector, cloud_of(sampled()[::2], stations=STATION), tmp_path, **TO_THE_END)
+    for truth in ROOM:
+        k = nearest(expected, truth.normal, np.array(truth.centre))
+        j = nearest(out.planes, truth.normal, np.array(truth.centre))
+        at_centre = np.append(truth.centre, -1.0)
+        sides = np.sign(out.planes.normal[j] @ expected.normal[k])
+        apart_m = (
+            out.planes.normal[j] @ np.array(truth.centre)
+            - out.planes.offset[j]
+            - sides * (expected.normal[k] @ np.array(truth.centre) - expected.offset[k])
+        )
+        variance = at_centre @ out.planes.covariance[j] @ at_centre
+        assert abs(apart_m) < 3.0 * np.sqrt(variance)
+
+
+@every_detector
+def test_five_percent_of_gross_outliers_neither_hide_nor_move_a_wall(
+    detector: str, rooms: dict[str, Any], tmp_path: Path
+) -> None:
+    stray = np.random.default_rng(3).uniform(-400.0, 400.0, (4_400, 3))
+    cloud = cloud_of(np.vstack([sampled(), stray]), stations=STATION)
+    out, _ = detect(detector, cloud, tmp_path)
+    for truth in ROOM[:6]:
+        angle_deg, miss_m = errors(out.planes, truth, np.eye(3))
+        assert angle_deg < 0.02
+        assert miss_m < 2e-4
+
+
+@every_detector
+def test_recesses_of_different_depth_are_not_joined_by_a_plane_that_leans(
+    detector: str, tmp_path: Path
+) -> None:
+    door = Rectangle("door", (1.7, 2.12, -0.4), (0.45, 0, 0), (0, 0, 1.1), 12_000)
+    niche = Rectangle("niche", (-1.5, 2.25, -0.2), (0.4, 0, 0), (0, 0, 0.9), 10_000)
+    cloud = cloud_of(sampled((*ROOM, door, niche)), stations=STATION)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    for truth in (door, niche):
+        angle_deg, miss_m = errors(out.planes, truth, np.eye(3))
+        assert angle_deg < 0.03
+        assert miss_m < 2e-4
+
+
+@every_detector
+def test_normals_point_to_the_station(detector: str, rooms: dict[str, Any]) -> None:
+    planes = rooms[detector].planes
+    assert planes.viewpoint == "stations"
+    assert (planes.normal @ STATION[0] > planes.offset).all()
+
+
+@every_detector
+@pytest.mark.parametrize(
+    ("constraint", "count"), [("vertical", 4), ("horizontal", 3)], ids=["walls", "levels"]
+)
+def test_a_constraint_leaves_only_its_planes(
+    detector: str, constraint: str, count: int, tmp_path: Path
+) -> None:
+    cloud = cloud_of(sampled(), stations=STATION)
+    planes = detect(detector, cloud, tmp_path, constraint=constraint, **TO_THE_END)[0].planes
+    rises = np.abs(planes.normal @ planes.up)
+    assert len(planes) == count
+    assert (rises < 0.1 if constraint == "vertical" else rises > 0.99).all()
+
+
+@every_detector
+def test_the_tilt_allowed_decides_about_a_leaning_wall(detector: str, tmp_path: Path) -> None:
+    lean = np.radians(6.0)
+    wall = Rectangle("wall", (0, 2, 0), (3, 0, 0), (0, np.sin(lean), np.cos(lean)), 20_000)
+    cloud = cloud_of(sampled((wall, ROOM[4])))
+    keep = detect(detector, cloud, tmp_path, constraint="vertical", max_tilt_deg=8.0)[0]
+    assert errors(keep.planes, wall, np.eye(3))[0] < 0.02
+    with pytest.raises(MethodError, match="no plane holds"):
+        detect(detector, cloud, tmp_path, constraint="vertical", max_tilt_deg=4.0)
+
+
+@every_detector
+def test_exact_walls_are_exactly_vertical_and_floors_exactly_level(
+    detector: str, tmp_path: Path
+) -> None:
+    cloud = cloud_of(sampled(), stations=STATION)
+    planes = detect(detector, cloud, tmp_path, exact=True)[0].planes
+    rises = np.abs(planes.normal @ planes.up)
+    assert (np.minimum(rises, 1.0 - rises) < 1e-12).all()
+
+
+@every_detector
+def test_parts_that_do_not_touch_are_one_plane_only_on_demand(
+    detector: str, tmp_path: Path
+) -> None:
+    pair = (
+        Rectangle("west", (-3, 2, 0), (1, 0, 0), (0, 0, 1.5), 8_000),
+        Rectangle("east", (3, 2, 0), (1.5, 0, 0), (0, 0, 1.5), 9_000),
+    )
+    cloud = cloud_of(sampled(pair))
+    joined = detect(detector, cloud, tmp_path)[0].planes
+    apart = detect(detector, cloud, tmp_path, join_parts=False)[0].planes
+    assert (len(joined), len(apart)) == (1, 2)
+    assert joined.part_plane is not None
+    assert joined.part_plane.tolist() == [0, 0]
+    widths = np.linalg.norm(apart.corners[:, 3] - apart.corners[:, 0], axis=1)
+    np.testing.assert_allclose(widths, [3.0, 2.0], atol=0.1)
+
+
+@every_detector
+def test_thinning_finds_the_same_planes_and_labels_every_point(
+    detector: str, rooms: dict[str, Any], tmp_path: Path
+) -> None:
+    cloud = cloud_of(sampled(), stations=STATION)
+    out, _ = detect(detector, cloud, tmp_path, thinning=5)
+    front = ROOM[0]
+    angle_deg, miss_m = errors(out.planes, front, np.eye(3))
+    assert angle_deg < 0.02
+    assert miss_m < 3e-4
+    index = nearest(out.planes, front.normal, np.array(front.centre))
+    assert np.mean(out.labels.plane_index[: front.n_points] == index) > 0.97
+    assert out.planes.n_points.sum() == np.count_nonzero(out.labels.plane_index >= 0)
+
+
+@every_detector
+def test_stop_rules_end_the_search(detector: str, tmp_path: Path) -> None:
+    cloud = cloud_of(sampled(), stations=STATION)
+    number = detect(detector, cloud, tmp_path, n_planes_max=2)[0].planes
+    support = detect(detector, cloud, tmp_path, min_share=0.15, **TO_THE_END)[0].planes
+    rest = detect(detector, cloud, tmp_path, stop_rest_share=0.25, **TO_THE_END)[0]
+    unclassified = detect(detector, cloud, tmp_path, stop_unclassified_share=0.6)[0]
+    assert len(number) == 2
+    assert len(support) == 3  # front, floor and ceiling hold 17 % and more
+    # front 34 % of all, floor 28 % of the rest, ceiling 36 %; the back wall 34 %, then the sides.
+    assert len(rest.planes) >= 4
+    left = np.mean(unclassified.labels.plane_index < 0)
+    assert left < 0.6 <= left + unclassified.planes.n_points[-1] / len(cloud)
+
+
+@every_detector
+def test_the_raw_detection_is_kept_beside_the_common_fit(
+    detector: str, rooms: dict[str, Any]
+) -> None:
+    planes = rooms[detector].planes
+    raw = planes.details["raw"]
+    assert len(raw) == len(planes)
+    for k, item in enumerate(raw):
+        assert angle_between_deg(np.array(item["normal"]), planes.normal[k]) < 4.0
+        middle = planes.corners[k].mean(axis=0)
+        assert abs(np.array(item["normal"]) @ middle - item["offset_m"]) < 0.06
+
+
+@every_detector
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_points_are_refused(detector: str, count: int, tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match=f"the cloud has {count} points, at least 3"):
+        detect(detector, cloud_of(np.zeros((count, 3))), tmp_path)
+
+
+@every_detector
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.outer(np.linspace(0, 5, 500), [1.0, 2.0, 0.5]), "lie on one line"),
+        (np.ones((500, 3)), "coincide"),
+    ],
+    ids=["collinear", "duplicates"],
+)
+def test_points_that_fix_no_plane_are_refused(
+    detector: str, points: NDArray[np.float64], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(MethodError, match=message):
+        detect(detector, cloud_of(points), tmp_path)
+
+
+@every_detector
+def test_coordinates_that_are_no_numbers_are_refused(detector: str, tmp_path: Path) -> None:
+    points = sampled()
+    points[-1, 1] = np.nan
+    with pytest.raises(ProductError, match=r"NaN or infinite: read it with read\.scan"):
+        detect(detector, cloud_of(points), tmp_path)
+
+
+@every_detector
+def test_duplicate_points_do_no_harm(detector: str, rooms: dict[str, Any], tmp_path: Path) -> None:
+    cloud = cloud_of(np.repeat(sampled(), 2, axis=0), stations=STATION)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    for truth in ROOM:
+        assert errors(out.planes, truth, np.eye(3))[1] < 2e-4
+
+
+@every_detector
+def test_clutter_alone_is_no_plane(detector: str, tmp_path: Path) -> None:
+    points = np.random.default_rng(1).uniform(-2.0, 2.0, (30_000, 3))
+    method = DETECTORS[detector][0].id
+    with pytest.raises(MethodError, match=rf"no plane holds .* \({re.escape(method)}\)"):
+        detect(detector, cloud_of(points), tmp_path)
+
+
+@every_detector
+def test_an_unknown_scan_of_a_point_does_not_matter(detector: str, tmp_path: Path) -> None:
+    cloud = cloud_of(sampled(ROOM[:1]), stations=np.array([[0.0, -4.0, 0.0]]))
+    cloud = dataclasses.replace(cloud, scan=np.zeros(len(cloud), dtype=np.uint16))
+    planes = detect(detector, cloud, tmp_path, thinning=2)[0].planes
+    assert planes.normal[0] @ (0.0, 1.0, 0.0) < -0.99
+
+
+@every_detector
+def test_a_fit_tolerance_above_the_find_tolerance_is_refused(detector: str) -> None:
+    with pytest.raises(ValidationError, match=r"must be at most tolerance_m = 0\.01"):
+        DETECTORS[detector][0].Params(tolerance_m=0.01, fit_tolerance_m=0.02)
