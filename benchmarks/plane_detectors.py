@@ -33,12 +33,13 @@ from orthoflow_plugins.plane.peeling import find_planes
 from orthoflow_plugins.plane.preparing import prepare
 from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.settling import name_points
+from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
 
 from orthoflow.geometry import basis_from_up
 from orthoflow.products import PointCloud
 
 CELL_M, SHARE = 0.02, 0.005
-METHODS = ("hough2d", "ransac")
+METHODS = ("hough2d", "hough3d", "hough3d-full", "ransac")
 
 
 @numba.njit(nogil=True)
@@ -115,6 +116,12 @@ def detect(
         found = search_sample(
             remainder, rules, _listen, lambda sample: ConsensusProposer(sample, search, rng)
         )
+    elif method.startswith("hough3d"):
+        coarser = 1.0 if method == "hough3d-full" else 2.0
+        space = SpaceVoting(
+            cell_m=coarser * CELL_M, angle_step_deg=coarser, least_points=SHARE * len(cloud)
+        )
+        found = find_planes(remainder, SpaceProposer(remainder, space), rules, _listen)
     else:
         voting = Voting(angle_step_deg=1.0, least_points=SHARE * len(cloud))
         found = find_planes(remainder, PlanProposer(remainder.grid, voting), rules, _listen)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.hough2d import Hough2d
+from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import Ransac
 from pydantic import ValidationError
 
@@ -22,6 +23,7 @@ from tests.plane_scenes import ROOM, Rectangle, cloud_of, sampled, turned
 
 DETECTORS: dict[str, tuple[type[Method], dict[str, Any]]] = {
     "hough2d": (Hough2d, {}),
+    "hough3d": (Hough3d, {}),
     "ransac-msac": (Ransac, {}),
     "ransac-count": (Ransac, {"scoring": "count"}),
     "ransac-a-contrario": (Ransac, {"scoring": "a-contrario"}),
@@ -147,6 +149,18 @@ def test_a_turned_room_gives_the_turned_planes(
     detector: str, angle_deg: float, rooms: dict[str, Any], tmp_path: Path
 ) -> None:
     turn = turned(angle_deg)
+    cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
+    out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
+    same_planes(out.planes, rooms[detector].planes, turn)
+
+
+@pytest.mark.parametrize("detector", ["hough3d", "ransac-msac"])
+def test_a_room_turned_any_way_gives_the_turned_planes(
+    detector: str, rooms: dict[str, Any], tmp_path: Path
+) -> None:
+    axis = np.array([0.48, 0.6, 0.64])
+    cross = np.cross(np.eye(3), axis)
+    turn = np.eye(3) + np.sin(1.0) * cross + (1.0 - np.cos(1.0)) * cross @ cross
     cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
     out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     same_planes(out.planes, rooms[detector].planes, turn)

@@ -10,7 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
 from orthoflow_plugins.plane.hough2d import Hough2d
+from orthoflow_plugins.plane.preparing import prepare
+from pydantic import ValidationError
 
 from orthoflow.errors import MethodError, ProductError
 from orthoflow.geometry import angle_between_deg, frame_over
@@ -190,6 +193,41 @@ def test_gross_outliers_neither_hide_nor_move_the_wall(room: Hough2d.Out, tmp_pa
     planes = detect(cloud_of(np.vstack([sampled(), stray]), stations=STATION), tmp_path).planes
     assert angle_between_deg(planes.normal[0], room.planes.normal[0]) < 0.005
     assert planes.offset[0] == pytest.approx(room.planes.offset[0], abs=5e-5)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"accumulator": "unit"}, {"accumulator": "canny"}, {"coordinates": "raw"}],
+    ids=lambda options: "-".join(options.values()),
+)
+def test_other_accumulators_find_the_densest_wall(
+    options: dict[str, str], room: Hough2d.Out, tmp_path: Path
+) -> None:
+    planes = detect(cloud_of(sampled(), stations=STATION), tmp_path, **options).planes
+    index = nearest(planes, ROOM[0].normal, np.array(ROOM[0].centre))
+    assert angle_between_deg(planes.normal[index], room.planes.normal[0]) < 0.005
+    assert planes.offset[index] == pytest.approx(room.planes.offset[0], abs=5e-5)
+    if "coordinates" in options:
+        assert len(planes) == 6  # "identical result, considerably longer" (markiewicz2015)
+
+
+def test_the_unit_accumulator_has_the_weaker_maximum(tmp_path: Path) -> None:
+    # Half of the floor's cells lie along any line through the room: a wall hardly stands out.
+    cloud = cloud_of(sampled(ROOM[:5]))
+    remainder = prepare(cloud, np.eye(3), cell_m=0.02, least_share=0.005, parts=1)
+    shares = []
+    for accumulator in ("counts", "unit"):
+        voting = Voting(angle_step_deg=1.0, least_points=1.0, accumulator=accumulator)
+        proposer = PlanProposer(remainder.grid, voting)
+        proposer.propose(remainder)
+        votes = proposer.first.votes
+        shares.append(votes.max() / votes.sum(axis=1).max())
+    assert shares[0] > 2.0 * shares[1]
+
+
+def test_raw_coordinates_with_one_vote_per_cell_are_refused() -> None:
+    with pytest.raises(ValidationError, match="coordinates: raw goes with accumulator: counts"):
+        Hough2d.Params(coordinates="raw", accumulator="unit")
 
 
 def test_floor_and_ceiling_alone_leave_no_smeared_wall(tmp_path: Path) -> None:

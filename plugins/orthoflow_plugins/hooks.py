@@ -173,6 +173,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="Hough transform of the plan, cells weighted by their points",
         ),
         MethodSpec(
+            id="plane.hough3d",
+            target="orthoflow_plugins.plane.hough3d:Hough3d",
+            summary="Hough transform of voxels, planes in any direction",
+        ),
+        MethodSpec(
             id="plane.ransac",
             target="orthoflow_plugins.plane.ransac:Ransac",
             summary="random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or the plan",

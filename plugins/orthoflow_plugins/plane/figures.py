@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry import omega_phi_deg
 from orthoflow.geometry.directions import basis_from_up
 from orthoflow.geometry.plane_kernels import HISTOGRAM_BINS
 from orthoflow.geometry.point_kernels import PlanGrid
@@ -133,3 +134,37 @@ def _thinned_sum(values: NDArray[np.int64]) -> NDArray[np.float64]:
     blocks = padded.reshape(padded.shape[0] // rows, rows, padded.shape[1] // columns, columns)
     thinned: NDArray[np.float64] = blocks.sum(axis=(1, 3)).astype(np.float64)
     return thinned
+
+
+def draw_space(ctx: StepContext, best: NDArray[np.float64], planes: Planes) -> None:
+    """Draw the best votes of a 3D accumulator over direction and inclination, and the planes.
+
+    Args:
+        ctx: takes the figure.
+        best: (o, p) over omega 0..180 and phi -90..90 degrees; NaN where nothing was asked.
+        planes: the planes, world.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
+    axes = figure.subplots()
+    axes.imshow(
+        np.sqrt(np.maximum(best.T, 0.0)),
+        origin="lower",
+        aspect="auto",
+        cmap="gray",
+        extent=(0.0, 180.0, -90.0, 90.0),
+    )
+    for normal in planes.normal:
+        omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
+        if omega_deg >= 180.0:
+            omega_deg, phi_deg = omega_deg - 180.0, -phi_deg
+        axes.plot(omega_deg, phi_deg, "o", fillstyle="none", markersize=9)
+    axes.set_xlabel("omega [deg]")
+    axes.set_ylabel("phi [deg]")
+    ctx.figure(
+        "accumulator",
+        figure,
+        "The best votes of any distance over the direction of the normal; circles mark the planes. "
+        "Directions are even over the hemisphere, so there are fewer towards the poles.",
+    )

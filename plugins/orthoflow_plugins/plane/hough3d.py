@@ -1,0 +1,106 @@
+"""`plane.hough3d`: planes in any direction from voxels that vote in a 3D accumulator."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
+
+from orthoflow.products import Planes, PointCloud, PointLabels
+from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow_plugins.plane.parameters import DetectorParams
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from orthoflow_plugins.plane.candidates import Family, FoundPlane, Rules
+    from orthoflow_plugins.plane.detecting import Report
+    from orthoflow_plugins.plane.remainders import Remainder
+
+
+class Hough3d(Method):
+    """Find planes by the 3D Hough transform of markiewicz2015: voxels vote with their points.
+
+    r = x cos(phi) cos(omega) + y cos(phi) sin(omega) + z sin(phi). For each omega the voxels are
+    first counted in an upright image, whose occupied cells then vote over phi. Directions are even
+    over the hemisphere, so that a floor is counted once and not for every omega.
+
+    `search: coarse-to-fine` votes with twice `cell_m` and twice `angle_step_deg` and looks finer
+    around each maximum only; `full` votes with both as they are. What follows is common to all
+    detectors: refined on a sample, fitted to all points, points taken away.
+    """
+
+    id = "plane.hough3d"
+    result_version = 1
+    determinism = "exact"
+    citations = (
+        (
+            "Markiewicz, Podlasiak, Zawieska 2015: A New Approach to the Generation of Orthoimages "
+            "of Cultural Heritage Objects. Remote Sensing 7(12), doi:10.3390/rs71215869"
+        ),
+        (
+            "Borrmann, Elseberg, Lingemann, Nuechter 2011: The 3D Hough Transform for plane "
+            "detection in point clouds, doi:10.1007/3DRes.02(2011)3 (accumulators safe at the pole)"
+        ),
+    )
+
+    class Params(DetectorParams):
+        """What may be set; the defaults suit rooms and facades scanned at millimetres."""
+
+        cell_m: float = Field(
+            0.02, gt=0.0, le=1.0, description="Side of a voxel and of a distance bin."
+        )
+        angle_step_deg: float = Field(
+            1.0, ge=0.25, le=15.0, description="Step between the directions that are voted for."
+        )
+        search: Literal["coarse-to-fine", "full"] = Field(
+            "coarse-to-fine",
+            description="Vote with doubled cells and steps and look finer around maxima, or vote "
+            "with all of them.",
+        )
+        coordinates: Literal["cells", "raw"] = Field(
+            "cells", description="What votes: voxels, or every point by itself."
+        )
+
+    class In(Ports):
+        """What it works on."""
+
+        cloud: PointCloud
+
+    class Out(Ports):
+        """What it finds."""
+
+        planes: Planes
+        labels: PointLabels
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Detect the planes of a cloud."""
+        from orthoflow_plugins.plane.detecting import detect
+        from orthoflow_plugins.plane.figures import draw_space
+        from orthoflow_plugins.plane.peeling import find_planes
+        from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
+
+        families: dict[str, Family] = {"any": "any", "vertical": "wall", "horizontal": "level"}
+        pictures: list[NDArray[np.float64]] = []
+        coarser = 1.0 if params.search == "full" else 2.0
+
+        def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
+            voting = SpaceVoting(
+                cell_m=coarser * params.cell_m,
+                angle_step_deg=coarser * params.angle_step_deg,
+                least_points=params.min_share * len(remainder.claims),
+                family=families[params.constraint],
+                tilt_most_deg=params.max_tilt_deg,
+                is_raw=params.coordinates == "raw",
+            )
+            proposer = SpaceProposer(remainder, voting)
+            found = find_planes(remainder, proposer, rules, report)
+            if proposer.first_picture is not None:
+                pictures.append(proposer.first_picture)
+            return found
+
+        detection = detect(inputs.cloud, params, ctx, find, method=self.id)
+        for picture in pictures:
+            draw_space(ctx, picture, detection.planes)
+        return self.Out(planes=detection.planes, labels=detection.labels)

@@ -1,0 +1,207 @@
+"""The 3D Hough transform: voxels vote, each with its points, for all planes through them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import Plane, wall_axes
+from orthoflow.geometry.point_kernels import in_threads
+from orthoflow.geometry.voxel_kernels import best_bins, vote_planes, vote_tilts
+from orthoflow_plugins.plane.accumulators import contrast, parabola
+from orthoflow_plugins.plane.candidates import Candidate, Family
+from orthoflow_plugins.plane.remainders import Remainder
+from orthoflow_plugins.plane.space_directions import directions_over
+from orthoflow_plugins.plane.voxels import Places, VoxelCounts
+
+# A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
+# several bins until it is refined.
+_VOTE_CAUTION: Final = 0.25
+_NOT_AGAIN_STEPS: Final = 2.2
+# Slopes tried around a maximum, per side.
+_FINE_SLOPES: Final = 5
+# More entries than this of all tables together cost more memory than they show; bins grow instead.
+_TABLE_MOST: Final = 120_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpaceVoting:
+    """How voxels vote.
+
+    Attributes:
+        cell_m: side of a voxel and width of a bin.
+        angle_step_deg: step between directions.
+        least_points: points that a plane needs.
+        family: which planes are proposed.
+        tilt_most_deg: how far they may be off vertical or level.
+        is_raw: every point votes with its own coordinates instead of its voxel.
+    """
+
+    cell_m: float
+    angle_step_deg: float
+    least_points: float
+    family: Family = "any"
+    tilt_most_deg: float = 10.0
+    is_raw: bool = False
+
+
+class SpaceProposer:
+    """Proposes planes from the maxima of a 3D accumulator.
+
+    The accumulator is linear: when points are taken away, their voxels take their votes back,
+    instead of all others voting again.
+
+    Attributes:
+        first_picture: (o, p) best contrast over omega and phi of the untouched cloud, NaN where no
+            direction was asked about.
+    """
+
+    def __init__(self, remainder: Remainder, voting: SpaceVoting) -> None:
+        """Get ready to propose."""
+        self._voting = voting
+        self._voxels = VoxelCounts(remainder, voting.cell_m)
+        self._directions = directions_over(
+            voting.angle_step_deg, voting.family, voting.tilt_most_deg
+        )
+        half_m = 0.5 * float(np.linalg.norm(self._voxels.extent_m))
+        n_rows = len(self._directions.normals)
+        self._bin_m = max(self._voxels.cell_m, 2.0 * half_m * n_rows / _TABLE_MOST)
+        n_bins = 2 * (math.ceil(half_m / self._bin_m) + 1)
+        self._smear_bins = max(1, round(0.3 * half_m * self._directions.step_rad / self._bin_m))
+        self._votes = np.zeros((n_rows, n_bins), dtype=np.int32)
+        self._barred = np.zeros((n_rows, n_bins), dtype=np.uint8)
+        self._scores = np.zeros(n_rows, dtype=np.int64)
+        self._places = np.zeros(n_rows, dtype=np.int64)
+        self._counts = np.zeros((0, 0), dtype=np.int32)
+        self._voted_for = -1
+        self._is_scored = False
+        self._last = (0, 0)
+        self.first_picture: NDArray[np.float64] | None = None
+
+    def propose(self, remainder: Remainder) -> Candidate | None:
+        """Name the plane whose votes stand out most."""
+        if self._voted_for != remainder.n_unclaimed:
+            self._vote(remainder)
+        if not self._is_scored:
+            self._score(remainder.parts)
+        direction = int(np.argmax(self._scores))
+        score = float(self._scores[direction])
+        if score < _VOTE_CAUTION * self._voting.least_points:
+            return None
+        self._last = (direction, int(self._places[direction]))
+        return self._refined(direction, score)
+
+    def reject(self, candidate: Candidate) -> None:
+        """Bar the surroundings of the last maximum."""
+        direction, place = self._last
+        n_bins = self._votes.shape[1]
+        cosines = self._directions.normals @ self._directions.normals[direction]
+        reach = self._smear_bins + 1
+        near = np.cos(_NOT_AGAIN_STEPS * self._directions.step_rad)
+        for row in np.flatnonzero(np.abs(cosines) > near):
+            # On the other side of the hemisphere distances count the other way.
+            middle = place if cosines[row] > 0.0 else n_bins - 1 - place
+            self._barred[row, max(0, middle - reach) : middle + reach + 1] = 1
+        self._is_scored = False
+
+    def _vote(self, remainder: Remainder) -> None:
+        counts = self._voxels.counted(remainder)
+        if self._voting.is_raw:
+            self._votes[:] = 0
+            self._add(self._voxels.raw_places(remainder), remainder.parts)
+        else:
+            changes = counts - self._counts if self._counts.size else counts
+            self._add(self._voxels.places(changes), remainder.parts)
+        self._counts = counts
+        self._voted_for = remainder.n_unclaimed
+        self._is_scored = False
+
+    def _add(self, places: Places, parts: int) -> None:
+        extent = self._voxels.extent_m / self._bin_m
+        shape = (math.ceil(extent[2]) + 2, math.ceil(math.hypot(extent[0], extent[1])) + 2)
+        tasks = []
+        starts = self._directions.starts
+        for turns in np.array_split(np.arange(len(starts) - 1), parts):
+            first, last = int(starts[turns[0]]), int(starts[turns[-1] + 1])
+            tasks.append(
+                partial(
+                    vote_planes,
+                    places.places_m,
+                    places.weights,
+                    self._directions.angles_rad[first:last],
+                    starts[turns[0] : turns[-1] + 2] - first,
+                    np.zeros(shape, dtype=np.int32),
+                    self._bin_m,
+                    self._votes[first:last],
+                )
+            )
+        in_threads(tasks)
+
+    def _score(self, parts: int) -> None:
+        tasks = []
+        for rows in np.array_split(np.arange(len(self._votes)), parts):
+            piece = slice(int(rows[0]), int(rows[-1]) + 1)
+            tasks.append(
+                partial(
+                    best_bins,
+                    self._votes[piece],
+                    self._smear_bins,
+                    self._barred[piece],
+                    self._scores[piece],
+                    self._places[piece],
+                )
+            )
+        in_threads(tasks)
+        self._is_scored = True
+        if self.first_picture is None:
+            self.first_picture = self._picture()
+
+    def _picture(self) -> NDArray[np.float64]:
+        """Best contrast over omega and phi."""
+        directions = self._directions
+        n_turns = len(directions.starts) - 1
+        picture = np.full((n_turns, n_turns + 1), np.nan)
+        omega = np.rint(directions.angles_rad[:, 0] / directions.step_rad).astype(int)
+        phi = np.rint((directions.angles_rad[:, 1] + 0.5 * math.pi) / directions.step_rad)
+        picture[omega, phi.astype(int)] = self._scores
+        return picture
+
+    def _refined(self, direction: int, score: float) -> Candidate:
+        """Look around a maximum with finer slopes and half bins, with the voxels near it."""
+        place = int(self._places[direction])
+        normal = self._directions.normals[direction]
+        up = np.array([0.0, 0.0, 1.0])
+        axes = wall_axes(normal, up)
+        distance_m = (place + 0.5 - 0.5 * self._votes.shape[1]) * self._bin_m
+        cells = self._voxels.places(self._counts)
+        reach_m = (self._smear_bins + 3) * self._bin_m
+        half_m = 0.5 * float(np.linalg.norm(self._voxels.extent_m))
+        heights = normal.astype(np.float32) @ cells.places_m - np.float32(distance_m)
+        near = np.abs(heights) < reach_m + self._directions.step_rad * half_m
+        on_plane = axes.astype(np.float32) @ cells.places_m[:, near]
+        local = np.vstack([on_plane, heights[None, near]])
+        middle = np.median(local[:2], axis=1) if near.any() else np.zeros(2)
+        local[:2] -= middle[:, None].astype(np.float32)
+        steps = np.linspace(-1.0, 1.0, 2 * _FINE_SLOPES + 1) * self._directions.step_rad
+        slopes = np.array([(a, b) for a in steps for b in steps])
+        bin_m = 0.5 * self._bin_m
+        fine = np.zeros((len(slopes), 4 * (self._smear_bins + 3)), dtype=np.int64)
+        vote_tilts(local, cells.weights[near], slopes, -reach_m, bin_m, fine)
+        scores = contrast(fine, 1)
+        best, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+        shift = parabola(scores[best], int(column))
+        height_m = -reach_m + (column + 0.5 + shift) * bin_m
+        tilted = normal - slopes[best] @ axes
+        point = (distance_m + height_m) * normal + middle @ axes + self._voxels.middle_m
+        world = tilted / np.linalg.norm(tilted) @ self._voxels.basis
+        world = world / np.linalg.norm(world)
+        return Candidate(
+            plane=Plane(normal=world, offset_m=float(world @ (point @ self._voxels.basis))),
+            family=self._voting.family,
+            support=score,
+        )
