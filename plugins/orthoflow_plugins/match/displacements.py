@@ -158,10 +158,13 @@ def _matched(
     places = np.ascontiguousarray(start[0])
     found = np.zeros((len(places), 4))
     found[:, :2] = start[1]
+    side, n_channels = len(window), first.values.shape[2]
+    shapes = ((side, side), (side + 3, side, n_channels), (side, side, n_channels))
     in_threads(
         [
-            partial(match_patches, first, second, places[part], window, found[part])
+            partial(match_patches, first, second, places[part], window, rooms, found[part])
             for part in _parts(len(places), threads)
+            for rooms in [tuple(np.empty(shape) for shape in shapes)]
         ]
     )
     sigma = math.sqrt(_CORRELATION_AREA_CELLS) * found[:, 2]

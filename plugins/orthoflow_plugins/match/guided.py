@@ -54,8 +54,8 @@ class MatchGuided(Method):
         channels: Literal["auto", "gradients", "grey"] = Field(
             default="auto",
             description="What is compared: oriented gradients; the grey itself, which is sharper "
-            "where laser and camera see the same; or both, of which each photo keeps what its "
-            "held-out ties fit better.",
+            "where laser and camera see the same; or both, of which each photo keeps the one with "
+            "the smaller error of held-out ties over the root of the number of ties.",
         )
         score_min_share: float = Field(
             default=0.35, ge=0, lt=1, description="Smallest correlation of two patches."

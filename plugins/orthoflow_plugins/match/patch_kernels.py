@@ -46,21 +46,27 @@ def search_shifts(first, second, places, reach, found):  # type: ignore[no-untyp
     """
     half, radius = reach
     side = 2 * radius + 1
-    scores = np.empty((side, side))
+    scores = np.empty(side * side)
     for i in range(places.shape[0]):
         at = (places[i, 1], places[i, 0])
+        top = 0
         for k in range(side * side):
             to = (at[0] + k // side - radius, at[1] + k % side - radius)
-            scores[k // side, k % side] = _correlation(first, second, at, to, half)
-        top = np.argmax(scores)
+            scores[k] = _correlation(first, second, at, to, half)
+            if scores[k] > scores[top]:
+                top = k
         down, across = top // side, top % side
         found[i, 0] = across - radius
         found[i, 1] = down - radius
-        found[i, 2] = scores[down, across]
+        found[i, 2] = scores[top]
         found[i, 3] = -1.0
         if 0 < down < side - 1 and 0 < across < side - 1:
-            scores[max(0, down - 2) : down + 3, max(0, across - 2) : across + 3] = -1.0
-            found[i, 3] = found[i, 2] - scores.max()
+            # Correlations reach down to -1: that much the best leads by where no other place is.
+            elsewhere = -1.0
+            for k in range(side * side):
+                if max(abs(k // side - down), abs(k % side - across)) > 2:
+                    elsewhere = max(elsewhere, scores[k])
+            found[i, 3] = scores[top] - elsewhere
 
 
 @njit(cache=True, nogil=True)
@@ -86,7 +92,7 @@ def _correlation(first, second, at, to, half):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def match_patches(first, second, places, window, found):  # type: ignore[no-untyped-def]
+def match_patches(first, second, places, window, patch, found):  # type: ignore[no-untyped-def]
     """Least-squares matching of each patch: shift, a gain, an offset per channel.
 
     Args:
@@ -94,20 +100,22 @@ def match_patches(first, second, places, window, found):  # type: ignore[no-unty
         second: `Picture`.
         places: (n, 2) int64 (column, row) of the patches' centres in the first picture.
         window: (p, p) float64 weights of a patch's cells.
+        patch: room to work in: (p, p), (p + 3, p, c) and (p, p, c) float64.
         found: (n, 4) float64: the shift (across, down), improved in place; filled with the
             standard deviation of a coordinate for independent cells, inf where a patch fixes none,
             and the correlation.
     """
-    side, n_channels = window.shape[0], first.values.shape[2]
-    weight = np.zeros((side, side))
-    moved = np.zeros((side, side, n_channels))
-    least = _KNOWN_SHARE_LEAST * window.sum()
+    weight, lines, moved = patch
+    least = 0.0
+    for y in range(window.shape[0]):
+        for x in range(window.shape[0]):
+            least += _KNOWN_SHARE_LEAST * window[y, x]
     for i in range(places.shape[0]):
         place = (places[i, 1], places[i, 0])
         found[i, 2], found[i, 3] = math.inf, 0.0
         for _ in range(_ITERATIONS):
             shift = (found[i, 1], found[i, 0])
-            total = _sample(first, second, place, shift, (window, weight, moved))
+            total = _sample(first, second, place, shift, (window, weight, lines, moved))
             if total <= least:
                 found[i, 2] = math.inf
                 break
@@ -126,7 +134,7 @@ def match_patches(first, second, places, window, found):  # type: ignore[no-unty
 @njit(cache=True, nogil=True)
 def _sample(first, second, place, shift, patch):  # type: ignore[no-untyped-def]
     """Resample the second picture around a shifted place; give the sum of the weights."""
-    window, weight, moved = patch
+    window, weight, lines, moved = patch
     rows, columns, n_channels = second.values.shape
     side = window.shape[0]
     half = side // 2
@@ -142,6 +150,17 @@ def _sample(first, second, place, shift, patch):  # type: ignore[no-untyped-def]
     across = _cubic(place[1] + shift[1] - low_x)
     down = _cubic(place[0] + shift[0] - low_y)
     total = 0.0
+    for y in range(side + 3):
+        r = low_y + y - half - 1
+        for x in range(side):
+            q = low_x + x - half
+            for c in range(n_channels):
+                lines[y, x, c] = (
+                    across[0] * second.values[r, q - 1, c]
+                    + across[1] * second.values[r, q, c]
+                    + across[2] * second.values[r, q + 1, c]
+                    + across[3] * second.values[r, q + 2, c]
+                )
     for y in range(side):
         for x in range(side):
             r, q = low_y + y - half, low_x + x - half
@@ -151,13 +170,12 @@ def _sample(first, second, place, shift, patch):  # type: ignore[no-untyped-def]
             weight[y, x] = window[y, x] * known
             total += weight[y, x]
             for c in range(n_channels):
-                value = 0.0
-                for k in range(4):
-                    line = 0.0
-                    for m in range(4):
-                        line += across[m] * second.values[r - 1 + k, q - 1 + m, c]
-                    value += down[k] * line
-                moved[y, x, c] = value
+                moved[y, x, c] = (
+                    down[0] * lines[y, x, c]
+                    + down[1] * lines[y + 1, x, c]
+                    + down[2] * lines[y + 2, x, c]
+                    + down[3] * lines[y + 3, x, c]
+                )
     return total
 
 
@@ -177,35 +195,32 @@ def _improvement(values, place, weight, moved, total):  # type: ignore[no-untype
     """One Gauss-Newton step (down, across), its standard deviation, and the correlation."""
     side, n_channels = weight.shape[0], values.shape[2]
     top, left = place[0] - side // 2, place[1] - side // 2
-    # Sums of products of: reference, moved, slope across, slope down, channel by channel.
-    products = np.zeros((4, 4))
-    row = np.empty(4)
-    for c in range(n_channels):
-        means = np.zeros(4)
-        sums = np.zeros((4, 4))
-        for y in range(side):
-            for x in range(side):
-                w = weight[y, x]
-                r, q = top + y, left + x
-                row[0] = values[r, q, c]
-                row[1] = moved[y, x, c]
-                row[2] = 0.5 * (values[r, q + 1, c] - values[r, q - 1, c])
-                row[3] = 0.5 * (values[r + 1, q, c] - values[r - 1, q, c])
-                for k in range(4):
-                    means[k] += w * row[k]
-                    for m in range(k, 4):
-                        sums[k, m] += w * row[k] * row[m]
-        for k in range(4):
-            for m in range(k, 4):
-                products[k, m] += sums[k, m] - means[k] * means[m] / total
-    saa, sab, sbb = products[0, 0], products[0, 1], products[1, 1]
-    nxx, nxy, nyy = products[2, 2], products[2, 3], products[3, 3]
+    # Sums of products of: a, reference; b, moved; x and y, slopes across and down.
+    saa, sab, sbb, nxx, nxy, nyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    sax, say, sbx, sby = 0.0, 0.0, 0.0, 0.0
+    for k in range(n_channels):
+        ma, mb, mx, my = 0.0, 0.0, 0.0, 0.0
+        for r in range(side):
+            for q in range(side):
+                w = weight[r, q]
+                a = values[top + r, left + q, k]
+                b = moved[r, q, k]
+                x = 0.5 * (values[top + r, left + q + 1, k] - values[top + r, left + q - 1, k])
+                y = 0.5 * (values[top + r + 1, left + q, k] - values[top + r - 1, left + q, k])
+                wa, wb, wx, wy = w * a, w * b, w * x, w * y
+                ma, mb, mx, my = ma + wa, mb + wb, mx + wx, my + wy
+                saa, sab, sbb = saa + wa * a, sab + wa * b, sbb + wb * b
+                nxx, nxy, nyy = nxx + wx * x, nxy + wx * y, nyy + wy * y
+                sax, say, sbx, sby = sax + wa * x, say + wa * y, sbx + wb * x, sby + wb * y
+        saa, sab, sbb = saa - ma * ma / total, sab - ma * mb / total, sbb - mb * mb / total
+        nxx, nxy, nyy = nxx - mx * mx / total, nxy - mx * my / total, nyy - my * my / total
+        sax, say = sax - ma * mx / total, say - ma * my / total
+        sbx, sby = sbx - mb * mx / total, sby - mb * my / total
     determinant = nxx * nyy - nxy * nxy
     if not (determinant > 1e-12 and sbb > 0.0 and sab > 0.0):
         return 0.0, 0.0, math.inf, 0.0
     gain = sab / sbb
-    across = gain * products[1, 2] - products[0, 2]
-    down = gain * products[1, 3] - products[0, 3]
+    across, down = gain * sbx - sax, gain * sby - say
     noise = max(saa - gain * sab, 0.0) / (total * n_channels)
     # Inverse compositional: the slopes are those of the unmoved picture.
     return (

@@ -52,7 +52,7 @@ class MatchSift(Method):
         """Key points, their contrast, and what counts as a match."""
 
         n_features_max: int = Field(
-            default=6000, ge=50, description="Key points per photo and per wall, spread evenly."
+            default=9000, ge=50, description="Key points per photo and per wall, spread evenly."
         )
         ratio: float = Field(
             default=0.85,

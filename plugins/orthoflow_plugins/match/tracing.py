@@ -32,7 +32,6 @@ _SIGMA_MOST_CELLS: Final = 2.0
 _SIGMA_FLOOR_CELLS: Final = 0.1
 _OCCUPIED_CELLS: Final = 5.0
 _RADIUS_LEAST: Final = 2
-_TIES_SHARE_LEAST: Final = 0.6
 # Warping again by a pose that moves the photo less than this on the walls changes nothing.
 _SETTLED_CELLS: Final = 0.3
 # Held-out error has to fall by this share for another round.
@@ -127,11 +126,13 @@ def trace_photo(
 
 
 def _is_better(tried: Trace, found: Trace) -> bool:
-    """Whether another content fits better without losing most of the ties."""
+    """Whether another content promises a better pose: held-out error over the root of n."""
     if not (tried.held_out_px and found.held_out_px):
         return tried.n_ties > found.n_ties
-    closer = min(tried.held_out_px) < min(found.held_out_px)
-    return closer and tried.n_ties >= _TIES_SHARE_LEAST * found.n_ties
+    promised = [
+        min(trace.held_out_px) / math.sqrt(max(trace.n_ties, 1)) for trace in (tried, found)
+    ]
+    return promised[0] < promised[1]
 
 
 def _traced(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo
 from orthoflow_plugins.orient.estimating import Estimate
-from orthoflow_plugins.orient.splitting import hull_area, quadrant_counts
+from orthoflow_plugins.orient.splitting import hull_area, image_cells, quadrant_counts
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
 
 TIES_LEAST: Final = 8
@@ -92,6 +92,25 @@ class Case:
         return self.estimate.agreeing & self.is_check
 
     @property
+    def quadrant_counts(self) -> list[int]:
+        """Ties that agree in the quarters of the photo, as `image_cells` numbers them."""
+        agreeing = self.seen.pixels_photo[self.estimate.agreeing]
+        counts: list[int] = quadrant_counts(agreeing, self.size_px).tolist()
+        return counts
+
+    @property
+    def gsd_m(self) -> float | None:
+        """Smallest cell of its walls, None when the ties do not say."""
+        return min((wall.gsd_m for wall in self.known if wall.gsd_m is not None), default=None)
+
+    def worst_in_quarter_m(self, quarter: int) -> float:
+        """Largest predicted error on the walls that a quarter shows; 0 when it shows none."""
+        if self.error is None:
+            return 0.0
+        cells = image_cells(self.error.footprint_px, self.size_px, 2)
+        return float(self.error.sigmas_m[cells == quarter].max(initial=0.0))
+
+    @property
     def hull_ratio(self) -> float:
         """Hull of the control over the footprint of its walls in the photo; 0 without one."""
         if self.error is None:
@@ -100,20 +119,12 @@ class Case:
         return hull_area(self.seen.pixels_photo[self.control]) / max(footprint, 1.0)
 
 
-def too_few(
-    pixels_photo: NDArray[np.float64], size_px: tuple[int, int], n_quadrant_least: int
-) -> str:
-    """Say why ties are too few for an orientation; empty when they suffice (markiewicz2015)."""
-    if len(pixels_photo) < TIES_LEAST:
+def too_few(n_ties: int) -> str:
+    """Say why ties are too few for an orientation; empty when they suffice."""
+    if n_ties < TIES_LEAST:
         return (
-            f"{len(pixels_photo)} ties with the walls, at least {TIES_LEAST} are needed: the photo "
+            f"{n_ties} ties with the walls, at least {TIES_LEAST} are needed: the photo "
             "shows none of the walls, or too differently"
-        )
-    counts = quadrant_counts(pixels_photo, size_px)
-    if counts.min() < n_quadrant_least:
-        return (
-            f"a quarter of the photo has {counts.min()} ties, each needs {n_quadrant_least}: the "
-            "pose would be extrapolated there"
         )
     return ""
 
@@ -130,10 +141,10 @@ def reason_against(case: Case) -> str:
 def warnings_for(case: Case) -> list[str]:
     """Say what limits an orientation that is `ok`."""
     notes = []
-    counts = quadrant_counts(case.seen.pixels_photo[case.estimate.agreeing], case.size_px)
-    if counts.max() > QUADRANT_RATIO * counts.min():
+    counts = case.quadrant_counts
+    if max(counts) > QUADRANT_RATIO * min(counts):
         notes.append(
-            f"a quarter of the photo has {counts.max()} ties, another {counts.min()}: more than "
+            f"a quarter of the photo has {max(counts)} ties, another {min(counts)}: more than "
             f"{QUADRANT_RATIO} times as many"
         )
     if case.hull_ratio < 1.5 * case.rule.hull_ratio_least:
@@ -201,8 +212,27 @@ def _check_agrees(case: Case) -> str:
 
 
 def _spread(case: Case) -> str:
-    agreeing = case.seen.pixels_photo[case.estimate.agreeing]
-    return too_few(agreeing, case.size_px, case.rule.n_quadrant_least)
+    """Hold each quarter of the photo to its ties, or else to what the others say about it.
+
+    After markiewicz2015 each quarter needs two ties. But an obstacle before the wall, or a view
+    past the end of the wall, may fill a quarter in which no tie can be. A surveyor keeps such a
+    photo when the rest of it fixes the pose: the error predicted for the walls in that quarter must
+    be as small at its worst place as it has to be on the average of the photo. A quarter that shows
+    no wall is painted nowhere and needs nothing.
+    """
+    for quarter, count in enumerate(case.quadrant_counts):
+        worst_m = case.worst_in_quarter_m(quarter)
+        if count >= case.rule.n_quadrant_least or worst_m == 0.0:
+            continue
+        most_m = case.rule.sigma_wall_most_gsd * case.gsd_m if case.gsd_m else 0.0
+        if worst_m > most_m:
+            return (
+                f"a quarter of the photo has {count} ties, each needs "
+                f"{case.rule.n_quadrant_least}: the pose would be extrapolated there, with a "
+                f"predicted error of {1000 * worst_m:.1f} mm"
+                + (f", at most {1000 * most_m:.1f} mm is allowed" if case.gsd_m else "")
+            )
+    return ""
 
 
 def _in_front(case: Case) -> str:
@@ -228,17 +258,16 @@ def _covered(case: Case) -> str:
 
 
 def _accurate(case: Case) -> str:
-    gsds = [wall.gsd_m for wall in case.known if wall.gsd_m is not None]
-    if case.error is None or not gsds:
+    if case.error is None or case.gsd_m is None:
         return ""
     for value, most, where in (
         (case.error.rms_m, case.rule.sigma_wall_most_gsd, "on the wall"),
         (case.error.worst_m, case.rule.sigma_corner_most_gsd, "at the worst place of the wall"),
     ):
-        if value > most * min(gsds):
+        if value > most * case.gsd_m:
             return (
                 f"its predicted error {where} is {1000 * value:.1f} mm, at most {most:g} cells of "
-                f"{1000 * min(gsds):g} mm are allowed"
+                f"{1000 * case.gsd_m:g} mm are allowed"
             )
     return ""
 
@@ -268,9 +297,9 @@ def _chance_probability(case: Case, limit: float) -> float:
 
 def _tail(n_least: int, n_all: int, probability: float) -> float:
     """Probability of at least n_least successes in n_all trials (binomial)."""
-    from scipy.stats import binom
+    from scipy.special import bdtrc  # scipy.stats would take seconds to import
 
-    return float(binom.sf(n_least - 1, n_all, probability))
+    return float(bdtrc(n_least - 1, n_all, probability))
 
 
 def _n_places(pixels: NDArray[np.float64]) -> int:

@@ -103,8 +103,9 @@ class OrientPnp(Method):
         n_quadrant_min: int = Field(
             default=2,
             ge=0,
-            description="Ties that must agree in each quarter of a photo (markiewicz2015: 2); 0 "
-            "leaves photos with a large obstacle to the predicted error.",
+            description="Ties that must agree in each quarter of a photo (markiewicz2015: 2), "
+            "unless the predicted error on the walls in that quarter stays below "
+            "sigma_wall_max_cells; 0 leaves it to the predicted error alone.",
         )
         inlier_min_share: float = Field(
             default=0.04,
@@ -224,7 +225,7 @@ def _orient(
     # Drawn for every photo, so that one photo's ties do not change the luck of the next.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
     size_px = (photo.width, photo.height)
-    reason = too_few(ties.pixels_photo[chosen], size_px, params.n_quadrant_min)
+    reason = too_few(len(chosen))
     if reason:
         return _refused(photo, reason, len(chosen))
     seen = SeenPoints(

@@ -45,11 +45,13 @@ class WallError:
         rms_m: standard deviation of a coordinate in the wall's plane, RMS over the footprint.
         worst_m: the largest one in the footprint.
         footprint_px: (n, 2) pixels of the grid points that lie in the footprint.
+        sigmas_m: (n,) standard deviation of a coordinate in the wall's plane at these.
     """
 
     rms_m: float
     worst_m: float
     footprint_px: NDArray[np.float64]
+    sigmas_m: NDArray[np.float64]
 
 
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
@@ -81,6 +83,7 @@ def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | 
         rms_m=float(np.sqrt(variances.mean())),
         worst_m=float(np.sqrt(variances.max())),
         footprint_px=np.vstack([part[1] for part in parts]),
+        sigmas_m=np.sqrt(variances),
     )
 
 
