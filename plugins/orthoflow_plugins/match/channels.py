@@ -65,7 +65,8 @@ def grey_channels(grey: NDArray[np.float32]) -> Channels:
     """Give a picture itself, less its local mean, evened out; for bands that look alike."""
     import cv2
 
-    smooth = cv2.GaussianBlur(filled_smoothly(grey), (0, 0), 0.5)
+    filled = filled_smoothly(grey)
+    smooth = np.asarray(cv2.GaussianBlur(filled, (0, 0), 0.5), dtype=np.float32)
     known = _safe(np.isfinite(grey))
     flat = smooth - _broadly(smooth)
     return Channels(values=_evened(flat[:, :, None], known), known=known)
