@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 from orthoflow_plugins.match.assembling import TiePiece, without_twins
 from orthoflow_plugins.match.features import FeatureRule, find_features
-from orthoflow_plugins.match.neighbours import Matches, mutual_matches
+from orthoflow_plugins.match.neighbours import (
+    Matches,
+    Window,
+    mutual_matches,
+    mutual_matches_within,
+)
 from orthoflow_plugins.match.pictures import filled_smoothly, points_on_wall, shrunk
 from orthoflow_plugins.match.rematching import Expectation, rematched
 from orthoflow_plugins.match.sift import MatchSift
+from scipy.spatial.distance import cdist
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image, encode_png
@@ -98,12 +104,52 @@ def test_neighbours_are_those_of_brute_force(seed: int) -> None:
         np.float32
     )
     found = mutual_matches(first, second, ratio_most=0.8)
-    distance = np.sqrt(((first[:, None].astype(np.float64) - second[None]) ** 2).sum(axis=2))
+    distance = cdist(first.astype(np.float64), second.astype(np.float64))
     order = np.argsort(distance, axis=1, kind="stable")
     rows = np.arange(len(first))
     nearest, ratio = order[:, 0], distance[rows, order[:, 0]] / distance[rows, order[:, 1]]
     mutual = distance.argmin(axis=0)[nearest] == rows
     expected = np.flatnonzero(mutual & (ratio <= 0.8))
+    np.testing.assert_array_equal(found.first, expected)
+    np.testing.assert_array_equal(found.second, nearest[expected])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, 80, (600, 128)).astype(np.float32)
+    second = (first[:500] + rng.integers(-9, 10, (500, 128))).astype(np.float32)
+    places = [rng.uniform(0.0, 100.0, (n, 2)).astype(np.float32) for n in (600, 500)]
+    sizes = [rng.normal(size=n).astype(np.float32) for n in (600, 500)]
+    angles = [rng.uniform(0.0, 360.0, n).astype(np.float32) for n in (600, 500)]
+    window = Window(
+        first=places[0],
+        second=places[1],
+        radius=30.0,
+        first_log_size=sizes[0],
+        second_log_size=sizes[1],
+        first_angle_deg=angles[0],
+        second_angle_deg=angles[1],
+        log_size_most=0.7,
+        angle_most_deg=90.0,
+    )
+    found = mutual_matches_within(first, second, window, ratio_most=0.95)
+    distance = cdist(first.astype(np.float64), second.astype(np.float64))
+    turn = np.abs(angles[0][:, None] - angles[1]) % 360.0
+    distance[
+        (np.abs(places[0][:, None] - places[1]).max(axis=2) > 30.0)
+        | (np.abs(sizes[0][:, None] - sizes[1]) > 0.7)
+        | (np.minimum(turn, 360.0 - turn) > 90.0)
+    ] = np.inf
+    ordered = np.sort(distance, axis=1)
+    nearest = distance.argmin(axis=1)
+    mutual = distance.argmin(axis=0)[nearest] == np.arange(len(first))
+    # One that has no rival is distinct from nothing.
+    ratio = np.full(len(first), np.inf)
+    rivals = np.isfinite(ordered[:, 1])
+    ratio[rivals] = ordered[rivals, 0] / ordered[rivals, 1]
+    expected = np.flatnonzero(mutual & (ratio <= 0.95))
+    assert len(expected) > 10
     np.testing.assert_array_equal(found.first, expected)
     np.testing.assert_array_equal(found.second, nearest[expected])
 

@@ -35,8 +35,9 @@ _SIGMA_MOST_CELLS: Final = 3.0
 class MatchSift(Method):
     """Match photos with the intensity rasters of the walls: RootSIFT, mutual, ratio test.
 
-    Every photo is tried on every wall; walls on which the matches do not agree roughly with a
-    homography keep their matches as rejected. Ties carry the surface's depth, so relief counts.
+    Every photo is tried on every wall, by its strongest key points first, then by all on the walls
+    recognised; walls on which the matches do not agree roughly with a homography keep them as
+    rejected. Ties carry the surface's depth, so relief counts.
     """
 
     id: ClassVar[str] = "match.sift"
@@ -52,7 +53,7 @@ class MatchSift(Method):
         """Key points, their contrast, and what counts as a match."""
 
         n_features_max: int = Field(
-            default=9000, ge=50, description="Key points per photo and per wall, spread evenly."
+            default=8000, ge=50, description="Key points per photo and per wall, spread evenly."
         )
         ratio: float = Field(
             default=0.85,
@@ -81,7 +82,11 @@ class MatchSift(Method):
             "shown by a photo.",
         )
         longest_side_max_px: int = Field(
-            default=4000, ge=200, description="Larger photos are shrunk to this for matching."
+            default=4000,
+            ge=200,
+            description="Larger photos are shrunk to this for matching. Smaller sizes come first, "
+            "from 800 px on, until a wall is recognised; then the size at which a pixel is about "
+            "as wide as a cell of the walls.",
         )
 
     class In(Ports):
