@@ -156,7 +156,9 @@ def photo_of(
     depth = np.zeros(len(rays))
     for _ in range(30):
         across, down = (start[i] + local[:, i] * (depth - start[2]) / local[:, 2] for i in range(2))
-        depth = scene.depth_m(across, down)
+        before, depth = depth, scene.depth_m(across, down)
+        if np.abs(depth - before).max() < 1e-7:
+            break
     grey = np.where(
         (across > 0) & (across < SIZE_M[0]) & (down > 0) & (down < SIZE_M[1]),
         scene.grey(across, down),
