@@ -125,6 +125,24 @@ def test_the_answers_are_the_quality_metrics(compared: Run) -> None:
     ]
 
 
+def test_the_answers_tell_the_final_orientation_and_the_sharper_completeness(
+    tmp_path: Path,
+) -> None:
+    def told(**values: float) -> tuple[RecordedMetric, ...]:
+        return tuple(RecordedMetric(name=n, value=v, unit="1") for n, v in values.items())
+
+    photographed = run(
+        tmp_path,
+        cell("first", metrics=told(n_oriented=4, n_photos=6)),
+        cell("orient", metrics=told(n_oriented=5, n_photos=6)),
+        cell("check", metrics=told(completeness=0.9, completeness_seen_by_both=0.99)),
+    )
+    assert [(answer.value, answer.cell) for answer in answers(photographed)] == [
+        ("0.99", "check"),
+        ("5 of 6", "orient"),
+    ]
+
+
 def test_the_diagram_draws_each_cell_once_and_each_hand_over(compared: Run) -> None:
     drawing = run_diagram(compared)
     assert drawing.count("<rect") == 4

@@ -89,3 +89,5 @@ def test_a_figure_from_bytes_is_kept_as_a_file(tmp_path: Path) -> None:
     ctx.figure("histogram", b"\x89PNG rest", "deviations")
     assert ctx.figures[0].path.read_bytes() == b"\x89PNG rest"
     assert ctx.figures[0].path.name == "histogram.png"
+    ctx.figure("photo", b"RIFF1234WEBP rest", "a photo")
+    assert ctx.figures[1].path.name == "photo.webp"

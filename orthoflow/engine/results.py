@@ -31,7 +31,7 @@ class FigureRef:
     Attributes:
         name: name the method gave.
         caption: one sentence.
-        media_type: `image/png` or `image/svg+xml`.
+        media_type: `image/png`, `image/webp` or `image/svg+xml`.
         sha256: digest of the bytes, hexadecimal; the store's object of that name holds them.
     """
 

@@ -31,7 +31,7 @@ from orthoflow.sdk.methods import Method
 
 # Inputs up to this size are digested again after the run: they must not have changed.
 _CHECKED_BYTES: Final = 16 << 20
-_MEDIA_TYPES: Final = {".png": "image/png", ".svg": "image/svg+xml"}
+_MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp", ".svg": "image/svg+xml"}
 
 Listener = Callable[[StepEvent], None]
 

@@ -53,6 +53,19 @@ def encode_jpeg(image: NDArray[np.uint8], *, quality: int = 90) -> bytes:
     return _encode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
+def encode_webp(image: NDArray[np.uint8], *, quality: int = 85) -> bytes:
+    """Encode an image as lossy WebP: about a tenth of the bytes of PNG for what photos look like.
+
+    Args:
+        image: (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA.
+        quality: 1..100.
+    """
+    import cv2
+
+    colour = np.dstack([image] * 3) if image.ndim == 2 else image
+    return _encode(".webp", colour, [cv2.IMWRITE_WEBP_QUALITY, quality])
+
+
 def stretch_to_grey(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Grey picture of a raster: the 1st percentile is black, the 99th white, NaN is black."""
     known = np.isfinite(values)
@@ -83,20 +96,9 @@ def preview_webp(
     shown: NDArray[np.bool_],
     *,
     longest_side_px: int = PREVIEW_SIDE_PX,
-    quality: int = 85,
 ) -> bytes:
-    """Give the picture of `preview_png` as lossy WebP, about a tenth of the bytes.
-
-    Args:
-        image: (rows, cols) grey or (rows, cols, 3) RGB.
-        shown: (rows, cols), True where the image holds something.
-        longest_side_px: larger images are averaged down to this; smaller ones stay as they are.
-        quality: 1..100.
-    """
-    import cv2
-
-    pixels = _preview(image, shown, longest_side_px)
-    return _encode(".webp", pixels, [cv2.IMWRITE_WEBP_QUALITY, quality])
+    """Give the picture of `preview_png` as lossy WebP."""
+    return encode_webp(_preview(image, shown, longest_side_px))
 
 
 def _preview(

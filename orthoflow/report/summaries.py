@@ -13,10 +13,16 @@ from orthoflow.geometry import omega_phi_deg
 from orthoflow.products import Planes
 from orthoflow.records import Run
 
+# Without photos that show a place, completeness cannot be asked for there.
+_SHARPER_COMPLETENESS: Final = "completeness_seen_by_both"
 # Metrics that say how good the products are, in the order in which a reader wants them.
 _QUALITY: Final[Mapping[str, str]] = {
     "rmse_u_mm": "error along u (right), RMS",
     "rmse_v_mm": "error along v (down), RMS",
+    _SHARPER_COMPLETENESS: "painted, of what a station and a photo see",
+    "n_oriented": "photos oriented",
+    "sigma_wall_mm_worst": "expected error on the wall, worst photo",
+    "check_rmse_mm_worst": "ties that only check, RMS on the wall, worst photo",
     "plane_angle_deg": "direction of the main plane, error",
     "plane_offset_mm": "position of the main plane, error",
     "depth_rmse_mm": "error of the depth, RMS",
@@ -74,14 +80,20 @@ class Comparison:
 
 def answers(run: Run) -> tuple[Answer, ...]:
     """How good the products are: the quality metrics of the inspections, else of the planes."""
-    found = [
-        Answer(
-            what=_QUALITY[row.metric], value=number_with_unit(row.value, row.unit), cell=row.cell
-        )
-        for wanted in _QUALITY
-        for row in run.metrics()
-        if row.metric == wanted
-    ]
+    rows = run.metrics()
+    values = {(row.cell, row.metric): row.value for row in rows}
+    found: list[Answer] = []
+    for wanted, what in _QUALITY.items():
+        told = [row for row in rows if row.metric == wanted]
+        # A later step of the chain improves on an earlier one: first and final orientation.
+        told = [row for row in told if row.step == told[-1].step]
+        if wanted == "completeness":
+            told = [row for row in told if (row.cell, _SHARPER_COMPLETENESS) not in values]
+        for row in told:
+            value = number_with_unit(row.value, row.unit)
+            if wanted == "n_oriented" and (row.cell, "n_photos") in values:
+                value = f"{value} of {number(values[row.cell, 'n_photos'])}"
+            found.append(Answer(what=what, value=value, cell=row.cell))
     return tuple(found)
 
 

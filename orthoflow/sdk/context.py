@@ -114,14 +114,14 @@ class StepContext:
 
         Args:
             name: short name, unique in the step; letters, digits, `-`, `_`.
-            content: the bytes of a PNG or SVG file, or a matplotlib figure.
+            content: the bytes of a PNG, WebP or SVG file, or a matplotlib figure. Charts are PNG or
+                SVG; what looks like a photo is WebP, which takes a tenth of the bytes.
             caption: one sentence on what it shows.
         """
         folder = self.scratch / "figures"
         folder.mkdir(exist_ok=True)
         if isinstance(content, bytes):
-            suffix = ".png" if content.startswith(b"\x89PNG") else ".svg"
-            path = folder / f"{name}{suffix}"
+            path = folder / f"{name}{_suffix(content)}"
             path.write_bytes(content)
         else:
             path = folder / f"{name}.png"
@@ -179,3 +179,9 @@ class StepContext:
             # Writing into the hole of a sparse file on a full disk would kill the process.
             os.posix_fallocate(file.fileno(), 0, size_bytes)
         return np.memmap(path, dtype=np.dtype(dtype), mode="r+", shape=shape)
+
+
+def _suffix(picture: bytes) -> str:
+    if picture.startswith(b"\x89PNG"):
+        return ".png"
+    return ".webp" if picture[:4] == b"RIFF" and picture[8:12] == b"WEBP" else ".svg"

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import encode_png
+from orthoflow.files.images import encode_webp
 from orthoflow.products import Orthoimage
 
 _LONGEST_PX: Final = 900
@@ -27,7 +27,7 @@ _TINT: Final = 0.45
 
 
 def source_map(image: Orthoimage) -> bytes:
-    """PNG of an orthoimage tinted by source, seams in white, nothing in black."""
+    """Picture of an orthoimage tinted by source, seams in white, nothing in black."""
     step = max(1, -(-max(image.source.shape) // _LONGEST_PX))
     source = image.source[::step, ::step]
     palette = np.array(list(_COLOURS.values()), dtype=np.float64)
@@ -35,7 +35,7 @@ def source_map(image: Orthoimage) -> bytes:
     grey = image.rgb[::step, ::step].mean(axis=2, keepdims=True)
     picture = np.where(source[..., None] >= 0, _TINT * tint + (1.0 - _TINT) * grey, 0.0)
     picture[is_seam(source)] = 255.0
-    return encode_png(np.rint(picture).astype(np.uint8))
+    return encode_webp(np.rint(picture).astype(np.uint8))
 
 
 def caption(image: Orthoimage) -> str:

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import decode_image, encode_png
+from orthoflow.files.images import decode_image, encode_webp
 from orthoflow.products import Photo, TieRole
 from orthoflow.sdk import StepContext
 
@@ -57,7 +57,7 @@ def draw_ties(
             cv2.circle(canvas, (u, v), 2 * unit, colour, -1, cv2.LINE_AA, _SUB_PIXEL_BITS)
     ctx.figure(
         name,
-        encode_png(canvas),
+        encode_webp(canvas),
         f"Ties of {photo.name}: control green, check yellow, rejected red. {status}.",
     )
 

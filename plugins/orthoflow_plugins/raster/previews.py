@@ -6,13 +6,14 @@ from typing import Final
 
 import numpy as np
 
+from orthoflow.files.images import encode_webp
 from orthoflow.products import SurfaceMask, Wall
 
 _LONGEST_PX: Final = 1400
 
 
 def depth_preview(wall: Wall) -> bytes:
-    """PNG of a wall's depth: its inner 98 % spread over a colour scale, void in grey."""
+    """Picture of a wall's depth: its inner 98 % spread over a colour scale, void in grey."""
     import cv2
 
     step = max(1, -(-max(wall.mask.shape) // _LONGEST_PX))
@@ -24,4 +25,4 @@ def depth_preview(wall: Wall) -> bytes:
     levels = np.clip(255.0 * scaled, 0.0, 255.0).astype(np.uint8)
     picture = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)
     picture[is_void] = 128
-    return bytes(cv2.imencode(".png", picture)[1])
+    return encode_webp(np.asarray(picture, dtype=np.uint8)[:, :, ::-1])

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import encode_png
+from orthoflow.files.images import encode_webp
 
 _SIDE_PX: Final = 1200
 _CELL_PX: Final = 300
@@ -56,8 +56,8 @@ class ContactSheet:
         cv2.putText(cell, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.38, _INK, 1, cv2.LINE_AA)
         self._cells.append(cell)
 
-    def png(self) -> bytes:
-        """Encode the sheet; no side is longer than 1200 pixels."""
+    def encoded(self) -> bytes:
+        """Encode the sheet as WebP; no side is longer than 1200 pixels."""
         starts = range(0, len(self._cells), self._columns)
         rows = [_in_a_row(self._cells[start : start + self._columns]) for start in starts]
         width = max(row.shape[1] for row in rows)
@@ -67,7 +67,7 @@ class ContactSheet:
         for row in rows:
             sheet[top : top + row.shape[0], : row.shape[1]] = row
             top += row.shape[0]
-        return encode_png(sheet)
+        return encode_webp(sheet)
 
 
 def _in_a_row(cells: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:

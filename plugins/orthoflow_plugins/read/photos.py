@@ -65,7 +65,7 @@ class ReadPhotos(Method):
         _warn(ctx, read, calibration)
         photos = Photos(photos=tuple(item.photo for item in read))
         _report_metrics(ctx, photos)
-        ctx.figure("photos", sheet.png(), sheet.caption)
+        ctx.figure("photos", sheet.encoded(), sheet.caption)
         return self.Out(photos=photos)
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import render_frame
 from orthoflow.products import JsonValue, Photos, PointCloud, Truth
@@ -75,7 +74,7 @@ def _number(value: JsonValue) -> float:
 
 
 def _contact_sheet(photos: Photos) -> bytes:
-    from orthoflow.files.images import decode_image, encode_png
+    from orthoflow.files.images import decode_image, encode_webp
 
     small = []
     for photo in photos.photos:
@@ -85,7 +84,7 @@ def _contact_sheet(photos: Photos) -> bytes:
     blank = np.zeros_like(small[0])
     small += [blank] * (-len(small) % per_row)
     rows = [np.hstack(small[i : i + per_row]) for i in range(0, len(small), per_row)]
-    return encode_png(np.vstack(rows))
+    return encode_webp(np.vstack(rows))
 
 
 def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> ScanStep | None:
@@ -115,12 +114,8 @@ def _inner(filled: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _picture(truth: Truth, cores: int) -> bytes:
-    import cv2
+    from orthoflow.files.images import encode_webp
 
     frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=_PICTURE_GSD_M)
     image = render_frame(truth.scene, frame, buffer_front_m=0.3, buffer_behind_m=0.3, supersample=2)
-    bgr = np.nan_to_num(image.rgb)[:, :, ::-1].round().astype(np.uint8)
-    done, encoded = cv2.imencode(".png", np.ascontiguousarray(bgr))
-    if not done:
-        raise MethodError("the picture of the main wall could not be written as PNG")
-    return bytes(encoded)
+    return encode_webp(np.nan_to_num(image.rgb).round().astype(np.uint8))

@@ -1,0 +1,197 @@
+"""The main job: scan + free-hand photographs -> orthoimages, walked with the command line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import orthoflow
+from orthoflow.files.calibration import write_calibration
+from orthoflow.products import Calibration, Photos, PointCloud, Truth
+from orthoflow.records import Run
+from tests.road.conftest import Shell
+from tests.scan_files import write_las
+
+# Half of the shipped recipe's points and pixels: scan step 4 mm, photos 3 mm, cells 6 mm.
+SMALL = (
+    *("--set", "room.scan_step_m=0.004", "--set", "room.photo_gsd_m=0.003"),
+    *("--set", "wall.gsd_m=0.006"),
+)
+GSD_MM, PHOTO_GSD_MM = 6.0, 3.0
+# What the recipe for simulated data sets, for the recipe for own data.
+SAME_WALL = (
+    *("--set", "wall.gsd_m=0.006", "--set", "wall.buffer_m=0.3"),
+    *("--set", "wall.n_walls_max=1"),
+)
+FOOT_M = 0.3048
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
+    """A folder in which `quickstart.yaml` ran once, small, as `run`, everything embedded."""
+    shell = Shell(tmp_path_factory.mktemp("quick"), store)
+    ended = shell("run", "quickstart.yaml", *SMALL, "--embed", "-o", "run", timeout_s=900)
+    assert ended.code == 0, ended.said
+    assert str(Path("run") / "report.html") in ended.out
+    assert "wall_0_ortho.tif" in ended.out
+    return shell
+
+
+def metrics_of(folder: Path) -> Mapping[tuple[str, str], float]:
+    with (folder / "products" / "metrics.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    return {(row["cell"], row["metric"]): float(row["value"]) for row in rows}
+
+
+def test_the_orthoimages_of_the_simulated_room_are_true(quick: Shell) -> None:
+    metrics = metrics_of(quick.folder / "run")
+    # The issue's limits: 0.35 cells in u and v, 97 % of what a station and a photo see, no ghost.
+    assert metrics["check", "rmse_u_mm"] <= 0.35 * GSD_MM
+    assert metrics["check", "rmse_v_mm"] <= 0.35 * GSD_MM
+    assert metrics["check", "completeness_seen_by_both"] >= 0.97
+    assert metrics["check", "ghost_share"] < 1e-3
+
+
+def test_a_second_run_comes_from_the_cache(quick: Shell) -> None:
+    ended = quick("run", "quickstart.yaml", *SMALL, "-o", "again")
+    assert ended.code == 0, ended.said
+    assert "all 10 steps were cached" in ended.out
+    assert quick("verify", "again").code == 0
+
+
+@dataclass(frozen=True)
+class Survey:
+    """How a surveyor's files lie in space: `metres = axes.T @ (file - shift) * unit_m`.
+
+    Attributes:
+        axes: (3, 3) rotation, file axes from the room's.
+        shift: (3,) file coordinates of the room's origin, in the file's unit.
+        unit_m: metres per unit of the file.
+        settings: what tells orthoflow.
+    """
+
+    axes: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    unit_m: float
+    settings: tuple[str, ...]
+
+    def file_from_room(self, points_room: NDArray[np.float64]) -> NDArray[np.float64]:
+        return points_room @ self.axes.T / self.unit_m + self.shift
+
+    def world_from_room(self, points_room: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What orthoflow works in: the file's axes, in metres."""
+        return self.file_from_room(points_room) * self.unit_m
+
+
+Z_TO_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0])
+SURVEYS = {
+    "y up, feet, national grid": Survey(
+        axes=Z_TO_Y,
+        shift=np.array([2081733.1, 369.4, -1595193.5]),
+        unit_m=FOOT_M,
+        settings=("cloud.up=y", "cloud.unit=ft"),
+    ),
+    "z down": Survey(
+        axes=HALF_TURN_ABOUT_X, shift=np.zeros(3), unit_m=1.0, settings=("cloud.up=-z",)
+    ),
+}
+
+
+def write_survey(folder: Path, run: Run, survey: Survey) -> None:
+    """Lay the simulated scan, photos and calibration out as a user's files."""
+    cloud = run.product("room", "cloud")
+    photos = run.product("room", "photos")
+    calibration = run.product("room", "calibration")
+    assert isinstance(cloud, PointCloud)
+    assert isinstance(photos, Photos)
+    assert isinstance(calibration, Calibration)
+    assert cloud.intensity is not None
+    points_room = cloud.origin + np.column_stack([cloud.x, cloud.y, cloud.z]).astype(np.float64)
+    rgb = None if cloud.rgb is None else cloud.rgb.astype(np.int64) * 257
+    folder.mkdir()
+    write_las(
+        folder / "scan.las",
+        survey.file_from_room(points_room),
+        intensity=np.rint(cloud.intensity * 65535).astype(np.int64),
+        rgb=rgb,
+    )
+    (folder / "photos").mkdir()
+    for photo in photos.photos:
+        (folder / "photos" / photo.name).write_bytes(photo.encoded)
+    write_calibration(folder / "calibration.yaml", calibration)
+
+
+def places_on(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A grid of points on a rectangle, (n, 3)."""
+    down, right = corners[1] - corners[0], corners[3] - corners[0]
+    shares = np.linspace(0.0, 1.0, 12)
+    return np.array([corners[0] + a * down + b * right for a in shares for b in shares])
+
+
+def truth_of(run: Run) -> Truth:
+    truth = run.product("room", "truth")
+    assert isinstance(truth, Truth)
+    return truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "y up, feet, national grid",
+        pytest.param(
+            "z down",
+            marks=pytest.mark.skipif(
+                os.environ.get("ORTHOFLOW_LONG_TESTS") != "1", reason="more of it: .ci/run --long"
+            ),
+        ),
+    ],
+)
+def test_own_files_give_the_same_accuracy_wherever_they_lie(quick: Shell, name: str) -> None:
+    survey = SURVEYS[name]
+    run = orthoflow.open_run(quick.folder / "run")
+    folder = quick.folder / name.replace(" ", "-").replace(",", "")
+    write_survey(folder, run, survey)
+    settings = [word for setting in survey.settings for word in ("--set", setting)]
+    truth = truth_of(run)
+    assert truth.cameras is not None
+    station = survey.world_from_room(truth.stations[0])
+    ended = quick(
+        *("run", "photos-on-scan.yaml", "-o", folder / "run", *SAME_WALL),
+        *("--input", f"scan={folder / 'scan.las'}", "--input", f"photos={folder / 'photos'}"),
+        *("--input", f"calibration={folder / 'calibration.yaml'}", *settings),
+        *("--set", f"cloud.view_from={station.tolist()}"),
+        timeout_s=900,
+    )
+    assert ended.code == 0, ended.said
+    found = json.loads((folder / "run" / "products" / "orient" / "cameras.json").read_text())
+    oriented = 0
+    for true in truth.cameras.cameras:
+        camera = found["cameras"][true.photo]
+        if camera["status"] != "ok":
+            continue
+        oriented += 1
+        places_room = places_on(truth.planes.corners[0])
+        pixels = true.viewing().project(places_room)[:, :2]
+        inside = np.all((pixels > 0) & (pixels < [camera["width"], camera["height"]]), axis=1)
+        found_px, _ = cv2.projectPoints(
+            survey.world_from_room(places_room[inside]),
+            cv2.Rodrigues(np.array(camera["R_camera_from_world"]))[0],
+            np.array(camera["t_camera_from_world"]),
+            np.array(camera["K"]),
+            np.array(camera["distortion"]),
+        )
+        # OpenCV counts from the centre of the first pixel. A sixth of a cell on the wall.
+        errors_px = found_px.reshape(-1, 2) + 0.5 - pixels[inside]
+        assert np.sqrt((errors_px**2).mean()) * PHOTO_GSD_MM < GSD_MM / 6
+    assert oriented >= len(truth.cameras.cameras) - 1
