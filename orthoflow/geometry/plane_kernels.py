@@ -141,6 +141,35 @@ def _misses(box: NDArray[np.float32], slab: NDArray[np.float64], reach_m: float)
 
 
 @compiled
+def _misses_rectangle(
+    box: NDArray[np.float32], slab: NDArray[np.float64], bounds: NDArray[np.float64]
+) -> bool:
+    """Whether no point of a block's box projects into a rectangle on the slab's plane."""
+    for row in range(1, 3):
+        centre, half = -slab[4 * row + 3], 0.0
+        for axis in range(3):
+            centre += slab[4 * row + axis] * 0.5 * (box[2 * axis] + box[2 * axis + 1])
+            half += abs(slab[4 * row + axis]) * 0.5 * (box[2 * axis + 1] - box[2 * axis])
+        if centre + half < bounds[2 * row - 1] or centre - half > bounds[2 * row]:
+            return True
+    return False
+
+
+@compiled
+def _measure(
+    points: BlockedPoints, start: int, slab: NDArray[np.float64], distances: NDArray[np.float64]
+) -> None:
+    """Distances of a block's points to the slab's plane.
+
+    Apart from what is done with them, so that the processor takes several points at once.
+    """
+    x, y, z = points.x, points.y, points.z
+    n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
+    for i in range(start, min(start + BLOCK_POINTS, x.size)):
+        distances[i - start] = n0 * x[i] + n1 * y[i] + n2 * z[i] - n3
+
+
+@compiled
 def _distance(slab: NDArray[np.float64], x: float, y: float, z: float) -> float:
     return float(abs(slab[0] * x + slab[1] * y + slab[2] * z - slab[3]))
 
@@ -156,9 +185,12 @@ def _within(
 
 
 @compiled
-def _place(row: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32) -> int:
+def _place(
+    frame: NDArray[np.float32], row: int, x: np.float32, y: np.float32, z: np.float32
+) -> int:
     """Cell of an offset along one axis of the plan, as `count_over_plan` has it; -1 before it."""
-    position = row[0] * x + row[1] * y + row[2] * z - row[3]
+    # The row is picked here: to hand over a row of an array per point costs more than all this.
+    position = frame[row, 0] * x + frame[row, 1] * y + frame[row, 2] * z - frame[row, 3]
     return int(position) if position >= 0.0 else -1
 
 
@@ -187,21 +219,20 @@ def sum_cells(
     per_m = 1.0 / limits[0]
     find_m, inner_m, fit_m = limits[1], limits[2], limits[3]
     to_steps = STEPS_PER_TOLERANCE / fit_m
-    n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
+    distances = np.empty(BLOCK_POINTS)
     u0, u1, u2, u3 = slab[4] * per_m, slab[5] * per_m, slab[6] * per_m, slab[7] * per_m
     v0, v1, v2, v3 = slab[8] * per_m, slab[9] * per_m, slab[10] * per_m, slab[11] * per_m
     for block in range(boxes.shape[0]):
         if _misses(boxes[block], slab, find_m):
             continue
         start = block * BLOCK_POINTS
+        _measure(points, start, slab, distances)
         for i in range(start, min(start + BLOCK_POINTS, x.size)):
-            if claims[i] >= 0:
+            distance = distances[i - start]
+            size = abs(distance)
+            if size > find_m or claims[i] >= 0:
                 continue
             px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-            distance = n0 * px + n1 * py + n2 * pz - n3
-            size = abs(distance)
-            if size > find_m:
-                continue
             column = math.floor(u0 * px + u1 * py + u2 * pz - u3)
             row = math.floor(v0 * px + v1 * py + v2 * pz - v3)
             if not (0 <= column < n_columns and 0 <= row < n_rows):
@@ -243,15 +274,19 @@ def claim_slab(
     index = slabs.shape[0] - 1
     slab = slabs[index]
     find_m = bounds[0]
-    n0, n1, n2, n3 = slab[0], slab[1], slab[2], slab[3]
+    n_taken = 0
+    distances = np.empty(BLOCK_POINTS)
     for block in range(boxes.shape[0]):
-        if _misses(boxes[block], slab, find_m):
+        if _misses(boxes[block], slab, find_m) or _misses_rectangle(boxes[block], slab, bounds):
             continue
         start = block * BLOCK_POINTS
+        _measure(points, start, slab, distances)
         for i in range(start, min(start + BLOCK_POINTS, x.size)):
+            size = abs(distances[i - start])
+            if size > find_m:
+                continue
             px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-            size = abs(n0 * px + n1 * py + n2 * pz - n3)
-            if size > find_m or not _within(slab, bounds, px, py, pz):
+            if not _within(slab, bounds, px, py, pz):
                 continue
             owner = claims[i]
             if owner >= 0:
@@ -259,14 +294,15 @@ def claim_slab(
                     claims[i] = index
                 continue
             claims[i] = index
-            taken_heights[n_storeys] += 1
-            first = _place(frame[0], x[i], y[i], z[i])
-            second = _place(frame[1], x[i], y[i], z[i])
-            storey = _place(frame[2], x[i], y[i], z[i])
+            n_taken += 1
+            first = _place(frame, 0, x[i], y[i], z[i])
+            second = _place(frame, 1, x[i], y[i], z[i])
+            storey = _place(frame, 2, x[i], y[i], z[i])
             if 0 <= first < n_first and 0 <= second < n_second:
                 taken[first, second] += 1
                 if 0 <= storey < n_storeys:
                     taken_heights[storey] += 1
+    taken_heights[n_storeys] += n_taken
 
 
 @compiled

@@ -6,8 +6,6 @@ mostly one or two, so that sixteen planes cost little more than one.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,32 +14,15 @@ from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compil
 
 
 @compiled
-def _box_misses(
-    boxes: NDArray[np.float32],
-    block: int,
-    slabs: NDArray[np.float64],
-    k: int,
-    reach_m: float,
-) -> bool:
-    """Whether no point of a block's box lies within reach of a slab's plane."""
-    centre = -slabs[k, 3]
-    half = reach_m
-    for axis in range(3):
-        low, high = np.float64(boxes[block, 2 * axis]), np.float64(boxes[block, 2 * axis + 1])
-        centre += slabs[k, axis] * 0.5 * (low + high)
-        half += abs(slabs[k, axis]) * 0.5 * (high - low)
-    return bool(abs(centre) > half)
-
-
-@compiled
-def _is_inside(
+def _meeting(
     boxes: NDArray[np.float32],
     block: int,
     slabs: NDArray[np.float64],
     bounds: NDArray[np.float64],
     k: int,
-) -> bool:
-    """Whether a slab within its rectangle holds the entire box of a block."""
+) -> int:
+    """How a slab within its rectangle meets the box of a block: 0 misses it, 2 holds it, else 1."""
+    holds = 2
     for row in range(3):
         centre = -slabs[k, 4 * row + 3]
         half = 0.0
@@ -51,9 +32,11 @@ def _is_inside(
             half += abs(slabs[k, 4 * row + axis]) * 0.5 * (high - low)
         least = -bounds[k, 0] if row == 0 else bounds[k, 2 * row - 1]
         most = bounds[k, 0] if row == 0 else bounds[k, 2 * row]
-        if not (centre - half >= least and centre + half <= most):
-            return False
-    return True
+        if centre + half < least or centre - half > most:
+            return 0
+        if centre - half < least or centre + half > most:
+            holds = 1
+    return holds
 
 
 @compiled
@@ -103,7 +86,65 @@ def _take_nearer(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bu
 
 
 @compiled
-def assign_points(  # noqa: C901 - one loop over all points, where a call would cost
+def _place(
+    points: BlockedPoints,
+    block: int,
+    slabs: NDArray[np.float64],
+    rasters: NDArray[np.float64],
+    k: int,
+    cells: NDArray[np.int32],
+) -> None:
+    """Set the cell of each point of a block in a slab's raster, clipped to its edges."""
+    x, y, z = points.x, points.y, points.z
+    per_m = rasters[k, 2]
+    u0, u1, u2 = slabs[k, 4] * per_m, slabs[k, 5] * per_m, slabs[k, 6] * per_m
+    v0, v1, v2 = slabs[k, 8] * per_m, slabs[k, 9] * per_m, slabs[k, 10] * per_m
+    u3, v3 = (slabs[k, 7] + rasters[k, 0]) * per_m, (slabs[k, 11] + rasters[k, 1]) * per_m
+    last_row, last_column = rasters[k, 3] - 1.0, rasters[k, 4] - 1.0
+    width, first = np.int32(rasters[k, 4]), np.int32(rasters[k, 5])
+    start = block * BLOCK_POINTS
+    for i in range(start, min(start + BLOCK_POINTS, x.size)):
+        u = u0 * x[i] + u1 * y[i] + u2 * z[i] - u3
+        v = v0 * x[i] + v1 * y[i] + v2 * z[i] - v3
+        u = max(0.0, u)
+        v = max(0.0, v)
+        column = np.int32(min(last_column, u))
+        row = np.int32(min(last_row, v))
+        cells[i - start] = first + row * width + column
+
+
+@compiled
+def _add(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bundle these in
+    count: int,
+    rasters: NDArray[np.float64],
+    k: int,
+    owner: NDArray[np.int8],
+    nearest: NDArray[np.float64],
+    cells: NDArray[np.int32],
+    counts: NDArray[np.int32],
+    sums: NDArray[np.int64],
+) -> None:
+    """Add the points of a block that a slab owns to its cells."""
+    fit_m, inner_m = rasters[k, 6], rasters[k, 7]
+    to_steps = STEPS_PER_TOLERANCE / fit_m
+    for i in range(count):
+        if owner[i] != k:
+            continue
+        cell = cells[i]
+        size = abs(nearest[i])
+        counts[cell, 0] += 1
+        counts[cell, 1] += size <= inner_m
+        if size <= fit_m:
+            # Rounded to the nearest whole number: truncation of a positive one.
+            steps = np.int64(nearest[i] * to_steps + (STEPS_PER_TOLERANCE + 0.5))
+            steps -= STEPS_PER_TOLERANCE
+            counts[cell, 2] += 1
+            sums[cell, 0] += steps
+            sums[cell, 1] += steps * steps
+
+
+@compiled
+def assign_points(  # noqa: C901 - one loop over all blocks, whose tables are made once
     points: BlockedPoints,
     claims: NDArray[np.int8],
     slabs: NDArray[np.float64],
@@ -127,23 +168,26 @@ def assign_points(  # noqa: C901 - one loop over all points, where a call would 
         sums: (cells, 2) distances and squared distances of those within the fit tolerance, in
             steps and squared steps; added to.
     """
-    x, y, z, boxes = points.x, points.y, points.z, points.boxes
+    boxes = points.boxes
     active = np.empty(slabs.shape[0], dtype=np.int64)
     owner = np.empty(BLOCK_POINTS, dtype=np.int8)
     distances, nearest = np.empty(BLOCK_POINTS), np.empty(BLOCK_POINTS)
+    cells = np.empty(BLOCK_POINTS, dtype=np.int32)
     is_summing = counts.shape[0] > 0
     for block in range(boxes.shape[0]):
-        n_active, n_wanted = 0, 0
+        n_active, n_wanted, meeting = 0, 0, 0
         for k in range(slabs.shape[0]):
-            if not _box_misses(boxes, block, slabs, k, bounds[k, 0]):
+            here = _meeting(boxes, block, slabs, bounds, k)
+            if here > 0:
                 active[n_active] = k
                 n_active += 1
                 n_wanted += rasters[k, 3] > 0.0
+                meeting = here
         start = block * BLOCK_POINTS
-        stop = min(start + BLOCK_POINTS, x.size)
+        stop = min(start + BLOCK_POINTS, claims.size)
         if is_summing and n_wanted == 0:
             continue
-        if n_active == 1 and _is_inside(boxes, block, slabs, bounds, active[0]):
+        if n_active == 1 and meeting == 2:
             # Most blocks of a scan are a short piece of one wall: no point has to be asked.
             if not is_summing:
                 claims[start:stop] = active[0]
@@ -156,37 +200,26 @@ def assign_points(  # noqa: C901 - one loop over all points, where a call would 
             for place in range(n_active):
                 k = active[place]
                 _take_nearer(points, block, slabs, bounds, k, owner, distances, nearest)
-        for i in range(start, stop):
-            k, distance = owner[i - start], nearest[i - start]
-            if not is_summing:
-                claims[i] = k
-                continue
-            if k < 0 or rasters[k, 3] == 0.0:
-                continue
-            px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-            u = slabs[k, 4] * px + slabs[k, 5] * py + slabs[k, 6] * pz - slabs[k, 7]
-            v = slabs[k, 8] * px + slabs[k, 9] * py + slabs[k, 10] * pz - slabs[k, 11]
-            column = np.int64((u - rasters[k, 0]) * rasters[k, 2])
-            row = np.int64((v - rasters[k, 1]) * rasters[k, 2])
-            column = min(column, np.int64(rasters[k, 4]) - 1)
-            row = min(row, np.int64(rasters[k, 3]) - 1)
-            cell = np.int64(rasters[k, 5]) + row * np.int64(rasters[k, 4]) + column
-            size = abs(distance)
-            counts[cell, 0] += 1
-            counts[cell, 1] += size <= rasters[k, 7]
-            if size <= rasters[k, 6]:
-                steps = np.int64(math.floor(distance * (STEPS_PER_TOLERANCE / rasters[k, 6]) + 0.5))
-                counts[cell, 2] += 1
-                sums[cell, 0] += steps
-                sums[cell, 1] += steps * steps
+        if not is_summing:
+            claims[start:stop] = owner[: stop - start]
+            continue
+        for place in range(n_active):
+            k = active[place]
+            if rasters[k, 3] > 0.0:
+                _place(points, block, slabs, rasters, k, cells)
+                _add(stop - start, rasters, k, owner, nearest, cells, counts, sums)
 
 
 @compiled
 def name_labels(
-    claims: NDArray[np.int8], names: NDArray[np.int16], labels: NDArray[np.int16]
+    claims: NDArray[np.uint8], names: NDArray[np.int16], labels: NDArray[np.int16]
 ) -> None:
-    """Set (n,) labels to the name of each claim; the last of (k + 1,) names is for -1."""
-    last = names.size - 1
+    """Set (n,) labels to the name of each claim.
+
+    Args:
+        claims: (n,) claims as bytes.
+        names: (256,) name of each byte.
+        labels: (n,) set.
+    """
     for i in range(claims.size):
-        claim = claims[i]
-        labels[i] = names[claim] if claim >= 0 else names[last]
+        labels[i] = names[claims[i]]

@@ -12,9 +12,50 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.point_kernels import BlockedPoints, compiled
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
 
 BRICK_SIDE: Final = 8
+
+
+@compiled
+def _place_block(
+    points: BlockedPoints,
+    start: int,
+    frame: NDArray[np.float32],
+    shape: tuple[int, int, int],
+    brick: NDArray[np.int32],
+    voxel: NDArray[np.int32],
+) -> int:
+    """Set brick (-1 outside) and voxel of a block's points, without branches; gives their number.
+
+    Apart from the counting, so that the processor takes several points at once.
+    """
+    x, y, z = points.x, points.y, points.z
+    a0, a1, a2, a3 = frame[0, 0], frame[0, 1], frame[0, 2], frame[0, 3]
+    b0, b1, b2, b3 = frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3]
+    c0, c1, c2, c3 = frame[2, 0], frame[2, 1], frame[2, 2], frame[2, 3]
+    zero, nowhere, low = np.float32(0.0), np.int32(-1), np.int32(BRICK_SIDE - 1)
+    top_a = np.float32(shape[0] * BRICK_SIDE)
+    top_b = np.float32(shape[1] * BRICK_SIDE)
+    top_c = np.float32(shape[2] * BRICK_SIDE)
+    n_b, n_c = np.int32(shape[1]), np.int32(shape[2])
+    side = np.int32(BRICK_SIDE)
+    count = min(BLOCK_POINTS, x.size - start)
+    for i in range(count):
+        px, py, pz = x[start + i], y[start + i], z[start + i]
+        a = a0 * px + a1 * py + a2 * pz - a3
+        b = b0 * px + b1 * py + b2 * pz - b3
+        c = c0 * px + c1 * py + c2 * pz - c3
+        within = (a >= zero) & (a < top_a) & (b >= zero) & (b < top_b)
+        within = within & (c >= zero) & (c < top_c)
+        p = np.int32(a if within else zero)
+        q = np.int32(b if within else zero)
+        r = np.int32(c if within else zero)
+        # A side of eight: whole bricks are three bits further up.
+        place = ((p >> np.int32(3)) * n_b + (q >> np.int32(3))) * n_c + (r >> np.int32(3))
+        brick[i] = place if within else nowhere
+        voxel[i] = ((p & low) * side + (q & low)) * side + (r & low)
+    return count
 
 
 @compiled
@@ -28,15 +69,14 @@ def touch_bricks(
         frame: (3, 4) voxel of a point: `frame @ p - frame[:, 3]`.
         touched: (a, b, c) set to 1.
     """
-    x, y, z = points.x, points.y, points.z
-    n_a, n_b, n_c = touched.shape
-    top_a, top_b, top_c = n_a * BRICK_SIDE, n_b * BRICK_SIDE, n_c * BRICK_SIDE
-    for i in range(x.size):
-        a = frame[0, 0] * x[i] + frame[0, 1] * y[i] + frame[0, 2] * z[i] - frame[0, 3]
-        b = frame[1, 0] * x[i] + frame[1, 1] * y[i] + frame[1, 2] * z[i] - frame[1, 3]
-        c = frame[2, 0] * x[i] + frame[2, 1] * y[i] + frame[2, 2] * z[i] - frame[2, 3]
-        if 0.0 <= a < top_a and 0.0 <= b < top_b and 0.0 <= c < top_c:
-            touched[int(a) // BRICK_SIDE, int(b) // BRICK_SIDE, int(c) // BRICK_SIDE] = 1
+    flat = touched.reshape(touched.size)
+    brick = np.empty(BLOCK_POINTS, dtype=np.int32)
+    voxel = np.empty(BLOCK_POINTS, dtype=np.int32)
+    for start in range(0, points.x.size, BLOCK_POINTS):
+        count = _place_block(points, start, frame, touched.shape, brick, voxel)
+        for i in range(count):
+            if brick[i] >= 0:
+                flat[brick[i]] = 1
 
 
 @compiled
@@ -56,20 +96,14 @@ def count_voxels(
         bricks: (a, b, c) number of each brick, -1 without points.
         counts: (bricks, BRICK_SIDE ** 3) points; added to.
     """
-    x, y, z = points.x, points.y, points.z
-    n_a, n_b, n_c = bricks.shape
-    top_a, top_b, top_c = n_a * BRICK_SIDE, n_b * BRICK_SIDE, n_c * BRICK_SIDE
-    for i in range(x.size):
-        if claims[i] >= 0:
-            continue
-        a = frame[0, 0] * x[i] + frame[0, 1] * y[i] + frame[0, 2] * z[i] - frame[0, 3]
-        b = frame[1, 0] * x[i] + frame[1, 1] * y[i] + frame[1, 2] * z[i] - frame[1, 3]
-        c = frame[2, 0] * x[i] + frame[2, 1] * y[i] + frame[2, 2] * z[i] - frame[2, 3]
-        if 0.0 <= a < top_a and 0.0 <= b < top_b and 0.0 <= c < top_c:
-            p, q, r = int(a), int(b), int(c)
-            brick = bricks[p // BRICK_SIDE, q // BRICK_SIDE, r // BRICK_SIDE]
-            place = (p % BRICK_SIDE * BRICK_SIDE + q % BRICK_SIDE) * BRICK_SIDE + r % BRICK_SIDE
-            counts[brick, place] += 1
+    flat = bricks.reshape(bricks.size)
+    brick = np.empty(BLOCK_POINTS, dtype=np.int32)
+    voxel = np.empty(BLOCK_POINTS, dtype=np.int32)
+    for start in range(0, points.x.size, BLOCK_POINTS):
+        count = _place_block(points, start, frame, bricks.shape, brick, voxel)
+        for i in range(count):
+            if claims[start + i] < 0 and brick[i] >= 0:
+                counts[flat[brick[i]], voxel[i]] += 1
 
 
 @compiled

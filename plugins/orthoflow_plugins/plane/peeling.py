@@ -18,7 +18,7 @@ from orthoflow_plugins.plane.examining import examine
 from orthoflow_plugins.plane.remainders import Remainder
 
 # Candidates in a row that turned out to be none, after which the search gives up.
-_REJECTED_MOST: Final = 40
+_REJECTED_MOST: Final = 30
 
 
 class Proposer(Protocol):

@@ -68,14 +68,16 @@ def label(found: list[FoundPlane], whole: Remainder, find_m: float) -> None:
         sums=np.zeros((0, 2), dtype=np.int64),
     )
     _assign(found, whole, find_m, [nothing] * whole.parts)
-    whole.n_unclaimed = int(np.count_nonzero(whole.claims < 0))
 
 
 def name_points(whole: Remainder, names: NDArray[np.int16], labels: NDArray[np.int16]) -> None:
     """Write the label (n,) of each point; the last of (k + 1,) names is for points on no plane."""
+    by_byte = np.full(256, names[-1], dtype=np.int16)
+    by_byte[: len(names) - 1] = names[:-1]
+    claims = whole.claims.view(np.uint8)
 
     def write(_part: int, piece: slice) -> None:
-        name_labels(whole.claims[piece], names, labels[piece])
+        name_labels(claims[piece], by_byte, labels[piece])
 
     each_part(len(labels), whole.parts, write)
 

@@ -87,13 +87,16 @@ class VoxelCounts:
 
     def places(self, counts: NDArray[np.int32]) -> Places:
         """Centres and counts of the voxels that have any."""
-        brick, voxel = np.nonzero(counts)
-        within = np.column_stack(np.unravel_index(voxel, (BRICK_SIDE,) * 3))
-        centres = (self._corners[brick] + within + 0.5) * self.cell_m + self._low_m - self.middle_m
-        return Places(
-            places_m=np.ascontiguousarray(centres.T, dtype=np.float32),
-            weights=counts[brick, voxel],
-        )
+        flat = counts.reshape(-1)
+        occupied = np.flatnonzero(flat)
+        brick, voxel = np.divmod(occupied, BRICK_SIDE**3)
+        within = np.unravel_index(voxel, (BRICK_SIDE,) * 3)
+        places_m = np.empty((3, len(occupied)), dtype=np.float32)
+        for axis in range(3):
+            shift_m = self._low_m[axis] - self.middle_m[axis]
+            cells = self._corners[brick, axis] + within[axis] + 0.5
+            places_m[axis] = cells * self.cell_m + shift_m
+        return Places(places_m=places_m, weights=flat[occupied])
 
     def raw_places(self, remainder: Remainder) -> Places:
         """All points with their own coordinates; the claimed ones have no vote."""
