@@ -9,8 +9,8 @@ import pytest
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import (
-    LensFreedom,
     SeenPoints,
     adjust,
     misfit,

@@ -208,6 +208,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="each photo by itself from its ties, with its accuracy or the reason against",
         ),
         MethodSpec(
+            id="orient.dlt",
+            target="orthoflow_plugins.orient.dlt:OrientDlt",
+            summary="each photo by a direct linear transform, with or without distortion",
+        ),
+        MethodSpec(
             id="ortho.pointcloud-direct",
             target="orthoflow_plugins.ortho.pointcloud_direct:PointcloudDirect",
             summary="the topmost point colours its cell",

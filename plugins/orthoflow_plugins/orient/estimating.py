@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import (
-    LensFreedom,
     Misfit,
     Resection,
     SeenPoints,
@@ -21,7 +20,7 @@ from orthoflow.geometry.resection import (
     misfit,
     pixels_by_point,
 )
-from orthoflow.products import Intrinsics, Photo
+from orthoflow.products import Intrinsics, JsonValue, Photo
 from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior, viewing
 from orthoflow_plugins.orient.robust import RobustPose, SamplingRule, robust_pose
 from orthoflow_plugins.orient.splitting import GROUPS, image_cells
@@ -34,7 +33,7 @@ _CHANCE_SHARE_MOST: Final = 0.1
 _TIGHTENING: Final = 0.8
 _TIGHTENED_MOST: Final = 7
 # Residuals beyond so many standard deviations pull less (Huber).
-_SOFT_LIMIT: Final = 2.0
+SOFT_LIMIT: Final = 2.0
 # Ties that determine a lens besides a pose.
 _LEAST_FOR_LENS: Final = 25
 
@@ -63,32 +62,49 @@ class Estimate:
     Attributes:
         resection: the adjusted camera.
         intrinsics: its interior orientation.
-        prior: what was known of the lens before.
+        source: what was known of the lens before: `calibration`, `exif`, `none` ...
         fit: of all the photo's ties, control and check.
         agreeing: (n,) bool, ties within the limit.
         limit: in standard deviations, as `fit.normalised`.
-        n_sampled: control ties that agreed with the robust start.
+        notes: what its method has to say of it.
+        details: its method's own numbers for the record.
     """
 
     resection: Resection
     intrinsics: Intrinsics
-    prior: LensPrior
+    source: str
     fit: Misfit
     agreeing: NDArray[np.bool_]
     limit: float
-    n_sampled: int
+    notes: tuple[str, ...] = ()
+    details: Mapping[str, JsonValue] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Start:
-    pose: RobustPose
-    intrinsics: Intrinsics
+class Start:
+    """Where the adjustment of a photo starts.
+
+    Attributes:
+        camera: pose and lens.
+        prior: what the lens is beforehand; of its pose nothing is used.
+        agreeing: (n,) bool, ties that determine the first adjustment.
+        freedom: what the adjustment may change of the lens.
+        source: what the lens is known from.
+        n_least_for_lens: ties that must agree before the lens may change.
+    """
+
+    camera: ViewingCamera
+    prior: ViewingCamera
+    agreeing: NDArray[np.bool_]
+    freedom: LensFreedom
+    source: str
+    n_least_for_lens: int = _LEAST_FOR_LENS
 
 
 def estimate_pose(
     photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
-) -> Estimate | None:
-    """Orient a photo by its control ties; None when no pose is found.
+) -> Estimate | str:
+    """Orient a photo by its control ties, or say why not.
 
     Args:
         photo: the photo.
@@ -96,75 +112,95 @@ def estimate_pose(
         is_check: (n,) ties withheld from everything but the final fit.
         rule: how.
     """
+    start = robust_start(photo, seen, is_check, rule)
+    if start is None:
+        return no_pose(seen)
+    try:
+        return adjusted(photo, seen, is_check, start, rule)
+    except GeometryError:
+        return no_pose(seen)
+
+
+def no_pose(seen: SeenPoints) -> str:
+    """Say that a photo's ties contradict each other."""
+    return f"no pose agrees with enough of its {len(seen)} ties"
+
+
+def robust_start(
+    photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
+) -> Start | None:
+    """Find the pose that most control ties agree with; None when there is none."""
     prior = lens_prior(photo)
     control = np.flatnonzero(~is_check)
-    start = _best_start(seen.take(control), prior, rule)
-    if start is None:
+    best: tuple[RobustPose, Intrinsics] | None = None
+    for pose, intrinsics in _starts(seen.take(control), prior, rule):
+        if best is None or pose.agreeing.sum() > best[0].agreeing.sum():
+            best = pose, intrinsics
+    if best is None:
         return None
     agreeing = np.zeros(len(seen), dtype=np.bool_)
-    agreeing[control] = start.pose.agreeing
+    agreeing[control] = best[0].agreeing
     # Points that appear twice say nothing new to a pose of six unknowns.
     if len(np.unique(seen.points_world[agreeing].round(4), axis=0)) < 5:
         return None
-    cells = image_cells(seen.pixels_photo, (photo.width, photo.height), GROUPS)
-    try:
-        return _adjusted(seen, is_check, (start, prior), (agreeing, cells), rule)
-    except GeometryError:
-        return None
+    pose, intrinsics = best
+    lens = viewing(intrinsics)
+    return Start(
+        camera=posed(lens, pose.camera),
+        prior=lens,
+        agreeing=agreeing,
+        freedom=prior.freedom,
+        source=prior.source,
+    )
 
 
-def _adjusted(
+def adjusted(
+    photo: Photo,
     seen: SeenPoints,
     is_check: NDArray[np.bool_],
-    known: tuple[_Start, LensPrior],
-    chosen: tuple[NDArray[np.bool_], NDArray[np.intp]],
+    start: Start,
     rule: EstimationRule,
 ) -> Estimate:
-    """Adjust and reject in turns until the control ties stay the same."""
-    start, prior = known
-    agreeing, cells = chosen
-    camera = viewing(start.intrinsics)
-    camera = replace(
-        camera, rotation=start.pose.camera.rotation, translation=start.pose.camera.translation
-    )
-    guess, limit, unit = camera, math.inf, 1.0
+    """Adjust and reject in turns until the control ties stay the same.
+
+    Raises:
+        GeometryError: the ties that agree do not determine the camera.
+    """
+    cells = image_cells(seen.pixels_photo, (photo.width, photo.height), GROUPS)
+    camera, agreeing, unit = start.camera, start.agreeing, 1.0
     for nth in range(_ROUNDS):
         used = agreeing & ~is_check
-        lens = prior.freedom if used.sum() >= _LEAST_FOR_LENS else LensFreedom()
-        # The prior of the lens stays where it was, the pose starts from the last one.
+        lens = start.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
         resection = adjust(
             seen.take(used),
-            replace(guess, rotation=camera.rotation, translation=camera.translation),
+            # A lens that may not change is the one known beforehand.
+            camera if lens.sigmas.size else posed(start.prior, camera),
+            prior=start.prior,
             lens=lens,
             groups=cells[used],
-            soft_limit=_SOFT_LIMIT * unit,
+            soft_limit=SOFT_LIMIT * unit,
         )
         camera = resection.camera
         fit = misfit(seen, camera)
-        unit = _unit_deviation(fit.normalised[used])
-        limit = rule.rejection_sigma * unit
-        limit = _without_chance(fit.normalised[~is_check], limit)
+        unit = unit_deviation(fit.normalised[used])
+        limit = without_chance(fit.normalised[~is_check], rule.rejection_sigma * unit)
         again = fit.normalised <= limit
         if np.array_equal(again & ~is_check, used) and nth >= 2:
             break
         agreeing = again
     return Estimate(
         resection=resection,
-        intrinsics=intrinsics_of(resection, start.intrinsics),
-        prior=prior,
+        intrinsics=intrinsics_of(resection, start.source),
+        source=start.source,
         fit=fit,
         agreeing=again,
         limit=limit,
-        n_sampled=int(start.pose.agreeing.sum()),
     )
 
 
-def _best_start(seen: SeenPoints, prior: LensPrior, rule: EstimationRule) -> _Start | None:
-    best: _Start | None = None
-    for pose, intrinsics in _starts(seen, prior, rule):
-        if best is None or pose.agreeing.sum() > best.pose.agreeing.sum():
-            best = _Start(pose=pose, intrinsics=intrinsics)
-    return best
+def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
+    """Give the lens of one camera the pose of another."""
+    return replace(lens, rotation=pose.rotation, translation=pose.translation)
 
 
 def _starts(
@@ -196,7 +232,7 @@ def _expected_px(seen: SeenPoints) -> float:
     return float(sigma)
 
 
-def _without_chance(normalised: NDArray[np.float64], limit: float) -> float:
+def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
     """Tighten a limit until hardly any wrong tie lies within it by chance.
 
     Wrong ties near a pose lie evenly around where they should be: the ring from one to three
@@ -210,7 +246,7 @@ def _without_chance(normalised: NDArray[np.float64], limit: float) -> float:
     return float(tightened)
 
 
-def _unit_deviation(normalised: NDArray[np.float64]) -> float:
+def unit_deviation(normalised: NDArray[np.float64]) -> float:
     """Robust standard deviation of unit weight, kept within reason."""
     median = float(np.median(normalised)) if normalised.size else 1.0
     return float(np.clip(median / _MEDIAN_LENGTH, *_SIGMA0_RANGE))

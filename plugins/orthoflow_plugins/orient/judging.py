@@ -149,7 +149,7 @@ def warnings_for(case: Case) -> list[str]:
         )
     if case.hull_ratio < 1.5 * case.rule.hull_ratio_least:
         notes.append(f"the control covers {case.hull_ratio:.0%} of the part that shows the walls")
-    if case.estimate.prior.source == "none":
+    if case.estimate.source == "none":
         notes.append("neither calibration nor EXIF says its focal length, which was estimated")
     return notes
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.resection import LensFreedom, Resection
+from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.resection import Resection
 from orthoflow.products import Intrinsics, Photo
 
 # EXIF says the focal length to a whole number of millimetres, or of the full-frame equivalent, and
@@ -70,17 +71,18 @@ def viewing(intrinsics: Intrinsics) -> ViewingCamera:
     )
 
 
-def intrinsics_of(resection: Resection, start: Intrinsics) -> Intrinsics:
-    """Give the interior orientation after an adjustment."""
-    if not resection.lens.sigmas.size:
-        return start
+def intrinsics_of(resection: Resection, source: str) -> Intrinsics:
+    """Give the interior orientation after an adjustment; `source` is what it was known from."""
     camera = resection.camera
-    return replace(
-        start,
+    return Intrinsics(
+        width=camera.width,
+        height=camera.height,
         fx=camera.fx,
         fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
         distortion=tuple(float(value) for value in camera.distortion),
-        source="estimated",
+        source="estimated" if resection.lens.sigmas.size or source == "none" else source,
     )
 
 

@@ -69,7 +69,7 @@ def numbers_json(case: Case, numbers: PhotoNumbers) -> dict[str, JsonValue]:
         "limit_sigma": case.estimate.limit,
         "sigma0": result.sigma0,
         "variance_factor": result.variance_factor,
-        "lens": case.estimate.prior.source,
+        "lens": case.estimate.source,
         "focal_px": result.camera.fx,
         "k1": float(result.camera.distortion[0]),
         "control": {
@@ -81,6 +81,7 @@ def numbers_json(case: Case, numbers: PhotoNumbers) -> dict[str, JsonValue]:
             "v": _column(residuals[case.checked, 1]),
         },
     }
+    entry |= case.estimate.details
     if case.error is not None:
         entry["sigma_wall_mm"] = 1000.0 * case.error.rms_m
         entry["sigma_wall_worst_mm"] = 1000.0 * case.error.worst_m

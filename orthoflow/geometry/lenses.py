@@ -1,0 +1,166 @@
+"""What an adjustment may change of a camera, and how pixels follow from pose and lens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.rotations import cross_matrices, rotation_from_vector
+
+POSE_PARAMETERS: Final = 6
+# Which of the five distortion coefficients k1, k2, p1, p2, k3 a name means.
+_COEFFICIENTS: Final = {"k1": 0, "k2": 1, "p1": 2, "p2": 3}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensFreedom:
+    """How far an adjustment may move the interior orientation; 0 holds it.
+
+    Attributes:
+        focal_sigma: standard deviation of ln(focal length) beforehand, common to fx and fy.
+        aspect_sigma: of ln(fy / fx).
+        centre_sigma_px: of each coordinate of the principal point, pixels.
+        k1_sigma: of k1.
+        k2_sigma: of k2.
+        tangential_sigma: of p1 and of p2.
+    """
+
+    focal_sigma: float = 0.0
+    aspect_sigma: float = 0.0
+    centre_sigma_px: float = 0.0
+    k1_sigma: float = 0.0
+    k2_sigma: float = 0.0
+    tangential_sigma: float = 0.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free ones, in the order in which every vector and matrix has them."""
+        return tuple(name for name, sigma in self._all() if sigma > 0.0)
+
+    @property
+    def sigmas(self) -> NDArray[np.float64]:
+        """Standard deviations of the free ones."""
+        return np.array([sigma for _, sigma in self._all() if sigma > 0.0])
+
+    def _all(self) -> tuple[tuple[str, float], ...]:
+        return (
+            ("focal", self.focal_sigma),
+            ("aspect", self.aspect_sigma),
+            ("cx", self.centre_sigma_px),
+            ("cy", self.centre_sigma_px),
+            ("k1", self.k1_sigma),
+            ("k2", self.k2_sigma),
+            ("p1", self.tangential_sigma),
+            ("p2", self.tangential_sigma),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Linear:
+    """The projection of points at a camera.
+
+    Attributes:
+        pixels: (n, 2); NaN behind the camera.
+        by_camera_point: (n, 2, 3) derivatives by the point in camera axes, pixels per metre.
+        by_parameters: (n, 2, 6 + free) by rotation vector (left of camera_from_world),
+            translation, then what is free of the lens.
+    """
+
+    pixels: NDArray[np.float64]
+    by_camera_point: NDArray[np.float64]
+    by_parameters: NDArray[np.float64]
+
+
+def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]:
+    """Give a camera's values of what is free of the lens, the focal length as its logarithm."""
+    values = {
+        "focal": math.log(camera.fx),
+        "aspect": math.log(camera.fy / camera.fx),
+        "cx": camera.cx,
+        "cy": camera.cy,
+    }
+    return np.array(
+        [
+            values[name] if name in values else camera.distortion[_COEFFICIENTS[name]]
+            for name in lens.names
+        ],
+        dtype=np.float64,
+    )
+
+
+def stepped(camera: ViewingCamera, step: NDArray[np.float64], lens: LensFreedom) -> ViewingCamera:
+    """Give a camera after a step (6 + free,) of an adjustment."""
+    moves = dict(zip(lens.names, step[POSE_PARAMETERS:].tolist(), strict=True))
+    scale = _factor(moves.get("focal", 0.0))
+    distortion = camera.distortion.copy()
+    for name, index in _COEFFICIENTS.items():
+        distortion[index] += moves.get(name, 0.0)
+    turned = rotation_from_vector(step[:3]) @ camera.rotation
+    left, _, right = np.linalg.svd(turned)  # keeps rounding from adding up
+    return replace(
+        camera,
+        fx=camera.fx * scale,
+        fy=camera.fy * scale * _factor(moves.get("aspect", 0.0)),
+        cx=camera.cx + moves.get("cx", 0.0),
+        cy=camera.cy + moves.get("cy", 0.0),
+        distortion=distortion,
+        rotation=left @ right,
+        translation=camera.translation + step[3:6],
+    )
+
+
+def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFreedom) -> Linear:
+    """Project points (n, 3), with derivatives."""
+    turned = points @ camera.rotation.T
+    x, y, z = (turned + camera.translation).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Behind the camera there is no pixel: NaN makes its cost infinite.
+        z = np.where(z > 1e-9, z, np.nan)
+        a, b = x / z, y / z
+    k1, k2, p1, p2, k3 = camera.distortion
+    r2 = a * a + b * b
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+    ad = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
+    bd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
+    ad_by_a = radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
+    ad_by_b = a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+    bd_by_b = radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
+    by_point = np.empty((len(points), 2, 3))
+    by_point[:, 0, 0] = camera.fx * ad_by_a / z
+    by_point[:, 0, 1] = camera.fx * ad_by_b / z
+    by_point[:, 0, 2] = -camera.fx * (ad_by_a * a + ad_by_b * b) / z
+    by_point[:, 1, 0] = camera.fy * ad_by_b / z
+    by_point[:, 1, 1] = camera.fy * bd_by_b / z
+    by_point[:, 1, 2] = -camera.fy * (ad_by_b * a + bd_by_b * b) / z
+    lens_columns = {
+        "focal": (ad, bd),
+        "aspect": (0.0 * a, bd),
+        "k1": (a * r2, b * r2),
+        "k2": (a * r2 * r2, b * r2 * r2),
+        "p1": (2.0 * a * b, r2 + 2.0 * b * b),
+        "p2": (r2 + 2.0 * a * a, 2.0 * a * b),
+    }
+    columns = [-by_point @ cross_matrices(turned), by_point]
+    for name in lens.names:
+        if name in lens_columns:
+            along, down = lens_columns[name]
+            columns.append(np.column_stack([camera.fx * along, camera.fy * down])[:, :, None])
+        else:
+            axis = np.array([[1.0], [0.0]] if name == "cx" else [[0.0], [1.0]])
+            columns.append(np.broadcast_to(axis, (len(points), 2, 1)))
+    return Linear(
+        pixels=np.column_stack([camera.fx * ad + camera.cx, camera.fy * bd + camera.cy]),
+        by_camera_point=by_point,
+        by_parameters=np.concatenate(columns, axis=2),
+    )
+
+
+def _factor(logarithm: float) -> float:
+    """At most e, so that a step too far cannot run away."""
+    return math.exp(min(1.0, max(-1.0, logarithm)))

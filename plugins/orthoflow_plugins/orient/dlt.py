@@ -1,0 +1,187 @@
+"""`orient.dlt`: each photo by itself by a direct linear transform (markiewicz2015, 3.6 and 4.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from importlib.metadata import version
+from typing import ClassVar, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.resection import SeenPoints
+from orthoflow.products import Cameras, Photo, Photos, Ties
+from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.orient.direct_linear import direct_linear, relief
+from orthoflow_plugins.orient.estimating import (
+    Estimate,
+    EstimationRule,
+    Start,
+    adjusted,
+    no_pose,
+    robust_start,
+)
+from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.photowise import oriented_by_itself, require, sighting
+from orthoflow_plugins.orient.reporting import told
+
+Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
+
+# Nearly free: what points with relief say of a lens outweighs these by far.
+_FREE: Final = {"focal_sigma": 1.0, "aspect_sigma": 0.5}
+_CENTRE_SHARE: Final = 0.5
+# Decentring and principal point explain each other on all but the deepest relief.
+_PINNED_CENTRE_SHARE: Final = 0.05
+_FREEDOMS: Final[Mapping[Distortion, LensFreedom]] = {
+    "none": LensFreedom(**_FREE),
+    "k1": LensFreedom(**_FREE, k1_sigma=0.5),
+    "k1 k2 p1 p2": LensFreedom(**_FREE, k1_sigma=0.5, k2_sigma=0.5, tangential_sigma=0.01),
+}
+_LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, "k1 k2 p1 p2": 24}
+# Relief below this many standard deviations of the points is mostly their noise.
+_RELIEF_SIGMAS: Final = 10.0
+# Flatter control leaves the eleven parameters to the rounding of its coordinates.
+_CONDITION_MOST: Final = 5000.0
+# Ties that deviate so many times more than they should show what the lens model lacks.
+_SIGMA0_MOST: Final = 1.5
+
+
+class OrientDlt(Method):
+    """Orient each photo by eleven parameters, or more with distortion, known from its ties alone.
+
+    Calibration and EXIF serve only to reject wrong ties. The linear solution starts a weighted
+    adjustment of pose, fx, fy and principal point (and distortion); of the eleven parameters the
+    skew is recorded but not kept, since no lens of today has one. Control that lies near one plane
+    does not determine the parameters and is refused. Everything is judged as in `orient.pnp`.
+    """
+
+    id: ClassVar[str] = "orient.dlt"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "seeded"
+    citations: ClassVar[tuple[str, ...]] = (
+        "abdelaziz1971: Direct linear transformation, doi:10.14358/PERS.81.2.103",
+        "hartley1997: In defense of the eight-point algorithm, doi:10.1109/34.601246",
+        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.6, 4.3",
+    )
+
+    class Params(OrientParams):
+        """The distortion that is estimated besides, and what `orient.pnp` takes, too."""
+
+        distortion: Distortion = Field(
+            default="none",
+            description="Distortion estimated with the eleven parameters: none, k1, or "
+            "k1 k2 p1 p2.",
+        )
+
+    class In(Ports):
+        """Ties, and the photos they are in."""
+
+        ties: Ties
+        photos: Photos
+
+    class Out(Ports):
+        """One orientation per photo."""
+
+        cameras: Cameras
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Orient the photos one after the other."""
+        ties, photos = inputs.ties, inputs.photos.photos
+        require(ties, inputs.photos)
+        estimator = partial(estimate_dlt, distortion=params.distortion)
+        found = []
+        for nth, photo in enumerate(photos):
+            ctx.progress(nth / len(photos), photo.name)
+            sight = sighting(photo, ties, params, ctx.rng)
+            found.append(oriented_by_itself(sight, ties, params, estimator))
+        return self.Out(cameras=told(ctx, ties, photos, found))
+
+    @classmethod
+    def tools(cls) -> dict[str, str]:
+        """COLMAP rejects wrong ties."""
+        return {name: version(name) for name in ("pycolmap", "scipy")}
+
+
+def estimate_dlt(
+    photo: Photo,
+    seen: SeenPoints,
+    is_check: NDArray[np.bool_],
+    rule: EstimationRule,
+    *,
+    distortion: Distortion,
+) -> Estimate | str:
+    """Orient a photo by a direct linear transform of its control ties, or say why not."""
+    robust = robust_start(photo, seen, is_check, rule)
+    if robust is None:
+        return no_pose(seen)
+    control = seen.take(robust.agreeing & ~is_check)
+    if len(control) < _LEAST[distortion]:
+        return (
+            f"only {len(control)} control ties agree with one pose, a DLT with distortion "
+            f'"{distortion}" needs {_LEAST[distortion]}'
+        )
+    reason = too_flat(control)
+    if reason:
+        return reason
+    size_px = (photo.width, photo.height)
+    try:
+        linear = direct_linear(control.pixels_photo, control.points_world, size_px)
+        if linear.condition > _CONDITION_MOST:
+            return _flat(control, f"the equations have condition {linear.condition:.0f}")
+        share = _PINNED_CENTRE_SHARE if distortion == "k1 k2 p1 p2" else _CENTRE_SHARE
+        start = Start(
+            camera=linear.camera,
+            prior=replace(linear.camera, cx=0.5 * photo.width, cy=0.5 * photo.height),
+            agreeing=robust.agreeing,
+            freedom=replace(_FREEDOMS[distortion], centre_sigma_px=share * max(size_px)),
+            source="dlt",
+            n_least_for_lens=_LEAST[distortion],
+        )
+        estimate = adjusted(photo, seen, is_check, start, rule)
+    except GeometryError as error:
+        return f"{error}: use orient.pnp or orient.colmap-bundle"
+    return replace(
+        estimate,
+        notes=_misfit_notes(estimate, distortion),
+        details={"skew_px": linear.skew_px, "condition": linear.condition},
+    )
+
+
+def _misfit_notes(estimate: Estimate, distortion: Distortion) -> tuple[str, ...]:
+    sigma0 = estimate.resection.sigma0
+    if distortion == "k1 k2 p1 p2" or sigma0 <= _SIGMA0_MOST:
+        return ()
+    note = (
+        f"its ties deviate {sigma0:.1f} times as much as they should: its lens has distortion "
+        f'that a DLT with distortion "{distortion}" does not describe, worst at the corners'
+    )
+    return (note,)
+
+
+def too_flat(control: SeenPoints) -> str:
+    """Say that control lies too near a plane for eleven parameters; empty when it does not."""
+    depth = relief(control.points_world)
+    sigma_m = float(np.sqrt(np.mean(control.sigma_m**2)))
+    if depth.rms_m < _RELIEF_SIGMAS * sigma_m:
+        return _flat(
+            control,
+            f"its points are known to {1000 * sigma_m:.1f} mm, and a DLT needs "
+            f"{_RELIEF_SIGMAS:g} times as much relief",
+        )
+    if depth.rms_m < depth.extent_m / _CONDITION_MOST:
+        return _flat(control, "a DLT needs relief")
+    return ""
+
+
+def _flat(control: SeenPoints, why: str) -> str:
+    depth = relief(control.points_world)
+    return (
+        f"the control lies within {1000 * depth.rms_m:.1f} mm (RMS) of one plane; {why}: use "
+        "orient.pnp or orient.colmap-bundle"
+    )

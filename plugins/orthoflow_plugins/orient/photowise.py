@@ -1,0 +1,208 @@
+"""Photos one by one: their ties, which of them only check, and the verdict on each orientation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry.resection import SeenPoints
+from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
+from orthoflow_plugins.orient.estimating import Estimate, EstimationRule
+from orthoflow_plugins.orient.judging import Case, reason_against, too_few, warnings_for
+from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.residuals import PhotoNumbers, numbers_json, photo_numbers
+from orthoflow_plugins.orient.splitting import withheld
+from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
+
+_SEED_LIMIT = 2**31 - 1
+
+Estimator = Callable[[Photo, SeenPoints, NDArray[np.bool_], EstimationRule], Estimate | str]
+"""Orients one photo by its control ties, or says why it cannot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sighting:
+    """A photo with the ties it is oriented by.
+
+    Attributes:
+        photo: the photo.
+        chosen: (n,) index into all ties.
+        seen: these ties as an adjustment takes them.
+        is_check: (n,) withheld from every estimation.
+        rule: how to estimate, with a seed of its own.
+    """
+
+    photo: Photo
+    chosen: NDArray[np.intp]
+    seen: SeenPoints
+    is_check: NDArray[np.bool_]
+    rule: EstimationRule
+
+
+@dataclass(frozen=True, kw_only=True)
+class Oriented:
+    """What became of one photo.
+
+    Attributes:
+        camera: its orientation, or why there is none.
+        chosen: (n,) index into all ties of those that were used.
+        role: (n,) `TieRole` of these.
+        residuals_px: (n, 2), NaN without an orientation.
+        numbers: for the metrics, None without an orientation.
+        entry: for the record.
+        notes: what limits it.
+    """
+
+    camera: Camera
+    chosen: NDArray[np.intp]
+    role: NDArray[np.uint8]
+    residuals_px: NDArray[np.float64]
+    numbers: PhotoNumbers | None = None
+    entry: JsonValue = None
+    notes: tuple[str, ...] = ()
+
+
+def require(ties: Ties, photos: Photos) -> None:
+    """Refuse what no orientation can start from.
+
+    Raises:
+        MethodError: no photos, no ties, or ties of other photos.
+    """
+    if not photos.photos:
+        raise MethodError("there are no photos to orient: give at least one photo")
+    if not len(ties.photo):
+        raise MethodError(
+            "there are no ties between photos and walls, so no photo can be oriented: see the "
+            "matching step for what it found"
+        )
+    names = {photo.name for photo in photos.photos}
+    strangers = [name for name in ties.photo_names if name not in names]
+    if strangers:
+        raise MethodError(
+            f"the ties speak of photo {strangers[0]}, which is not among the photos given: wire "
+            "the photos that the ties were made from"
+        )
+
+
+def of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
+    """Index of the ties of a photo."""
+    if name not in ties.photo_names:
+        return np.empty(0, dtype=np.intp)
+    mine: NDArray[np.intp] = np.flatnonzero(ties.photo == ties.photo_names.index(name))
+    return mine
+
+
+def sighting(photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator) -> Sighting:
+    """Choose the ties of a photo and split them into control and check."""
+    # Drawn for every photo, so that one photo's ties do not change the luck of the next.
+    own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
+    chosen = _usable(ties, photo.name, params.n_ties_max)
+    seen = SeenPoints(
+        pixels_photo=ties.pixels_photo[chosen],
+        points_world=ties.points_world[chosen],
+        sigma_px=ties.sigma_px[chosen],
+        sigma_m=ties.sigma_m[chosen],
+    )
+    size_px = (photo.width, photo.height)
+    return Sighting(
+        photo=photo,
+        chosen=chosen,
+        seen=seen,
+        is_check=withheld(seen.pixels_photo, size_px, params.check_share, own),
+        rule=params.estimation(int(own.integers(_SEED_LIMIT))),
+    )
+
+
+def oriented_by_itself(
+    sight: Sighting, ties: Ties, params: OrientParams, estimator: Estimator
+) -> Oriented:
+    """Orient a photo by its own ties alone, and judge it."""
+    reason = too_few(len(sight.seen))
+    if reason:
+        return refused(sight, reason)
+    estimate = estimator(sight.photo, sight.seen, sight.is_check, sight.rule)
+    if isinstance(estimate, str):
+        return refused(sight, estimate)
+    return judged(sight, case_of(sight, ties, params, estimate))
+
+
+def case_of(sight: Sighting, ties: Ties, params: OrientParams, estimate: Estimate) -> Case:
+    """Bring together what an orientation is judged by."""
+    used = np.zeros(len(ties.photo), dtype=np.bool_)
+    used[sight.chosen[estimate.agreeing]] = True
+    known = known_walls(ties, used)
+    return Case(
+        photo=sight.photo,
+        seen=sight.seen,
+        is_check=sight.is_check,
+        walls=ties.wall[sight.chosen],
+        estimate=estimate,
+        known=known,
+        error=wall_error(estimate.resection, known),
+        rule=params.gates(),
+        search_radius_px=_search_radius_px(ties, sight.photo.name),
+    )
+
+
+def judged(sight: Sighting, case: Case) -> Oriented:
+    """Call an orientation ok, or say why not."""
+    reason = reason_against(case)
+    numbers = photo_numbers(case) if case.control.any() else None
+    entry: JsonValue = None if numbers is None else numbers_json(case, numbers)
+    if reason:
+        return replace(refused(sight, reason), entry=entry)
+    result, estimate = case.estimate.resection, case.estimate
+    role = np.where(case.is_check, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
+    role[~estimate.agreeing] = TieRole.REJECTED
+    return Oriented(
+        camera=Camera(
+            photo=case.photo.name,
+            status="ok",
+            intrinsics=estimate.intrinsics,
+            rotation_camera_from_world=result.camera.rotation,
+            translation_camera_from_world=result.camera.translation,
+            covariance=result.covariance[:6, :6],
+            sigma0_px=result.sigma0 * float(np.median(case.seen.sigma_px[case.control])),
+            sigma_wall_m=None if case.error is None else case.error.rms_m,
+        ),
+        chosen=sight.chosen,
+        role=role,
+        residuals_px=estimate.fit.residuals_px,
+        numbers=numbers,
+        entry=entry,
+        notes=(*estimate.notes, *warnings_for(case)),
+    )
+
+
+def refused(sight: Sighting, reason: str) -> Oriented:
+    """Give a photo without an orientation."""
+    n_ties = len(sight.chosen)
+    return Oriented(
+        camera=Camera(photo=sight.photo.name, status=reason),
+        chosen=sight.chosen,
+        role=np.full(n_ties, TieRole.REJECTED, dtype=np.uint8),
+        residuals_px=np.full((n_ties, 2), np.nan),
+    )
+
+
+def _usable(ties: Ties, name: str, n_most: int) -> NDArray[np.intp]:
+    """Ties of a photo that may be used: not rejected by the matcher, thinned evenly."""
+    mine = of_photo(ties, name)
+    mine = np.asarray(mine[ties.role[mine] != TieRole.REJECTED], dtype=np.intp)
+    if len(mine) <= n_most:
+        return mine
+    thinned = np.floor(np.arange(n_most) * len(mine) / n_most).astype(np.intp)
+    return np.asarray(mine[thinned], dtype=np.intp)
+
+
+def _search_radius_px(ties: Ties, name: str) -> float:
+    """What the matcher says of how far it looked for the ties of a photo."""
+    photos = ties.details.get("photos")
+    entry = photos.get(name) if isinstance(photos, Mapping) else None
+    radius = entry.get("search_radius_px") if isinstance(entry, Mapping) else None
+    return float(radius) if isinstance(radius, int | float) else math.inf

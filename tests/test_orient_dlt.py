@@ -1,0 +1,219 @@
+"""The direct linear transform: exact for exact points, wrong at the corners without distortion."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.orient.direct_linear import direct_linear, relief
+from orthoflow_plugins.orient.dlt import OrientDlt
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.products import Cameras, Photo, Photos, Ties
+from orthoflow.sdk import StepContext
+from tests import matching_scenes as ms
+from tests.scenes import SURVEY_SHIFT_M
+
+SIZE_PX = (4000, 3000)
+# A grey photo: what it shows is in the ties.
+ENCODED = ms.encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
+
+
+def camera(*, k1: float = -0.08, full: bool = False) -> ViewingCamera:
+    """A wide camera 2.6 m before the middle of a wall in the plane y = 0."""
+    centre = np.array([0.15, -2.6, 0.1])
+    rotation = looking_at(centre, np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    return ViewingCamera(
+        width=SIZE_PX[0],
+        height=SIZE_PX[1],
+        fx=3200.0,
+        fy=3204.0,
+        cx=2012.0,
+        cy=1490.0,
+        distortion=np.array([k1, 0.03, 4e-4, -3e-4, 0.0] if full else [k1, 0.0, 0.0, 0.0, 0.0]),
+        rotation=rotation,
+        translation=-rotation @ centre,
+    )
+
+
+def points_in_view(
+    viewer: ViewingCamera, n: int, *, relief_m: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Points all over the photo, up to `relief_m` before the wall."""
+    pixels = rng.uniform([0.0, 0.0], SIZE_PX, (n, 2))
+    rays = viewer.rays_world(pixels)
+    depth = -relief_m * rng.random(n)
+    reach = (depth - viewer.centre_world[1]) / rays[:, 1]
+    return viewer.centre_world + reach[:, None] * rays
+
+
+def ties_of(
+    viewer: ViewingCamera,
+    seed: int,
+    *,
+    n: int = 300,
+    relief_m: float = 0.12,
+    noise_px: float = 1.5,
+    noise_m: float = 0.0,
+) -> Ties:
+    rng = np.random.default_rng(seed)
+    points = points_in_view(viewer, n, relief_m=relief_m, rng=rng)
+    pixels = viewer.project(points)[:, :2] + noise_px * rng.normal(size=(n, 2))
+    half = (1.9, 1.5)
+    return Ties(
+        photo_names=("a.png",),
+        photo=np.zeros(n, np.int32),
+        wall=np.zeros(n, np.int32),
+        pixels_photo=pixels,
+        points_world=points + noise_m * rng.normal(size=points.shape),
+        sigma_px=np.full(n, max(noise_px, 0.01)),
+        sigma_m=np.full(n, max(noise_m, 1e-5)),
+        role=np.zeros(n, np.uint8),
+        residual_px=np.full((n, 2), np.nan),
+        details={
+            "walls": [
+                {
+                    "gsd_m": 0.003,
+                    "normal": [0.0, -1.0, 0.0],
+                    "corners_world": [
+                        [-half[0], 0.0, half[1]],
+                        [-half[0], 0.0, -half[1]],
+                        [half[0], 0.0, -half[1]],
+                        [half[0], 0.0, half[1]],
+                    ],
+                }
+            ]
+        },
+    )
+
+
+def photos() -> Photos:
+    photo = Photo(
+        name="a.png", encoded=ENCODED, width=SIZE_PX[0], height=SIZE_PX[1], exif_focal_px=3150.0
+    )
+    return ms.photos(photo)
+
+
+def context(tmp_path: Path) -> StepContext:
+    return StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
+
+
+def orient(ties: Ties, ctx: StepContext, **params: object) -> Cameras:
+    inputs = OrientDlt.In(ties=ties, photos=photos())
+    return OrientDlt().run(inputs, OrientDlt.Params(**params), ctx).cameras
+
+
+def frame_errors_px(found: ViewingCamera, true: ViewingCamera) -> NDArray[np.float64]:
+    """Where the wall's points of a grid over the frame go, found less true: (21 x 21,) lengths."""
+    steps = [np.linspace(0.0, side, 21) for side in SIZE_PX]
+    pixels = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
+    rays = true.rays_world(pixels)
+    points = true.centre_world - (true.centre_world[1] / rays[:, 1])[:, None] * rays
+    return np.linalg.norm(found.project(points)[:, :2] - pixels, axis=1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_eleven_parameters_miss_the_corners_of_a_distorted_photo_by_ten_pixels(
+    tmp_path: Path, seed: int
+) -> None:
+    true = camera()
+    ctx = context(tmp_path)
+    gates = {"sigma_wall_max_cells": 50.0, "sigma_corner_max_cells": 500.0}
+    found = orient(ties_of(true, seed), ctx, **gates).cameras[0]
+    assert found.status == "ok"
+    assert frame_errors_px(found.viewing(), true).max() >= 10.0
+    assert any("its lens has distortion that a DLT" in warning for warning in ctx.warnings)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("distortion", "full", "most_px", "rms_px"),
+    [("k1", False, 4.0, 0.7), ("k1 k2 p1 p2", True, 4.0, 0.7)],
+    ids=["k1", "k1 k2 p1 p2"],
+)
+def test_with_distortion_the_corners_are_right(
+    tmp_path: Path, seed: int, distortion: str, full: bool, most_px: float, rms_px: float
+) -> None:
+    true = camera(full=full)
+    found = orient(ties_of(true, seed), context(tmp_path), distortion=distortion).cameras[0]
+    assert found.status == "ok"
+    errors = frame_errors_px(found.viewing(), true)
+    assert errors.max() <= most_px
+    assert np.sqrt(np.mean(errors**2)) <= rms_px
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_stated_errors_hold_where_the_model_does(tmp_path: Path, seed: int) -> None:
+    true = camera()
+    found = orient(ties_of(true, seed), context(tmp_path), distortion="k1").cameras[0]
+    errors = frame_errors_px(found.viewing(), true)
+    pixel_m = 2.6 / 3200.0
+    assert found.sigma_wall_m is not None
+    # Length of a two-dimensional error is root two of a coordinate's; chance lets it vary.
+    assert 0.2 < np.sqrt(np.mean(errors**2) / 2.0) * pixel_m / found.sigma_wall_m < 3.0
+
+
+@pytest.mark.parametrize(
+    ("relief_m", "noise_m", "reason"),
+    [
+        (0.0, 0.0, r"within 0\.0 mm \(RMS\) of one plane; .*use orient\.pnp"),
+        (0.03, 0.002, r"known to 2\.0 mm, and a DLT needs 10 times as much relief"),
+    ],
+    ids=["a plane", "relief of four sigmas"],
+)
+def test_control_near_a_plane_is_refused(
+    tmp_path: Path, relief_m: float, noise_m: float, reason: str
+) -> None:
+    ties = ties_of(camera(), 1, relief_m=relief_m, noise_m=noise_m)
+    found = orient(ties, context(tmp_path), distortion="k1").cameras[0]
+    assert re.search(reason, found.status)
+
+
+def test_little_control_is_refused(tmp_path: Path) -> None:
+    ties = ties_of(camera(), 1, n=24)
+    found = orient(ties, context(tmp_path), distortion="k1 k2 p1 p2").cameras[0]
+    assert re.match(r"only \d+ control ties agree with one pose, a DLT with .* 24", found.status)
+
+
+@pytest.mark.parametrize("shift_m", [np.zeros(3), SURVEY_SHIFT_M], ids=["near", "survey"])
+def test_exact_points_give_the_exact_camera(shift_m: NDArray[np.float64]) -> None:
+    true = replace(camera(k1=0.0), cx=2050.0)
+    points = points_in_view(true, 60, relief_m=0.3, rng=np.random.default_rng(2))
+    found = direct_linear(true.project(points)[:, :2], points + shift_m, SIZE_PX)
+    near = found.camera.shifted(shift_m)
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(near, name) == pytest.approx(getattr(true, name), abs=0.05)
+    assert found.skew_px == pytest.approx(0.0, abs=0.05)
+    np.testing.assert_allclose(near.centre_world, true.centre_world, atol=1e-4)
+
+
+def test_eleven_parameters_find_skew() -> None:
+    true = camera(k1=0.0)
+    points = points_in_view(true, 60, relief_m=0.3, rng=np.random.default_rng(3))
+    pixels = true.project(points)[:, :2]
+    skewed = pixels + np.outer((pixels[:, 1] - true.cy) / true.fy, [12.0, 0.0])
+    assert direct_linear(skewed, points, SIZE_PX).skew_px == pytest.approx(12.0, abs=0.05)
+
+
+def test_too_few_points_are_refused() -> None:
+    with pytest.raises(GeometryError, match=r"needs six points, got 5"):
+        direct_linear(np.ones((5, 2)), np.ones((5, 3)), SIZE_PX)
+
+
+def test_points_in_one_place_are_refused() -> None:
+    with pytest.raises(GeometryError, match=r"lie in one place"):
+        direct_linear(np.ones((8, 2)), np.ones((8, 3)), SIZE_PX)
+
+
+def test_relief_is_the_distance_from_the_best_plane() -> None:
+    rng = np.random.default_rng(0)
+    flat = rng.uniform([-2.0, -1.0, 0.0], [2.0, 1.0, 0.0], (4000, 3))
+    depth = 0.05 * np.where(rng.random(4000) < 0.5, -1.0, 1.0)
+    found = relief(flat + np.column_stack([np.zeros((4000, 2)), depth]))
+    assert found.rms_m == pytest.approx(0.05, rel=0.01)
+    assert found.extent_m == pytest.approx(4.0 / np.sqrt(12.0), rel=0.05)
