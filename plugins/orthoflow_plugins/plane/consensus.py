@@ -14,6 +14,8 @@ from orthoflow.geometry import Plane
 from orthoflow.geometry.consensus_kernels import distance_histograms
 from orthoflow.geometry.point_kernels import in_threads
 from orthoflow_plugins.plane.candidates import Candidate, Family
+from orthoflow_plugins.plane.fitting import refine_plane
+from orthoflow_plugins.plane.footprints import INNER_SHARE
 from orthoflow_plugins.plane.hypotheses import (
     Hypotheses,
     Model,
@@ -42,6 +44,8 @@ _SUPPORT_CAUTION: Final = 0.4
 _POLISHED: Final = 4
 # So many hypotheses near each other are scored again; the best of them fits better than any one.
 _ALIKE_MOST: Final = 5
+# Of the points within the tolerance so many must lie in its inner part; chance puts 0.4 there.
+_CROWDED_SHARE: Final = 0.5
 # Fresh draws after all hypotheses turned out to be none.
 _REDRAWS: Final = 2
 
@@ -71,10 +75,11 @@ class Search:
 
 @dataclass(frozen=True, kw_only=True)
 class _Pool:
-    """Hypotheses with what they are worth, the best first."""
+    """Hypotheses with what they are worth, the best first, and the points that were asked."""
 
     hypotheses: Hypotheses
     scores: Scores
+    asked_m: NDArray[np.float64]
 
 
 class ConsensusProposer:
@@ -125,8 +130,12 @@ class ConsensusProposer:
             return None
         for place in range(len(pool.hypotheses)):
             hypothesis = pool.hypotheses.chosen(np.array([place]))
-            if self._is_worth_it(pool.scores, place, remainder) and not self._is_barred(hypothesis):
+            if self._is_barred(hypothesis) or not self._is_worth_it(pool.scores, place, remainder):
+                continue
+            if self._is_crowded(hypothesis, pool.asked_m, remainder.up):
                 return self._candidate(hypothesis, pool.scores, place, remainder)
+            # Not asked about again; the full examination would cost ten times as much.
+            self._barred.append(hypothesis)
         return None
 
     def reject(self, candidate: Candidate) -> None:
@@ -159,10 +168,12 @@ class ConsensusProposer:
         n_kept = max(_SECOND_LEAST, round(_SECOND_SHARE * len(hypotheses)))
         kept = self._distinct(hypotheses, np.argsort(-first.value, kind="stable"), n_kept)
         hypotheses = hypotheses.chosen(kept)
-        second = self._score(hypotheses, points_m[asked[:_SECOND_POINTS]] - self._centre_m, parts)
+        asked_m = points_m[asked[:_SECOND_POINTS]] - self._centre_m
+        second = self._score(hypotheses, asked_m, parts)
         ranked = np.argsort(-second.value, kind="stable")
         self._pool = _Pool(
             hypotheses=hypotheses.chosen(ranked),
+            asked_m=asked_m,
             scores=Scores(
                 value=second.value[ranked],
                 tolerance_m=second.tolerance_m[ranked],
@@ -232,6 +243,23 @@ class ConsensusProposer:
         share = scores.n_points[place] / max(1, asked)
         n_points = share * remainder.n_unclaimed
         return bool(n_points >= _SUPPORT_CAUTION * self._search.least_share * len(remainder.claims))
+
+    def _is_crowded(
+        self, hypothesis: Hypotheses, asked_m: NDArray[np.float64], up: NDArray[np.float64]
+    ) -> bool:
+        """Whether points crowd about a hypothesis once it is moved to the densest layer near it.
+
+        A plane through mouldings and clutter holds many points too, but spread over its slab.
+        """
+        normal = hypothesis.normals[0] / np.linalg.norm(hypothesis.normals[0])
+        start = Plane(normal=normal, offset_m=float(hypothesis.offsets_m[0]))
+        find_m = self._search.find_m
+        moved = refine_plane(asked_m, start, find_m, freedom="free", up=up)
+        if moved is None:
+            return False
+        sizes_m = np.abs(moved.distances_m(asked_m))
+        inner = np.count_nonzero(sizes_m <= INNER_SHARE * find_m)
+        return bool(inner >= _CROWDED_SHARE * np.count_nonzero(sizes_m <= find_m))
 
     def _candidate(
         self, hypothesis: Hypotheses, scores: Scores, place: int, remainder: Remainder
