@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image
 from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.products import Layer, LayerMask, Layers, Orthoimages, OrthoMask
 from tests import raster_scenes as scenes
@@ -278,4 +279,8 @@ def test_the_map_of_sources_names_their_colours(tmp_path: Path) -> None:
     MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
     (figure,) = ctx.figures
     assert figure.caption == "west, by source: blue left, orange right; seams in white."
-    assert figure.path.read_bytes().startswith(b"\x89PNG")
+    picture = decode_image(figure.path.read_bytes()).astype(float)
+    third = picture.shape[1] // 3
+    left, right = (picture[:, part].mean(axis=(0, 1)) for part in np.s_[:third, -third:])
+    assert left[2] > 2 * left[0]  # blue
+    assert right[0] > 2 * right[2]  # orange
