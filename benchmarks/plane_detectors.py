@@ -31,15 +31,18 @@ from orthoflow_plugins.plane.deviations import measure_planes
 from orthoflow_plugins.plane.parameters import DetectorParams
 from orthoflow_plugins.plane.peeling import find_planes
 from orthoflow_plugins.plane.preparing import prepare
+from orthoflow_plugins.plane.region_proposer import RegionProposer
+from orthoflow_plugins.plane.regions import Growth, Regions, grow
 from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.settling import name_points
 from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
+from orthoflow_plugins.plane.surface_cells import Neighbourhood, surface_cells
 
 from orthoflow.geometry import basis_from_up
 from orthoflow.products import PointCloud
 
 CELL_M, SHARE = 0.02, 0.005
-METHODS = ("hough2d", "hough3d", "hough3d-full", "ransac")
+METHODS = ("hough2d", "hough3d", "hough3d-full", "ransac", "region")
 
 
 @numba.njit(nogil=True)
@@ -116,6 +119,13 @@ def detect(
         found = search_sample(
             remainder, rules, _listen, lambda sample: ConsensusProposer(sample, search, rng)
         )
+    elif method == "region":
+        wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, cell_m=0.1 / 3.0)
+        growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=0.2 * SHARE * len(cloud))
+        regions = grow(surface_cells(remainder, wanted), growth, np.zeros(3))
+        found = search_sample(
+            remainder, rules, _listen, lambda sample: region_proposer(regions, sample)
+        )
     elif method.startswith("hough3d"):
         coarser = 1.0 if method == "hough3d-full" else 2.0
         space = SpaceVoting(
@@ -128,6 +138,17 @@ def detect(
     labels = np.empty(len(cloud), dtype=np.int16)
     name_points(remainder, np.arange(len(found) + 1, dtype=np.int16), labels)
     return remainder, found
+
+
+def region_proposer(regions: Regions, sample: Remainder) -> RegionProposer:
+    return RegionProposer(
+        regions=regions,
+        region_of_sample=regions.region_of(sample.points),
+        family="any",
+        tilt_most_deg=10.0,
+        least_points=SHARE * len(sample.claims),
+        proposes_once=False,
+    )
 
 
 def _listen(_part: float, _text: str) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import Ransac
+from orthoflow_plugins.plane.region import Region
 from pydantic import ValidationError
 
 from orthoflow.errors import MethodError, ProductError
@@ -27,6 +28,9 @@ DETECTORS: dict[str, tuple[type[Method], dict[str, Any]]] = {
     "ransac-msac": (Ransac, {}),
     "ransac-count": (Ransac, {"scoring": "count"}),
     "ransac-a-contrario": (Ransac, {"scoring": "a-contrario"}),
+    "region-cube": (Region, {}),
+    "region-radius": (Region, {"neighbourhood": "radius"}),
+    "region-knn": (Region, {"neighbourhood": "knn"}),
 }
 STATION = np.array([[0.3, -0.2, 0.1]])
 SURVEY = (634512.347, 486215.781, 112.193)
@@ -154,7 +158,7 @@ def test_a_turned_room_gives_the_turned_planes(
     same_planes(out.planes, rooms[detector].planes, turn)
 
 
-@pytest.mark.parametrize("detector", ["hough3d", "ransac-msac"])
+@pytest.mark.parametrize("detector", ["hough3d", "ransac-msac", "region-cube"])
 def test_a_room_turned_any_way_gives_the_turned_planes(
     detector: str, rooms: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -183,6 +183,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="random sample consensus: Max-Consensus, MSAC or AC-RANSAC, in 3D or the plan",
         ),
         MethodSpec(
+            id="plane.region",
+            target="orthoflow_plugins.plane.region:Region",
+            summary="regions grown over neighbouring points with like normals and one plane",
+        ),
+        MethodSpec(
             id="plane.given",
             target="orthoflow_plugins.plane.given:GivenPlane",
             summary="a reference plane that the user gives",

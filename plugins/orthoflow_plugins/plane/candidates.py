@@ -27,12 +27,14 @@ class Candidate:
         family: what it may be.
         support: the points that speak for it, by the detector's own count.
         own_tolerance_m: the tolerance that the detector found by itself, or None.
+        start: where the common fit starts, if not from the plane itself.
     """
 
     plane: Plane
     family: Family
     support: float
     own_tolerance_m: float | None = None
+    start: Plane | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

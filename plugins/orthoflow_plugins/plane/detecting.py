@@ -94,6 +94,7 @@ def detect(
     *,
     method: str,
     plan_cell_m: float = _PLAN_CELL_M,
+    relabel: Callable[[list[FoundPlane], Remainder], None] | None = None,
 ) -> Detection:
     """Run a search on a cloud and turn what it finds into products.
 
@@ -105,6 +106,7 @@ def detect(
             its planes, they are claimed here.
         method: id of the method, for messages.
         plan_cell_m: side of the plan's cells.
+        relabel: changes the claims of the whole cloud once all points have theirs.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
@@ -136,6 +138,8 @@ def detect(
     if params.thinning > 1:
         whole = prepared(cloud)
         label(found, whole, rules.find_m)
+    if relabel is not None:
+        relabel(found, whole)
     ctx.progress(0.8, "measuring deviations")
     deviations = measure_planes(
         whole,

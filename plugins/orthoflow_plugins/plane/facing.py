@@ -32,6 +32,16 @@ def known_viewpoint(cloud: PointCloud) -> Viewpoint:
     return "view_from" if cloud.stations_source == "view_from" else "stations"
 
 
+def middle_viewpoint_m(cloud: PointCloud, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) middle of the stations, of some points of the cloud where none is known; offsets."""
+    stations = cloud.stations
+    if stations is None or len(stations) == 0:
+        middle: NDArray[np.float64] = np.median(points_m, axis=0)
+    else:
+        middle = stations.mean(axis=0) - cloud.origin
+    return middle
+
+
 def side_of_stations(
     plane: Plane, centre_m: NDArray[np.float64], cloud: PointCloud, index: NDArray[np.int64]
 ) -> int:

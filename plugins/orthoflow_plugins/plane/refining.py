@@ -50,7 +50,8 @@ def refine_on_sample(
     sample, claims = remainder.sample, remainder.sample_claims
     free_points = sample.offsets_m[claims < 0]
     first, *rest = shrinking_tolerances(rules.find_m, rules.fit_m)
-    plane = refine_plane(free_points, candidate.plane, first, freedom=freedom, up=remainder.up)
+    start = candidate.plane if candidate.start is None else candidate.start
+    plane = refine_plane(free_points, start, first, freedom=freedom, up=remainder.up)
     if plane is None:
         return None
     near = free_points[np.abs(free_points @ plane.normal - plane.offset_m) <= rules.find_m]

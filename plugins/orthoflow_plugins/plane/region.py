@@ -1,0 +1,184 @@
+"""`plane.region`: regions grown over neighbouring points with like normals and a common plane."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from pydantic import Field, model_validator
+
+from orthoflow.products import Planes, PointCloud, PointLabels
+from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow_plugins.plane.parameters import DetectorParams
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.plane.candidates import Family, FoundPlane, Rules
+    from orthoflow_plugins.plane.detecting import Report
+    from orthoflow_plugins.plane.regions import Regions
+    from orthoflow_plugins.plane.remainders import Remainder
+    from orthoflow_plugins.plane.surface_cells import Neighbourhood
+
+# What `preset: paper` sets where nothing else is said: markiewicz2015, 4.1.2.
+_PAPER: Final[dict[str, object]] = {
+    "criterion": "normal",
+    "neighbourhood": "cube",
+    "neighbourhood_m": 0.01,
+    "cell_m": 0.01,
+    "angle_deg": 1.0,
+    "thinning": 10,
+    "labels": "region",
+}
+
+
+class Region(Method):
+    """Find planes by region growing on the normals of neighbourhoods, on all points.
+
+    The points are summed into cells once; the sums of neighbouring cells give the normal of each
+    neighbourhood. From the flattest cell on, neighbours join whose normal is like the region's and
+    whose middle is near its plane, which is fitted anew as the region grows. The planes of the
+    regions, largest first, then go the way of every detector: refined on a sample, fitted to all
+    points, parts of one plane joined, points labelled by the plane they are near.
+
+    `criterion: normal` asks for the normal alone, wherever a cell lies, as in markiewicz2015; with
+    `labels: region` a niche then belongs to its wall, whatever its depth. `preset: paper` sets both
+    and the other values of that paper (a cube of 10 mm, 1 degree, every 10th point), each of which
+    can still be set otherwise.
+
+    Where the cloud is so thin that a neighbourhood would hold too few points, it is enlarged;
+    `neighbourhood_mm` says to what. `normal_scatter_deg` says how far the normals of the first
+    plane lie apart: an `angle_deg` below it leaves crumbs.
+    """
+
+    id = "plane.region"
+    result_version = 1
+    determinism = "exact"
+    citations = (
+        (
+            "Markiewicz, Podlasiak, Zawieska 2015: A New Approach to the Generation of Orthoimages "
+            "of Cultural Heritage Objects. Remote Sensing 7(12), doi:10.3390/rs71215869"
+        ),
+        (
+            "Rabbani, van den Heuvel, Vosselman 2006: Segmentation of point clouds using "
+            "smoothness constraint. ISPRS Archives 36(5)"
+        ),
+    )
+
+    class Params(DetectorParams):
+        """What may be set; the defaults suit rooms and facades scanned at millimetres."""
+
+        preset: Literal["none", "paper"] = Field(
+            "none", description="Values to begin with: those above, or those of markiewicz2015."
+        )
+        neighbourhood: Literal["cube", "radius", "knn"] = Field(
+            "cube",
+            description="From which points a normal is taken: a cube, a sphere, or the nearest "
+            "cells that hold `n_neighbours` points.",
+        )
+        neighbourhood_m: float = Field(
+            0.1, gt=0.0, le=2.0, description="Side of the cube, radius of the sphere."
+        )
+        n_neighbours: int = Field(
+            30, ge=3, le=100_000, description="Points of a neighbourhood for knn."
+        )
+        cell_m: float | None = Field(
+            None,
+            gt=0.0,
+            le=1.0,
+            description="Side of the cells that grow together; a third of the cube's side, half of "
+            "the sphere's radius, a third of `neighbourhood_m` for knn unless given.",
+        )
+        criterion: Literal["normal-and-distance", "normal"] = Field(
+            "normal-and-distance",
+            description="What must be like the region's: the normal and the distance, or the "
+            "normal alone, wherever the points lie.",
+        )
+        angle_deg: float = Field(
+            10.0, gt=0.0, le=45.0, description="Largest angle between a normal and the region's."
+        )
+        distance_m: float = Field(
+            0.015, gt=0.0, description="Largest distance of a cell's middle from the region."
+        )
+        labels: Literal["plane", "region"] = Field(
+            "plane",
+            description="What labels a point: the plane it is near, or the region it is in.",
+        )
+
+        @model_validator(mode="before")
+        @classmethod
+        def _preset_fills_in(cls, given: Any) -> Any:
+            # Any: what a user wrote, before it is checked.
+            if isinstance(given, dict) and given.get("preset") == "paper":
+                return {**_PAPER, **given}
+            return given
+
+    class In(Ports):
+        """What it works on."""
+
+        cloud: PointCloud
+
+    class Out(Ports):
+        """What it finds."""
+
+        planes: Planes
+        labels: PointLabels
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Detect the planes of a cloud."""
+        from orthoflow_plugins.plane.detecting import detect, search_sample
+        from orthoflow_plugins.plane.facing import middle_viewpoint_m
+        from orthoflow_plugins.plane.region_figures import draw_normals
+        from orthoflow_plugins.plane.region_proposer import (
+            PART_SHARE,
+            RegionProposer,
+            claim_by_region,
+        )
+        from orthoflow_plugins.plane.regions import Growth, grow
+        from orthoflow_plugins.plane.surface_cells import surface_cells
+
+        families: dict[str, Family] = {"any": "any", "vertical": "wall", "horizontal": "level"}
+        by_normal = params.criterion == "normal"
+        grown: list[Regions] = []
+
+        def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
+            growth = Growth(
+                angle_deg=params.angle_deg,
+                distance_m=None if by_normal else params.distance_m,
+                least_points=PART_SHARE * rules.least_share * len(remainder.claims),
+            )
+            cells = surface_cells(remainder, _neighbourhood(params))
+            report(0.5, "growing regions")
+            viewer_m = middle_viewpoint_m(inputs.cloud, remainder.sample.offsets_m)
+            regions = grow(cells, growth, viewer_m)
+            grown.append(regions)
+
+            def proposer(sample: Remainder) -> RegionProposer:
+                return RegionProposer(
+                    regions=regions,
+                    region_of_sample=regions.region_of(sample.points),
+                    family=families[params.constraint],
+                    tilt_most_deg=params.max_tilt_deg,
+                    least_points=rules.least_share * len(sample.claims),
+                    proposes_once=by_normal,
+                )
+
+            return search_sample(remainder, rules, report, proposer)
+
+        def relabel(found: list[FoundPlane], whole: Remainder) -> None:
+            if params.labels == "region":
+                claim_by_region(found, grown[0], whole)
+
+        detection = detect(inputs.cloud, params, ctx, find, method=self.id, relabel=relabel)
+        draw_normals(ctx, grown[0], detection.planes, inputs.cloud)
+        return self.Out(planes=detection.planes, labels=detection.labels)
+
+
+def _neighbourhood(params: Region.Params) -> Neighbourhood:
+    from orthoflow_plugins.plane.surface_cells import Neighbourhood
+
+    share = 0.5 if params.neighbourhood == "radius" else 1.0 / 3.0
+    cell_m = share * params.neighbourhood_m if params.cell_m is None else params.cell_m
+    return Neighbourhood(
+        shape=params.neighbourhood,
+        size_m=params.neighbourhood_m,
+        n_points=params.n_neighbours,
+        cell_m=cell_m,
+    )
