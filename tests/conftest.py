@@ -32,3 +32,15 @@ def shared_data() -> Path:
     if not _SHARED.is_dir():
         pytest.skip("the real test data beside the checkout (../shared/data) are not here")
     return _SHARED
+
+
+@pytest.fixture(scope="session")
+def _open3d() -> None:
+    """Skip where open3d does not load, with the sentence that a user would get."""
+    from orthoflow.errors import PluginError
+    from orthoflow.files.open3d_guard import load_open3d
+
+    try:
+        load_open3d("this test")
+    except PluginError as error:
+        pytest.skip(str(error))

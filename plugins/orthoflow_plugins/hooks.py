@@ -188,6 +188,16 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="regions grown over neighbouring points with like normals and one plane",
         ),
         MethodSpec(
+            id="plane.open3d-ransac",
+            target="orthoflow_plugins.plane.open3d_ransac:Open3dRansac",
+            summary="open3d's segment_plane, plane after plane, for comparison",
+        ),
+        MethodSpec(
+            id="plane.open3d-patches",
+            target="orthoflow_plugins.plane.open3d_patches:Open3dPatches",
+            summary="open3d's detect_planar_patches, for comparison",
+        ),
+        MethodSpec(
             id="plane.given",
             target="orthoflow_plugins.plane.given:GivenPlane",
             summary="a reference plane that the user gives",

@@ -15,6 +15,7 @@ from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import assemble
 from orthoflow_plugins.plane.candidates import FoundPlane, Rules
 from orthoflow_plugins.plane.deviations import measure_planes
+from orthoflow_plugins.plane.examining import as_proposed
 from orthoflow_plugins.plane.figures import draw_deviations
 from orthoflow_plugins.plane.parameters import DetectorParams
 from orthoflow_plugins.plane.peeling import Proposer, find_planes
@@ -137,6 +138,9 @@ def detect(
         )
     if params.thinning > 1:
         whole = prepared(cloud)
+        label(found, whole, rules.find_m)
+    if not params.refit:
+        found = [as_proposed(item, whole.up) for item in found]
         label(found, whole, rules.find_m)
     if relabel is not None:
         relabel(found, whole)

@@ -6,7 +6,7 @@ The same for every detector, so that methods differ in how they look, not in how
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -145,3 +145,11 @@ def carried(raster: SurfaceRaster, plane: Plane, up: NDArray[np.float64]) -> Sur
         cell_m=raster.cell_m,
         shape=raster.shape,
     )
+
+
+def as_proposed(item: FoundPlane, up: NDArray[np.float64]) -> FoundPlane:
+    """Give a plane back as its detector proposed it, with the rectangle that was found for it."""
+    plane = item.candidate.plane
+    if float(plane.normal @ item.raster.plane.normal) < 0.0:
+        plane = plane.flipped()
+    return replace(item, raster=carried(item.raster, plane, up))

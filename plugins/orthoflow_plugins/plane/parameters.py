@@ -61,6 +61,12 @@ class DetectorParams(MethodParams):
         description="Parts of one plane that do not touch are one plane; else each is its own.",
     )
 
+    refit: bool = Field(
+        default=True,
+        description="Fit planes to all their points, the same for every detector; else they stay "
+        "as the detector itself gave them.",
+    )
+
     @model_validator(mode="after")
     def _fit_lies_within_find(self) -> Self:
         if self.fit_tolerance_m > self.tolerance_m and "fit_tolerance_m" in self.model_fields_set:
