@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any
 
 import pytest
 
@@ -75,13 +74,8 @@ def cases() -> list[ConformanceCase]:
     ]
 
 
-def marked(case: ConformanceCase) -> Any:
-    """Comparators of open3d run where it loads."""
-    if "open3d" not in str(case):
-        return case
-    return pytest.param(case, marks=[pytest.mark.heavy, pytest.mark.usefixtures("_open3d")])
-
-
-@pytest.mark.parametrize("case", [marked(case) for case in cases()], ids=str)
-def test_our_methods_conform(case: ConformanceCase) -> None:
+@pytest.mark.parametrize("case", cases(), ids=str)
+def test_our_methods_conform(case: ConformanceCase, request: pytest.FixtureRequest) -> None:
+    if "open3d" in str(case):
+        request.getfixturevalue("_open3d")
     case.run()
