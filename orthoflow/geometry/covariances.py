@@ -40,8 +40,11 @@ def honest_covariance(
     np.add.at(normals, group, np.einsum("nij,nik->njk", jacobian, jacobian))
     left_out = np.linalg.pinv(np.eye(n_free) - normals @ cofactors) @ pulls[:, :, None]
     moves = (cofactors @ left_out)[:, :, 0]
-    spread = (names.size - 1) / names.size * moves.T @ moves
-    # In the axes in which the plain covariance is one: the larger of both along each.
+    return widened(plain, (names.size - 1) / names.size * moves.T @ moves)
+
+
+def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Give the larger of two covariances (p, p), along each axis in which the first is one."""
     root = np.linalg.cholesky(plain)
     inverse = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse @ spread @ inverse.T)

@@ -146,7 +146,7 @@ def adjust(
     )
     factor = float(np.trace(np.linalg.solve(cofactors, covariance))) / n_free
     camera = camera.shifted(-middle)
-    to_world = _moved_origin(camera, middle, n_free)
+    to_world = moved_origin(camera, middle, n_free)
     return Resection(
         camera=camera,
         covariance=to_world @ covariance @ to_world.T,
@@ -164,7 +164,7 @@ def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
     residuals = seen.pixels_photo - pixels
     linear = linearised(near, seen.points_world - middle, LensFreedom())
     with np.errstate(invalid="ignore"):
-        whitened = _whiten(_pixel_covariances(linear, seen), residuals[:, :, None])[:, :, 0]
+        whitened = whiten(_pixel_covariances(linear, seen), residuals[:, :, None])[:, :, 0]
         normalised = np.linalg.norm(whitened, axis=1)
     return Misfit(
         residuals_px=residuals, normalised=np.where(np.isfinite(normalised), normalised, np.inf)
@@ -189,6 +189,29 @@ def pixels_by_point(
     linear = linearised(camera, points_world, LensFreedom())
     derivatives: NDArray[np.float64] = linear.by_camera_point @ camera.rotation
     return derivatives
+
+
+def moved_origin(
+    camera: ViewingCamera, middle: NDArray[np.float64], n_free: int
+) -> NDArray[np.float64]:
+    """Derivative (n_free, n_free) of a camera by the parameters of the one shifted by `middle`.
+
+    t = t_local - R middle; a turn w left of R moves R middle by w x (R middle).
+    """
+    derivative = np.eye(n_free)
+    derivative[3:6, :3] = cross_matrix(camera.rotation @ middle)
+    return derivative
+
+
+def whiten(covariances: NDArray[np.float64], columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Columns (n, 2, c) in units of standard deviation: the inverse Cholesky factor applied."""
+    first = np.sqrt(covariances[:, 0, 0])
+    mixed = covariances[:, 0, 1] / first
+    second = np.sqrt(covariances[:, 1, 1] - mixed**2)
+    whitened = np.empty_like(columns)
+    whitened[:, 0] = columns[:, 0] / first[:, None]
+    whitened[:, 1] = (columns[:, 1] - mixed[:, None] * whitened[:, 0]) / second[:, None]
+    return whitened
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,7 +262,7 @@ class _Problem:
         linear = linearised(camera, seen.points_world, self._lens)
         residuals = seen.pixels_photo - linear.pixels
         both = np.concatenate([residuals[:, :, None], linear.by_parameters], axis=2)
-        both = _whiten(_pixel_covariances(linear, seen), both)
+        both = whiten(_pixel_covariances(linear, seen), both)
         length = np.linalg.norm(both[:, :, 0], axis=1)
         weight = np.minimum(1.0, self._soft_limit / np.maximum(length, 1e-12))
         both *= np.sqrt(weight)[:, None, None]
@@ -260,7 +283,7 @@ class _Problem:
         linear = linearised(camera, self._seen.points_world, self._lens)
         residuals = self._seen.pixels_photo - linear.pixels
         covariances = _pixel_covariances(linear, self._seen)
-        length = np.linalg.norm(_whiten(covariances, residuals[:, :, None])[:, :, 0], axis=1)
+        length = np.linalg.norm(whiten(covariances, residuals[:, :, None])[:, :, 0], axis=1)
         limit = self._soft_limit
         if math.isinf(limit):
             loss = length**2
@@ -280,26 +303,3 @@ def _pixel_covariances(linear: Linear, seen: SeenPoints) -> NDArray[np.float64]:
     covariances[:, [0, 1], [0, 1]] += (seen.sigma_px**2)[:, None]
     result: NDArray[np.float64] = covariances
     return result
-
-
-def _whiten(covariances: NDArray[np.float64], columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Columns (n, 2, c) in units of standard deviation: the inverse Cholesky factor applied."""
-    first = np.sqrt(covariances[:, 0, 0])
-    mixed = covariances[:, 0, 1] / first
-    second = np.sqrt(covariances[:, 1, 1] - mixed**2)
-    whitened = np.empty_like(columns)
-    whitened[:, 0] = columns[:, 0] / first[:, None]
-    whitened[:, 1] = (columns[:, 1] - mixed[:, None] * whitened[:, 0]) / second[:, None]
-    return whitened
-
-
-def _moved_origin(
-    camera: ViewingCamera, middle: NDArray[np.float64], n_free: int
-) -> NDArray[np.float64]:
-    """Derivative of the world's parameters by those around the points' middle.
-
-    t = t_local - R middle; a turn w left of R moves R middle by w x (R middle).
-    """
-    derivative = np.eye(n_free)
-    derivative[3:6, :3] = cross_matrix(camera.rotation @ middle)
-    return derivative

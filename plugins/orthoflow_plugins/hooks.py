@@ -228,6 +228,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="each photo by a direct linear transform, with or without distortion",
         ),
         MethodSpec(
+            id="orient.colmap-bundle",
+            target="orthoflow_plugins.orient.bundle:OrientColmapBundle",
+            summary="all photos at once, tied to the walls and to each other, lenses refined",
+        ),
+        MethodSpec(
             id="ortho.pointcloud-direct",
             target="orthoflow_plugins.ortho.pointcloud_direct:PointcloudDirect",
             summary="the topmost point colours its cell",

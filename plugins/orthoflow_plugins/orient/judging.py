@@ -138,6 +138,15 @@ def reason_against(case: Case) -> str:
     return ""
 
 
+def reason_to_leave_out(case: Case) -> str:
+    """Say why an orientation would harm those of other photos; empty when it would not.
+
+    What it lacks in exactness, the other photos may bring.
+    """
+    gates = (_enough_control, _enough_share, _not_by_chance, _check_agrees, _in_front)
+    return next((reason for gate in gates if (reason := gate(case))), "")
+
+
 def warnings_for(case: Case) -> list[str]:
     """Say what limits an orientation that is `ok`."""
     notes = []

@@ -1,0 +1,313 @@
+"""All photos at once: adjust, reject what does not agree, weigh anew, until nothing changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import Misfit, Resection, misfit, moved_origin
+from orthoflow_plugins.orient.block import Block, Observations, Points
+from orthoflow_plugins.orient.block_covariance import BlockCovariance, block_covariance
+from orthoflow_plugins.orient.block_solving import solve
+from orthoflow_plugins.orient.estimating import (
+    SOFT_LIMIT,
+    Estimate,
+    posed,
+    unit_deviation,
+    without_chance,
+)
+from orthoflow_plugins.orient.lens_groups import LensGroups
+from orthoflow_plugins.orient.lenses import intrinsics_of
+from orthoflow_plugins.orient.photo_ties import PhotoTies
+from orthoflow_plugins.orient.photowise import Sighting
+
+_ROUNDS: Final = 5
+_MEDIAN_LENGTH: Final = 1.1774
+_TIE_SIGMA_START_PX: Final = 0.5
+_TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
+# Scan ties of several photos at one place of the wall are one point of the scan.
+_SAME_PLACE_M: Final = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trusted:
+    """A photo whose own ties orient it beyond chance.
+
+    Attributes:
+        sight: its ties.
+        estimate: its orientation by itself.
+    """
+
+    sight: Sighting
+    estimate: Estimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adjusted:
+    """A block after its adjustment.
+
+    Attributes:
+        block: cameras, lenses and points, in a world shifted to `middle`.
+        middle: (3,) metres.
+        covariance: of all unknowns.
+        estimates: one per photo, in the world.
+        tie_sigma_px: standard deviation of a coordinate of a tie between photos, in pixels of the
+            picture it was found in; NaN without ties.
+        tie_rmse_px: root mean square of such a coordinate's residual, photo pixels; NaN without.
+        n_tie_points: points that only photos see.
+        n_tie_observations: in how many photos, added up.
+    """
+
+    block: Block
+    middle: NDArray[np.float64]
+    covariance: BlockCovariance
+    estimates: tuple[Estimate, ...]
+    tie_sigma_px: float
+    tie_rmse_px: float
+    n_tie_points: int
+    n_tie_observations: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _State:
+    """What a round of the adjustment starts from.
+
+    Attributes:
+        cameras: local.
+        tie_points: (k, 3) local.
+        agreeing: per photo, (n,) bool of its scan ties.
+        units: standard deviation of unit weight of each photo's scan ties.
+        tie_active: (m,) bool of the observations between photos.
+        tie_sigma: of these, in pixels of the picture they were found in.
+    """
+
+    cameras: tuple[ViewingCamera, ...]
+    tie_points: NDArray[np.float64]
+    agreeing: tuple[NDArray[np.bool_], ...]
+    units: tuple[float, ...]
+    tie_active: NDArray[np.bool_]
+    tie_sigma: float
+
+
+def adjust_block(photos: Sequence[Trusted], ties: PhotoTies, groups: LensGroups) -> Adjusted:
+    """Adjust photos and lenses together.
+
+    Args:
+        photos: the photos.
+        ties: between them, in the world.
+        groups: the lenses of the photos.
+
+    Raises:
+        GeometryError: the ties do not determine the block.
+    """
+    middle = np.mean([item.sight.seen.points_world.mean(axis=0) for item in photos], axis=0)
+    state = _start(photos, ties, groups, middle)
+    fits: list[Misfit] = []
+    limits: list[float] = []
+    for nth in range(_ROUNDS):
+        block = solve(_block(photos, ties, groups, state, middle), soft_limit=SOFT_LIMIT)
+        fits = [
+            misfit(item.sight.seen, camera.shifted(-middle))
+            for item, camera in zip(photos, block.cameras, strict=True)
+        ]
+        before = state
+        state, limits = _weighed(photos, ties, block, fits, before)
+        if nth >= 1 and _same(before, state):
+            break
+    covariance = block_covariance(block, soft_limit=SOFT_LIMIT)
+    estimates = tuple(
+        _estimate(at, photos[at], block, (covariance, middle), (fits[at], before, limits[at]))
+        for at in range(len(photos))
+    )
+    lengths = _tie_residuals(ties, block)[before.tie_active]
+    return Adjusted(
+        block=block,
+        middle=middle,
+        covariance=covariance,
+        estimates=estimates,
+        tie_sigma_px=before.tie_sigma if len(lengths) else math.nan,
+        tie_rmse_px=float(np.sqrt(np.mean(lengths**2) / 2.0)) if len(lengths) else math.nan,
+        n_tie_points=len(np.unique(ties.point[before.tie_active])),
+        n_tie_observations=int(before.tie_active.sum()),
+    )
+
+
+def _start(
+    photos: Sequence[Trusted],
+    ties: PhotoTies,
+    groups: LensGroups,
+    middle: NDArray[np.float64],
+) -> _State:
+    cameras: list[ViewingCamera] = []
+    for at, item in enumerate(photos):
+        lens = groups.lenses[groups.lens_of[at]]
+        own = item.estimate.resection.camera.shifted(middle)
+        if not lens.freedom.sigmas.size:
+            own = posed(lens.prior, own)
+        elif groups.lens_of.index(groups.lens_of[at]) != at:
+            # Photos that share a lens start from that of the first of them.
+            own = posed(cameras[groups.lens_of.index(groups.lens_of[at])], own)
+        cameras.append(own)
+    return _State(
+        cameras=tuple(cameras),
+        tie_points=ties.points_world - middle,
+        agreeing=tuple(item.estimate.agreeing & ~item.sight.is_check for item in photos),
+        units=tuple(max(item.estimate.resection.sigma0, 0.1) for item in photos),
+        tie_active=np.ones(len(ties.photo), dtype=np.bool_),
+        tie_sigma=_TIE_SIGMA_START_PX,
+    )
+
+
+def _block(
+    photos: Sequence[Trusted],
+    ties: PhotoTies,
+    groups: LensGroups,
+    state: _State,
+    middle: NDArray[np.float64],
+) -> Block:
+    """Join scan ties and ties between photos."""
+    used = state.agreeing
+    seen = [item.sight.seen.take(chosen) for item, chosen in zip(photos, used, strict=True)]
+    counts = [len(part) for part in seen]
+    world = np.vstack([part.points_world for part in seen])
+    sigmas = np.concatenate(
+        [unit * part.sigma_m for unit, part in zip(state.units, seen, strict=True)]
+    )
+    _, first, place = np.unique(
+        np.rint(world / _SAME_PLACE_M), axis=0, return_index=True, return_inverse=True
+    )
+    known = world[first] - middle
+    sigma_m = np.zeros(len(first))
+    np.maximum.at(sigma_m, place.ravel(), sigmas)
+    active = state.tie_active
+    control = Observations(
+        photo=np.repeat(np.arange(len(photos)), counts),
+        point=place.ravel().astype(np.intp),
+        pixels=np.vstack([part.pixels_photo for part in seen]),
+        sigma_px=np.concatenate(
+            [unit * part.sigma_px for unit, part in zip(state.units, seen, strict=True)]
+        ),
+    )
+    return Block(
+        cameras=state.cameras,
+        lens_of=groups.lens_of,
+        lenses=groups.lenses,
+        points=Points(
+            now=np.vstack([known, state.tie_points]),
+            known=np.vstack([known, state.tie_points]),
+            sigma_m=np.concatenate([sigma_m, np.full(len(state.tie_points), np.inf)]),
+        ),
+        seen=Observations(
+            photo=np.concatenate([control.photo, ties.photo[active]]),
+            point=np.concatenate([control.point, len(first) + ties.point[active]]),
+            pixels=np.vstack([control.pixels, ties.pixels[active]]),
+            sigma_px=np.concatenate([control.sigma_px, state.tie_sigma * ties.scale[active]]),
+        ),
+    )
+
+
+def _weighed(
+    photos: Sequence[Trusted],
+    ties: PhotoTies,
+    block: Block,
+    fits: Sequence[Misfit],
+    state: _State,
+) -> tuple[_State, list[float]]:
+    """Reject what disagrees with the block, and estimate how exact the rest is."""
+    agreeing, units, limits = [], [], []
+    for item, fit, used in zip(photos, fits, state.agreeing, strict=True):
+        is_check = item.sight.is_check
+        unit = unit_deviation(fit.normalised[used])
+        limit = without_chance(fit.normalised[~is_check], item.sight.rule.rejection_sigma * unit)
+        agreeing.append((fit.normalised <= limit) & ~is_check)
+        units.append(unit)
+        limits.append(limit)
+    active, sigma = state.tie_active, state.tie_sigma
+    if active.any():
+        lengths = _tie_residuals(ties, block) / ties.scale
+        # Of 2 m coordinates, 3 go into the point.
+        per_point = np.bincount(ties.point[active], minlength=len(state.tie_points))
+        left = np.maximum(2 * per_point[per_point > 0] - 3, 1).sum() / (2 * active.sum())
+        sigma = float(np.median(lengths[active]) / _MEDIAN_LENGTH / math.sqrt(left))
+        sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
+        rejection = photos[0].sight.rule.rejection_sigma
+        active = _in_several(ties.point, lengths <= rejection * sigma)
+    return (
+        _State(
+            cameras=block.cameras,
+            tie_points=block.points.now[len(block.points) - len(state.tie_points) :],
+            agreeing=tuple(agreeing),
+            units=tuple(units),
+            tie_active=active,
+            tie_sigma=sigma,
+        ),
+        limits,
+    )
+
+
+def _in_several(point: NDArray[np.intp], active: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Observations of points that at least two photos still see."""
+    counts = np.bincount(point[active], minlength=int(point.max()) + 1)
+    kept: NDArray[np.bool_] = active & (counts[point] > 1)
+    return kept
+
+
+def _tie_residuals(ties: PhotoTies, block: Block) -> NDArray[np.float64]:
+    """Length (m,) in pixels of the residuals of the ties between photos."""
+    n_points = len(ties.points_world)
+    points = block.points.now[len(block.points) - n_points :]
+    lengths = np.full(len(ties.photo), np.inf)
+    for at, camera in enumerate(block.cameras):
+        mine = ties.photo == at
+        off = camera.project(points[ties.point[mine]])[:, :2] - ties.pixels[mine]
+        found = np.linalg.norm(off, axis=1)
+        lengths[mine] = np.where(np.isfinite(found), found, np.inf)
+    return lengths
+
+
+def _same(before: _State, after: _State) -> bool:
+    """Whether another round would change nothing that matters."""
+    return all(
+        np.array_equal(first, second)
+        for first, second in zip(before.agreeing, after.agreeing, strict=True)
+    ) and np.array_equal(before.tie_active, after.tie_active)
+
+
+def _estimate(
+    at: int,
+    item: Trusted,
+    block: Block,
+    known: tuple[BlockCovariance, NDArray[np.float64]],
+    fitted: tuple[Misfit, _State, float],
+) -> Estimate:
+    """Give a photo's part of the block as an orientation of its own."""
+    (covariance, middle), (fit, state, limit) = known, fitted
+    lens = block.lenses[block.lens_of[at]]
+    columns = block.columns(at)
+    own = covariance.matrix[np.ix_(columns, columns)]
+    cofactors = covariance.cofactors[np.ix_(columns, columns)]
+    unit = state.units[at]
+    camera = block.cameras[at].shifted(-middle)
+    to_world = moved_origin(camera, middle, len(columns))
+    resection = Resection(
+        camera=camera,
+        covariance=to_world @ own @ to_world.T,
+        sigma0=unit * covariance.sigma0,
+        variance_factor=unit**2 * float(np.trace(np.linalg.solve(cofactors, own))) / len(columns),
+        lens=lens.freedom,
+    )
+    return replace(
+        item.estimate,
+        resection=resection,
+        intrinsics=intrinsics_of(resection, lens.source),
+        source=lens.source,
+        fit=fit,
+        agreeing=fit.normalised <= limit,
+        limit=limit,
+    )

@@ -1,0 +1,216 @@
+"""`orient.colmap-bundle`: all photos at once, from their ties with the walls and between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import ClassVar, Final
+
+import numpy as np
+from pydantic import Field
+
+from orthoflow.errors import GeometryError
+from orthoflow.products import Cameras, JsonValue, Photo, Photos, Ties
+from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.orient.block_estimating import Adjusted, Trusted, adjust_block
+from orthoflow_plugins.orient.estimating import estimate_pose
+from orthoflow_plugins.orient.judging import reason_to_leave_out, too_few
+from orthoflow_plugins.orient.lens_groups import (
+    Refined,
+    Sharing,
+    correlation_notes,
+    lens_groups,
+    lens_statistics,
+    lenses_json,
+)
+from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.photo_features import no_features, photo_features
+from orthoflow_plugins.orient.photo_ties import (
+    PhotoTies,
+    no_photo_ties,
+    overlapping_pairs,
+    tie_photos,
+)
+from orthoflow_plugins.orient.photowise import (
+    Oriented,
+    Sighting,
+    case_of,
+    judged,
+    refused,
+    require,
+    sighting,
+)
+from orthoflow_plugins.orient.reporting import told
+
+_SHARE_BY_ITSELF: Final = 0.4
+_SHARE_FEATURES: Final = 0.7
+
+
+class OrientColmapBundle(Method):
+    """Orient all photos at once: bundle adjustment with the scan as control.
+
+    Each photo is first oriented by itself, and one whose pose agrees with its ties no better than
+    chance stays out. Key points that photos share tie them to each other. COLMAP's cost functions
+    and the Ceres solver then adjust poses, lenses and points together: every tie with a wall pulls
+    with the standard deviation that its matcher gives, ties between photos with the one that their
+    residuals show. Lenses without calibration start from EXIF and are refined, common to the photos
+    that share a focal length. Photos are judged as in `orient.pnp`, by the same withheld ties.
+    """
+
+    id: ClassVar[str] = "orient.colmap-bundle"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "seeded"
+    citations: ClassVar[tuple[str, ...]] = (
+        "schoenberger2016: Structure-from-motion revisited (COLMAP), doi:10.1109/CVPR.2016.445",
+        "triggs2000: Bundle adjustment, a modern synthesis, doi:10.1007/3-540-44480-7_21",
+        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.3",
+    )
+
+    class Params(OrientParams):
+        """Lenses and ties between photos, and what `orient.pnp` takes, too."""
+
+        intrinsics: Sharing = Field(
+            default="focal-group",
+            description="Which photos share a lens: those of one size and one known focal length "
+            "(focal-group), all of one size (shared), or none (per-photo).",
+        )
+        refine: Refined = Field(
+            default="uncalibrated",
+            description="Which lenses the adjustment refines: uncalibrated, all, or none.",
+        )
+        photo_ties: bool = Field(
+            default=True, description="Tie the photos to each other, too, where they overlap."
+        )
+        overlap_min_share: float = Field(
+            default=0.2,
+            gt=0,
+            le=1,
+            description="Photos are tied when each shows at least this share of what the other "
+            "shows of the walls.",
+        )
+        n_features_max: int = Field(
+            default=6000, ge=100, description="Key points per photo for ties between photos."
+        )
+        n_photo_points_max: int = Field(
+            default=2000, ge=0, description="Points at most that tie photos to each other."
+        )
+
+    class In(Ports):
+        """Ties with the walls, and the photos they are in."""
+
+        ties: Ties
+        photos: Photos
+
+    class Out(Ports):
+        """One orientation per photo."""
+
+        cameras: Cameras
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Orient each photo, then all of them together."""
+        ties, photos = inputs.ties, inputs.photos.photos
+        require(ties, inputs.photos)
+        found: dict[int, Oriented] = {}
+        trusted: dict[int, Trusted] = {}
+        for nth, photo in enumerate(photos):
+            ctx.progress(_SHARE_BY_ITSELF * nth / len(photos), photo.name)
+            sight = sighting(photo, ties, params, ctx.rng)
+            result = _by_itself(sight, ties, params)
+            if isinstance(result, Trusted):
+                trusted[nth] = result
+            else:
+                found[nth] = result
+        details: dict[str, JsonValue] = {}
+        if trusted:
+            block = list(trusted.values())
+            estimates = [item.estimate for item in block]
+            adjusted = _adjusted(block, params, ctx)
+            if adjusted is not None:
+                estimates = list(adjusted.estimates)
+                details = _tell(ctx, adjusted, [item.sight.photo for item in block])
+            for at, item, estimate in zip(trusted, block, estimates, strict=True):
+                found[at] = judged(item.sight, case_of(item.sight, ties, params, estimate))
+        every = [found[nth] for nth in range(len(photos))]
+        return self.Out(cameras=told(ctx, ties, photos, every, details))
+
+    @classmethod
+    def tools(cls) -> dict[str, str]:
+        """COLMAP and Ceres adjust, OpenCV finds key points."""
+        names = ("pycolmap", "pyceres", "scipy", "opencv-python-headless")
+        return {name: version(name) for name in names}
+
+
+def _by_itself(
+    sight: Sighting, ties: Ties, params: OrientColmapBundle.Params
+) -> Trusted | Oriented:
+    """Orient a photo by its own ties; refused where they agree by chance only."""
+    reason = too_few(len(sight.seen))
+    if reason:
+        return refused(sight, reason)
+    estimate = estimate_pose(sight.photo, sight.seen, sight.is_check, sight.rule)
+    if isinstance(estimate, str):
+        return refused(sight, estimate)
+    # A wrong pose would pull at the photos that are tied to it.
+    reason = reason_to_leave_out(case_of(sight, ties, params, estimate))
+    return refused(sight, reason) if reason else Trusted(sight=sight, estimate=estimate)
+
+
+def _adjusted(
+    block: Sequence[Trusted], params: OrientColmapBundle.Params, ctx: StepContext
+) -> Adjusted | None:
+    photos = [item.sight.photo for item in block]
+    cameras = [item.estimate.resection.camera for item in block]
+    groups = lens_groups(photos, cameras, params.intrinsics, params.refine)
+    between = _photo_ties(block, params, ctx)
+    ctx.progress(_SHARE_FEATURES, "bundle adjustment")
+    try:
+        return adjust_block(block, between, groups)
+    except GeometryError as error:
+        ctx.warn(f"the photos stay as each was oriented by itself: {error}")
+        return None
+
+
+def _photo_ties(
+    block: Sequence[Trusted], params: OrientColmapBundle.Params, ctx: StepContext
+) -> PhotoTies:
+    cameras = [item.estimate.resection.camera for item in block]
+    shown = [
+        item.sight.seen.points_world[item.estimate.agreeing & ~item.sight.is_check]
+        for item in block
+    ]
+    pairs = overlapping_pairs(cameras, shown, params.overlap_min_share)
+    if not (params.photo_ties and pairs):
+        return no_photo_ties()
+    needed = {at for pair in pairs for at in pair}
+    features = []
+    for at, item in enumerate(block):
+        done = _SHARE_BY_ITSELF + (_SHARE_FEATURES - _SHARE_BY_ITSELF) * at / len(block)
+        ctx.progress(done, f"key points of {item.sight.photo.name}")
+        wanted = photo_features(item.sight.photo, params.n_features_max) if at in needed else None
+        features.append(wanted or no_features())
+    return tie_photos(cameras, features, pairs, params.n_photo_points_max)
+
+
+def _tell(ctx: StepContext, adjusted: Adjusted, photos: Sequence[Photo]) -> dict[str, JsonValue]:
+    """Tell of the block as a whole; of its photos, each tells itself."""
+    block, covariance = adjusted.block, adjusted.covariance
+    for note in correlation_notes(block, photos, covariance.cofactors):
+        ctx.warn(note)
+    ctx.metric("sigma0", covariance.sigma0, "1")
+    ctx.metric("redundancy", covariance.redundancy, "1")
+    ctx.metric("n_photo_points", adjusted.n_tie_points, "1")
+    if math.isfinite(adjusted.tie_rmse_px):
+        ctx.metric("photo_tie_rmse_px", adjusted.tie_rmse_px, "px")
+    return {
+        "sigma0": covariance.sigma0,
+        "redundancy": covariance.redundancy,
+        "lenses": lenses_json(block, photos, covariance.matrix),
+        "lens_statistics": lens_statistics(block),
+        "photo_ties": {
+            "n_points": adjusted.n_tie_points,
+            "n_observations": adjusted.n_tie_observations,
+            "sigma_px": adjusted.tie_sigma_px if np.isfinite(adjusted.tie_sigma_px) else None,
+        },
+    }

@@ -1,0 +1,234 @@
+"""Ties between photos: key points that several photos share, joined to tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.cameras import ViewingCamera, undistorted
+from orthoflow.geometry.rotations import cross_matrix
+from orthoflow_plugins.orient.photo_features import PhotoFeatures
+
+_RATIO_MOST: Final = 0.85
+_PARTNERS_MOST: Final = 8
+_BLOCK_ROWS: Final = 1024
+# The poses are known to a few pixels already.
+_OFF_LINE_MOST_PX: Final = 6.0
+_OFF_POINT_MOST_PX: Final = 8.0
+_ANGLE_LEAST: Final = np.radians(2.0)
+_UNDONE: Final = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoTies:
+    """Points that several photos see, unknown to the scan.
+
+    Attributes:
+        photo: (m,) index of the photo of each observation.
+        point: (m,) index of its point, 0..k-1, each at least twice.
+        pixels: (m, 2).
+        scale: (m,) pixels of the photo per pixel in which the key point was found.
+        points_world: (k, 3) metres, where the poses given have them.
+    """
+
+    photo: NDArray[np.intp]
+    point: NDArray[np.intp]
+    pixels: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    points_world: NDArray[np.float64]
+
+
+def no_photo_ties() -> PhotoTies:
+    """Give none."""
+    none = np.empty(0, dtype=np.intp)
+    return PhotoTies(
+        photo=none,
+        point=none,
+        pixels=np.empty((0, 2)),
+        scale=np.empty(0),
+        points_world=np.empty((0, 3)),
+    )
+
+
+def overlapping_pairs(
+    cameras: Sequence[ViewingCamera], points: Sequence[NDArray[np.float64]], least_share: float
+) -> list[tuple[int, int]]:
+    """Choose the pairs of photos that show much of the same.
+
+    Args:
+        cameras: of the photos.
+        points: (n, 3) of each photo, what it shows of the walls.
+        least_share: of one photo's points that the other must show.
+    """
+    shares = np.zeros((len(cameras), len(cameras)))
+    for first, shown in enumerate(points):
+        for second, camera in enumerate(cameras):
+            if first != second and len(shown):
+                shares[first, second] = camera.sees(camera.project(shown)[:, :2]).mean()
+    both = np.minimum(shares, shares.T)
+    pairs = set()
+    for first in range(len(cameras)):
+        for second in np.argsort(-both[first], kind="stable")[:_PARTNERS_MOST].tolist():
+            if both[first, second] >= least_share:
+                pairs.add((min(first, second), max(first, second)))
+    return sorted(pairs)
+
+
+def tie_photos(
+    cameras: Sequence[ViewingCamera],
+    features: Sequence[PhotoFeatures],
+    pairs: Sequence[tuple[int, int]],
+    n_most: int,
+) -> PhotoTies:
+    """Match key points of pairs of photos, and join what agrees with the poses to tracks.
+
+    Args:
+        cameras: of the photos, known to a few pixels.
+        features: of the photos.
+        pairs: photos to match.
+        n_most: points at most; those that most photos see are kept.
+    """
+    starts = np.concatenate([[0], np.cumsum([len(item.pixels) for item in features])])
+    rays = [_rays(camera, item.pixels) for camera, item in zip(cameras, features, strict=True)]
+    links = [np.empty((0, 2), dtype=np.intp)]
+    for first, second in pairs:
+        matched = _mutual(features[first].descriptors, features[second].descriptors)
+        off = _off_line_px(
+            (cameras[first], rays[first][matched[:, 0]]),
+            (cameras[second], rays[second][matched[:, 1]]),
+        )
+        links.append(matched[off <= _OFF_LINE_MOST_PX] + [starts[first], starts[second]])
+    tracks = _tracks(np.vstack(links), starts)
+    return _located(cameras, features, rays, tracks[:n_most], starts)
+
+
+def _rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions (n, 3) with z = 1 in camera axes; NaN where the distortion cannot be undone."""
+    a, b = (pixels - [camera.cx, camera.cy]).T / np.array([[camera.fx], [camera.fy]])
+    found = undistorted(a, b, camera.distortion)
+    rays = np.column_stack([found[0], found[1], np.ones(len(pixels))])
+    rays[~(found[2] < _UNDONE)] = np.nan
+    return rays
+
+
+def _mutual(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Pairs (n, 2) of descriptors that are each other's nearest, and distinctly so."""
+    if min(len(first), len(second)) < 2:
+        return np.empty((0, 2), dtype=np.intp)
+    norms = (second**2).sum(axis=1)
+    nearest = np.empty(len(first), dtype=np.intp)
+    distinct = np.empty(len(first), dtype=np.bool_)
+    back_best = np.full(len(second), np.inf, dtype=np.float32)
+    back = np.zeros(len(second), dtype=np.intp)
+    for start in range(0, len(first), _BLOCK_ROWS):
+        part = first[start : start + _BLOCK_ROWS]
+        distances = (part**2).sum(axis=1)[:, None] + norms - 2.0 * (part @ second.T)
+        rows = np.arange(len(part))
+        two = np.argpartition(distances, 1, axis=1)[:, :2]
+        values = np.take_along_axis(distances, two, axis=1)
+        nearest[start : start + len(part)] = two[rows, values.argmin(axis=1)]
+        distinct[start : start + len(part)] = values.min(axis=1) <= _RATIO_MOST**2 * values.max(
+            axis=1
+        )
+        best_row = distances.argmin(axis=0)
+        best = distances[best_row, np.arange(len(second))]
+        closer = best < back_best
+        back[closer], back_best[closer] = best_row[closer] + start, best[closer]
+    index = np.flatnonzero(distinct & (back[nearest] == np.arange(len(first))))
+    return np.column_stack([index, nearest[index]])
+
+
+def _off_line_px(
+    first: tuple[ViewingCamera, NDArray[np.float64]],
+    second: tuple[ViewingCamera, NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Distance (n,) in pixels of rays of the second photo from the epipolar lines of the first."""
+    rotation = second[0].rotation @ first[0].rotation.T
+    baseline = second[0].translation - rotation @ first[0].translation
+    lines = first[1] @ (cross_matrix(baseline) @ rotation).T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = np.abs((second[1] * lines).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1)
+    result: NDArray[np.float64] = np.where(np.isfinite(off), off * second[0].fx, np.inf)
+    return result
+
+
+def _tracks(links: NDArray[np.intp], starts: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Sets of linked key points, longest first; none with two points of one photo."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if not len(links):
+        return []
+    n_all = int(starts[-1])
+    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n_all, n_all))
+    label = connected_components(graph, directed=False)[1]
+    used = np.unique(links)
+    order = used[np.argsort(label[used], kind="stable")]
+    ends = np.flatnonzero(np.diff(label[order])) + 1
+    tracks = []
+    for track in np.split(order, ends):
+        photos = np.searchsorted(starts, track, side="right")
+        if len(np.unique(photos)) == len(track):
+            tracks.append(track)
+    return sorted(tracks, key=lambda track: -len(track))
+
+
+def _located(
+    cameras: Sequence[ViewingCamera],
+    features: Sequence[PhotoFeatures],
+    rays: Sequence[NDArray[np.float64]],
+    tracks: Sequence[NDArray[np.intp]],
+    starts: NDArray[np.intp],
+) -> PhotoTies:
+    """Intersect the rays of each track, and keep those that meet."""
+    kept: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
+    points: list[NDArray[np.float64]] = []
+    for track in tracks:
+        photos = np.searchsorted(starts, track, side="right") - 1
+        own = track - starts[photos]
+        directions = np.array(
+            [
+                cameras[photo].rotation.T @ rays[photo][at]
+                for photo, at in zip(photos.tolist(), own.tolist(), strict=True)
+            ]
+        )
+        centres = np.array([cameras[photo].centre_world for photo in photos.tolist()])
+        point = _intersection(centres, directions)
+        if point is None:
+            continue
+        off = [
+            cameras[photo].project(point[None])[0, :2] - features[photo].pixels[at]
+            for photo, at in zip(photos.tolist(), own.tolist(), strict=True)
+        ]
+        if np.linalg.norm(off, axis=1).max() <= _OFF_POINT_MOST_PX:
+            kept.append((photos, own))
+            points.append(point)
+    if not kept:
+        return no_photo_ties()
+    photo = np.concatenate([item[0] for item in kept])
+    own = np.concatenate([item[1] for item in kept])
+    return PhotoTies(
+        photo=photo,
+        point=np.repeat(np.arange(len(kept)), [len(item[0]) for item in kept]),
+        pixels=np.array([features[p].pixels[at] for p, at in zip(photo, own, strict=True)]),
+        scale=np.array([features[p].scale for p in photo]),
+        points_world=np.array(points),
+    )
+
+
+def _intersection(
+    centres: NDArray[np.float64], directions: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Point (3,) nearest to rays; None when they are too parallel or do not meet in front."""
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    cosines = unit @ unit.T
+    if not cosines.min() < np.cos(_ANGLE_LEAST):
+        return None
+    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+    point = np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, centres))
+    in_front = ((point - centres) * unit).sum(axis=1) > 0.0
+    return np.asarray(point) if in_front.all() else None
