@@ -18,6 +18,7 @@ from orthoflow.products import (
     Orthoimage,
     Orthoimages,
     OrthoMask,
+    Planes,
     PointLabels,
     SurfaceMask,
     Truth,
@@ -292,3 +293,43 @@ def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, trut
     context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
     with pytest.raises(MethodError, match="there is no orthoimage to inspect"):
         InspectTruth().run(empty, InspectTruth.Params(), context)
+
+
+def inspect_planes(
+    folder: Path, truth: Truth, planes: Planes | None, labels: PointLabels | None
+) -> dict[str, float]:
+    context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
+    inputs = InspectTruth.In(truth=truth, planes=planes, labels=labels)
+    InspectTruth().run(inputs, InspectTruth.Params(), context)
+    return {metric.name: metric.value for metric in context.metrics}
+
+
+def test_planes_alone_are_compared_without_orthoimages(tmp_path: Path, truth: Truth) -> None:
+    true = truth.planes
+    metrics = inspect_planes(tmp_path, truth, true, PointLabels(plane_index=truth.labels))
+    assert metrics["true_planes_found"] == metrics["true_planes"] == len(true)
+    assert metrics["worst_plane_angle_deg"] < 1e-5
+    assert metrics["worst_plane_offset_mm"] < 1e-9
+    assert metrics["label_iou"] == metrics["label_iou_mean"] == 1.0
+
+
+def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
+    tmp_path: Path, truth: Truth
+) -> None:
+    true = truth.planes
+    near, far = true.offset.copy(), true.offset.copy()
+    near[0] += 0.004
+    far[0] += 0.4
+    metrics = inspect_planes(tmp_path, truth, replace(true, offset=near), None)
+    assert metrics["plane_offset_mm"] == pytest.approx(4.0, abs=1e-6)
+    assert metrics["worst_plane_offset_mm"] == pytest.approx(4.0, abs=1e-6)
+    assert metrics["plane_angle_deg"] < 1e-5
+    lost = inspect_planes(tmp_path, truth, replace(true, offset=far), None)
+    assert lost["main_found"] == 0.0
+    assert lost["true_planes_found"] == len(true) - 1
+    assert "plane_angle_deg" not in lost
+
+
+def test_nothing_to_inspect_is_refused(tmp_path: Path, truth: Truth) -> None:
+    with pytest.raises(MethodError, match="nothing to inspect: wire orthoimages and walls, or pla"):
+        inspect_planes(tmp_path, truth, None, None)

@@ -51,6 +51,8 @@ class InspectTruth(Method):
     every cell that a photo painted is told exactly: its point on the found surface is projected
     through the estimated camera, and the ray of that pixel through the true camera meets the true
     scene at the place that the colour is of. The displacements of patches are then named `patch_`.
+
+    Without orthoimages only planes and labels are compared, as for a comparison of detectors.
     """
 
     id: ClassVar[str] = "inspect.truth"
@@ -82,9 +84,9 @@ class InspectTruth(Method):
     class In(Ports):
         """What to judge, and the truth."""
 
-        orthoimages: Orthoimages
-        walls: Walls
         truth: Truth
+        orthoimages: Orthoimages | None = None
+        walls: Walls | None = None
         planes: Planes | None = None
         labels: PointLabels | None = None
         cameras: Cameras | None = None
@@ -102,6 +104,8 @@ class InspectTruth(Method):
         from orthoflow_plugins.inspect.scores import found_planes, label_findings, sample_findings
         from orthoflow_plugins.inspect.sources import source_findings
 
+        if inputs.orthoimages is None or inputs.walls is None:
+            return self.Out(inspection=_inspect_planes(inputs, ctx))
         if not inputs.orthoimages.images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
         rule = sampling_rule(
@@ -111,7 +115,14 @@ class InspectTruth(Method):
         )
         views = _views(inputs, ctx.cores)
         poses = _pose_errors(inputs, views)
-        truth = _Truth(inputs=inputs, params=params, rule=rule, views=views, cores=ctx.cores)
+        truth = _Truth(
+            inputs=inputs,
+            walls=inputs.walls,
+            params=params,
+            rule=rule,
+            views=views,
+            cores=ctx.cores,
+        )
         verdicts: list[_Verdict] = []
         findings: list[Finding] = []
         for place, image in enumerate(inputs.orthoimages.images):
@@ -159,6 +170,16 @@ class _Verdict:
         return numbers + ([] if self.sources is None else source_findings([self.sources], wall))
 
 
+def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
+    from orthoflow_plugins.inspect.plane_truth import inspect_planes
+
+    if inputs.planes is None:
+        raise MethodError(
+            "there is nothing to inspect: wire orthoimages and walls, or planes (inspect.truth)"
+        )
+    return inspect_planes(inputs.planes, inputs.labels, inputs.truth, ctx)
+
+
 def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
     if inputs.cameras is None:
         return None
@@ -168,7 +189,7 @@ def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
 
 
 def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[PoseError, ...]:
-    if inputs.cameras is None or views is None:
+    if inputs.cameras is None or views is None or inputs.walls is None:
         return ()
     from orthoflow_plugins.inspect.poses import pose_errors
 
@@ -180,6 +201,7 @@ class _Truth:
     """What walls are judged by; `views` is None without cameras."""
 
     inputs: InspectTruth.In
+    walls: Walls
     params: InspectTruth.Params
     rule: SamplingRule
     views: SceneCameras | None
@@ -192,7 +214,7 @@ class _Truth:
         from orthoflow_plugins.inspect.sources import trace_sources
 
         inputs = self.inputs
-        wall = _wall_of(image, inputs.walls)
+        wall = _wall_of(image, self.walls)
         chosen = sampling(image, self.rule)
         true = self._true_orthoimage(image, chosen)
         sources = None
@@ -215,8 +237,8 @@ class _Truth:
             highest_elevation_deg=_detail_deg(truth, "highest_elevation_deg", 90.0),
         )
         rendering = Rendering(
-            buffer_front_m=self.inputs.walls.buffer_front_m,
-            buffer_behind_m=self.inputs.walls.buffer_behind_m,
+            buffer_front_m=self.walls.buffer_front_m,
+            buffer_behind_m=self.walls.buffer_behind_m,
             viewers=viewers,
             supersample=self.params.supersample,
             coloured=chosen.coloured,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Final
 
 import numpy as np
@@ -18,10 +19,10 @@ from orthoflow_plugins.plane.deviations import measure_planes
 from orthoflow_plugins.plane.examining import as_proposed
 from orthoflow_plugins.plane.figures import draw_deviations
 from orthoflow_plugins.plane.parameters import DetectorParams
-from orthoflow_plugins.plane.peeling import Proposer, find_planes
+from orthoflow_plugins.plane.peeling import PLANE_FOUND, Proposer, find_planes
 from orthoflow_plugins.plane.preparing import prepare, sample_alone
 from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.reporting import report_planes
+from orthoflow_plugins.plane.reporting import report_planes, report_times
 from orthoflow_plugins.plane.sampling import thinned
 from orthoflow_plugins.plane.settling import label, name_points, settle
 
@@ -114,6 +115,7 @@ def detect(
         MethodError: the points fix no plane, or none has enough of them.
     """
     rules = rules_of(params)
+    started_s = perf_counter()
     ctx.progress(0.0, "preparing the points")
 
     def prepared(points: PointCloud) -> Remainder:
@@ -126,7 +128,14 @@ def detect(
         )
 
     whole = remainder = prepared(thinned(cloud, params.thinning))
-    found = find(remainder, rules, lambda part, text: ctx.progress(0.1 + 0.7 * part, text))
+    moments_s = [started_s]
+
+    def heard(part: float, text: str) -> None:
+        if text.startswith(PLANE_FOUND):
+            moments_s.append(perf_counter())
+        ctx.progress(0.1 + 0.7 * part, text)
+
+    found = find(remainder, rules, heard)
     if not found:
         raise MethodError(
             _NO_PLANE.format(
@@ -144,6 +153,8 @@ def detect(
         label(found, whole, rules.find_m)
     if relabel is not None:
         relabel(found, whole)
+    moments_s.append(perf_counter())
+    report_times(ctx, np.diff(moments_s))
     ctx.progress(0.8, "measuring deviations")
     deviations = measure_planes(
         whole,

@@ -17,6 +17,8 @@ from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, Rules
 from orthoflow_plugins.plane.examining import examine
 from orthoflow_plugins.plane.remainders import Remainder
 
+# What the report begins with when a plane was found.
+PLANE_FOUND: Final = "plane"
 # Candidates in a row that turned out to be none, after which the search gives up.
 _REJECTED_MOST: Final = 30
 
@@ -70,5 +72,5 @@ def find_planes(
         n_rejected = 0
         slabs = np.array([item.raster.slab() for item in found])
         remainder.claim(slabs, plane.label_bounds(rules.find_m))
-        report(len(found) / rules.n_planes_most, f"plane {len(found)}")
+        report(len(found) / rules.n_planes_most, f"{PLANE_FOUND} {len(found)}")
     return found

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from orthoflow.geometry import omega_phi_deg
+from orthoflow.geometry import angle_between_deg, omega_phi_deg
 from orthoflow.products import Planes
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import Assembly
@@ -25,10 +26,41 @@ def report_planes(ctx: StepContext, assembly: Assembly, *, n_points: int) -> Non
     ctx.metric("omega_deg", omega_deg, "deg")
     ctx.metric("phi_deg", phi_deg, "deg")
     ctx.metric("offset_m", float(planes.offset[0]), "m")
+    ctx.metric("r_m", abs(float(planes.offset[0])), "m")
     ctx.metric("sigma_angle_deg", sigma_deg, "deg")
     ctx.metric("sigma_offset_mm", 1000.0 * sigma_m, "mm")
+    _report_raw(ctx, planes)
     if assembly.n_guessed:
         warn_of_guesses(ctx, assembly.n_guessed, len(planes))
+
+
+def report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
+    """Report the seconds of a detection, loading apart, as Table 1 of markiewicz2015 does.
+
+    Args:
+        ctx: takes the metrics.
+        passed_s: seconds up to each plane, and from the last one to the labels of all points.
+    """
+    ctx.metric("detection_s", float(passed_s.sum()), "s")
+    ctx.metric("first_plane_s", float(passed_s[0]), "s")
+    if len(passed_s) > 2:
+        ctx.metric("next_plane_s", float(passed_s[1:-1].mean()), "s")
+
+
+def _report_raw(ctx: StepContext, planes: Planes) -> None:
+    """Report what the detector itself said about the first plane, and how far the fit moved it."""
+    raw = planes.details["raw"]
+    if not isinstance(raw, list) or not isinstance(raw[0], dict):
+        return
+    normal = np.array(raw[0]["normal"], dtype=np.float64)
+    offset_m = float(str(raw[0]["offset_m"]))
+    omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
+    middle = planes.corners[0].mean(axis=0)
+    ctx.metric("raw_omega_deg", omega_deg, "deg")
+    ctx.metric("raw_phi_deg", phi_deg, "deg")
+    ctx.metric("raw_r_m", abs(offset_m), "m")
+    ctx.metric("raw_angle_deg", angle_between_deg(normal, planes.normal[0]), "deg")
+    ctx.metric("raw_offset_mm", 1000.0 * float(offset_m - normal @ middle), "mm")
 
 
 def warn_of_guesses(ctx: StepContext, n_guessed: int, n_planes: int) -> None:
