@@ -12,7 +12,7 @@ import pytest
 from orthoflow.catalog import discover_catalog
 from orthoflow.files.images import encode_jpeg
 from orthoflow.products import InputFiles, Product
-from orthoflow.testing import ConformanceCase, Trial, conformance_cases, run_trial
+from orthoflow.testing import ConformanceCase, Trial, conformance_cases, example, run_trial
 from tests import matching_scenes, photo_files
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
@@ -31,6 +31,9 @@ ELSEWHERE = {"ortho.dsm-backward"}
 def inputs(method_id: str) -> Mapping[str, Product | InputFiles]:
     if method_id in FILES:
         return {"files": example_files(FILES[method_id])}
+    if method_id == "inspect.truth":
+        # None of them alone is required: it judges orthoimages, or planes where there are none.
+        return {name: example(name) for name in ("orthoimages", "walls", "planes", "labels")}
     if method_id.startswith(("match.", "orient.")):
         return photographed_wall(method_id)
     return {}
