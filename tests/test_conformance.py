@@ -12,7 +12,8 @@ import pytest
 from orthoflow.catalog import discover_catalog
 from orthoflow.files.images import encode_jpeg
 from orthoflow.products import InputFiles, Product
-from orthoflow.testing import ConformanceCase, Trial, conformance_cases, example, run_trial
+from orthoflow.testing import ConformanceCase, Trial, conformance_cases, run_trial
+from orthoflow.testing.examples import example
 from tests import matching_scenes, photo_files
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
