@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError, StoreError
 from orthoflow.files import geotiff, images, publishing
+from orthoflow.files.calibration import read_calibration
 from orthoflow.geometry import WallFrame
 from orthoflow.products import (
     Camera,
@@ -314,3 +316,34 @@ def test_previews_are_small_and_do_not_darken_at_the_rim_of_voids() -> None:
     assert preview is not None
     assert preview.shape == (32, 1600, 4)
     assert set(np.unique(preview[preview[:, :, 3] > 0][:, :3])) <= {199, 200}
+
+
+def test_estimated_lenses_are_published_as_a_calibration_file(tmp_path: Path) -> None:
+    lens = Intrinsics(
+        width=30,
+        height=20,
+        fx=25.25,
+        fy=25.5,
+        cx=15.125,
+        cy=10.0,
+        distortion=(-0.1, 0.02, 1e-3, -1e-3, 0.0),
+        source="estimated",
+    )
+    pose = {
+        "rotation_camera_from_world": np.eye(3),
+        "translation_camera_from_world": np.array([0.0, 0.0, 5.0]),
+    }
+    cameras = (
+        Camera(photo="a[1].jpg", status="ok", intrinsics=lens, **pose),
+        Camera(photo="b.jpg", status="ok", intrinsics=replace(lens, source="calibration"), **pose),
+    )
+    publishing.publish_cameras(Cameras(cameras=cameras), tmp_path, DIGEST)
+    found = read_calibration(tmp_path / "calibration.yaml")
+    assert found.patterns == ("a[1].jpg",)
+    assert found.intrinsics == (replace(lens, source="calibration"),)
+
+
+def test_calibrated_lenses_are_not_published_again(tmp_path: Path) -> None:
+    refused = Camera(photo="b.jpg", status="only 3 ties, 6 are needed")
+    publishing.publish_cameras(Cameras(cameras=(refused,)), tmp_path, DIGEST)
+    assert [path.name for path in tmp_path.iterdir()] == ["cameras.json"]

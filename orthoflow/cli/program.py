@@ -20,6 +20,7 @@ _SUMMARIES: Final = {
     "show": "Summarise a finished run.",
     "report": "Write the HTML report of one or more runs.",
     "verify": "Check that a record is whole and unchanged.",
+    "export": "Write a run's results for other programs.",
     "plugins": "List the methods that are installed, or show one.",
     "schema": "Print the JSON Schema of workflow files.",
     "cache": "List or clean the store of results.",

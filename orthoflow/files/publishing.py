@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.calibration import write_calibration
 from orthoflow.files.geotiff import write_orthoimage, write_raster
 from orthoflow.files.images import preview_png, stretch_to_grey
 from orthoflow.files.sidecars import (
@@ -30,6 +31,7 @@ from orthoflow.files.sidecars import (
 )
 from orthoflow.geometry import omega_phi_deg
 from orthoflow.products import (
+    Calibration,
     Camera,
     Cameras,
     JsonValue,
@@ -141,7 +143,11 @@ def publish_ties(product: Ties, folder: Path, digest: str) -> None:
 
 
 def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
-    """Write `cameras.json`, and `ties.csv` with the residuals if the orientation kept its ties."""
+    """Write `cameras.json`, and what else the orientation found.
+
+    That is `calibration.yaml` with the lenses that it estimated, to orient other photos of them,
+    and `ties.csv` with the residuals if it kept its ties.
+    """
     write_json(
         folder / "cameras.json",
         {
@@ -151,6 +157,14 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
             "product_digest": digest,
         },
     )
+    estimated = {
+        camera.photo: camera.intrinsics
+        for camera in product.cameras
+        if camera.intrinsics is not None and camera.intrinsics.source == "estimated"
+    }
+    if estimated:
+        calibration = Calibration(patterns=tuple(estimated), intrinsics=tuple(estimated.values()))
+        write_calibration(folder / "calibration.yaml", calibration)
     if product.ties is not None:
         publish_ties(product.ties, folder, digest)
 

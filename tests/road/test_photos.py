@@ -68,6 +68,41 @@ def test_a_second_run_comes_from_the_cache(quick: Shell) -> None:
     assert quick("verify", "again").code == 0
 
 
+def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
+    import pycolmap
+
+    cameras = orthoflow.open_run(quick.folder / "run").product("orient", "cameras").cameras
+    ended = quick("export", "run", "--to", "colmap", "-o", "model")
+    assert ended.code == 0, ended.said
+    assert ended.out.startswith(f"colmap: model: {len(cameras)} photos, 1 camera, ")
+    assert ended.out.rstrip().endswith(" of orient")
+    scene = pycolmap.Reconstruction(str(quick.folder / "model"))
+    centres = {image.name: image.projection_center() for image in scene.images.values()}
+    for camera in cameras:
+        np.testing.assert_allclose(centres[camera.photo], camera.viewing().centre_world, atol=1e-9)
+    first = quick("export", "run", "--to", "colmap", "--cell", "first")
+    assert first.code == 0, first.said
+    assert (quick.folder / "run" / "colmap" / "images.txt").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--to", "colmap", "--cell", "wall"), "the cell wall holds no orientations; those"),
+        (("--to", "colmap", "--cell", "wal"), "has no cell 'wal'"),
+        (("--to", "colmap", "-o", "run"), "run exists already and is not empty"),
+        (("--to", "dwg"), "'dwg' is not 'colmap'"),
+    ],
+    ids=["no orientations", "no such cell", "folder in use", "no such format"],
+)
+def test_an_export_that_cannot_be_says_why(
+    quick: Shell, arguments: tuple[str, ...], sentence: str
+) -> None:
+    ended = quick("export", "run", *arguments)
+    assert ended.code == 2
+    assert sentence in ended.said
+
+
 @dataclass(frozen=True)
 class Survey:
     """How a surveyor's files lie in space: `metres = axes.T @ (file - shift) * unit_m`.

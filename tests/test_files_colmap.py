@@ -1,0 +1,121 @@
+"""The COLMAP text model: COLMAP opens it and sees every tie where the orientation has it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import ArgumentError
+from orthoflow.files.colmap import write_colmap_model
+from orthoflow.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from orthoflow.products import Camera, Cameras, TieRole
+from tests import block_scenes as bs
+from tests import matching_scenes as ms
+
+
+def oriented() -> Cameras:
+    """Four photos, the last of them refused; ties with exact residuals, some rejected."""
+    ties = bs.scan_ties(0, n=40)
+    cameras = [
+        ms.oriented(camera, name=name)
+        for camera, name in zip(bs.viewers(), bs.names(), strict=True)
+    ]
+    cameras[3] = Camera(photo=bs.names()[3], status="too few ties")
+    residuals = np.full_like(ties.pixels_photo, np.nan)
+    role = np.full(len(ties.photo), TieRole.REJECTED, dtype=np.uint8)
+    for index, camera in enumerate(bs.viewers()[:3]):
+        mine = ties.photo == index
+        residuals[mine] = ties.pixels_photo[mine] - camera.project(ties.points_world[mine])[:, :2]
+        role[mine] = np.where(np.arange(mine.sum()) % 5 == 0, TieRole.CHECK, TieRole.CONTROL)
+    role[np.linalg.norm(residuals, axis=1) > 3.0] = TieRole.REJECTED
+    return Cameras(cameras=tuple(cameras), ties=replace(ties, residual_px=residuals, role=role))
+
+
+def test_colmap_opens_the_model_and_sees_the_same_residuals(tmp_path: Path) -> None:
+    import pycolmap
+
+    cameras = oriented()
+    ties = cameras.ties
+    assert ties is not None
+    written = write_colmap_model(tmp_path, cameras)
+    scene = pycolmap.Reconstruction(str(tmp_path))
+    kept = ties.role != TieRole.REJECTED
+    assert (written.n_images, written.n_points) == (3, int(kept.sum()))
+    assert (scene.num_images(), scene.num_points3D()) == (3, int(kept.sum()))
+    assert {image.name for image in scene.images.values()} == set(bs.names()[:3])
+    found = []
+    for image in scene.images.values():
+        at = bs.names().index(image.name)
+        np.testing.assert_allclose(
+            image.projection_center(), bs.viewers()[at].centre_world, atol=1e-12
+        )
+        for point in image.points2D:
+            pixel = image.project_point(scene.points3D[point.point3D_id].xyz)
+            found.append(point.xy - pixel)
+    expected = ties.residual_px[kept]
+    np.testing.assert_allclose(
+        np.sort(np.linalg.norm(found, axis=1)),
+        np.sort(np.linalg.norm(expected, axis=1)),
+        atol=1e-9,
+    )
+
+
+def test_photos_of_one_lens_share_a_camera_and_k3_takes_the_fuller_model(tmp_path: Path) -> None:
+    cameras = oriented()
+    assert write_colmap_model(tmp_path, cameras).n_cameras == 1
+    first = cameras.cameras[0]
+    assert first.intrinsics is not None
+    fuller = replace(first.intrinsics, distortion=(-0.1, 0.02, 0.0, 0.0, 0.01))
+    own = replace(cameras, cameras=(replace(first, intrinsics=fuller), *cameras.cameras[1:]))
+    assert write_colmap_model(tmp_path, own).n_cameras == 2
+    models = [line.split()[1] for line in (tmp_path / "cameras.txt").read_text().splitlines()[1:]]
+    assert models == ["FULL_OPENCV", "OPENCV"]
+
+
+def test_a_place_that_two_photos_see_is_one_point(tmp_path: Path) -> None:
+    cameras = oriented()
+    ties = cameras.ties
+    assert ties is not None
+    points = ties.points_world.copy()
+    first, second = (
+        np.flatnonzero((ties.photo == at) & (ties.role != TieRole.REJECTED))[0] for at in (0, 1)
+    )
+    points[second] = points[first]
+    joined = replace(cameras, ties=replace(ties, points_world=points))
+    written = write_colmap_model(tmp_path, joined)
+    assert written.n_points == int((ties.role != TieRole.REJECTED).sum()) - 1
+
+
+def test_without_ties_the_cameras_are_written(tmp_path: Path) -> None:
+    import pycolmap
+
+    write_colmap_model(tmp_path, replace(oriented(), ties=None))
+    assert pycolmap.Reconstruction(str(tmp_path)).num_images() == 3
+
+
+def test_a_name_that_colmap_would_cut_is_refused(tmp_path: Path) -> None:
+    camera = replace(oriented().cameras[0], photo="north wall 1.jpg")
+    with pytest.raises(ArgumentError, match=r'first space, but one is "north wall 1\.jpg"'):
+        write_colmap_model(tmp_path, Cameras(cameras=(camera,)))
+
+
+def test_without_an_oriented_photo_there_is_no_model(tmp_path: Path) -> None:
+    refused = Cameras(cameras=(Camera(photo="a.png", status="too few ties"),))
+    with pytest.raises(ArgumentError, match=r"no photo is oriented"):
+        write_colmap_model(tmp_path, refused)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi])
+def test_quaternions_turn_as_their_matrix(angle: float) -> None:
+    axis = np.array([0.48, -0.6, 0.64])
+    rotation = rotation_from_vector(angle * axis)
+    w, *xyz = quaternion_from_rotation(rotation)
+    assert w >= 0.0
+    vector = 2.0 * np.arctan2(np.linalg.norm(xyz), w)
+    assert vector == pytest.approx(angle, abs=1e-8)
+    vectors = np.eye(3)
+    turned = vectors + 2.0 * np.cross(xyz, np.cross(xyz, vectors) + w * vectors)
+    np.testing.assert_allclose(turned, rotation.T, atol=1e-9)
