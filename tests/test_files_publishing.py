@@ -347,3 +347,14 @@ def test_calibrated_lenses_are_not_published_again(tmp_path: Path) -> None:
     refused = Camera(photo="b.jpg", status="only 3 ties, 6 are needed")
     publishing.publish_cameras(Cameras(cameras=(refused,)), tmp_path, DIGEST)
     assert [path.name for path in tmp_path.iterdir()] == ["cameras.json"]
+
+
+def test_the_table_of_residuals_is_published_as_it_is(tmp_path: Path) -> None:
+    row = {"photo": "a b.jpg", "role": "check", "axis": "u", "unit": "px", "n": 3, "shift_p": None}
+    cameras = Cameras(cameras=(), details={"residual_table": [row, row | {"shift_p": 0.25}]})
+    publishing.publish_cameras(cameras, tmp_path, DIGEST)
+    with (tmp_path / "residuals.csv").open() as table:
+        found = list(csv.DictReader(table))
+    assert [list(line) for line in found] == [list(row)] * 2
+    assert [line["shift_p"] for line in found] == ["", "0.25"]
+    assert found[0]["n"] == "3"

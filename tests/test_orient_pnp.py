@@ -149,6 +149,28 @@ def test_residuals_are_observed_less_computed(tmp_path: Path) -> None:
     np.testing.assert_allclose(ties.residual_px, ties.pixels_photo - computed, atol=1e-9)
 
 
+def test_the_table_of_residuals_says_what_the_ties_do(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    cameras = orient(known_ties(camera, 4), calibrated(camera), context(tmp_path))
+    ties, table = cameras.ties, cameras.details["residual_table"]
+    assert ties is not None
+    assert isinstance(table, list)
+    rows = {(row["role"], row["axis"], row["unit"]): row for row in table}
+    assert len(rows) == len(table) == 2 * 2 * 3
+    for role in (TieRole.CONTROL, TieRole.CHECK):
+        values = ties.residual_px[ties.role == role, 1]
+        row = rows[role.name.lower(), "v", "px"]
+        assert row["n"] == len(values)
+        assert row["rmse"] == pytest.approx(np.sqrt(np.mean(values**2)))
+        # 2.6 m before a lens of 840 px, a pixel is 3 mm on the wall, half a cell of 6 mm.
+        assert rows[role.name.lower(), "v", "mm"]["rmse"] == pytest.approx(
+            3.1 * row["rmse"], rel=0.1
+        )
+        assert rows[role.name.lower(), "v", "cell"]["sd"] == pytest.approx(
+            0.52 * row["sd"], rel=0.1
+        )
+
+
 def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
     ties = known_ties(camera, 5)

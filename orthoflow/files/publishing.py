@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -146,7 +147,8 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
     """Write `cameras.json`, and what else the orientation found.
 
     That is `calibration.yaml` with the lenses that it estimated, to orient other photos of them,
-    and `ties.csv` with the residuals if it kept its ties.
+    `ties.csv` with the residuals if it kept its ties, and `residuals.csv` with the rows that its
+    details have of them as `residual_table`.
     """
     write_json(
         folder / "cameras.json",
@@ -167,6 +169,19 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
         write_calibration(folder / "calibration.yaml", calibration)
     if product.ties is not None:
         publish_ties(product.ties, folder, digest)
+    table = product.details.get("residual_table")
+    if isinstance(table, list) and table:
+        write_text(folder / "residuals.csv", _table_text(table))
+
+
+def _table_text(rows: Sequence[JsonValue]) -> str:
+    """Rows of equal keys as CSV; what is absent stays empty."""
+    tables = [row for row in rows if isinstance(row, Mapping)]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(tables[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(tables)
+    return text.getvalue()
 
 
 def _publish_band(

@@ -15,7 +15,12 @@ from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
 from orthoflow_plugins.orient.estimating import Estimate, EstimationRule
 from orthoflow_plugins.orient.judging import Case, reason_against, too_few, warnings_for
 from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.residuals import PhotoNumbers, numbers_json, photo_numbers
+from orthoflow_plugins.orient.residuals import (
+    PhotoNumbers,
+    numbers_json,
+    photo_numbers,
+    residual_table,
+)
 from orthoflow_plugins.orient.splitting import withheld
 from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
@@ -55,6 +60,7 @@ class Oriented:
         residuals_px: (n, 2), NaN without an orientation.
         numbers: for the metrics, None without an orientation.
         entry: for the record.
+        table: rows of the table of residuals.
         notes: what limits it.
     """
 
@@ -64,6 +70,7 @@ class Oriented:
     residuals_px: NDArray[np.float64]
     numbers: PhotoNumbers | None = None
     entry: JsonValue = None
+    table: tuple[JsonValue, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -175,6 +182,7 @@ def judged(sight: Sighting, case: Case) -> Oriented:
         residuals_px=estimate.fit.residuals_px,
         numbers=numbers,
         entry=entry,
+        table=() if numbers is None else tuple(residual_table(case, numbers)),
         notes=(*estimate.notes, *warnings_for(case)),
     )
 

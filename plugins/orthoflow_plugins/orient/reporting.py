@@ -11,6 +11,7 @@ from orthoflow.products import Cameras, JsonValue, Photo, TieRole, Ties
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.orient.figures import draw_residuals, draw_ties
 from orthoflow_plugins.orient.photowise import Oriented, of_photo
+from orthoflow_plugins.orient.residual_tables import COLUMNS_SAID
 
 
 def told(
@@ -41,6 +42,8 @@ def told(
     draw_residuals(ctx, residuals, role)
     said: dict[str, JsonValue] = {
         "photos": {item.camera.photo: item.entry for item in found},
+        "residual_table": [row for item in found for row in item.table],
+        "residual_columns": dict(COLUMNS_SAID),
         "sigma_wall": "standard deviation of one coordinate in the wall's plane, from the "
         "covariance, RMS over what the photo shows of its walls",
     }

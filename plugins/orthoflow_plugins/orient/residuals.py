@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from orthoflow.products import JsonValue
 from orthoflow_plugins.orient.estimating import metres_per_pixel
 from orthoflow_plugins.orient.judging import Case
+from orthoflow_plugins.orient.residual_tables import residual_rows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +58,7 @@ def photo_numbers(case: Case) -> PhotoNumbers:
 
 
 def numbers_json(case: Case, numbers: PhotoNumbers) -> dict[str, JsonValue]:
-    """Give the numbers of an orientation as JSON, with those of each coordinate."""
-    residuals = case.estimate.fit.residuals_px
+    """Give the numbers of an orientation as JSON."""
     result = case.estimate.resection
     entry: dict[str, JsonValue] = {
         "n_control": numbers.n_control,
@@ -72,14 +72,6 @@ def numbers_json(case: Case, numbers: PhotoNumbers) -> dict[str, JsonValue]:
         "lens": case.estimate.source,
         "focal_px": result.camera.fx,
         "k1": float(result.camera.distortion[0]),
-        "control": {
-            "u": _column(residuals[case.control, 0]),
-            "v": _column(residuals[case.control, 1]),
-        },
-        "check": {
-            "u": _column(residuals[case.checked, 0]),
-            "v": _column(residuals[case.checked, 1]),
-        },
     }
     entry |= case.estimate.details
     if case.error is not None:
@@ -90,19 +82,16 @@ def numbers_json(case: Case, numbers: PhotoNumbers) -> dict[str, JsonValue]:
     return entry
 
 
-def _column(values: NDArray[np.float64]) -> JsonValue:
-    if not values.size:
-        return {"n": 0}
-    median = float(np.median(values))
-    return {
-        "n": values.size,
-        "mean_px": float(values.mean()),
-        "sd_px": float(values.std(ddof=1)) if values.size > 1 else 0.0,
-        "median_px": median,
-        "nmad_px": 1.4826 * float(np.median(np.abs(values - median))),
-        "rmse_px": float(np.sqrt(np.mean(values**2))),
-        "max_px": float(np.abs(values).max()),
-    }
+def residual_table(case: Case, numbers: PhotoNumbers) -> list[JsonValue]:
+    """Give the rows of the table of residuals, control and check apart."""
+    units = {"px": 1.0, "mm": numbers.pixel_mm}
+    if case.gsd_m is not None:
+        units["cell"] = numbers.pixel_mm / (1000.0 * case.gsd_m)
+    rows: list[JsonValue] = []
+    for role, chosen in (("control", case.control), ("check", case.checked)):
+        place: dict[str, JsonValue] = {"photo": case.photo.name, "role": role}
+        rows += residual_rows(place, case.estimate.fit.residuals_px[chosen], units)
+    return rows
 
 
 def _rms(residuals: NDArray[np.float64]) -> float:
