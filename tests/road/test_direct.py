@@ -14,7 +14,7 @@ import pytest
 import orthoflow
 from orthoflow.files.geotiff import read_raster
 from orthoflow.geometry import angle_between_deg
-from tests.road.conftest import Shell
+from tests.road.conftest import IS_LONG, Shell
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
 SMALL = ("--set", "room.scan_step_m=0.008", "--set", "wall.gsd_m=0.012")
@@ -168,6 +168,8 @@ def test_a_gridded_e57_gives_intensity_and_depth(shell: Shell, shared_data: Path
     assert np.nanmax(intensity) <= 1.0
 
 
+ALWAYS = ("ceiling-808/808_db.ply", "indoor-laz/indoor.laz")
+ONLY_LONG = pytest.mark.skipif(not IS_LONG, reason="every other scan: .ci/run --long")
 OTHER_SCANS = {
     "fountain-p11/cloud_from_photos.laz": ("cloud.up=-z",),
     "ceiling-808/808_db.ply": (),
@@ -180,7 +182,13 @@ OTHER_SCANS = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scan", OTHER_SCANS, ids=str)
+@pytest.mark.parametrize(
+    "scan",
+    [
+        pytest.param(scan, marks=() if scan in ALWAYS else ONLY_LONG, id=scan)
+        for scan in OTHER_SCANS
+    ],
+)
 def test_every_other_scan_goes_through_or_ends_with_a_sentence(
     shell: Shell, shared_data: Path, scan: str
 ) -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.road.conftest import Shell
+from tests.road.conftest import IS_LONG, Shell
 
 Write = Callable[[str, str], Path]
 
@@ -144,10 +143,7 @@ def test_methods_that_misbehave_fail_alone(with_stranger: Shell, write: Write) -
 
 
 @pytest.mark.long
-@pytest.mark.skipif(
-    os.environ.get("ORTHOFLOW_LONG_TESTS") != "1",
-    reason="fills the machine's memory: .ci/run --long",
-)
+@pytest.mark.skipif(not IS_LONG, reason="fills the machine's memory: .ci/run --long")
 def test_a_method_that_eats_all_memory_is_stopped_and_the_rest_goes_on(
     with_stranger: Shell, write: Write
 ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 import signal
 import subprocess
@@ -10,10 +9,10 @@ import time
 from pathlib import Path
 
 import orthoflow
-from tests.road.conftest import Shell
+from tests.road.conftest import IS_LONG, Shell
 
 SMALL = ("--set", "room.scan_step_m=0.05", "--set", "wall.gsd_m=0.05")
-KILLS = 10 if os.environ.get("ORTHOFLOW_LONG_TESTS") == "1" else 2
+KILLS = 10 if IS_LONG else 2
 
 
 def digests(run_folder: Path) -> dict[str, str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ import orthoflow
 from orthoflow.files.calibration import write_calibration
 from orthoflow.products import Calibration, Photos, PointCloud, Truth
 from orthoflow.records import Run
-from tests.road.conftest import Shell
+from tests.road.conftest import IS_LONG, Shell
 from tests.scan_files import write_las
 
 # Half of the shipped recipe's points and pixels: scan step 4 mm, photos 3 mm, cells 6 mm.
@@ -186,9 +185,7 @@ def truth_of(run: Run) -> Truth:
         "y up, feet, national grid",
         pytest.param(
             "z down",
-            marks=pytest.mark.skipif(
-                os.environ.get("ORTHOFLOW_LONG_TESTS") != "1", reason="more of it: .ci/run --long"
-            ),
+            marks=pytest.mark.skipif(not IS_LONG, reason="more of it: .ci/run --long"),
         ),
     ],
 )
