@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Final
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import basis_from_up
-from orthoflow.products import Planes, PointCloud, PointLabels
+from orthoflow.products import JsonValue, Planes, PointCloud, PointLabels
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import assemble
 from orthoflow_plugins.plane.candidates import FoundPlane, Rules
@@ -22,9 +22,11 @@ from orthoflow_plugins.plane.parameters import DetectorParams
 from orthoflow_plugins.plane.peeling import PLANE_FOUND, Proposer, find_planes
 from orthoflow_plugins.plane.preparing import prepare, sample_alone
 from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.reporting import report_planes, report_times
+from orthoflow_plugins.plane.reporting import report_planes, report_thickness, report_times
 from orthoflow_plugins.plane.sampling import thinned
 from orthoflow_plugins.plane.settling import label, name_points, settle
+from orthoflow_plugins.plane.thickness import measure_thickness, scan_row
+from orthoflow_plugins.plane.thickness_figures import draw_thickness
 
 Report = Callable[[float, str], None]
 # Plan cells of detectors that do not look at the plan.
@@ -169,8 +171,20 @@ def detect(
     report_planes(ctx, assembly, n_points=len(cloud))
     ctx.progress(0.9, "drawing")
     draw_deviations(ctx, assembly)
+    # The last of the labels is for points on no plane: a claim of -1 picks it.
+    plane_of_sample = assembly.labels_from_claims[whole.sample_claims].astype(np.int64)
+    found_thickness = measure_thickness(
+        assembly.planes, plane_of_sample, whole, cloud, reach_m=rules.fit_m
+    )
+    row = scan_row(assembly.planes, plane_of_sample, whole, cloud)
+    report_thickness(ctx, found_thickness)
+    draw_thickness(ctx, assembly.planes, found_thickness, row)
+    details: dict[str, JsonValue] = {
+        **assembly.planes.details,
+        "thickness": [None if item is None else item.to_json() for item in found_thickness],
+    }
     return Detection(
-        planes=assembly.planes,
+        planes=replace(assembly.planes, details=details),
         labels=PointLabels(plane_index=labels),
         own_tolerances_m=assembly.own_tolerances_m,
     )

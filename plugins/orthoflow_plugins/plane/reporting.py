@@ -11,6 +11,7 @@ from orthoflow.geometry import angle_between_deg, omega_phi_deg
 from orthoflow.products import Planes
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import Assembly
+from orthoflow_plugins.plane.thickness import Thickness
 
 
 def report_planes(ctx: StepContext, assembly: Assembly, *, n_points: int) -> None:
@@ -45,6 +46,19 @@ def report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
     ctx.metric("first_plane_s", float(passed_s[0]), "s")
     if len(passed_s) > 2:
         ctx.metric("next_plane_s", float(passed_s[1:-1].mean()), "s")
+
+
+def report_thickness(ctx: StepContext, found: tuple[Thickness | None, ...]) -> None:
+    """Report how thick the cloud is on the first plane, beside its scan step, and the worst."""
+    known = [item for item in found if item is not None]
+    if known:
+        ctx.metric("thickest_mm", 1000.0 * max(item.sigma_m for item in known), "mm")
+    first = found[0]
+    if first is not None:
+        ctx.metric("thickness_mm", 1000.0 * first.sigma_m, "mm")
+        ctx.metric("thickness_width_mm", 1000.0 * first.width_m, "mm")
+        ctx.metric("scan_step_mm", 1000.0 * first.scan_step_m, "mm")
+        ctx.metric("thickness_scan_steps", first.sigma_m / first.scan_step_m, "1")
 
 
 def _report_raw(ctx: StepContext, planes: Planes) -> None:
