@@ -75,6 +75,7 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         return digests(world.run(STEPS, executor="inline"))
 
 
+@pytest.mark.long  # twice in a normal run
 @pytest.mark.parametrize("attempt", range(10 if LONG else 2))
 def test_a_run_killed_at_any_moment_resumes_with_the_same_digests(
     world: World, quiet: list[str], attempt: int

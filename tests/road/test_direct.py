@@ -169,7 +169,10 @@ def test_a_gridded_e57_gives_intensity_and_depth(shell: Shell, shared_data: Path
 
 
 ALWAYS = ("ceiling-808/808_db.ply", "indoor-laz/indoor.laz")
-ONLY_LONG = pytest.mark.skipif(not IS_LONG, reason="every other scan: .ci/run --long")
+ONLY_LONG = (
+    pytest.mark.long,
+    pytest.mark.skipif(not IS_LONG, reason="every other scan: .ci/run --long"),
+)
 OTHER_SCANS = {
     "fountain-p11/cloud_from_photos.laz": ("cloud.up=-z",),
     "ceiling-808/808_db.ply": (),

@@ -8,6 +8,8 @@ import subprocess
 import time
 from pathlib import Path
 
+import pytest
+
 import orthoflow
 from tests.road.conftest import IS_LONG, Shell
 
@@ -24,6 +26,7 @@ def digests(run_folder: Path) -> dict[str, str]:
     }
 
 
+@pytest.mark.long  # twice in a normal run
 def test_killed_runs_resume_with_the_same_digests(shell: Shell) -> None:
     command = ("run", "direct.yaml", *SMALL)
     started = time.monotonic()

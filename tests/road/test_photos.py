@@ -185,7 +185,10 @@ def truth_of(run: Run) -> Truth:
         "y up, feet, national grid",
         pytest.param(
             "z down",
-            marks=pytest.mark.skipif(not IS_LONG, reason="more of it: .ci/run --long"),
+            marks=[
+                pytest.mark.long,
+                pytest.mark.skipif(not IS_LONG, reason="more of it: .ci/run --long"),
+            ],
         ),
     ],
 )
