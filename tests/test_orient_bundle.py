@@ -120,6 +120,14 @@ def test_lenses_of_their_own_have_a_mean_and_a_spread(tmp_path: Path) -> None:
     assert entry["sd"]["focal"] == pytest.approx(np.std(focals, ddof=1))
 
 
+def test_one_calibrated_photo_calibrates_all_that_share_its_lens(tmp_path: Path) -> None:
+    ties, known = bs.scan_ties(3), bs.photos(calibrated=True).photos[2]
+    uncalibrated = bs.photos(calibrated=False).photos
+    mixed = ms.photos(*uncalibrated[:2], known, uncalibrated[3])
+    together = bundle(ties, mixed, context(tmp_path), intrinsics="shared", **ALONE)
+    assert {camera.intrinsics for camera in together.cameras} == {known.intrinsics}
+
+
 def test_a_calibrated_lens_stays_unless_all_are_refined(tmp_path: Path) -> None:
     ties, photos = bs.scan_ties(4), bs.photos(calibrated=True)
     fixed = bundle(ties, photos, context(tmp_path), **ALONE)

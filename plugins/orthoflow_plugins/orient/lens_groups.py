@@ -61,7 +61,8 @@ def lens_groups(
     lenses = []
     for name in names:
         members = [index for index, key in enumerate(keys) if key == name]
-        lenses.append(_lens(photos[members[0]], [cameras[at] for at in members], refined))
+        best_known = min(members, key=lambda at: _uncertainty(photos[at]))
+        lenses.append(_lens(photos[best_known], [cameras[at] for at in members], refined))
     return LensGroups(lens_of=tuple(names.index(key) for key in keys), lenses=tuple(lenses))
 
 
@@ -155,6 +156,11 @@ def _key(index: int, photo: Photo, sharing: Sharing) -> tuple[object, ...]:
         return (*size, photo.intrinsics)
     # A focal length that nobody knows may be another one for every photo.
     return (*size, photo.exif_focal_px if photo.exif_focal_px is not None else index)
+
+
+def _uncertainty(photo: Photo) -> float:
+    """How little is known of a photo's focal length."""
+    return lens_prior(photo).freedom.focal_sigma
 
 
 def _lens(photo: Photo, cameras: Sequence[ViewingCamera], refined: Refined) -> Lens:
