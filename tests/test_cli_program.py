@@ -36,6 +36,7 @@ COMMANDS = [
     "show",
     "report",
     "verify",
+    "export",
     "plugins",
     "schema",
     "cache",
