@@ -80,21 +80,19 @@ def test_listing_loads_no_heavy_library(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["plugins", "list"]])
-def test_listing_takes_less_than_half_a_second(arguments: list[str]) -> None:
-    # Processor time, which bounds the time on the clock from below and does not count what else
-    # the machine does; the fastest of three, because the first fills the file system's cache.
-    times_s = []
-    for _ in range(3):
-        before = os.times()
-        assert orthoflow(*arguments).returncode == 0
-        after = os.times()
-        times_s.append(
-            after.children_user
-            - before.children_user
-            + after.children_system
-            - before.children_system
-        )
-    assert min(times_s) < 0.4
+def test_listing_imports_little(arguments: list[str]) -> None:
+    # What half a second allows. Times themselves depend on what else the machine does.
+    code = (
+        "import sys\n"
+        "from orthoflow.cli import program\n"
+        "try:\n"
+        f"    program.main({arguments!r})\n"
+        "except SystemExit as exit:\n"
+        "    assert exit.code == 0, exit.code\n"
+        "print(len(sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert int(done.stdout.splitlines()[-1]) < 320, done.stderr
 
 
 def test_help_names_every_command_and_every_exit_code() -> None:
