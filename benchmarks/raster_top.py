@@ -24,7 +24,7 @@ from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.raster_kernels import NO_POINT
 from orthoflow.geometry.rastering import topmost_points
-from orthoflow.geometry.slabs import OffsetPoints, Slab
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
 
@@ -78,8 +78,7 @@ def one_pass(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float
 
 
 def with_ours(cloud: PointCloud, slab: Slab, threads: int) -> tuple[NDArray, NDArray]:
-    points = OffsetPoints(origin=cloud.origin, x=cloud.x, y=cloud.y, z=cloud.z)
-    winners = topmost_points(points, slab, threads=threads)
+    winners = topmost_points(cloud, slab, threads=threads)
     has_point = winners["point"] != NO_POINT
     intensity = np.full(has_point.size, np.nan, dtype=np.float32)
     intensity[has_point] = cloud.intensity[winners["point"][has_point]]

@@ -18,18 +18,16 @@ from orthoflow.products import (
     Camera,
     Cameras,
     Orthoimage,
-    Orthoimages,
     OrthoMask,
     SurfaceMask,
     Truth,
     Wall,
-    Walls,
 )
 from orthoflow.sdk import StepContext
 from tests import scenes
+from tests.inspecting import BUFFER_M, inspect
 
 GSD_M = 0.02
-BUFFER_M = 0.15
 
 
 def simulate(folder: Path, **params: object) -> Truth:
@@ -100,7 +98,7 @@ def painted(true: TrueOrthoimage, truth: Truth) -> Orthoimage:
     )
 
 
-def inspect(
+def inspect_cameras(
     folder: Path,
     truth: Truth,
     cameras: Cameras,
@@ -120,21 +118,8 @@ def inspect(
         count=np.ones(shape, dtype=np.uint32),
         mask=np.where(true.rectangle >= 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
     )
-    context = StepContext(rng=np.random.default_rng(0), cores=2, scratch=folder)
-    inputs = InspectTruth.In(
-        orthoimages=Orthoimages(images=(painted(true, truth) if image is None else image,)),
-        walls=Walls(
-            walls=(wall,),
-            up=truth.planes.up,
-            intensity_source="laser",
-            buffer_front_m=BUFFER_M,
-            buffer_behind_m=BUFFER_M,
-        ),
-        truth=truth,
-        cameras=cameras,
-    )
-    out = InspectTruth().run(inputs, InspectTruth.Params(supersample=1), context)
-    return {metric.name: metric.value for metric in context.metrics}, out, context
+    shown = painted(true, truth) if image is None else image
+    return inspect(folder, truth, shown, wall, InspectTruth.Params(supersample=1), cameras=cameras)
 
 
 @pytest.mark.parametrize("where", ["truth", "far_truth"])
@@ -142,7 +127,7 @@ def test_true_cameras_and_true_depths_have_no_error(
     tmp_path: Path, where: str, request: pytest.FixtureRequest
 ) -> None:
     truth = request.getfixturevalue(where)
-    metrics, out, context = inspect(tmp_path, truth, true_cameras(truth))
+    metrics, out, context = inspect_cameras(tmp_path, truth, true_cameras(truth))
     assert metrics["n_photos"] == metrics["n_oriented"] == 6
     assert metrics["n_misoriented"] == 0
     # Millimetres: what is hidden by less than half a millimetre counts as seen.
@@ -169,7 +154,7 @@ def test_shifted_cameras_shift_the_image_the_other_way(
     frame = rendered(truth).frame
     shift = 0.004 * frame.u_world - 0.002 * frame.v_world + 0.001 * frame.normal_world
     cameras = Cameras(cameras=tuple(moved(c, shift) for c in true_cameras(truth).cameras))
-    metrics, out, _ = inspect(tmp_path, truth, cameras)
+    metrics, out, _ = inspect_cameras(tmp_path, truth, cameras)
     assert metrics["pose_centre_max_mm"] == pytest.approx(1e3 * np.linalg.norm(shift), rel=1e-6)
     assert metrics["pose_rotation_max_deg"] < 1e-9
     # A camera believed to stand 4 mm too far right looks 4 mm too far left for each cell: what a
@@ -187,7 +172,7 @@ def test_shifted_cameras_shift_the_image_the_other_way(
 
 
 def test_a_wrong_depth_displaces_along_the_ray(tmp_path: Path, truth: Truth) -> None:
-    metrics, _, _ = inspect(tmp_path, truth, true_cameras(truth), lift_m=0.005)
+    metrics, _, _ = inspect_cameras(tmp_path, truth, true_cameras(truth), lift_m=0.005)
     # 5 mm times the tangent of the ray's angle, at most about 33 degrees aside.
     assert 0.5 < metrics["rmse_u_mm"] < 5.0 * np.tan(np.radians(33.0))
     assert 0.5 < metrics["rmse_v_mm"] < 5.0 * np.tan(np.radians(33.0))
@@ -208,7 +193,7 @@ def test_a_cell_painted_from_the_object_is_a_ghost(tmp_path: Path, truth: Truth)
     inside = camera.sees(camera.project(points)[:, :2])
     source[rows[inside], columns[inside]] = middle
     mask = np.where(source >= 0, OrthoMask.PAINTED, OrthoMask.OCCLUDED).astype(np.uint8)
-    metrics, _, _ = inspect(
+    metrics, _, _ = inspect_cameras(
         tmp_path, truth, true_cameras(truth), image=replace(fair, source=source, mask=mask)
     )
     # The object hides 1.2 m x 1.7 m or so of 16 m2 of wall from this photo.
@@ -224,7 +209,9 @@ def test_a_cell_left_out_lowers_the_completeness(tmp_path: Path, truth: Truth) -
     fair = painted(true, truth)
     mask = fair.mask.copy()
     mask[:, : mask.shape[1] // 2] = OrthoMask.NONE
-    metrics, _, _ = inspect(tmp_path, truth, true_cameras(truth), image=replace(fair, mask=mask))
+    metrics, _, _ = inspect_cameras(
+        tmp_path, truth, true_cameras(truth), image=replace(fair, mask=mask)
+    )
     assert metrics["completeness_seen_by_both"] == pytest.approx(0.5, abs=0.1)
 
 
@@ -238,7 +225,7 @@ def test_a_stated_sigma_is_compared_with_the_error(tmp_path: Path, truth: Truth)
             *(replace(camera, sigma_wall_m=0.0015) for camera in rest),
         )
     )
-    metrics, out, _ = inspect(tmp_path, truth, cameras)
+    metrics, out, _ = inspect_cameras(tmp_path, truth, cameras)
     # Error over sigma: 30 for the first, 2 for five others; 30 is called wrong.
     assert metrics["n_misoriented"] == 1
     expected = np.sqrt((30.0**2 + 5 * 2.0**2) / 6)
@@ -254,7 +241,7 @@ def test_refused_photos_are_counted_and_paint_nothing_to_trace(
 ) -> None:
     first, *rest = true_cameras(truth).cameras
     refused = Camera(photo=first.photo, status="too few ties agree")
-    metrics, out, _ = inspect(tmp_path, truth, Cameras(cameras=(refused, *rest)))
+    metrics, out, _ = inspect_cameras(tmp_path, truth, Cameras(cameras=(refused, *rest)))
     assert metrics["n_photos"] == 6
     assert metrics["n_oriented"] == 5
     assert metrics["n_misoriented"] == 0
@@ -276,7 +263,7 @@ def test_a_camera_that_looks_away_is_called_wrong(tmp_path: Path, truth: Truth) 
     assert rotation is not None
     about = scenes.rotation_about(np.array([0.0, 1.0, 0.0]), 180.0) @ rotation
     turned = replace(first, rotation_camera_from_world=about, sigma_wall_m=0.001)
-    metrics, _, _ = inspect(tmp_path, truth, Cameras(cameras=(turned, *rest)))
+    metrics, _, _ = inspect_cameras(tmp_path, truth, Cameras(cameras=(turned, *rest)))
     assert metrics["n_misoriented"] == 1
     assert metrics["pose_rotation_max_deg"] == pytest.approx(180.0)
 
@@ -286,4 +273,4 @@ def test_cameras_of_other_photos_are_refused(tmp_path: Path, truth: Truth) -> No
     with pytest.raises(
         MethodError, match=r"the truth holds no photo holiday\.jpg, it has 6 photos"
     ):
-        inspect(tmp_path, truth, stranger)
+        inspect_cameras(tmp_path, truth, stranger)

@@ -27,9 +27,9 @@ from orthoflow.products import (
 )
 from orthoflow.sdk import StepContext
 from tests import scenes
+from tests.inspecting import BUFFER_M, inspect
 
 GSD_M = 0.014
-BUFFER_M = 0.15
 
 # Rendered once for all tests, by displacement.
 _RENDERED: dict[tuple[float, float], TrueOrthoimage] = {}
@@ -83,31 +83,6 @@ def walled(image: TrueOrthoimage) -> Wall:
             np.uint8
         ),
     )
-
-
-def inspect(
-    folder: Path,
-    truth: Truth,
-    image: Orthoimage,
-    wall: Wall,
-    params: InspectTruth.Params | None = None,
-    **more: object,
-) -> tuple[dict[str, float], InspectTruth.Out, StepContext]:
-    context = StepContext(rng=np.random.default_rng(0), cores=2, scratch=folder)
-    inputs = InspectTruth.In(
-        orthoimages=Orthoimages(images=(image,)),
-        walls=Walls(
-            walls=(wall,),
-            up=truth.planes.up,
-            intensity_source="laser",
-            buffer_front_m=BUFFER_M,
-            buffer_behind_m=BUFFER_M,
-        ),
-        truth=truth,
-        **more,  # type: ignore[arg-type] # planes and labels of the tests below
-    )
-    out = InspectTruth().run(inputs, params or InspectTruth.Params(), context)
-    return {metric.name: metric.value for metric in context.metrics}, out, context
 
 
 def test_the_true_orthoimage_has_no_error(tmp_path: Path, truth: Truth) -> None:

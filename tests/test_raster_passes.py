@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,9 @@ from orthoflow.geometry.rastering import (
     topmost_points,
     wall_from_offset,
 )
-from orthoflow.geometry.slabs import OffsetPoints, Slab
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes
-
-
-def offsets(cloud: PointCloud) -> OffsetPoints:
-    return OffsetPoints(origin=cloud.origin, x=cloud.x, y=cloud.y, z=cloud.z)
 
 
 def slab_of(wall: scenes.KnownWall, *, front_m: float = 0.15, behind_m: float = 0.15) -> Slab:
@@ -67,7 +64,7 @@ def sorted_winners(cloud: PointCloud, slab: Slab) -> NDArray[np.uint32]:
 def test_the_topmost_point_is_the_one_that_sorting_finds(seed: int) -> None:
     wall = scenes.upright_wall(shape=(60, 80))
     cloud, slab = random_cloud(wall, n_points=60_000, seed=seed), slab_of(wall)
-    winners = topmost_points(offsets(cloud), slab, threads=2)
+    winners = topmost_points(cloud, slab, threads=2)
     np.testing.assert_array_equal(winners["point"], sorted_winners(cloud, slab))
 
 
@@ -75,22 +72,22 @@ def test_the_topmost_point_is_the_one_that_sorting_finds(seed: int) -> None:
 def test_no_bit_depends_on_the_number_of_threads(threads: int) -> None:
     wall = scenes.leaning_wall(shape=(60, 80))
     cloud, slab = random_cloud(wall, n_points=60_000, seed=1), slab_of(wall)
-    alone = topmost_points(offsets(cloud), slab, threads=1)
-    shared = topmost_points(offsets(cloud), slab, threads=threads)
+    alone = topmost_points(cloud, slab, threads=1)
+    shared = topmost_points(cloud, slab, threads=threads)
     np.testing.assert_array_equal(alone, shared)
 
 
 def test_of_equal_points_the_first_wins() -> None:
     wall = scenes.upright_wall()
     twins = wall.world(np.full(5, 3.5), np.full(5, 4.5), np.zeros(5))
-    winners = topmost_points(offsets(scenes.cloud_of(twins)), slab_of(wall), threads=1)
+    winners = topmost_points(scenes.cloud_of(twins), slab_of(wall), threads=1)
     assert winners["point"][4 * 40 + 3] == 0
 
 
 def test_a_cell_owns_its_left_and_upper_border() -> None:
     wall = scenes.upright_wall()
     corners = wall.world(np.array([7.0, 0.0, 40.0]), np.array([5.0, 0.0, 0.0]), np.zeros(3))
-    winners = topmost_points(offsets(scenes.cloud_of(corners)), slab_of(wall), threads=1)
+    winners = topmost_points(scenes.cloud_of(corners), slab_of(wall), threads=1)
     assert np.flatnonzero(winners["point"] != NO_POINT).tolist() == [0, 5 * 40 + 7]
 
 
@@ -99,7 +96,7 @@ def test_both_ends_of_the_buffer_are_inside() -> None:
     depths_m = np.array([0.25, 0.2500001, -0.5, -0.5000001])
     points = wall.world(np.array([0.5, 1.5, 2.5, 3.5]), np.full(4, 0.5), depths_m)
     winners = topmost_points(
-        offsets(scenes.cloud_of(points)), slab_of(wall, front_m=0.25, behind_m=0.5), threads=1
+        scenes.cloud_of(points), slab_of(wall, front_m=0.25, behind_m=0.5), threads=1
     )
     assert np.flatnonzero(winners["point"] != NO_POINT).tolist() == [0, 2]
 
@@ -170,7 +167,7 @@ def test_inputs_may_be_read_only_and_mapped(tmp_path: Path) -> None:
     cloud, slab = random_cloud(wall, n_points=1000, seed=2), slab_of(wall)
     np.save(tmp_path / "x.npy", cloud.x)
     mapped = np.load(tmp_path / "x.npy", mmap_mode="r")
-    points = OffsetPoints(origin=cloud.origin, x=mapped, y=cloud.y, z=cloud.z)
+    points = replace(cloud, x=mapped)
     np.testing.assert_array_equal(
         topmost_points(points, slab, threads=1)["point"], sorted_winners(cloud, slab)
     )

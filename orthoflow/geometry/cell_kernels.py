@@ -185,6 +185,15 @@ def merge_cells(
 
 
 @compiled
+def _known_cell(
+    brick: int, voxel: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]
+) -> int:
+    """Give the number of a cell, -1 if it has none."""
+    slot = bricks[brick] if brick >= 0 else -1
+    return numbers[slot, voxel] if slot >= 0 else -1
+
+
+@compiled
 def find_cells(
     points: BlockedPoints,
     frame: NDArray[np.float32],
@@ -198,9 +207,7 @@ def find_cells(
     for start in range(0, points.x.size, BLOCK_POINTS):
         count = place_points(points, start, frame, bricks.shape, where)
         for i in range(count):
-            brick = where[0, i]
-            slot = flat[brick] if brick >= 0 else -1
-            found[start + i] = numbers[slot, where[1, i]] if slot >= 0 else -1
+            found[start + i] = _known_cell(where[0, i], where[1, i], flat, numbers)
 
 
 @compiled
@@ -218,7 +225,5 @@ def claim_cells(
     for start in range(0, points.x.size, BLOCK_POINTS):
         count = place_points(points, start, frame, bricks.shape, where)
         for i in range(count):
-            brick = where[0, i]
-            slot = flat[brick] if brick >= 0 else -1
-            cell = numbers[slot, where[1, i]] if slot >= 0 else -1
+            cell = _known_cell(where[0, i], where[1, i], flat, numbers)
             claims[start + i] = owners[cell] if cell >= 0 else -1

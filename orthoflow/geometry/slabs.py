@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,21 +11,24 @@ from numpy.typing import NDArray
 from orthoflow.geometry.frames import WallFrame
 
 
-@dataclass(frozen=True, kw_only=True)
-class OffsetPoints:
-    """Points as a cloud keeps them.
+class OffsetPoints(Protocol):
+    """What the raster passes read of a `PointCloud`."""
 
-    Attributes:
-        origin: (3,) float64 metres.
-        x: (n,) float32 metres from the origin; y and z alike.
-        y: see x.
-        z: see x.
-    """
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """(3,) metres."""
 
-    origin: NDArray[np.float64]
-    x: NDArray[np.float32]
-    y: NDArray[np.float32]
-    z: NDArray[np.float32]
+    @property
+    def x(self) -> NDArray[np.float32]:
+        """(n,) metres from the origin along x."""
+
+    @property
+    def y(self) -> NDArray[np.float32]:
+        """(n,) metres from the origin along y."""
+
+    @property
+    def z(self) -> NDArray[np.float32]:
+        """(n,) metres from the origin along z."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import shutil
 import subprocess
@@ -73,6 +74,12 @@ class Shell:
             stdin=subprocess.DEVNULL,
         )
         return Ended(completed.returncode, completed.stdout, completed.stderr)
+
+
+def metrics_of(folder: Path) -> dict[tuple[str, str], float]:
+    """Metrics of a run's folder by cell and name."""
+    with (folder / "products" / "metrics.csv").open() as table:
+        return {(row["cell"], row["metric"]): float(row["value"]) for row in csv.DictReader(table)}
 
 
 @pytest.fixture(scope="session")

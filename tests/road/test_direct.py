@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ import pytest
 import orthoflow
 from orthoflow.files.geotiff import read_raster
 from orthoflow.geometry import angle_between_deg
-from tests.road.conftest import IS_LONG, Shell
+from tests.road.conftest import IS_LONG, Shell, metrics_of
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
 SMALL = ("--set", "room.scan_step_m=0.008", "--set", "wall.gsd_m=0.012")
@@ -37,12 +35,6 @@ def planes_of(folder: Path) -> list[dict[str, object]]:
         (folder / "products" / "plane" / "planes.json").read_text()
     )["planes"]
     return found
-
-
-def metrics_of(folder: Path) -> Mapping[tuple[str, str], float]:
-    with (folder / "products" / "metrics.csv").open() as table:
-        rows = list(csv.DictReader(table))
-    return {(row["cell"], row["metric"]): float(row["value"]) for row in rows}
 
 
 def test_a_second_run_comes_from_the_cache_and_says_so(road: Shell) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import pytest
 
 from orthoflow.workflow import shipped_workflow
-from tests.road.conftest import Shell
+from tests.road.conftest import Shell, metrics_of
 
 SMALL = (
     *("--set", "room.scan_step_m=0.004", "--set", "room.photo_gsd_m=0.003"),
@@ -28,8 +27,7 @@ def table(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Table:
     (shell.folder / "quick.yaml").write_text("\n".join(quick))
     ended = shell("run", "quick.yaml", *SMALL, "-o", "run", timeout_s=1200)
     assert ended.code == 0, ended.said
-    with (shell.folder / "run" / "products" / "metrics.csv").open() as rows:
-        return {(row["cell"], row["metric"]): float(row["value"]) for row in csv.DictReader(rows)}
+    return metrics_of(shell.folder / "run")
 
 
 def of(table: Table, step: str, orient: str, metric: str) -> float:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +15,7 @@ import orthoflow
 from orthoflow.files.calibration import write_calibration
 from orthoflow.products import Calibration, Photos, PointCloud, Truth
 from orthoflow.records import Run
-from tests.road.conftest import IS_LONG, Shell
+from tests.road.conftest import IS_LONG, Shell, metrics_of
 from tests.scan_files import write_las
 
 # Half of the shipped recipe's points and pixels: scan step 4 mm, photos 3 mm, cells 6 mm.
@@ -43,12 +41,6 @@ def quick(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
     assert str(Path("run") / "report.html") in ended.out
     assert "wall_0_ortho.tif" in ended.out
     return shell
-
-
-def metrics_of(folder: Path) -> Mapping[tuple[str, str], float]:
-    with (folder / "products" / "metrics.csv").open() as table:
-        rows = list(csv.DictReader(table))
-    return {(row["cell"], row["metric"]): float(row["value"]) for row in rows}
 
 
 def test_the_orthoimages_of_the_simulated_room_are_true(quick: Shell) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import pytest
 
 from orthoflow.workflow import shipped_workflow
-from tests.road.conftest import Shell
+from tests.road.conftest import Shell, metrics_of
 
 DETECTORS = (
     "hough2d", "hough3d", "hough3d-full", "ransac", "ransac-2d", "region", "region-normals",
@@ -29,10 +28,9 @@ def table(
     ended = shell("run", "quick.yaml", *coarse, "-o", "run", timeout_s=900)
     assert ended.code == 0, ended.said
     metrics = {}
-    with (shell.folder / "run" / "products" / "metrics.csv").open() as rows:
-        for row in csv.DictReader(rows):
-            step, _, variant = row["cell"].partition("@plane=")
-            metrics[step, variant, row["metric"]] = float(row["value"])
+    for (cell, name), value in metrics_of(shell.folder / "run").items():
+        step, _, variant = cell.partition("@plane=")
+        metrics[step, variant, name] = value
     return metrics
 
 

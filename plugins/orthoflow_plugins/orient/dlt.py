@@ -28,7 +28,7 @@ from orthoflow_plugins.orient.estimating import (
     robust_start,
 )
 from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.photowise import oriented_by_itself, require, sighting
+from orthoflow_plugins.orient.photowise import each_by_itself
 from orthoflow_plugins.orient.reporting import told
 
 Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
@@ -92,15 +92,9 @@ class OrientDlt(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Orient the photos one after the other."""
-        ties, photos = inputs.ties, inputs.photos.photos
-        require(ties, inputs.photos)
         estimator = partial(estimate_dlt, distortion=params.distortion)
-        found = []
-        for nth, photo in enumerate(photos):
-            ctx.progress(nth / len(photos), photo.name)
-            sight = sighting(photo, ties, params, ctx.rng)
-            found.append(oriented_by_itself(sight, ties, params, estimator))
-        return self.Out(cameras=told(ctx, ties, photos, found))
+        found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
+        return self.Out(cameras=told(ctx, inputs.ties, inputs.photos.photos, found))
 
     @classmethod
     def tools(cls) -> dict[str, str]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
+from orthoflow.sdk import StepContext
 from orthoflow_plugins.orient.estimating import Estimate, EstimationRule
 from orthoflow_plugins.orient.judging import Case, reason_against, too_few, warnings_for
 from orthoflow_plugins.orient.parameters import OrientParams
@@ -125,10 +126,24 @@ def sighting(photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Gene
     )
 
 
-def oriented_by_itself(
-    sight: Sighting, ties: Ties, params: OrientParams, estimator: Estimator
-) -> Oriented:
-    """Orient a photo by its own ties alone, and judge it."""
+def each_by_itself(
+    ties: Ties, photos: Photos, params: OrientParams, ctx: StepContext, estimator: Estimator
+) -> list[Oriented]:
+    """Orient the photos one after the other by their own ties alone, and judge each.
+
+    Raises:
+        MethodError: no photos, no ties, or ties of other photos.
+    """
+    require(ties, photos)
+    found = []
+    for nth, photo in enumerate(photos.photos):
+        ctx.progress(nth / len(photos.photos), photo.name)
+        sight = sighting(photo, ties, params, ctx.rng)
+        found.append(_by_itself(sight, ties, params, estimator))
+    return found
+
+
+def _by_itself(sight: Sighting, ties: Ties, params: OrientParams, estimator: Estimator) -> Oriented:
     reason = too_few(len(sight.seen))
     if reason:
         return refused(sight, reason)

@@ -10,7 +10,7 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.estimating import estimate_pose
 from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.photowise import oriented_by_itself, require, sighting
+from orthoflow_plugins.orient.photowise import each_by_itself
 from orthoflow_plugins.orient.reporting import told
 
 
@@ -48,14 +48,8 @@ class OrientPnp(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Orient the photos one after the other."""
-        ties, photos = inputs.ties, inputs.photos.photos
-        require(ties, inputs.photos)
-        found = []
-        for nth, photo in enumerate(photos):
-            ctx.progress(nth / len(photos), photo.name)
-            sight = sighting(photo, ties, params, ctx.rng)
-            found.append(oriented_by_itself(sight, ties, params, estimate_pose))
-        return self.Out(cameras=told(ctx, ties, photos, found))
+        found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimate_pose)
+        return self.Out(cameras=told(ctx, inputs.ties, inputs.photos.photos, found))
 
     @classmethod
     def tools(cls) -> dict[str, str]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.slabs import OffsetPoints, Slab
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
@@ -119,9 +119,8 @@ def _project(
     from orthoflow.geometry.rastering import topmost_points
 
     cloud, walls = inputs.cloud, inputs.walls
-    points = OffsetPoints(origin=cloud.origin, x=cloud.x, y=cloud.y, z=cloud.z)
     slab = Slab(frame=wall.frame, front_m=walls.buffer_front_m, behind_m=walls.buffer_behind_m)
-    winners = topmost_points(points, slab, threads=threads)
+    winners = topmost_points(cloud, slab, threads=threads)
     has_point = winners["point"] != NO_POINT
     rgb = np.zeros((slab.n_cells, 3), dtype=np.uint8)
     rgb[has_point] = colours[winners["point"][has_point]]

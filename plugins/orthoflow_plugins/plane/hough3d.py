@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from orthoflow_plugins.plane.candidates import Family, FoundPlane, Rules
+    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
     from orthoflow_plugins.plane.detecting import Report
     from orthoflow_plugins.plane.remainders import Remainder
 
@@ -81,7 +81,6 @@ class Hough3d(Method):
         from orthoflow_plugins.plane.peeling import find_planes
         from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
 
-        families: dict[str, Family] = {"any": "any", "vertical": "wall", "horizontal": "level"}
         pictures: list[NDArray[np.float64]] = []
         coarser = 1.0 if params.search == "full" else 2.0
 
@@ -90,7 +89,7 @@ class Hough3d(Method):
                 cell_m=coarser * params.cell_m,
                 angle_step_deg=coarser * params.angle_step_deg,
                 least_points=params.min_share * len(remainder.claims),
-                family=families[params.constraint],
+                family=params.family,
                 tilt_most_deg=params.max_tilt_deg,
                 is_raw=params.coordinates == "raw",
             )

@@ -13,7 +13,7 @@ from orthoflow_plugins.plane.open3d_ransac import open3d_version
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Family, FoundPlane, Rules
+    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
     from orthoflow_plugins.plane.detecting import Report
     from orthoflow_plugins.plane.remainders import Remainder
 
@@ -72,7 +72,6 @@ class Open3dPatches(Method):
         from orthoflow_plugins.plane.peeling import find_planes
 
         open3d = load_open3d(self.id)
-        families: dict[str, Family] = {"any": "any", "vertical": "wall", "horizontal": "level"}
 
         def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
             search = PatchSearch(
@@ -82,7 +81,7 @@ class Open3dPatches(Method):
                 outlier_share=params.outlier_share,
                 least_points=max(10, int(0.2 * rules.least_share * len(remainder.claims))),
             )
-            proposer = patches(open3d, remainder, search, families[params.constraint])
+            proposer = patches(open3d, remainder, search, params.family)
             return find_planes(remainder, proposer, rules, report)
 
         detection = detect(inputs.cloud, params, ctx, find, method=self.id)

@@ -13,7 +13,7 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Family, FoundPlane, Rules
+    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
     from orthoflow_plugins.plane.detecting import Report
     from orthoflow_plugins.plane.remainders import Remainder
 
@@ -70,12 +70,11 @@ class Open3dRansac(Method):
 
         open3d = load_open3d(self.id)
         open3d.utility.random.seed(int(ctx.rng.integers(2**31)))
-        families: dict[str, Family] = {"any": "any", "vertical": "wall", "horizontal": "level"}
 
         def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
             proposer = SegmentProposer(
                 open3d=open3d,
-                family=families[params.constraint],
+                family=params.family,
                 tolerance_m=rules.find_m,
                 n_iterations=params.n_iterations,
                 least_points=rules.least_share * len(remainder.claims),

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from orthoflow.sdk import MethodParams
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.plane.candidates import Family
+
+_FAMILIES: Final[Mapping[str, Family]] = {"any": "any", "vertical": "wall", "horizontal": "level"}
 
 
 class DetectorParams(MethodParams):
@@ -66,6 +72,11 @@ class DetectorParams(MethodParams):
         description="Fit planes to all their points, the same for every detector; else they stay "
         "as the detector itself gave them.",
     )
+
+    @property
+    def family(self) -> Family:
+        """The planes that `constraint` asks for."""
+        return _FAMILIES[self.constraint]
 
     @model_validator(mode="after")
     def _fit_lies_within_find(self) -> Self:

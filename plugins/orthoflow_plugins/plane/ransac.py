@@ -11,7 +11,7 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Family, FoundPlane, Rules
+    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
     from orthoflow_plugins.plane.detecting import Report
     from orthoflow_plugins.plane.remainders import Remainder
 
@@ -86,15 +86,13 @@ class Ransac(Method):
         from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
         from orthoflow_plugins.plane.detecting import detect, search_sample
 
-        families: dict[str, Family] = {"any": "any", "vertical": "wall", "horizontal": "level"}
-
         def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
             search = Search(
                 model=params.model,
                 scoring=params.scoring,
                 n_hypotheses=params.n_hypotheses,
                 find_m=rules.find_m,
-                family=families[params.constraint],
+                family=params.family,
                 tilt_most_deg=params.max_tilt_deg,
                 least_share=params.min_share,
             )

@@ -11,7 +11,7 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Family, FoundPlane, Rules
+    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
     from orthoflow_plugins.plane.detecting import Report
     from orthoflow_plugins.plane.regions import Regions
     from orthoflow_plugins.plane.remainders import Remainder
@@ -134,7 +134,6 @@ class Region(Method):
         from orthoflow_plugins.plane.regions import Growth, grow
         from orthoflow_plugins.plane.surface_cells import surface_cells
 
-        families: dict[str, Family] = {"any": "any", "vertical": "wall", "horizontal": "level"}
         by_normal = params.criterion == "normal"
         grown: list[Regions] = []
 
@@ -154,7 +153,7 @@ class Region(Method):
                 return RegionProposer(
                     regions=regions,
                     region_of_sample=regions.region_of(sample.points),
-                    family=families[params.constraint],
+                    family=params.family,
                     tilt_most_deg=params.max_tilt_deg,
                     least_points=rules.least_share * len(sample.claims),
                     proposes_once=by_normal,

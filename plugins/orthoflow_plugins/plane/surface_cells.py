@@ -33,6 +33,7 @@ from orthoflow.geometry.point_kernels import (
 from orthoflow.geometry.region_kernels import fit_neighbourhoods
 from orthoflow.geometry.voxel_kernels import BRICK_SIDE
 from orthoflow_plugins.plane.remainders import Remainder
+from orthoflow_plugins.plane.voxels import coarsened
 
 T = TypeVar("T", bound=np.generic)
 Shape = Literal["cube", "radius", "knn"]
@@ -41,8 +42,6 @@ Shape = Literal["cube", "radius", "knn"]
 _POINTS_LEAST: Final = 16.0
 # A cell is no larger than this share of the scene.
 _CELL_SHARE_MOST: Final = 0.05
-# More bricks than this in the table of a scene cost more than they show; the cells grow instead.
-_BRICKS_MOST: Final = 8_000_000
 # Rows and cells that tables begin with.
 _ROWS_FIRST: Final = 4_096
 _CELLS_FIRST: Final = 131_072
@@ -235,8 +234,7 @@ def _cell_grid(remainder: Remainder, wanted: Neighbourhood) -> PlanGrid:
     scale = math.sqrt(_POINTS_LEAST / max(in_neighbourhood, 1e-9))
     cell_m = wanted.cell_m * scale if scale > 1.0 else wanted.cell_m
     cell_m = min(cell_m, max(wanted.cell_m, _CELL_SHARE_MOST * float(extent_m.max())))
-    brick_m3 = float(np.prod(extent_m + BRICK_SIDE * cell_m)) / _BRICKS_MOST
-    cell_m = max(cell_m, math.cbrt(brick_m3) / BRICK_SIDE)
+    cell_m = coarsened(cell_m, extent_m)
     n_cells = np.maximum(1, np.ceil(extent_m / cell_m)).astype(int)
     return PlanGrid(
         basis=grid.basis,

@@ -30,6 +30,12 @@ class Places:
     weights: NDArray[np.int32]
 
 
+def coarsened(cell_m: float, extent_m: NDArray[np.float64]) -> float:
+    """Enlarge cells until a scene of (3,) this size has at most `_BRICKS_MOST` bricks of them."""
+    brick_m3 = float(np.prod(extent_m + BRICK_SIDE * cell_m)) / _BRICKS_MOST
+    return max(cell_m, math.cbrt(brick_m3) / BRICK_SIDE)
+
+
 class VoxelCounts:
     """Counts the unclaimed points of a cloud per voxel.
 
@@ -45,8 +51,7 @@ class VoxelCounts:
         grid = remainder.grid
         self.basis = grid.basis
         self.extent_m = np.array(grid.shape) * grid.cell_m
-        brick_m3 = float(np.prod(self.extent_m + BRICK_SIDE * cell_m)) / _BRICKS_MOST
-        self.cell_m = max(cell_m, math.cbrt(brick_m3) / BRICK_SIDE)
+        self.cell_m = coarsened(cell_m, self.extent_m)
         self.middle_m = grid.low_m + 0.5 * self.extent_m
         shape = np.ceil(self.extent_m / (BRICK_SIDE * self.cell_m)).astype(int)
         self._low_m = grid.low_m

@@ -17,7 +17,7 @@ from orthoflow.geometry.rastering import (
     share_cells,
     spread_m,
 )
-from orthoflow.geometry.slabs import OffsetPoints, Slab
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow_plugins.raster.rules import SurfaceRule
 
@@ -41,11 +41,6 @@ class CellSurface:
     rgb: NDArray[np.uint8] | None
 
 
-def offset_points(cloud: PointCloud) -> OffsetPoints:
-    """Give the coordinates of a cloud as the raster passes read them."""
-    return OffsetPoints(origin=cloud.origin, x=cloud.x, y=cloud.y, z=cloud.z)
-
-
 def surface_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """Lay a cloud into the raster of a wall."""
     if rule.surface in {"nearest", "topmost"}:
@@ -57,7 +52,7 @@ def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> Cel
     """One pass: the winning point gives depth, intensity and colour."""
     winners, moments = empty_winners(slab.n_cells), np.zeros((slab.n_cells, 2))
     keep = kernels.keep_topmost if rule.surface == "topmost" else kernels.keep_nearest
-    for entries in entries_inside(offset_points(cloud), slab, threads=rule.threads):
+    for entries in entries_inside(cloud, slab, threads=rule.threads):
         share_cells(
             rule.threads,
             partial(keep, entries, winners),
@@ -98,7 +93,7 @@ def _gathered_rgb(
 def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """Two or three passes: count, sort if a median is wanted, average what lies on the surface."""
     count, moments = np.zeros(slab.n_cells, dtype=np.uint32), np.zeros((slab.n_cells, 2))
-    for entries in entries_inside(offset_points(cloud), slab, threads=rule.threads):
+    for entries in entries_inside(cloud, slab, threads=rule.threads):
         share_cells(
             rule.threads,
             partial(kernels.count_points, entries, count),
@@ -126,7 +121,7 @@ def _medians_m(
     ends = np.cumsum(count, dtype=np.int64)
     cursors = ends - count
     sorted_m = np.empty(int(ends[-1]), dtype=np.float32)
-    for entries in entries_inside(offset_points(cloud), slab, threads=rule.threads):
+    for entries in entries_inside(cloud, slab, threads=rule.threads):
         share_cells(rule.threads, partial(kernels.sort_into_cells, entries, cursors, sorted_m))
     medians_m = np.empty(slab.n_cells, dtype=np.float32)
     in_parts(
@@ -150,7 +145,7 @@ def _averaged_values(
         for values in channels
     ]
     if channels:
-        for entries in entries_inside(offset_points(cloud), slab, threads=threads):
+        for entries in entries_inside(cloud, slab, threads=threads):
             passes = [
                 partial(kernels.add_values, entries, values, depth_m, layer_m, sum_of_values)
                 for values, sum_of_values in zip(channels, sums, strict=True)
