@@ -5,9 +5,15 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+from base64 import b64decode
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 import pytest
+
+from orthoflow.sdk import StepContext
+from orthoflow.sdk.context import Drawing
 
 _ROOT = Path(__file__).resolve().parents[1]
 
@@ -22,6 +28,13 @@ def _sources_digest() -> str:
 os.environ.setdefault(
     "NUMBA_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"orthoflow-kernels-{_sources_digest()}")
 )
+
+# A PNG of one pixel.
+_DOT: Final = b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg=="
+)
+
+_FIGURE: Final = StepContext.figure
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -44,3 +57,21 @@ def _open3d() -> None:
         load_open3d("this test")
     except PluginError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _undrawn_charts() -> Iterator[None]:
+    """Keep a dot in the place of every chart: drawing takes longer than what most tests look at."""
+
+    def figure(self: StepContext, name: str, content: bytes | Drawing, caption: str = "") -> None:
+        _FIGURE(self, name, content if isinstance(content, bytes) else _DOT, caption)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StepContext, "figure", figure)
+        yield
+
+
+@pytest.fixture
+def charts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw charts in this test all the same."""
+    monkeypatch.setattr(StepContext, "figure", _FIGURE)

@@ -339,6 +339,7 @@ def test_scan_numbers_of_the_points_outvote_a_nearer_station(tmp_path: Path) -> 
     assert planes.normal[0] @ (0.0, 1.0, 0.0) < -0.99
 
 
+@pytest.mark.usefixtures("charts")
 def test_metrics_and_figures_tell_of_the_first_plane(tmp_path: Path) -> None:
     ctx = context(tmp_path)
     out = Hough2d().run(

@@ -196,6 +196,7 @@ def test_the_scatter_of_normals_follows_noise_and_neighbourhood(tmp_path: Path) 
     assert scatters[0] == pytest.approx(4.0 * scatters[1], rel=0.2)
 
 
+@pytest.mark.usefixtures("charts")
 def test_normals_are_drawn(tmp_path: Path) -> None:
     _, ctx = detect(tmp_path)
     assert {"normals", "deviations"} <= {figure.name for figure in ctx.figures}

@@ -52,6 +52,7 @@ def test_the_scan_step_is_that_of_the_points_on_the_plane(tmp_path: Path) -> Non
     assert metrics["thickness_scan_steps"] == pytest.approx(2.0 / step_mm, rel=0.05)
 
 
+@pytest.mark.usefixtures("charts")
 def test_noise_that_grows_with_incidence_and_range_is_told_by_class(tmp_path: Path) -> None:
     flat = wall(0.0)
     range_m = np.linalg.norm(flat, axis=1)
@@ -81,6 +82,7 @@ def test_a_material_that_scatters_more_is_told_by_its_intensity(tmp_path: Path) 
     assert classes["intensity"][-1]["sigma_m"] == pytest.approx(0.001, rel=0.05)
 
 
+@pytest.mark.usefixtures("charts")
 def test_one_row_of_the_scan_is_drawn_where_rows_are_known(tmp_path: Path) -> None:
     from orthoflow_plugins.plane import detecting, thickness
 
