@@ -112,17 +112,22 @@ def test_the_chain_orients_within_its_stated_error(tmp_path: Path, seed: int) ->
         assert error < 0.0002
 
 
-def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path) -> None:
+@pytest.mark.parametrize("known", [True, False], ids=["calibrated", "exif"])
+def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path, known: bool) -> None:
+    # The lens has its centre 5 px aside, and distortion of all kinds; EXIF is 1 % off.
     scene = ms.textured_wall(0)
     ratios = []
-    for seed in range(16):
-        camera = ms.camera_before(scene, centre=(0.4 + 0.15 * seed, -2.5, 0.9))
+    for seed in range(10):
+        camera = ms.camera_before(scene, centre=(0.4 + 0.24 * seed, -2.5, 0.9))
         (tmp_path / str(seed)).mkdir()
         ctx = context(tmp_path / str(seed), seed=seed)
-        found = orient(known_ties(camera, seed, wrong_share=0.2), calibrated(camera), ctx)
+        exif = ms.photos(replace(PIXEL, exif_focal_px=1.01 * camera.fx))
+        photos = calibrated(camera) if known else exif
+        found = orient(known_ties(camera, seed, wrong_share=0.2), photos, ctx)
         sigma = found.cameras[0].sigma_wall_m
         assert sigma is not None
         ratios.append(ms.wall_error_m(scene, found.cameras[0].viewing(), camera) / sigma)
+    # Measured over 16 seeds: 0.96 and 1.26; with only focal length and k1 free, EXIF gave 2.26.
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.5
 
 

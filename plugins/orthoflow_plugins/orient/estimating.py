@@ -34,8 +34,8 @@ _TIGHTENING: Final = 0.8
 _TIGHTENED_MOST: Final = 7
 # Residuals beyond so many standard deviations pull less (Huber).
 SOFT_LIMIT: Final = 2.0
-# Ties that determine a lens besides a pose.
-_LEAST_FOR_LENS: Final = 25
+# What is known of a lens beforehand keeps it in bounds; so many ties make the equations solvable.
+_LEAST_FOR_LENS: Final = 8
 
 
 @dataclass(frozen=True, kw_only=True)

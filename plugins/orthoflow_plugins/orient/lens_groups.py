@@ -18,12 +18,9 @@ from orthoflow_plugins.orient.lenses import lens_prior, viewing
 Sharing = Literal["focal-group", "shared", "per-photo"]
 Refined = Literal["uncalibrated", "all", "none"]
 
-# A principal point lies this near to the middle of the image, as a share of its longer side.
-_CENTRE_SHARE: Final = 0.01
 _CALIBRATED: Final = {"focal_sigma": 0.01, "k1_sigma": 0.02, "k2_sigma": 0.04}
 _CALIBRATED_CENTRE_SHARE: Final = 0.003
-_K2_SIGMA: Final = 0.1
-_TANGENTIAL_SIGMA: Final = 1e-3
+_CALIBRATED_TANGENTIAL: Final = 1e-3
 _CORRELATED: Final = 0.95
 _POSE_NAMES: Final = ("tilt", "pan", "roll", "x", "y", "distance")
 
@@ -175,17 +172,10 @@ def _lens(photo: Photo, cameras: Sequence[ViewingCamera], refined: Refined) -> L
             freedom = LensFreedom(
                 **_CALIBRATED,
                 centre_sigma_px=_CALIBRATED_CENTRE_SHARE * longest,
-                tangential_sigma=_TANGENTIAL_SIGMA,
+                tangential_sigma=_CALIBRATED_TANGENTIAL,
             )
     else:
-        freedom = replace(
-            known.freedom,
-            centre_sigma_px=_CENTRE_SHARE * longest,
-            k2_sigma=_K2_SIGMA,
-            tangential_sigma=_TANGENTIAL_SIGMA,
-        )
-        if refined == "none":
-            freedom = LensFreedom()
+        freedom = LensFreedom() if refined == "none" else known.freedom
     return Lens(prior=prior, freedom=freedom, source=known.source)
 
 

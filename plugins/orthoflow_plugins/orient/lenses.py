@@ -16,7 +16,12 @@ from orthoflow.products import Intrinsics, Photo
 # nothing of the focusing distance; nothing at all leaves what lenses usually are.
 _EXIF_SIGMA: Final = 0.05
 _UNKNOWN_SIGMA: Final = 0.35
+# What else a lens may have that nobody measured. Held at nothing, it bends the pose: photos came out
+# wrong by 2.4 times the error they stated, and by 1.7 times as much as they had to.
+_CENTRE_SHARE: Final = 0.01
 _K1_SIGMA: Final = 0.1
+_K2_SIGMA: Final = 0.1
+_TANGENTIAL_SIGMA: Final = 1e-3
 _EXIF_FACTORS: Final = (1.0, 0.94, 1.06)
 _UNKNOWN_FACTORS: Final = (0.6, 0.75, 0.95, 1.2, 1.6, 2.2)
 
@@ -45,13 +50,13 @@ def lens_prior(photo: Photo) -> LensPrior:
     if photo.exif_focal_px is not None:
         return LensPrior(
             guesses=tuple(_centred(photo, photo.exif_focal_px * f) for f in _EXIF_FACTORS),
-            freedom=LensFreedom(focal_sigma=_EXIF_SIGMA, k1_sigma=_K1_SIGMA),
+            freedom=_unmeasured(photo, _EXIF_SIGMA),
             source="exif",
         )
     longest = max(photo.width, photo.height)
     return LensPrior(
         guesses=tuple(_centred(photo, longest * f) for f in _UNKNOWN_FACTORS),
-        freedom=LensFreedom(focal_sigma=_UNKNOWN_SIGMA, k1_sigma=_K1_SIGMA),
+        freedom=_unmeasured(photo, _UNKNOWN_SIGMA),
         source="none",
     )
 
@@ -83,6 +88,17 @@ def intrinsics_of(resection: Resection, source: str) -> Intrinsics:
         cy=camera.cy,
         distortion=tuple(float(value) for value in camera.distortion),
         source="estimated" if resection.lens.sigmas.size or source == "none" else source,
+    )
+
+
+def _unmeasured(photo: Photo, focal_sigma: float) -> LensFreedom:
+    """How far a lens without calibration may be from one without any errors."""
+    return LensFreedom(
+        focal_sigma=focal_sigma,
+        centre_sigma_px=_CENTRE_SHARE * max(photo.width, photo.height),
+        k1_sigma=_K1_SIGMA,
+        k2_sigma=_K2_SIGMA,
+        tangential_sigma=_TANGENTIAL_SIGMA,
     )
 
 
