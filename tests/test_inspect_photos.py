@@ -20,6 +20,8 @@ from orthoflow.products import (
     Orthoimage,
     OrthoMask,
     SurfaceMask,
+    TieRole,
+    Ties,
     Truth,
     Wall,
 )
@@ -266,6 +268,41 @@ def test_a_camera_that_looks_away_is_called_wrong(tmp_path: Path, truth: Truth) 
     metrics, _, _ = inspect_cameras(tmp_path, truth, Cameras(cameras=(turned, *rest)))
     assert metrics["n_misoriented"] == 1
     assert metrics["pose_rotation_max_deg"] == pytest.approx(180.0)
+
+
+def test_ties_are_wrong_beyond_one_and_a_half_cells(tmp_path: Path, truth: Truth) -> None:
+    frame = rendered(truth).frame
+    cameras = true_cameras(truth)
+    cells = np.array([[0.5, 0.5], [0.4, 0.6], [0.55, 0.45], [0.6, 0.5]]) * (
+        frame.width,
+        frame.height,
+    )
+    points = frame.world_from_wall(cells)
+    photo = next(
+        index
+        for index, camera in enumerate(cameras.cameras)
+        if camera.viewing().sees(camera.viewing().project(points)[:, :2]).all()
+    )
+    # Off along u by nothing, 1 and 2 cells; the last one is off, too, but was rejected.
+    off = np.array([0.0, 1.0, 2.0, 9.0])[:, None] * GSD_M * frame.u_world
+    ties = Ties(
+        photo_names=tuple(camera.photo for camera in cameras.cameras),
+        photo=np.full(4, photo, np.int32),
+        wall=np.zeros(4, np.int32),
+        pixels_photo=cameras.cameras[photo].viewing().project(points)[:, :2],
+        points_world=points + off,
+        sigma_px=np.ones(4),
+        sigma_m=np.full(4, 1e-3),
+        role=np.array(
+            [TieRole.CONTROL, TieRole.CHECK, TieRole.CONTROL, TieRole.REJECTED], dtype=np.uint8
+        ),
+        residual_px=np.zeros((4, 2)),
+    )
+    metrics, _, _ = inspect_cameras(tmp_path, truth, replace(cameras, ties=ties))
+    assert metrics["n_ties_kept"] == 3
+    assert metrics["match_wrong_share"] == pytest.approx(2 / 4)
+    assert metrics["tie_wrong_share"] == pytest.approx(1 / 3)
+    assert metrics["tie_error_median_cells"] == pytest.approx(1.0, abs=0.02)
 
 
 def test_cameras_of_other_photos_are_refused(tmp_path: Path, truth: Truth) -> None:

@@ -51,12 +51,14 @@ class InspectTruth(Method):
     every cell that a photo painted is told exactly: its point on the found surface is projected
     through the estimated camera, and the ray of that pixel through the true camera meets the true
     scene at the place that the colour is of. The displacements of patches are then named `patch_`.
+    Ties that come with the cameras are compared, too: `tie_wrong_share` of those that photos kept,
+    `match_wrong_share` of all, are more than 1.5 cells of the wall from where their pixel looks.
 
     Without orthoimages only planes and labels are compared, as for a comparison of detectors.
     """
 
     id: ClassVar[str] = "inspect.truth"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Gruen 1985, Adaptive least squares correlation (patch matching)",
@@ -103,6 +105,7 @@ class InspectTruth(Method):
         from orthoflow_plugins.inspect.sampling import sampling_rule
         from orthoflow_plugins.inspect.scores import found_planes, label_findings, sample_findings
         from orthoflow_plugins.inspect.sources import source_findings
+        from orthoflow_plugins.inspect.tie_truth import tie_findings
 
         if inputs.orthoimages is None or inputs.walls is None:
             return self.Out(inspection=_inspect_planes(inputs, ctx))
@@ -138,6 +141,7 @@ class InspectTruth(Method):
         findings += source_findings(sources, -1) + _worst_planes(findings)
         if inputs.cameras is not None:
             findings += pose_findings(poses)
+            findings += tie_findings(inputs.cameras, inputs.walls, inputs.truth)
         if inputs.planes is not None:
             findings += found_planes(inputs.planes, inputs.truth.planes)
         if inputs.labels is not None:

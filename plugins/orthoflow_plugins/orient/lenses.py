@@ -16,8 +16,8 @@ from orthoflow.products import Intrinsics, Photo
 # nothing of the focusing distance; nothing at all leaves what lenses usually are.
 _EXIF_SIGMA: Final = 0.05
 _UNKNOWN_SIGMA: Final = 0.35
-# What else a lens may have that nobody measured. Held at nothing, it bends the pose: photos came out
-# wrong by 2.4 times the error they stated, and by 1.7 times as much as they had to.
+# What else a lens may have that nobody measured. Held at nothing, it bends the pose: photos came
+# out wrong by 2.4 times the error they stated, and by 1.7 times as much as they had to.
 _CENTRE_SHARE: Final = 0.01
 _K1_SIGMA: Final = 0.1
 _K2_SIGMA: Final = 0.1
