@@ -77,6 +77,8 @@ def publish_planes(product: Planes, folder: Path, digest: str) -> None:
             "corners_world": numbers(product.corners[index]),
             "n_points": int(product.n_points[index]),
             "rms_mm": number(1000.0 * float(product.rms_m[index])),
+            "sigma_angle_deg": product.sigma_angle_deg(index),
+            "sigma_offset_mm": 1000.0 * product.sigma_offset_m(index),
             "label": product.names[index],
             "omega_deg": omega,
             "phi_deg": phi,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -81,6 +82,19 @@ class Planes(Product):
     def plane(self, index: int) -> Plane:
         """Give one of the planes, 0 the one with the largest support."""
         return Plane(normal=self.normal[index].copy(), offset_m=float(self.offset[index]))
+
+    def sigma_angle_deg(self, index: int) -> float:
+        """Standard deviation of a plane's direction, about the axis where it is largest."""
+        largest = float(np.linalg.eigvalsh(self.covariance[index, :3, :3])[-1])
+        return math.degrees(math.sqrt(max(0.0, largest)))
+
+    def sigma_offset_m(self, index: int) -> float:
+        """Standard deviation of a plane's position at the middle of its rectangle.
+
+        The offset itself belongs to the origin, which may be far away.
+        """
+        at_middle = np.append(self.corners[index].mean(axis=0), -1.0)
+        return math.sqrt(max(0.0, float(at_middle @ self.covariance[index] @ at_middle)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,15 +1,17 @@
-"""The final fit of a plane to the cells on it, and how well it is known.
+"""The final fit of a plane to the cells on it: robust total least squares, cell by cell.
 
 Neighbouring points of a scan share errors: relief, bow and plaster waves are larger than the
-scanner's noise. A covariance from single points would promise micrometres. Here a cell is one
-observation with a variance of its own (surface) plus noise over its points, and the covariance is a
-cluster-robust ("sandwich") one over tiles; of several tile sizes the one that gives the largest
-variance holds, because that is where neighbouring tiles stop sharing their errors.
+scanner's noise. Here a cell is one observation with a variance of its own (surface) plus the noise
+of its points; what the fit says of its own exactness is in `uncertainty`.
+
+Mouldings, edges and mixed distances put points beside the surface, nearly always on one side of it.
+Three things keep them out: the fit starts at the densest layer of cells instead of their median,
+cells far off lose their weight, and so do cells whose points scatter more than those of others.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -19,11 +21,20 @@ from orthoflow.geometry import Plane
 from orthoflow.geometry.plane_kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.fitting import Freedom
 from orthoflow_plugins.plane.footprints import CellSums, SurfaceRaster
+from orthoflow_plugins.plane.uncertainty import CellFit, CellHeights, Stated, stated_covariance
 
-_TILE_CELLS: Final = (2, 4, 8, 16)
-# Fewer tiles do not show a spread.
-_TILES_LEAST: Final = 20
-_TUKEY: Final = 6.0
+# In standard deviations of a cell: beyond, a cell has no weight (Beaton & Tukey 1974).
+_TUKEY: Final = 3.5
+# The densest layer holds this share of the cells; a normal distribution holds it within +-0.385.
+_LAYER_SHARE: Final = 0.3
+_LAYER_SIGMAS: Final = 0.7706
+# What is usual near a cell counts beside its own variance as if it had so many points.
+_USUAL_POINTS: Final = 40
+# What is usual is the median of blocks so wide, if they hold so many cells.
+_BLOCK_CELLS: Final = 8
+_BLOCK_LEAST: Final = 12
+_CHANCE_SIGMAS: Final = 3.0
+_STEPS_MOST: Final = 30
 # What a surface is never flatter than, so that a perfectly flat simulation has weights too.
 _FLATTEST_M: Final = 2e-5
 _UNKNOWNS: Final[dict[Freedom, tuple[int, ...]]] = {
@@ -39,30 +50,40 @@ class AdjustedPlane:
 
     Attributes:
         plane: in the cloud's offsets.
-        covariance: (4, 4) of (normal, offset), in offsets.
         moved_m: how far the fit moved a corner of the cells at most.
         sigma_cell_m: spread of the cells about the plane, robust.
         bend_per_m: strongest curvature of the surface that the cells show, 1 over its radius.
         bend_share: share of the cells' variance that this curvature explains.
+        observed: the cells.
+        fit: the fit to them.
+        jacobian: (4, p) of (normal, offset) by the unknowns of the fit.
     """
 
     plane: Plane
-    covariance: NDArray[np.float64]
     moved_m: float
     sigma_cell_m: float
     bend_per_m: float
     bend_share: float
+    observed: CellHeights
+    fit: CellFit
+    jacobian: NDArray[np.float64]
+
+    def stated(self) -> Stated:
+        """State the covariance (4, 4) of (normal, offset), in offsets."""
+        stated = stated_covariance(self.observed, self.fit)
+        return Stated(
+            covariance=self.jacobian @ stated.covariance @ self.jacobian.T,
+            n_independent=stated.n_independent,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Observations:
-    """Cells as observations of the height over the raster's plane."""
+class _Placed:
+    """Where cells lie, and how many points each has; (n,) each."""
 
-    design: NDArray[np.float64]
-    heights_m: NDArray[np.float64]
-    noise_m2: NDArray[np.float64]
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
+    number: NDArray[np.int64]
 
 
 def adjust_plane(
@@ -91,67 +112,114 @@ def adjust_plane(
     step_m = fit_m / STEPS_PER_TOLERANCE
     number = sums.n_fit[rows, columns]
     heights_m = sums.steps[rows, columns] / number * step_m
-    spread = np.maximum(sums.squared_steps[rows, columns] / number * step_m**2 - heights_m**2, 0.0)
-    within = float(np.sum(spread * number) / max(1, int(np.sum(number - 1))))
+    squares_m2 = sums.squared_steps[rows, columns] / number * step_m**2
+    placed = _Placed(rows=rows, columns=columns, number=number)
+    noise_m2, mixture_m2 = _cell_variances(squares_m2 - heights_m**2, placed, fit_m)
     u, v = raster.centres_m()
     centre = np.array([u[rows, columns].mean(), v[rows, columns].mean()])
     full = np.column_stack(
         [np.ones(len(rows)), u[rows, columns] - centre[0], v[rows, columns] - centre[1]]
     )
-    observed = _Observations(
+    observed = CellHeights(
         design=full[:, _UNKNOWNS[freedom]],
         heights_m=heights_m,
-        noise_m2=within / number,
+        noise_m2=noise_m2,
+        mixture_m2=mixture_m2,
         rows=rows,
         columns=columns,
     )
     solved = _solve(observed)
     if solved is None:
         return None
-    solution, weights, sigma_cell_m = solved
     change = np.zeros(3)
-    change[list(_UNKNOWNS[freedom])] = solution
-    covariance = np.zeros((3, 3))
-    covariance[np.ix_(_UNKNOWNS[freedom], _UNKNOWNS[freedom])] = _tile_covariance(
-        observed, weights, solution
-    )
+    change[list(_UNKNOWNS[freedom])] = solved.solution
     plane, jacobian = _tilted(raster, change, centre)
     bend_per_m, bend_share = _bend(full, heights_m)
     return AdjustedPlane(
         plane=plane,
-        covariance=jacobian @ covariance @ jacobian.T,
         moved_m=float(np.abs(full @ change).max()),
-        sigma_cell_m=sigma_cell_m,
+        sigma_cell_m=solved.scale_m,
         bend_per_m=bend_per_m,
         bend_share=bend_share,
+        observed=observed,
+        fit=solved,
+        jacobian=jacobian[:, _UNKNOWNS[freedom]],
     )
 
 
-def _solve(
-    observed: _Observations,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
+def _cell_variances(
+    spread_m2: NDArray[np.float64], placed: _Placed, fit_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Variance of each cell's mean by the noise of its points, and by points that do not belong.
+
+    A share of points spread evenly from the surface to the tolerance D, as mixed distances are,
+    adds share * D**2 / 3 to the variance of a cell and moves its mean by share * D / 2: the mean is
+    off by 1.5 / D times the variance in excess of what is usual thereabouts.
+    """
+    number = placed.number
+    free = np.maximum(number - 1, 0)
+    own = np.maximum(spread_m2, 0.0) * number / np.maximum(free, 1)
+    usual = _usual_nearby(own, placed)
+    blended = (own * free + _USUAL_POINTS * usual) / (free + _USUAL_POINTS)
+    by_chance = usual * (1.0 + _CHANCE_SIGMAS * np.sqrt(2.0 / np.maximum(free, 1)))
+    excess = np.where(own > by_chance, own - usual, 0.0)
+    return blended / number, (1.5 * excess / fit_m) ** 2
+
+
+def _usual_nearby(own_m2: NDArray[np.float64], placed: _Placed) -> NDArray[np.float64]:
+    """Median variance of the cells in each cell's block: noise differs with incidence and cloth."""
+    several = placed.number >= 3
+    overall = float(np.median(own_m2[several])) if several.any() else float(own_m2.mean())
+    across = int(placed.columns.max()) // _BLOCK_CELLS + 1
+    block = placed.rows // _BLOCK_CELLS * across + placed.columns // _BLOCK_CELLS
+    order = np.lexsort([own_m2, block])
+    _, first, member, count = np.unique(
+        block[order], return_index=True, return_inverse=True, return_counts=True
+    )
+    middle = own_m2[order][first + count // 2]
+    usual = np.empty(len(own_m2))
+    usual[order] = np.where(count >= _BLOCK_LEAST, middle, overall)[member]
+    return np.maximum(usual, 0.1 * overall)
+
+
+def _solve(observed: CellHeights) -> CellFit | None:
     """Weighted least squares with the cells' own variance estimated along; outliers lose weight."""
     design, heights_m = observed.design, observed.heights_m
     solution = np.zeros(design.shape[1])
-    solution[0] = np.median(heights_m)
-    sigma_cell_m = 0.0
-    weights = np.ones(len(heights_m))
-    for _ in range(15):
+    solution[0] = _densest_layer(heights_m)[0]
+    noise_m2 = float(np.median(observed.noise_m2 + observed.mixture_m2))
+    for _ in range(_STEPS_MOST):
         residuals = heights_m - design @ solution
-        scale_m = max(1.4826 * float(np.median(np.abs(residuals))), _FLATTEST_M)
-        surface = max(scale_m**2 - float(np.median(observed.noise_m2)), _FLATTEST_M**2)
-        sigma = np.sqrt(surface + observed.noise_m2)
-        ratio = residuals / (_TUKEY * np.maximum(sigma, scale_m))
-        weights = np.where(np.abs(ratio) < 1.0, (1.0 - ratio**2) ** 2, 0.0) / sigma**2
-        normal_matrix = design.T @ (weights[:, None] * design)
-        if np.linalg.cond(normal_matrix) > 1e12:
+        scale_m = max(_densest_layer(residuals)[1], _FLATTEST_M)
+        surface_m2 = max(scale_m**2 - noise_m2, _FLATTEST_M**2)
+        fit = CellFit(
+            solution=solution,
+            scale_m=scale_m,
+            limit_m=_TUKEY * np.sqrt(surface_m2 + observed.noise_m2),
+            variance_m2=surface_m2 + observed.noise_m2 + observed.mixture_m2,
+        )
+        updated = fit.stepped(observed)
+        if updated is None:
             return None
-        updated = np.linalg.solve(normal_matrix, design.T @ (weights * heights_m))
-        settled = float(np.abs(design @ (updated - solution)).max()) < 1e-7
-        solution, sigma_cell_m = updated, scale_m
-        if settled:
+        moved_m = float(np.abs(design @ (updated - solution)).max())
+        solution = updated
+        if moved_m < 1e-7:
             break
-    return solution, weights, sigma_cell_m
+    return replace(fit, solution=solution)
+
+
+def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
+    """Middle of the shortest interval that holds a share of the heights, and the spread it shows.
+
+    The "shorth" of Rousseeuw & Leroy 1987 with a smaller share: a panel that covers half of a wall
+    does not move it.
+    """
+    ordered = np.sort(heights_m)
+    held = max(2, int(_LAYER_SHARE * len(ordered)))
+    lengths = ordered[held - 1 :] - ordered[: len(ordered) - held + 1]
+    first = int(np.argmin(lengths))
+    middle = float(np.median(ordered[first : first + held]))
+    return middle, float(lengths[first]) / _LAYER_SIGMAS
 
 
 def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[float, float]:
@@ -170,35 +238,6 @@ def _bend(design: NDArray[np.float64], heights_m: NDArray[np.float64]) -> tuple[
     hessian = np.array([[2.0 * terms[3], terms[4]], [terms[4], 2.0 * terms[5]]]) / reach_m**2
     strongest = float(np.abs(np.linalg.eigvalsh(hessian)).max())
     return strongest, 1.0 - max(0.0, squares - float(terms @ right)) / variance
-
-
-def _tile_covariance(
-    observed: _Observations, weights: NDArray[np.float64], solution: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Sandwich covariance over square tiles, the largest of several tile sizes."""
-    design = observed.design
-    residuals = observed.heights_m - design @ solution
-    inverse = np.linalg.inv(design.T @ (weights[:, None] * design))
-    scores = weights[:, None] * design * residuals[:, None]
-    largest = np.zeros(inverse.shape)
-    reach = -1.0
-    for size in _TILE_CELLS:
-        tiles_across = int(observed.columns.max()) // size + 1
-        tile = observed.rows // size * tiles_across + observed.columns // size
-        _, member = np.unique(tile, return_inverse=True)
-        n_tiles = int(member.max()) + 1
-        if n_tiles < _TILES_LEAST and reach >= 0.0:
-            break
-        tile_scores = np.column_stack([np.bincount(member, column) for column in scores.T])
-        correction = n_tiles / max(1, n_tiles - design.shape[1])
-        covariance: NDArray[np.float64] = (
-            inverse @ (tile_scores.T @ tile_scores) @ inverse * correction
-        )
-        # Mean variance of the plane's height over its cells: one number to compare sizes by.
-        variance = float(np.einsum("ij,jk,ik->i", design, covariance, design).mean())
-        if variance > reach:
-            largest, reach = covariance, variance
-    return largest
 
 
 def _tilted(

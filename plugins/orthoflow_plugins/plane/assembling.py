@@ -21,6 +21,7 @@ from orthoflow_plugins.plane.facing import (
     side_of_stations,
 )
 from orthoflow_plugins.plane.remainders import Remainder
+from orthoflow_plugins.plane.uncertainty import Stated
 
 _VOTERS_MOST: Final = 5000
 # Cosine of 20 degrees.
@@ -37,6 +38,7 @@ class Assembly:
         deviations: of the planes in their final order.
         n_guessed: planes whose side was guessed.
         own_tolerances_m: of each plane the tolerance that the detector found itself, or None.
+        n_independent: of each plane, how many cells without common errors would fix it as well.
     """
 
     planes: Planes
@@ -44,6 +46,7 @@ class Assembly:
     deviations: Deviations
     n_guessed: int
     own_tolerances_m: tuple[float | None, ...]
+    n_independent: tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +54,7 @@ class _Faced:
     """A found plane with its normal towards the viewer, in offsets."""
 
     plane: Plane
-    covariance: NDArray[np.float64]
+    stated: Stated
     corners_m: NDArray[np.float64]
     part_corners_m: NDArray[np.float64]
     is_guessed: bool
@@ -80,7 +83,7 @@ def assemble(
         normal=np.array([item.plane.normal for item in faced]),
         offset=np.array([_world_offset(item.plane, cloud) for item in faced]),
         corners=np.array([cloud.origin + item.corners_m for item in faced]),
-        covariance=np.array([_world_covariance(item.covariance, cloud) for item in faced]),
+        covariance=np.array([_world_covariance(item.stated.covariance, cloud) for item in faced]),
         n_points=ordered.n_find,
         rms_m=ordered.rms_find_m,
         up=cloud.up.copy(),
@@ -97,6 +100,7 @@ def assemble(
         details={
             "fit_n_points": [int(n) for n in ordered.n_fit],
             "fit_rms_m": [float(value) for value in ordered.rms_fit_m],
+            "n_independent": [item.stated.n_independent for item in faced],
             "find_tolerance_m": ordered.find_m,
             "fit_tolerance_m": ordered.fit_m,
             "raw": [
@@ -113,6 +117,7 @@ def assemble(
         deviations=ordered,
         n_guessed=sum(item.is_guessed for item in faced),
         own_tolerances_m=tuple(found[i].candidate.own_tolerance_m for i in order),
+        n_independent=tuple(item.stated.n_independent for item in faced),
     )
 
 
@@ -203,14 +208,14 @@ def _faced(
         rectangle_m(plane, axes, np.clip(bounds, extent_m[[0, 0, 2, 2]], extent_m[[1, 1, 3, 3]]))
         for bounds in place.parts_m
     ]
-    covariance = found[claim].adjusted.covariance
+    stated = found[claim].adjusted.stated()
     if side < 0:
         # Normal and offset change sign together, so their covariance stays as it is.
         plane = plane.flipped()
     turned = wall_axes(plane.normal, cloud.up)
     return _Faced(
         plane=plane,
-        covariance=covariance,
+        stated=stated,
         corners_m=enclosing(corners_m, plane, turned),
         part_corners_m=np.array([enclosing(part, plane, turned) for part in parts_m]),
         is_guessed=is_guessed,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +16,6 @@ def report_planes(ctx: StepContext, assembly: Assembly, *, n_points: int) -> Non
     """Report number, shares, angles and accuracy of the planes."""
     planes, deviations = assembly.planes, assembly.deviations
     omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
-    sigma_deg, sigma_m = first_plane_sigmas(planes)
     ctx.metric("n_planes", len(planes), "1")
     ctx.metric("labelled_share", float(deviations.n_find.sum()) / n_points, "1")
     ctx.metric("first_share", float(deviations.n_find[0]) / n_points, "1")
@@ -28,8 +25,9 @@ def report_planes(ctx: StepContext, assembly: Assembly, *, n_points: int) -> Non
     ctx.metric("phi_deg", phi_deg, "deg")
     ctx.metric("offset_m", float(planes.offset[0]), "m")
     ctx.metric("r_m", abs(float(planes.offset[0])), "m")
-    ctx.metric("sigma_angle_deg", sigma_deg, "deg")
-    ctx.metric("sigma_offset_mm", 1000.0 * sigma_m, "mm")
+    ctx.metric("sigma_angle_deg", planes.sigma_angle_deg(0), "deg")
+    ctx.metric("sigma_offset_mm", 1000.0 * planes.sigma_offset_m(0), "mm")
+    ctx.metric("n_independent", assembly.n_independent[0], "1")
     _report_raw(ctx, planes)
     if assembly.n_guessed:
         warn_of_guesses(ctx, assembly.n_guessed, len(planes))
@@ -84,13 +82,3 @@ def warn_of_guesses(ctx: StepContext, n_guessed: int, n_planes: int) -> None:
         "side with more of the other points was taken: if an image comes out mirrored, set "
         "view_from of read.scan"
     )
-
-
-def first_plane_sigmas(planes: Planes) -> tuple[float, float]:
-    """Standard deviations of the first plane: direction in degrees, position at its middle, m."""
-    covariance = planes.covariance[0]
-    direction = float(np.sqrt(max(0.0, np.linalg.eigvalsh(covariance[:3, :3])[-1])))
-    # The offset belongs to the origin, which may be far away; the wall's middle is what matters.
-    at_middle = np.append(planes.corners[0].mean(axis=0), -1.0)
-    variance = float(at_middle @ covariance @ at_middle)
-    return math.degrees(direction), math.sqrt(max(0.0, variance))
