@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from orthoflow.catalog import discover_catalog
+from orthoflow.engine.sources import compiled_digest
+from orthoflow.engine.store import Store
 
 ROOT = Path(__file__).resolve().parents[2]
 STRANGER = ROOT / "tests" / "third_party" / "orthoflow-stranger"
@@ -59,7 +63,8 @@ class Shell:
 
     def compiled_store(self, name: str) -> str:
         """A new store in the folder that has nothing but the session's compiled kernels."""
-        shutil.copytree(self.store / "numba", self.folder / name / "numba")
+        (self.folder / name).mkdir()
+        (self.folder / name / "numba").symlink_to(self.store / "numba")
         return name
 
     def __call__(self, *arguments: object, timeout_s: float = 300) -> Ended:
@@ -84,13 +89,30 @@ def metrics_of(folder: Path) -> dict[tuple[str, str], float]:
 
 @pytest.fixture(scope="session")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A store in which `direct.yaml` ran once, so that its kernels are compiled."""
-    folder = tmp_path_factory.mktemp("store")
-    shell = Shell(folder, folder / "store")
-    coarse = ("--set", "room.scan_step_m=0.08", "--set", "wall.gsd_m=0.08")
-    ended = shell("run", "direct.yaml", *coarse, "-o", "warm", timeout_s=900)
-    assert ended.code == 0, ended.said
-    return folder / "store"
+    """A store for all processes of a test run, so that each result is computed by one of them.
+
+    `direct.yaml` ran in it once, which compiles the kernels; they lie where those of the tests lie.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    shell = Shell(folder / "road-store", folder / "road-store" / "store")
+    shell.folder.mkdir(exist_ok=True)
+    with (shell.folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (shell.folder / "warm").exists():
+            kernels = Store(shell.store).numba_folder(
+                compiled_digest(discover_catalog().method("plane.hough2d"))
+            )
+            compiled = Path(os.environ["NUMBA_CACHE_DIR"])
+            compiled.mkdir(parents=True, exist_ok=True)
+            kernels.parent.mkdir(parents=True)
+            kernels.symlink_to(compiled)
+            coarse = ("--set", "room.scan_step_m=0.08", "--set", "wall.gsd_m=0.08")
+            ended = shell("run", "direct.yaml", *coarse, "-o", "warm", timeout_s=900)
+            assert ended.code == 0, ended.said
+            assert any(compiled.iterdir())
+    return shell.store
 
 
 @pytest.fixture

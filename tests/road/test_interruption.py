@@ -6,6 +6,7 @@ import random
 import signal
 import subprocess
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,11 @@ import pytest
 import orthoflow
 from tests.road.conftest import IS_LONG, Shell
 
-SMALL = ("--set", "room.scan_step_m=0.05", "--set", "wall.gsd_m=0.05")
-KILLS = 10 if IS_LONG else 2
+RUN = (
+    *("run", "direct.yaml", "--until", "wall"),
+    *("--set", "room.scan_step_m=0.05", "--set", "wall.gsd_m=0.05"),
+)
+KILLS = 10 if IS_LONG else 1
 
 
 def digests(run_folder: Path) -> dict[str, str]:
@@ -26,23 +30,34 @@ def digests(run_folder: Path) -> dict[str, str]:
     }
 
 
-@pytest.mark.long  # twice in a normal run
-def test_killed_runs_resume_with_the_same_digests(shell: Shell) -> None:
-    command = ("run", "direct.yaml", *SMALL)
+@dataclass(frozen=True)
+class Quiet:
+    """A run that nobody disturbed: how long it took, and the digests of its products."""
+
+    duration_s: float
+    digests: dict[str, str]
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Quiet:
+    shell = Shell(tmp_path_factory.mktemp("quiet"), store)
     started = time.monotonic()
-    quiet = shell(*command, "-o", "quiet", "--store", shell.compiled_store("quiet-store"))
-    duration_s = time.monotonic() - started
-    assert quiet.code == 0, quiet.said
-    expected = digests(shell.folder / "quiet")
+    ended = shell(*RUN, "-o", "run", "--store", shell.compiled_store("store"))
+    assert ended.code == 0, ended.said
+    return Quiet(time.monotonic() - started, digests(shell.folder / "run"))
+
+
+@pytest.mark.long  # once in a normal run
+def test_killed_runs_resume_with_the_same_digests(shell: Shell, quiet: Quiet) -> None:
     rng = random.Random(20150807)
     for attempt in range(KILLS):
         store = shell.compiled_store(f"store{attempt}")
-        arguments = (*command, "-o", f"killed{attempt}", "--store", store)
-        _kill_after(shell, arguments, rng.uniform(0.5, duration_s))
+        arguments = (*RUN, "-o", f"killed{attempt}", "--store", store)
+        _kill_after(shell, arguments, rng.uniform(0.5, quiet.duration_s))
         ended = shell(*arguments)
         finished_before = ended.code == 2 and "run.h5" in ended.said
         assert ended.code == 0 or finished_before, ended.said
-        assert digests(shell.folder / f"killed{attempt}") == expected
+        assert digests(shell.folder / f"killed{attempt}") == quiet.digests
         assert shell("verify", f"killed{attempt}").code == 0
 
 
@@ -64,7 +79,7 @@ def _kill_after(shell: Shell, arguments: tuple[str, ...], seconds: float) -> Non
 
 def test_ctrl_c_says_how_to_go_on(shell: Shell) -> None:
     store = shell.compiled_store("store")
-    arguments = ("run", "direct.yaml", *SMALL, "-o", "run", "--store", store)
+    arguments = (*RUN, "-o", "run", "--store", store)
     process = subprocess.Popen(
         shell.command(*arguments),
         cwd=shell.folder,
@@ -86,12 +101,8 @@ def test_ctrl_c_says_how_to_go_on(shell: Shell) -> None:
     assert shell(*arguments).code == 0
 
 
-def test_both_executors_give_the_same_digests(shell: Shell) -> None:
-    found = []
-    for executor in ("inline", "local"):
-        store = shell.compiled_store(f"{executor}-store")
-        options = ("--store", store, "-o", executor, "--executor", executor)
-        ended = shell("run", "direct.yaml", *SMALL, *options)
-        assert ended.code == 0, ended.said
-        found.append(digests(shell.folder / executor))
-    assert found[0] == found[1]
+def test_both_executors_give_the_same_digests(shell: Shell, quiet: Quiet) -> None:
+    store = shell.compiled_store("store")
+    ended = shell(*RUN, "-o", "run", "--store", store, "--executor", "inline")
+    assert ended.code == 0, ended.said
+    assert digests(shell.folder / "run") == quiet.digests
