@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom
+from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom
 from orthoflow.geometry.resection import (
     Misfit,
     Resection,
@@ -36,6 +37,11 @@ _TIGHTENED_MOST: Final = 7
 SOFT_LIMIT: Final = 2.0
 # What is known of a lens beforehand keeps it in bounds; so many ties make the equations solvable.
 _LEAST_FOR_LENS: Final = 8
+# A calibration that is off by more than both is another lens's.
+_FOCAL_OFF_LEAST: Final = 0.03
+_FOCAL_OFF_SIGMAS: Final = 5.0
+_LEAST_FOR_FOCAL: Final = 25
+_OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,9 +122,34 @@ def estimate_pose(
     if start is None:
         return no_pose(seen)
     try:
-        return adjusted(photo, seen, is_check, start, rule)
+        found = adjusted(photo, seen, is_check, start, rule)
     except GeometryError:
         return no_pose(seen)
+    return calibration_doubt(found, seen.take(found.agreeing & ~is_check)) or found
+
+
+def calibration_doubt(found: Estimate, control: SeenPoints) -> str:
+    """Say that a calibrated photo was taken with another focal length; empty when it may be right.
+
+    The pose of such a photo takes up most of the mistake, and its residuals do not show the rest.
+    """
+    camera = found.resection.camera
+    if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
+        return ""
+    cells = image_cells(control.pixels_photo, (camera.width, camera.height), GROUPS)
+    try:
+        free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
+    except GeometryError:
+        return ""
+    off = abs(math.log(free.camera.fx / camera.fx))
+    sigma = math.sqrt(float(free.covariance[POSE_PARAMETERS, POSE_PARAMETERS]))
+    if off < max(_FOCAL_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma):
+        return ""
+    return (
+        f"its ties ask for a focal length of {free.camera.fx:.0f} px, give or take "
+        f"{sigma * free.camera.fx:.0f} px, but its calibration says {camera.fx:.0f} px: it is the "
+        "calibration of another lens, zoom or image size"
+    )
 
 
 def no_pose(seen: SeenPoints) -> str:
