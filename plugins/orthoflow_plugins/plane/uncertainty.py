@@ -125,7 +125,7 @@ def stated_covariance(observed: CellHeights, fit: CellFit) -> Stated:
         variance = _mean_variance(design, covariance)
         if variance > reach:
             # Tiles twice as wide add as much again: what crosses their rims halves with each step.
-            beyond = max(1.0, 2.0 - before / variance)
+            beyond = max(1.0, 2.0 - before / variance) if variance else 1.0
             largest, reach = beyond * covariance, variance
         before = variance
     moved = _moved_by_more(observed, fit)
