@@ -80,9 +80,13 @@ def _blocks(
 
 
 def _block(chunk: Any) -> PointBlock:
-    # laspy applies scale and offset in float64: survey coordinates keep every digit.
+    # Scale and offset in float64: survey coordinates keep every digit.
     # Axis by axis in memory: later passes go along the axes.
-    points = np.vstack([np.asarray(chunk[axis], dtype=np.float64) for axis in "xyz"]).T
+    axes = np.empty((3, len(chunk)))
+    for place, name in enumerate("XYZ"):
+        np.multiply(chunk[name], chunk.scales[place], out=axes[place])
+        axes[place] += chunk.offsets[place]
+    points = axes.T
     names = set(chunk.point_format.dimension_names)
     intensity = np.asarray(chunk.intensity, dtype=np.float32) if "intensity" in names else None
     rgb = None

@@ -24,6 +24,7 @@ from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.uncertainty import Stated
 
 _VOTERS_MOST: Final = 5000
+_WITNESSES_MOST: Final = 40_000
 # Cosine of 20 degrees.
 _PARALLEL: Final = 0.94
 
@@ -196,11 +197,12 @@ def _faced(
         parallel = [
             abs(float(item.raster.plane.normal @ plane.normal)) > _PARALLEL for item in found
         ]
+        every = max(1, len(claims) // _WITNESSES_MOST)
         side = side_of_remaining(
             plane,
             corners_m,
-            remainder.sample.offsets_m,
-            np.array([*parallel, False])[claims],
+            remainder.sample.offsets_m[::every],
+            np.array([*parallel, False])[claims[::every]],
             clear_m=deviations.find_m,
         )
     # Parts are known to a cell; none reaches beyond the points that are there.

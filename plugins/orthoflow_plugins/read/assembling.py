@@ -124,23 +124,18 @@ class CloudAssembly:
         count.n_invalid += block.n_invalid
         count.n_withheld += block.n_withheld
         points = block.points * self._unit_m if self._unit_m != 1.0 else block.points
-        # NaN compares as False.
-        is_usable = np.logical_and.reduce(
-            [np.abs(points[:, axis]) < FARTHEST_M for axis in (0, 1, 2)]
-        )
-        kept: NDArray[np.bool_] | slice = is_usable
-        n_kept = int(np.count_nonzero(is_usable))
-        if n_kept == len(points):
-            kept = slice(None)
+        kept = _usable(points)
+        usable = points[kept]
+        n_kept = len(usable)
         count.n_not_finite += len(points) - n_kept
         count.n_kept += n_kept
-        self._summarise(block, scan, points[kept])
+        self._summarise(block, scan, usable)
         if n_kept == 0:
             return
         if self.n_points + n_kept > self._capacity:
             raise InputError(f"{count.name} holds more points than its header states")
         part = slice(self.n_points, self.n_points + n_kept)
-        self._store_points(points[kept], part)
+        self._store_points(usable, part)
         self._store_fields(block, kept, part)
         if colours is not None and block.rgb is not None:
             colours.add(block.rgb[kept])
@@ -153,7 +148,7 @@ class CloudAssembly:
             # The median, so that stray points far away cannot cost the scan its precision.
             self.origin = np.floor(np.median(points, axis=0))
         for axis, array in enumerate(self._axes):
-            array[part] = points[:, axis] - self.origin[axis]
+            np.subtract(points[:, axis], self.origin[axis], out=array[part], casting="same_kind")
 
     def _store_fields(
         self, block: PointBlock, kept: NDArray[np.bool_] | slice, part: slice
@@ -200,6 +195,17 @@ class CloudAssembly:
     def _new(self, name: str, dtype: type[np.generic], width: int = 1) -> NDArray[Any]:
         shape = (self._capacity,) if width == 1 else (self._capacity, width)
         return self._ctx.allocate("cloud", name, shape, dtype)
+
+
+def _usable(points: NDArray[np.float64]) -> NDArray[np.bool_] | slice:
+    """Which points can be used; a slice when all can, so that nothing need be copied."""
+    # NaN passes through minimum and maximum, and compares as False.
+    if len(points) and points.min() > -FARTHEST_M and points.max() < FARTHEST_M:
+        return slice(None)
+    mask: NDArray[np.bool_] = np.logical_and.reduce(
+        [np.abs(points[:, axis]) < FARTHEST_M for axis in (0, 1, 2)]
+    )
+    return mask
 
 
 def _require_space(ctx: StepContext, n_points: int) -> None:

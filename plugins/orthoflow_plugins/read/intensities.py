@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-_BLOCK: Final = 4_000_000
+_BLOCK: Final = 1 << 16
 _SAMPLE: Final = 200_000
 # lion-takanawa, whose intensity is the grey of its colours, has 0.99997; laser intensity at
 # 532..1550 nm stays far below.
@@ -62,8 +62,15 @@ def choose_scale(
     return IntensityScale(low=min(0.0, low), high=max(high, 0.0), rule="0 to the only value")
 
 
-def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
+def normalise(
+    intensity: NDArray[np.float32], scale: IntensityScale, *, may_exceed: bool = True
+) -> int:
     """Scale in place to 0..1, what is not finite to 0.
+
+    Args:
+        intensity: (n,) as read.
+        scale: what becomes 0 and 1.
+        may_exceed: whether there may be values beyond the scale, or that are not finite.
 
     Returns:
         How many values lay beyond the scale and were clipped.
@@ -71,9 +78,13 @@ def normalise(intensity: NDArray[np.float32], scale: IntensityScale) -> int:
     n_clipped = 0
     for start in range(0, len(intensity), _BLOCK):
         part = intensity[start : start + _BLOCK]
-        scaled = (part.astype(np.float64) - scale.low) / (scale.high - scale.low)
-        n_clipped += int(np.count_nonzero((scaled < -1e-6) | (scaled > 1.0 + 1e-6)))
-        part[:] = np.clip(np.nan_to_num(scaled, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+        scaled = part.astype(np.float64)
+        scaled -= scale.low
+        scaled /= scale.high - scale.low
+        if may_exceed:
+            n_clipped += int(np.count_nonzero((scaled < -1e-6) | (scaled > 1.0 + 1e-6)))
+            scaled = np.clip(np.nan_to_num(scaled, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
+        part[:] = scaled
     return n_clipped
 
 

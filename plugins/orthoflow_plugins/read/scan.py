@@ -168,7 +168,8 @@ def _intensity(
         return None, None
     stated = [file.intensity_limits for file in files]
     scale = choose_scale((low, high), stated, params.intensity_max)
-    n_clipped = normalise(intensity, scale)
+    may_exceed = low < scale.low or high > scale.high or assembly.n_intensity_lost > 0
+    n_clipped = normalise(intensity, scale, may_exceed=may_exceed)
     if n_clipped:
         ctx.warn(
             f"{n_clipped} intensities lie beyond 0..{scale.high:g} (intensity_max) and were "

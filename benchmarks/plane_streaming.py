@@ -1,0 +1,286 @@
+"""From a LAZ file to labelled planes: time beside laspy's reading alone, and anonymous memory.
+
+    python benchmarks/plane_streaming.py                           # a room of 10 million points
+    python benchmarks/plane_streaming.py --points 48000000 --npy room.npy --repeats 3
+    python benchmarks/plane_streaming.py --points 48000000 --npy room.npy --tiled 5
+
+Measured, each in a process of its own: laspy reading all chunks; laspy reading them into
+coordinates; `read.scan` and a detector in one process; the same two steps through the engine.
+Memory is the largest sum of RssAnon over a process and its children, sampled: files that are mapped
+do not count, because the system may drop them. `--tiled n` detects planes in the points n times
+over, from files that are mapped, and compares the time per point with that of the points once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+HERE = Path(__file__).resolve()
+CHUNK = 1_000_000
+SAMPLED_S = 0.02
+DETECTORS = ("hough2d", "ransac")
+WORKFLOW = """\
+orthoflow: 1
+name: streaming
+inputs: {{scan: {{}}}}
+steps:
+  cloud: {{use: read.scan, in: {{files: inputs.scan}}}}
+  plane: {{use: plane.{method}, in: {{cloud: cloud.cloud}}}}
+"""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a process cost: wall and processor seconds, largest anonymous memory."""
+
+    wall_s: float
+    cpu_s: float
+    anonymous_mib: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--points", type=int, default=10_000_000)
+    parser.add_argument("--npy", type=Path, help="(n, 3) float32 points instead of the room")
+    parser.add_argument("--tiled", type=int, default=0)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--folder", type=Path, help="where the files go; removed unless given")
+    parser.add_argument("--child", nargs="+", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        run_child(options.child)
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = options.folder or Path(scratch)
+        if options.tiled:
+            report_tiles(folder, options)
+        else:
+            report_file(folder, options)
+
+
+def report_file(folder: Path, options: argparse.Namespace) -> None:
+    """Print what reading a LAZ file and finding its planes costs."""
+    path = folder / "room.laz"
+    if not path.exists():
+        write_laz(path, room(options))
+    print(f"{options.points} points, {path.stat().st_size / 2**20:.0f} MiB, {os.cpu_count()} cores")
+    tasks = {
+        "laspy alone": ["chunks", str(path)],
+        "laspy, x y z": ["coordinates", str(path)],
+        **{
+            f"{name}, one process": ["process", name, str(path), scratch]
+            for name in DETECTORS
+            for scratch in [str(folder)]
+        },
+    }
+    engine = {f"{name}, engine": engine_command(name, path, folder) for name in DETECTORS}
+    commands = {name: child_command(arguments) for name, arguments in tasks.items()} | engine
+    for name in DETECTORS:  # so that nothing is compiled in what is measured
+        measured(child_command(["process", name, str(path), str(folder)]))
+        measured(engine[f"{name}, engine"])
+    costs: dict[str, list[Cost]] = {name: [] for name in commands}
+    for _ in range(options.repeats):
+        for name, command in commands.items():
+            costs[name].append(measured(command))
+    floor = fastest(costs["laspy alone"])
+    for name, found in costs.items():
+        best = fastest(found)
+        print(
+            f"  {name:22} {best.wall_s:7.2f} s = {best.wall_s / floor.wall_s:.2f} x laspy; "
+            f"processor {best.cpu_s:7.2f} s = {best.cpu_s / floor.cpu_s:.2f} x; "
+            f"anonymous {max(cost.anonymous_mib for cost in found):6.0f} MiB"
+        )
+
+
+def report_tiles(folder: Path, options: argparse.Namespace) -> None:
+    """Print what finding planes costs per point, once and many times over, from mapped files."""
+    points = room(options)
+    for name in ("once", "tiled"):
+        copies = 1 if name == "once" else options.tiled
+        for axis in range(3):
+            with (folder / f"{name}_{axis}.f32").open("wb") as file:
+                for _ in range(copies):
+                    np.ascontiguousarray(points[:, axis]).tofile(file)
+    for method in DETECTORS:
+        measured(child_command(["mapped", method, str(folder), "once"]))
+        per_point = {}
+        for name in ("once", "tiled"):
+            copies = 1 if name == "once" else options.tiled
+            command = child_command(["mapped", method, str(folder), name])
+            costs = [measured(command) for _ in range(options.repeats)]
+            best = fastest(costs)
+            count = copies * options.points
+            per_point[name] = best.cpu_s / count
+            print(
+                f"  {method:8} {count:11d} points {best.wall_s:6.2f} s, processor "
+                f"{best.cpu_s:6.2f} s = {1e9 * best.cpu_s / count:5.1f} ns a point; anonymous "
+                f"{max(cost.anonymous_mib for cost in costs):6.0f} MiB"
+            )
+        print(f"  {method:8} per point {per_point['tiled'] / per_point['once']:.2f} x")
+
+
+def room(options: argparse.Namespace) -> NDArray[np.float32]:
+    """The points, (n, 3), made or mapped."""
+    if options.npy:
+        stored: NDArray[np.float32] = np.load(options.npy, mmap_mode="r")[: options.points]
+        options.points = len(stored)
+        return stored
+    from plane_detectors import simulated_room
+
+    return simulated_room(options.points)[0]
+
+
+def write_laz(path: Path, points: NDArray[np.float32]) -> None:
+    """Write points as a scanner's software does: format 6, a tenth of a millimetre, intensity."""
+    import laspy
+
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = np.full(3, 1e-4), np.zeros(3)
+    rng = np.random.default_rng(1)
+    with laspy.open(path, mode="w", header=header) as file:
+        for start in range(0, len(points), CHUNK):
+            part = np.asarray(points[start : start + CHUNK], dtype=np.float64)
+            record = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+            record.x, record.y, record.z = part.T
+            record.intensity = rng.integers(2**10, 2**14, len(part)).astype(np.uint16)
+            file.write_points(record)
+
+
+def child_command(arguments: list[str]) -> list[str]:
+    return [sys.executable, str(HERE), "--child", *arguments]
+
+
+def engine_command(method: str, path: Path, folder: Path) -> list[str]:
+    workflow = folder / f"{method}.yaml"
+    workflow.write_text(WORKFLOW.format(method=method))
+    forced = ("--force", "cloud", "--force", "plane")
+    run = ["run", str(workflow), "--input", f"scan={path}", *forced, "--store", str(folder / "st")]
+    # Without -o every run has a folder of its own.
+    return [sys.executable, "-m", "orthoflow", *run]
+
+
+def run_child(arguments: list[str]) -> None:
+    """Do one of the things that are measured."""
+    task, *rest = arguments
+    if task in {"chunks", "coordinates"}:
+        read_with_laspy(Path(rest[0]), keeps=task == "coordinates")
+    elif task == "process":
+        detect_in_file(rest[0], Path(rest[1]), Path(rest[2]))
+    else:
+        detect_mapped(rest[0], Path(rest[1]), rest[2])
+
+
+def read_with_laspy(path: Path, *, keeps: bool) -> None:
+    import laspy
+
+    with laspy.open(path) as reader:
+        count = reader.header.point_count if keeps else 0
+        kept = np.empty((3, count), dtype=np.float32)
+        start = 0
+        for chunk in reader.chunk_iterator(CHUNK):
+            if keeps:
+                for row, axis in enumerate("xyz"):
+                    kept[row, start : start + len(chunk)] = chunk[axis]
+                start += len(chunk)
+
+
+def detect_in_file(method: str, path: Path, folder: Path) -> None:
+    from orthoflow_plugins.read.scan import ReadScan
+
+    from orthoflow.products import InputFiles
+    from orthoflow.sdk import StepContext
+
+    def context(scratch: Path) -> StepContext:
+        return StepContext(rng=np.random.default_rng(0), cores=2, scratch=scratch)
+
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        files = InputFiles(name="scan", paths=(path,))
+        read = ReadScan()
+        cloud = read.run(ReadScan.In(files=files), ReadScan.Params(), context(Path(scratch))).cloud
+        detector = method_of(method)
+        detector().run(detector.In(cloud=cloud), detector.Params(), context(Path(scratch)))
+
+
+def detect_mapped(method: str, folder: Path, name: str) -> None:
+    from orthoflow.products import PointCloud
+    from orthoflow.sdk import StepContext
+
+    x, y, z = (np.memmap(folder / f"{name}_{axis}.f32", np.float32, "r") for axis in range(3))
+    cloud = PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]))
+    detector = method_of(method)
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        ctx = StepContext(rng=np.random.default_rng(0), cores=2, scratch=Path(scratch))
+        detector().run(detector.In(cloud=cloud), detector.Params(), ctx)
+
+
+def method_of(name: str):  # a class; which one is known when it is run
+    from orthoflow_plugins.plane.hough2d import Hough2d
+    from orthoflow_plugins.plane.ransac import Ransac
+
+    return {"hough2d": Hough2d, "ransac": Ransac}[name]
+
+
+def measured(command: list[str]) -> Cost:
+    """Run a command and measure it and all that it starts."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    start_s = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    peaks = [0]
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(SAMPLED_S):
+            peaks[0] = max(peaks[0], anonymous_bytes(process.pid))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    said = process.communicate()[1]
+    ended.set()
+    watcher.join()
+    if process.returncode:
+        sys.exit(f"{' '.join(command)} failed: {said.decode()}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Cost(time.perf_counter() - start_s, cpu_s, peaks[0] / 2**20)
+
+
+def anonymous_bytes(pid: int) -> int:
+    """Anonymous memory of a process and of all that it started; 0 for what has ended."""
+    total, waiting = 0, [pid]
+    while waiting:
+        folder = Path("/proc") / str(waiting.pop())
+        try:
+            lines = (folder / "status").read_text().splitlines()
+            for task in (folder / "task").iterdir():
+                waiting += [int(child) for child in (task / "children").read_text().split()]
+        except OSError:
+            continue
+        total += sum(1024 * int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
+    return total
+
+
+def fastest(costs: list[Cost]) -> Cost:
+    """The least of each."""
+    return Cost(
+        min(cost.wall_s for cost in costs),
+        min(cost.cpu_s for cost in costs),
+        max(cost.anonymous_mib for cost in costs),
+    )
+
+
+if __name__ == "__main__":
+    main()
