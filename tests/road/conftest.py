@@ -7,7 +7,7 @@ import fcntl
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,6 +85,15 @@ def metrics_of(folder: Path) -> dict[tuple[str, str], float]:
     """Metrics of a run's folder by cell and name."""
     with (folder / "products" / "metrics.csv").open() as table:
         return {(row["cell"], row["metric"]): float(row["value"]) for row in csv.DictReader(table)}
+
+
+def without_variants(text: str, variants: Iterable[str]) -> str:
+    """Take variants out of a workflow's text, each of which has a line of its own."""
+    starts = tuple(f"      {variant}:" for variant in variants)
+    lines = text.splitlines()
+    kept = [line for line in lines if not line.startswith(starts)]
+    assert len(lines) - len(kept) == len(starts), "a variant was renamed, or has several lines"
+    return "\n".join(kept)
 
 
 @pytest.fixture(scope="session")

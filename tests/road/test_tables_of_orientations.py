@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from orthoflow.workflow import shipped_workflow
-from tests.road.conftest import Shell, metrics_of
+from tests.road.conftest import IS_LONG, Shell, metrics_of, without_variants
 
+pytestmark = pytest.mark.long  # some of the variants in a normal run
 SMALL = (
     *("--set", "room.scan_step_m=0.004", "--set", "room.photo_gsd_m=0.003"),
     *("--set", "wall.gsd_m=0.006", "--executor", "inline"),
@@ -21,10 +22,8 @@ def table(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Table:
     """Metrics by cell and name of a small run, from the guided ties alone."""
     shell = Shell(tmp_path_factory.mktemp("orient-methods"), store)
     text = shipped_workflow("orient-methods").read_text()
-    left_out = ("      unmasked:", "      dlt-k1:")
-    quick = [line for line in text.splitlines() if not line.startswith(left_out)]
-    assert len(quick) == len(text.splitlines()) - len(left_out)
-    (shell.folder / "quick.yaml").write_text("\n".join(quick))
+    left_out = ("unmasked", "dlt-k1", *(() if IS_LONG else ("dlt-all",)))
+    (shell.folder / "quick.yaml").write_text(without_variants(text, left_out))
     ended = shell("run", "quick.yaml", *SMALL, "-o", "run", timeout_s=1200)
     assert ended.code == 0, ended.said
     return metrics_of(shell.folder / "run")
@@ -37,7 +36,7 @@ def of(table: Table, step: str, orient: str, metric: str) -> float:
 @pytest.mark.parametrize(
     ("orient", "n_oriented", "limit_mm"),
     # The control of one photo is too flat for a DLT.
-    [("pnp", 6, 0.6), ("bundle", 6, 0.3), ("dlt-all", 5, 1.2)],
+    [("pnp", 6, 0.6), ("bundle", 6, 0.3), *([("dlt-all", 5, 1.2)] if IS_LONG else [])],
 )
 def test_photos_are_oriented_within_what_is_stated(
     table: Table, orient: str, n_oriented: int, limit_mm: float
@@ -53,5 +52,5 @@ def test_eleven_parameters_show_in_the_orthoimage(table: Table) -> None:
     # Measured: 3.6 mm instead of 1.7, from poses that are off by 3.9 mm on the wall.
     assert of(table, "check", "dlt", "rmse_u_mm") > 1.5 * of(table, "check", "pnp", "rmse_u_mm")
     assert of(table, "check", "dlt", "pose_wall_rms_mm") > 3.0 * of(
-        table, "check", "dlt-all", "pose_wall_rms_mm"
+        table, "check", "pnp", "pose_wall_rms_mm"
     )
