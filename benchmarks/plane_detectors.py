@@ -29,7 +29,6 @@ from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
 from orthoflow_plugins.plane.detecting import rules_of, search_sample
 from orthoflow_plugins.plane.deviations import measure_planes
 from orthoflow_plugins.plane.parameters import DetectorParams
-from orthoflow_plugins.plane.peeling import find_planes
 from orthoflow_plugins.plane.preparing import prepare
 from orthoflow_plugins.plane.region_proposer import RegionProposer
 from orthoflow_plugins.plane.regions import Growth, Regions, grow
@@ -103,7 +102,12 @@ def detect(
     rules = replace(rules_of(DetectorParams()), n_planes_most=most, least_share=SHARE)
     cell_m = CELL_M if method == "hough2d" else 0.5
     remainder = prepare(
-        cloud, basis_from_up(cloud.up), cell_m=cell_m, least_share=SHARE, parts=cores
+        cloud,
+        basis_from_up(cloud.up),
+        cell_m=cell_m,
+        least_share=SHARE,
+        parts=cores,
+        counts_plan=method == "hough2d",
     )
     if method == "ransac":
         search = Search(
@@ -131,10 +135,10 @@ def detect(
         space = SpaceVoting(
             cell_m=coarser * CELL_M, angle_step_deg=coarser, least_points=SHARE * len(cloud)
         )
-        found = find_planes(remainder, SpaceProposer(remainder, space), rules, _listen)
+        found = search_sample(remainder, rules, _listen, lambda _: SpaceProposer(remainder, space))
     else:
         voting = Voting(angle_step_deg=1.0, least_points=SHARE * len(cloud))
-        found = find_planes(remainder, PlanProposer(remainder.grid, voting), rules, _listen)
+        found = search_sample(remainder, rules, _listen, lambda _: PlanProposer(remainder, voting))
     labels = np.empty(len(cloud), dtype=np.int16)
     name_points(remainder, np.arange(len(found) + 1, dtype=np.int16), labels)
     return remainder, found

@@ -202,11 +202,11 @@ def test_other_accumulators_find_the_densest_wall(
 def test_the_unit_accumulator_has_the_weaker_maximum(tmp_path: Path) -> None:
     # Half of the floor's cells lie along any line through the room: a wall hardly stands out.
     cloud = cloud_of(sampled(ROOM[:5]))
-    remainder = prepare(cloud, np.eye(3), cell_m=0.02, least_share=0.005, parts=1)
+    remainder = prepare(cloud, np.eye(3), cell_m=0.02, least_share=0.005, parts=1, counts_plan=True)
     shares = []
     for accumulator in ("counts", "unit"):
         voting = Voting(angle_step_deg=1.0, least_points=1.0, accumulator=accumulator)
-        proposer = PlanProposer(remainder.grid, voting)
+        proposer = PlanProposer(remainder, voting)
         proposer.propose(remainder)
         votes = proposer.first.votes
         shares.append(votes.max() / votes.sum(axis=1).max())

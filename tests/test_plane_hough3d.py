@@ -14,7 +14,7 @@ from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVotin
 from orthoflow_plugins.plane.space_directions import directions_over
 
 from orthoflow.geometry import angle_between_deg
-from orthoflow.geometry.voxel_kernels import vote_planes
+from orthoflow.geometry.voxel_kernels import VOTE_SHARES, vote_planes
 from orthoflow.products import Planes, PointCloud
 from tests.plane_scenes import ROOM, Rectangle, cloud_of, context, sampled
 
@@ -94,7 +94,7 @@ def test_every_place_votes_once_per_direction_and_takes_its_votes_back() -> None
     places = rng.uniform(-1.5, 1.5, (3, 500)).astype(np.float32)
     weights = rng.integers(1, 9, 500).astype(np.int32)
     votes = votes_of(places, weights)
-    np.testing.assert_array_equal(votes.sum(axis=1), weights.sum())
+    np.testing.assert_array_equal(votes.sum(axis=1), VOTE_SHARES * weights.sum())
     part = votes_of(places[:, :200], weights[:200])
     rest = votes + votes_of(np.ascontiguousarray(places[:, 200:]), -weights[200:])
     np.testing.assert_array_equal(rest, part)
@@ -105,8 +105,8 @@ def test_votes_lie_at_the_distance_that_the_equation_gives() -> None:
     votes = votes_of(places, np.ones(1, dtype=np.int32))
     normals = directions_over(5.0, "any", 10.0).normals
     distances_m = (np.argmax(votes, axis=1) + 0.5 - 100.0) * 0.05
-    # Half a cell of the image along both of its axes, and half a bin.
-    assert np.abs(distances_m - normals @ places[:, 0]).max() < 0.05 * (0.5 * np.sqrt(2.0) + 0.5)
+    # Half a cell of the image along both of its axes, half a one when rows shift, and half a bin.
+    assert np.abs(distances_m - normals @ places[:, 0]).max() < 0.05 * (0.5 * np.sqrt(2.0) + 1.0)
 
 
 def test_the_number_of_threads_does_not_change_a_bit(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from orthoflow.geometry.point_kernels import (
 # Distances are summed in steps of the fit tolerance over this: half a micrometre at 15 mm, and the
 # squares of 48 million points still fit into 64 bits.
 STEPS_PER_TOLERANCE: Final = 32768
-# Columns of what `claim_slab` and `measure_deviations` count.
+# Bins that the deviations of a plane's points are counted in.
 HISTOGRAM_BINS: Final = 200
 
 
@@ -96,40 +96,6 @@ def vote_points(
 
 
 @compiled
-def robust_moments(
-    points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float
-) -> NDArray[np.float64]:
-    """Weighted sums of the points near a plane, Tukey's weights with a cut at the tolerance.
-
-    Args:
-        points: (m, 3) offsets, metres.
-        plane: (4,) normal and offset.
-        tolerance_m: distance at which a point's weight has fallen to zero.
-
-    Returns:
-        (10,) sum of weights, of w x, w y, w z, and of w times xx, xy, xz, yy, yz, zz.
-    """
-    sums = np.zeros(10)
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        ratio = (plane[0] * x + plane[1] * y + plane[2] * z - plane[3]) / tolerance_m
-        if abs(ratio) >= 1.0:
-            continue
-        weight = (1.0 - ratio * ratio) ** 2
-        sums[0] += weight
-        sums[1] += weight * x
-        sums[2] += weight * y
-        sums[3] += weight * z
-        sums[4] += weight * x * x
-        sums[5] += weight * x * y
-        sums[6] += weight * x * z
-        sums[7] += weight * y * y
-        sums[8] += weight * y * z
-        sums[9] += weight * z * z
-    return sums
-
-
-@compiled
 def _misses(box: NDArray[np.float32], slab: NDArray[np.float64], reach_m: float) -> bool:
     """Whether no point of a block's box lies within the reach of the slab's plane."""
     centre = -slab[3]
@@ -182,16 +148,6 @@ def _within(
     u = slab[4] * x + slab[5] * y + slab[6] * z - slab[7]
     v = slab[8] * x + slab[9] * y + slab[10] * z - slab[11]
     return bool(bounds[1] <= u <= bounds[2] and bounds[3] <= v <= bounds[4])
-
-
-@compiled
-def _place(
-    frame: NDArray[np.float32], row: int, x: np.float32, y: np.float32, z: np.float32
-) -> int:
-    """Cell of an offset along one axis of the plan, as `count_over_plan` has it; -1 before it."""
-    # The row is picked here: to hand over a row of an array per point costs more than all this.
-    position = frame[row, 0] * x + frame[row, 1] * y + frame[row, 2] * z - frame[row, 3]
-    return int(position) if position >= 0.0 else -1
 
 
 @compiled
@@ -253,10 +209,7 @@ def claim_slab(
     claims: NDArray[np.int8],
     slabs: NDArray[np.float64],
     bounds: NDArray[np.float64],
-    frame: NDArray[np.float32],
-    taken: NDArray[np.int32],
-    taken_heights: NDArray[np.int32],
-) -> None:
+) -> int:
     """Give the points of the last slab to it, unless an earlier slab that has them is nearer.
 
     Args:
@@ -264,13 +217,11 @@ def claim_slab(
         claims: (n,) plane of each point, negative for none; changed.
         slabs: (k, 12) all slabs so far, the new one last.
         bounds: (5,) of the new slab: find tolerance, then smallest and largest u and v, metres.
-        frame: (3, 4) plan cells and storeys of a point, see `count_over_plan`.
-        taken: (cells along e1, along e2) points that were unclaimed and no longer are.
-        taken_heights: (storeys + 1,) the same per storey, and in the last column in all.
+
+    Returns:
+        How many points were unclaimed and no longer are.
     """
     x, y, z, boxes = points.x, points.y, points.z, points.boxes
-    n_first, n_second = taken.shape
-    n_storeys = taken_heights.size - 1
     index = slabs.shape[0] - 1
     slab = slabs[index]
     find_m = bounds[0]
@@ -289,67 +240,9 @@ def claim_slab(
             if not _within(slab, bounds, px, py, pz):
                 continue
             owner = claims[i]
-            if owner >= 0:
-                if size < _distance(slabs[owner], px, py, pz):
-                    claims[i] = index
-                continue
-            claims[i] = index
-            n_taken += 1
-            first = _place(frame, 0, x[i], y[i], z[i])
-            second = _place(frame, 1, x[i], y[i], z[i])
-            storey = _place(frame, 2, x[i], y[i], z[i])
-            if 0 <= first < n_first and 0 <= second < n_second:
-                taken[first, second] += 1
-                if 0 <= storey < n_storeys:
-                    taken_heights[storey] += 1
-    taken_heights[n_storeys] += n_taken
-
-
-@compiled
-def measure_deviations(
-    points: BlockedPoints,
-    claims: NDArray[np.int8],
-    slabs: NDArray[np.float64],
-    limits: NDArray[np.float64],
-    sums: NDArray[np.int64],
-    histogram: NDArray[np.int64],
-    extents: NDArray[np.float64],
-) -> None:
-    """Sum and bin the distances of claimed points to their plane, and see how far they reach.
-
-    Args:
-        points: (n,) offsets in blocks.
-        claims: (n,) plane of each point, negative for none.
-        slabs: (k, 12) the planes.
-        limits: (k, 6) find tolerance, fit tolerance, smallest and largest u, smallest and largest
-            v of the plane's rectangle; metres.
-        sums: (k, 6) of points within the find tolerance: number, steps, squared steps, then
-            the same within the fit tolerance; added to.
-        histogram: (k, HISTOGRAM_BINS) points per bin of -find tolerance..find tolerance.
-        extents: (k, 4) smallest and largest u, smallest and largest v of the points within the fit
-            tolerance and the rectangle; widened.
-    """
-    x, y, z = points.x, points.y, points.z
-    # Numbers are picked one by one: a row of an array per point costs more than the sums.
-    for i in range(x.size):
-        k = claims[i]
-        if k < 0:
-            continue
-        px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
-        distance = slabs[k, 0] * px + slabs[k, 1] * py + slabs[k, 2] * pz - slabs[k, 3]
-        steps = np.int64(math.floor(distance * (STEPS_PER_TOLERANCE / limits[k, 1]) + 0.5))
-        sums[k, 0] += 1
-        sums[k, 1] += steps
-        sums[k, 2] += steps * steps
-        place = int((distance / limits[k, 0] + 1.0) * (0.5 * HISTOGRAM_BINS))
-        histogram[k, min(max(place, 0), HISTOGRAM_BINS - 1)] += 1
-        if abs(distance) > limits[k, 1]:
-            continue
-        sums[k, 3] += 1
-        sums[k, 4] += steps
-        sums[k, 5] += steps * steps
-        u = slabs[k, 4] * px + slabs[k, 5] * py + slabs[k, 6] * pz - slabs[k, 7]
-        v = slabs[k, 8] * px + slabs[k, 9] * py + slabs[k, 10] * pz - slabs[k, 11]
-        if limits[k, 2] <= u <= limits[k, 3] and limits[k, 4] <= v <= limits[k, 5]:
-            extents[k, 0], extents[k, 1] = min(extents[k, 0], u), max(extents[k, 1], u)
-            extents[k, 2], extents[k, 3] = min(extents[k, 2], v), max(extents[k, 3], v)
+            if owner < 0:
+                claims[i] = index
+                n_taken += 1
+            elif size < _distance(slabs[owner], px, py, pz):
+                claims[i] = index
+    return n_taken

@@ -116,20 +116,44 @@ class PlanGrid:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Boxes:
+    """Where the blocks of a cloud lie.
+
+    Attributes:
+        boxes: (blocks, 6) float32, smallest and largest x, y, z offsets of each block.
+        n_unusable: coordinates that are NaN or infinite.
+    """
+
+    boxes: NDArray[np.float32]
+    n_unusable: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class PlanCounts:
     """How the points of a cloud spread over a plan.
 
     Attributes:
         cells: (cells along e1, cells along e2) int64, points per cell.
         heights: (storeys,) int64, points per storey of those that lie over the plan.
-        boxes: (blocks, 6) float32, smallest and largest x, y, z offsets of each block.
-        n_unusable: points that are NaN or infinite.
+        boxed: where the blocks lie.
     """
 
     cells: NDArray[np.int64]
     heights: NDArray[np.int64]
-    boxes: NDArray[np.float32]
-    n_unusable: int
+    boxed: Boxes
+
+
+def box_blocks(offsets: Offsets, *, parts: int) -> Boxes:
+    """Find the box of each block of points, in one pass."""
+    n_points = len(offsets.x)
+    boxes = np.empty((-(-n_points // BLOCK_POINTS), 6), dtype=np.float32)
+    unusable = np.zeros(parts, dtype=np.int64)
+
+    def find(part: int, piece: slice) -> None:
+        unusable[part] = _set_boxes(piece_of(blocked(offsets, boxes), piece))
+
+    each_part(n_points, parts, find)
+    return Boxes(boxes=boxes, n_unusable=int(unusable.sum()))
 
 
 def plan_frame(grid: PlanGrid) -> NDArray[np.float32]:
@@ -157,29 +181,46 @@ def count_over_plan(offsets: Offsets, grid: PlanGrid, *, parts: int) -> PlanCoun
     return PlanCounts(
         cells=cells.sum(axis=0, dtype=np.int64),
         heights=heights.sum(axis=0, dtype=np.int64),
-        boxes=boxes,
-        n_unusable=int(unusable.sum()),
+        boxed=Boxes(boxes=boxes, n_unusable=int(unusable.sum())),
     )
 
 
 @compiled
-def _set_box(points: BlockedPoints, block: int) -> None:
-    """Set the box of a block."""
-    x, y, z, boxes = points.x, points.y, points.z, points.boxes
+def _unusable(values: NDArray[np.float32]) -> int:
+    """Count the values that are NaN or infinite: all bits of the exponent are set."""
+    bits = values.view(np.int32)
+    exponent, one, none = np.int32(0x7F800000), np.int32(1), np.int32(0)
+    bad = np.int32(0)
+    for i in range(bits.size):
+        bad += one if (bits[i] & exponent) == exponent else none
+    return int(bad)
+
+
+@compiled
+def _set_box(points: BlockedPoints, block: int) -> int:
+    """Set the box of a block, and give how many of its coordinates are unusable."""
+    boxes = points.boxes
     start = block * BLOCK_POINTS
-    x_low = x_high = x[start]
-    y_low = y_high = y[start]
-    z_low = z_high = z[start]
-    for i in range(start, min(start + BLOCK_POINTS, x.size)):
-        x_low = min(x_low, x[i])
-        x_high = max(x_high, x[i])
-        y_low = min(y_low, y[i])
-        y_high = max(y_high, y[i])
-        z_low = min(z_low, z[i])
-        z_high = max(z_high, z[i])
-    boxes[block, 0], boxes[block, 1] = x_low, x_high
-    boxes[block, 2], boxes[block, 3] = y_low, y_high
-    boxes[block, 4], boxes[block, 5] = z_low, z_high
+    stop = min(start + BLOCK_POINTS, points.x.size)
+    bad = 0
+    for axis in range(3):
+        values = (points.x, points.y, points.z)[axis][start:stop]
+        low = high = values[0]
+        for i in range(values.size):
+            low = min(low, values[i])
+            high = max(high, values[i])
+        boxes[block, 2 * axis], boxes[block, 2 * axis + 1] = low, high
+        bad += _unusable(values)
+    return bad
+
+
+@compiled
+def _set_boxes(points: BlockedPoints) -> int:
+    """Set the boxes of all blocks, and give how many coordinates are unusable."""
+    bad = 0
+    for block in range(points.boxes.shape[0]):
+        bad += _set_box(points, block)
+    return bad
 
 
 @compiled
@@ -191,8 +232,8 @@ def _place_block(
     n_storeys: int,
     cell: NDArray[np.int32],
     storey: NDArray[np.int32],
-) -> int:
-    """Set cell and storey of a block's points, -1 outside, and give the number that are unusable.
+) -> None:
+    """Set cell and storey of a block's points, -1 outside.
 
     Apart from the counting, and without branches, so that the processor takes several points at
     once: the counts wait for each other, the places need not.
@@ -201,11 +242,10 @@ def _place_block(
     a0, a1, a2, a3 = frame[0, 0], frame[0, 1], frame[0, 2], frame[0, 3]
     b0, b1, b2, b3 = frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3]
     c0, c1, c2, c3 = frame[2, 0], frame[2, 1], frame[2, 2], frame[2, 3]
-    zero, most = np.float32(0.0), np.float32(3.0e38)
+    zero = np.float32(0.0)
     top_first, top_second = np.float32(shape[0]), np.float32(shape[1])
     top_storey = np.float32(n_storeys)
     width, nowhere = np.int32(shape[1]), np.int32(-1)
-    bad = 0
     start = block * BLOCK_POINTS
     for i in range(start, min(start + BLOCK_POINTS, x.size)):
         first = a0 * x[i] + a1 * y[i] + a2 * z[i] - a3
@@ -218,8 +258,18 @@ def _place_block(
         level = np.int32(height if within else zero)
         cell[i - start] = row * width + column if over else nowhere
         storey[i - start] = level if within else nowhere
-        bad += not (abs(first + second + height) <= most)
-    return bad
+
+
+@compiled
+def _add_runs(places: NDArray[np.int32], count: int, table: NDArray[np.int32]) -> None:
+    """Count places into a table, none of them negative; a scan's neighbours share one."""
+    i = 0
+    while i < count:
+        first, place = i, places[i]
+        while i < count and places[i] == place:
+            i += 1
+        if place >= 0:
+            table[place] += i - first
 
 
 @compiled
@@ -238,11 +288,8 @@ def _count_over_plan(
     for block in range(boxes.shape[0]):
         start = block * BLOCK_POINTS
         stop = min(start + BLOCK_POINTS, points.x.size)
-        _set_box(points, block)
-        bad += _place_block(points, block, frame, cells.shape, heights.size, cell, storey)
-        for i in range(stop - start):
-            if cell[i] >= 0:
-                flat[cell[i]] += 1
-            if storey[i] >= 0:
-                heights[storey[i]] += 1
+        bad += _set_box(points, block)
+        _place_block(points, block, frame, cells.shape, heights.size, cell, storey)
+        _add_runs(cell, stop - start, flat)
+        _add_runs(storey, stop - start, heights)
     return bad

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
 from orthoflow.geometry.plane_kernels import vote_lines, vote_points
-from orthoflow.geometry.point_kernels import PlanGrid, in_threads
+from orthoflow.geometry.point_kernels import in_threads
 from orthoflow_plugins.plane.candidates import Candidate
+from orthoflow_plugins.plane.leftovers import PlanLeftovers
 from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.voters import Accumulation, plan_centre_m, voters
+from orthoflow_plugins.plane.voters import Accumulation, Voters, plan_centre_m, voters
 
 # A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
 # several bins until it is refined.
@@ -76,8 +77,24 @@ class PlanProposer:
         first: the accumulator of the untouched cloud.
     """
 
-    def __init__(self, grid: PlanGrid, voting: Voting) -> None:
-        """Get ready to propose."""
+    def __init__(self, whole: Remainder, voting: Voting) -> None:
+        """Get ready to propose.
+
+        Args:
+            whole: the cloud, counted over its plan.
+            voting: how it votes.
+
+        Raises:
+            ValueError: the points were not counted over the plan.
+        """
+        grid = whole.grid
+        if whole.plan is None:
+            raise ValueError("the points of the cloud were not counted over its plan")
+        self._whole = whole
+        self._leftovers = PlanLeftovers(whole.plan, grid, whole)
+        self._cells = np.zeros(grid.shape[:2], dtype=np.int64)
+        self._heights = whole.plan.heights
+        self._voters: Voters | None = None
         self._grid = grid
         self._voting = voting
         self._least_votes = _VOTE_CAUTION * voting.least_points
@@ -89,24 +106,24 @@ class PlanProposer:
         self._smear_bins = max(1, round(0.3 * half_m * math.pi / n_angles / grid.cell_m))
         self._barred = np.zeros((n_angles, 2 * self._reach_bins), dtype=bool)
         self._barred_heights = np.zeros(grid.shape[2], dtype=bool)
-        self._voted_for = -1
+        self._counted_for = -1
+        self._votes = np.zeros((n_angles, 2 * self._reach_bins), dtype=np.int64)
         self._scores = np.zeros((0, 0))
-        self._accumulator: Accumulator | None = None
         self._last = (-1, -1)
         self.first: Accumulator | None = None
 
     def propose(self, remainder: Remainder) -> Candidate | None:
         """Name the better of the best line and the best height."""
+        self._count(remainder)
         line_score, angle, place = -math.inf, -1, -1
         if self._voting.walls:
-            self._vote(remainder)
             scores = np.where(self._barred, -np.inf, self._scores)
             best = np.unravel_index(int(np.argmax(scores)), scores.shape)
             angle, place = int(best[0]), int(best[1])
             line_score = float(scores[angle, place])
         height_score, storey = -math.inf, -1
         if self._voting.levels:
-            heights = contrast(remainder.heights[None, :], 1)[0]
+            heights = contrast(self._heights[None, :], 1)[0]
             heights = np.where(self._barred_heights, -np.inf, heights)
             storey = int(np.argmax(heights))
             height_score = float(heights[storey])
@@ -116,7 +133,7 @@ class PlanProposer:
             self._last = (-1, storey)
             return self._level(storey, height_score)
         self._last = (angle, place)
-        return self._wall(remainder, angle, place, line_score)
+        return self._wall(angle, place, line_score)
 
     def reject(self, candidate: Candidate) -> None:
         """Bar the surroundings of the last maximum."""
@@ -133,54 +150,78 @@ class PlanProposer:
             row = self._barred[(angle + step) % n_angles]
             row[max(0, centre - reach) : centre + reach + 1] = True
 
-    def _vote(self, remainder: Remainder) -> None:
-        if self._voted_for == remainder.n_unclaimed:
+    def _count(self, remainder: Remainder) -> None:
+        """See what is left, and let it vote, unless nothing was taken since the last time."""
+        if self._counted_for == remainder.n_unclaimed:
             return
+        self._counted_for = remainder.n_unclaimed
+        claims = remainder.sample_claims
+        self._heights = self._leftovers.heights(claims)
+        before, self._cells = self._cells, self._leftovers.cells(claims)
+        self._voters = None
+        if not self._voting.walls:
+            return
+        if self._voting.is_raw:
+            self._whole.catch_up(remainder)
+            self._vote_raw()
+        elif self._voting.accumulator == "counts":
+            # Votes are sums: what was taken away takes its votes back.
+            self._add(voters(self._grid, self._cells - before, "counts"))
+        else:
+            self._votes = np.zeros(self._votes.shape, dtype=np.int64)
+            self._add(voters(self._grid, self._cells, self._voting.accumulator))
+        if self.first is None:
+            self.first = Accumulator(
+                angles_rad=self._angles_rad,
+                low_m=-self._reach_bins * self._grid.cell_m,
+                bin_m=self._grid.cell_m,
+                centre_m=plan_centre_m(self._grid),
+                votes=self._votes.copy(),
+            )
+        self._scores = contrast(self._votes, self._smear_bins)
+
+    def _add(self, cells: Voters) -> None:
+        """Let cells vote for all lines through them."""
         bin_m = self._grid.cell_m
         low_m = -self._reach_bins * bin_m
-        votes = np.zeros((len(self._angles_rad), 2 * self._reach_bins), dtype=np.int64)
-        shares = zip(
-            np.array_split(self._angles_rad, remainder.parts),
-            np.array_split(votes, remainder.parts),
-            strict=True,
-        )
-        if self._voting.is_raw:
-            plan = np.column_stack([self._grid.basis[:2], plan_centre_m(self._grid)])
-            tasks = [
-                partial(
-                    vote_points,
-                    remainder.points,
-                    remainder.claims,
-                    plan,
-                    angles,
-                    low_m,
-                    bin_m,
-                    part,
-                )
-                for angles, part in shares
-            ]
-        else:
-            cells = voters(self._grid, remainder.cells, self._voting.accumulator)
-            tasks = [
+        in_threads(
+            [
                 partial(vote_lines, cells.places_m, cells.votes, angles, low_m, bin_m, table)
-                for angles, table in shares
+                for angles, table in self._shares()
             ]
-        in_threads(tasks)
-        self._accumulator = Accumulator(
-            angles_rad=self._angles_rad,
-            low_m=low_m,
-            bin_m=bin_m,
-            centre_m=plan_centre_m(self._grid),
-            votes=votes,
         )
-        if self.first is None:
-            self.first = self._accumulator
-        self._scores = contrast(votes, self._smear_bins)
-        self._voted_for = remainder.n_unclaimed
 
-    def _wall(self, remainder: Remainder, angle: int, place: int, score: float) -> Candidate:
+    def _vote_raw(self) -> None:
+        """Let every unclaimed point of the cloud vote for all lines through it."""
+        bin_m = self._grid.cell_m
+        low_m = -self._reach_bins * bin_m
+        plan = np.column_stack([self._grid.basis[:2], plan_centre_m(self._grid)])
+        points, claims = self._whole.points, self._whole.claims
+        self._votes = np.zeros(self._votes.shape, dtype=np.int64)
+        in_threads(
+            [
+                partial(vote_points, points, claims, plan, angles, low_m, bin_m, table)
+                for angles, table in self._shares()
+            ]
+        )
+
+    def _shares(self) -> list[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+        """Angles and their rows of the votes, one share per thread."""
+        parts = self._whole.parts
+        return list(
+            zip(
+                np.array_split(self._angles_rad, parts),
+                np.array_split(self._votes, parts),
+                strict=True,
+            )
+        )
+
+    def _wall(self, angle: int, place: int, score: float) -> Candidate:
         """Look around a maximum with finer angles and half-cell bins."""
-        cells = voters(self._grid, remainder.cells, self._voting.accumulator)
+        cells = self._voters
+        if cells is None:
+            cells = voters(self._grid, self._cells, self._voting.accumulator)
+            self._voters = cells
         places_m = cells.places_m
         bin_m = self._grid.cell_m
         distance_m = (place + 0.5 - self._reach_bins) * bin_m

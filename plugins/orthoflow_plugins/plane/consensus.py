@@ -128,14 +128,16 @@ class ConsensusProposer:
         pool = self._pool
         if pool is None:
             return None
+        is_barred = self._near_any(pool.hypotheses, self._barred)
         for place in range(len(pool.hypotheses)):
-            hypothesis = pool.hypotheses.chosen(np.array([place]))
-            if self._is_barred(hypothesis) or not self._is_worth_it(pool.scores, place, remainder):
+            if is_barred[place] or not self._is_worth_it(pool.scores, place, remainder):
                 continue
+            hypothesis = pool.hypotheses.chosen(np.array([place]))
             if self._is_crowded(hypothesis, pool.asked_m, remainder.up):
                 return self._candidate(hypothesis, pool.scores, place, remainder)
             # Not asked about again; the full examination would cost ten times as much.
             self._barred.append(hypothesis)
+            is_barred |= self._near_any(pool.hypotheses, [hypothesis])
         return None
 
     def reject(self, candidate: Candidate) -> None:
@@ -158,8 +160,7 @@ class ConsensusProposer:
         )
         hypotheses = _joined(drawn, None if earlier is None else earlier.hypotheses)
         hypotheses = hypotheses.chosen(self._leans_well(hypotheses, remainder.up))
-        for barred in self._barred:
-            hypotheses = hypotheses.chosen(~self._near(hypotheses, barred))
+        hypotheses = hypotheses.chosen(~self._near_any(hypotheses, self._barred))
         if len(hypotheses) == 0:
             return
         asked = self._shuffled[claims[self._shuffled] < 0]
@@ -210,17 +211,19 @@ class ConsensusProposer:
         leans: NDArray[np.bool_] = tilts_deg <= limit_deg if wall else tilts_deg >= 90 - limit_deg
         return leans
 
-    def _is_barred(self, hypothesis: Hypotheses) -> bool:
-        return any(bool(self._near(hypothesis, barred)[0]) for barred in self._barred)
-
-    def _near(self, hypotheses: Hypotheses, one: Hypotheses) -> NDArray[np.bool_]:
-        """(h,) whether hypotheses are much the same as one of them."""
-        cosines = hypotheses.normals @ one.normals[0]
-        apart_m = np.abs(hypotheses.offsets_m - np.copysign(1.0, cosines) * one.offsets_m[0])
+    def _near_any(self, hypotheses: Hypotheses, others: list[Hypotheses]) -> NDArray[np.bool_]:
+        """(h,) whether hypotheses are much the same as one of some."""
+        if not others:
+            return np.zeros(len(hypotheses), dtype=bool)
+        normals = np.concatenate([one.normals for one in others])
+        offsets_m = np.concatenate([one.offsets_m for one in others])
+        cosines = hypotheses.normals @ normals.T
+        apart_m = np.abs(hypotheses.offsets_m[:, None] - np.copysign(1.0, cosines) * offsets_m)
         near: NDArray[np.bool_] = (np.abs(cosines) > math.cos(math.radians(_BARRED_DEG))) & (
             apart_m < _BARRED_TOLERANCES * self._search.find_m
         )
-        return near
+        any_near: NDArray[np.bool_] = np.logical_or.reduce(near, axis=1)
+        return any_near
 
     def _distinct(
         self, hypotheses: Hypotheses, ranked: NDArray[np.intp], n_most: int
@@ -231,7 +234,7 @@ class ConsensusProposer:
         for index in ranked:
             if alike[index] < _ALIKE_MOST:
                 kept.append(index)
-                alike += self._near(hypotheses, hypotheses.chosen(np.array([index])))
+                alike += self._near_any(hypotheses, [hypotheses.chosen(np.array([index]))])
                 if len(kept) == n_most:
                     break
         return np.array(kept, dtype=np.intp)

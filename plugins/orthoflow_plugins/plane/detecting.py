@@ -29,7 +29,7 @@ from orthoflow_plugins.plane.thickness import measure_thickness, scan_row
 from orthoflow_plugins.plane.thickness_figures import draw_thickness
 
 Report = Callable[[float, str], None]
-# Plan cells of detectors that do not look at the plan.
+# Steps of the robust box of detectors that do not look at the plan.
 _PLAN_CELL_M: Final = 0.5
 
 _NO_PLANE: Final = (
@@ -97,7 +97,7 @@ def detect(
     find: Callable[[Remainder, Rules, Report], list[FoundPlane]],
     *,
     method: str,
-    plan_cell_m: float = _PLAN_CELL_M,
+    plan_cell_m: float | None = None,
     relabel: Callable[[list[FoundPlane], Remainder], None] | None = None,
 ) -> Detection:
     """Run a search on a cloud and turn what it finds into products.
@@ -109,7 +109,7 @@ def detect(
         find: the search: finds planes in a remainder. If it leaves points unclaimed that lie on
             its planes, they are claimed here.
         method: id of the method, for messages.
-        plan_cell_m: side of the plan's cells.
+        plan_cell_m: side of the plan's cells; None for detectors that do not look at the plan.
         relabel: changes the claims of the whole cloud once all points have theirs.
 
     Raises:
@@ -124,9 +124,10 @@ def detect(
         return prepare(
             points,
             basis_from_up(cloud.up),
-            cell_m=plan_cell_m,
+            cell_m=_PLAN_CELL_M if plan_cell_m is None else plan_cell_m,
             least_share=params.min_share,
             parts=ctx.cores,
+            counts_plan=plan_cell_m is not None,
         )
 
     whole = remainder = prepared(thinned(cloud, params.thinning))

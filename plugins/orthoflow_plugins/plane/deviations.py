@@ -7,11 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.plane_kernels import (
-    HISTOGRAM_BINS,
-    STEPS_PER_TOLERANCE,
-    measure_deviations,
-)
+from orthoflow.geometry.deviation_kernels import measure_deviations
+from orthoflow.geometry.plane_kernels import HISTOGRAM_BINS, STEPS_PER_TOLERANCE
 from orthoflow.geometry.point_kernels import each_part, piece_of
 from orthoflow_plugins.plane.remainders import Remainder
 

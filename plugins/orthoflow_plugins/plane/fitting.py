@@ -13,16 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.plane_kernels import robust_moments
+from orthoflow.geometry.plane_fit_kernels import FREE, LEVEL, VERTICAL, refine_robustly
 
 # What a fit may change: everything, or a normal kept exactly horizontal, or kept along up.
 Freedom = Literal["free", "vertical", "level"]
 
-_STEPS_MOST: Final = 20
-# A fit has settled when a point ten metres away moves by less than this.
-_SETTLED_M: Final = 2e-6
-# Points nearer to a line than this (root mean square) do not say how the plane lies about it.
-_LINE_WIDTH_M: Final = 1e-4
+_FREEDOMS: Final[dict[Freedom, int]] = {"free": FREE, "vertical": VERTICAL, "level": LEVEL}
 
 
 def shrinking_tolerances(find_m: float, fit_m: float) -> tuple[float, ...]:
@@ -56,44 +52,9 @@ def refine_plane(
     Returns:
         The plane, or None where fewer than three points or only a line of points support it.
     """
-    plane = start
-    for _ in range(_STEPS_MOST):
-        row = np.append(plane.normal, plane.offset_m)
-        fitted = plane_from_moments(
-            robust_moments(points, row, tolerance_m), plane, freedom=freedom, up=up
-        )
-        if fitted is None:
-            return None
-        turned = float(np.linalg.norm(fitted.normal - plane.normal))
-        # The shift is taken at the points, not at the origin, which may be far from them.
-        moved = abs(fitted.offset_m - plane.offset_m)
-        plane = fitted
-        if max(10.0 * turned, moved) < _SETTLED_M:
-            break
-    return plane
-
-
-def plane_from_moments(
-    sums: NDArray[np.float64], near: Plane, *, freedom: Freedom, up: NDArray[np.float64]
-) -> Plane | None:
-    """Give the plane of least squared distances from `robust_moments`, on the side of `near`."""
-    if sums[0] <= 0.0:
+    row = np.append(start.normal, start.offset_m)
+    if not refine_robustly(points, row, tolerance_m, _FREEDOMS[freedom], up):
         return None
-    mean = sums[1:4] / sums[0]
-    second = np.array([[sums[4], sums[5], sums[6]], [sums[5], sums[7], sums[8]]])
-    moments = np.vstack([second, [sums[6], sums[8], sums[9]]]) / sums[0] - np.outer(mean, mean)
-    if freedom == "level":
-        normal = up
-    else:
-        if freedom == "vertical":
-            # Without its part along up, the covariance has up itself as a null direction.
-            across = np.eye(3) - np.outer(up, up)
-            moments = across @ moments @ across + np.outer(up, up) * np.trace(moments)
-        variances, directions = np.linalg.eigh(moments)
-        if variances[1] < max(_LINE_WIDTH_M**2, 1e-8 * variances[2]):
-            return None
-        normal = directions[:, 0]
-    if float(normal @ near.normal) < 0.0:
-        normal = -normal
-    normal = normal / np.linalg.norm(normal)
-    return Plane(normal=normal, offset_m=float(normal @ mean))
+    # Twice, because Plane accepts no length that is off by more than rounding.
+    normal = row[:3] / np.linalg.norm(row[:3])
+    return Plane(normal=normal / np.linalg.norm(normal), offset_m=float(row[3]))

@@ -22,8 +22,9 @@ class Hough2d(Method):
 
     Points are counted in the cells of a plan; every occupied cell votes, with as many votes as it
     has points, for all lines through it. The best line is refined on a sample of the points, with a
-    tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, then fitted to all points at
-    once (total least squares of cell means), given a rectangle, and its points are taken away.
+    tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, given a rectangle, and its
+    points are taken away: the sample says which share of each cell those are. When all planes are
+    found, one pass over all points fits them (total least squares of cell means), one labels.
     Floors, ceilings and other level planes come from the histogram of heights in the same race and
     are refitted in 3D.
 
@@ -84,14 +85,12 @@ class Hough2d(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
-        from orthoflow_plugins.plane.detecting import detect
+        from orthoflow_plugins.plane.detecting import detect, search_sample
         from orthoflow_plugins.plane.figures import VotePicture, draw_accumulator
-        from orthoflow_plugins.plane.peeling import find_planes
 
         pictures: list[VotePicture] = []
 
         def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
-            plan = remainder.cells.copy()
             voting = Voting(
                 angle_step_deg=params.angle_step_deg,
                 least_points=params.min_share * len(remainder.claims),
@@ -100,9 +99,10 @@ class Hough2d(Method):
                 accumulator=params.accumulator,
                 is_raw=params.coordinates == "raw",
             )
-            proposer = PlanProposer(remainder.grid, voting)
-            found = find_planes(remainder, proposer, rules, report)
-            if proposer.first is not None:
+            proposer = PlanProposer(remainder, voting)
+            found = search_sample(remainder, rules, report, lambda _: proposer)
+            if proposer.first is not None and remainder.plan is not None:
+                plan = remainder.plan.cells
                 pictures.append(
                     VotePicture(grid=remainder.grid, plan=plan, accumulator=proposer.first)
                 )

@@ -76,9 +76,8 @@ class Hough3d(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.detecting import detect
+        from orthoflow_plugins.plane.detecting import detect, search_sample
         from orthoflow_plugins.plane.figures import draw_space
-        from orthoflow_plugins.plane.peeling import find_planes
         from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
 
         pictures: list[NDArray[np.float64]] = []
@@ -94,7 +93,7 @@ class Hough3d(Method):
                 is_raw=params.coordinates == "raw",
             )
             proposer = SpaceProposer(remainder, voting)
-            found = find_planes(remainder, proposer, rules, report)
+            found = search_sample(remainder, rules, report, lambda _: proposer)
             if proposer.first_picture is not None:
                 pictures.append(proposer.first_picture)
             return found

@@ -1,4 +1,4 @@
-"""One pass over the cloud that every detector starts with: sample, robust box, plan, blocks."""
+"""What every detector starts with: sample and robust box, then one pass for blocks and plan."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.point_kernels import Offsets, blocked, count_over_plan, read_only
+from orthoflow.geometry.point_kernels import blocked, box_blocks, count_over_plan, read_only
 from orthoflow.products import PointCloud
 from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.sampling import draw_sample, plan_grid
@@ -23,9 +23,6 @@ _THINNEST_M: Final = 1e-4
 def sample_alone(remainder: Remainder) -> Remainder:
     """Give the sample as a remainder of its own, nothing claimed: every point of it is asked."""
     sample = remainder.sample
-    counts = count_over_plan(
-        Offsets(sample.points.x, sample.points.y, sample.points.z), remainder.grid, parts=1
-    )
     count = len(sample.index)
     return Remainder(
         points=sample.points,
@@ -34,8 +31,6 @@ def sample_alone(remainder: Remainder) -> Remainder:
         up=remainder.up,
         parts=remainder.parts,
         claims=np.full(count, -1, dtype=np.int8),
-        cells=counts.cells,
-        heights=counts.heights,
     )
 
 
@@ -46,8 +41,9 @@ def prepare(
     cell_m: float,
     least_share: float,
     parts: int,
+    counts_plan: bool = False,
 ) -> Remainder:
-    """Sample a cloud and count its points over the plan; nothing is claimed yet.
+    """Sample a cloud and see where its blocks lie; nothing is claimed yet.
 
     Args:
         cloud: the cloud.
@@ -55,6 +51,7 @@ def prepare(
         cell_m: side of a plan cell.
         least_share: share of the points that a plane must hold.
         parts: threads.
+        counts_plan: count the points over the plan in the same pass.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
@@ -70,16 +67,16 @@ def prepare(
     grid = plan_grid(sample, basis, cell_m=cell_m, outside_share=0.25 * least_share)
     parts = max(1, min(parts, _PARTS_MOST))
     offsets = read_only(cloud.x, cloud.y, cloud.z)
-    counts = count_over_plan(offsets, grid, parts=parts)
-    if counts.n_unusable:
+    plan = count_over_plan(offsets, grid, parts=parts) if counts_plan else None
+    boxes = box_blocks(offsets, parts=parts) if plan is None else plan.boxed
+    if boxes.n_unusable:
         cloud.require_points(3)
     return Remainder(
-        points=blocked(offsets, counts.boxes),
+        points=blocked(offsets, boxes.boxes),
         sample=sample,
         grid=grid,
         up=basis[2],
         parts=parts,
         claims=np.full(len(cloud), -1, dtype=np.int8),
-        cells=counts.cells,
-        heights=counts.heights,
+        plan=plan,
     )

@@ -28,6 +28,8 @@ _SAMPLE_CAUTION: Final = 0.7
 # Parts are of one plane when the common fit lies not much worse in the largest than its own.
 _ASKEW: Final = 1.5
 _SAME_M: Final = 2e-4
+# Points that are enough to move a candidate to the surface near it; the fit that follows has all.
+_FIRST_POINTS: Final = 60_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,11 +49,12 @@ def refine_on_sample(
     candidate: Candidate, remainder: Remainder, rules: Rules, freedom: Freedom
 ) -> Refined | None:
     """Move a candidate to the surface near it; None where too few of the sample crowd there."""
-    sample, claims = remainder.sample, remainder.sample_claims
-    free_points = sample.offsets_m[claims < 0]
+    sample = remainder.sample
+    free_points = remainder.free_sample_m()
     first, *rest = shrinking_tolerances(rules.find_m, rules.fit_m)
     start = candidate.plane if candidate.start is None else candidate.start
-    plane = refine_plane(free_points, start, first, freedom=freedom, up=remainder.up)
+    some = free_points[:: max(1, len(free_points) // _FIRST_POINTS)]
+    plane = refine_plane(some, start, first, freedom=freedom, up=remainder.up)
     if plane is None:
         return None
     near = free_points[np.abs(free_points @ plane.normal - plane.offset_m) <= rules.find_m]

@@ -1,4 +1,4 @@
-"""The cloud while planes are taken from it: who has which point, and what is left per plan cell."""
+"""The cloud while planes are taken from it: who has which point, and how many have none."""
 
 from __future__ import annotations
 
@@ -11,12 +11,25 @@ from numpy.typing import NDArray
 from orthoflow.geometry.plane_kernels import claim_slab
 from orthoflow.geometry.point_kernels import (
     BlockedPoints,
+    PlanCounts,
     PlanGrid,
     each_part,
     piece_of,
-    plan_frame,
 )
 from orthoflow_plugins.plane.sampling import Sample
+
+
+@dataclass(frozen=True, kw_only=True)
+class Taking:
+    """A plane that took points.
+
+    Attributes:
+        slabs: (k, 12) all planes so far, this one last.
+        bounds: (5,) find tolerance, then smallest and largest u and v of its rectangle, metres.
+    """
+
+    slabs: NDArray[np.float64]
+    bounds: NDArray[np.float64]
 
 
 @dataclass(kw_only=True)
@@ -30,8 +43,8 @@ class Remainder:
         up: (3,) unit vector.
         parts: parts of parallel passes.
         claims: (n,) int8, plane of each point, -1 for none yet.
-        cells: (e1, e2) int64, unclaimed points per plan cell.
-        heights: (storeys,) int64, unclaimed points per storey.
+        plan: all points per plan cell and per storey, claimed or not, where they were counted.
+        takings: the planes that took points, in their order.
         n_unclaimed: points no plane holds.
     """
 
@@ -41,16 +54,25 @@ class Remainder:
     up: NDArray[np.float64]
     parts: int
     claims: NDArray[np.int8]
-    cells: NDArray[np.int64]
-    heights: NDArray[np.int64]
+    plan: PlanCounts | None = None
+    takings: list[Taking] = field(default_factory=list)
     n_unclaimed: int = field(init=False)
+    _free: tuple[int, NDArray[np.float64]] | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self.n_unclaimed = len(self.claims)
 
+    def free_sample_m(self) -> NDArray[np.float64]:
+        """(m, 3) offsets of the sample points that no plane has; kept until the next claim."""
+        if self._free is None or self._free[0] != len(self.takings):
+            self._free = (len(self.takings), self.sample.offsets_m[self.sample_claims < 0])
+        return self._free[1]
+
     @property
     def sample_claims(self) -> NDArray[np.int8]:
         """(m,) int8, plane of each sample point, -1 for none yet."""
+        if len(self.sample.index) == len(self.claims):
+            return self.claims
         return self.claims[self.sample.index]
 
     def box_corners(self) -> NDArray[np.float64]:
@@ -62,23 +84,18 @@ class Remainder:
 
     def claim(self, slabs: NDArray[np.float64], bounds: NDArray[np.float64]) -> None:
         """Give the points of the last slab to it, and count what is left."""
-        taken = np.zeros((self.parts, *self.cells.shape), dtype=np.int32)
-        taken_heights = np.zeros((self.parts, len(self.heights) + 1), dtype=np.int32)
-        frame = plan_frame(self.grid)
+        taken = np.zeros(self.parts, dtype=np.int64)
 
         def take(part: int, piece: slice) -> None:
-            claim_slab(
-                piece_of(self.points, piece),
-                self.claims[piece],
-                slabs,
-                bounds,
-                frame,
-                taken[part],
-                taken_heights[part],
+            taken[part] = claim_slab(
+                piece_of(self.points, piece), self.claims[piece], slabs, bounds
             )
 
         each_part(len(self.claims), self.parts, take)
-        self.cells -= taken.sum(axis=0)
-        in_all = taken_heights.sum(axis=0, dtype=np.int64)
-        self.heights -= in_all[:-1]
-        self.n_unclaimed -= int(in_all[-1])
+        self.n_unclaimed -= int(taken.sum())
+        self.takings.append(Taking(slabs=slabs, bounds=bounds))
+
+    def catch_up(self, other: Remainder) -> None:
+        """Let the planes take points that took them from another remainder of the same cloud."""
+        for taking in other.takings[len(self.takings) :]:
+            self.claim(taking.slabs, taking.bounds)

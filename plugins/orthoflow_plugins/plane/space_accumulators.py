@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.point_kernels import in_threads
-from orthoflow.geometry.voxel_kernels import best_bins, vote_planes, vote_tilts
+from orthoflow.geometry.voxel_kernels import VOTE_SHARES, best_bins, vote_planes, vote_tilts
 from orthoflow_plugins.plane.accumulators import contrast, parabola
 from orthoflow_plugins.plane.candidates import Candidate, Family
 from orthoflow_plugins.plane.remainders import Remainder
@@ -23,8 +24,8 @@ from orthoflow_plugins.plane.voxels import Places, VoxelCounts
 # several bins until it is refined.
 _VOTE_CAUTION: Final = 0.25
 _NOT_AGAIN_STEPS: Final = 2.2
-# Slopes tried around a maximum, per side.
-_FINE_SLOPES: Final = 5
+# Slopes tried around a maximum, in steps between directions: first these, then closer ones.
+_FINE_STEPS: Final = ((-1.0, -0.5, 0.0, 0.5, 1.0), (-0.4, -0.2, 0.0, 0.2, 0.4))
 # More entries than this of all tables together cost more memory than they show; bins grow instead.
 _TABLE_MOST: Final = 120_000_000
 
@@ -62,8 +63,14 @@ class SpaceProposer:
     """
 
     def __init__(self, remainder: Remainder, voting: SpaceVoting) -> None:
-        """Get ready to propose."""
+        """Get ready to propose.
+
+        Args:
+            remainder: the cloud.
+            voting: how its voxels vote.
+        """
         self._voting = voting
+        self._whole = remainder
         self._voxels = VoxelCounts(remainder, voting.cell_m)
         self._directions = directions_over(
             voting.angle_step_deg, voting.family, voting.tilt_most_deg
@@ -77,9 +84,8 @@ class SpaceProposer:
         self._barred = np.zeros((n_rows, n_bins), dtype=np.uint8)
         self._scores = np.zeros(n_rows, dtype=np.int64)
         self._places = np.zeros(n_rows, dtype=np.int64)
-        self._counts = np.zeros((0, 0), dtype=np.int32)
         self._voted_for = -1
-        self._is_scored = False
+        self._unscored = np.arange(n_rows)
         self._last = (0, 0)
         self.first_picture: NDArray[np.float64] | None = None
 
@@ -87,10 +93,10 @@ class SpaceProposer:
         """Name the plane whose votes stand out most."""
         if self._voted_for != remainder.n_unclaimed:
             self._vote(remainder)
-        if not self._is_scored:
+        if len(self._unscored):
             self._score(remainder.parts)
         direction = int(np.argmax(self._scores))
-        score = float(self._scores[direction])
+        score = float(self._scores[direction]) / VOTE_SHARES
         if score < _VOTE_CAUTION * self._voting.least_points:
             return None
         self._last = (direction, int(self._places[direction]))
@@ -103,23 +109,25 @@ class SpaceProposer:
         cosines = self._directions.normals @ self._directions.normals[direction]
         reach = self._smear_bins + 1
         near = np.cos(_NOT_AGAIN_STEPS * self._directions.step_rad)
-        for row in np.flatnonzero(np.abs(cosines) > near):
+        self._unscored = np.flatnonzero(np.abs(cosines) > near)
+        for row in self._unscored:
             # On the other side of the hemisphere distances count the other way.
             middle = place if cosines[row] > 0.0 else n_bins - 1 - place
             self._barred[row, max(0, middle - reach) : middle + reach + 1] = 1
-        self._is_scored = False
 
     def _vote(self, remainder: Remainder) -> None:
-        counts = self._voxels.counted(remainder)
+        changes = self._voxels.take(remainder.takings)
         if self._voting.is_raw:
+            self._whole.catch_up(remainder)
             self._votes[:] = 0
-            self._add(self._voxels.raw_places(remainder), remainder.parts)
+            self._add(self._voxels.raw_places(self._whole), remainder.parts)
+        elif self._voted_for < 0:
+            places = Places(places_m=self._voxels.middles_m, weights=self._voxels.left)
+            self._add(places, remainder.parts)
         else:
-            changes = counts - self._counts if self._counts.size else counts
-            self._add(self._voxels.places(changes), remainder.parts)
-        self._counts = counts
+            self._add(changes, remainder.parts)
         self._voted_for = remainder.n_unclaimed
-        self._is_scored = False
+        self._unscored = np.arange(len(self._votes))
 
     def _add(self, places: Places, parts: int) -> None:
         extent = self._voxels.extent_m / self._bin_m
@@ -142,22 +150,42 @@ class SpaceProposer:
             )
         in_threads(tasks)
 
+    def _vote_tilts(
+        self,
+        local: NDArray[np.float32],
+        weights: NDArray[np.int32],
+        slopes: NDArray[np.float64],
+        low_m: float,
+        fine: NDArray[np.int64],
+    ) -> None:
+        """Let voxels near a plane vote for those that lean a little from it, in half bins."""
+        parts, bin_m = self._whole.parts, 0.5 * self._bin_m
+        shares = zip(np.array_split(slopes, parts), np.array_split(fine, parts), strict=True)
+        in_threads(
+            [
+                partial(vote_tilts, local, weights, some, low_m, bin_m, table)
+                for some, table in shares
+            ]
+        )
+
     def _score(self, parts: int) -> None:
+        """Find the best bin of each direction whose votes or bars changed."""
         tasks = []
-        for rows in np.array_split(np.arange(len(self._votes)), parts):
-            piece = slice(int(rows[0]), int(rows[-1]) + 1)
+        rows = self._unscored
+        for first, last in itertools.pairwise(np.linspace(0, len(rows), parts + 1).astype(int)):
             tasks.append(
                 partial(
                     best_bins,
-                    self._votes[piece],
+                    self._votes,
+                    rows[first:last],
                     self._smear_bins,
-                    self._barred[piece],
-                    self._scores[piece],
-                    self._places[piece],
+                    self._barred,
+                    self._scores,
+                    self._places,
                 )
             )
         in_threads(tasks)
-        self._is_scored = True
+        self._unscored = rows[:0]
         if self.first_picture is None:
             self.first_picture = self._picture()
 
@@ -168,7 +196,7 @@ class SpaceProposer:
         picture = np.full((n_turns, n_turns + 1), np.nan)
         omega = np.rint(directions.angles_rad[:, 0] / directions.step_rad).astype(int)
         phi = np.rint((directions.angles_rad[:, 1] + 0.5 * math.pi) / directions.step_rad)
-        picture[omega, phi.astype(int)] = self._scores
+        picture[omega, phi.astype(int)] = self._scores / VOTE_SHARES
         return picture
 
     def _refined(self, direction: int, score: float) -> Candidate:
@@ -178,25 +206,27 @@ class SpaceProposer:
         up = np.array([0.0, 0.0, 1.0])
         axes = wall_axes(normal, up)
         distance_m = (place + 0.5 - 0.5 * self._votes.shape[1]) * self._bin_m
-        cells = self._voxels.places(self._counts)
         reach_m = (self._smear_bins + 3) * self._bin_m
         half_m = 0.5 * float(np.linalg.norm(self._voxels.extent_m))
-        heights = normal.astype(np.float32) @ cells.places_m - np.float32(distance_m)
-        near = np.abs(heights) < reach_m + self._directions.step_rad * half_m
-        on_plane = axes.astype(np.float32) @ cells.places_m[:, near]
-        local = np.vstack([on_plane, heights[None, near]])
-        middle = np.median(local[:2], axis=1) if near.any() else np.zeros(2)
+        near = self._voxels.near(normal, distance_m, reach_m + self._directions.step_rad * half_m)
+        local = np.vstack([axes, normal]).astype(np.float32) @ near.places_m
+        local[2] -= np.float32(distance_m)
+        middle = np.median(local[:2], axis=1) if local.size else np.zeros(2)
         local[:2] -= middle[:, None].astype(np.float32)
-        steps = np.linspace(-1.0, 1.0, 2 * _FINE_SLOPES + 1) * self._directions.step_rad
-        slopes = np.array([(a, b) for a in steps for b in steps])
         bin_m = 0.5 * self._bin_m
-        fine = np.zeros((len(slopes), 4 * (self._smear_bins + 3)), dtype=np.int64)
-        vote_tilts(local, cells.weights[near], slopes, -reach_m, bin_m, fine)
-        scores = contrast(fine, 1)
-        best, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
-        shift = parabola(scores[best], int(column))
+        best = np.zeros(2)
+        for steps in _FINE_STEPS:
+            slopes = best + self._directions.step_rad * np.array(
+                [(a, b) for a in steps for b in steps]
+            )
+            fine = np.zeros((len(slopes), 4 * (self._smear_bins + 3)), dtype=np.int64)
+            self._vote_tilts(local, near.weights, slopes, -reach_m, fine)
+            scores = contrast(fine, 1)
+            row, column = np.unravel_index(int(np.argmax(scores)), scores.shape)
+            best = slopes[row]
+        shift = parabola(scores[row], int(column))
         height_m = -reach_m + (column + 0.5 + shift) * bin_m
-        tilted = normal - slopes[best] @ axes
+        tilted = normal - best @ axes
         point = (distance_m + height_m) * normal + middle @ axes + self._voxels.middle_m
         world = tilted / np.linalg.norm(tilted) @ self._voxels.basis
         world = world / np.linalg.norm(world)

@@ -49,7 +49,7 @@ def voters(grid: PlanGrid, counts: NDArray[np.int64], accumulation: Accumulation
         counts: (e1, e2) points per cell.
         accumulation: how loud a cell is.
     """
-    chosen = _edges(counts) if accumulation == "canny" else counts > 0
+    chosen = _edges(counts) if accumulation == "canny" else counts != 0
     first, second = np.nonzero(chosen)
     votes = counts[first, second]
     if accumulation != "counts":

@@ -1,0 +1,129 @@
+"""Compiled robust fit of a plane to points: total least squares, reweighted until it settles."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.point_kernels import compiled
+from orthoflow.geometry.region_kernels import flattest
+
+# What a fit may change: everything, a normal kept across up, or one kept along up.
+FREE: Final = 0
+VERTICAL: Final = 1
+LEVEL: Final = 2
+
+_STEPS_MOST: Final = 20
+# A fit has settled when a point ten metres away moves by less than this.
+_SETTLED_M: Final = 2e-6
+# Points nearer to a line than this (root mean square) do not say how the plane lies about it.
+_LINE_WIDTH_M: Final = 1e-4
+
+
+@compiled
+def robust_moments(
+    points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float
+) -> NDArray[np.float64]:
+    """Weighted sums of the points near a plane, Tukey's weights with a cut at the tolerance.
+
+    Args:
+        points: (m, 3) offsets, metres.
+        plane: (4,) normal and offset.
+        tolerance_m: distance at which a point's weight has fallen to zero.
+
+    Returns:
+        (10,) sum of weights, of w x, w y, w z, and of w times xx, xy, xz, yy, yz, zz.
+    """
+    sums = np.zeros(10)
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        ratio = (plane[0] * x + plane[1] * y + plane[2] * z - plane[3]) / tolerance_m
+        if abs(ratio) >= 1.0:
+            continue
+        weight = (1.0 - ratio * ratio) ** 2
+        sums[0] += weight
+        sums[1] += weight * x
+        sums[2] += weight * y
+        sums[3] += weight * z
+        sums[4] += weight * x * x
+        sums[5] += weight * x * y
+        sums[6] += weight * x * z
+        sums[7] += weight * y * y
+        sums[8] += weight * y * z
+        sums[9] += weight * z * z
+    return sums
+
+
+@compiled
+def _without_rise(sums: NDArray[np.float64], up: NDArray[np.float64]) -> None:
+    """Replace moments by those that have up as their widest direction, so that no normal leans."""
+    mean, second, across = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    order = ((4, 5, 6), (5, 7, 8), (6, 8, 9))
+    for i in range(3):
+        mean[i] = sums[1 + i] / sums[0]
+    trace = 0.0
+    for i in range(3):
+        for j in range(3):
+            second[i, j] = sums[order[i][j]] / sums[0] - mean[i] * mean[j]
+            across[i, j] = (1.0 if i == j else 0.0) - up[i] * up[j]
+        trace += second[i, i]
+    for i in range(3):
+        for j in range(i, 3):
+            total = up[i] * up[j] * trace
+            for k in range(3):
+                for m in range(3):
+                    total += across[i, k] * second[k, m] * across[m, j]
+            sums[order[i][j]] = total + mean[i] * mean[j]
+    sums[0] = 1.0
+    for i in range(3):
+        sums[1 + i] = mean[i]
+
+
+@compiled
+def refine_robustly(
+    points: NDArray[np.float64],
+    plane: NDArray[np.float64],
+    tolerance_m: float,
+    freedom: int,
+    up: NDArray[np.float64],
+) -> bool:
+    """Move a plane to the densest layer of points near it.
+
+    Args:
+        points: (m, 3) offsets, metres.
+        plane: (4,) normal and offset to start from; changed.
+        tolerance_m: points further away have no weight (Tukey's weights).
+        freedom: FREE, VERTICAL or LEVEL.
+        up: (3,) unit vector.
+
+    Returns:
+        Whether more than a line of points supports it; if not, the plane means nothing.
+    """
+    fitted = np.empty(9)
+    for _ in range(_STEPS_MOST):
+        sums = robust_moments(points, plane, tolerance_m)
+        if sums[0] <= 0.0:
+            return False
+        if freedom == VERTICAL:
+            _without_rise(sums, up)
+        if freedom == LEVEL:
+            fitted[0:3] = up
+        else:
+            flattest(sums, fitted)
+            if fitted[7] < max(_LINE_WIDTH_M**2, 1e-8 * fitted[8]):
+                return False
+        turn, offset_m, sign = 0.0, 0.0, 0.0
+        for i in range(3):
+            sign += fitted[i] * plane[i]
+        sign = -1.0 if sign < 0.0 else 1.0
+        for i in range(3):
+            offset_m += sign * fitted[i] * sums[1 + i] / sums[0]
+            turn += (sign * fitted[i] - plane[i]) ** 2
+            plane[i] = sign * fitted[i]
+        moved_m = abs(offset_m - plane[3])
+        plane[3] = offset_m
+        if max(10.0 * np.sqrt(turn), moved_m) < _SETTLED_M:
+            break
+    return True

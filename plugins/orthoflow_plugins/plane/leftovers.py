@@ -1,0 +1,69 @@
+"""What planes leave over of counts that all points were counted into, as the sample says.
+
+To count all points anew after each plane would cost a pass over the cloud. The sample knows which
+share of a cell's points a plane took; where it is all of the cloud, it knows that exactly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.point_kernels import PlanCounts, PlanGrid
+from orthoflow_plugins.plane.remainders import Remainder
+
+
+class PlanLeftovers:
+    """The points of a cloud per plan cell and storey that no plane of the sample has taken."""
+
+    def __init__(self, plan: PlanCounts, grid: PlanGrid, whole: Remainder) -> None:
+        """See in which cell and storey each point of the sample lies.
+
+        Args:
+            plan: counts of all points.
+            grid: where the cells lie.
+            whole: the cloud.
+        """
+        self._plan = plan
+        framed = whole.sample.offsets_m @ grid.basis.T - grid.low_m
+        places = np.floor(framed / grid.cell_m)
+        shape = np.array(grid.shape)
+        inside = (places >= 0) & (places < shape)
+        over = inside[:, 0] & inside[:, 1]
+        within = over & inside[:, 2]
+        places = np.where(over[:, None], places, 0.0).astype(np.int64)
+        n_cells = grid.shape[0] * grid.shape[1]
+        # The last place is for points outside.
+        self._cell = np.where(over, places[:, 0] * grid.shape[1] + places[:, 1], n_cells)
+        self._storey = np.where(within, places[:, 2], grid.shape[2])
+        # A sample has too few points per cell to ask one alone.
+        self._reach = 0 if whole.sample.n_represented <= 1.0 else 1
+
+    def cells(self, claims: NDArray[np.int8]) -> NDArray[np.int64]:
+        """(e1, e2) points left per plan cell, given the claims of the sample."""
+        return _left(self._plan.cells, self._cell, claims < 0, self._reach)
+
+    def heights(self, claims: NDArray[np.int8]) -> NDArray[np.int64]:
+        """(storeys,) points left per storey, given the claims of the sample."""
+        return _left(self._plan.heights, self._storey, claims < 0, self._reach)
+
+
+def _left(
+    counts: NDArray[np.int64], place: NDArray[np.int64], free: NDArray[np.bool_], reach: int
+) -> NDArray[np.int64]:
+    from scipy import ndimage
+
+    if free.all():
+        return counts
+    asked, left = (
+        np.bincount(chosen, minlength=counts.size + 1)[:-1].reshape(counts.shape)
+        for chosen in (place, place[free])
+    )
+    if reach:
+        asked, left = (
+            ndimage.convolve(number, np.ones((3,) * counts.ndim, dtype=int), mode="constant")
+            for number in (asked, left)
+        )
+    share = np.divide(left, asked, out=np.ones(counts.shape), where=asked > 0)
+    remaining: NDArray[np.int64] = np.rint(counts * share).astype(np.int64)
+    return remaining
