@@ -12,10 +12,12 @@ from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.pnp import OrientPnp
 from orthoflow_plugins.orient.splitting import hull_area, withheld
+from orthoflow_plugins.orient.wall_errors import known_walls, sigmas_on_wall, wall_error
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import StepContext
 from tests import matching_scenes as ms
@@ -129,6 +131,30 @@ def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path, known:
         ratios.append(ms.wall_error_m(scene, found.cameras[0].viewing(), camera) / sigma)
     # Measured over 16 seeds: 0.96 and 1.26; with only focal length and k1 free, EXIF gave 2.26.
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+
+
+def test_the_predicted_error_is_mapped_and_grows_away_from_the_ties(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0))
+    ties, ctx = known_ties(camera, 4), context(tmp_path)
+    orient(ties, calibrated(camera), ctx)
+    (figure,) = (item for item in ctx.figures if item.name == "wall_0_predicted_error")
+    assert re.search(r"black 0 to yellow 0\.\d+ mm and more, median 0\.\d+ mm", figure.caption)
+    seen = SeenPoints(
+        pixels_photo=ties.pixels_photo,
+        points_world=ties.points_world,
+        sigma_px=ties.sigma_px,
+        sigma_m=ties.sigma_m,
+    )
+    (wall,) = known_walls(ties, np.ones(len(ties.photo), np.bool_))
+    resection = adjust(seen, camera)
+    sigmas = sigmas_on_wall(resection, wall, (15, 15))
+    expected = wall_error(resection, [wall])
+    assert expected is not None
+    assert np.sqrt(np.nanmean(sigmas**2)) == pytest.approx(expected.rms_m)
+    row, column = np.unravel_index(np.nanargmin(sigmas), sigmas.shape)
+    middle = wall.corners_world[0] + [3.0 * (column + 0.5) / 15, 0.0, -2.0 * (row + 0.5) / 15]
+    far = np.linalg.norm(camera.project(middle[None])[0, :2] - [450.0, 320.0])
+    assert far < 250.0
 
 
 @pytest.mark.parametrize("wrong_share", [0.3, 0.6, 0.8])

@@ -31,7 +31,7 @@ class Features:
         pixels: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
         sizes_px: (n,) float64 diameter of the described neighbourhood.
         angles_deg: (n,) float64 main direction of the gradient, clockwise from u.
-        descriptors: (n, 128) float32 RootSIFT, whole numbers.
+        descriptors: (n, 128) float32 RootSIFT, or SIFT where asked for, whole numbers.
     """
 
     pixels: NDArray[np.float64]
@@ -93,11 +93,15 @@ class FeatureRule:
         n_most: at most so many.
         contrast_threshold: of the difference of Gaussians, as OpenCV counts it.
         edge_threshold: largest ratio of curvatures, as OpenCV counts it.
+        is_unbiased: whether key points are where they are, or off as OpenCV has them by default.
+        is_rooted: whether descriptors are RootSIFT, or SIFT.
     """
 
     n_most: int
     contrast_threshold: float
     edge_threshold: float
+    is_unbiased: bool = True
+    is_rooted: bool = True
 
 
 def find_features(
@@ -115,7 +119,7 @@ def find_features(
     sift: Any = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
         contrastThreshold=rule.contrast_threshold,
         edgeThreshold=rule.edge_threshold,
-        enable_precise_upscale=True,
+        enable_precise_upscale=rule.is_unbiased,
     )
     parts = [part for corner in _tiles(picture.shape) if (part := _in_tile(sift, picture, corner))]
     if not parts:
@@ -132,7 +136,7 @@ def find_features(
         pixels=pixels[chosen],
         sizes_px=points[chosen, 2],
         angles_deg=points[chosen, 3],
-        descriptors=_root(raw[chosen]),
+        descriptors=_root(raw[chosen]) if rule.is_rooted else raw[chosen],
     )
 
 

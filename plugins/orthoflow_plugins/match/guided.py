@@ -42,6 +42,12 @@ class MatchGuided(Method):
     class Params(MethodParams):
         """Search radius, patches, and how many ties."""
 
+        preset: Literal["none", "paper"] = Field(
+            default="none",
+            description="paper: the mask of markiewicz2015 and no more: key points as OpenCV sets "
+            "SIFT, those of a wall that the photo shows by its pose, each with its best match in "
+            "the photo, once; no other option applies.",
+        )
         search_radius_cells: int = Field(
             default=8,
             ge=2,
@@ -94,6 +100,8 @@ class MatchGuided(Method):
         require_photos(photos)
         require_intensity(walls)
         oriented = _oriented(inputs.cameras)
+        if params.preset == "paper":
+            return self.Out(ties=_masked(photos, walls, oriented, ctx))
         ctx.progress(0.0, "walls")
         targets = [target_of(wall) for wall in walls.walls]
         indices = [k for k, photo in enumerate(photos.photos) if photo.name in oriented]
@@ -131,6 +139,23 @@ class MatchGuided(Method):
     def tools(cls) -> dict[str, str]:
         """OpenCV warps and correlates."""
         return opencv_version()
+
+
+def _masked(photos: Photos, walls: Walls, oriented: dict[str, Camera], ctx: StepContext) -> Ties:
+    """Match as markiewicz2015 did, within the footprint of each oriented photo."""
+    from orthoflow_plugins.match.paper import footprints, paper_pieces, paper_wall_features
+
+    on_walls = list(in_order(paper_wall_features, walls.walls, ctx.cores))
+    pieces: list[TiePiece] = []
+    for index, photo in enumerate(photos.photos):
+        if photo.name not in oriented:
+            continue
+        ctx.progress(index / len(photos.photos), photo.name)
+        masks = footprints(oriented[photo.name].viewing(), walls)
+        pieces += paper_pieces(index, photo, on_walls, walls, masks)
+    ties = ties_of(pieces, photos, walls, {"intensity_source": walls.intensity_source})
+    _report(ctx, ties, {})
+    return ties
 
 
 def _oriented(cameras: Cameras) -> dict[str, Camera]:

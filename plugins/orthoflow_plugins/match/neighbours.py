@@ -108,7 +108,7 @@ def mutual_matches(
     # Few are distinct, so that only they are looked up backwards.
     distinct = np.flatnonzero(ratio <= ratio_most)
     asked, place = np.unique(nearest[distinct], return_inverse=True)
-    back = _nearest(second[asked], first)[place]
+    back = best_matches(second[asked], first)[place]
     kept = distinct[back == distinct]
     return Matches(first=kept, second=nearest[kept], ratio=ratio[kept])
 
@@ -147,7 +147,8 @@ def mutual_matches_within(
     return Matches(first=i[best[kept]], second=j[best[kept]], ratio=ratio[kept])
 
 
-def _nearest(asked: NDArray[np.float32], among: NDArray[np.float32]) -> NDArray[np.intp]:
+def best_matches(asked: NDArray[np.float32], among: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Index (n,) of the nearest of `among` (m, d), at least one, for each of `asked` (n, d)."""
     left, right = _left(asked), _right(among)
     parts = [(left[rows] @ right).argmin(axis=1) for rows in _blocks(len(asked), len(among))]
     return np.concatenate([np.empty(0, dtype=np.intp), *parts])

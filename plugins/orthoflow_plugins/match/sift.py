@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, Wall, Walls
@@ -13,23 +12,18 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of, without_twins
 from orthoflow_plugins.match.features import FeatureRule, Features, find_features
+from orthoflow_plugins.match.key_point_ties import key_point_ties
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo
+from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features
 from orthoflow_plugins.match.pictures import (
     photo_grey,
-    points_on_wall,
     require_intensity,
     wall_picture,
 )
 from orthoflow_plugins.match.versions import opencv_version
 from orthoflow_plugins.match.workers import in_order
 
-# How well SIFT places a key point, in pixels of the image it was found in: for the smallest ones,
-# and growing with their size.
-_SIGMA_LEAST_PX: Final = 0.35
-_SIGMA_PER_SIZE: Final = 0.06
 _VOID_MARGIN_CELLS: Final = 3
-# At an edge of the relief a key point belongs to neither side.
-_SIGMA_MOST_CELLS: Final = 3.0
 
 
 class MatchSift(Method):
@@ -52,6 +46,12 @@ class MatchSift(Method):
     class Params(MethodParams):
         """Key points, their contrast, and what counts as a match."""
 
+        preset: Literal["none", "paper"] = Field(
+            default="none",
+            description="paper: SIFT as OpenCV sets it, on the pictures as they are, and every key "
+            "point of a wall with its best match in the photo, as in markiewicz2015; no other "
+            "option applies.",
+        )
         n_features_max: int = Field(
             default=8000, ge=50, description="Key points per photo and per wall, spread evenly."
         )
@@ -105,6 +105,8 @@ class MatchSift(Method):
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         require_intensity(walls)
+        if params.preset == "paper":
+            return self.Out(ties=_paper(photos, walls, ctx))
         rule = _rule(params)
         ctx.progress(0.0, "key points of the walls")
         on_walls = list(in_order(lambda wall: _wall_features(wall, rule), walls.walls, ctx.cores))
@@ -130,6 +132,17 @@ class MatchSift(Method):
     def tools(cls) -> dict[str, str]:
         """OpenCV finds and describes the key points."""
         return opencv_version()
+
+
+def _paper(photos: Photos, walls: Walls, ctx: StepContext) -> Ties:
+    on_walls = list(in_order(paper_wall_features, walls.walls, ctx.cores))
+    pieces: list[TiePiece] = []
+    for index, photo in enumerate(photos.photos):
+        ctx.progress(index / len(photos.photos), photo.name)
+        pieces += paper_pieces(index, photo, on_walls, walls, None)
+    ties = ties_of(pieces, photos, walls, {"intensity_source": walls.intensity_source})
+    _report(ctx, ties, on_walls)
+    return ties
 
 
 def _rule(params: MatchSift.Params) -> PairingRule:
@@ -173,27 +186,15 @@ def _piece(
     on_walls: list[Features | None],
     walls: Walls,
 ) -> TiePiece:
-    wall, features = walls.walls[pair.wall], on_walls[pair.wall]
+    features = on_walls[pair.wall]
     assert features is not None  # noqa: S101 - pairs are made of walls that have key points
-    in_photo, on_wall = pair.matches.first, pair.matches.second
-    points = points_on_wall(wall, features.pixels[on_wall])
-    photo_sizes = pairs.features.sizes_px[in_photo]
-    wall_sigma_m = wall.frame.gsd_m * _sigma_px(features.sizes_px[on_wall])
-    piece = TiePiece(
-        photo=photo,
-        wall=pair.wall,
-        pixels_photo=pairs.features.pixels[in_photo],
-        points_world=points.points_world,
-        sigma_px=_sigma_px(photo_sizes * pairs.scale) / pairs.scale,
-        sigma_m=np.hypot(points.sigma_m, wall_sigma_m),
+    return key_point_ties(
+        (photo, pair.wall),
+        walls.walls[pair.wall],
+        (pairs.features.take(pair.matches.first), features.take(pair.matches.second)),
+        scale=pairs.scale,
         role=TieRole.CONTROL if pair.is_shown else TieRole.REJECTED,
     )
-    return piece.take(points.known & (piece.sigma_m < _SIGMA_MOST_CELLS * wall.frame.gsd_m))
-
-
-def _sigma_px(sizes_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    sigma: NDArray[np.float64] = np.maximum(_SIGMA_LEAST_PX, _SIGMA_PER_SIZE * sizes_px)
-    return sigma
 
 
 def _note(ctx: StepContext, name: str, pairs: PhotoPairs, walls: Walls) -> JsonValue:

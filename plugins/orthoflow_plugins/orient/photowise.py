@@ -63,6 +63,7 @@ class Oriented:
         entry: for the record.
         table: rows of the table of residuals.
         notes: what limits it.
+        case: what it was judged by, of a photo that is ok.
     """
 
     camera: Camera
@@ -73,6 +74,7 @@ class Oriented:
     entry: JsonValue = None
     table: tuple[JsonValue, ...] = ()
     notes: tuple[str, ...] = ()
+    case: Case | None = None
 
 
 def require(ties: Ties, photos: Photos) -> None:
@@ -199,6 +201,7 @@ def judged(sight: Sighting, case: Case) -> Oriented:
         entry=entry,
         table=() if numbers is None else tuple(residual_table(case, numbers)),
         notes=(*estimate.notes, *warnings_for(case)),
+        case=case,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from orthoflow.products import Cameras, JsonValue, Photo, TieRole, Ties
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.figures import draw_residuals, draw_ties
+from orthoflow_plugins.orient.figures import draw_residuals, draw_ties, draw_wall_errors
 from orthoflow_plugins.orient.photowise import Oriented, of_photo
 from orthoflow_plugins.orient.residual_tables import COLUMNS_SAID
 
@@ -39,6 +39,7 @@ def told(
         status = f"Status: {oriented.camera.status}"
         draw_ties(ctx, photo, ties.pixels_photo[mine], role[mine], status)
     _measure(ctx, found)
+    draw_wall_errors(ctx, [item.case for item in found if item.case is not None])
     draw_residuals(ctx, residuals, role)
     said: dict[str, JsonValue] = {
         "photos": {item.camera.photo: item.entry for item in found},

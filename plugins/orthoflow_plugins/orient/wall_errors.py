@@ -87,32 +87,63 @@ def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | 
     )
 
 
+def sigmas_on_wall(
+    resection: Resection, wall: KnownWall, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Predicted standard deviation of a coordinate in a wall's plane, on a grid over the wall.
+
+    Returns:
+        (rows, cols) metres, the first row at the top, NaN where the photo does not show the wall.
+    """
+    variances, _ = _variances(resection, wall, _grid(wall, shape))
+    return np.sqrt(variances).reshape(shape)
+
+
 def _on_one_wall(
     resection: Resection, wall: KnownWall
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Variances (n,) in metres squared per coordinate, and pixels (n, 2), over the footprint."""
+    variances, pixels = _variances(resection, wall, _grid(wall, (_SIDE, _SIDE)))
+    shown = np.isfinite(variances)
+    return variances[shown], pixels[shown]
+
+
+def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Centres (rows * cols, 3) of the cells of a grid over a wall's rectangle."""
     top_left, bottom_left, _, top_right = wall.corners_world
-    steps = (np.arange(_SIDE) + 0.5) / _SIDE
-    along, down = (axis.ravel() for axis in np.meshgrid(steps, steps))
-    points = (
+    down, along = (
+        axis.ravel()
+        for axis in np.meshgrid(*((np.arange(n) + 0.5) / n for n in shape), indexing="ij")
+    )
+    points: NDArray[np.float64] = (
         top_left
         + along[:, None] * (top_right - top_left)
         + down[:, None] * (bottom_left - top_left)
     )
+    return points
+
+
+def _variances(
+    resection: Resection, wall: KnownWall, points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Variances (n,) per coordinate and pixels (n, 2) of wall points; NaN where not shown."""
     pixels = _seen(resection.camera, points, wall.normal)
-    points, pixels = points[np.isfinite(pixels[:, 0])], pixels[np.isfinite(pixels[:, 0])]
-    if not len(points):
-        return np.empty(0), np.empty((0, 2))
+    variances = np.full(len(points), np.nan)
+    shown = np.isfinite(pixels[:, 0])
+    if not shown.any():
+        return variances, pixels
+    top_left, bottom_left, _, top_right = wall.corners_world
     axes = np.vstack(
         [
             (top_right - top_left) / np.linalg.norm(top_right - top_left),
             (bottom_left - top_left) / np.linalg.norm(bottom_left - top_left),
         ]
     )
-    plane_by_pixel = np.linalg.inv(pixels_by_point(resection.camera, points) @ axes.T)
-    covariances = plane_by_pixel @ predicted_covariances(resection, points)
+    plane_by_pixel = np.linalg.inv(pixels_by_point(resection.camera, points[shown]) @ axes.T)
+    covariances = plane_by_pixel @ predicted_covariances(resection, points[shown])
     covariances = covariances @ plane_by_pixel.transpose(0, 2, 1)
-    return 0.5 * np.trace(covariances, axis1=1, axis2=2), pixels
+    variances[shown] = 0.5 * np.trace(covariances, axis1=1, axis2=2)
+    return variances, pixels
 
 
 def _seen(
