@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 STRATA: Final = 6
 # Cells per side of a photo within which ties may err together. On simulated rooms ties agree in
 # their errors up to some 60 px of 1200: with 6 cells more of that crosses the borders, with 4 too
-# few are left to learn from (error over stated one, pooled over 94 photos: 1.39 with 6, 1.34 with 5).
+# few are left to learn from (error over stated, pooled over 94 photos: 1.39 with 6, 1.34 with 5).
 GROUPS: Final = 5
 
 
