@@ -339,7 +339,12 @@ def test_metrics_and_figures_tell_of_the_first_plane(tmp_path: Path) -> None:
     assert metrics["phi_deg"] == pytest.approx(0.4, abs=0.02)
     assert metrics["fit_rms_mm"] == pytest.approx(2.0, rel=0.05)
     assert 0.9 < metrics["labelled_share"] < 1.0
-    assert [figure.name for figure in ctx.figures] == ["deviations", "thickness", "accumulator"]
+    assert [figure.name for figure in ctx.figures] == [
+        "deviations",
+        "planes",
+        "thickness",
+        "accumulator",
+    ]
     assert all(figure.path.stat().st_size > 5_000 for figure in ctx.figures)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable, Iterable
@@ -15,10 +16,12 @@ from orthoflow_plugins.read import assembling
 from orthoflow_plugins.read.colours import ColourScale
 from orthoflow_plugins.read.intensities import choose_scale, normalise
 from orthoflow_plugins.read.precision import rounding_m
+from orthoflow_plugins.read.previews import polar_view_png
 from orthoflow_plugins.read.scan import ReadScan
 from orthoflow_plugins.read.stations import ScanSummary, choose_stations
 
 from orthoflow.errors import CancelledStepError, InputError, StoreError
+from orthoflow.files.images import decode_image
 from orthoflow.products import InputFiles, PointCloud
 from orthoflow.sdk import StepContext
 from tests import scan_files
@@ -454,6 +457,34 @@ def test_no_path_enters_the_cloud(
 ) -> None:
     cloud = read(write_text(tmp_path / "a.xyz", points))
     assert str(tmp_path) not in json.dumps(cloud.source)
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["clockwise", "counter-clockwise"])
+def test_a_gridded_scan_is_drawn_as_its_station_saw_it(turned: bool) -> None:
+    rows, columns = np.indices((30, 80))
+    azimuth = np.radians(90.0 + (1 if turned else -1) * (columns - 40.0))
+    elevation = np.radians(rows - 15.0)
+    away = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1).reshape(-1, 3)
+    # The upper right of what one sees who looks north is bright.
+    bright = (away[:, 0] > 0.3) & (away[:, 2] > 0.1)
+    cloud = PointCloud(
+        origin=np.zeros(3),
+        **{name: 5.0 * away[:, k].astype(np.float32) for k, name in enumerate("xyz")},
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity=np.where(bright, 0.9, 0.1).astype(np.float32),
+        row=rows.ravel().astype(np.uint32),
+        column=columns.ravel().astype(np.uint32),
+        stations=np.zeros((1, 3)),
+        stations_source="file",
+    )
+    picture = polar_view_png(cloud)
+    assert picture is not None
+    image = decode_image(picture)[..., 0]
+    assert image.shape == (30, 80)
+    assert image[:5, -10:].min() > 200
+    assert image[-5:].max() < 100
+    assert image[:, :40].max() < 100
+    assert polar_view_png(dataclasses.replace(cloud, intensity=None)) is None
 
 
 def test_a_picture_from_above_is_drawn(

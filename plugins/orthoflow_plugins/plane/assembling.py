@@ -20,6 +20,7 @@ from orthoflow_plugins.plane.facing import (
     side_of_remaining,
     side_of_stations,
 )
+from orthoflow_plugins.plane.normality import Normality, normality
 from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.uncertainty import Stated
 
@@ -39,6 +40,7 @@ class Assembly:
         deviations: of the planes in their final order.
         n_guessed: planes whose side was guessed.
         own_tolerances_m: of each plane the tolerance that the detector found itself, or None.
+        normalities: of each plane how normal its deviations are, None where it has too few points.
         n_independent: of each plane, how many cells without common errors would fix it as well.
     """
 
@@ -47,6 +49,7 @@ class Assembly:
     deviations: Deviations
     n_guessed: int
     own_tolerances_m: tuple[float | None, ...]
+    normalities: tuple[Normality | None, ...]
     n_independent: tuple[float, ...]
 
 
@@ -77,6 +80,9 @@ def assemble(
     )
     ordered.histogram[flips] = ordered.histogram[flips][:, ::-1]
     ordered.mean_fit_m[flips] *= -1.0
+    normalities = tuple(
+        normality(row, find_m=ordered.find_m, fit_m=ordered.fit_m) for row in ordered.histogram
+    )
     viewpoint: Viewpoint = known_viewpoint(cloud)
     if all(item.is_guessed for item in faced):
         viewpoint = "guess"
@@ -102,6 +108,7 @@ def assemble(
             "fit_n_points": [int(n) for n in ordered.n_fit],
             "fit_rms_m": [float(value) for value in ordered.rms_fit_m],
             "n_independent": [item.stated.n_independent for item in faced],
+            "normality": [None if item is None else item.to_json() for item in normalities],
             "find_tolerance_m": ordered.find_m,
             "fit_tolerance_m": ordered.fit_m,
             "raw": [
@@ -118,6 +125,7 @@ def assemble(
         deviations=ordered,
         n_guessed=sum(item.is_guessed for item in faced),
         own_tolerances_m=tuple(found[i].candidate.own_tolerance_m for i in order),
+        normalities=normalities,
         n_independent=tuple(item.stated.n_independent for item in faced),
     )
 

@@ -24,6 +24,7 @@ from orthoflow_plugins.plane.preparing import prepare, sample_alone
 from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.reporting import report_planes, report_thickness, report_times
 from orthoflow_plugins.plane.sampling import thinned
+from orthoflow_plugins.plane.scene_figures import draw_planes
 from orthoflow_plugins.plane.settling import label, name_points, settle
 from orthoflow_plugins.plane.thickness import measure_thickness, scan_row
 from orthoflow_plugins.plane.thickness_figures import draw_thickness
@@ -174,6 +175,7 @@ def detect(
     draw_deviations(ctx, assembly)
     # The last of the labels is for points on no plane: a claim of -1 picks it.
     plane_of_sample = assembly.labels_from_claims[whole.sample_claims].astype(np.int64)
+    draw_planes(ctx, assembly.planes, whole.sample.offsets_m, plane_of_sample, cloud)
     found_thickness = measure_thickness(
         assembly.planes, plane_of_sample, whole, cloud, reach_m=rules.fit_m
     )

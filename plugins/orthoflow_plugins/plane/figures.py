@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,10 @@ from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.accumulators import Accumulator
 from orthoflow_plugins.plane.assembling import Assembly
+from orthoflow_plugins.plane.normality import Normality
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _PANELS_MOST: Final = 4
 _PIXELS_MOST: Final = 900
@@ -28,11 +32,11 @@ def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
 
     deviations, names = assembly.deviations, assembly.planes.names
     count = min(_PANELS_MOST, len(names))
-    figure = Figure(figsize=(3.2 * count, 2.8), layout="constrained")
+    figure = Figure(figsize=(3.2 * count, 5.4), layout="constrained")
     edges_mm = 1000.0 * np.linspace(-deviations.find_m, deviations.find_m, HISTOGRAM_BINS + 1)
     middles_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1])
     for index in range(count):
-        axes = figure.add_subplot(1, count, index + 1)
+        axes = figure.add_subplot(2, count, index + 1)
         axes.stairs(deviations.histogram[index], edges_mm, fill=True, color="#9db8d2")
         sigma_mm = 1000.0 * float(deviations.rms_fit_m[index])
         if sigma_mm > 0.0:
@@ -45,12 +49,27 @@ def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
         axes.set_xlabel("distance to the plane [mm]", fontsize=8)
         axes.tick_params(labelsize=7)
         axes.set_yticks([])
+        shape = assembly.normalities[index]
+        if shape is not None:
+            _draw_quantiles(figure.add_subplot(2, count, count + index + 1), shape)
     ctx.figure(
         "deviations",
         figure,
         "Distances of the points to their plane, positive towards the viewer; the curve is the "
-        f"normal distribution of those within {1000.0 * deviations.fit_m:.0f} mm.",
+        f"normal distribution of those within {1000.0 * deviations.fit_m:.0f} mm. Below, their "
+        "quantiles against those of a normal distribution, which would lie on the line.",
     )
+
+
+def _draw_quantiles(axes: Axes, shape: Normality) -> None:
+    reach = float(shape.expected_sigmas[-1])
+    axes.plot([-reach, reach], [-reach, reach], color="#b03a2e", linewidth=1.0)
+    axes.plot(shape.expected_sigmas, shape.found_sigmas, ".", markersize=4, color="#33658a")
+    axes.set_title(
+        f"skewness {shape.skewness:+.2f}, kurtosis {shape.excess_kurtosis:+.2f}", fontsize=8
+    )
+    axes.set_xlabel("normal quantile [sigma]", fontsize=8)
+    axes.tick_params(labelsize=7)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,6 +78,7 @@ class Hough3d(Method):
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.detecting import detect, search_sample
         from orthoflow_plugins.plane.figures import draw_space
+        from orthoflow_plugins.plane.scene_figures import draw_sections
         from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
 
         pictures: list[NDArray[np.float64]] = []
@@ -101,4 +102,5 @@ class Hough3d(Method):
         detection = detect(inputs.cloud, params, ctx, find, method=self.id)
         for picture in pictures:
             draw_space(ctx, picture, detection.planes)
+        draw_sections(ctx, detection.planes, inputs.cloud, cell_m=params.cell_m)
         return self.Out(planes=detection.planes, labels=detection.labels)

@@ -28,6 +28,12 @@ def report_planes(ctx: StepContext, assembly: Assembly, *, n_points: int) -> Non
     ctx.metric("sigma_angle_deg", planes.sigma_angle_deg(0), "deg")
     ctx.metric("sigma_offset_mm", 1000.0 * planes.sigma_offset_m(0), "mm")
     ctx.metric("n_independent", assembly.n_independent[0], "1")
+    shape = assembly.normalities[0]
+    if shape is not None:
+        ctx.metric("skewness", shape.skewness, "1")
+        ctx.metric("excess_kurtosis", shape.excess_kurtosis, "1")
+        for reach, share in enumerate(shape.within, start=1):
+            ctx.metric(f"within_{reach}_sigma", share, "1")
     _report_raw(ctx, planes)
     if assembly.n_guessed:
         warn_of_guesses(ctx, assembly.n_guessed, len(planes))

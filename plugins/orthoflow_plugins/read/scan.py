@@ -25,7 +25,7 @@ from orthoflow_plugins.read.intensities import (
     normalise,
 )
 from orthoflow_plugins.read.precision import COARSE_M, FINE_M, resolution_m
-from orthoflow_plugins.read.previews import plan_view_png
+from orthoflow_plugins.read.previews import plan_view_png, polar_view_png
 from orthoflow_plugins.read.stations import Stations, choose_stations
 
 Unit = Literal["m", "mm", "ft", "us-ft"]
@@ -101,6 +101,9 @@ class ReadScan(Method):
                 ctx.warn(note)
         cloud = _finish(ctx, assembly, files, params)
         ctx.figure("plan", plan_view_png(cloud), "The cloud from above, brighter where denser.")
+        polar = polar_view_png(cloud)
+        if polar is not None:
+            ctx.figure("polar", polar, "Intensity over the scanner's own rows and columns.")
         return self.Out(cloud=cloud)
 
     @classmethod
