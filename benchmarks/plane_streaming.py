@@ -89,9 +89,11 @@ def report_file(folder: Path, options: argparse.Namespace) -> None:
     }
     engine = {f"{name}, engine": engine_command(name, path, folder) for name in DETECTORS}
     commands = {name: child_command(arguments) for name, arguments in tasks.items()} | engine
+    small = folder / "small.laz"
+    write_laz(small, room(options)[:: max(1, options.points // 300_000)])
     for name in DETECTORS:  # so that nothing is compiled in what is measured
-        measured(child_command(["process", name, str(path), str(folder)]))
-        measured(engine[f"{name}, engine"])
+        measured(child_command(["process", name, str(small), str(folder)]))
+        measured(engine_command(name, small, folder))
     costs: dict[str, list[Cost]] = {name: [] for name in commands}
     for _ in range(options.repeats):
         for name, command in commands.items():
