@@ -10,7 +10,14 @@ from orthoflow.workflow import shipped_workflow
 from tests.road.conftest import IS_LONG, Shell, metrics_of, without_variants
 
 pytestmark = pytest.mark.long  # some of the variants in a normal run
-ONLY_LONG = ("hough3d-full", "ransac-2d", "ransac-1in20", "ransac-2d-1in20")
+ONLY_LONG = (
+    "hough2d-1in20",
+    "hough3d-1in20",
+    "hough3d-full",
+    "ransac-2d",
+    "ransac-1in20",
+    "ransac-2d-1in20",
+)
 DETECTORS = (
     "hough2d", "hough3d", "ransac", "region", "region-normals", "region-1in20",
     *(ONLY_LONG if IS_LONG else ()),
@@ -48,6 +55,7 @@ def test_every_detector_finds_the_main_wall(
     assert table["plane", variant, "omega_deg"] == pytest.approx(282.0, abs=angle_deg)
     assert table["plane", variant, "phi_deg"] == pytest.approx(-0.8, abs=angle_deg)
     assert table["plane", variant, "r_m"] >= 0.0
+    assert table["plane", variant, "thinning"] == (20 if "1in20" in variant else 1)
 
 
 @pytest.mark.parametrize(
@@ -75,3 +83,14 @@ def test_random_methods_are_repeated_with_other_seeds(
     raws = {table["plane", variant, "raw_offset_mm"] for variant in ("ransac", "ransac#1")}
     assert len(raws) == 2
     assert table["plane", "ransac#1", "omega_deg"] == pytest.approx(282.0, abs=0.02)
+
+
+@pytest.mark.parametrize("variant", ["hough2d", "hough3d", "ransac", "region"])
+def test_the_table_tells_how_exact_and_how_normal_the_first_wall_is(
+    variant: str, table: dict[tuple[str, str, str], float]
+) -> None:
+    stated_mm = table["plane", variant, "sigma_offset_mm"]
+    assert 0.001 < stated_mm < 1.0
+    # Mixed distances and mouldings on one side: more in the middle and in the tails.
+    assert table["plane", variant, "excess_kurtosis"] > 0.0
+    assert table["plane", variant, "within_1_sigma"] > 0.683

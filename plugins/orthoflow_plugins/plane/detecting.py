@@ -170,6 +170,7 @@ def detect(
     assembly = assemble(found, whole, deviations, cloud)
     labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
     name_points(whole, assembly.labels_from_claims, labels)
+    ctx.metric("thinning", params.thinning, "1")
     report_planes(ctx, assembly, n_points=len(cloud))
     ctx.progress(0.9, "drawing")
     draw_deviations(ctx, assembly)
