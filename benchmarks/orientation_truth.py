@@ -40,8 +40,6 @@ from orthoflow.sdk import StepContext
 Estimator = type[OrientPnp] | type[OrientColmapBundle]
 # As the shipped workflows have it: a first pose needs to be good to a few cells only.
 ROUGHLY = {
-    "n_features_max": 2000,
-    "n_photo_points_max": 600,
     "n_quadrant_min": 0,
     "hull_min_ratio": 0.1,
     "sigma_wall_max_cells": 4.0,

@@ -54,3 +54,18 @@ def test_eleven_parameters_show_in_the_orthoimage(table: Table) -> None:
     assert of(table, "check", "dlt", "pose_wall_rms_mm") > 3.0 * of(
         table, "check", "pnp", "pose_wall_rms_mm"
     )
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not IS_LONG, reason="a recipe of its own")
+def test_a_looser_threshold_keeps_more_wrong_ties(
+    tmp_path_factory: pytest.TempPathFactory, store: Path
+) -> None:
+    shell = Shell(tmp_path_factory.mktemp("orient-thresholds"), store)
+    ended = shell("run", "orient-thresholds.yaml", *SMALL, "-o", "run", timeout_s=1200)
+    assert ended.code == 0, ended.said
+    found = metrics_of(shell.folder / "run")
+    rejected = [found[f"orient@orient=sigma{n}", "rejected_share"] for n in (2, 3, 4, 6, 9)]
+    assert rejected == sorted(rejected, reverse=True)
+    wrong = {n: found[f"check@orient=sigma{n}", "tie_wrong_share"] for n in (2, 9)}
+    assert wrong[2] < wrong[9]

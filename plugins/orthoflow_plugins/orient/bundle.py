@@ -91,10 +91,10 @@ class OrientColmapBundle(Method):
             "shows of the walls.",
         )
         n_features_max: int = Field(
-            default=6000, ge=100, description="Key points per photo for ties between photos."
+            default=3000, ge=100, description="Key points per photo for ties between photos."
         )
         n_photo_points_max: int = Field(
-            default=2000, ge=0, description="Points at most that tie photos to each other."
+            default=1000, ge=0, description="Points at most that tie photos to each other."
         )
 
     class In(Ports):
