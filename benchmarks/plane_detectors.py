@@ -1,27 +1,29 @@
-"""Time and accuracy of the plane detectors: first plane, all planes, statistics, in memory passes.
+"""Time, memory and accuracy of the plane detectors and of other programs, on one room.
 
-    python benchmarks/plane_detectors.py                          # a room of 10 million points
-    python benchmarks/plane_detectors.py --points 48000000 --method ransac
-    python benchmarks/plane_detectors.py --npy room.npy --truth truth.json
+    python benchmarks/plane_detectors.py                          # the room of 48 million points
+    python benchmarks/plane_detectors.py --points 5000000 --method ransac --no-peers
+    python benchmarks/plane_detectors.py --npy room.npy --truth truth.json --labels labels.npy
 
 F is one pass over separate x, y, z arrays at memory speed, measured in the same run: seconds of
 different machines do not compare, seconds over F do. Code is warm, points are in memory. Detection
-and labels are measured, statistics apart; figures and files are not.
+and labels are measured, statistics apart; figures and files are not. Processor seconds are those of
+both threads together: on a machine that does nothing else a run takes half of them or more.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
-import statistics
+import os
+import re
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numba
 import numpy as np
+from great_room import FULL_POINTS, great_room
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
 from orthoflow_plugins.plane.candidates import FoundPlane
@@ -36,6 +38,7 @@ from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.settling import name_points
 from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
 from orthoflow_plugins.plane.surface_cells import Neighbourhood, surface_cells
+from plane_peers import PEERS, measured
 
 from orthoflow.geometry import basis_from_up
 from orthoflow.products import PointCloud
@@ -53,46 +56,14 @@ def _pass(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]
     return near
 
 
-def simulated_room(n_points: int) -> tuple[NDArray[np.float32], list[tuple[str, NDArray, float]]]:
-    """A room with clutter and outliers, ordered by direction like a scan, and its planes."""
-    rng = np.random.default_rng(20150807)
-    faces, points = [], []
-    for name, omega, phi, offset, share in (
-        ("main", 102.0, 0.8, 3.7, 0.30),
-        ("opposite", 282.4, -0.2, 0.5, 0.08),
-        ("right", 12.2, 0.3, 4.5, 0.05),
-        ("left", 191.7, -0.3, 4.1, 0.05),
-        ("floor", 0.0, -89.9, 1.5, 0.15),
-        ("ceiling", 40.0, 89.8, 3.5, 0.17),
-    ):
-        o, p = np.radians(omega), np.radians(phi)
-        normal = np.array([np.cos(p) * np.cos(o), np.cos(p) * np.sin(o), np.sin(p)])
-        first = np.cross([0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [0.0, 1.0, 0.0], normal)
-        first /= np.linalg.norm(first)
-        second = np.cross(normal, first)
-        count = int(share * n_points)
-        height = 1.0 if abs(normal[2]) < 0.9 else 0.0
-        spread = rng.uniform(-1.0, 1.0, (count, 2)) * (4.2, 2.5 if height else 2.1)
-        centre = offset * normal + height * second * np.sign(second[2])
-        flat = centre + spread @ np.array([first, second])
-        points.append(flat + rng.normal(0.0, 0.002, (count, 1)) * normal)
-        faces.append((name, normal, offset))
-    clutter = n_points - sum(map(len, points))
-    points.append(rng.uniform((-4, -0.5, -1.5), (4, 3.5, 0.5), (clutter, 3)))
-    cloud = np.concatenate(points).astype(np.float32)
-    cloud[:: max(1, n_points // (n_points // 200))] += rng.normal(0, 3, 3).astype(np.float32)
-    order = np.lexsort([cloud[:, 2], np.round(np.arctan2(cloud[:, 1], cloud[:, 0]), 3)])
-    return cloud[order], faces
-
-
-def median_s(task: Callable[[], object], repeats: int) -> tuple[float, float, float]:
-    """Median, fastest and slowest of some runs, in seconds."""
-    times = []
+def times_s(task: Callable[[], object], repeats: int) -> tuple[float, float, float]:
+    """Fastest and slowest of some runs, and the processor time of the fastest; seconds."""
+    runs = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         task()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times), min(times), max(times)
+        runs.append((time.perf_counter() - start, time.process_time() - cpu))
+    return min(runs)[0], max(runs)[0], min(cpu_s for _, cpu_s in runs)
 
 
 def detect(
@@ -159,84 +130,197 @@ def _listen(_part: float, _text: str) -> None:
     """Hear progress and say nothing."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """What is measured on.
+
+    Attributes:
+        cloud: the points.
+        truth: name, (3,) normal, offset and (3,) centroid of its points, per true plane; the main
+            wall first.
+        is_main: (n,) whether a point is truly on the main wall.
+        floor_s: seconds of one pass over the points at memory speed, F.
+    """
+
+    cloud: PointCloud
+    truth: list[tuple[str, NDArray[np.float64], float, NDArray[np.float64]]]
+    is_main: NDArray[np.bool_]
+    floor_s: float
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--method", choices=METHODS, action="append")
-    parser.add_argument("--points", type=int, default=10_000_000)
+    parser.add_argument("--points", type=int, default=FULL_POINTS)
     parser.add_argument("--npy", type=Path, help="(n, 3) float32 points instead of the room")
     parser.add_argument("--truth", type=Path, help="JSON with planes: {name: {n: [3], R}}")
+    parser.add_argument("--labels", type=Path, help="(n,) true plane of each point, names as ints")
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--no-peers", action="store_true")
     options = parser.parse_args()
-    if options.npy:
-        points = np.load(options.npy, mmap_mode="r")
-        stored = json.loads(options.truth.read_text())["planes"] if options.truth else {}
-        truth = [(name, np.array(item["n"]), item["R"]) for name, item in stored.items()]
-    else:
-        points, truth = simulated_room(options.points)
-    x, y, z = (np.ascontiguousarray(points[:, axis]) for axis in range(3))
-    cloud = PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]))
-    del points
-    _pass(x, y, z)
-    floor_s = min(median_s(lambda: _pass(x, y, z), 5)[1] for _ in range(3))
-    print(f"{len(cloud)} points, {options.cores} threads, F = {1000 * floor_s:.1f} ms")
+    room = _stored(options) if options.npy else _simulated(options)
+    machine = f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+    print(f"{len(room.cloud)} points, {options.cores} threads, {machine}")
+    print("| method | first plane | all planes | statistics | extra memory | main wall | others |")
+    print("|---|---|---|---|---|---|---|")
     for method in options.method or METHODS:
-        report_method(method, cloud, floor_s, options)
-        _, found = detect(method, cloud, most=16, cores=options.cores)
-        for name, normal, offset in truth:
-            report_nearest(name, normal, offset, found)
+        room = report_method(method, room, options)
+    print(f"F = {1000 * room.floor_s:.1f} ms; load at the end {os.getloadavg()[0]:.1f}")
+    if not options.no_peers:
+        report_peers(room)
 
 
-def report_method(
-    method: str, cloud: PointCloud, floor_s: float, options: argparse.Namespace
-) -> None:
-    """Print times and memory of a method."""
-    cores = options.cores
+def _room(cloud: PointCloud, planes: list[tuple[str, NDArray, float]], labels: NDArray) -> Room:
+    """Join a cloud and its truth; labels count in planes."""
+    truth = []
+    for number, (name, normal, offset) in enumerate(planes):
+        mine = np.flatnonzero(labels == number)[::7]
+        points = np.column_stack([cloud.x[mine], cloud.y[mine], cloud.z[mine]])
+        truth.append((name, normal, offset, points.astype(np.float64).mean(axis=0)))
+    return Room(cloud=cloud, truth=truth, is_main=labels == 0, floor_s=pass_s(cloud))
+
+
+def _simulated(options: argparse.Namespace) -> Room:
+    scanned = great_room(options.points, cores=options.cores)
+    planes = [(p.name, p.plane.normal, p.plane.offset_m) for p in scanned.planes]
+    return _room(_cloud(scanned.x, scanned.y, scanned.z), planes, scanned.plane_index)
+
+
+def _stored(options: argparse.Namespace) -> Room:
+    points = np.load(options.npy, mmap_mode="r")
+    stored = json.loads(options.truth.read_text())["planes"]
+    planes = [(name, np.array(item["n"]), item["R"]) for name, item in stored.items()]
+    named = np.load(options.labels)
+    labels = np.full(len(named), -1, dtype=np.int8)
+    for number, (name, _, _) in enumerate(planes):
+        labels[named == int(name)] = number
+    columns = [np.ascontiguousarray(points[:, axis]) for axis in range(3)]
+    return _room(_cloud(*columns), planes, labels)
+
+
+def _cloud(x: NDArray, y: NDArray, z: NDArray) -> PointCloud:
+    return PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]))
+
+
+def pass_s(cloud: PointCloud) -> float:
+    """Seconds of the fastest of some passes over the points."""
+    _pass(cloud.x, cloud.y, cloud.z)
+    return times_s(lambda: _pass(cloud.x, cloud.y, cloud.z), 5)[0]
+
+
+def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
+    """Print times, memory and accuracy of a method; gives the room with the fastest pass so far."""
+    cloud, cores = room.cloud, options.cores
     detect(method, cloud, most=2, cores=cores)  # warm
-    before_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    before_mib = forget_peak()
     remainder, found = detect(method, cloud, most=16, cores=cores)
+    grown_mib = peak_mib() - before_mib
     slabs = np.array([item.raster.slab() for item in found])
     bounds = np.array([item.footprint.bounds_m for item in found])
-    print(method)
-    for name, task in (
-        ("first plane", lambda: detect(method, cloud, most=1, cores=cores)),
-        (f"{len(found)} planes", lambda: detect(method, cloud, most=16, cores=cores)),
-        ("statistics", lambda: measure_planes(remainder, slabs, bounds, find_m=0.05, fit_m=0.015)),
+    cells = []
+    for task in (
+        lambda: detect(method, cloud, most=1, cores=cores),
+        lambda: detect(method, cloud, most=16, cores=cores),
+        lambda: measure_planes(remainder, slabs, bounds, find_m=0.05, fit_m=0.015),
     ):
-        cpu_s = time.process_time()
-        median, fastest, slowest = median_s(task, options.repeats)
-        cpu_s = (time.process_time() - cpu_s) / options.repeats
-        print(
-            f"  {name:12} {median:.3f} s ({fastest:.3f}..{slowest:.3f}) = {median / floor_s:.1f} F,"
-            f" fastest {fastest / floor_s:.1f} F; processor {cpu_s:.3f} s = {cpu_s / floor_s:.1f} F"
+        fastest, slowest, cpu_s = times_s(task, options.repeats)
+        # Measured beside each task: other work on the machine slows both.
+        room = replace(room, floor_s=min(room.floor_s, pass_s(cloud)))
+        cells.append(
+            f"{fastest:.2f}..{slowest:.2f} s, processor {cpu_s:.2f} s"
+            f" = {fastest / room.floor_s:.0f} F, {cpu_s / room.floor_s:.0f} F"
         )
-    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    input_mib = 12 * len(cloud) / 2**20
-    print(
-        f"  input {input_mib:.0f} MiB, peak grew by {peak_mib - before_mib:.0f} MiB after warming"
+    share = grown_mib * 2**20 / (12 * len(cloud))
+    cells += [f"{grown_mib:.0f} MiB = {share:.2f} of the input", *accuracy(room, remainder, found)]
+    print(f"| {method}, {len(found)} planes | {' | '.join(cells)} |", flush=True)
+    return room
+
+
+def accuracy(room: Room, remainder: Remainder, found: list[FoundPlane]) -> tuple[str, str]:
+    """How near the planes come to the true ones: of the main wall, and the worst of the others."""
+    nearest = [_nearest(normal, offset, centre, found) for _, normal, offset, centre in room.truth]
+    hits = [item for item in nearest if item is not None]
+    others = [item for item in nearest[1:] if item is not None]
+    worst = f"{len(hits)} of {len(nearest)} planes"
+    if others:
+        worst += (
+            f", {max(angle for angle, _, _ in others):.4f} deg"
+            f" {max(abs(miss) for _, miss, _ in others):.2f} mm at most"
+        )
+    if nearest[0] is None:
+        return "missed", worst
+    angle, miss_mm, index = nearest[0]
+    plane = found[index].raster.plane
+    a, b, c = plane.normal.astype(np.float32)
+    cloud = room.cloud
+    apart = np.abs(a * cloud.x + b * cloud.y + c * cloud.z - np.float32(plane.offset_m))
+    chosen = (remainder.claims == index) & (apart <= 0.015)
+    both = np.count_nonzero(chosen & room.is_main)
+    precision, recall = both / np.count_nonzero(chosen), both / np.count_nonzero(room.is_main)
+    return (
+        f"{angle:.4f} deg {miss_mm:+.2f} mm, precision {precision:.3f} recall {recall:.3f}",
+        worst,
     )
 
 
-def report_nearest(
-    name: str, normal: NDArray[np.float64], offset: float, found: list[FoundPlane]
-) -> None:
-    """Print how near the best plane comes to a true one, at the middle of its rectangle."""
+def _nearest(
+    normal: NDArray[np.float64],
+    offset: float,
+    centre: NDArray[np.float64],
+    found: list[FoundPlane],
+) -> tuple[float, float, int] | None:
+    """Angle, distance at the true centroid in millimetres, and number of the nearest plane."""
     best = None
-    for item in found:
+    for index, item in enumerate(found):
         plane = item.raster.plane
         angle = float(np.degrees(np.linalg.norm(np.cross(plane.normal, normal))))
-        u, v = item.raster.centres_m()
-        cells = item.footprint.cells
-        middle = (
-            np.array([u[cells].mean(), v[cells].mean()]) @ item.raster.axes
-            + plane.offset_m * plane.normal
+        on_truth = centre - (float(centre @ normal) - offset) * normal
+        miss_mm = 1000.0 * (float(plane.normal @ on_truth) - plane.offset_m)
+        if angle < 1.0 and abs(miss_mm) < 15.0 and (best is None or abs(miss_mm) < abs(best[1])):
+            best = (angle, miss_mm, index)
+    return best
+
+
+def report_peers(room: Room) -> None:
+    """Print what other programs take for the main wall, on the same points."""
+    print("| peer | points | time | main wall | planes |")
+    print("|---|---|---|---|---|")
+    _, normal, offset, centre = room.truth[0]
+    points = np.column_stack([room.cloud.x, room.cloud.y, room.cloud.z])
+    on_truth = centre - (float(centre @ normal) - offset) * normal
+    for peer in PEERS:
+        result = measured(peer, points, np.append(normal, offset))
+        part = "all" if peer.every == 1 else f"1:{peer.every}"
+        if isinstance(result, str):
+            print(f"| {peer.name} | {part} | {result} | | |", flush=True)
+            continue
+        angle = float(np.degrees(np.linalg.norm(np.cross(result.normal, normal))))
+        miss_mm = 1000.0 * (float(result.normal @ on_truth) - result.offset_m)
+        wall = (
+            "missed"
+            if angle > 1.5 or abs(miss_mm) > 100.0
+            else f"{angle:.3f} deg {miss_mm:+.1f} mm"
         )
-        miss_mm = 1000.0 * (float(normal @ middle) - offset)
-        if angle < 1.0 and abs(miss_mm) < 15.0 and (best is None or angle < best[0]):
-            best = (angle, miss_mm)
-    print(f"  truth {name:9}", "missed" if best is None else f"{best[0]:.4f} deg {best[1]:+.2f} mm")
+        print(
+            f"| {peer.name} | {part} | {result.seconds:.2f} s = "
+            f"{result.seconds / room.floor_s:.0f} F | {wall} | {result.n_planes} |",
+            flush=True,
+        )
+
+
+def forget_peak() -> float:
+    """Let the peak of this process's memory start anew; gives its memory now, MiB."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return peak_mib()
+
+
+def peak_mib() -> float:
+    """Largest resident memory since the peak was forgotten, MiB."""
+    status = Path("/proc/self/status").read_text()
+    return int(re.search(r"VmHWM:\s+(\d+)", status)[1]) / 1024
 
 
 if __name__ == "__main__":
