@@ -117,13 +117,14 @@ def _add_sheared(
     spans: NDArray[np.int32],
     shear: float,
     line: NDArray[np.int32],
-) -> None:
+) -> tuple[int, int]:
     """Add the rows of an image to a line, each shifted by its height over the middle times a shear.
 
-    A row's first column lands at half its number of rows, and one more, with no shift.
+    A row's first column lands at half its number of rows, and one more, with no shift. The line is
+    zero before; gives the piece of it that no longer is.
     """
     n_rows = image.shape[0]
-    line[:] = 0
+    low, high = line.size, 0
     for row in range(n_rows):
         first, last = spans[row, 0], spans[row, 1]
         if first >= last:
@@ -133,50 +134,69 @@ def _add_sheared(
         source = image[row, first:last]
         for i in range(source.size):
             target[i] += source[i]
+        low, high = min(low, shift + first), max(high, shift + last)
+    return low, high
 
 
 @compiled
 def _share_out(
-    line: NDArray[np.int32], n_rows: int, n_columns: int, scale: float, votes: NDArray[np.int32]
+    line: NDArray[np.int32],
+    piece: tuple[int, int],
+    shape: tuple[int, int],
+    scale: float,
+    votes: NDArray[np.int32],
 ) -> None:
-    """Add a line to a row of votes whose bins are narrower, in quarters."""
+    """Add a piece of a line to a row of votes whose bins are narrower, in quarters; clears it.
+
+    Args:
+        line: see `_add_sheared`.
+        piece: what of it is not zero.
+        shape: rows and columns of the image that was added up.
+        scale: width of a cell of the line, in bins; negative when it runs the other way.
+        votes: (bins,) added to.
+    """
     middle = 0.5 * votes.size
-    for i in range(n_columns + n_rows + 2):
+    for i in range(piece[0], piece[1]):
         if line[i] == 0:
             continue
-        left = scale * (i - (n_rows // 2 + 1) - 0.5 * n_columns) + middle
-        right = left + scale
-        low = min(left, right)
+        left = scale * (i - (shape[0] // 2 + 1) - 0.5 * shape[1]) + middle
+        low = min(left, left + scale)
         first = math.floor(low)
         share = min(VOTE_SHARES, int(VOTE_SHARES * (first + 1 - low) / abs(scale) + 0.5))
         if 0 <= first < votes.size:
             votes[first] += share * line[i]
         if 0 <= first + 1 < votes.size:
             votes[first + 1] += (VOTE_SHARES - share) * line[i]
+        line[i] = 0
 
 
 @compiled
-def _span_rows(image: NDArray[np.int32], spans: NDArray[np.int32]) -> None:
-    """Set (rows, 2) spans to the first column with votes and the one behind the last."""
-    n_columns = image.shape[1]
-    for row in range(image.shape[0]):
-        first = 0
-        while first < n_columns and image[row, first] == 0:
+def _span_rows(
+    image: NDArray[np.int32], window: tuple[int, int, int, int], spans: NDArray[np.int32]
+) -> None:
+    """Set (rows, 2) spans to the first column with votes and the one behind the last.
+
+    All votes lie in the window: first row, row behind the last, and the same for the columns.
+    """
+    spans[:] = 0
+    for row in range(window[0], window[1]):
+        first, last = window[2], window[3]
+        while first < last and image[row, first] == 0:
             first += 1
-        last = n_columns
         while last > first and image[row, last - 1] == 0:
             last -= 1
         spans[row, 0], spans[row, 1] = first, last
 
 
 @compiled
-def _turn_image(image: NDArray[np.int32], turned: NDArray[np.int32]) -> None:
+def _turn_image(
+    image: NDArray[np.int32], window: tuple[int, int, int, int], turned: NDArray[np.int32]
+) -> None:
     """Set turned to the image with rows and columns exchanged, tile by tile for the cache."""
-    n_rows, n_columns = image.shape
-    for top in range(0, n_rows, _TILE):
-        for left in range(0, n_columns, _TILE):
-            for column in range(left, min(left + _TILE, n_columns)):
-                for row in range(top, min(top + _TILE, n_rows)):
+    for top in range(window[0], window[1], _TILE):
+        for left in range(window[2], window[3], _TILE):
+            for column in range(left, min(left + _TILE, window[3])):
+                for row in range(top, min(top + _TILE, window[1])):
                     turned[column, row] = image[row, column]
 
 
@@ -188,8 +208,11 @@ def _count_upright(
     bin_m: float,
     cells: NDArray[np.int32],
     image: NDArray[np.int32],
-) -> None:
-    """Count places in an upright image along a direction; (m,) cells is scratch."""
+) -> tuple[int, int, int, int]:
+    """Count places in an upright image along a direction; (m,) cells is scratch.
+
+    Gives the window that they lie in: first row, row behind the last, and the same for columns.
+    """
     n_rows, n_columns = image.shape
     cosine, sine = np.float32(math.cos(omega_rad) / bin_m), np.float32(math.sin(omega_rad) / bin_m)
     per_m, zero, none = np.float32(1.0 / bin_m), np.float32(0.0), np.int32(-1)
@@ -197,11 +220,14 @@ def _count_upright(
     top_columns, top_rows = np.float32(n_columns), np.float32(n_rows)
     width = np.int32(n_columns)
     xs, ys, zs = places[0], places[1], places[2]
+    left, right, bottom, top = top_columns, zero, top_rows, zero
     # Without branches, so that the processor takes several places at once.
     for i in range(cells.size):
         column = cosine * xs[i] + sine * ys[i] + half_columns
         row = zs[i] * per_m + half_rows
         within = (column >= zero) & (column < top_columns) & (row >= zero) & (row < top_rows)
+        left, right = min(left, column), max(right, column)
+        bottom, top = min(bottom, row), max(top, row)
         column = column if within else zero
         row = row if within else zero
         cells[i] = np.int32(row) * width + np.int32(column) if within else none
@@ -209,6 +235,12 @@ def _count_upright(
     for i in range(cells.size):
         if cells[i] >= 0:
             flat[cells[i]] += weights[i]
+    return (
+        max(0, int(bottom)),
+        min(n_rows, int(top) + 1),
+        max(0, int(left)),
+        min(n_columns, int(right) + 1),
+    )
 
 
 @compiled
@@ -247,19 +279,19 @@ def vote_planes(
     for turn in range(starts.size - 1):
         if starts[turn] == starts[turn + 1]:
             continue
-        _count_upright(places, weights, angles[starts[turn], 0], bin_m, cells, image)
-        _turn_image(image, turned)
-        _span_rows(image, spans)
-        _span_rows(turned, turned_spans)
+        window = _count_upright(places, weights, angles[starts[turn], 0], bin_m, cells, image)
+        _turn_image(image, window, turned)
+        _span_rows(image, window, spans)
+        _span_rows(turned, (window[2], window[3], window[0], window[1]), turned_spans)
         for d in range(starts[turn], starts[turn + 1]):
             level, rise = math.cos(angles[d, 1]), math.sin(angles[d, 1])
             if level >= abs(rise):
-                _add_sheared(image, spans, rise / level, line)
-                _share_out(line, n_rows, n_columns, level, votes[d])
+                piece = _add_sheared(image, spans, rise / level, line)
+                _share_out(line, piece, (n_rows, n_columns), level, votes[d])
             else:
-                _add_sheared(turned, turned_spans, level / rise, line)
-                _share_out(line, n_columns, n_rows, rise, votes[d])
-        image[:] = 0
+                piece = _add_sheared(turned, turned_spans, level / rise, line)
+                _share_out(line, piece, (n_columns, n_rows), rise, votes[d])
+        image[window[0] : window[1], window[2] : window[3]] = 0
 
 
 @compiled
