@@ -217,6 +217,35 @@ def test_recesses_of_different_depth_are_not_joined_by_a_plane_that_leans(
         assert miss_m < 2e-4
 
 
+@pytest.mark.parametrize("detector", ["hough2d", "hough3d", "ransac-msac", "region-cube"])
+def test_mirror_ghosts_and_furniture_neither_hide_nor_move_the_walls(
+    detector: str, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(5)
+    room = sampled()
+    # A mirror on the front wall shows the room behind it: 4 % of the points lie where nothing is.
+    front = ROOM[0]
+    seen = room[rng.choice(len(room), 3_500, replace=False)]
+    depth_m = (seen - front.centre) @ front.normal
+    ghosts = seen - 2.0 * depth_m[:, None] * front.normal
+    boxes = tuple(
+        Rectangle(f"box {k}", (x, y, z), a, b, 1_200)
+        for k, (x, y, z, a, b) in enumerate(
+            [
+                (-1.5, 0.4, -1.1, (0.3, 0.1, 0), (0, 0, 0.4)),
+                (-1.4, 0.1, -0.7, (0.3, 0.1, 0), (-0.1, 0.3, 0)),
+                (1.8, -0.8, -1.2, (0.1, 0.35, 0), (0, 0, 0.3)),
+            ]
+        )
+    )
+    points = np.concatenate([room, ghosts, sampled(boxes, seed=6)])
+    planes = detect(detector, cloud_of(points, stations=STATION), tmp_path, **TO_THE_END)[0].planes
+    for truth in ROOM[:6]:
+        angle_deg, miss_m = errors(planes, truth, np.eye(3))
+        assert angle_deg < 0.03
+        assert miss_m < 3e-4
+
+
 @every_detector
 def test_normals_point_to_the_station(detector: str, rooms: dict[str, Any]) -> None:
     planes = rooms[detector].planes
