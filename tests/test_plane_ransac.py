@@ -17,6 +17,7 @@ from orthoflow.geometry import angle_between_deg
 from orthoflow.products import PointCloud
 from orthoflow.sdk import StepContext
 from tests.plane_scenes import ROOM, cloud_of, sampled
+from tests.road.conftest import IS_LONG
 
 STATION = np.array([[0.3, -0.2, 0.1]])
 UP = np.array([0.0, 0.0, 1.0])
@@ -36,7 +37,8 @@ def histogram_of(distances_m: NDArray[np.float64], reach_m: float) -> NDArray[np
     )
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.long  # ten of the seeds in a normal run
+@pytest.mark.parametrize("seed", range(50 if IS_LONG else 10))
 def test_no_seed_misses_a_wall(seed: int, tmp_path: Path) -> None:
     planes = detect(cloud_of(sampled(seed=seed), stations=STATION), tmp_path, seed=seed)[0].planes
     for truth in ROOM[:6]:
