@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _POINTS_MOST: Final = 25_000
 _SECTION_POINTS_MOST: Final = 2_000_000
+_SECTION_CELLS_MOST: Final = 2_000
 _NAMED_MOST: Final = 12
 # The view is from above, a little aside, along parallel lines.
 _AZIMUTH_DEG: Final = -60.0
@@ -76,20 +77,24 @@ def draw_planes(
 
 
 def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m: float) -> None:
-    """Draw the points per voxel in three sections through the middle of the scene.
+    """Draw the points per voxel in three sections through the middle of the planes' parts.
 
     Args:
         ctx: takes the figure.
-        planes: the planes, world.
+        planes: the planes, world; at least one.
         cloud: the cloud.
-        cell_m: side of a voxel.
+        cell_m: side of a voxel; drawn larger where a scene would need too many.
     """
     from matplotlib.figure import Figure
 
     every = max(1, len(cloud) // _SECTION_POINTS_MOST)
     points_m = np.column_stack([cloud.x[::every], cloud.y[::every], cloud.z[::every]])
-    framed = points_m.astype(np.float64) @ basis_from_up(planes.up).T
-    low, high = np.quantile(framed[:: max(1, len(framed) // 40_000)], (0.003, 0.997), axis=0)
+    basis = basis_from_up(planes.up)
+    framed = points_m.astype(np.float64) @ basis.T
+    # Not what the points span: some lie far outside, behind mirrors and windows.
+    corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ basis.T
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    cell_m = max(cell_m, float((high - low).max()) / _SECTION_CELLS_MOST)
     low, high = low - 5.0 * cell_m, high + 5.0 * cell_m
     middle = 0.5 * (low + high)
     figure = Figure(figsize=(12.0, 4.2), layout="constrained")
@@ -111,8 +116,8 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
     ctx.figure(
         "voxels",
         figure,
-        f"Points per voxel of {100.0 * cell_m:g} cm (darker is more, logarithmic) in three "
-        "sections through the middle of the scene.",
+        f"Points per voxel of {100.0 * cell_m:.3g} cm (darker is more, logarithmic) in three "
+        "sections through the middle of the planes' parts.",
     )
 
 
