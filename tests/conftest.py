@@ -39,6 +39,12 @@ _FIGURE: Final = StepContext.figure
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give a second process what needs no kernels while the first compiles them for tests/road."""
+    early = ["test_direct.py", "test_cli_running.py"]
+    items.sort(key=lambda item: early.index(item.path.name) if item.path.name in early else 2)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real scans and photos beside the checkout, which never ships with it."""
