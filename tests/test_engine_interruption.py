@@ -16,8 +16,8 @@ import pytest
 from orthoflow.engine import RunOutcome, collect_garbage
 from orthoflow.errors import StoreError
 from tests.engine_world import World, start_coordinator, toy_world
+from tests.road.conftest import IS_LONG
 
-LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
 STEPS = """
 steps:
   first: {use: make.range, params: {count: 20000}}
@@ -76,12 +76,12 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 @pytest.mark.long  # twice in a normal run
-@pytest.mark.parametrize("attempt", range(10 if LONG else 2))
+@pytest.mark.parametrize("attempt", range(10 if IS_LONG else 2))
 def test_a_run_killed_at_any_moment_resumes_with_the_same_digests(
     world: World, quiet: list[str], attempt: int
 ) -> None:
     rng = random.Random(attempt)
-    for _ in range(2 if LONG else 1):
+    for _ in range(2 if IS_LONG else 1):
         process = start_coordinator(world, STEPS, "run")
         assert process.stdout is not None
         process.stdout.readline()
