@@ -51,7 +51,6 @@ class AdjustedPlane:
     Attributes:
         plane: in the cloud's offsets.
         moved_m: how far the fit moved a corner of the cells at most.
-        sigma_cell_m: spread of the cells about the plane, robust.
         bend_per_m: strongest curvature of the surface that the cells show, 1 over its radius.
         bend_share: share of the cells' variance that this curvature explains.
         observed: the cells.
@@ -61,7 +60,6 @@ class AdjustedPlane:
 
     plane: Plane
     moved_m: float
-    sigma_cell_m: float
     bend_per_m: float
     bend_share: float
     observed: CellHeights
@@ -138,7 +136,6 @@ def adjust_plane(
     return AdjustedPlane(
         plane=plane,
         moved_m=float(np.abs(full @ change).max()),
-        sigma_cell_m=solved.scale_m,
         bend_per_m=bend_per_m,
         bend_share=bend_share,
         observed=observed,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal, TypeVar
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +33,8 @@ from orthoflow.geometry.point_kernels import (
 from orthoflow.geometry.region_kernels import fit_neighbourhoods
 from orthoflow.geometry.voxel_kernels import BRICK_SIDE
 from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.voxels import coarsened
+from orthoflow_plugins.plane.voxels import coarsened, with_room
 
-T = TypeVar("T", bound=np.generic)
 Shape = Literal["cube", "radius", "knn"]
 
 # Points a neighbourhood should hold where the cloud is thin, so that its normal means something.
@@ -206,16 +205,8 @@ class _Table:
 
     def make_room(self, n_rows: int, n_cells: int) -> None:
         """Enlarge the tables if fewer rows and cells than these are free."""
-        self.numbers = _enlarged(self.numbers, int(self.n_used[0]), n_rows)
-        self.sums = _enlarged(self.sums, int(self.n_used[1]), n_cells)
-
-
-def _enlarged(values: NDArray[T], n_used: int, n_free: int) -> NDArray[T]:
-    if n_used + n_free <= len(values):
-        return values
-    larger = np.zeros((max(2 * n_used, n_used + n_free), *values.shape[1:]), dtype=values.dtype)
-    larger[:n_used] = values[:n_used]
-    return larger
+        self.numbers = with_room(self.numbers, int(self.n_used[0]), n_rows)
+        self.sums = with_room(self.sums, int(self.n_used[1]), n_cells)
 
 
 def _cell_grid(remainder: Remainder, wanted: Neighbourhood) -> PlanGrid:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from orthoflow.geometry.point_kernels import (
 )
 from orthoflow.geometry.voxel_kernels import BRICK_SIDE, gather_voxels
 from orthoflow_plugins.plane.remainders import Remainder, Taking
+
+T = TypeVar("T", bound=np.generic)
 
 # More bricks than this in the table of a scene cost more than they show; the voxels grow instead.
 _BRICKS_MOST: Final = 8_000_000
@@ -43,6 +45,15 @@ def coarsened(cell_m: float, extent_m: NDArray[np.float64]) -> float:
     """Enlarge cells until a scene of (3,) this size has at most `_BRICKS_MOST` bricks of them."""
     brick_m3 = float(np.prod(extent_m + BRICK_SIDE * cell_m)) / _BRICKS_MOST
     return max(cell_m, math.cbrt(brick_m3) / BRICK_SIDE)
+
+
+def with_room(values: NDArray[T], n_used: int, n_free: int) -> NDArray[T]:
+    """Enlarge a table unless so many of its rows are free; what is in use stays."""
+    if n_used + n_free <= len(values):
+        return values
+    larger = np.zeros((max(2 * n_used, n_used + n_free), *values.shape[1:]), dtype=values.dtype)
+    larger[:n_used] = values[:n_used]
+    return larger
 
 
 class VoxelCounts:
@@ -157,10 +168,7 @@ class _Table:
         """Count points, with more room whenever the table is full."""
         start = 0
         while start < len(points.x):
-            if self._n_used[0] + BLOCK_POINTS > len(self.counts):
-                larger = np.zeros((2 * len(self.counts), BRICK_SIDE**3), dtype=np.int32)
-                larger[: len(self.counts)] = self.counts
-                self.counts = larger
+            self.counts = with_room(self.counts, int(self._n_used[0]), BLOCK_POINTS)
             start = gather_voxels(
                 points, start, frame, shape, self.bricks, self.counts, self._n_used
             )
