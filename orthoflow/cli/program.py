@@ -18,6 +18,7 @@ _SUMMARIES: Final = {
     "graph": "Draw a workflow as a Mermaid graph.",
     "run": "Run a workflow; makes orthoimages, report and record.",
     "show": "Summarise a finished run.",
+    "compare": "Lay two runs side by side: what differs, and how far.",
     "report": "Write the HTML report of one or more runs.",
     "verify": "Check that a record is whole and unchanged.",
     "export": "Write a run's results for other programs.",

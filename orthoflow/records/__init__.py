@@ -13,7 +13,16 @@ from orthoflow_provenance.model import (
     RunRecord,
 )
 
+from orthoflow.records.comparison import (
+    CellFacts,
+    MetricValue,
+    Pair,
+    ParameterValue,
+    RunComparison,
+    compare_runs,
+)
 from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.product_distances import Distance, ProductDistance
 from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run, open_run
 from orthoflow.records.verification import Verification, verify_run
 from orthoflow.records.writing import write_run
@@ -21,7 +30,13 @@ from orthoflow.records.writing import write_run
 __all__ = [
     "RECORD_FILE",
     "REPORT_FILE",
+    "CellFacts",
+    "Distance",
     "MetricRow",
+    "MetricValue",
+    "Pair",
+    "ParameterValue",
+    "ProductDistance",
     "RecordedCell",
     "RecordedEnvironment",
     "RecordedFigure",
@@ -30,9 +45,11 @@ __all__ = [
     "RecordedMetric",
     "RecordedProduct",
     "Run",
+    "RunComparison",
     "RunRecord",
     "Verification",
     "cell_metrics",
+    "compare_runs",
     "open_run",
     "verify_run",
     "write_run",

@@ -20,7 +20,7 @@ _EXACT: tuple[float, str] = (0.0, "1")
 
 @dataclass(frozen=True, kw_only=True)
 class ArrayDifference:
-    """One array or metadata value in which two products differ by more than allowed.
+    """One array or metadata value in which two products differ.
 
     Attributes:
         name: name of the array, or path of the value in the metadata.
@@ -28,7 +28,7 @@ class ArrayDifference:
             be subtracted (another shape or type, missing, NaN against a number).
         limit: largest difference that is allowed.
         unit: unit of both.
-        n_values: how many values differ by more than the limit.
+        n_values: how many values differ by more than the limit; 0 when the products agree here.
         problem: one sentence.
     """
 
@@ -43,7 +43,24 @@ class ArrayDifference:
 def compare_payloads(
     left: PayloadLike, right: PayloadLike, tolerances: Tolerances
 ) -> tuple[ArrayDifference, ...]:
-    """Compare two products; arrays are read block by block.
+    """Compare two products and give what differs by more than allowed.
+
+    Args:
+        left: one product.
+        right: the other.
+        tolerances: as in `measure_payloads`.
+
+    Returns:
+        Differences beyond the limits, by name; empty when the products agree.
+    """
+    measured = measure_payloads(left, right, tolerances)
+    return tuple(difference for difference in measured if difference.n_values)
+
+
+def measure_payloads(
+    left: PayloadLike, right: PayloadLike, tolerances: Tolerances
+) -> tuple[ArrayDifference, ...]:
+    """Measure how far two products lie apart; arrays are read block by block.
 
     Args:
         left: one product.
@@ -53,7 +70,7 @@ def compare_payloads(
             metadata. Fields not named must be equal. NaN equals NaN.
 
     Returns:
-        Differences beyond the limits, by name; empty when the products agree.
+        All differences, also those within the limits, by name; empty when the products are equal.
     """
     differences: list[ArrayDifference] = []
     if (left.type_name, left.encoding_version) != (right.type_name, right.encoding_version):
@@ -90,15 +107,20 @@ def _array_differences(
         distances = _distances(np.ravel(left[index]), np.ravel(right[index]))
         largest = max(largest, float(distances.max()))
         n_values += int(np.count_nonzero(distances > limit))
-    if n_values:
+    if largest:
+        problem = (
+            f"{n_values} of {left.size} values differ by more than {limit:g} {unit}, the "
+            f"largest by {largest:g}"
+            if n_values
+            else f"differs by {largest:g} {unit} at most, {limit:g} are allowed"
+        )
         yield ArrayDifference(
             name=name,
             largest=largest,
             limit=limit,
             unit=unit,
             n_values=n_values,
-            problem=f"{n_values} of {left.size} values differ by more than {limit:g} {unit}, the "
-            f"largest by {largest:g}",
+            problem=problem,
         )
 
 
@@ -142,13 +164,13 @@ def _number_differences(
 ) -> Iterator[ArrayDifference]:
     limit, unit = tolerance
     distance = abs(left - right)
-    if distance > limit:
+    if distance:
         yield ArrayDifference(
             name=name,
             largest=distance,
             limit=limit,
             unit=unit,
-            n_values=1,
+            n_values=int(distance > limit),
             problem=f"{left:g} against {right:g}, {limit:g} {unit} are allowed",
         )
 

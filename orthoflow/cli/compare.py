@@ -1,0 +1,188 @@
+"""`orthoflow compare`: lay two runs side by side."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import click
+
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import Command, json_option, store_option
+from orthoflow.cli.product_tables import echo_distances
+from orthoflow.cli.tables import counted, echo_json, echo_table, number
+
+if TYPE_CHECKING:
+    from orthoflow.records import (
+        CellFacts,
+        MetricValue,
+        Pair,
+        ParameterValue,
+        RecordedFile,
+        RunComparison,
+    )
+
+Value = TypeVar("Value")
+_NOTHING: Final = "-"
+
+
+@click.command(cls=Command)
+@click.argument("first", metavar="A", type=click.Path(path_type=Path))
+@click.argument("second", metavar="B", type=click.Path(path_type=Path))
+@store_option
+@json_option
+def compare(first: Path, second: Path, store: Path, *, as_json: bool) -> int:
+    """Lay the runs A and B, run folders or their run.h5, side by side.
+
+    Says in what their inputs, workflows, parameters, versions and environments differ, and how
+    far their metrics and products lie apart. A parameter with * was set, others are defaults.
+    Cells are the same when their addresses are. --json has also what is equal.
+    """
+    from orthoflow.engine import Store
+    from orthoflow.records import compare_runs, open_run
+
+    stores = (Store(store),) if store.is_dir() else ()
+    comparison = compare_runs(open_run(first), open_run(second), stores=stores)
+    if as_json:
+        echo_json(comparison_json(comparison))
+    else:
+        _print(comparison)
+    return EXIT_GOOD
+
+
+def comparison_json(comparison: RunComparison) -> dict[str, object]:
+    """Give a comparison as JSON; every row says whether both sides are the same."""
+    return {
+        "runs": [
+            {
+                "run_id": record.run_id,
+                "name": record.name,
+                "created_by": record.created_by,
+                "status": record.status,
+                "started": record.started,
+                "ended": record.ended,
+                "seed": record.seed,
+            }
+            for record in (comparison.left, comparison.right)
+        ],
+        "workflow": list(comparison.workflow),
+        "overrides": _row_json(comparison.overrides),
+        **{
+            name: [_row_json(row) for row in getattr(comparison, name)]
+            for name in ("inputs", "cells", "parameters", "environment", "metrics")
+        },
+        "products": [dataclasses.asdict(distance) for distance in comparison.products],
+    }
+
+
+# Any: rows of all kinds.
+def _row_json(row: Pair[Any]) -> dict[str, object]:
+    return {**dataclasses.asdict(row), "same": row.is_same}
+
+
+def _print(comparison: RunComparison) -> None:
+    for mark, record in (("A", comparison.left), ("B", comparison.right)):
+        click.echo(
+            f"{mark}: {record.name}, run {record.run_id}, {record.created_by}, {record.started}, "
+            f"seed {record.seed}, {counted(len(record.cells), 'cell')}"
+        )
+    _print_pairs("inputs", comparison.inputs, _files_text)
+    if comparison.workflow:
+        click.echo("\nworkflow, A (-) against B (+)")
+        for line in comparison.workflow[2:]:
+            click.echo(line)
+    else:
+        click.echo("\nworkflow: same text")
+    _print_pairs("options", [comparison.overrides], " ".join)
+    _print_pairs("cells", comparison.cells, _facts_text)
+    _print_pairs("parameters (* set, others are defaults)", comparison.parameters, _parameter_text)
+    _print_pairs("environment", comparison.environment, str)
+    _print_metrics(comparison.metrics)
+    click.echo("\nproducts")
+    echo_distances(comparison.products)
+
+
+def _print_pairs(title: str, rows: Sequence[Pair[Value]], text: Callable[[Value], str]) -> None:
+    """Print the rows that differ under a title, or that none does."""
+    different = [row for row in rows if not row.is_same]
+    if not different:
+        click.echo(f"\n{title}: same")
+        return
+    click.echo(f"\n{title}: {len(different)} of {len(rows)} differ")
+    echo_table(
+        ("", "A", "B"),
+        [
+            (
+                ".".join(part for part in (row.cell, row.name) if part),
+                *(_NOTHING if side is None else text(side) for side in (row.left, row.right)),
+            )
+            for row in different
+        ],
+    )
+
+
+def _files_text(files: Sequence[RecordedFile]) -> str:
+    if not files:
+        return "not given"
+    named = ", ".join(f"{file.name} {file.sha256[:12]}" for file in files[:3])
+    return named if len(files) <= 3 else f"{named} and {len(files) - 3} more"
+
+
+def _facts_text(facts: CellFacts) -> str:
+    parts = [facts.status, f"{facts.method} result version {facts.result_version}"]
+    parts.append(facts.distribution)
+    if facts.code:
+        codes = " ".join(f"{name} {digest[:8]}" for name, digest in facts.code.items())
+        parts.append(f"code {codes}")
+    parts += [f"{name} {version}" for name, version in facts.tools.items()]
+    if facts.seed is not None:
+        parts.append(f"seed {facts.seed}")
+    if facts.error:
+        parts.append(facts.error)
+    return ", ".join(parts)
+
+
+def _parameter_text(parameter: ParameterValue) -> str:
+    value = parameter.value
+    text = number(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+    return f"{text}*" if parameter.is_set else text
+
+
+def _print_metrics(rows: Sequence[Pair[MetricValue]]) -> None:
+    """Print every metric that differs; time and memory always do, so they are not counted."""
+    is_measured = [not _side(row).is_cost for row in rows]
+    is_different = [_value(row.left) != _value(row.right) for row in rows]
+    n_different = sum(a and b for a, b in zip(is_measured, is_different, strict=True))
+    click.echo(f"\nmetrics: {n_different} of {sum(is_measured)} differ, time and memory left aside")
+    echo_table(
+        ("metric", "A", "B", "B - A", "unit"),
+        [
+            (
+                f"{row.cell}.{row.name}",
+                *(
+                    _NOTHING if side is None else number(side.value)
+                    for side in (row.left, row.right)
+                ),
+                ""
+                if row.left is None or row.right is None
+                else number(row.right.value - row.left.value),
+                _side(row).unit,
+            )
+            for row in itertools.compress(rows, is_different)
+        ],
+    )
+
+
+def _side(row: Pair[MetricValue]) -> MetricValue:
+    side = row.left or row.right
+    if side is None:
+        raise AssertionError("a row stands for something that a run has")
+    return side
+
+
+def _value(side: MetricValue | None) -> float | None:
+    return None if side is None else side.value

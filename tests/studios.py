@@ -1,0 +1,49 @@
+"""The command line on the workshop's methods, in this process, with a store per folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from orthoflow.cli.program import program
+from orthoflow.records import Run, open_run
+from tests.workshop_runs import WORKSHOP, write_studio
+
+
+@dataclass(frozen=True)
+class Studio:
+    """A folder with a workflow of two steps; commands run in it."""
+
+    folder: Path
+
+    def __call__(self, *arguments: object) -> Result:
+        words = [str(argument) for argument in arguments]
+        if words[0] in ("run", "replay"):
+            words += ["--executor", "inline"]
+        return CliRunner().invoke(program, words)
+
+    def run(self, name: str, *arguments: object) -> Run:
+        """Run the workflow into a folder of that name."""
+        done = self("run", "studio.yaml", "-o", name, *arguments)
+        assert done.exit_code == 0, done.output
+        return open_run(self.folder / name)
+
+    # Any: JSON.
+    def json(self, *arguments: object, code: int = 0) -> Any:
+        """Run a command with `--json` and read what it prints."""
+        done = self(*arguments, "--json")
+        assert done.exit_code == code, done.output
+        return json.loads(done.stdout)
+
+
+def open_studio(folder: Path, patch: pytest.MonkeyPatch) -> Studio:
+    """Write the workflow into a folder, make it the working directory, install the workshop."""
+    write_studio(folder)
+    patch.chdir(folder)
+    patch.syspath_prepend(str(WORKSHOP))
+    return Studio(folder)
