@@ -27,13 +27,7 @@ class Command(click.Command):
 
 def workflow_arguments(command: _Decorated) -> _Decorated:
     """Add the workflow and what changes it: `WORKFLOW --set --input`."""
-    command = click.option(
-        "--input",
-        "inputs",
-        multiple=True,
-        metavar="NAME=PATH",
-        help="Give an input: a file, a folder or a quoted glob, relative to the current folder.",
-    )(command)
+    command = input_option(command)
     command = click.option(
         "--set",
         "sets",
@@ -42,6 +36,17 @@ def workflow_arguments(command: _Decorated) -> _Decorated:
         help="Change a parameter, e.g. wall.gsd_m=0.002 or plane.ransac.tolerance_m=0.05.",
     )(command)
     return click.argument("workflow", metavar="WORKFLOW")(command)
+
+
+def input_option(command: _Decorated) -> _Decorated:
+    """Add `--input`."""
+    return click.option(
+        "--input",
+        "inputs",
+        multiple=True,
+        metavar="NAME=PATH",
+        help="Give an input: a file, a folder or a quoted glob, relative to the current folder.",
+    )(command)
 
 
 def selection_options(command: _Decorated) -> _Decorated:

@@ -21,6 +21,7 @@ _SUMMARIES: Final = {
     "compare": "Lay two runs side by side: what differs, and how far.",
     "report": "Write the HTML report of one or more runs.",
     "verify": "Check that a record is whole and unchanged.",
+    "replay": "Make a run again from its record and say what came out differently.",
     "export": "Write a run's results for other programs.",
     "plugins": "List the methods that are installed, or show one.",
     "schema": "Print the JSON Schema of workflow files.",

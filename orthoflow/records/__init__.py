@@ -22,7 +22,13 @@ from orthoflow.records.comparison import (
     compare_runs,
 )
 from orthoflow.records.metrics import MetricRow, cell_metrics
-from orthoflow.records.product_distances import Distance, ProductDistance
+from orthoflow.records.product_distances import (
+    Distance,
+    ProductDistance,
+    RunProducts,
+    Verdict,
+    product_distances,
+)
 from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run, open_run
 from orthoflow.records.verification import Verification, verify_run
 from orthoflow.records.writing import write_run
@@ -46,11 +52,14 @@ __all__ = [
     "RecordedProduct",
     "Run",
     "RunComparison",
+    "RunProducts",
     "RunRecord",
+    "Verdict",
     "Verification",
     "cell_metrics",
     "compare_runs",
     "open_run",
+    "product_distances",
     "verify_run",
     "write_run",
 ]

@@ -1,0 +1,183 @@
+"""`orthoflow replay`: make a run again from its record and measure the differences."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
+from orthoflow.cli.options import DEFAULT_STORE, Command, input_option, json_option
+from orthoflow.cli.product_tables import echo_distances
+from orthoflow.cli.sessions import current_session
+from orthoflow.cli.tables import echo_json
+from orthoflow.errors import CancelledStepError
+
+if TYPE_CHECKING:
+    from orthoflow.engine import Store
+    from orthoflow.records import ProductDistance, Run
+    from orthoflow.records.replaying import Replay
+
+
+@click.command(cls=Command)
+@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@input_option
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="RUNDIR",
+    help="Folder of the replay.  [default: runs/<name>-replay-<run id>]",
+)
+@click.option(
+    "--store",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Folder of stored results; without it an empty one, so that all is computed anew.",
+)
+@click.option("--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time.")
+@click.option(
+    "--executor",
+    type=click.Choice(["local", "inline"]),
+    default="local",
+    help="A process per step, or all in this one (for debugging).",
+)
+@json_option
+def replay(
+    run: Path,
+    inputs: Sequence[str],
+    output: Path | None,
+    store: Path | None,
+    jobs: int,
+    executor: Literal["local", "inline"],
+    *,
+    as_json: bool,
+) -> int:
+    """Make RUN, a run folder or its run.h5, again from its record and its input files.
+
+    Takes workflow, parameters and seeds as recorded, and looks for the inputs by content where
+    they were, beside the run, or where --input says. What is missing or not as it was is named
+    before anything runs. Says of every product whether it has the same bits, is equal within the
+    tolerance of its type, or differs, and ends with 3 when one differs.
+    """
+    from orthoflow.catalog import discover_catalog
+    from orthoflow.engine import RunOptions, Store
+    from orthoflow.engine.journal import new_run_id
+    from orthoflow.records import open_run
+    from orthoflow.records.replaying import plan_replay
+
+    options = RunOptions(jobs=jobs, executor=executor)
+    original = open_run(run)
+    run_id = new_run_id()
+    folder = output or Path("runs") / f"{original.record.name}-replay-{run_id}"
+    with _store_folder(store, folder) as store_folder:
+        opened = Store(store_folder)
+        planned = plan_replay(original, discover_catalog(), opened, options, inputs=inputs)
+        call = _Call(
+            original=original,
+            replay=planned,
+            store=opened,
+            folder=folder,
+            run_id=run_id,
+            as_json=as_json,
+        )
+        with opened.in_use():
+            return call.go()
+
+
+@contextmanager
+def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
+    """The store: a given one, or a new one beside the run that is removed at the end."""
+    if given is not None:
+        yield given
+        return
+    fresh = folder.with_name(f"{folder.name}.store")
+    fresh.mkdir(parents=True, exist_ok=True)
+    is_interrupted = False
+    try:
+        yield fresh
+    except (CancelledStepError, KeyboardInterrupt):
+        # What is finished serves the same command, called again.
+        is_interrupted = True
+        raise
+    finally:
+        if not is_interrupted:
+            shutil.rmtree(fresh, ignore_errors=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Call:
+    """One call of the command, ready to go."""
+
+    original: Run
+    replay: Replay
+    store: Store
+    folder: Path
+    run_id: str
+    as_json: bool
+
+    def go(self) -> int:
+        """Execute, record, report, compare and say how far the products lie apart."""
+        current_session().resume_hint = (
+            "interrupted; what is finished is kept, and the same command with "
+            f"-o {self.folder} goes on from there"
+        )
+        for note in self.replay.notes:
+            click.echo(f"note: {note}", err=self.as_json)
+        made = self._make()
+        distances = self._distances(made)
+        differs = any(item.verdict == "different" for item in distances)
+        content = {
+            "record": str(self.original.path),
+            "replay": str(made.path),
+            "ok": not differs,
+            "notes": list(self.replay.notes),
+            "products": [dataclasses.asdict(item) for item in distances],
+        }
+        if self.as_json:
+            echo_json(content)
+        else:
+            click.echo()
+            echo_distances(distances)
+            click.echo(f"record of the replay: {made.path}")
+        if differs:
+            say_error(f"error: the replay of {self.original.path} differs, see above")
+        return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD
+
+    def _make(self) -> Run:
+        from orthoflow.cli.progress import make_progress
+        from orthoflow.engine import execute
+        from orthoflow.records import REPORT_FILE, write_run
+        from orthoflow.report import write_report
+
+        plan = self.replay.plan
+        with make_progress(tuple(item.cell.address for item in plan.cells)) as progress:
+            outcome = execute(plan, self.folder, self.store, progress.tell, run_id=self.run_id)
+        return write_run(
+            outcome,
+            plan,
+            self.replay.workflow,
+            self.folder,
+            self.store,
+            embed=self.replay.is_embedded,
+            before_finish=lambda run: write_report([run], self.folder / REPORT_FILE),
+        )
+
+    def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
+        from orthoflow.catalog import discover_catalog
+        from orthoflow.engine import Store
+        from orthoflow.records import RunProducts, product_distances
+
+        earlier = (Store(DEFAULT_STORE),) if DEFAULT_STORE.is_dir() else ()
+        return product_distances(
+            RunProducts(run=self.original, stores=earlier),
+            RunProducts(run=made, stores=(self.store,)),
+            [address for address in self.original.cells if address in made.cells],
+            discover_catalog(),
+        )

@@ -1,0 +1,142 @@
+"""Finding the input files of a record again: by content, wherever they may lie now."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from orthoflow_provenance.model import RecordedFile, RecordedInput
+
+from orthoflow.engine.file_digests import FileDigests
+from orthoflow.workflow import Workflow, resolve_input_files
+from orthoflow.workflow.model import WorkflowInputSpec
+from orthoflow.workflow.positions import Table, read_yaml
+from orthoflow.workflow.problems import ProblemLog
+from orthoflow.workflow.sections import override_inputs, read_inputs
+
+# A run lies in runs/<name>/ below the folder of its workflow, when nobody says otherwise.
+_FOLDERS_ABOVE: Final = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputSearch:
+    """What a search found.
+
+    Attributes:
+        paths: input -> its files in the order of the record; inputs that were not given have none.
+        problems: one sentence per file that is missing or was changed.
+    """
+
+    paths: Mapping[str, tuple[Path, ...]]
+    problems: tuple[str, ...]
+
+
+def find_inputs(
+    workflow: Workflow,
+    recorded: Sequence[RecordedInput],
+    run_folder: Path,
+    digests: FileDigests,
+    *,
+    given: Sequence[str] = (),
+) -> InputSearch:
+    """Look for files with the content and the name that a record states.
+
+    Looks where `given` says; else at the places that the workflow names, below the working
+    directory, the run's folder and the folders above it, and in these folders themselves.
+
+    Args:
+        workflow: of the record.
+        recorded: the record's inputs.
+        run_folder: the folder of the record.
+        digests: remembers digests, so that each file is read once.
+        given: `NAME=PATH`, each as behind `--input`.
+
+    Raises:
+        InvalidArgumentsError: `given` names no input of the workflow.
+        InputError: there is nothing at a given path.
+    """
+    places = _places(workflow, run_folder, given)
+    paths: dict[str, tuple[Path, ...]] = {}
+    problems: list[str] = []
+    for entry in recorded:
+        found = []
+        for file in entry.files:
+            where = _find(entry.name, file, places[entry.name], digests)
+            if isinstance(where, Path):
+                found.append(where)
+            else:
+                problems.append(where)
+        paths[entry.name] = tuple(found)
+    return InputSearch(paths=paths, problems=tuple(problems))
+
+
+def _find(name: str, file: RecordedFile, places: _Places, digests: FileDigests) -> Path | str:
+    """The file, or a sentence that says why there is none."""
+    same_name: list[Path] = []
+    for path in places.candidates(file.name):
+        if path in same_name or not path.is_file():
+            continue
+        is_same_size = path.stat().st_size == file.size_bytes
+        if is_same_size and digests.digest(path).sha256 == file.sha256:
+            return path.absolute()
+        same_name.append(path)
+    if same_name:
+        return (
+            f"input {name}: {same_name[0]} is not the {file.name} of the record: it was changed "
+            f"(expected {file.size_bytes} bytes with the SHA-256 {file.sha256[:12]}...)"
+        )
+    return (
+        f"input {name}: {file.name} ({file.size_bytes} bytes, SHA-256 {file.sha256[:12]}...) is "
+        f"not to be found; give it with --input {name}=PATH"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Places:
+    """Where the files of one input may lie: in folders, or exactly here when a user says so."""
+
+    folders: tuple[Path, ...] = ()
+    files: tuple[Path, ...] = ()
+
+    def candidates(self, name: str) -> Iterator[Path]:
+        """Paths at which a file of that name may be, the likeliest first."""
+        yield from (path for path in self.files if path.name == name)
+        yield from (folder / name for folder in self.folders)
+
+
+def _places(workflow: Workflow, run_folder: Path, given: Sequence[str]) -> dict[str, _Places]:
+    log = ProblemLog(file="")
+    overridden = override_inputs(workflow.inputs, given, log)
+    log.raise_any()
+    specs = {name: spec for name, spec in overridden.items() if spec.is_given}
+    by_hand = resolve_input_files(dataclasses.replace(workflow, inputs=specs))
+    roots = dict.fromkeys(
+        (Path(), run_folder, *run_folder.absolute().parents[: _FOLDERS_ABOVE - 1])
+    )
+    written = _written_specs(workflow)
+    places: dict[str, _Places] = {}
+    for name, spec in workflow.inputs.items():
+        files = by_hand.get(name)
+        if files is not None:
+            places[name] = _Places(files=files.paths)
+            continue
+        texts = (*spec.files, *(written[name].files if name in written else ()))
+        named = [
+            root / folder
+            for root in roots
+            for pattern in map(Path, dict.fromkeys(texts))
+            for folder in (pattern.parent, pattern)
+        ]
+        places[name] = _Places(folders=tuple(dict.fromkeys((*named, *roots))))
+    return places
+
+
+def _written_specs(workflow: Workflow) -> Mapping[str, WorkflowInputSpec]:
+    """What the file itself names: the resolved form has options in its place, and no folders."""
+    log = ProblemLog(file="")
+    document = read_yaml(workflow.source, log)
+    section = document.get("inputs") if isinstance(document, Table) else None
+    return read_inputs(section.value, Path(), log) if section else {}

@@ -1,0 +1,282 @@
+"""Replay: a recorded run planned again from its record alone, after everything was checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthoflow_provenance.model import RecordedCell
+from pydantic import ValidationError
+
+from orthoflow.engine.environment import environment
+from orthoflow.engine.plan import RunPlan, plan_run
+from orthoflow.errors import PluginError, RecordError, WorkflowError
+from orthoflow.records.input_search import find_inputs
+from orthoflow.records.runs import Run
+from orthoflow.records.verification import verify_run
+from orthoflow.workflow import Cell, CellOutput, Workflow, WorkflowInput
+from orthoflow.workflow.model import StepVariant
+from orthoflow.workflow.resolved import workflow_from_resolved
+
+if TYPE_CHECKING:
+    from orthoflow.catalog import Catalog
+    from orthoflow.engine import RunOptions, Store
+
+_ENVIRONMENT: tuple[str, ...] = ("python", "os", "cpu")
+
+
+class UnreplayableRunError(RecordError):
+    """A run cannot be replayed as it was; `problems` says why, a sentence each."""
+
+    def __init__(self, problems: tuple[str, ...]) -> None:
+        self.problems = problems
+        super().__init__("\n".join(problems))
+
+
+class MissingMethodsError(PluginError):
+    """Methods or product types of a record are not installed; `problems` names them."""
+
+    def __init__(self, problems: tuple[str, ...]) -> None:
+        self.problems = problems
+        super().__init__("\n".join(problems))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """A replay that can start.
+
+    Attributes:
+        workflow: of the record, for the record of the replay.
+        plan: its cells with the parameters and seeds as recorded.
+        notes: what is not as it was and may change results: code, libraries, Python, processor.
+        is_embedded: the record has the arrays of every product.
+    """
+
+    workflow: Workflow
+    plan: RunPlan
+    notes: tuple[str, ...]
+    is_embedded: bool
+
+
+def plan_replay(
+    run: Run,
+    catalog: Catalog,
+    store: Store,
+    options: RunOptions,
+    *,
+    inputs: Sequence[str] = (),
+) -> Replay:
+    """Check that a run can be made again, and plan it. Nothing is computed.
+
+    Args:
+        run: the run.
+        catalog: the installed plugins.
+        store: where the replay keeps its results.
+        options: of the replay.
+        inputs: `NAME=PATH`, each as behind `--input`.
+
+    Raises:
+        UnreplayableRunError: the record was changed, a method has another result version or takes
+            other parameters, or an input file is missing or was changed.
+        MissingMethodsError: nothing is wrong but that methods or product types are not installed.
+        InvalidArgumentsError: `inputs` names no input of the workflow.
+        InputError: there is nothing at a given path.
+    """
+    findings = verify_run(run.path).findings or tuple(_inconsistencies(run))
+    if findings:
+        raise UnreplayableRunError(
+            tuple(f"{run.path} is not as it was written: {finding}" for finding in findings)
+        )
+    workflow = _workflow(run)
+    check = _MethodCheck(catalog=catalog)
+    for cell in run.record.cells:
+        if cell.status != "skipped":
+            check.add(cell)
+    digests = store.file_digests()
+    search = find_inputs(workflow, run.record.inputs, run.folder, digests, given=inputs)
+    if check.others or search.problems:
+        raise UnreplayableRunError((*check.others, *check.missing, *search.problems))
+    if check.missing:
+        raise MissingMethodsError(tuple(check.missing))
+    if store.folder.is_dir():
+        digests.save()
+    found = _with_files(workflow, search.paths)
+    cells = [_cell(cell, workflow) for cell in run.record.cells]
+    plan = plan_run(cells, found, catalog, store, options)
+    return Replay(
+        workflow=workflow,
+        plan=plan,
+        notes=tuple(dict.fromkeys((*_environment_notes(run), *_method_notes(run, plan)))),
+        is_embedded=all(
+            output.embedded for cell in run.record.cells for output in cell.outputs.values()
+        ),
+    )
+
+
+def _workflow(run: Run) -> Workflow:
+    try:
+        workflow = workflow_from_resolved(run.record.workflow_resolved, run.record.workflow_source)
+    except WorkflowError as error:
+        raise UnreplayableRunError((f"{run.path}: {error}",)) from error
+    strangers = tuple(
+        f"{run.path}: its workflow has no cell {cell.address}"
+        for cell in run.record.cells
+        if _variant(cell, workflow) is None
+    )
+    if strangers:
+        raise UnreplayableRunError(strangers)
+    return workflow
+
+
+def _variant(cell: RecordedCell, workflow: Workflow) -> StepVariant | None:
+    name = cell.assignment.get(cell.step, "")
+    step = workflow.steps.get(cell.step)
+    return next((item for item in step.variants if item.name == name), None) if step else None
+
+
+def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Workflow:
+    """Name the files that were found; inputs without files were not given then either."""
+    specs = {
+        name: dataclasses.replace(
+            spec,
+            files=tuple(str(path) for path in paths.get(name, ())),
+            optional=spec.optional or not paths.get(name),
+        )
+        for name, spec in workflow.inputs.items()
+    }
+    return dataclasses.replace(workflow, inputs=specs)
+
+
+def _inconsistencies(run: Run) -> Iterator[str]:
+    """Find cells that say something else than the key that they were computed under."""
+    for cell in run.record.cells:
+        if not cell.key_preimage:
+            continue
+        preimage = _preimage(cell)
+        stated = {
+            "method": cell.method,
+            "result_version": cell.result_version,
+            "params": dict(cell.params),
+            "seed": cell.seed,
+            "inputs": {
+                port: f"{product.type_name}@{product.encoding_version}:{product.digest}"
+                for port, product in cell.inputs.items()
+            },
+        }
+        for name, value in stated.items():
+            if preimage.get(name) != value:
+                yield f"{cell.address}: {name} is not what its key was made from"
+
+
+# Any: JSON, compared and never trusted.
+def _preimage(cell: RecordedCell) -> Mapping[str, Any]:
+    try:
+        content = json.loads(cell.key_preimage)
+    except ValueError:
+        content = None
+    return content if isinstance(content, dict) else {}
+
+
+@dataclass(kw_only=True)
+class _MethodCheck:
+    """Compares the recorded methods with the installed ones; each problem is said once."""
+
+    catalog: Catalog
+    missing: list[str] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)
+
+    def add(self, cell: RecordedCell) -> None:
+        """Check the method of one more cell."""
+        try:
+            cls = self.catalog.method(cell.method).load()
+            for product in cell.outputs.values():
+                found = self.catalog.product_class(product.type_name).encoding_version
+                if found != product.encoding_version:
+                    _add(
+                        self.others,
+                        f"product type {product.type_name}: the installed one has encoding "
+                        f"version {found}, the record has {product.encoding_version}",
+                    )
+        except (WorkflowError, PluginError) as error:
+            origin = f"{cell.distribution} {cell.distribution_version}".strip()
+            _add(self.missing, f"method {cell.method} of {origin}: {error}")
+            return
+        if cls.result_version != cell.result_version:
+            _add(
+                self.others,
+                f"method {cell.method}: the installed one has result version "
+                f"{cls.result_version}, the record was made with {cell.result_version} "
+                f"({cell.distribution} {cell.distribution_version})",
+            )
+            return
+        try:
+            cls.Params.model_validate_json(json.dumps(dict(cell.params)), strict=True)
+        except ValidationError as error:
+            first = error.errors()[0]
+            name = ".".join(str(part) for part in first["loc"])
+            _add(
+                self.others,
+                f"cell {cell.address}: the installed {cell.method} refuses the recorded "
+                f"parameter {name}: {first['msg']}",
+            )
+
+
+def _add(problems: list[str], problem: str) -> None:
+    if problem not in problems:
+        problems.append(problem)
+
+
+def _cell(recorded: RecordedCell, workflow: Workflow) -> Cell:
+    variant = _variant(recorded, workflow)
+    return Cell(
+        address=recorded.address,
+        step=recorded.step,
+        method=recorded.method,
+        assignment=recorded.assignment,
+        repeat=recorded.repeat,
+        params=recorded.params,
+        params_set=recorded.params_set,
+        inputs={port: _source(product.source) for port, product in recorded.inputs.items()},
+        # A method without a seed is given a generator all the same, and does not use it.
+        seed=recorded.seed or 0,
+        cores=variant.cores if variant else None,
+        timeout_s=variant.timeout_s if variant else None,
+        skip_reason=recorded.error_message if recorded.status == "skipped" else "",
+    )
+
+
+def _source(text: str) -> CellOutput | WorkflowInput:
+    owner, _, name = text.rpartition(".")
+    if owner == "inputs":
+        return WorkflowInput(name=name)
+    return CellOutput(address=owner, port=name)
+
+
+def _environment_notes(run: Run) -> Iterator[str]:
+    here = environment(1)
+    for recorded in run.record.environments:
+        for name in _ENVIRONMENT:
+            if getattr(recorded, name) != here[name]:
+                yield f"{name}: {here[name]} here, {getattr(recorded, name)} in the record"
+
+
+def _method_notes(run: Run, plan: RunPlan) -> Iterator[str]:
+    for cell in run.record.cells:
+        facts = plan.methods.get(cell.method)
+        if facts is None or not cell.key_preimage:
+            continue
+        preimage = _preimage(cell)
+        if (preimage.get("code") or {}) != dict(facts.code):
+            yield (
+                f"{cell.method}: its code is not that of the record, though both say result "
+                f"version {cell.result_version}"
+            )
+        recorded = preimage.get("tools") or {}
+        for tool in sorted(recorded.keys() | facts.tools.keys()):
+            versions = facts.tools.get(tool), recorded.get(tool)
+            if versions[0] != versions[1]:
+                yield f"{cell.method}: {tool} {versions[0]} here, {versions[1]} in the record"

@@ -1,0 +1,199 @@
+"""`orthoflow replay`: a run made again from its record; what is not as it was is named first."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import h5py
+import pytest
+from orthoflow_provenance.digests import canonical_json, sha256_text
+from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.reader import read_record
+from orthoflow_provenance.writer import write_record
+
+from orthoflow.engine import Store
+from tests.studios import Studio, open_studio
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    """A folder with a run `first` whose plane a file says, kept as it was."""
+    with pytest.MonkeyPatch.context() as patch:
+        studio = open_studio(tmp_path_factory.mktemp("finished"), patch)
+        (studio.folder / "n.txt").write_text("1.5")
+        studio.run("first", "--input", "number=n.txt", "--set", "paint.grey=131")
+        yield studio
+
+
+@pytest.fixture
+def studio(finished: Studio, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Studio:
+    """A folder of its own with the run, its input and its store."""
+    opened = open_studio(tmp_path, monkeypatch)
+    for name in ("first", ".orthoflow"):
+        shutil.copytree(finished.folder / name, tmp_path / name)
+    shutil.copyfile(finished.folder / "n.txt", tmp_path / "n.txt")
+    return opened
+
+
+def write_changed(studio: Studio, change: Callable[[RecordedCell], RecordedCell]) -> None:
+    """Write the record again with one cell changed, sealed as if it had always been so."""
+    path = studio.folder / "first" / "run.h5"
+    record = read_record(path)
+    cells = (change(record.cells[0]), *record.cells[1:])
+    store = Store(studio.folder / ".orthoflow")
+    write_record(path, dataclasses.replace(record, cells=cells), store.product_file)
+
+
+def with_preimage(cell: RecordedCell, **changes: object) -> RecordedCell:
+    preimage = canonical_json({**json.loads(cell.key_preimage), **changes})  # type: ignore[dict-item]
+    return dataclasses.replace(cell, key_preimage=preimage, key=sha256_text(preimage))
+
+
+def refused(studio: Studio, *arguments: str, code: int = 3) -> str:
+    done = studio("replay", "first", "-o", "again", *arguments)
+    assert done.exit_code == code, done.output
+    assert not (studio.folder / "again").exists()
+    assert not (studio.folder / "again.store").exists()
+    return done.stderr
+
+
+def test_a_replay_computes_everything_anew_with_the_same_bits(studio: Studio) -> None:
+    said = studio.json("replay", "first", "-o", "again")
+    assert said["ok"] is True
+    assert said["notes"] == []
+    assert [(row["cell"], row["verdict"]) for row in said["products"]] == [
+        ("survey", "identical"),
+        ("paint", "identical"),
+    ]
+    made = read_record(studio.folder / "again" / "run.h5")
+    first = read_record(studio.folder / "first" / "run.h5")
+    assert [cell.cached_from for cell in made.cells] == ["", ""]
+    assert made.run_id != first.run_id
+    for name in ("workflow_source", "workflow_resolved", "overrides", "inputs", "seed"):
+        assert getattr(made, name) == getattr(first, name)
+    assert not (studio.folder / "again.store").exists()
+
+
+def test_a_replay_can_be_replayed_and_says_so_in_words(studio: Studio) -> None:
+    assert studio("replay", "first", "-o", "again").exit_code == 0
+    done = studio("replay", "again/run.h5", "-o", "third", "--store", "kept")
+    assert done.exit_code == 0, done.output
+    assert "2 products: 2 identical" in done.stdout.splitlines()
+    assert (studio.folder / "kept" / "results").is_dir()
+    assert studio("verify", "third").exit_code == 0
+
+
+def test_inputs_are_found_by_content_where_a_user_says(studio: Studio) -> None:
+    (studio.folder / "elsewhere").mkdir()
+    (studio.folder / "n.txt").rename(studio.folder / "elsewhere" / "n.txt")
+    missing = refused(studio)
+    assert "input number: n.txt (3 bytes, SHA-256 " in missing
+    assert "is not to be found; give it with --input number=PATH" in missing
+    done = studio("replay", "first", "-o", "again", "--input", "number=elsewhere")
+    assert done.exit_code == 0, done.output
+
+
+def test_a_changed_input_is_named_before_anything_runs(studio: Studio) -> None:
+    (studio.folder / "n.txt").write_text("1.6")
+    said = refused(studio)
+    assert "input number: n.txt is not the n.txt of the record: it was changed" in said
+    assert said.splitlines()[-1] == "error: 1 problem"
+
+
+def test_an_unknown_input_is_an_argument_error(studio: Studio) -> None:
+    assert "there is no input nmber" in refused(studio, "--input", "nmber=n.txt", code=2)
+
+
+def test_an_edited_parameter_is_named(studio: Studio) -> None:
+    path = studio.folder / "first" / "run.h5"
+    with h5py.File(path, "r+") as file:
+        cell = file["cells/survey"]
+        text = cell["params"][()].replace(b"2.0", b"3.0")
+        cell["params"][()] = text
+    assert "/cells/survey/params: changed after the record was sealed" in refused(studio)
+
+
+def test_an_edited_parameter_is_named_under_a_new_seal_too(studio: Studio) -> None:
+    write_changed(studio, lambda cell: dataclasses.replace(cell, params={"offset_m": 3.0}))
+    assert studio("verify", "first").exit_code == 0
+    assert "survey: params is not what its key was made from" in refused(studio)
+
+
+def test_another_result_version_is_named(studio: Studio) -> None:
+    def change(cell: RecordedCell) -> RecordedCell:
+        return dataclasses.replace(with_preimage(cell, result_version=2), result_version=2)
+
+    write_changed(studio, change)
+    said = refused(studio)
+    assert (
+        "method survey.offset: the installed one has result version 1, the record was made with 2"
+        in said
+    )
+
+
+def test_a_missing_method_is_named(studio: Studio) -> None:
+    def change(cell: RecordedCell) -> RecordedCell:
+        return dataclasses.replace(
+            with_preimage(cell, method="survey.laser"), method="survey.laser", distribution="far"
+        )
+
+    write_changed(studio, change)
+    assert "method survey.laser of far 1.0: unknown method survey.laser" in refused(studio, code=4)
+
+
+def test_a_parameter_that_the_method_has_lost_is_named(studio: Studio) -> None:
+    params = {"offset_m": 2.0, "tilt_deg": 0.0}
+
+    def change(cell: RecordedCell) -> RecordedCell:
+        return dataclasses.replace(with_preimage(cell, params=params), params=params)
+
+    write_changed(studio, change)
+    assert "the installed survey.offset refuses the recorded parameter tilt_deg" in refused(studio)
+
+
+@pytest.mark.parametrize(
+    ("offset_m", "code", "verdict"),
+    [(1.500004, 0, "within tolerance"), (1.51, 3, "different")],
+)
+def test_other_products_are_measured(
+    studio: Studio, offset_m: float, code: int, verdict: str
+) -> None:
+    # The record claims the products of another run: what a method with hidden state would do.
+    (studio.folder / "n.txt").write_text(str(offset_m))
+    other = studio.run("other", "--input", "number=n.txt", "--set", "paint.grey=131")
+    (studio.folder / "n.txt").write_text("1.5")
+    path = studio.folder / "first" / "run.h5"
+    record = read_record(path)
+    survey, paint = record.cells
+    planes = other.cells["survey"].outputs
+    inputs = {"planes": dataclasses.replace(paint.inputs["planes"], digest=planes["planes"].digest)}
+    ref = planes["planes"]
+    paint = with_preimage(
+        dataclasses.replace(paint, inputs=inputs, outputs=other.cells["paint"].outputs),
+        inputs={"planes": f"{ref.type_name}@{ref.encoding_version}:{ref.digest}"},
+    )
+    cells = (dataclasses.replace(survey, outputs=planes), paint)
+    store = Store(studio.folder / ".orthoflow")
+    write_record(path, dataclasses.replace(record, cells=cells), store.product_file)
+    said = studio.json("replay", "first", "-o", "again", code=code)
+    assert said["ok"] is (code == 0)
+    assert [row["verdict"] for row in said["products"]] == [verdict, verdict]
+    [distance] = said["products"][0]["distances"][-1:]
+    assert distance["unit"] == "m"
+    assert distance["largest"] == pytest.approx(offset_m - 1.5, abs=1e-12)
+
+
+def test_a_failed_cell_fails_again_and_the_rest_is_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    studio = open_studio(tmp_path, monkeypatch)
+    path = tmp_path / "studio.yaml"
+    path.write_text(path.read_text().replace("paint.plain", "paint.fail"))
+    assert studio("run", "studio.yaml", "-o", "first").exit_code == 1
+    said = studio.json("replay", "first", "-o", "again")
+    assert [(row["cell"], row["verdict"]) for row in said["products"]] == [("survey", "identical")]
+    assert read_record(tmp_path / "again" / "run.h5").cells[1].status == "failed"
