@@ -19,41 +19,85 @@ if TYPE_CHECKING:
 @click.command(cls=Command)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @click.option(
-    "--to", "target", type=click.Choice(["colmap"]), required=True, help="The format to write."
+    "--to",
+    "target",
+    type=click.Choice(["colmap", "csv", "ro-crate"]),
+    required=True,
+    help="The format to write.",
 )
 @click.option(
     "--cell",
     metavar="ADDRESS",
-    help="The cell whose orientations are meant; without it the last one that oriented photos.",
+    help="colmap: the cell whose orientations are meant; without it the last one that oriented "
+    "photos.",
+)
+@click.option(
+    "--license",
+    "license_text",
+    metavar="URL",
+    help="ro-crate: the license of the results, its URL or name.",
 )
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Where to write it, a new or empty folder; without it RUN's own folder colmap.",
+    help="Where to write it, a new or empty folder; without it RUN's own folder of that name.",
 )
-def export(run: Path, target: str, cell: str | None, output: Path | None) -> int:
+def export(
+    run: Path, target: str, cell: str | None, license_text: str | None, output: Path | None
+) -> int:
     """Write the results of RUN, a run folder or its run.h5, for other programs.
 
-    colmap: the oriented photos with their lenses and ties as a text model that COLMAP opens.
+    colmap: the oriented photos with their lenses and ties as a text model that COLMAP opens. csv:
+    tables of cells, metrics, parameters, inputs, products and environments. ro-crate: record,
+    report and products as a Provenance Run Crate, for archives.
     """
-    from orthoflow.files.colmap import write_colmap_model
-    from orthoflow.products import Cameras
     from orthoflow.records import open_run
 
+    if cell is not None and target != "colmap":
+        raise ArgumentError(f"--cell belongs to --to colmap, not to --to {target}")
+    if license_text is not None and target != "ro-crate":
+        raise ArgumentError(f"--license belongs to --to ro-crate, not to --to {target}")
     opened = open_run(run)
-    address, port = _orientation(opened, cell)
-    cameras = Cameras.from_payload(opened.payload(address, port))
     folder = output if output is not None else opened.folder / target
+    if target == "colmap":
+        said = _export_colmap(opened, folder, cell)
+    elif target == "csv":
+        said = _export_csv(opened, folder)
+    else:
+        said = _export_crate(opened, folder, license_text)
+    click.echo(f"{target}: {folder}: {said}")
+    return EXIT_GOOD
+
+
+def _export_colmap(run: Run, folder: Path, cell: str | None) -> str:
+    from orthoflow.files.colmap import write_colmap_model
+    from orthoflow.products import Cameras
+
+    address, port = _orientation(run, cell)
+    cameras = Cameras.from_payload(run.payload(address, port))
     _make_empty(folder)
     model = write_colmap_model(folder, cameras)
-    click.echo(
-        f"colmap: {folder}: {counted(model.n_images, 'photo')}, "
-        f"{counted(model.n_cameras, 'camera')}, {counted(model.n_points, 'point')} "
-        f"of {address}"
+    return (
+        f"{counted(model.n_images, 'photo')}, {counted(model.n_cameras, 'camera')}, "
+        f"{counted(model.n_points, 'point')} of {address}"
     )
-    return EXIT_GOOD
+
+
+def _export_csv(run: Run, folder: Path) -> str:
+    from orthoflow.records.spreadsheets import write_csv_tables
+
+    _make_empty(folder)
+    return ", ".join(path.name for path in write_csv_tables(run, folder))
+
+
+def _export_crate(run: Run, folder: Path, license_text: str | None) -> str:
+    from orthoflow.records.crates import NO_LICENSE, write_crate
+
+    _make_empty(folder)
+    files = write_crate(run, folder, license_text=license_text or NO_LICENSE)
+    return f"{counted(len(files), 'file')}, described in {files[0].name}"
 
 
 def _orientation(run: Run, cell: str | None) -> tuple[str, str]:

@@ -1,0 +1,67 @@
+"""A run as a Provenance Run Crate: a folder that workflow archives and their tools understand."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Final
+
+from orthoflow.engine.durability import writing_to
+from orthoflow.records.crate_entities import RESOLVED_FILE, WORKFLOW_FILE, environment_file
+from orthoflow.records.crate_graph import METADATA_FILE, crate_metadata
+from orthoflow.records.published import PRODUCTS_FOLDER
+from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run
+
+NO_LICENSE: Final = "not stated: ask who made these results"
+
+
+def write_crate(run: Run, folder: Path, *, license_text: str = NO_LICENSE) -> tuple[Path, ...]:
+    """Write a run as an RO-Crate: record, report, products, workflow and their description.
+
+    Input files are named by their digests, not copied: they may be large, and others' property.
+
+    Args:
+        run: the run.
+        folder: existing empty folder.
+        license_text: URL or name of the license of the results.
+
+    Returns:
+        The files, the description first.
+
+    Raises:
+        StoreError: the disk refuses.
+    """
+    with writing_to(folder):
+        texts = {
+            WORKFLOW_FILE: run.record.workflow_source,
+            RESOLVED_FILE: run.record.workflow_resolved,
+            **{
+                environment_file(environment): "".join(
+                    f"{name}=={version}\n" for name, version in environment.packages.items()
+                )
+                for environment in run.record.environments
+            },
+        }
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8", newline="")
+        names = [*texts, *_copy_files(run, folder)]
+        crate = crate_metadata(run.record, names, license_text=license_text)
+        path = folder / METADATA_FILE
+        path.write_text(json.dumps(crate, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    return (path, *(folder / name for name in names))
+
+
+def _copy_files(run: Run, folder: Path) -> list[str]:
+    """Copy record, report and published files; give their paths in the crate."""
+    sources = {RECORD_FILE: run.path}
+    report = run.folder / REPORT_FILE
+    if report.is_file():
+        sources[REPORT_FILE] = report
+    for files in run.files.values():
+        for file in files:
+            sources[f"{PRODUCTS_FOLDER}/{file.relative_to(run.products_folder).as_posix()}"] = file
+    for name, source in sources.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(source, folder / name)
+    return list(sources)
