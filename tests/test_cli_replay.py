@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -121,6 +122,19 @@ def test_an_edited_parameter_is_named_under_a_new_seal_too(studio: Studio) -> No
     write_changed(studio, lambda cell: dataclasses.replace(cell, params={"offset_m": 3.0}))
     assert studio("verify", "first").exit_code == 0
     assert "survey: params is not what its key was made from" in refused(studio)
+
+
+def test_exchanged_digests_of_input_files_are_named_under_a_new_seal_too(studio: Studio) -> None:
+    path = studio.folder / "first" / "run.h5"
+    record = read_record(path)
+    [given] = record.inputs
+    [file] = given.files
+    (studio.folder / "n.txt").write_text("1.6")
+    digest = hashlib.sha256(b"1.6").hexdigest()
+    changed = dataclasses.replace(given, files=(dataclasses.replace(file, sha256=digest),))
+    store = Store(studio.folder / ".orthoflow")
+    write_record(path, dataclasses.replace(record, inputs=(changed,)), store.product_file)
+    assert "survey: files is not made of the files of inputs.number" in refused(studio)
 
 
 def test_another_result_version_is_named(studio: Studio) -> None:

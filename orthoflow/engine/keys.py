@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, cast
+from typing import Final, Protocol, cast
 
 from orthoflow.catalog import Catalog
-from orthoflow.engine.file_digests import FileRef
 from orthoflow.engine.results import ProductRef
 from orthoflow.engine.sources import compiled_digest, files_digest, unreleased_code
 from orthoflow.engine.store import canonical_json
@@ -103,7 +102,26 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
     )
 
 
-def input_digest(files: tuple[FileRef, ...]) -> str:
+class NamedContent(Protocol):
+    """A file by name and content; `FileRef` is one, and so is a file in a record."""
+
+    @property
+    def name(self) -> str:
+        """Name without its folder."""
+        raise AssertionError("a protocol is never called")
+
+    @property
+    def size_bytes(self) -> int:
+        """Its size."""
+        raise AssertionError("a protocol is never called")
+
+    @property
+    def sha256(self) -> str:
+        """Hexadecimal digest of its bytes."""
+        raise AssertionError("a protocol is never called")
+
+
+def input_digest(files: Sequence[NamedContent]) -> str:
     """Digest of a workflow input: names without folders, sizes and contents, in order."""
     listing: JsonValue = [
         {"name": file.name, "size_bytes": file.size_bytes, "sha256": file.sha256} for file in files

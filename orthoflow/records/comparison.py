@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from orthoflow_provenance.model import RecordedCell, RecordedFile, RunRecord
@@ -86,7 +86,7 @@ class CellFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class MetricValue:
-    """One number of one cell.
+    """One number of one cell; equal when value and unit are.
 
     Attributes:
         value: the number.
@@ -98,9 +98,9 @@ class MetricValue:
 
     value: float
     unit: str
-    is_cost: bool
-    is_cached: bool
-    environment: str
+    is_cost: bool = field(compare=False)
+    is_cached: bool = field(compare=False)
+    environment: str = field(compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,6 +13,7 @@ from orthoflow_provenance.model import RecordedCell
 from pydantic import ValidationError
 
 from orthoflow.engine.environment import environment
+from orthoflow.engine.keys import input_digest
 from orthoflow.engine.plan import RunPlan, plan_run
 from orthoflow.errors import PluginError, RecordError, WorkflowError
 from orthoflow.records.input_search import find_inputs
@@ -153,7 +154,11 @@ def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Wo
 
 def _inconsistencies(run: Run) -> Iterator[str]:
     """Find cells that say something else than the key that they were computed under."""
+    files = {f"inputs.{entry.name}": input_digest(entry.files) for entry in run.record.inputs}
     for cell in run.record.cells:
+        for port, product in cell.inputs.items():
+            if files.get(product.source, product.digest) != product.digest:
+                yield f"{cell.address}: {port} is not made of the files of {product.source}"
         if not cell.key_preimage:
             continue
         preimage = _preimage(cell)

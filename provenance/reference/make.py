@@ -1,0 +1,81 @@
+"""Makes the reference records: small runs of toy methods, as every later version must read them.
+
+    python provenance/reference/make.py
+
+The methods are those of tests/workshop. What depends on the machine and the hour (environment,
+times, run ids) is replaced by constants, so that a record made again differs only where the format
+or the digest of the unreleased code does. Made once for each version of the format and then kept.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+HERE: Final = Path(__file__).resolve().parent
+MINUTE: Final = "2026-01-02T03:04:"
+
+
+def make(name: str, sets: Sequence[str]) -> Path:
+    """Run the workflow of a name and write its record beside it."""
+    from orthoflow_provenance.model import RecordedEnvironment
+    from orthoflow_provenance.writer import write_record
+
+    from orthoflow.catalog import discover_catalog
+    from orthoflow.engine import RunOptions, Store, execute, plan_run
+    from orthoflow.records.writing import build_record
+    from orthoflow.workflow import expand_cells, load_workflow
+
+    catalog = discover_catalog()
+    workflow = load_workflow(HERE / f"{name}.yaml", catalog, sets=sets)
+    environment = RecordedEnvironment(
+        id=f"sha256:{'0' * 63}1",
+        python="3.11.0",
+        os="Linux",
+        cpu="reference",
+        cores=1,
+        threads=1,
+        git_commit="",
+        packages={"orthoflow-tls": "0.1.0", "workshop": "1.0"},
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(Path(folder) / "store")
+        cells = expand_cells(workflow, catalog)
+        plan = plan_run(cells, workflow, catalog, store, RunOptions(executor="inline"))
+        outcome = execute(plan, Path(folder) / "run", store, run_id=f"reference-{name}")
+        record = build_record(outcome, plan, workflow, store)
+        record = dataclasses.replace(
+            record,
+            started=f"{MINUTE}05.000Z",
+            ended=f"{MINUTE}09.000Z",
+            environments=(environment,),
+            cells=tuple(
+                dataclasses.replace(
+                    cell,
+                    started=f"{MINUTE}06.000Z",
+                    ended=f"{MINUTE}07.500Z",
+                    wall_s=1.5,
+                    cpu_s=1.25,
+                    peak_rss_mib=64.0,
+                    environment=environment.id,
+                    log="",
+                )
+                if cell.status != "skipped"
+                else cell
+                for cell in record.cells
+            ),
+        )
+        target = HERE / f"{name}.h5"
+        write_record(target, record, store.product_file)
+    return target
+
+
+if __name__ == "__main__":
+    sys.path[:0] = [str(ROOT / part) for part in ("", "plugins", "provenance", "tests/workshop")]
+    for path in (make("studio", ["paint.grey=131"]), make("comparison", [])):
+        sys.stdout.write(f"{path.name}: {path.stat().st_size} bytes\n")

@@ -1,0 +1,60 @@
+"""Records of format 1.0 that were written once: every later version verifies and replays them.
+
+Where one of these tests fails, old records can no longer be read or made again: raise the
+`result_version` of the method or the `encoding_version` of the product that changed, keep the old
+record with a test of what is said about it, and make new ones with provenance/reference/make.py.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orthoflow.records import open_run
+from tests.studios import Studio, open_studio
+
+REFERENCE = Path(__file__).resolve().parents[1] / "provenance" / "reference"
+NAMES = ["studio", "comparison"]
+
+
+@pytest.fixture
+def studio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Studio:
+    return open_studio(tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reference_records_are_small_and_as_they_were_written(studio: Studio, name: str) -> None:
+    path = REFERENCE / f"{name}.h5"
+    assert path.stat().st_size < 200_000
+    assert studio("verify", path).exit_code == 0
+    assert open_run(path).record.workflow_source == (REFERENCE / f"{name}.yaml").read_text()
+
+
+@pytest.mark.parametrize(("name", "n_products"), [("studio", 2), ("comparison", 3)])
+def test_reference_records_replay_with_the_same_bits(
+    studio: Studio, name: str, n_products: int
+) -> None:
+    said = studio.json("replay", REFERENCE / f"{name}.h5", "-o", "again")
+    assert [row["verdict"] for row in said["products"]] == ["identical"] * n_products
+    recorded = open_run(REFERENCE / f"{name}.h5").cells
+    made = open_run(studio.folder / "again").cells
+    assert [(cell.address, cell.status) for cell in made.values()] == [
+        (cell.address, cell.status) for cell in recorded.values()
+    ]
+    comparison = studio.json("compare", REFERENCE / f"{name}.h5", "again")
+    for section in ("inputs", "parameters"):
+        assert all(row["same"] for row in comparison[section])
+    assert all(row["same"] for row in comparison["metrics"] if not row["left"]["is_cost"])
+
+
+def test_reference_records_are_compared(studio: Studio) -> None:
+    said = studio.json("compare", REFERENCE / "studio.h5", REFERENCE / "comparison.h5")
+    assert [row["same"] for row in said["inputs"] if row["name"] == "number"] == [True]
+    assert [(row["cell"], row["verdict"]) for row in said["products"]] == [("survey", "identical")]
+    assert {row["cell"] for row in said["cells"] if row["left"] is None} == {
+        "guess",
+        "paint@paint=plain",
+        "paint@paint=dark",
+        "paint@paint=spoilt",
+    }
