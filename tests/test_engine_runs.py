@@ -287,6 +287,7 @@ def test_an_unfinished_run_of_another_workflow_is_refused(world: World) -> None:
 
 def test_the_same_folder_resumes_under_the_same_id(world: World) -> None:
     first = world.run(CHAIN, executor="inline")
+    assert journal(world)[0]["time"] == first.started
     second = world.run(CHAIN, executor="inline")
     assert second.run_id == first.run_id
     assert second.started == first.started

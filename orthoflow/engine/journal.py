@@ -99,7 +99,10 @@ class Journal:
             and not event.get("cached")
         )
         if not events:
-            self.write("run", format=_FORMAT, run_id=self.run_id, workflow=name)
+            # One reading of the clock: who resumes takes the run's start from this line.
+            self.write(
+                "run", time=self.started, format=_FORMAT, run_id=self.run_id, workflow=name
+            )
             with writing_to(self._folder):
                 sync_folder(self._folder)
         elif first.get("workflow") != name:
