@@ -100,9 +100,7 @@ class Journal:
         )
         if not events:
             # One reading of the clock: who resumes takes the run's start from this line.
-            self.write(
-                "run", time=self.started, format=_FORMAT, run_id=self.run_id, workflow=name
-            )
+            self.write("run", time=self.started, format=_FORMAT, run_id=self.run_id, workflow=name)
             with writing_to(self._folder):
                 sync_folder(self._folder)
         elif first.get("workflow") != name:
