@@ -24,11 +24,10 @@ import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 from orthoflow_provenance.digests import canonical_json, payload_digest
 from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.payloads import StoredPayload, read_product_file, write_product_file
 
 from orthoflow.engine.durability import (
     place_folder,
@@ -44,6 +43,9 @@ from orthoflow.engine.result_files import result_from_json, result_to_json
 from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.errors import ProductError, StoreError
 from orthoflow.products.product import Payload, Product
+
+if TYPE_CHECKING:
+    from orthoflow_provenance.payloads import StoredPayload
 
 __all__ = ["Preimage", "Publisher", "Store", "canonical_json", "digest_of"]
 
@@ -133,6 +135,9 @@ class Store:
             StoreError: full disk, or another failure of the disk.
             ProductError: the product holds what no store can keep.
         """
+        # Loads h5py, which a plan does without.
+        from orthoflow_provenance.payloads import write_product_file  # noqa: PLC0415
+
         aside = self._new_folder()
         try:
             with writing_to(self.folder):
@@ -157,6 +162,8 @@ class Store:
             StoreError: it is not there, or was damaged; a damaged one is removed.
             ProductError: it is of another type.
         """
+        from orthoflow_provenance.payloads import read_product_file  # noqa: PLC0415 - as above
+
         path = self._object(digest) / "product.h5"
         if not path.is_file():
             # Another run may be exchanging the folder for an equal one this very moment.

@@ -23,7 +23,6 @@ from orthoflow.workflow.problems import (
 from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
 from orthoflow.workflow.schema import workflow_schema
 from orthoflow.workflow.selection import Selection, check_step_names
-from orthoflow.workflow.wiring import topological_steps
 
 __all__ = [
     "Cell",
@@ -49,6 +48,5 @@ __all__ = [
     "resolved_json",
     "shipped_workflow",
     "shipped_workflows",
-    "topological_steps",
     "workflow_schema",
 ]
