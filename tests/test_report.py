@@ -1,81 +1,51 @@
-"""The report page: what it answers, from records made by hand."""
+"""The report: what it answers, from records made by hand."""
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_provenance.model import (
-    RecordedCell,
-    RecordedFigure,
-    RecordedMetric,
-    RecordedProduct,
-    RunRecord,
-)
 
 from orthoflow.errors import StoreError
 from orthoflow.records import Run
-from orthoflow.report import write_report
+from orthoflow.report import write_page, write_report
+from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.diagrams import run_diagram
-from orthoflow.report.pictures import depth_colours
-from orthoflow.report.summaries import answers, comparisons, number_with_unit, warnings
-
-DIGEST = "sha256:" + 64 * "0"
-
-
-def cell(address: str, **more: object) -> RecordedCell:
-    step = address.partition("@")[0]
-    wanted: dict[str, object] = {"address": address, "step": step, "method": f"{step}.toy"}
-    return RecordedCell(**{**wanted, "status": "ok", **more})  # type: ignore[arg-type]
-
-
-def planes_from(source: str) -> dict[str, RecordedProduct]:
-    product = RecordedProduct(
-        type_name="planes", encoding_version=1, digest=DIGEST, source=f"{source}.planes"
-    )
-    return {"planes": product}
-
-
-def rms(value: float) -> tuple[RecordedMetric, ...]:
-    return (RecordedMetric(name="rms_mm", value=value, unit="mm"),)
-
-
-def run(tmp_path: Path, *cells: RecordedCell) -> Run:
-    record = RunRecord(
-        run_id="r1",
-        name="toy <run>",
-        created_by="orthoflow 0.1.0",
-        status="ok",
-        started="2026-01-02T03:04:05Z",
-        ended="2026-01-02T03:05:05Z",
-        seed=1,
-        workflow_source="orthoflow: 1\n",
-        workflow_resolved="{}",
-        cells=cells,
-    )
-    return Run(path=tmp_path / "run.h5", record=record)
+from orthoflow.report.figures import figure_groups
+from orthoflow.report.numbers import number_with_unit
+from orthoflow.report.overlays import magnification_for, residuals_on_wall
+from orthoflow.report.pictures import Picture, depth_colours, side_px
+from orthoflow.report.rankings import Mark, Value, rank
+from orthoflow.report.senses import Sense, sense_of
+from orthoflow.report.sliders import sliders
+from orthoflow.report.summaries import answers, limits
+from tests.report_runs import (
+    FOCAL_PX,
+    FRAME,
+    HeldRun,
+    camera,
+    cell,
+    compared_resolved,
+    compared_run,
+    environment,
+    given,
+    metrics,
+    record,
+)
 
 
 @pytest.fixture
-def compared(tmp_path: Path) -> Run:
-    """Two variants of one step, a step behind each, one of them failed."""
-    figure = RecordedFigure(
-        name="deviations", caption="how far", media_type="image/png", data=b"\x89PNG"
-    )
-    return run(
-        tmp_path,
-        cell("plane@plane=fine", metrics=rms(1.25), figures=(figure,), wall_s=3.0),
-        cell("plane@plane=coarse", metrics=rms(4.0), warnings=("the grid is <coarse>",)),
-        cell("wall@plane=fine", inputs=planes_from("plane@plane=fine")),
-        cell(
-            "wall@plane=coarse",
-            status="failed",
-            error_message="no plane & no wall",
-            inputs=planes_from("plane@plane=coarse"),
-        ),
-    )
+def compared(tmp_path: Path) -> HeldRun:
+    """Three variants of one step, one of them failed."""
+    return compared_run(tmp_path)
+
+
+def run(*cells: object, **more: object) -> Run:
+    return Run(path=Path("run.h5"), record=record(cells, **more))  # type: ignore[arg-type]
 
 
 def test_the_page_needs_no_network_and_escapes_what_methods_say(
@@ -83,18 +53,22 @@ def test_the_page_needs_no_network_and_escapes_what_methods_say(
 ) -> None:
     write_report([compared], tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
-    assert re.findall(r"(?:src|href)=\"(?!data:|#)[^\"]*\"", page) == []
+    assert re.findall(r"src=\"(?!data:)[^\"]*\"", page) == []
+    # A citation's link is followed by those who want to, never by the page.
+    assert re.findall(r"href=\"(?!data:|#)([^\"]*)\"", page) == [
+        "https://doi.org/10.3390/rs71215869"
+    ]
     assert "toy &lt;run&gt;" in page
-    assert "no plane &amp; no wall" in page
+    assert "no plane &amp; no &lt;wall&gt;" in page
     assert "the grid is &lt;coarse&gt;" in page
-    assert "data:image/png;base64,iVBORw==" in page
 
 
-def test_several_runs_share_one_page(compared: Run, tmp_path: Path) -> None:
+def test_several_runs_share_one_page_with_a_common_table(compared: Run, tmp_path: Path) -> None:
     write_report([compared, compared], tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
-    assert page.count("<main") == 2
-    anchors = re.findall(r"id=\"([^\"]*)\"", page)
+    assert page.count("<article") == 2
+    assert "All runs beside each other" in page
+    anchors = re.findall(r"\bid=\"([^\"]*)\"", page)
     assert len(anchors) == len(set(anchors))
 
 
@@ -105,48 +79,217 @@ def test_a_report_that_cannot_be_written_ends_with_a_sentence(
         write_report([compared], tmp_path / "missing" / "report.html")
 
 
-def test_failures_stand_before_warnings(compared: Run) -> None:
-    assert warnings(compared) == (
-        ("wall@plane=coarse", "failed: no plane & no wall"),
-        ("plane@plane=coarse", "the grid is <coarse>"),
+def test_figures_lie_beside_the_page_as_png_and_svg(compared: Run, tmp_path: Path) -> None:
+    write_page(compared, tmp_path / "report.html")
+    files = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("figures/**/*.*")}
+    assert files == {
+        "figures/graph.svg",
+        "figures/check@plane=fine/error_map.png",
+        "figures/check@plane=fine/chart.png",
+        "figures/check@plane=coarse/error_map.png",
+        "figures/check@plane=coarse/chart.png",
+    }
+    for path in tmp_path.rglob("figures/**/*.png"):
+        assert path.read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "figures" / "graph.svg").read_text().startswith("<svg xmlns=")
+
+
+def test_figures_beyond_the_budget_are_drawn_smaller(
+    compared: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = sum(
+        len(picture.uri) for group in figure_groups(compared) for picture in group.pictures
     )
+    monkeypatch.setattr("orthoflow.report.figures._BYTES_MOST", 100)
+    monkeypatch.setattr("orthoflow.report.figures._SMALL_BYTES", 0)
+    monkeypatch.setattr("orthoflow.report.figures._SIDES_PX", (40, 20))
+    groups = figure_groups(compared)
+    assert [len(group.pictures) for group in groups] == [2, 2]
+    assert sum(len(picture.uri) for group in groups for picture in group.pictures) < before / 2
 
 
-def test_variants_stand_beside_each_other(compared: Run) -> None:
-    table = next(iter(comparisons(compared)))
-    assert table.cells == ("plane@plane=fine", "plane@plane=coarse")
-    assert table.rows["rms_mm"] == ("1.25", "4")
+def test_many_pictures_are_small_ones() -> None:
+    assert side_px(1) == 1000
+    # Their bytes go with their area: 400 together are not more than 60 large ones.
+    assert 400 * side_px(400) ** 2 <= 1.01 * 60 * 1000**2
 
 
-def test_the_answers_are_the_quality_metrics(compared: Run) -> None:
-    assert [(answer.value, answer.cell) for answer in answers(compared)] == [
-        ("1.25 mm", "plane@plane=fine"),
-        ("4 mm", "plane@plane=coarse"),
+def test_what_limits_the_result_is_said_once_failures_first(compared: Run) -> None:
+    assert [(limit.text, limit.cells) for limit in limits(compared)] == [
+        ("failed: no plane & no <wall>", ("plane@plane=broken",)),
+        ("the grid is <fine>", ("check@plane=fine",)),
+        ("the grid is <coarse>", ("check@plane=coarse",)),
     ]
 
 
-def test_the_answers_tell_the_final_orientation_and_the_sharper_completeness(
-    tmp_path: Path,
-) -> None:
-    def told(**values: float) -> tuple[RecordedMetric, ...]:
-        return tuple(RecordedMetric(name=n, value=v, unit="1") for n, v in values.items())
+def test_the_answers_are_the_baselines_quality_metrics(compared: Run) -> None:
+    assert [(answer.value, answer.cell) for answer in answers(compared)] == [
+        ("0.4 mm", "check@plane=fine"),
+        ("99.3 %", "check@plane=fine"),
+        ("1 mm", "plane@plane=fine"),
+    ]
 
+
+def test_the_answers_tell_the_final_orientation_and_the_sharper_completeness() -> None:
     photographed = run(
-        tmp_path,
-        cell("first", metrics=told(n_oriented=4, n_photos=6)),
-        cell("orient", metrics=told(n_oriented=5, n_photos=6)),
-        cell("check", metrics=told(completeness=0.9, completeness_seen_by_both=0.99)),
+        cell("first", metrics=metrics(n_oriented=4, n_photos=6)),
+        cell("orient", metrics=metrics(n_oriented=5, n_photos=6)),
+        cell("check", metrics=metrics(completeness=0.9, completeness_seen_by_both=0.99)),
     )
     assert [(answer.value, answer.cell) for answer in answers(photographed)] == [
-        ("0.99", "check"),
+        ("99.0 %", "check"),
         ("5 of 6", "orient"),
     ]
 
 
+def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
+    compared: Run,
+) -> None:
+    table = comparison_table([compared])
+    assert table is not None
+    assert [(column.step, column.metric) for column in table.columns] == [
+        ("plane", "rms_mm"),
+        ("plane", "omega_deg"),
+        ("check", "rmse_u_mm"),
+        ("check", "completeness"),
+        ("check", "wall_s"),
+        ("check", "cpu_s"),
+        ("check", "peak_rss_mib"),
+    ]
+    fine, coarse, broken = table.rows
+    assert fine.is_baseline
+    assert fine.values[0].text == "1.10 ± 0.10"
+    assert fine.values[0].mark is Mark.BEST
+    assert coarse.values[0].mark is Mark.WORST
+    assert fine.values[1].mark is Mark.NONE  # an angle has no good side
+    assert broken.failure == "plane@plane=broken: no plane & no <wall>"
+    assert broken.values[0].text == ""
+    assert (fine.time.text, coarse.time.text, broken.time.text) == ("5.0", "4.2", "")
+    assert "1 of 5 steps cached, with their time in run r0" in fine.remark
+    assert table.groups == {}
+
+
+def test_values_of_different_environments_carry_letters_and_are_ranked_apart() -> None:
+    cells = [
+        cell(f"plane@plane={name}", metrics=metrics(rms_mm=value), environment=place)
+        for name, value, place in (("fine", 1.0, "e1"), ("b", 2.0, "e1"), ("c", 9.0, "e2"))
+    ]
+    mixed = run(
+        *cells,
+        environments=(environment(), environment("e2", threads=1)),
+        workflow_resolved=compared_resolved("plane.rms_mm"),
+    )
+    table = comparison_table([mixed])
+    assert table is not None
+    values = [row.values[0] for row in table.rows]
+    assert [(value.group, value.mark) for value in values] == [
+        ("A", Mark.BEST),
+        ("A", Mark.WORST),
+        ("B", Mark.NONE),
+    ]
+    assert list(table.groups) == ["A", "B"]
+
+
+def test_runs_on_different_data_are_not_ranked_together() -> None:
+    runs = [
+        run(
+            cell("scan", outputs={"cloud": given("", digest, "cloud")}),
+            cell(
+                "plane",
+                metrics=metrics(rms_mm=value),
+                inputs={"cloud": given("scan.cloud", digest, "cloud")},
+            ),
+            run_id=f"r{digest}",
+        )
+        for digest, value in (("1", 1.0), ("2", 2.0))
+    ]
+    table = comparison_table(runs)
+    assert table is not None
+    assert [(row.run_id, row.values[0].group, row.values[0].mark) for row in table.rows] == [
+        ("r1", "1", Mark.NONE),
+        ("r2", "2", Mark.NONE),
+    ]
+
+
+def test_a_value_within_the_spread_of_the_best_is_no_loser() -> None:
+    values = [
+        Value(text="a", sort=1.0, spread=0.2),
+        Value(text="b", sort=1.2, spread=0.1),
+        Value(text="c", sort=-3.0),
+        Value(),
+    ]
+    marks = [value.mark for value in rank(values, Sense.LESS)]
+    assert marks == [Mark.BEST, Mark.NEAR, Mark.WORST, Mark.NONE]
+
+
+def test_equal_values_have_no_winner() -> None:
+    values = [Value(text="a", sort=1.0), Value(text="b", sort=1.0)]
+    assert rank(values, Sense.MORE) == values
+
+
+@pytest.mark.parametrize(
+    ("metric", "sense"),
+    [
+        ("rmse_u_mm", Sense.LESS),
+        ("check_rmse_px_median", Sense.LESS),
+        ("wall_s", Sense.LESS),
+        ("match_wrong_share", Sense.LESS),
+        ("label_recall", Sense.MORE),
+        ("completeness_seen_by_both", Sense.MORE),
+        ("pose_error_over_sigma", Sense.ONE),
+        ("raw_omega_deg", Sense.NEITHER),
+        ("n_points", Sense.NEITHER),
+        ("sigma0_px", Sense.NEITHER),
+    ],
+)
+def test_a_metrics_name_says_which_value_is_better(metric: str, sense: Sense) -> None:
+    assert sense_of(metric) is sense
+
+
+def test_residuals_in_a_photo_become_lengths_on_the_wall() -> None:
+    points_world = FRAME.world_from_wall(np.array([[10.0, 10.0], [100.0, 70.0]]))
+    # The camera looks square at the wall from 2 m: 1 px is 2 m over the focal length.
+    residual_px = np.array([[1.0, 0.0], [0.0, -2.0]])
+    lengths_m = residuals_on_wall(camera(), points_world, residual_px, FRAME)
+    np.testing.assert_allclose(lengths_m, residual_px * 2.0 / FOCAL_PX, atol=1e-8)  # metres
+
+
+def test_magnifications_are_round_and_make_vectors_visible() -> None:
+    lengths_m = np.full((10, 2), 1e-4)
+    magnification = magnification_for(FRAME, lengths_m)
+    assert magnification / 10 ** math.floor(math.log10(magnification)) in (1.0, 2.0, 5.0)
+    drawn_share = magnification * np.hypot(1e-4, 1e-4) / (FRAME.width * FRAME.gsd_m)
+    assert 0.01 <= drawn_share <= 0.025
+
+
+def test_pictures_of_one_place_share_a_slider_where_they_lie() -> None:
+    moved = replace(FRAME, origin_world=FRAME.world_from_wall(np.array([[6.0, 0.0]]))[0])
+    turned = replace(FRAME, u_world=-FRAME.u_world, normal_world=-FRAME.normal_world)
+    pictures = [
+        Picture(uri="", title=title, caption="", frame=frame)
+        for title, frame in (("ortho", FRAME), ("depth", moved), ("other side", turned))
+    ]
+    (slider,) = sliders(pictures, 1)
+    assert [laid.title for laid in slider.pictures] == ["ortho", "depth"]
+    assert slider.pictures[1].left == pytest.approx(5.0)  # 6 of 120 cells
+    assert slider.pictures[1].width == pytest.approx(100.0)
+
+
 def test_the_diagram_draws_each_cell_once_and_each_hand_over(compared: Run) -> None:
     drawing = run_diagram(compared)
-    assert drawing.count("<rect") == 4
-    assert drawing.count('class="arrow"') == 2
+    assert drawing.count("<rect") == len(compared.cells)
+    assert drawing.count('class="arrow"') == 4
+
+
+def test_the_diagram_of_many_cells_has_a_box_per_step() -> None:
+    cells = [cell("scan")] + [
+        cell(f"plane@plane=v{index}", inputs={"cloud": given("scan.cloud", "1", "cloud")})
+        for index in range(40)
+    ]
+    drawing = run_diagram(run(*cells))
+    assert drawing.count("<rect") == 2
+    assert drawing.count('class="arrow"') == 1
+    assert "40 cells, 40.0 s" in drawing
 
 
 def test_depths_run_from_blue_over_white_to_red() -> None:

@@ -21,9 +21,12 @@ from orthoflow.errors import ArgumentError
     help="Where to write it; for a single run its own report.html.",
 )
 def report(runs: tuple[str, ...], output: Path | None) -> int:
-    """Write the HTML report of one or more runs, each a run folder or its run.h5."""
+    """Write the HTML report of one or more runs, each a run folder or its run.h5.
+
+    Without -o it lies in the run's folder, with figures/ beside it: every figure as PNG or SVG.
+    """
     from orthoflow.records import REPORT_FILE, open_run
-    from orthoflow.report import write_report
+    from orthoflow.report import write_page, write_report
 
     opened = [open_run(run) for run in runs]
     if output is None and len(opened) > 1:
@@ -33,6 +36,9 @@ def report(runs: tuple[str, ...], output: Path | None) -> int:
     target = output if output is not None else opened[0].folder / REPORT_FILE
     if not target.parent.is_dir():
         raise ArgumentError(f"{target.parent} does not exist: make the folder, or choose another")
-    write_report(opened, target)
+    if output is None:
+        write_page(opened[0], target)
+    else:
+        write_report(opened, target)
     click.echo(f"report: {target}")
     return EXIT_GOOD

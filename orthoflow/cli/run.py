@@ -89,7 +89,7 @@ class _Call:
         from orthoflow.cli.run_summaries import print_failures, print_summary
         from orthoflow.engine.journal import new_run_id
         from orthoflow.records import REPORT_FILE, write_run
-        from orthoflow.report import write_report
+        from orthoflow.report import write_page
 
         run_id = new_run_id()
         folder = self.folder or Path("runs") / f"{self.workflow.name}-{run_id}"
@@ -106,7 +106,7 @@ class _Call:
             folder,
             self.store,
             embed=self.embed,
-            before_finish=lambda run: write_report([run], report),
+            before_finish=lambda run: write_page(run, report),
         )
         print_failures(finished.record.cells)
         try:

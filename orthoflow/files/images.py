@@ -6,7 +6,7 @@ orientation: the pixel frame is the stored array.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from orthoflow.files.exif import without_orientation
 
 PREVIEW_SIDE_PX: Final = 1600
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
+
+Shrunk = TypeVar("Shrunk", np.float32, np.uint8)
 
 
 def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
@@ -101,6 +103,18 @@ def preview_webp(
     return encode_webp(_preview(image, shown, longest_side_px))
 
 
+def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
+    """Give an encoded image as WebP whose longest side is at most so many pixels.
+
+    Raises:
+        InputError: the bytes are no image.
+    """
+    image = decode_image(encoded, name)
+    if max(image.shape[:2]) > longest_side_px:
+        image = _shrink(image, longest_side_px)
+    return encode_webp(image, quality=80)
+
+
 def _preview(
     image: NDArray[np.uint8], shown: NDArray[np.bool_], longest_side_px: int
 ) -> NDArray[np.uint8]:
@@ -115,13 +129,14 @@ def _preview(
     return np.dstack([colour, alpha])
 
 
-def _shrink(values: NDArray[np.float32], longest_side_px: int) -> NDArray[np.float32]:
+def _shrink(values: NDArray[Shrunk], longest_side_px: int) -> NDArray[Shrunk]:
     import cv2
 
     rows, columns = values.shape[:2]
     scale = longest_side_px / max(rows, columns)
     size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
-    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=values.dtype)
 
 
 def _encode(suffix: str, image: NDArray[np.uint8], options: list[int]) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +12,7 @@ from typing import Final
 
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord
-from orthoflow_provenance.reader import read_output, read_record
+from orthoflow_provenance.reader import read_outputs, read_record
 
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
 from orthoflow.products.product import Payload, Product
@@ -83,6 +83,28 @@ class Run:
             ArgumentError: the run has no such cell, or the cell no such output.
             RecordError: the record holds only the digest of the output, or is damaged.
         """
+        return next(self.payloads([(address, port)]))
+
+    def payloads(self, places: Sequence[tuple[str, str]]) -> Iterator[Payload]:
+        """Give outputs, each an address and a port, one after the other; opens the record once.
+
+        Raises:
+            ArgumentError: the run has no such cell, or the cell no such output.
+            RecordError: the record holds only the digest of an output, or is damaged.
+        """
+        for address, port in places:
+            self._check_embedded(address, port)
+        with record_errors(self.path):
+            for stored in read_outputs(self.path, places):
+                yield Payload(
+                    type_name=stored.type_name,
+                    encoding_version=stored.encoding_version,
+                    metadata=stored.metadata,
+                    arrays=dict(stored.arrays),
+                    mapped=stored.mapped,
+                )
+
+    def _check_embedded(self, address: str, port: str) -> None:
         outputs = self.cell(address).outputs
         if port not in outputs:
             raise ArgumentError(
@@ -93,15 +115,6 @@ class Run:
             raise RecordError(
                 f"{self.path} names {address}.{port} only by its digest; run the workflow with "
                 "--embed to put every product into the record"
-            )
-        with record_errors(self.path):
-            stored = read_output(self.path, address, port)
-            return Payload(
-                type_name=stored.type_name,
-                encoding_version=stored.encoding_version,
-                metadata=stored.metadata,
-                arrays=dict(stored.arrays),
-                mapped=stored.mapped,
             )
 
     def product(self, address: str, port: str) -> Product:

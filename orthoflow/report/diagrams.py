@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Final
 
-from orthoflow.records import Run
+from orthoflow.records import RecordedCell, Run
+from orthoflow.report.numbers import seconds_in_words
 
 _BOX_WIDTH: Final = 190
 _BOX_HEIGHT: Final = 46
 _GAP_X: Final = 60
 _GAP_Y: Final = 16
-_LETTERS: Final = 27  # that fit a box at this size
+_CELLS_MOST: Final = 24
+_LETTERS: Final = 25  # that fit a box at this size
+
+# On white paper; the page brings its own for light and dark.
+_STYLE: Final = (
+    "svg{font-family:sans-serif;background:#fff}.arrow{fill:none;stroke:#5b6570}"
+    "rect{fill:#f3f5f7;stroke:#b0b8c0}text{font-size:13px}.small{font-size:11px;fill:#5b6570}"
+    ".failed rect{stroke:#a11616;stroke-width:2}.skipped rect{stroke-dasharray:4 3;fill:none}"
+    ".cached rect{stroke:#1c6b35}"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,31 +32,87 @@ class _Place:
     y: float
 
 
-def run_diagram(run: Run) -> str:
-    """Draw the cells of a run that ran or should have, left to right, as an `<svg>` element."""
-    sources = {address: _cells_before(run, address) for address in run.cells}
-    places = _lay_out(sources)
+def run_diagram(run: Run, *, stands_alone: bool = False) -> str:
+    """Draw the cells of a run that ran or should have, left to right, as an `<svg>` element.
+
+    With more cells than a reader can follow, cells of a step become one box.
+
+    Args:
+        run: the run.
+        stands_alone: give the text of an SVG file; on the page its style sheet colours the parts.
+    """
+    boxes = _boxes(run)
+    places = _lay_out({name: box.before for name, box in boxes.items()})
     width = max(place.x for place in places.values()) + _BOX_WIDTH + 2 if places else 0
     height = max(place.y for place in places.values()) + _BOX_HEIGHT + 2 if places else 0
     arrows = [
-        _arrow(places[before], places[address])
-        for address, befores in sources.items()
-        for before in befores
+        _arrow(places[before], places[name]) for name, box in boxes.items() for before in box.before
     ]
-    boxes = [_box(run, address, place) for address, place in places.items()]
+    drawn = [_draw(box, places[name]) for name, box in boxes.items()]
+    alone = f' xmlns="http://www.w3.org/2000/svg" height="{height:.0f}"' if stands_alone else ""
+    style = f"<style>{_STYLE}</style>" if stands_alone else ""
     return (
-        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" role="img" '
-        f'aria-label="graph of the run">{"".join(arrows)}{"".join(boxes)}</svg>'
+        f'<svg{alone} viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" role="img" '
+        f'aria-label="graph of the run">{style}{"".join(arrows)}{"".join(drawn)}</svg>'
     )
 
 
-def _cells_before(run: Run, address: str) -> tuple[str, ...]:
-    found = []
-    for product in run.cells[address].inputs.values():
-        before = product.source.rpartition(".")[0]
-        if before in run.cells and before not in found:
-            found.append(before)
-    return tuple(found)
+@dataclass(frozen=True, kw_only=True)
+class _Box:
+    """What one box says, and the boxes whose products it takes."""
+
+    title: str
+    below: str
+    state: str
+    before: tuple[str, ...]
+
+
+def _boxes(run: Run) -> dict[str, _Box]:
+    groups: dict[str, list[RecordedCell]] = {}
+    of_cell: dict[str, str] = {}
+    is_crowded = len(run.cells) > _CELLS_MOST
+    for address, cell in run.cells.items():
+        of_cell[address] = cell.step if is_crowded else address
+        groups.setdefault(of_cell[address], []).append(cell)
+    return {
+        name: _Box(
+            title=name,
+            below=_told(cells),
+            state=_state(cells),
+            before=tuple(
+                dict.fromkeys(
+                    of_cell[before]
+                    for cell in cells
+                    for before in _cells_before(run, cell)
+                    if of_cell[before] != name
+                )
+            ),
+        )
+        for name, cells in groups.items()
+    }
+
+
+def _cells_before(run: Run, cell: RecordedCell) -> list[str]:
+    sources = (product.source.rpartition(".")[0] for product in cell.inputs.values())
+    return [source for source in sources if source in run.cells]
+
+
+def _told(cells: Sequence[RecordedCell]) -> str:
+    done = [cell for cell in cells if cell.status == "ok"]
+    seconds = seconds_in_words(sum(cell.wall_s for cell in done))
+    if len(cells) == 1:
+        return f"{cells[0].method}, {seconds}" if done else cells[0].status
+    n_failed = sum(cell.status == "failed" for cell in cells)
+    return f"{len(cells)} cells, {seconds}" + (f", {n_failed} failed" if n_failed else "")
+
+
+def _state(cells: Sequence[RecordedCell]) -> str:
+    states = {cell.status for cell in cells}
+    if "failed" in states:
+        return "failed"
+    if "ok" not in states:
+        return "skipped"
+    return "cached" if all(cell.cached_from for cell in cells if cell.status == "ok") else "ok"
 
 
 def _lay_out(sources: Mapping[str, tuple[str, ...]]) -> dict[str, _Place]:
@@ -74,17 +140,14 @@ def _arrow(start: _Place, end: _Place) -> str:
     )
 
 
-def _box(run: Run, address: str, place: _Place) -> str:
-    cell = run.cells[address]
-    state = "cached" if cell.status == "ok" and cell.cached_from else cell.status
-    below = f"{cell.method}, {cell.wall_s:.1f} s" if cell.status == "ok" else cell.status
+def _draw(box: _Box, place: _Place) -> str:
     return (
-        f'<g class="cell {state}"><title>{escape(address)}: {escape(cell.method)}</title>'
+        f'<g class="cell {box.state}"><title>{escape(box.title)}: {escape(box.below)}</title>'
         f'<rect x="{place.x:.0f}" y="{place.y:.0f}" width="{_BOX_WIDTH}" '
         f'height="{_BOX_HEIGHT}" rx="6"/>'
-        f'<text x="{place.x + 10:.0f}" y="{place.y + 19:.0f}">{escape(_short(address))}</text>'
+        f'<text x="{place.x + 10:.0f}" y="{place.y + 19:.0f}">{escape(_short(box.title))}</text>'
         f'<text class="small" x="{place.x + 10:.0f}" y="{place.y + 36:.0f}">'
-        f"{escape(_short(below))}</text></g>"
+        f"{escape(_short(box.below))}</text></g>"
     )
 
 

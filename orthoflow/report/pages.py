@@ -1,48 +1,80 @@
-"""Writing the page: the template filled with what the records say."""
+"""Writing the page: the templates filled with what the records say."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Final
+from urllib.parse import quote
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from orthoflow import __version__
 from orthoflow.errors import StoreError
 from orthoflow.records import Run
+from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.comparisons import ComparisonTable, comparison_table
 from orthoflow.report.diagrams import run_diagram
-from orthoflow.report.pictures import Picture, data_uri, orthoimage_pictures, wall_pictures
-from orthoflow.report.summaries import (
-    Answer,
-    Comparison,
-    PlaneTable,
-    answers,
-    comparisons,
-    number,
-    number_with_unit,
-    plane_tables,
-    warnings,
-)
+from orthoflow.report.figures import FIGURES_FOLDER, FigureGroup, figure_groups, write_figures
+from orthoflow.report.numbers import number_with_unit
+from orthoflow.report.origins import environment_words
+from orthoflow.report.overlays import overlays
+from orthoflow.report.pictures import Picture, orthoimage_pictures, wall_pictures
+from orthoflow.report.plane_tables import PlaneTable, plane_tables
+from orthoflow.report.sliders import sliders
+from orthoflow.report.summaries import Answer, Limit, answers, citations, limits
+
+_DOI: Final = re.compile(r"doi:\s*(10\.[^\s,;)]+[^\s,;).])")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ground:
+    """A drawing and the id of the picture that it lies over."""
+
+    svg: Markup
+    title: str
+    caption: str
+    ground: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Section:
-    """All that the template needs of one run."""
+    """All that the templates need of one run."""
 
     run: Run
+    prefix: str
     answers: tuple[Answer, ...]
-    warnings: tuple[tuple[str, str], ...]
+    limits: tuple[Limit, ...]
+    comparison: ComparisonTable | None
     orthoimages: tuple[Picture, ...]
     walls: tuple[Picture, ...]
+    sliders: list[dict[str, object]]
+    overlays: tuple[_Ground, ...]
     planes: tuple[PlaneTable, ...]
-    comparisons: tuple[Comparison, ...]
-    figures: Mapping[str, tuple[Picture, ...]]
+    figures: tuple[FigureGroup, ...]
     diagram: Markup
+    citations: Mapping[str, tuple[str, ...]]
+
+
+def write_page(run: Run, path: Path) -> None:
+    """Write the report of one run, and its figures as PNG and SVG files into `figures/` beside it.
+
+    Raises:
+        StoreError: a file cannot be written.
+        RecordError: the record is damaged.
+    """
+    write_report([run], path)
+    folder = path.parent / FIGURES_FOLDER
+    try:
+        write_figures(run, folder)
+    except OSError as error:
+        raise StoreError(f"figures cannot be written to {folder}: {error.strerror}") from error
 
 
 def write_report(runs: Sequence[Run], path: Path) -> None:
@@ -57,7 +89,8 @@ def write_report(runs: Sequence[Run], path: Path) -> None:
         RecordError: a record is damaged.
     """
     text = _template().render(
-        sections=[_section(run) for run in runs],
+        sections=[_section(run, f"r{index + 1}-", path.parent) for index, run in enumerate(runs)],
+        comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
         title=", ".join(dict.fromkeys(run.record.name for run in runs)),
         version=__version__,
     )
@@ -75,35 +108,104 @@ def write_report(runs: Sequence[Run], path: Path) -> None:
 
 def _template() -> jinja2.Template:
     environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+        loader=jinja2.PackageLoader("orthoflow.report"),
     )
-    environment.filters["number"] = number
     environment.filters["with_unit"] = number_with_unit
-    source = files("orthoflow.report").joinpath("page.html.j2").read_text(encoding="utf-8")
-    return environment.from_string(source)
+    environment.filters["environment"] = environment_words
+    environment.filters["cited"] = _cited
+    environment.filters["breakable"] = _breakable
+    environment.filters["urlpath"] = quote
+    # Ours, and no template: braces in them mean nothing.
+    environment.globals["css"] = Markup(_packaged("page.css"))
+    environment.globals["script"] = Markup(_packaged("page.js"))
+    return environment.get_template("page.html.j2")
 
 
-def _section(run: Run) -> _Section:
+def _packaged(name: str) -> str:
+    return files("orthoflow.report").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+def _cited(citation: str) -> Markup:
+    """Escape a citation and make its DOI a link: a page that links needs no network itself."""
+    return Markup(
+        _DOI.sub(
+            lambda found: (
+                f'<a href="https://doi.org/{quote(found[1], safe="/.()-;")}">doi:{found[1]}</a>'
+            ),
+            str(escape(citation)),
+        )
+    )
+
+
+def _breakable(name: str) -> Markup:
+    """Let a long name be broken behind its underscores."""
+    return Markup("_<wbr>").join(name.split("_"))
+
+
+def _section(run: Run, prefix: str, folder: Path) -> _Section:
+    # The baseline's stand first: they are what the numbers beside them are of.
+    baseline = {cell.address for cell in baseline_cells(run)}
+    orthoimages = sorted(orthoimage_pictures(run), key=lambda picture: picture.cell not in baseline)
+    walls = sorted(wall_pictures(run), key=lambda picture: picture.cell not in baseline)
+    # Files are named from where the page will lie.
+    from_page = Path(os.path.relpath(run.folder, folder))
+    numbered = [
+        replace(
+            picture,
+            id=f"{prefix}picture-{index}",
+            file=(from_page / picture.file).as_posix() if picture.file else "",
+        )
+        for index, picture in enumerate([*orthoimages, *walls])
+    ]
+    orthoimages, walls = numbered[: len(orthoimages)], numbered[len(orthoimages) :]
+    grounds = {(picture.cell, picture.wall): picture.id for picture in reversed(walls)}
     return _Section(
         run=run,
+        prefix=prefix,
         answers=answers(run),
-        warnings=warnings(run),
-        orthoimages=tuple(orthoimage_pictures(run)),
-        walls=tuple(wall_pictures(run)),
-        planes=tuple(plane_tables(run)),
-        comparisons=tuple(comparisons(run)),
-        figures={
-            address: tuple(
-                Picture(
-                    uri=data_uri(figure.data, figure.media_type),
-                    title=figure.name.replace("_", " "),
-                    caption=figure.caption,
-                )
-                for figure in cell.figures
+        limits=limits(run),
+        comparison=comparison_table([run]),
+        orthoimages=tuple(orthoimages),
+        walls=tuple(walls),
+        sliders=_slider_data(numbered, len(orthoimages)),
+        overlays=tuple(
+            _Ground(
+                svg=Markup(overlay.svg),
+                title=overlay.title,
+                caption=overlay.caption,
+                ground=grounds.get((overlay.walls_cell, overlay.wall), ""),
             )
-            for address, cell in run.cells.items()
-            if cell.figures
-        },
-        # Built from escaped parts only.
+            for overlay in overlays(run, walls)
+        ),
+        planes=tuple(plane_tables(run)),
+        figures=figure_groups(run),
+        # Built from escaped parts only, as the overlays are.
         diagram=Markup(run_diagram(run)),
+        citations=citations(run),
     )
+
+
+def _slider_data(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, object]]:
+    """What the page's script needs to know of pictures that show the same place."""
+    return [
+        {
+            "name": slider.name,
+            "ratio": slider.ratio,
+            "pictures": [
+                {
+                    "id": pictures[laid.picture].id,
+                    "title": laid.title,
+                    "left": laid.left,
+                    "top": laid.top,
+                    "width": laid.width,
+                    "height": laid.height,
+                }
+                for laid in slider.pictures
+            ],
+        }
+        for slider in sliders(pictures, n_orthoimages)
+    ]

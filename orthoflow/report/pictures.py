@@ -18,6 +18,10 @@ from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, 
 from orthoflow.records import Run
 
 LONGEST_SIDE_PX: Final = 1000
+SHORTEST_SIDE_PX: Final = 320
+# Pictures of the full size that a page holds; of more, each becomes smaller. A picture of 1000 px
+# takes about 90 kB.
+_FULL_PICTURES: Final = 60
 
 # From blue (behind the plane) over white (on it) to red (in front): readable in grey and with
 # red-green blindness. Colours of the classes RdBu, Brewer 2003.
@@ -42,12 +46,20 @@ class Picture:
         title: what it shows.
         caption: size and shares, in words.
         file: path of the full image relative to the run folder, or empty.
+        cell: address of the cell it comes from.
+        wall: index of the wall it shows, -1 for what is no raster of a wall.
+        frame: where it lies in the world, None for what is no raster of a wall.
+        id: name of its place on the page; empty where nothing refers to it.
     """
 
     uri: str
     title: str
     caption: str
     file: str = ""
+    cell: str = ""
+    wall: int = -1
+    frame: WallFrame | None = None
+    id: str = ""
 
 
 def data_uri(content: bytes, media_type: str) -> str:
@@ -55,48 +67,65 @@ def data_uri(content: bytes, media_type: str) -> str:
     return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
 
 
+def side_px(n_pictures: int) -> int:
+    """Longest side of each of so many pictures, in pixels: the page stays small enough to send."""
+    share = min(1.0, (_FULL_PICTURES / max(1, n_pictures)) ** 0.5)
+    return max(SHORTEST_SIDE_PX, round(LONGEST_SIDE_PX * share))
+
+
 def orthoimage_pictures(run: Run) -> Iterator[Picture]:
-    """Every orthoimage that the record holds."""
-    for address, port in _embedded(run, "orthoimages"):
-        product = Orthoimages.from_payload(run.payload(address, port))
+    """Every orthoimage that the record holds; equal ones of several cells once."""
+    places = embedded_products(run, "orthoimages")
+    # One product at a time: those of a large building fill the memory together.
+    for (address, _), payload in zip(places, run.payloads(places), strict=True):
+        product = Orthoimages.from_payload(payload)
         yield from _drawn(
-            [_orthoimage(run, address, index, image) for index, image in enumerate(product.images)]
+            [_orthoimage(run, address, index, image) for index, image in enumerate(product.images)],
+            n_products=len(places),
         )
 
 
 def wall_pictures(run: Run) -> Iterator[Picture]:
-    """Depth and intensity of every wall raster that the record holds."""
-    for address, port in _embedded(run, "walls"):
-        product = Walls.from_payload(run.payload(address, port))
+    """Intensity and depth of every wall raster that the record holds; equal ones once."""
+    places = embedded_products(run, "walls")
+    for (address, _), payload in zip(places, run.payloads(places), strict=True):
+        product = Walls.from_payload(payload)
         drawings: list[_Drawing] = []
         for index, wall in enumerate(product.walls):
-            drawings.append(_depth(run, address, index, wall))
             if wall.intensity is not None:
                 source = product.intensity_source
                 drawings.append(_intensity(run, address, index, wall, wall.intensity, source))
-        yield from _drawn(drawings)
+            drawings.append(_depth(run, address, index, wall))
+        yield from _drawn(drawings, n_products=len(places))
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Drawing:
     """A picture that is still to be drawn."""
 
-    draw: Callable[[], bytes]
+    draw: Callable[[int], bytes]
     title: str
     caption: str
     file: str
+    cell: str
+    wall: int
+    frame: WallFrame
 
 
-def _drawn(drawings: Sequence[_Drawing]) -> Iterator[Picture]:
+def _drawn(drawings: Sequence[_Drawing], *, n_products: int) -> Iterator[Picture]:
     """Draw pictures side by side; encoding takes most of a report's time."""
+    longest_side_px = side_px(n_products * len(drawings))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        contents = pool.map(lambda drawing: drawing.draw(), drawings)
+        contents = pool.map(lambda drawing: drawing.draw(longest_side_px), drawings)
         for drawing, content in zip(drawings, contents, strict=True):
             yield Picture(
                 uri=data_uri(content, "image/webp"),
                 title=drawing.title,
                 caption=drawing.caption,
                 file=drawing.file,
+                cell=drawing.cell,
+                wall=drawing.wall,
+                frame=drawing.frame,
             )
 
 
@@ -104,7 +133,7 @@ def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawi
     shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
     filled = float(np.mean(image.mask == OrthoMask.FILLED))
     return _Drawing(
-        draw=lambda: preview_webp(image.rgb, shown, longest_side_px=LONGEST_SIDE_PX),
+        draw=lambda side: preview_webp(image.rgb, shown, longest_side_px=side),
         title=_title(image.name, address),
         caption=(
             f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells show something, "
@@ -113,6 +142,9 @@ def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawi
             else f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells painted"
         ),
         file=_published(run, address, f"wall_{index}_ortho.tif"),
+        cell=address,
+        wall=image.wall,
+        frame=image.frame,
     )
 
 
@@ -120,8 +152,8 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
     known = wall.mask != SurfaceMask.VOID
     limit_m = _depth_limit_m(wall.depth_m)
     return _Drawing(
-        draw=lambda: preview_webp(
-            depth_colours(wall.depth_m, limit_m), known, longest_side_px=LONGEST_SIDE_PX
+        draw=lambda side: preview_webp(
+            depth_colours(wall.depth_m, limit_m), known, longest_side_px=side
         ),
         title=_title(f"{wall.name}, depth", address),
         caption=(
@@ -129,6 +161,9 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
             f"{1000 * limit_m:.0f} mm in front; {_percent(known.mean())} of the cells known"
         ),
         file=_published(run, address, f"wall_{index}_depth.tif"),
+        cell=address,
+        wall=index,
+        frame=wall.frame,
     )
 
 
@@ -136,8 +171,8 @@ def _intensity(
     run: Run, address: str, index: int, wall: Wall, intensity: NDArray[np.float32], source: str
 ) -> _Drawing:
     return _Drawing(
-        draw=lambda: preview_webp(
-            stretch_to_grey(intensity), np.isfinite(intensity), longest_side_px=LONGEST_SIDE_PX
+        draw=lambda side: preview_webp(
+            stretch_to_grey(intensity), np.isfinite(intensity), longest_side_px=side
         ),
         title=_title(f"{wall.name}, intensity", address),
         caption={
@@ -145,6 +180,9 @@ def _intensity(
             "luminance": "no laser intensity in the scan: grey of its colours instead",
         }.get(source, source),
         file=_published(run, address, f"wall_{index}_intensity.tif"),
+        cell=address,
+        wall=index,
+        frame=wall.frame,
     )
 
 
@@ -165,11 +203,17 @@ def frame_words(frame: WallFrame) -> str:
     )
 
 
-def _embedded(run: Run, type_name: str) -> Iterator[tuple[str, str]]:
+def embedded_products(run: Run, type_name: str) -> tuple[tuple[str, str], ...]:
+    """Cells and ports whose product of a type lies in the record; equal products once.
+
+    Repeats of a random method are left out: they are alike but for their numbers.
+    """
+    found: dict[str, tuple[str, str]] = {}
     for address, cell in run.cells.items():
         for port, product in cell.outputs.items():
-            if product.type_name == type_name and product.embedded:
-                yield address, port
+            if product.type_name == type_name and product.embedded and cell.repeat == 0:
+                found.setdefault(product.digest, (address, port))
+    return tuple(found.values())
 
 
 def _depth_limit_m(depth_m: NDArray[np.float32]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,8 +72,10 @@ class OpenRecord:
         return _payload(self.file, address, port)
 
 
-def read_output(path: Path, address: str, port: str) -> StoredPayload:
-    """Read an embedded output of a cell without reading the rest of the record.
+def read_outputs(path: Path, wanted: Iterable[tuple[str, str]]) -> Iterator[StoredPayload]:
+    """Read embedded outputs, each an address and a port, one after the other from one open file.
+
+    Opening looks at everything in the file, which takes longer than most outputs do.
 
     Raises:
         RecordFormatError: the file is no record, or it has no such output, or it is damaged.
@@ -81,7 +83,8 @@ def read_output(path: Path, address: str, port: str) -> StoredPayload:
     """
     with safe_open(path) as file:
         check_format(file, layout.RUN_FORMAT, layout.RUN_FORMAT_VERSION)
-        return _payload(file, address, port)
+        for address, port in wanted:
+            yield _payload(file, address, port)
 
 
 def read_record(path: Path) -> RunRecord:

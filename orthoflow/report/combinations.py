@@ -1,0 +1,155 @@
+"""The combinations of variants that a run computed, and what each of them gave."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthoflow.records import RecordedCell, Run, cell_metrics
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """A metric of one combination.
+
+    Attributes:
+        value: the mean over the repeats.
+        spread: standard deviation over the repeats, NaN without repeats.
+        n_repeats: how many values there are.
+        unit: `1` for counts and shares.
+        environment: id of the environment that it was computed in.
+    """
+
+    value: float
+    spread: float
+    n_repeats: int
+    unit: str
+    environment: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Combination:
+    """One way through the variants.
+
+    Attributes:
+        run: the run it belongs to.
+        assignment: step -> variant; empty when nothing varies.
+        cells: the cells that it is made of, in the order of the graph, repeats behind the first.
+        is_baseline: it is the one that the workflow calls its baseline.
+    """
+
+    run: Run
+    assignment: Mapping[str, str]
+    cells: tuple[RecordedCell, ...]
+    is_baseline: bool
+
+    @property
+    def name(self) -> str:
+        """The variants in words, e.g. `plane=ransac, orient=pnp`."""
+        return ", ".join(f"{step}={variant}" for step, variant in self.assignment.items())
+
+    @property
+    def failure(self) -> RecordedCell | None:
+        """The first cell that failed; what lies behind it was skipped and is not named."""
+        failed = (cell for cell in self.cells if cell.status == "failed" and cell.repeat == 0)
+        return next(failed, None)
+
+    @property
+    def n_failed_repeats(self) -> int:
+        """How many of the repeats after the first failed."""
+        return sum(cell.status == "failed" and cell.repeat > 0 for cell in self.cells)
+
+    @property
+    def varied_cells(self) -> tuple[RecordedCell, ...]:
+        """Cells that the variants have a part in, without repeats; all when nothing varies."""
+        first = [cell for cell in self.cells if cell.repeat == 0]
+        return tuple(cell for cell in first if cell.assignment or not self.assignment)
+
+    def measured(self, step: str, metric: str) -> Measured | None:
+        """Give a metric of a step, None when the step did not report it."""
+        found = [
+            (row, cell.environment)
+            for cell in self.cells
+            if cell.step == step
+            for row in cell_metrics(cell)
+            if row.metric == metric
+        ]
+        if not found:
+            return None
+        values = np.array([row.value for row, _ in found])
+        return Measured(
+            value=float(values.mean()),
+            spread=float(values.std(ddof=1)) if len(values) > 1 else math.nan,
+            n_repeats=len(values),
+            unit=found[0][0].unit,
+            environment=found[0][1],
+        )
+
+
+def combinations_of(run: Run) -> tuple[Combination, ...]:
+    """Give every combination of variants that the run has cells of, the baseline marked.
+
+    A combination that is part of a larger one (`plane=ransac` of `plane=ransac, orient=pnp`) is
+    no row of its own.
+    """
+    assignments = list(dict.fromkeys(tuple(cell.assignment.items()) for cell in run.record.cells))
+    parts = [frozenset(items) for items in assignments]
+    largest = [
+        items
+        for items, part in zip(assignments, parts, strict=True)
+        if not any(part < other for other in parts)
+    ]
+    baseline = baseline_of(run)
+    return tuple(
+        Combination(
+            run=run,
+            assignment=dict(items),
+            cells=tuple(
+                cell
+                for cell in run.record.cells
+                if frozenset(cell.assignment.items()) <= frozenset(items)
+            ),
+            is_baseline=_is_baseline(dict(items), baseline),
+        )
+        for items in largest
+    )
+
+
+def baseline_of(run: Run) -> Mapping[str, str]:
+    """The variants that the workflow calls its baseline; empty without a comparison."""
+    found = _comparison(run).get("baseline")
+    if not isinstance(found, dict):
+        return {}
+    return {str(step): str(variant) for step, variant in found.items()}
+
+
+def baseline_cells(run: Run) -> tuple[RecordedCell, ...]:
+    """The cells of the baseline, of the first combination when the workflow names none."""
+    found = combinations_of(run)
+    chosen = next((one for one in found if one.is_baseline), found[0] if found else None)
+    return tuple(cell for cell in chosen.cells if cell.repeat == 0) if chosen else ()
+
+
+def wanted_metrics(run: Run) -> tuple[str, ...]:
+    """The patterns `step.metric` that the workflow's comparison asks for."""
+    found = _comparison(run).get("metrics")
+    return tuple(str(pattern) for pattern in found) if isinstance(found, list) else ()
+
+
+def _comparison(run: Run) -> Mapping[str, object]:
+    try:
+        document = json.loads(run.record.workflow_resolved)
+    except json.JSONDecodeError:
+        return {}
+    found = document.get("compare") if isinstance(document, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _is_baseline(assignment: Mapping[str, str], baseline: Mapping[str, str]) -> bool:
+    return bool(baseline) and all(
+        baseline.get(step) == variant for step, variant in assignment.items()
+    )

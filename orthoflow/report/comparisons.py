@@ -1,0 +1,212 @@
+"""The comparison table: combinations as rows, metrics as columns, best and worst marked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from typing import Final
+
+from orthoflow.records import Run, cell_metrics
+from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics
+from orthoflow.report.numbers import metric_label, number, number_with_spread
+from orthoflow.report.origins import Origins
+from orthoflow.report.rankings import Value, rank
+from orthoflow.report.senses import Sense, sense_of
+from orthoflow.report.summaries import QUALITY
+
+_COSTS: Final = ("wall_s", "cpu_s", "peak_rss_mib")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column:
+    """One metric of one step.
+
+    Attributes:
+        step: name of the step.
+        metric: name of the metric.
+        label: the metric with its unit.
+        sense: what makes a value good.
+    """
+
+    step: str
+    metric: str
+    label: str
+    sense: Sense
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One combination.
+
+    Attributes:
+        run_id: the run it belongs to.
+        variants: variant of each varied step; a dash where the step has no part in it.
+        is_baseline: the workflow calls it its baseline.
+        failure: where and why it failed, empty when it did not.
+        values: one per column.
+        time: seconds of the cells that the variants have a part in.
+        memory: largest memory of these cells.
+        remark: what was cached and what else to know, in words.
+    """
+
+    run_id: str
+    variants: tuple[str, ...]
+    is_baseline: bool
+    failure: str
+    values: tuple[Value, ...]
+    time: Value
+    memory: Value
+    remark: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonTable:
+    """Combinations beside each other.
+
+    Attributes:
+        steps: the varied steps.
+        columns: metrics.
+        rows: in the order of the runs and their graphs.
+        shows_runs: rows come from more than one run.
+        groups: letter -> what environment or data it stands for; empty when all is of one kind.
+    """
+
+    steps: tuple[str, ...]
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    shows_runs: bool
+    groups: Mapping[str, str]
+
+
+def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
+    """Lay the combinations of one or more runs beside each other; None when there is but one.
+
+    Values are ranked only among those of one environment and one set of data; with more than one
+    of either, letters say which is which.
+    """
+    combinations = [one for run in runs for one in combinations_of(run)]
+    if len(combinations) < 2:
+        return None
+    steps = tuple(dict.fromkeys(step for one in combinations for step in one.assignment))
+    columns = _columns(combinations)
+    origins = Origins.of(runs)
+    rows = [_row(one, steps, columns, origins) for one in combinations]
+    return ComparisonTable(
+        steps=steps,
+        columns=columns,
+        rows=_ranked(rows, columns),
+        shows_runs=len(runs) > 1,
+        groups=origins.legend,
+    )
+
+
+def _columns(combinations: Sequence[Combination]) -> tuple[Column, ...]:
+    """Metrics that the workflows ask for, else the quality metrics; the cost has its own places."""
+    units: dict[tuple[str, str], str] = {}
+    for cell in (cell for one in combinations for cell in one.cells):
+        for row in cell_metrics(cell):
+            units.setdefault((row.step, row.metric), row.unit)
+    runs = {one.run.path: one.run for one in combinations}.values()
+    patterns = dict.fromkeys(pattern for run in runs for pattern in wanted_metrics(run))
+    if patterns:
+        wanted = _matching(patterns, units)
+    else:
+        wanted = [key for name in QUALITY for key in units if key[1] == name]
+    return tuple(
+        Column(
+            step=step,
+            metric=metric,
+            label=metric_label(metric, units[step, metric]),
+            sense=sense_of(metric),
+        )
+        for step, metric in wanted
+    )
+
+
+def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    found: dict[tuple[str, str], None] = {}
+    for pattern in patterns:
+        for step, metric in known:
+            # `*.wall_s` asks for every step's time; the table sums it up in a column of its own.
+            is_summed = pattern.startswith("*.") and metric in _COSTS
+            if not is_summed and fnmatchcase(f"{step}.{metric}", pattern):
+                found[step, metric] = None
+    return list(found)
+
+
+def _row(
+    one: Combination, steps: Sequence[str], columns: Sequence[Column], origins: Origins
+) -> Row:
+    failed = one.failure
+    varied = [cell for cell in one.varied_cells if cell.status == "ok"]
+    group = origins.letters(one.run, varied[0].environment if varied else "")
+    has_cost = failed is None and bool(varied)
+    time_s = sum(cell.wall_s for cell in varied)
+    memory_mib = max((cell.peak_rss_mib for cell in varied), default=0.0)
+    cost_group = "".join(
+        dict.fromkeys(origins.letters(one.run, cell.environment) for cell in varied)
+    )
+    return Row(
+        run_id=one.run.record.run_id,
+        variants=tuple(one.assignment.get(step, "-") for step in steps),
+        is_baseline=one.is_baseline,
+        failure=f"{failed.address}: {failed.error_message}" if failed else "",
+        values=tuple(
+            _value(one.measured(column.step, column.metric), one.run, origins) for column in columns
+        ),
+        time=Value(text=f"{time_s:.1f}", sort=time_s, group=cost_group) if has_cost else Value(),
+        memory=(
+            Value(text=f"{memory_mib:.0f}", sort=memory_mib, group=group) if has_cost else Value()
+        ),
+        remark=_remark(one),
+    )
+
+
+def _value(measured: Measured | None, run: Run, origins: Origins) -> Value:
+    if measured is None:
+        return Value()
+    repeated = measured.n_repeats > 1
+    return Value(
+        text=(
+            number_with_spread(measured.value, measured.spread)
+            if repeated
+            else number(measured.value)
+        ),
+        sort=measured.value,
+        spread=measured.spread,
+        group=origins.letters(run, measured.environment),
+        note=(f"mean and standard deviation of {measured.n_repeats} repeats" if repeated else ""),
+    )
+
+
+def _remark(one: Combination) -> str:
+    cached = [cell for cell in one.varied_cells if cell.cached_from]
+    parts = []
+    if cached:
+        sources = ", ".join(dict.fromkeys(cell.cached_from for cell in cached))
+        parts.append(
+            f"{len(cached)} of {len(one.varied_cells)} steps cached, with their time in run "
+            f"{sources}"
+        )
+    if one.n_failed_repeats:
+        parts.append(f"{one.n_failed_repeats} repeats failed")
+    return "; ".join(parts)
+
+
+def _ranked(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
+    by_column = [
+        rank([row.values[index] for row in rows], column.sense)
+        for index, column in enumerate(columns)
+    ]
+    times = rank([row.time for row in rows], Sense.LESS)
+    memories = rank([row.memory for row in rows], Sense.LESS)
+    return tuple(
+        replace(
+            row,
+            values=tuple(values[index] for values in by_column),
+            time=times[index],
+            memory=memories[index],
+        )
+        for index, row in enumerate(rows)
+    )

@@ -1,0 +1,123 @@
+"""The pictures that methods drew: on the page, bounded in bytes, and as files of the run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from orthoflow.files.images import decode_image, encode_png, shrunk_webp
+from orthoflow.records import RecordedFigure, Run
+from orthoflow.records.published import folder_name
+from orthoflow.report.diagrams import run_diagram
+from orthoflow.report.pictures import Picture, data_uri
+
+FIGURES_FOLDER: Final = "figures"
+_BYTES_MOST: Final = 10_500_000  # of all figures on a page; a third more in base64
+_SIDES_PX: Final = (700, 480, 340, 240)
+_SMALL_BYTES: Final = 20_000  # not worth drawing anew
+_SUFFIXES: Final[Mapping[str, str]] = {
+    "image/png": ".png",
+    "image/svg+xml": ".svg",
+    "image/webp": ".webp",
+    "image/jpeg": ".jpg",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FigureGroup:
+    """The figures of one cell."""
+
+    cell: str
+    method: str
+    pictures: tuple[Picture, ...]
+
+
+def figure_groups(run: Run) -> tuple[FigureGroup, ...]:
+    """The figures of every cell, repeats of random methods left out; equal ones once.
+
+    When they are too many for a page, the large ones are drawn smaller.
+    """
+    chosen: dict[tuple[str, str], RecordedFigure] = {}
+    seen: set[bytes] = set()
+    for address, cell in run.cells.items():
+        for figure in cell.figures if cell.repeat == 0 else ():
+            if figure.data not in seen:
+                seen.add(figure.data)
+                chosen[address, figure.name] = figure
+    fitted = dict(zip(chosen, _fitted(tuple(chosen.values())), strict=True))
+    groups = []
+    for address, cell in run.cells.items():
+        pictures = tuple(
+            Picture(
+                uri=data_uri(figure.data, figure.media_type),
+                title=figure.name.replace("_", " "),
+                caption=figure.caption,
+                cell=address,
+            )
+            for (owner, _), figure in fitted.items()
+            if owner == address
+        )
+        if pictures:
+            groups.append(FigureGroup(cell=address, method=cell.method, pictures=pictures))
+    return tuple(groups)
+
+
+def write_figures(run: Run, folder: Path) -> None:
+    """Write every figure of a run as a PNG or SVG file below `folder/<cell>/`, and its graph.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "graph.svg").write_text(run_diagram(run, stands_alone=True), encoding="utf-8")
+    waiting: list[tuple[Path, RecordedFigure]] = []
+    for address, cell in run.cells.items():
+        inside = folder / folder_name(address)
+        if cell.figures:
+            inside.mkdir(exist_ok=True)
+        waiting.extend((inside / figure.name, figure) for figure in cell.figures)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        # Drained, so that an error in a thread is not lost.
+        list(pool.map(lambda item: _write_figure(*item), waiting))
+
+
+def _write_figure(stem: Path, figure: RecordedFigure) -> None:
+    suffix = _SUFFIXES.get(figure.media_type, "")
+    content = figure.data
+    if figure.media_type == "image/webp":
+        # What papers and word processors take.
+        suffix, content = ".png", encode_png(decode_image(figure.data, figure.name))
+    stem.with_name(stem.name + suffix).write_bytes(content)
+
+
+def _fitted(figures: tuple[RecordedFigure, ...]) -> Iterable[RecordedFigure]:
+    """Figures as they are or, where all are too many bytes, drawn smaller."""
+    n_bytes = sum(len(figure.data) for figure in figures)
+    if n_bytes <= _BYTES_MOST:
+        return figures
+    fitted = figures
+    # Bytes go about with the area: begin where it may be enough.
+    sides = [
+        side for side in _SIDES_PX if (side / 1000) ** 2 <= 2 * _BYTES_MOST / n_bytes
+    ] or _SIDES_PX[-1:]
+    for side_px in sides:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            fitted = tuple(pool.map(lambda figure, side=side_px: _smaller(figure, side), figures))
+        if sum(len(figure.data) for figure in fitted) <= _BYTES_MOST:
+            break
+    return fitted
+
+
+def _smaller(figure: RecordedFigure, side_px: int) -> RecordedFigure:
+    if figure.media_type == "image/svg+xml" or len(figure.data) <= _SMALL_BYTES:
+        return figure
+    data = shrunk_webp(figure.data, figure.name, longest_side_px=side_px)
+    if len(data) >= len(figure.data):
+        return figure
+    return RecordedFigure(
+        name=figure.name, caption=figure.caption, media_type="image/webp", data=data
+    )

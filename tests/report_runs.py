@@ -1,0 +1,293 @@
+"""Runs made by hand for the report: a comparison with pictures, ties, a failure and repeats."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from orthoflow_provenance.model import (
+    RecordedCell,
+    RecordedEnvironment,
+    RecordedFigure,
+    RecordedMetric,
+    RecordedProduct,
+    RunRecord,
+)
+
+from orthoflow.files.images import encode_png, encode_webp
+from orthoflow.geometry import WallFrame
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Inspection,
+    Intrinsics,
+    Orthoimage,
+    Orthoimages,
+    TieRole,
+    Ties,
+    Wall,
+    Walls,
+)
+from orthoflow.products.product import Payload, Product
+from orthoflow.records import Run
+
+FRAME = WallFrame(
+    # As far from the origin as survey coordinates are.
+    origin_world=np.array([4.0e5, 5.0e6, 3.0]),
+    u_world=np.array([1.0, 0.0, 0.0]),
+    v_world=np.array([0.0, 0.0, -1.0]),
+    normal_world=np.array([0.0, -1.0, 0.0]),
+    gsd_m=0.01,
+    width=120,
+    height=80,
+)
+# Looks at the middle of the wall from 2 m away: x right, y down, z forward.
+ROTATION = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+CENTRE = FRAME.origin_world + np.array([0.6, -2.0, -0.4])
+FOCAL_PX = 1000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldRun(Run):
+    """A run whose products are in memory.
+
+    Attributes:
+        products: (address, port) -> product.
+    """
+
+    products: Mapping[tuple[str, str], Product] = field(default_factory=dict)
+
+    def payloads(self, places: Sequence[tuple[str, str]]) -> Iterator[Payload]:
+        for place in places:
+            yield self.products[place].to_payload()
+
+
+def cell(address: str, **more: object) -> RecordedCell:
+    """A cell that went well, but for what `more` says."""
+    step, _, variants = address.partition("#")[0].partition("@")
+    assignment = dict(pair.split("=") for pair in variants.split(",") if pair)
+    wanted: dict[str, object] = {
+        "address": address,
+        "step": step,
+        "method": f"{step}.toy",
+        "status": "ok",
+        "assignment": assignment,
+        "repeat": int(address.partition("#")[2] or 0),
+        "environment": "e1",
+        "wall_s": 1.0,
+    }
+    return RecordedCell(**{**wanted, **more})  # type: ignore[arg-type]
+
+
+def metrics(**values: float) -> tuple[RecordedMetric, ...]:
+    """Metrics whose unit is what their name ends with."""
+    units = {"mm": "mm", "deg": "deg", "s": "s"}
+    return tuple(
+        RecordedMetric(name=name, value=value, unit=units.get(name.rpartition("_")[2], "1"))
+        for name, value in values.items()
+    )
+
+
+def given(source: str, digest: str, type_name: str) -> RecordedProduct:
+    """A product that a cell takes or, without a source, gives."""
+    return RecordedProduct(
+        type_name=type_name,
+        encoding_version=1,
+        digest=f"sha256:{digest * 64}",
+        source=source,
+        embedded=not source,
+    )
+
+
+def environment(name: str = "e1", *, threads: int = 2) -> RecordedEnvironment:
+    return RecordedEnvironment(
+        id=name,
+        python="3.11.2",
+        os="Linux",
+        cpu="toy",
+        cores=2,
+        threads=threads,
+        git_commit="",
+        packages={"numpy": "2.1"},
+    )
+
+
+def record(cells: Sequence[RecordedCell], **more: object) -> RunRecord:
+    wanted: dict[str, object] = {
+        "run_id": "r1",
+        "name": "toy <run>",
+        "created_by": "orthoflow 0.1.0",
+        "status": "ok",
+        "started": "2026-01-02T03:04:05Z",
+        "ended": "2026-01-02T03:05:05Z",
+        "seed": 1,
+        "workflow_source": "orthoflow: 1\n",
+        "workflow_resolved": "{}",
+        "environments": (environment(),),
+        "cells": tuple(cells),
+    }
+    return RunRecord(**{**wanted, **more})  # type: ignore[arg-type]
+
+
+def compared_resolved(*patterns: str) -> str:
+    """The resolved workflow of a comparison of `plane`, as much of it as the report reads."""
+    return json.dumps({"compare": {"baseline": {"plane": "fine"}, "metrics": list(patterns)}})
+
+
+def compared_run(folder: Path) -> HeldRun:
+    """Three variants of `plane`: one repeated, one not, one failed; orthoimages of two."""
+    cells = [
+        cell("scan", outputs={"cloud": replace(given("", "0", "cloud"), embedded=False)}),
+        *(
+            cell(
+                f"plane@plane=fine{mark}",
+                metrics=metrics(rms_mm=value, omega_deg=10.0),
+                params={"cell_m": 0.01, "exact": False},
+                params_set={"cell_m": 0.01},
+                citations=("A. Author, Planes, 2015, doi:10.3390/rs71215869",),
+            )
+            for mark, value in (("", 1.0), ("#1", 1.2), ("#2", 1.1))
+        ),
+        cell("plane@plane=coarse", metrics=metrics(rms_mm=4.0, omega_deg=11.0), wall_s=0.2),
+        cell("plane@plane=broken", status="failed", error_message="no plane & no <wall>"),
+    ]
+    products: dict[tuple[str, str], Product] = {}
+    for mark, shift in (("fine", 0), ("coarse", 60)):
+        walls = f"wall@plane={mark}"
+        digest = "ab"[mark == "coarse"]
+        cells += [
+            cell(walls, outputs={"walls": given("", digest, "walls")}),
+            cell(
+                f"orient@plane={mark}",
+                inputs={"walls": given(f"{walls}.walls", digest, "walls")},
+                outputs={"cameras": given("", "cd"[mark == "coarse"], "cameras")},
+                cached_from="r0",
+            ),
+            cell(
+                f"check@plane={mark}",
+                inputs={"walls": given(f"{walls}.walls", digest, "walls")},
+                outputs={"inspection": given("", "ef"[mark == "coarse"], "inspection")},
+                figures=(
+                    RecordedFigure(
+                        name="error_map",
+                        caption="how far",
+                        media_type="image/webp",
+                        data=encode_webp(picture(shift)),
+                    ),
+                    RecordedFigure(
+                        name="chart",
+                        caption="a chart",
+                        media_type="image/png",
+                        data=encode_png(picture(shift + 1)),
+                    ),
+                ),
+                metrics=metrics(rmse_u_mm=0.4 + shift, completeness=0.9931),
+                warnings=(f"the grid is <{mark}>",),
+            ),
+            cell(
+                f"mosaic@plane={mark}",
+                outputs={"orthoimages": given("", "12"[mark == "coarse"], "orthoimages")},
+            ),
+        ]
+        products[walls, "walls"] = walls_product()
+        products[f"orient@plane={mark}", "cameras"] = cameras_product()
+        products[f"check@plane={mark}", "inspection"] = inspection_product()
+        products[f"mosaic@plane={mark}", "orthoimages"] = orthoimages_product(shift)
+    told = record(
+        cells,
+        status="failed",
+        workflow_resolved=compared_resolved(
+            "plane.rms_mm", "plane.omega_deg", "check.*", "*.wall_s"
+        ),
+    )
+    return HeldRun(path=folder / "run.h5", record=told, products=products)
+
+
+def picture(shift: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    """A colour gradient."""
+    rows, columns = np.indices(FRAME.shape)
+    return np.dstack([columns + shift, 2 * rows, 255 - columns]).astype(np.uint8)
+
+
+def walls_product() -> Walls:
+    depth_m = np.full(FRAME.shape, 0.002, dtype=np.float32)
+    wall = Wall(
+        frame=FRAME,
+        plane_index=0,
+        name="wall 0",
+        depth_m=depth_m,
+        sigma_m=depth_m,
+        count=np.ones(FRAME.shape, dtype=np.uint32),
+        mask=np.ones(FRAME.shape, dtype=np.uint8),
+        intensity=np.linspace(0, 1, FRAME.width * FRAME.height, dtype=np.float32).reshape(
+            FRAME.shape
+        ),
+    )
+    return Walls(
+        walls=(wall,),
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity_source="laser",
+        buffer_front_m=0.1,
+        buffer_behind_m=0.1,
+    )
+
+
+def orthoimages_product(shift: int) -> Orthoimages:
+    return Orthoimages(
+        images=(
+            Orthoimage(
+                frame=FRAME,
+                wall=0,
+                name="wall 0",
+                rgb=picture(shift),
+                mask=np.ones(FRAME.shape, dtype=np.uint8),
+                source=np.zeros(FRAME.shape, dtype=np.int16),
+                sources=("cloud",),
+            ),
+        )
+    )
+
+
+def camera() -> Camera:
+    return Camera(
+        photo="a.jpg",
+        status="ok",
+        intrinsics=Intrinsics(width=1200, height=900, fx=FOCAL_PX, fy=FOCAL_PX, cx=600.0, cy=450.0),
+        rotation_camera_from_world=ROTATION,
+        translation_camera_from_world=-ROTATION @ CENTRE,
+    )
+
+
+def cameras_product() -> Cameras:
+    n_ties = 30
+    rng = np.random.default_rng(4)
+    pixels_wall = rng.uniform((5, 5), (115, 75), (n_ties, 2))
+    points_world = FRAME.world_from_wall(pixels_wall)
+    role = np.array([TieRole.CONTROL, TieRole.CHECK, TieRole.REJECTED] * 10, dtype=np.uint8)
+    ties = Ties(
+        photo_names=("a.jpg",),
+        photo=np.zeros(n_ties, dtype=np.int32),
+        wall=np.zeros(n_ties, dtype=np.int32),
+        pixels_photo=np.zeros((n_ties, 2)),
+        points_world=points_world,
+        sigma_px=np.ones(n_ties),
+        sigma_m=np.ones(n_ties),
+        role=role,
+        residual_px=rng.normal(0.0, 0.5, (n_ties, 2)),
+    )
+    return Cameras(cameras=(camera(),), ties=ties)
+
+
+def inspection_product() -> Inspection:
+    pixels_wall = np.array([[20.0, 20.0], [100.0, 60.0]])
+    return Inspection(
+        wall=np.zeros(2, dtype=np.int32),
+        points_world=FRAME.world_from_wall(pixels_wall),
+        displacement_m=np.array([[0.001, 0.0], [0.0, -0.001]]),
+        kind=np.zeros(2, dtype=np.uint8),
+        kinds=("patch",),
+        findings=(),
+    )
