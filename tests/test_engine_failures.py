@@ -67,10 +67,11 @@ def bad_result(world: World, bad: str, timeout: str = "", **options: object) -> 
     return result
 
 
+TOYS = "of toy-plugin 1.0"
 RAISED = {
     "raises": (
         "MethodError",
-        "method work.raises failed unexpectedly: KeyError: 'missing'",
+        f"method work.raises {TOYS} failed unexpectedly: KeyError: 'missing'",
         1,
     ),
     "refuses": ("MethodError", "no number is large enough", 1),
@@ -78,24 +79,35 @@ RAISED = {
     "needs_library": (
         "PluginError",
         (
-            "method work.needs_library needs no_such_library, which is missing or fails to import: "
-            "No module named 'no_such_library'"
+            f"method work.needs_library {TOYS} needs no_such_library, which is missing or "
+            "fails to import: No module named 'no_such_library'"
         ),
         4,
     ),
     "changes_input": (
         "MethodError",
-        "method work.changes_input failed unexpectedly: ValueError: output array is read-only",
+        (
+            f"method work.changes_input {TOYS} writes to an array that is read-only, as all "
+            "its inputs are (output array is read-only); it must work on a copy"
+        ),
         1,
     ),
     "wrong_type": (
         "MethodError",
-        "method work.wrong_type must give a numbers on its port numbers, got Strangers",
+        f"method work.wrong_type {TOYS} must give a numbers on its port numbers, got Strangers",
         1,
     ),
-    "wrong_out": ("MethodError", "method work.wrong_out must return its Out, got Numbers", 1),
+    "wrong_out": (
+        "MethodError",
+        f"method work.wrong_out {TOYS} must return its Out, got Numbers",
+        1,
+    ),
     "bad_param": ("ProductError", "metric nan must be finite, got nan", 1),
-    "leave": ("MethodError", "method work.leave tried to end the program (bye)", 1),
+    "leave": (
+        "MethodError",
+        f"method work.leave {TOYS} tried to end the program (bye)",
+        1,
+    ),
     "unstorable": (
         "ProductError",
         (
@@ -119,7 +131,7 @@ def test_running_out_of_memory_in_an_allocation_is_a_sentence(world: World) -> N
     result = bad_result(world, "no_memory", executor="inline")
     assert result.error_type == "StepFailedError"
     assert result.error_message.startswith(
-        "method work.no_memory needed more memory than it could get: Unable to allocate"
+        f"method work.no_memory {TOYS} needed more memory than it could get: Unable to allocate"
     )
 
 
@@ -132,13 +144,13 @@ def test_a_full_disk_in_a_method_names_the_store(world: World) -> None:
 
 
 CRASHES = {
-    "segfault": "method work.segfault crashed (segmentation fault, SIGSEGV)",
-    "abort": "method work.abort crashed (abort, SIGABRT)",
+    "segfault": f"method work.segfault {TOYS} crashed (segmentation fault, SIGSEGV)",
+    "abort": f"method work.abort {TOYS} crashed (abort, SIGABRT)",
     "quit": (
-        "method work.quit ended its process without a result (exit status 7); its log ends "
+        f"method work.quit {TOYS} ended its process without a result (exit status 7); its log ends "
         "with: last words"
     ),
-    "hang": "method work.hang ran past its timeout of 1.5 s and was stopped",
+    "hang": f"method work.hang {TOYS} ran past its timeout of 1.5 s and was stopped",
 }
 
 
@@ -203,7 +215,7 @@ def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
     result = bad_result(world, "eat")
     assert result.error_type == "StepFailedError"
     assert result.error_message == (
-        "method work.eat needed more memory than the machine has "
+        f"method work.eat {TOYS} needed more memory than the machine has "
         f"({result.peak_rss_mib / 1024:.1f} GiB when stopped); give it less data or coarser "
         "parameters"
     )
@@ -289,14 +301,16 @@ def test_a_gone_process_has_no_memory() -> None:
 
 
 def test_a_kill_from_outside_is_named() -> None:
-    assert describe_exit("a.b", -signal.SIGKILL, 3 << 30, "") == (
+    assert describe_exit("method a.b", -signal.SIGKILL, 3 << 30, "") == (
         "method a.b was killed from outside (SIGKILL) while it held 3.0 GiB of memory"
     )
-    assert "signal 64" in describe_exit("a.b", -64, 0, "").replace("SIGRTMAX", "signal 64")
+    assert "signal 64" in describe_exit("method a.b", -64, 0, "").replace("SIGRTMAX", "signal 64")
 
 
 def test_a_bus_error_hints_at_the_disk() -> None:
-    assert "bus error, as when the disk is full" in describe_exit("a.b", -signal.SIGBUS, 0, "")
+    assert "bus error, as when the disk is full" in describe_exit(
+        "method a.b", -signal.SIGBUS, 0, ""
+    )
 
 
 # Full disk ----------------------------------------------------------------------------------------

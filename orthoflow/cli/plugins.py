@@ -1,4 +1,4 @@
-"""`orthoflow plugins`: list the methods that are installed, or show one."""
+"""`orthoflow plugins`: list, show and check methods, and write a plugin."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from orthoflow.cli.lazy_groups import LazyCommand, LazyGroup
 _SUMMARIES: Final = {
     "list": "List every method, and what is wrong with plugins that do not load.",
     "show": "Show a method's parameters, ports, origin and citations.",
+    "new": "Write a plugin of your own that works and passes its tests at once.",
+    "check": "Run the conformance suite on a method.",
 }
 
 
@@ -21,7 +23,7 @@ def _nothing_before_the_command() -> None:
 plugins: Final[click.Command] = LazyGroup(
     name="plugins",
     callback=_nothing_before_the_command,
-    help="List the methods that are installed, or show one.",
+    help="List, show and check methods, and write a plugin of your own.",
     lazy={
         name: LazyCommand(target=f"orthoflow.cli.plugins_{name}:plugins_{name}", summary=summary)
         for name, summary in _SUMMARIES.items()

@@ -24,7 +24,7 @@ _SUMMARIES: Final = {
     "verify": "Check that a record is whole and unchanged.",
     "replay": "Make a run again from its record and say what came out differently.",
     "export": "Write a run's results for other programs.",
-    "plugins": "List the methods that are installed, or show one.",
+    "plugins": "List, show and check methods, and write a plugin of your own.",
     "schema": "Print the JSON Schema of workflow files.",
     "cache": "List or clean the store of results.",
     "doctor": "Say what is installed, what is missing, and what that costs.",

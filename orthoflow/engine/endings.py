@@ -17,40 +17,35 @@ _CRASHES: Final = {
 }
 
 
-def describe_exit(method: str, code: int, n_bytes: int, tail: str) -> str:
+def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
     """Say how a process ended that left no result.
 
     Args:
-        method: method id.
+        who: method and distribution, as `Task.who` has them.
         code: as `subprocess` has it, negative for signals.
         n_bytes: largest memory seen.
         tail: last line of its log.
     """
     if code >= 0:
         last = f"; its log ends with: {tail}" if tail else ""
-        return f"method {method} ended its process without a result (exit status {code}){last}"
+        return f"{who} ended its process without a result (exit status {code}){last}"
     name = _signal_name(-code)
     if -code in _CRASHES:
-        return f"method {method} crashed ({_CRASHES[signal.Signals(-code)]}, {name})"
-    return (
-        f"method {method} was killed from outside ({name}) while it held {n_bytes / GIB:.1f} GiB "
-        f"of memory"
-    )
+        return f"{who} crashed ({_CRASHES[signal.Signals(-code)]}, {name})"
+    return f"{who} was killed from outside ({name}) while it held {n_bytes / GIB:.1f} GiB of memory"
 
 
-def describe_memory(method: str, n_bytes: int) -> StepFailedError:
+def describe_memory(who: str, n_bytes: int) -> StepFailedError:
     """Say that a step was stopped for want of memory."""
     return StepFailedError(
-        f"method {method} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
+        f"{who} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
         f"stopped); give it less data or coarser parameters"
     )
 
 
-def describe_timeout(method: str, limit_s: float) -> StepFailedError:
+def describe_timeout(who: str, limit_s: float) -> StepFailedError:
     """Say that a step took longer than its workflow allows."""
-    return StepFailedError(
-        f"method {method} ran past its timeout of {duration(limit_s)} and was stopped"
-    )
+    return StepFailedError(f"{who} ran past its timeout of {duration(limit_s)} and was stopped")
 
 
 def duration(seconds: float) -> str:

@@ -185,7 +185,7 @@ class LocalExecutor:
             if run.kill_at is not None and time_now > run.kill_at:
                 _signal_group(run, signal.SIGKILL)
             elif limit is not None and run.reason is None and time_now - run.clock > limit:
-                self._stop(run, describe_timeout(run.task.method, limit))
+                self._stop(run, describe_timeout(run.task.who, limit))
         self._guard_memory()
 
     def _guard_memory(self) -> None:
@@ -196,7 +196,7 @@ class LocalExecutor:
             return
         run = self._running[victim.address]
         run.is_victim = True
-        run.reason = describe_memory(run.task.method, victim.n_bytes)
+        run.reason = describe_memory(run.task.who, victim.n_bytes)
         run.peak_bytes = max(run.peak_bytes, victim.n_bytes)
         _signal_group(run, signal.SIGKILL)
 
@@ -250,9 +250,9 @@ def _reason_of_silence(run: _Running) -> OrthoflowError:
         return StoreError(run.last_words)
     code = run.process.returncode
     if code == -signal.SIGKILL and oom_kills() > run.oom_kills:
-        return describe_memory(run.task.method, run.peak_bytes)
+        return describe_memory(run.task.who, run.peak_bytes)
     tail = _read_log(Path(run.task.log)).strip().rpartition("\n")[2]
-    return StepFailedError(describe_exit(run.task.method, code, run.peak_bytes, tail))
+    return StepFailedError(describe_exit(run.task.who, code, run.peak_bytes, tail))
 
 
 def _has_ended(run: _Running) -> bool:

@@ -53,7 +53,7 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
     except Exception as error:  # noqa: BLE001 - a foreign method may raise anything
         result = failed_result(task, explain_failure(task, error), _trace(error))
     except SystemExit as error:
-        reason = MethodError(f"method {task.method} tried to end the program ({error.code})")
+        reason = MethodError(f"{task.who} tried to end the program ({error.code})")
         result = failed_result(task, reason, _trace(error))
     return dataclasses.replace(
         result,
@@ -103,17 +103,22 @@ def explain_failure(task: Task, error: Exception) -> OrthoflowError:
         return error
     if isinstance(error, MemoryError):
         return StepFailedError(
-            f"method {task.method} needed more memory than it could get: "
+            f"{task.who} needed more memory than it could get: "
             f"{str(error) or 'an allocation failed'}"
         )
     if isinstance(error, ImportError):
         missing = error.name or "a library"
         return PluginError(
-            f"method {task.method} needs {missing}, which is missing or fails to import: {error}"
+            f"{task.who} needs {missing}, which is missing or fails to import: {error}"
         )
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return store_error(error, Path(task.store))
-    return MethodError(f"method {task.method} failed unexpectedly: {type(error).__name__}: {error}")
+    if isinstance(error, ValueError) and "read-only" in str(error):
+        return MethodError(
+            f"{task.who} writes to an array that is read-only, as all its inputs are ({error}); it "
+            f"must work on a copy"
+        )
+    return MethodError(f"{task.who} failed unexpectedly: {type(error).__name__}: {error}")
 
 
 def now() -> str:
@@ -176,9 +181,7 @@ class _Call:
         try:
             return cls.Params.model_validate_json(json.dumps(dict(self.task.params)), strict=True)
         except ValidationError as error:
-            raise MethodError(
-                f"method {self.task.method} refuses its parameters: {error}"
-            ) from error
+            raise MethodError(f"{self.task.who} refuses its parameters: {error}") from error
 
     def _check_inputs(self, inputs: Mapping[str, Product | InputFiles]) -> None:
         for port, given in self.task.inputs.items():
@@ -188,21 +191,19 @@ class _Call:
             is_checked = isinstance(product, Product) and _n_bytes(product) <= _CHECKED_BYTES
             if is_checked and digest_of(cast("Product", product)) != given.ref.digest:
                 raise MethodError(
-                    f"method {self.task.method} changed its input {port}, which is read-only; "
+                    f"{self.task.who} changed its input {port}, which is read-only; "
                     f"it must work on a copy"
                 )
 
     def _products(self, cls: type[Method], outputs: object) -> dict[str, Product]:
         if not isinstance(outputs, cls.Out):
-            raise MethodError(
-                f"method {self.task.method} must return its Out, got {type(outputs).__name__}"
-            )
+            raise MethodError(f"{self.task.who} must return its Out, got {type(outputs).__name__}")
         products: dict[str, Product] = {}
         for port, expected in self.task.outputs.items():
             product = getattr(outputs, port)
             if not isinstance(product, Product) or product.type_name != expected.type_name:
                 raise MethodError(
-                    f"method {self.task.method} must give a {expected.type_name} on its port "
+                    f"{self.task.who} must give a {expected.type_name} on its port "
                     f"{port}, got {type(product).__name__}"
                 )
             products[port] = product

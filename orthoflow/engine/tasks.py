@@ -103,6 +103,14 @@ class Task:
     citations: tuple[str, ...] = ()
 
     @property
+    def who(self) -> str:
+        """Method and distribution, as sentences about it begin."""
+        brought = (
+            f" of {self.distribution} {self.distribution_version}" if self.distribution else ""
+        )
+        return f"method {self.method}{brought}"
+
+    @property
     def task_file(self) -> Path:
         """Where the task itself is written."""
         return Path(self.folder) / "task.json"

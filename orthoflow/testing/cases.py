@@ -9,11 +9,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.errors import ArgumentError
+from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.products import InputFiles, Product
-from orthoflow.sdk import Method, port_specs
-from orthoflow.testing.checks import CHECKS, Check, Subject
-from orthoflow.testing.examples import example
+from orthoflow.sdk import Method
+from orthoflow.testing.checks import CHECKS, Check
+from orthoflow.testing.examples import example_inputs
+from orthoflow.testing.subjects import Subject
 from orthoflow.testing.trials import Trial
 from orthoflow.testing.witnesses import Witness
 
@@ -33,12 +34,14 @@ class ConformanceCase:
         check: what is checked.
         witness: gives the runs of the method, which its cases share.
         expected_failure: why the check is known to fail; empty when it must pass.
+        golden: file of digests that results are held to; None for none.
     """
 
     method_id: str
     check: Check
     witness: Callable[[], Witness]
     expected_failure: str = ""
+    golden: Path | None = None
 
     def __str__(self) -> str:
         return f"{self.method_id}-{self.check.name}"
@@ -50,7 +53,7 @@ class ConformanceCase:
             ConformanceError: the method breaks the rule, or a failure that was expected did not
                 happen.
         """
-        problem = self._problem()
+        problem = self.problem()
         if self.expected_failure and not problem:
             raise ConformanceError(
                 f"{self}: passes, although it was expected to fail ({self.expected_failure}): "
@@ -59,12 +62,18 @@ class ConformanceCase:
         if problem and not self.expected_failure:
             raise ConformanceError(f"{self}: {problem}")
 
-    def _problem(self) -> str:
+    def problem(self) -> str:
+        """Run the check and give what is wrong in one sentence, empty when nothing is."""
         with TemporaryDirectory(prefix="orthoflow-conformance-") as folder:
             try:
-                self.check.run(Subject(witness=self.witness(), folder=Path(folder)))
+                subject = Subject(witness=self.witness(), folder=Path(folder), golden=self.golden)
+                self.check.run(subject)
             except AssertionError as error:
                 return str(error)
+            except OrthoflowError as error:
+                return f"the method refuses the suite's inputs: {error}"
+            except Exception as error:  # noqa: BLE001 - a foreign method may raise anything
+                return f"the method raised {type(error).__name__}: {error}"
         return ""
 
 
@@ -74,6 +83,7 @@ def conformance_cases(
     inputs: Inputs | Callable[[], Inputs] | None = None,
     params: Mapping[str, object] | None = None,
     expected_failures: Mapping[str, str] | None = None,
+    golden: Path | None = None,
 ) -> tuple[ConformanceCase, ...]:
     """Give every check that applies to an installed method.
 
@@ -83,6 +93,8 @@ def conformance_cases(
             when the first case runs.
         params: parameters that differ from the defaults, for a quick run.
         expected_failures: check name -> why the method cannot pass it.
+        golden: file of digests that results are held to as long as `result_version` stays; what it
+            lacks is added at the first run. Keep it beside the tests, under version control.
 
     Raises:
         ArgumentError: `expected_failures` names a check that does not exist or gives no reason.
@@ -101,11 +113,7 @@ def conformance_cases(
     @cache
     def witness() -> Witness:
         given = inputs() if callable(inputs) else inputs or {}
-        filled = {
-            name: given.get(name) or example(port.type_name)
-            for name, port in port_specs(method.In).items()
-            if name in given or port.required or port.type_name == "truth"
-        }
+        filled = {**example_inputs(method, besides=given), **given}
         return Witness(Trial(method=method, inputs=filled, params=dict(params or {})))
 
     return tuple(
@@ -114,7 +122,8 @@ def conformance_cases(
             check=check,
             witness=witness,
             expected_failure=expected.get(check.name, ""),
+            golden=golden,
         )
         for check in CHECKS
-        if check.applies(method)
+        if check.applies(method) and (golden is not None or check.name != "golden-digest-holds")
     )

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from pydantic import ValidationError
 
 from orthoflow.engine.store import digest_of
-from orthoflow.errors import OrthoflowError
-from orthoflow.products import Planes, PointCloud, Product
+from orthoflow.errors import CancelledStepError, OrthoflowError
+from orthoflow.products import Cameras, PointCloud
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.examples import example_room, few_points
-from orthoflow.testing.trials import TrialRun, run_trial
-from orthoflow.testing.witnesses import Witness
+from orthoflow.testing.golden import golden_problem
+from orthoflow.testing.photographed import example_ties
+from orthoflow.testing.physics import (
+    cells_show_their_own_place,
+    finds_planes,
+    lays_onto_walls,
+    orients_photos,
+    planes_follow_a_rigid_motion,
+    poses_are_recovered,
+)
+from orthoflow.testing.subjects import Subject, require
 
 # What a float parameter's name ends with: its unit, or a word that says it has none.
 UNIT_SUFFIXES: Final = (
@@ -26,30 +36,6 @@ UNIT_SUFFIXES: Final = (
     *("grey", "share", "ratio", "factor", "scale", "exponent", "power", "probability", "world"),
     "intensity",
 )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Subject:
-    """A method with what to try it on.
-
-    Attributes:
-        witness: runs of the method on its inputs.
-        folder: empty, for further runs.
-    """
-
-    witness: Witness
-    folder: Path
-
-    @property
-    def method(self) -> type[Method]:
-        """The class."""
-        return self.witness.trial.method
-
-    def run_on(self, name: str, **inputs: Product) -> TrialRun:
-        """Run the method with other inputs on some ports, in a scratch folder of that name."""
-        trial = self.witness.trial
-        changed = replace(trial, inputs={**trial.inputs, **inputs})
-        return run_trial(changed, self.folder / name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,18 +55,13 @@ class Check:
     applies: Callable[[type[Method]], bool]
 
 
-def _require(holds: object, sentence: str) -> None:
-    if not holds:
-        raise AssertionError(sentence)
-
-
 def parameters_are_documented(subject: Subject) -> None:
     """Every parameter has a default, a description, and a unit in its name."""
     for name, info in subject.method.Params.model_fields.items():
-        _require(info.description, f"parameter {name} has no description")
-        _require(not info.is_required(), f"parameter {name} has no default")
+        require(info.description, f"parameter {name} has no description")
+        require(not info.is_required(), f"parameter {name} has no default")
         if info.annotation is float or info.annotation == (float | None):
-            _require(
+            require(
                 re.search(rf"_({'|'.join(UNIT_SUFFIXES)})(_|$)", f"_{name}"),
                 f"parameter {name} does not say its unit: end it with one of "
                 f"{', '.join(UNIT_SUFFIXES)}",
@@ -92,8 +73,8 @@ def parameters_round_trip(subject: Subject) -> None:
     model = subject.method.Params
     params = model(**subject.witness.trial.params)
     text = json.dumps(params.model_dump(mode="json"), allow_nan=False)
-    _require(model.model_validate_json(text) == params, f"parameters change through JSON: {text}")
-    _require(model.model_config.get("frozen"), "parameters are not frozen")
+    require(model.model_validate_json(text) == params, f"parameters change through JSON: {text}")
+    require(model.model_config.get("frozen"), "parameters are not frozen")
     try:
         model.model_validate({"no_such_parameter": 1})
     except ValidationError:
@@ -106,17 +87,17 @@ def outputs_are_valid(subject: Subject) -> None:
     run = subject.witness.first.run
     for name, port in port_specs(subject.method.Out).items():
         product = run.outputs.get(name)
-        _require(product is not None or not port.required, f"output {name} is missing")
+        require(product is not None or not port.required, f"output {name} is missing")
         if product is None:
             continue
-        _require(
+        require(
             product.type_name == port.type_name,
             f"output {name} is a {product.type_name}, declared is {port.type_name}",
         )
         again = type(product).from_payload(product.to_payload())
-        _require(digest_of(again) == run.digests[name], f"output {name} changes when stored")
+        require(digest_of(again) == run.digests[name], f"output {name} changes when stored")
     for metric in run.metrics:
-        _require(metric.unit, f"metric {metric.name} has no unit (`1` for counts and shares)")
+        require(metric.unit, f"metric {metric.name} has no unit (`1` for counts and shares)")
 
 
 def inputs_stay_untouched(subject: Subject) -> None:
@@ -127,7 +108,7 @@ def inputs_stay_untouched(subject: Subject) -> None:
 
 def global_state_stays_untouched(subject: Subject) -> None:
     """Numpy's global generator is not used."""
-    _require(
+    require(
         not subject.witness.first.drew_globally,
         "the method draws from numpy's global generator, not from ctx.rng",
     )
@@ -136,7 +117,7 @@ def global_state_stays_untouched(subject: Subject) -> None:
 def nothing_is_written_outside_scratch(subject: Subject) -> None:
     """Working directory, home and temporary folder stay empty."""
     strays = subject.witness.elsewhere.strays
-    _require(not strays, f"files were written outside the scratch folder: {', '.join(strays)}")
+    require(not strays, f"files were written outside the scratch folder: {', '.join(strays)}")
 
 
 def results_repeat(subject: Subject) -> None:
@@ -148,11 +129,11 @@ def results_repeat(subject: Subject) -> None:
     first, second, elsewhere = witness.first.run, witness.again, witness.elsewhere
     exact = subject.method.determinism != "loose"
     for name, digest in first.digests.items():
-        _require(
+        require(
             not exact or second.digests[name] == digest,
             f"output {name} differs between two runs with one seed in one process",
         )
-        _require(
+        require(
             name in elsewhere.digests and (not exact or elsewhere.digests[name] == digest),
             f"output {name} differs in a new process with another working directory and hash seed",
         )
@@ -162,7 +143,7 @@ def threads_do_not_show(subject: Subject) -> None:
     """One core or two give the same digest."""
     one, two = subject.witness.first.run, subject.witness.on_two_cores
     for name, digest in one.digests.items():
-        _require(two.digests[name] == digest, f"output {name} depends on the number of cores")
+        require(two.digests[name] == digest, f"output {name} depends on the number of cores")
 
 
 def _cloud_ports(method: type[Method]) -> Iterator[str]:
@@ -174,7 +155,7 @@ def _refuses(subject: Subject, cloud: PointCloud, what: str) -> None:
         try:
             subject.run_on(f"{port}-{what}", **{port: cloud})
         except OrthoflowError as error:
-            _require(str(error).strip(), f"a cloud with {what} is refused without a word")
+            require(str(error).strip(), f"a cloud with {what} is refused without a word")
         except Exception as error:
             raise AssertionError(
                 f"a cloud with {what} ends in {type(error).__name__}, not in an OrthoflowError: "
@@ -199,38 +180,59 @@ def nan_is_refused(subject: Subject) -> None:
     cloud, _ = example_room(n_points=5000)
     y = cloud.y.copy()
     y[100] = np.nan
-    fields = {name: value for name, value in vars(cloud).items() if name != "y"}
-    _refuses(subject, PointCloud(y=y, **fields), "NaN coordinates")
+    _refuses(subject, replace(cloud, y=y), "NaN coordinates")
 
 
-def planes_follow_a_rigid_motion(subject: Subject) -> None:
-    """Planes of a room turned about up and shifted are the planes, turned and shifted.
-
-    Tolerances: 0.02 deg and 1 mm, far above the fit's own noise (2 mm / sqrt(n)) and far below
-    what a method that thinks in axes or loses digits would show.
-    """
-    shift = np.array([634512.347, 486215.781, 112.193])
-    for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
-        cloud, truth = example_room(turned_deg=turned_deg, shift_m=moved_by)
-        run = subject.run_on(f"turned{turned_deg}{moved_by[0]}", cloud=cloud)
-        planes = run.outputs["planes"]
-        _require(isinstance(planes, Planes) and len(planes) > 0, "no plane was found")
-        if isinstance(planes, Planes):
-            _match_planes(planes, truth)
+def huge_coordinates_are_refused(subject: Subject) -> None:
+    """A cloud with a coordinate that no place on Earth has ends in an OrthoflowError."""
+    cloud, _ = example_room(n_points=5000)
+    x = cloud.x.copy()
+    x[100] = 1e30
+    _refuses(subject, replace(cloud, x=x), "a coordinate of 1e30 m")
 
 
-def _match_planes(found: Planes, truth: Planes) -> None:
-    for index in range(len(found)):
-        cosines = truth.normal @ found.normal[index]
-        centres = truth.corners.mean(axis=1)
-        gaps_m = np.abs(centres @ found.normal[index] - found.offset[index])
-        angles_deg = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
-        fits = (angles_deg < 0.02) & (gaps_m < 0.001)
-        _require(
-            bool(fits.any()),
-            f"plane {index} of a moved room is {angles_deg.min():.3f} deg and "
-            f"{1000 * gaps_m[np.argmin(angles_deg)]:.2f} mm from the nearest true plane",
+def missing_ties_are_told(subject: Subject) -> None:
+    """Without any ties no photo is called oriented."""
+    ties = example_ties()
+    empty = {name: value[:0] for name, value in vars(ties).items() if isinstance(value, np.ndarray)}
+    try:
+        run = subject.run_on("no-ties", ties=replace(ties, **empty))
+    except OrthoflowError:
+        return
+    cameras = run.outputs["cameras"]
+    found = cameras.cameras if isinstance(cameras, Cameras) else ()
+    oriented = [camera.photo for camera in found if camera.status == "ok"]
+    require(not oriented, f"without any ties {', '.join(oriented)} was oriented all the same")
+
+
+def progress_never_goes_back(subject: Subject) -> None:
+    """Progress is told in fractions from 0 to 1 that never become smaller."""
+    fractions = subject.witness.first.run.fractions
+    for before, after in pairwise((0.0, *fractions, 1.0)):
+        require(
+            math.isfinite(after) and before <= after <= 1.0,
+            f"progress goes from {before:.3f} to {after:.3f}",
         )
+
+
+def cancel_is_honoured(subject: Subject) -> None:
+    """A cancelled step stops as soon as the method asks, and the method asks."""
+    try:
+        subject.run_cancelled()
+    except CancelledStepError:
+        return
+    raise AssertionError(
+        "a cancelled step ran to its end: call ctx.progress(fraction, text) between parts of the "
+        "work, which stops it"
+    )
+
+
+def golden_digest_holds(subject: Subject) -> None:
+    """Results are those of the golden file, unless result_version was raised."""
+    if subject.golden is not None:
+        digests = subject.witness.first.run.digests
+        problem = golden_problem(subject.golden, subject.method, digests)
+        require(not problem, problem)
 
 
 def _always(method: type[Method]) -> bool:
@@ -245,8 +247,9 @@ def _takes_a_cloud(method: type[Method]) -> bool:
     return any(True for _ in _cloud_ports(method))
 
 
-def _finds_planes(method: type[Method]) -> bool:
-    return method.id.startswith("plane.") and method.id != "plane.given"
+def _takes_ties(method: type[Method]) -> bool:
+    ports = port_specs(method.In)
+    return orients_photos(method) and "ties" in ports and ports["ties"].required
 
 
 def _check(run: Callable[[Subject], None], applies: Callable[[type[Method]], bool]) -> Check:
@@ -263,8 +266,15 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(nothing_is_written_outside_scratch, _always),
     _check(results_repeat, _always),
     _check(threads_do_not_show, _is_reproducible),
+    _check(progress_never_goes_back, _always),
+    _check(cancel_is_honoured, _always),
     _check(empty_cloud_is_refused, _takes_a_cloud),
     _check(single_point_is_refused, _takes_a_cloud),
     _check(nan_is_refused, _takes_a_cloud),
-    _check(planes_follow_a_rigid_motion, _finds_planes),
+    _check(huge_coordinates_are_refused, _takes_a_cloud),
+    _check(missing_ties_are_told, _takes_ties),
+    _check(planes_follow_a_rigid_motion, finds_planes),
+    _check(poses_are_recovered, orients_photos),
+    _check(cells_show_their_own_place, lays_onto_walls),
+    _check(golden_digest_holds, _is_reproducible),
 )

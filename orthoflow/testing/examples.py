@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -16,7 +16,8 @@ from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.errors import OrthoflowError
 from orthoflow.geometry import up_vector, wall_axes
 from orthoflow.products import InputFiles, Planes, PointCloud, Product
-from orthoflow.sdk import StepContext
+from orthoflow.sdk import Method, StepContext, port_specs
+from orthoflow.testing.photographed import PHOTOGRAPHED
 
 # The road of built-in methods that makes an example of each product type, with parameters small
 # enough for a test: product type -> (method, output port, parameters, inputs by port).
@@ -35,6 +36,31 @@ class ExampleError(OrthoflowError, LookupError):
     """There is no example of a product type: the caller has to give one."""
 
 
+def example_inputs(
+    method: type[Method], *, besides: Collection[str] = ()
+) -> dict[str, Product | InputFiles]:
+    """Give what a method requires, from one scene: the photographed wall or the simulated room.
+
+    A truth is given wherever a method takes it.
+
+    Args:
+        method: the class.
+        besides: ports that need no example.
+
+    Raises:
+        ExampleError: there is no example for a port.
+    """
+    ports = port_specs(method.In)
+    required = {port.type_name for port in ports.values() if port.required}
+    scene = PHOTOGRAPHED if required & {"photos", "cameras", "ties"} else {}
+    found: dict[str, Product | InputFiles] = {}
+    for name, port in ports.items():
+        if name not in besides and (port.required or port.type_name == "truth"):
+            make = scene.get(port.type_name)
+            found[name] = make() if make else example(port.type_name)
+    return found
+
+
 def example(type_name: str) -> Product | InputFiles:
     """Give a small product of a type, the same in every process.
 
@@ -43,6 +69,8 @@ def example(type_name: str) -> Product | InputFiles:
     """
     if type_name == "files":
         return _example_files()
+    if type_name in PHOTOGRAPHED and type_name not in _ROAD:
+        return PHOTOGRAPHED[type_name]()
     if type_name not in _ROAD:
         raise ExampleError(
             f"there is no example of a {type_name} product: give one in `inputs` of "

@@ -43,6 +43,7 @@ class TrialRun:
         metrics: what the method reported.
         figures: pictures, still in the scratch folder.
         events: progress, log lines and warnings, in order.
+        fractions: progress as the method told it, before the context kept it from going back.
     """
 
     outputs: Mapping[str, Product]
@@ -50,10 +51,27 @@ class TrialRun:
     metrics: tuple[Metric, ...]
     figures: tuple[Figure, ...]
     events: tuple[StepEvent, ...]
+    fractions: tuple[float, ...] = ()
 
 
-def run_trial(trial: Trial, scratch: Path) -> TrialRun:
+@dataclass(kw_only=True)
+class _WatchedContext(StepContext):
+    """Remembers every fraction that it was told."""
+
+    fractions: list[float] = field(default_factory=list)
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        self.fractions.append(float(fraction))
+        super().progress(fraction, text)
+
+
+def run_trial(trial: Trial, scratch: Path, *, is_cancelled: bool = False) -> TrialRun:
     """Run a method once in an empty scratch folder.
+
+    Args:
+        trial: what to run.
+        scratch: made when it is not there.
+        is_cancelled: the step was cancelled before it began.
 
     Raises:
         OrthoflowError: what the method raises.
@@ -61,11 +79,12 @@ def run_trial(trial: Trial, scratch: Path) -> TrialRun:
     """
     scratch.mkdir(parents=True, exist_ok=True)
     events: list[StepEvent] = []
-    ctx = StepContext(
+    ctx = _WatchedContext(
         rng=np.random.default_rng(trial.seed),
         cores=trial.cores,
         scratch=scratch,
         listen=events.append,
+        is_cancelled=lambda: is_cancelled,
     )
     method = trial.method
     returned = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
@@ -79,4 +98,5 @@ def run_trial(trial: Trial, scratch: Path) -> TrialRun:
         metrics=tuple(ctx.metrics),
         figures=tuple(ctx.figures),
         events=tuple(events),
+        fractions=tuple(ctx.fractions),
     )

@@ -50,7 +50,8 @@ class ReadCheckpoints(Method):
             raise InputError(f"the input {inputs.files.name} names no files: expected check points")
         points: list[SurveyPoint] = []
         places: dict[str, str] = {}
-        for path in inputs.files.paths:
+        for index, path in enumerate(inputs.files.paths):
+            ctx.progress(index / len(inputs.files.paths), path.name)
             for point in read_survey_points(path):
                 if point.name in places:
                     raise InputError(

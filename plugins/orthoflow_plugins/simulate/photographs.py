@@ -48,7 +48,7 @@ def take_photos(
     exif_focal = shots[0].camera.fx * (1.0 + rng.uniform(-_EXIF_ERROR, _EXIF_ERROR))
     photos = []
     for place, shot in enumerate(shots):
-        ctx.progress(place / len(shots), f"photo {place + 1} of {len(shots)}")
+        ctx.progress(0.5 + 0.5 * place / len(shots), f"photo {place + 1} of {len(shots)}")
         seed = int(rng.integers(0, 2**62))
         image = views.expose(shot.camera, supersample=film.supersample, seed=seed)
         photos.append(

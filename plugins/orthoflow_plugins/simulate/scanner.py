@@ -104,7 +104,7 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
     row = np.asarray(ctx.allocate("cloud", "row", (len(points.x),), np.uint32))
     column = np.asarray(ctx.allocate("cloud", "column", (len(points.x),), np.uint32))
     for index, sweep in enumerate(sweeps):
-        ctx.progress(index / len(sweeps), f"scan {index + 1} of {len(sweeps)}")
+        ctx.progress(0.5 * index / len(sweeps), f"scan {index + 1} of {len(sweeps)}")
         span = slice(int(starts[index]), int(starts[index + 1]))
         in_threads(
             partial(_sweep, scanner, sweep, points.part(span)),

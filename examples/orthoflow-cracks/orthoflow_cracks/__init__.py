@@ -1,0 +1,1 @@
+"""An orthoflow plugin with a kind and a product of its own: cracks in orthoimages, as lines."""

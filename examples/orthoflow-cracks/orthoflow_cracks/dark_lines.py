@@ -1,0 +1,94 @@
+"""`crack.dark-lines`: what is darker than both of its sides, and long."""
+
+from __future__ import annotations
+
+import numpy as np
+from orthoflow.products import Orthoimages, OrthoMask
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from pydantic import Field
+
+from orthoflow_cracks.cracks import Cracks
+
+
+class DarkLines(Method):
+    """Cells darker than their surroundings (black top-hat), joined to lines that are long enough."""
+
+    id = "crack.dark-lines"
+    result_version = 1
+    determinism = "exact"
+    citations = ("Serra 1982: Image Analysis and Mathematical Morphology (top-hat)",)
+
+    class Params(MethodParams):
+        """What counts as a crack."""
+
+        darker_grey: float = Field(
+            25.0, gt=0, le=255, description="A crack is so much darker than its surroundings."
+        )
+        width_max_m: float = Field(0.02, gt=0, description="Wider dark strips are no cracks.")
+        length_min_m: float = Field(0.2, gt=0, description="Shorter lines are no cracks.")
+        vertex_step_m: float = Field(0.05, gt=0, description="Distance of a line's vertices.")
+
+    class In(Ports):
+        """What the method takes."""
+
+        orthoimages: Orthoimages
+
+    class Out(Ports):
+        """What it gives."""
+
+        cracks: Cracks
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Look through every orthoimage."""
+        lines, walls, widths_m = [], [], []
+        images = inputs.orthoimages.images
+        for index, image in enumerate(images):
+            ctx.progress(index / len(images), image.name)
+            for vertices, width_m in lines_of(image, params):
+                lines.append(vertices)
+                walls.append(image.wall)
+                widths_m.append(width_m)
+        cracks = Cracks(
+            vertices_world=np.concatenate([np.zeros((0, 3)), *lines]),
+            line=np.repeat(np.arange(len(lines)), [len(line) for line in lines]).astype(np.int32),
+            wall=np.array(walls, dtype=np.int32),
+            width_m=np.array(widths_m, dtype=np.float64),
+        )
+        ctx.metric("n_cracks", len(cracks), "1")
+        ctx.metric("length_m", cracks.length_m(), "m")
+        return self.Out(cracks=cracks)
+
+
+def lines_of(image, params):
+    """Give vertices (m, 3), metres, and width of every crack in an orthoimage."""
+    import cv2
+
+    frame = image.frame
+    shown = np.isin(image.mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
+    grey = image.rgb.mean(axis=2)
+    # What is not shown must not look dark.
+    grey = np.where(shown, grey, grey[shown].mean() if shown.any() else 0.0).astype(np.float32)
+    width = 2 * max(1, round(params.width_max_m / frame.gsd_m / 2)) + 1
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+    dark = cv2.morphologyEx(grey, cv2.MORPH_BLACKHAT, around) > params.darker_grey
+    count, parts = cv2.connectedComponents((dark & shown).astype(np.uint8), connectivity=8)
+    for part in range(1, count):
+        rows, columns = np.nonzero(parts == part)
+        cells = np.column_stack([columns, rows]) + 0.5
+        along = _along(cells)
+        length_m = float(np.ptp(along)) * frame.gsd_m
+        if length_m < params.length_min_m:
+            continue
+        n_vertices = max(2, round(length_m / params.vertex_step_m) + 1)
+        bins = np.rint((along - along.min()) / np.ptp(along) * (n_vertices - 1)).astype(int)
+        kept = np.unique(bins)
+        middle = np.array([cells[bins == number].mean(axis=0) for number in kept])
+        yield frame.world_from_wall(middle), len(cells) * frame.gsd_m**2 / length_m
+
+
+def _along(cells):
+    """Give each cell's place on the longest axis of all of them."""
+    centred = cells - cells.mean(axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    axis = axes[:, 1]
+    return centred @ (axis if axis[np.abs(axis).argmax()] > 0 else -axis)

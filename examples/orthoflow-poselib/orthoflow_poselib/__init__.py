@@ -1,0 +1,1 @@
+"""An orthoflow plugin: PoseLib orients the photos."""

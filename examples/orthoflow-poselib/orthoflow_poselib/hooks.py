@@ -1,0 +1,15 @@
+"""What the plugin announces."""
+
+from orthoflow.sdk import MethodSpec, hookimpl
+
+
+@hookimpl
+def orthoflow_methods() -> list[MethodSpec]:
+    """Give the one method."""
+    return [
+        MethodSpec(
+            id="orient.poselib",
+            target="orthoflow_poselib.method:OrientPoselib",
+            summary="PoseLib's absolute pose, LO-RANSAC with refinement, photo by photo",
+        ),
+    ]

@@ -1,0 +1,1 @@
+"""An orthoflow plugin: pyRANSAC-3D finds the planes."""

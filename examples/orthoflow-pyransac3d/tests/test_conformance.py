@@ -1,0 +1,16 @@
+"""The method keeps every rule that orthoflow's own methods keep."""
+
+from pathlib import Path
+
+import pytest
+from orthoflow.testing import conformance_cases
+
+CASES = conformance_cases(
+    "plane.pyransac3d",
+    golden=Path(__file__).with_name("golden.json"),
+)
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_conformance(case):
+    case.run()

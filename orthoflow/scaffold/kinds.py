@@ -1,0 +1,123 @@
+"""What a new method of a kind takes and gives, as Python classes, and what it starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from orthoflow import products
+from orthoflow.catalog import Catalog, MethodEntry
+from orthoflow.errors import PluginError
+from orthoflow.sdk import PortSpec, port_specs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Port:
+    """One port of the new method.
+
+    Attributes:
+        name: of the port.
+        class_name: product class.
+        required: must be wired.
+        same_as: for an output, the required input of the same type that can be handed on.
+    """
+
+    name: str
+    class_name: str
+    required: bool = True
+    same_as: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KindPorts:
+    """Ports of a new method, and the method that does its work at first.
+
+    Attributes:
+        inputs: in the kind's order.
+        outputs: likewise.
+        imports: module -> names, for the product classes.
+        start_module: module of an installed method of the kind, empty without one.
+        start_class: its class.
+        start_id: its id.
+    """
+
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    imports: Mapping[str, tuple[str, ...]]
+    start_module: str = ""
+    start_class: str = ""
+    start_id: str = ""
+
+    @property
+    def hands_on(self) -> bool:
+        """Whether every output can be an input handed on."""
+        return all(port.same_as for port in self.outputs)
+
+
+def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
+    """Derive the ports of a new method from a kind and the methods that it has.
+
+    Raises:
+        PluginError: the kind cannot be used.
+    """
+    entry = catalog.kinds[kind]
+    if entry.state != "fine":
+        raise PluginError(entry.problem)
+    start = _loadable(catalog, kind)
+    taken, given = _declared(start) if start else ({}, {})
+    if not entry.spec.is_source:
+        required = {name: name not in taken or taken[name].required for name in entry.spec.inputs}
+        wanted = {name for name in taken if taken[name].required} or set(entry.spec.inputs)
+        taken = {
+            name: PortSpec(name=name, type_name=type_name, required=required[name])
+            for name, type_name in entry.spec.inputs.items()
+            if name in wanted
+        }
+        given = {
+            name: PortSpec(name=name, type_name=type_name, required=True)
+            for name, type_name in entry.spec.outputs.items()
+        }
+    imports: dict[str, set[str]] = {}
+    for port in (*taken.values(), *given.values()):
+        module, name = _class_of(catalog, port.type_name)
+        imports.setdefault(module, set()).add(name)
+    handed = {port.type_name: port.name for port in taken.values() if port.required}
+    module, _, class_name = start.spec.target.partition(":") if start else ("", "", "")
+    return KindPorts(
+        inputs=tuple(_port(catalog, port, "") for port in taken.values()),
+        outputs=tuple(
+            _port(catalog, port, handed.get(port.type_name, "")) for port in given.values()
+        ),
+        imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
+        start_module=module,
+        start_class=class_name,
+        start_id=start.spec.id if start else "",
+    )
+
+
+def _loadable(catalog: Catalog, kind: str) -> MethodEntry | None:
+    for entry in catalog.methods.values():
+        if entry.spec.kind == kind:
+            try:
+                entry.load()
+            except PluginError:
+                continue
+            return entry
+    return None
+
+
+def _declared(start: MethodEntry) -> tuple[dict[str, PortSpec], dict[str, PortSpec]]:
+    method = start.load()
+    return port_specs(method.In), port_specs(method.Out)
+
+
+def _port(catalog: Catalog, port: PortSpec, same_as: str) -> Port:
+    name = _class_of(catalog, port.type_name)[1]
+    return Port(name=port.name, class_name=name, required=port.required, same_as=same_as)
+
+
+def _class_of(catalog: Catalog, type_name: str) -> tuple[str, str]:
+    if type_name == products.InputFiles.type_name:
+        return products.__name__, products.InputFiles.__name__
+    module, _, name = catalog.products[type_name].spec.target.partition(":")
+    return (products.__name__, name) if name in products.__all__ else (module, name)

@@ -1,0 +1,142 @@
+"""The files of a new plugin, filled from templates and from what the catalog says of its kind."""
+
+from __future__ import annotations
+
+import keyword
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+import jinja2
+
+from orthoflow import __version__
+from orthoflow.catalog import Catalog, did_you_mean
+from orthoflow.errors import ArgumentError
+from orthoflow.scaffold.comparing import comparison_text
+from orthoflow.scaffold.kinds import KindPorts, kind_ports
+
+_TEMPLATES: Final = Path(__file__).parent / "templates"
+_NAME: Final = re.compile(r"[a-z][a-z0-9-]{1,31}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Project:
+    """What the author says of a new plugin.
+
+    Attributes:
+        name: of distribution and method, e.g. `my-detector`.
+        kind: kind of its method, any that an installed plugin announces.
+        author: for pyproject, licence and citation.
+        licence: SPDX expression.
+        citation: where the method comes from: DOI, title or URL; may be empty.
+    """
+
+    name: str
+    kind: str
+    author: str = "The authors"
+    licence: str = "MIT"
+    citation: str = ""
+
+    @property
+    def package(self) -> str:
+        """Name of the Python package."""
+        return self.name.replace("-", "_")
+
+    @property
+    def method_id(self) -> str:
+        """Id of the method."""
+        return f"{self.kind}.{self.name}"
+
+    @property
+    def class_name(self) -> str:
+        """Name of the method's class."""
+        return "".join(part.capitalize() for part in self.name.split("-"))
+
+
+def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Path, ...]:
+    """Write a new plugin into a folder of its name.
+
+    Args:
+        project: what the author says.
+        parent: gets the folder.
+        catalog: what is installed.
+
+    Returns:
+        The files written, the folder's name first in each path relative to `parent`.
+
+    Raises:
+        ArgumentError: name or kind cannot be used, or the folder exists already.
+    """
+    folder = parent / project.name
+    _check(project, folder, catalog)
+    ports = kind_ports(catalog, project.kind)
+    written: list[Path] = []
+    for name, text in _files(project, ports, catalog):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        written.append(path.relative_to(parent))
+    return tuple(written)
+
+
+def _check(project: Project, folder: Path, catalog: Catalog) -> None:
+    if not _NAME.fullmatch(project.name) or keyword.iskeyword(project.package):
+        raise ArgumentError(
+            f"a plugin's name must be small letters, digits and hyphens, as in my-detector, got "
+            f"{project.name!r}"
+        )
+    if project.kind not in catalog.kinds:
+        raise ArgumentError(
+            f"no installed plugin announces kind {project.kind}"
+            f"{did_you_mean(project.kind, catalog.kinds)}; there are {', '.join(catalog.kinds)}"
+        )
+    if taken := catalog.methods.get(project.method_id):
+        raise ArgumentError(
+            f"method {project.method_id} is brought by {taken.distribution} already; take another "
+            "name"
+        )
+    if find_spec(project.package) is not None:
+        raise ArgumentError(
+            f"a Python package {project.package} is installed already; take another name"
+        )
+    if folder.exists():
+        raise ArgumentError(f"{folder} exists already; take another name, or remove it")
+
+
+def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tuple[str, str]]:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(_TEMPLATES),
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    own = f"kinds/{project.kind}.py.jinja"
+    has_own = (_TEMPLATES / own).is_file()
+    comparison = comparison_text(project.method_id, project.name, catalog)
+    known = {
+        "project": project,
+        "ports": ports,
+        "version": __version__,
+        "has_comparison": bool(comparison),
+    }
+    sources = {
+        "pyproject.toml": "pyproject.toml.jinja",
+        "README.md": "README.md.jinja",
+        "LICENSE": "LICENSE.jinja",
+        "CITATION.cff": "CITATION.cff.jinja",
+        ".gitignore": "gitignore.jinja",
+        ".github/workflows/tests.yml": "tests.yml.jinja",
+        f"{project.package}/__init__.py": "init.py.jinja",
+        f"{project.package}/hooks.py": "hooks.py.jinja",
+        f"{project.package}/method.py": own if has_own else "method.py.jinja",
+        "tests/test_conformance.py": "test_conformance.py.jinja",
+    }
+    for name, template in sources.items():
+        yield name, environment.get_template(template).render(known)
+    if comparison:
+        yield "compare.yaml", comparison

@@ -1,0 +1,125 @@
+"""What a result must be like in the world: planes that follow a motion, poses, cells in place."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.products import Cameras, Layer, LayerMask, Layers, Planes, Product
+from orthoflow.sdk import Method, port_specs
+from orthoflow.testing.examples import example_room
+from orthoflow.testing.photographed import (
+    PHOTOGRAPHED,
+    photographed_scene,
+    photographing_cameras,
+)
+from orthoflow.testing.subjects import Subject, require
+from orthoflow.testing.textured_walls import cloud_of, places_of_cells, wall_error_m, walls_of
+
+# Ties of 0.3 px and 1 mm at 2.5 m: single ones are off by 1.3 mm on the wall, a hundred together by
+# a tenth of that. A half pixel of the wrong convention is 1.5 mm.
+_POSE_LIMIT_M: Final = 0.0008
+_CELL_SIZES_M: Final = (0.006, 0.01)
+_SHIFT_LIMIT_CELLS: Final = 0.2
+_PAINTED_SHARE: Final = 0.3
+
+
+def planes_follow_a_rigid_motion(subject: Subject) -> None:
+    """Planes of a room turned about up and shifted are the planes, turned and shifted.
+
+    Tolerances: 0.02 deg and 1 mm, far above the fit's own noise (2 mm / sqrt(n)) and far below
+    what a method that thinks in axes or loses digits would show.
+    """
+    shift = np.array([634512.347, 486215.781, 112.193])
+    for turned_deg, moved_by in ((0.0, shift), (33.0, np.zeros(3)), (191.7, shift)):
+        cloud, truth = example_room(turned_deg=turned_deg, shift_m=moved_by)
+        run = subject.run_on(f"turned{turned_deg}{moved_by[0]}", cloud=cloud)
+        planes = run.outputs["planes"]
+        require(isinstance(planes, Planes) and len(planes) > 0, "no plane was found")
+        if isinstance(planes, Planes):
+            _match_planes(planes, truth)
+
+
+def _match_planes(found: Planes, truth: Planes) -> None:
+    for index in range(len(found)):
+        cosines = truth.normal @ found.normal[index]
+        centres = truth.corners.mean(axis=1)
+        gaps_m = np.abs(centres @ found.normal[index] - found.offset[index])
+        angles_deg = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+        fits = (angles_deg < 0.02) & (gaps_m < 0.001)
+        require(
+            bool(fits.any()),
+            f"plane {index} of a moved room is {angles_deg.min():.3f} deg and "
+            f"{1000 * gaps_m[np.argmin(angles_deg)]:.2f} mm from the nearest true plane",
+        )
+
+
+def poses_are_recovered(subject: Subject) -> None:
+    """Two photos with ties of 0.3 px, some of them wrong, are oriented to 0.8 mm on the wall."""
+    cameras = subject.run_on_photographs().outputs["cameras"]
+    require(isinstance(cameras, Cameras), "cameras are missing")
+    if not isinstance(cameras, Cameras):
+        return
+    for camera in cameras.cameras:
+        require(camera.status == "ok", f"{camera.photo} was not oriented: {camera.status}")
+        true = photographing_cameras()[camera.photo]
+        error_m = wall_error_m(photographed_scene(), camera.viewing(), true)
+        require(
+            error_m < _POSE_LIMIT_M,
+            f"{camera.photo} is oriented {1000 * error_m:.2f} mm beside its true pose on the wall, "
+            f"allowed are {1000 * _POSE_LIMIT_M:.1f} mm",
+        )
+
+
+def cells_show_their_own_place(subject: Subject) -> None:
+    """At two cell sizes each painted cell has the colour of its own place, to 0.2 cells."""
+    for gsd_m in _CELL_SIZES_M:
+        scene = photographed_scene(gsd_m)
+        given: dict[str, Product] = {"walls": walls_of(scene), "cloud": cloud_of(scene)}
+        ports = {name: port.type_name for name, port in port_specs(subject.method.In).items()}
+        inputs = {
+            name: given[kind] if kind in given else PHOTOGRAPHED[kind]()
+            for name, kind in ports.items()
+            if kind in given or kind in PHOTOGRAPHED
+        }
+        layers = subject.run_on(f"cells{gsd_m}", **inputs).outputs["layers"]
+        require(isinstance(layers, Layers) and layers.layers, "no layer was made")
+        if isinstance(layers, Layers):
+            for layer in layers.layers:
+                _check_layer(layer, 255.0 * scene.grey(*places_of_cells(layer.frame)))
+
+
+def _check_layer(layer: Layer, truth_grey: NDArray[np.float64]) -> None:
+    painted = layer.mask == LayerMask.PAINTED
+    where = f"{layer.source} at {layer.frame.gsd_m} m"
+    share = float(painted.mean())
+    require(share > _PAINTED_SHARE, f"{where}: only {share:.0%} of the wall is painted")
+    down, across = np.gradient(truth_grey)
+    # What is shown - true = gradient * displacement: one displacement for the layer, least squares.
+    design = np.column_stack([across[painted], down[painted], np.ones(int(painted.sum()))])
+    difference = layer.rgb[..., 0][painted].astype(np.float64) - truth_grey[painted]
+    shift_cells = np.linalg.lstsq(design, difference, rcond=None)[0][:2]
+    require(
+        bool(np.abs(shift_cells).max() < _SHIFT_LIMIT_CELLS),
+        f"{where}: colours lie {shift_cells[0]:+.2f} columns and {shift_cells[1]:+.2f} rows beside "
+        "their place",
+    )
+    off_grey = float(np.median(np.abs(difference)))
+    require(off_grey < 16.0, f"{where}: half of the colours are off by {off_grey:.0f} grey or more")
+
+
+def finds_planes(method: type[Method]) -> bool:
+    """Whether the method looks for planes itself."""
+    return method.id.startswith("plane.") and method.id != "plane.given"
+
+
+def orients_photos(method: type[Method]) -> bool:
+    """Whether the method orients photos from ties."""
+    return method.id.startswith("orient.")
+
+
+def lays_onto_walls(method: type[Method]) -> bool:
+    """Whether the method paints layers."""
+    return method.id.startswith("ortho.")

@@ -1,0 +1,129 @@
+"""`orthoflow plugins new`: what it writes installs, works and passes its tests, for every kind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from orthoflow.catalog import discover_catalog
+from orthoflow.cli import program
+from orthoflow.errors import ArgumentError
+from orthoflow.scaffold import Project, write_project
+from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
+from orthoflow.testing import conformance_cases
+from orthoflow.workflow import load_workflow
+
+IS_LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
+ROOT = Path(__file__).resolve().parents[1]
+KINDS = sorted(discover_catalog().kinds)
+
+
+def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lay metadata beside a written plugin, as pip would, and put both on the path."""
+    package = folder.name.replace("-", "_")
+    info = folder / f"{package}-0.1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {folder.name}\nVersion: 0.1.0\n")
+    (info / "entry_points.txt").write_text(
+        f"[{ENTRY_POINT_GROUP}]\n{folder.name} = {package}.hooks\n", encoding="utf-8"
+    )
+    monkeypatch.syspath_prepend(folder)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = Project(name=f"new-{kind}", kind=kind, citation="doi:10.1000/xyz")
+    write_project(project, tmp_path, discover_catalog())
+    folder = tmp_path / project.name
+    install(folder, monkeypatch)
+    catalog = discover_catalog()
+    method = catalog.method(project.method_id).load()
+    assert method.citations == ("doi:10.1000/xyz",)
+    comparison = folder / "compare.yaml"
+    if comparison.exists():
+        steps = load_workflow(comparison, catalog).steps.values()
+        uses = {variant.method for step in steps for variant in step.variants}
+        assert project.method_id in uses
+
+
+@pytest.mark.parametrize("kind", ["mosaic"])
+def test_a_new_plugin_passes_the_suite_as_it_is(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project = Project(name=f"fresh-{kind}", kind=kind)
+    write_project(project, tmp_path, discover_catalog())
+    install(tmp_path / project.name, monkeypatch)
+    golden = tmp_path / "golden.json"
+    problems = [case.problem() for case in conformance_cases(project.method_id, golden=golden)]
+    assert [problem for problem in problems if problem] == []
+    assert project.method_id in golden.read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "sentence"),
+    [
+        ("My Detector", "plane", "a plugin's name must be small letters"),
+        ("mine", "plain", r"no installed plugin announces kind plain \(did you mean plane\?\)"),
+        ("hough2d", "plane", "method plane.hough2d is brought by orthoflow-tls"),
+        ("numpy", "plane", "a Python package numpy is installed already"),
+        ("taken", "plane", "taken exists already"),
+    ],
+)
+def test_a_name_that_cannot_be_used_is_refused(
+    name: str, kind: str, sentence: str, tmp_path: Path
+) -> None:
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(ArgumentError, match=sentence):
+        write_project(Project(name=name, kind=kind), tmp_path, discover_catalog())
+
+
+def test_the_command_says_what_it_wrote_and_what_comes_next(tmp_path: Path) -> None:
+    arguments = ["plugins", "new", "my-detector", "--kind", "plane", "--folder", str(tmp_path)]
+    result = CliRunner().invoke(program, arguments)
+    assert result.exit_code == 0
+    assert "wrote my-detector/pyproject.toml" in result.output
+    assert "next: cd my-detector, python -m pip install -e '.[test]'" in result.output
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment with this checkout installed, and what it needs taken from the tests' own."""
+    folder = tmp_path_factory.mktemp("author")
+    venv.create(folder, with_pip=True)
+    (packages,) = (folder / "lib").glob("python*/site-packages")
+    paths = [str(ROOT / part) for part in ("", "plugins", "provenance")]
+    paths += [path for path in sys.path if path.endswith("-packages")]
+    (packages / "shared.pth").write_text("\n".join(paths))
+    return folder / "bin" / "python"
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not IS_LONG, reason="installs a plugin per kind: .ci/run --long")
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_new_plugin_installs_and_passes_its_tests_at_once(
+    kind: str, environment: Path, tmp_path: Path
+) -> None:
+    run = [environment, "-m"]
+    named = ["orthoflow", "plugins", "new", f"own-{kind}", "--kind", kind]
+    steps = [
+        (tmp_path, [*run, *named]),
+        (
+            tmp_path / f"own-{kind}",
+            [*run, "pip", "install", "-q", "--no-deps", "--no-build-isolation", "-e", "."],
+        ),
+        (tmp_path / f"own-{kind}", [*run, "pytest", "-q", "-p", "no:dash", "-W", "error"]),
+    ]
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    for folder, command in steps:
+        done = subprocess.run(
+            command, cwd=folder, env=variables, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
