@@ -54,7 +54,7 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
         assert project.method_id in uses
 
 
-@pytest.mark.parametrize("kind", ["mosaic"])
+@pytest.mark.parametrize("kind", ["simulate"])
 def test_a_new_plugin_passes_the_suite_as_it_is(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

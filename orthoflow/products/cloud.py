@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.products.product import JsonValue, Product, Tolerance
-
-# Offsets from a cloud's origin; survey coordinates are in the origin.
-_FARTHEST_M: Final = 1e7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,21 +96,14 @@ class PointCloud(Product):
         """Refuse a cloud that no method can work on.
 
         Raises:
-            ProductError: fewer than `n_least` points, or coordinates that are not finite, or that
-                no scan can have.
+            ProductError: fewer than `n_least` points, or coordinates that are not finite.
         """
         if len(self) < n_least:
             raise ProductError(f"the cloud has {len(self)} points, at least {n_least} are needed")
         for name, values in (("x", self.x), ("y", self.y), ("z", self.z)):
             # A sum is NaN or infinite exactly when a term is (float64 cannot overflow here), and
-            # needs no mask of scan size. A single wild coordinate shows in it as well.
-            total = float(np.sum(values, dtype=np.float64))
-            if math.isfinite(total) and abs(total) > _FARTHEST_M * len(self):
-                raise ProductError(
-                    f"the cloud has coordinates in {name} farther than {_FARTHEST_M:.0e} m from "
-                    "its origin: no scan reaches so far, is its unit right?"
-                )
-            if not math.isfinite(total):
+            # needs no mask of scan size.
+            if not np.isfinite(np.sum(values, dtype=np.float64)):
                 raise ProductError(
                     f"the cloud has coordinates in {name} that are NaN or infinite: read it with "
                     "read.scan, which drops such points"

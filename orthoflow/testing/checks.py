@@ -183,20 +183,40 @@ def nan_is_refused(subject: Subject) -> None:
     _refuses(subject, replace(cloud, y=y), "NaN coordinates")
 
 
-def huge_coordinates_are_refused(subject: Subject) -> None:
-    """A cloud with a coordinate that no place on Earth has ends in an OrthoflowError."""
-    cloud, _ = example_room(n_points=5000)
-    x = cloud.x.copy()
-    x[100] = 1e30
-    _refuses(subject, replace(cloud, x=x), "a coordinate of 1e30 m")
+def a_huge_coordinate_does_no_harm(subject: Subject) -> None:
+    """A cloud with one coordinate of 1e30 m gives a result or ends in an OrthoflowError."""
+    for port in _cloud_ports(subject.method):
+        cloud = subject.witness.trial.inputs.get(port)
+        if not isinstance(cloud, PointCloud):
+            cloud = example_room(n_points=5000)[0]
+        x = cloud.x.copy()
+        x[len(x) // 2] = 1e30
+        try:
+            subject.run_on(f"{port}-huge", **{port: replace(cloud, x=x)})
+        except OrthoflowError:
+            continue
+        except Exception as error:
+            raise AssertionError(
+                f"a cloud with a coordinate of 1e30 m ends in {type(error).__name__}: {error}"
+            ) from error
 
 
 def missing_ties_are_told(subject: Subject) -> None:
     """Without any ties no photo is called oriented."""
     ties = example_ties()
-    empty = {name: value[:0] for name, value in vars(ties).items() if isinstance(value, np.ndarray)}
+    empty = replace(
+        ties,
+        photo=ties.photo[:0],
+        wall=ties.wall[:0],
+        pixels_photo=ties.pixels_photo[:0],
+        points_world=ties.points_world[:0],
+        sigma_px=ties.sigma_px[:0],
+        sigma_m=ties.sigma_m[:0],
+        role=ties.role[:0],
+        residual_px=ties.residual_px[:0],
+    )
     try:
-        run = subject.run_on("no-ties", ties=replace(ties, **empty))
+        run = subject.run_on("no-ties", ties=empty)
     except OrthoflowError:
         return
     cameras = run.outputs["cameras"]
@@ -271,7 +291,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     _check(empty_cloud_is_refused, _takes_a_cloud),
     _check(single_point_is_refused, _takes_a_cloud),
     _check(nan_is_refused, _takes_a_cloud),
-    _check(huge_coordinates_are_refused, _takes_a_cloud),
+    _check(a_huge_coordinate_does_no_harm, _takes_a_cloud),
     _check(missing_ties_are_told, _takes_ties),
     _check(planes_follow_a_rigid_motion, finds_planes),
     _check(poses_are_recovered, orients_photos),

@@ -100,7 +100,7 @@ def _check_layer(layer: Layer, truth_grey: NDArray[np.float64]) -> None:
     # What is shown - true = gradient * displacement: one displacement for the layer, least squares.
     design = np.column_stack([across[painted], down[painted], np.ones(int(painted.sum()))])
     difference = layer.rgb[..., 0][painted].astype(np.float64) - truth_grey[painted]
-    shift_cells = np.linalg.lstsq(design, difference, rcond=None)[0][:2]
+    shift_cells = np.linalg.solve(design.T @ design, design.T @ difference)[:2]
     require(
         bool(np.abs(shift_cells).max() < _SHIFT_LIMIT_CELLS),
         f"{where}: colours lie {shift_cells[0]:+.2f} columns and {shift_cells[1]:+.2f} rows beside "

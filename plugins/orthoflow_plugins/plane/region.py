@@ -144,7 +144,7 @@ class Region(Method):
                 least_points=PART_SHARE * rules.least_share * len(remainder.claims),
             )
             cells = surface_cells(remainder, _neighbourhood(params))
-            report(0.5, "growing regions")
+            report(0.0, "growing regions")
             viewer_m = middle_viewpoint_m(inputs.cloud, remainder.sample.offsets_m)
             regions = grow(cells, growth, viewer_m)
             grown.append(regions)
