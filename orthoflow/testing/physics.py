@@ -96,7 +96,8 @@ def _check_layer(layer: Layer, truth_grey: NDArray[np.float64]) -> None:
     where = f"{layer.source} at {layer.frame.gsd_m} m"
     share = float(painted.mean())
     require(share > _PAINTED_SHARE, f"{where}: only {share:.0%} of the wall is painted")
-    down, across = np.gradient(truth_grey)
+    gradient: list[NDArray[np.float64]] = list(np.gradient(truth_grey))
+    down, across = gradient
     # What is shown - true = gradient * displacement: one displacement for the layer, least squares.
     design = np.column_stack([across[painted], down[painted], np.ones(int(painted.sum()))])
     difference = layer.rgb[..., 0][painted].astype(np.float64) - truth_grey[painted]
