@@ -57,6 +57,7 @@ def test_a_run_shows_every_cell_and_every_warning(finished: tuple[Path, str, str
 def test_a_finished_folder_holds_nothing_unfinished(finished: tuple[Path, str, str]) -> None:
     folder = finished[0] / "good"
     assert sorted(path.name for path in folder.iterdir()) == [
+        "figures",
         "journal.jsonl",
         "logs",
         "products",
