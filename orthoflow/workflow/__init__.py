@@ -23,6 +23,7 @@ from orthoflow.workflow.problems import (
 from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
 from orthoflow.workflow.schema import workflow_schema
 from orthoflow.workflow.selection import Selection, check_step_names
+from orthoflow.workflow.wiring import topological_steps
 
 __all__ = [
     "Cell",
@@ -48,5 +49,6 @@ __all__ = [
     "resolved_json",
     "shipped_workflow",
     "shipped_workflows",
+    "topological_steps",
     "workflow_schema",
 ]

@@ -8,14 +8,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
+import networkx as nx
+
 from orthoflow.catalog import Catalog
 from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
 from orthoflow.workflow.designs import Assignment, combinations, is_excluded
-from orthoflow.workflow.graphs import step_graph
 from orthoflow.workflow.inputs import present_inputs
 from orthoflow.workflow.methods import MethodInfo, describe_method
 from orthoflow.workflow.model import Reference, StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.selection import EVERYTHING, Selection, select_cells
+from orthoflow.workflow.wiring import step_graph, topological_steps
 
 _SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
 
@@ -40,7 +42,7 @@ def expand_cells(
             for step in workflow.steps.values()
             for variant in step.variants
         },
-        rank={name: index for index, name in enumerate(step_graph(workflow.steps).ordered())},
+        rank={name: index for index, name in enumerate(topological_steps(workflow.steps))},
     )
     return select_cells(workflow, expansion.expand(), selection)
 
@@ -95,7 +97,7 @@ class _Expansion:
         cells: dict[str, Cell] = {}
         for name in self.rank:
             step = self.workflow.steps[name]
-            before = graph.ancestors(name)
+            before = nx.ancestors(graph, name)
             relevant = [other for other in self.rank if other in before or other == name]
             made: dict[frozenset[tuple[str, str]], _Node] = {}
             self.nodes[name] = made

@@ -6,11 +6,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
+import networkx as nx
+
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.workflow.cells import Cell, CellOutput
-from orthoflow.workflow.graphs import step_graph
 from orthoflow.workflow.model import Workflow
+from orthoflow.workflow.wiring import step_graph
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,9 +81,11 @@ def _chosen_steps(workflow: Workflow, selection: Selection) -> set[str]:
     graph = step_graph(workflow.steps)
     chosen = set(workflow.steps)
     if selection.from_:
-        chosen &= {step for name in selection.from_ for step in (name, *graph.descendants(name))}
+        chosen &= {
+            step for name in selection.from_ for step in (name, *nx.descendants(graph, name))
+        }
     if selection.until:
-        chosen &= {step for name in selection.until for step in (name, *graph.ancestors(name))}
+        chosen &= {step for name in selection.until for step in (name, *nx.ancestors(graph, name))}
     if selection.only:
         chosen &= set(selection.only)
     if not chosen:

@@ -5,13 +5,30 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+import networkx as nx
+
 from orthoflow.catalog import did_you_mean
 from orthoflow.catalog.loading import FILES
-from orthoflow.workflow.graphs import is_acyclic
-from orthoflow.workflow.model import INPUTS
+from orthoflow.workflow.model import INPUTS, WorkflowStep
 from orthoflow.workflow.positions import join
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.steps import DraftPort, DraftReference, DraftStep
+
+
+def step_graph(steps: Mapping[str, WorkflowStep]) -> nx.DiGraph[str]:
+    """Give the graph of steps; an edge runs from the step that makes a product to its user."""
+    graph: nx.DiGraph[str] = nx.DiGraph()
+    graph.add_nodes_from(steps)
+    for step in steps.values():
+        graph.add_edges_from((source, step.name) for source in step.upstream())
+    return graph
+
+
+def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
+    """Order steps so that each stands behind all it needs, else in the order of the file."""
+    rank = {name: index for index, name in enumerate(steps)}
+    ordered = nx.lexicographical_topological_sort(step_graph(steps), key=rank.__getitem__)
+    return tuple(str(name) for name in ordered)
 
 
 def check_wiring(
@@ -173,11 +190,6 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
             for draft in port.references:
                 if draft.reference.source in names:
                     wires.setdefault((draft.reference.source, step.name), draft)
-    upstream = {name: tuple(source for source, user in wires if user == name) for name in names}
-    if is_acyclic(upstream):
-        return
-    import networkx as nx  # noqa: PLC0415 - slow to load, and few workflows have cycles
-
     graph: nx.DiGraph[str] = nx.DiGraph(list(wires))
     for members in nx.strongly_connected_components(graph):
         inside = graph.subgraph(members)
