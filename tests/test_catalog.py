@@ -17,6 +17,8 @@ from tests.laboratories import (
     LABORATORY,
     entry_points_in,
     laboratory_catalog,
+    load,
+    with_steps,
     write_distribution,
 )
 
@@ -352,3 +354,26 @@ def test_publishers_are_loaded_by_name(tmp_path: Path, monkeypatch: pytest.Monke
     assert publish is not None
     with pytest.raises(PluginError, match=r"product type notes of press .* its class says planes"):
         catalog.product_class("notes")
+
+
+def test_two_bad_plugins_leave_every_other_workflow_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    again = write_distribution(
+        tmp_path / "again",
+        "again",
+        {"again_hooks.py": hooks(methods=method("plane.ransac", "a:B"))},
+    )
+    broken = write_distribution(
+        tmp_path / "broken", "broken", {"broken_hooks.py": "raise RuntimeError('no licence')"}
+    )
+    catalog = laboratory_catalog(monkeypatch, again, broken)
+    assert [str(plugin) for plugin in catalog.broken] == [
+        "plugin broken of broken 1.0 fails to load: RuntimeError: no licence"
+    ]
+    path = tmp_path / "flow.yaml"
+    fine = load(with_steps("plane: {use: plane.hough2d, in: {cloud: cloud.cloud}}"), path, catalog)
+    assert set(fine.steps) == {"cloud", "plane"}
+    needy = with_steps("plane: {use: plane.ransac, in: {cloud: cloud.cloud}}")
+    with pytest.raises(PluginError, match=r"plane.ransac is claimed by again 1.0 and laboratory"):
+        load(needy, path, catalog)

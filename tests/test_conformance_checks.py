@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from orthoflow.errors import ArgumentError
 from orthoflow.testing import ConformanceCase, ConformanceError, conformance_cases
 from tests.laboratories import write_distribution
 
@@ -40,6 +41,7 @@ class Floor(Method):
 
     def run(self, inputs, params, ctx):
         cloud = inputs.cloud
+        self.listen(ctx)
         self.look_at(cloud)
         x, y = (float(np.nanmin(a)) for a in (cloud.x, cloud.y))
         lowest = cloud.z[cloud.z < np.quantile(cloud.z, 0.01) + 0.02]
@@ -54,6 +56,9 @@ class Floor(Method):
         return self.Out(
             planes=planes, labels=PointLabels(plane_index=np.zeros(len(cloud), dtype=np.int16))
         )
+
+    def listen(self, ctx):
+        ctx.progress(0.0, "looking")
 
     def look_at(self, cloud):
         cloud.require_points(3)
@@ -151,6 +156,33 @@ CHEATS: dict[str, tuple[str, str, str]] = {
             return ctx.cores / 1000.0
         """,
     ),
+    "backwards": (
+        "progress-never-goes-back",
+        "progress goes from 0.800 to 0.300",
+        """
+        def lift_m(self, cloud, ctx):
+            ctx.progress(0.8)
+            ctx.progress(0.3)
+            return 0.0
+        """,
+    ),
+    "deaf": (
+        "cancel-is-honoured",
+        "a cancelled step ran to its end",
+        """
+        def listen(self, ctx):
+            pass
+        """,
+    ),
+    "overflowing": (
+        "a-huge-coordinate-does-no-harm",
+        "a cloud with a coordinate of 1e30 m ends in ValueError",
+        """
+        def lift_m(self, cloud, ctx):
+            np.zeros(int(cloud.x.max() / 1e-3) % 10**6 - 10**7 * (cloud.x.max() > 1e6))
+            return 0.0
+        """,
+    ),
     "careless": (
         "empty-cloud-is-refused",
         "a cloud with no points ends in IndexError, not in an OrthoflowError",
@@ -236,3 +268,35 @@ def test_an_expected_failure_that_passes_is_reported() -> None:
     )
     with pytest.raises(ConformanceError, match="passes, although it was expected to fail"):
         case.run()
+
+
+@pytest.mark.usefixtures("cheats")
+def test_a_result_that_moved_without_its_version_is_noticed(tmp_path: Path) -> None:
+    golden = tmp_path / "golden.json"
+
+    def problem(lift_m: float) -> str:
+        cases = conformance_cases("plane.floor", params={"lift_m": lift_m}, golden=golden)
+        (case,) = (case for case in cases if case.check.name == "golden-digest-holds")
+        return case.problem()
+
+    assert problem(0.0) == ""
+    recorded = golden.read_text()
+    assert problem(0.0) == ""
+    assert problem(0.1) == (
+        "output planes is another one than golden.json has, but result_version is 1 still: raise "
+        "it, or find out why the result moved"
+    )
+    assert golden.read_text() == recorded
+
+
+@pytest.mark.usefixtures("cheats")
+def test_a_method_that_raises_what_nobody_expects_is_told_in_a_sentence() -> None:
+    cases = conformance_cases("plane.floor", inputs=lambda: {"cloud": None})
+    (case,) = (case for case in cases if case.check.name == "outputs-are-valid")
+    assert case.problem().startswith("the method raised AttributeError: ")
+
+
+def test_an_expected_failure_needs_a_check_and_a_reason() -> None:
+    for expected in ({"no-such-check": "why"}, {"results-repeat": " "}):
+        with pytest.raises(ArgumentError, match="needs the name of a check and a reason"):
+            conformance_cases("plane.hough2d", expected_failures=expected)

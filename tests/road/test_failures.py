@@ -43,6 +43,8 @@ steps:
       raise: {use: mischief.raise}
       hang: {use: mischief.hang, timeout: 5s}
       fill: {use: mischief.fill}
+      meddle: {use: mischief.meddle}
+      wrong: {use: mischief.wrong}
       good: {use: mischief.good}
   wall: {use: raster.grid, in: {cloud: room.cloud, planes: bad.planes}, params: {gsd_m: 0.1}}
 compare: {design: product}
@@ -130,11 +132,16 @@ def test_methods_that_misbehave_fail_alone(with_stranger: Shell, write: Write) -
         "raise": "KeyError",
         "hang": "5 s",
         "fill": "No space left",
+        "meddle": "writes to an array that is read-only, as all its inputs are",
+        "wrong": "must give a planes on its port planes, got PointCloud",
     }
     for variant, reason in reasons.items():
         cell = cells[f"bad@bad={variant}"]
         assert cell["status"] == "failed"
         assert reason in cell["error_message"]
+        if variant != "fill":  # there the disk is to blame
+            who = f"method mischief.{variant} of orthoflow-stranger 0.3.0 "
+            assert cell["error_message"].startswith(who)
         assert cells[f"wall@bad={variant}"]["status"] == "skipped"
     assert cells["room"]["status"] == "ok"
     assert cells["bad@bad=good"]["status"] == "ok"

@@ -18,6 +18,8 @@ def orthoflow_methods() -> list[MethodSpec]:
         MethodSpec(id="mischief.hang", target=f"{_MISCHIEF}:Hang", summary="never ends"),
         MethodSpec(id="mischief.raise", target=f"{_MISCHIEF}:Raise", summary="raises"),
         MethodSpec(id="mischief.exit", target=f"{_MISCHIEF}:Exit", summary="exits the process"),
+        MethodSpec(id="mischief.meddle", target=f"{_MISCHIEF}:Meddle", summary="writes to inputs"),
+        MethodSpec(id="mischief.wrong", target=f"{_MISCHIEF}:Wrong", summary="wrong type"),
         MethodSpec(id="mischief.good", target=f"{_MISCHIEF}:Good", summary="works"),
         MethodSpec(id="mischief.fill", target=f"{_MISCHIEF}:Fill", summary="fills the disk"),
     ]

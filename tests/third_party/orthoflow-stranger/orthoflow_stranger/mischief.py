@@ -88,6 +88,25 @@ class Fill(_Mischief):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(ctx.scratch / "big"))
 
 
+class Meddle(_Mischief):
+    """Writes to its inputs."""
+
+    id = "mischief.meddle"
+
+    def run(self, inputs: object, params: object, ctx: StepContext) -> object:
+        inputs.cloud.x[0] = 1.0
+        return Good().run(inputs, params, ctx)
+
+
+class Wrong(_Mischief):
+    """Returns what it was not asked for."""
+
+    id = "mischief.wrong"
+
+    def run(self, inputs: object, params: object, ctx: StepContext) -> object:
+        return self.Out(planes=inputs.cloud)
+
+
 class Good(_Mischief):
     """Does what it should, in bad company."""
 

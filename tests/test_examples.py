@@ -1,0 +1,98 @@
+"""The plugins in `examples/`: installed, each keeps the rules and stands beside our own methods."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from orthoflow.catalog import discover_catalog
+from orthoflow.cli import program
+from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
+from orthoflow.testing import conformance_cases
+
+IS_LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+
+
+@pytest.fixture
+def cracks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The plugin with a kind of its own, installed."""
+    site = tmp_path / "site"
+    shutil.copytree(EXAMPLES / "orthoflow-cracks" / "orthoflow_cracks", site / "orthoflow_cracks")
+    info = site / "orthoflow_cracks-0.1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: orthoflow-cracks\nVersion: 0.1.0\n"
+    )
+    (info / "entry_points.txt").write_text(
+        f"[{ENTRY_POINT_GROUP}]\ncracks = orthoflow_cracks.hooks\n"
+    )
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def orthoflow(*arguments: str) -> str:
+    result = CliRunner().invoke(program, arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_a_kind_and_a_product_of_a_plugin_go_through_a_comparison_like_ours(cracks: Path) -> None:
+    shutil.copy(EXAMPLES / "orthoflow-cracks" / "compare.yaml", cracks)
+    orthoflow("run", "compare.yaml", "-o", "run", "--executor", "inline")
+    shown = json.loads(orthoflow("show", "run", "--json"))
+    assert {cell["address"]: cell["status"] for cell in shown["cells"]} == {
+        "wall": "ok",
+        "crack@crack=faint": "ok",
+        "crack@crack=plain": "ok",
+    }
+    published = cracks / "run" / "products" / "crack@crack=plain" / "cracks.geojson"
+    features = json.loads(published.read_text())["features"]
+    assert len(features) == 3
+    assert {feature["geometry"]["type"] for feature in features} == {"LineString"}
+    assert "crack.n_cracks" in (cracks / "run" / "report.html").read_text()
+    orthoflow("verify", "run")
+    orthoflow("run", "compare.yaml", "-o", "again", "--executor", "inline")
+    compared = json.loads(orthoflow("compare", "run", "again", "--json"))
+    assert "crack@crack=plain" in json.dumps(compared)
+
+
+def test_a_method_of_a_plugins_own_kind_keeps_the_rules(cracks: Path) -> None:
+    assert discover_catalog().kinds["crack"].state == "fine"
+    problems = [case.problem() for case in conformance_cases("simulate.cracked-wall")]
+    assert [problem for problem in problems if problem] == []
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not IS_LONG, reason="installs the examples from an index: .ci/run --long")
+@pytest.mark.parametrize("name", ["orthoflow-pyransac3d", "orthoflow-poselib", "orthoflow-cracks"])
+def test_an_example_installs_and_passes_its_tests(name: str, tmp_path: Path) -> None:
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    (packages,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
+    paths = [str(ROOT / part) for part in ("", "plugins", "provenance")]
+    paths += [path for path in sys.path if path.endswith("-packages")]
+    (packages / "shared.pth").write_text("\n".join(paths))
+    folder = tmp_path / name
+    shutil.copytree(EXAMPLES / name, folder)
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    for command in (["pip", "install", "-q", "."], ["pytest", "-q", "-p", "no:dash"]):
+        done = subprocess.run(
+            [python, "-m", *command],
+            cwd=folder,
+            env=variables,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
