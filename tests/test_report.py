@@ -169,6 +169,23 @@ def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
     assert table.groups == {}
 
 
+def test_two_runs_on_a_page_say_what_differs(compared: HeldRun, tmp_path: Path) -> None:
+    cells = [
+        replace(one, params={"cell_m": 0.02}, metrics=metrics(rms_mm=1.5, omega_deg=10.0))
+        if one.address == "plane@plane=fine"
+        else one
+        for one in compared.record.cells
+    ]
+    changed = replace(compared, record=replace(compared.record, run_id="r2", cells=tuple(cells)))
+    write_report([compared, changed], tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "What differs between r1 and r2" in page
+    assert re.search(r"cell_m</th><td>0\.01 \(set\)</td><td>0\.02 \(set\)</td>", page)
+    assert re.search(r"rms_mm</th><td>1 mm</td><td>1\.5 mm</td><td class=\"n\">0\.5</td>", page)
+    assert "Environment: the same." in page
+    assert page.count(">identical</td>") == 9
+
+
 def test_values_of_different_environments_carry_letters_and_are_ranked_apart() -> None:
     cells = [
         cell(f"plane@plane={name}", metrics=metrics(rms_mm=value), environment=place)

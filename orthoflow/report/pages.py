@@ -17,10 +17,11 @@ from markupsafe import Markup, escape
 
 from orthoflow import __version__
 from orthoflow.errors import StoreError
-from orthoflow.records import Run
+from orthoflow.records import Run, compare_runs
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table
 from orthoflow.report.diagrams import run_diagram
+from orthoflow.report.differences import differences
 from orthoflow.report.figures import FIGURES_FOLDER, FigureGroup, figure_groups, write_figures
 from orthoflow.report.numbers import number_with_unit
 from orthoflow.report.origins import environment_words
@@ -81,7 +82,7 @@ def write_report(runs: Sequence[Run], path: Path) -> None:
     """Write one self-contained HTML file about one or more runs.
 
     Args:
-        runs: opened with `orthoflow.open_run`.
+        runs: opened with `orthoflow.open_run`; of two, the page also says what differs.
         path: file to write; replaced as a whole, never half.
 
     Raises:
@@ -91,6 +92,7 @@ def write_report(runs: Sequence[Run], path: Path) -> None:
     text = _template().render(
         sections=[_section(run, f"r{index + 1}-", path.parent) for index, run in enumerate(runs)],
         comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
+        differences=differences(compare_runs(*runs)) if len(runs) == 2 else None,
         title=", ".join(dict.fromkeys(run.record.name for run in runs)),
         version=__version__,
     )

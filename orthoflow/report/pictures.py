@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -69,7 +70,7 @@ def data_uri(content: bytes, media_type: str) -> str:
 
 def side_px(n_pictures: int) -> int:
     """Longest side of each of so many pictures, in pixels: the page stays small enough to send."""
-    share = min(1.0, (_FULL_PICTURES / max(1, n_pictures)) ** 0.5)
+    share = min(1.0, math.sqrt(_FULL_PICTURES / max(1, n_pictures)))
     return max(SHORTEST_SIDE_PX, round(LONGEST_SIDE_PX * share))
 
 

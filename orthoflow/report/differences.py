@@ -1,0 +1,188 @@
+"""Two runs side by side, for the page: what differs, and how far products lie apart."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+from orthoflow.records import (
+    CellFacts,
+    MetricValue,
+    Pair,
+    ParameterValue,
+    ProductDistance,
+    RecordedFile,
+    RunComparison,
+)
+from orthoflow.report.numbers import number, number_with_unit
+
+Side = TypeVar("Side")
+_DIGEST_LETTERS: Final = 12
+_NOTHING: Final = "-"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """One thing that the two runs say differently."""
+
+    cell: str
+    name: str
+    left: str
+    right: str
+    change: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DifferenceTable:
+    """What differs of one kind.
+
+    Attributes:
+        title: what kind.
+        n_compared: how many things were compared.
+        rows: those that differ.
+    """
+
+    title: str
+    n_compared: int
+    rows: tuple[Difference, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProductRow:
+    """How far one product of the two runs lies apart."""
+
+    cell: str
+    name: str
+    verdict: str
+    words: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Differences:
+    """Everything the page says of two runs.
+
+    Attributes:
+        left: id of the first run.
+        right: id of the second.
+        workflow: unified diff of the workflow files; empty when equal.
+        tables: a table per kind of thing.
+        products: a row per product, those that differ first.
+    """
+
+    left: str
+    right: str
+    workflow: str
+    tables: tuple[DifferenceTable, ...]
+    products: tuple[ProductRow, ...]
+
+
+def differences(comparison: RunComparison) -> Differences:
+    """Put a comparison of two runs into tables of what differs."""
+    return Differences(
+        left=comparison.left.run_id,
+        right=comparison.right.run_id,
+        workflow="\n".join(comparison.workflow[2:]),
+        tables=(
+            _table("Inputs", comparison.inputs, _files_text),
+            _table("Options", [comparison.overrides], " ".join),
+            _table("Steps", comparison.cells, _facts_text),
+            _table("Parameters", comparison.parameters, _parameter_text),
+            _table("Environment", comparison.environment, str),
+            _metric_table(comparison.metrics),
+        ),
+        products=tuple(
+            sorted(
+                (_product_row(distance) for distance in comparison.products),
+                key=lambda row: row.verdict == "identical",
+            )
+        ),
+    )
+
+
+def _table(title: str, pairs: Sequence[Pair[Side]], text: Callable[[Side], str]) -> DifferenceTable:
+    return DifferenceTable(
+        title=title,
+        n_compared=len(pairs),
+        rows=tuple(
+            Difference(
+                cell=pair.cell,
+                name=pair.name,
+                left=_NOTHING if pair.left is None else text(pair.left),
+                right=_NOTHING if pair.right is None else text(pair.right),
+            )
+            for pair in pairs
+            if not pair.is_same
+        ),
+    )
+
+
+def _metric_table(pairs: Sequence[Pair[MetricValue]]) -> DifferenceTable:
+    """Metrics that differ; time and memory always do, and stand in the comparison table."""
+    measured = [pair for pair in pairs if not _either(pair).is_cost]
+    rows = []
+    for pair in measured:
+        left, right = pair.left, pair.right
+        if left is not None and right is not None and left.value == right.value:
+            continue
+        rows.append(
+            Difference(
+                cell=pair.cell,
+                name=pair.name,
+                left=_NOTHING if left is None else number_with_unit(left.value, left.unit),
+                right=_NOTHING if right is None else number_with_unit(right.value, right.unit),
+                change="" if left is None or right is None else number(right.value - left.value),
+            )
+        )
+    return DifferenceTable(
+        title="Metrics, time and memory left aside", n_compared=len(measured), rows=tuple(rows)
+    )
+
+
+def _either(pair: Pair[MetricValue]) -> MetricValue:
+    side = pair.left or pair.right
+    if side is None:
+        raise AssertionError("a pair stands for something that a run has")
+    return side
+
+
+def _product_row(distance: ProductDistance) -> ProductRow:
+    apart = [
+        f"{number(part.largest)} {part.unit} at most in {part.field}"
+        if part.largest is not None
+        else f"{part.field} cannot be subtracted"
+        for part in distance.distances
+    ]
+    return ProductRow(
+        cell=distance.cell,
+        name=f"{distance.port} ({distance.type_name})",
+        verdict=distance.verdict,
+        words="; ".join([*apart, distance.reason] if distance.reason else apart),
+    )
+
+
+def _files_text(files: Sequence[RecordedFile]) -> str:
+    named = [f"{file.name} {file.sha256[:_DIGEST_LETTERS]}" for file in files]
+    return ", ".join(named) or "not given"
+
+
+def _facts_text(facts: CellFacts) -> str:
+    code = [f"code of {name} {digest[:8]}" for name, digest in facts.code.items()]
+    tools = [f"{name} {version}" for name, version in facts.tools.items()]
+    seed = [] if facts.seed is None else [f"seed {facts.seed}"]
+    parts = [
+        facts.status,
+        f"{facts.method} result version {facts.result_version}",
+        facts.distribution,
+        *code,
+        *tools,
+        *seed,
+        facts.error,
+    ]
+    return ", ".join(part for part in parts if part)
+
+
+def _parameter_text(parameter: ParameterValue) -> str:
+    text = json.dumps(parameter.value, ensure_ascii=False)
+    return f"{text} (set)" if parameter.is_set else text
