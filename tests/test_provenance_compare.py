@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_provenance.compare import ArrayDifference, compare_payloads
+from orthoflow_provenance.compare import ArrayDifference, compare_payloads, measure_payloads
 from orthoflow_provenance.model import JsonValue
 
 from tests.provenance_records import Given, walls_payload
@@ -39,6 +39,19 @@ def test_a_difference_within_the_limit_is_none_and_beyond_it_is_measured() -> No
         n_values=1,
         problem="1 of 20 values differ by more than 0.0001 m, the largest by 0.25",
     )
+
+
+def test_differences_within_the_limits_are_measured_too() -> None:
+    depth, moved = np.zeros(3), np.array([0.0, 5e-5, -2e-5])
+    left = Given(arrays={"walls/0/depth_m": depth}, metadata={"rms_mm": 1.0, "gsd_m": 0.01})
+    right = Given(arrays={"walls/0/depth_m": moved}, metadata={"rms_mm": 1.0 + 1e-9, "gsd_m": 0.01})
+    found = measure_payloads(left, right, LIMITS)
+    assert [(item.name, item.unit, item.n_values) for item in found] == [
+        ("walls/0/depth_m", "m", 0),
+        ("rms_mm", "mm", 0),
+    ]
+    assert [item.largest for item in found] == pytest.approx([5e-5, 1e-9], rel=1e-6)
+    assert found[0].problem == "differs by 5e-05 m at most, 0.0001 are allowed"
 
 
 def test_fields_without_a_limit_must_be_equal() -> None:
@@ -135,6 +148,14 @@ def test_products_of_other_types_cannot_be_compared() -> None:
             [("walls/0/gsd_m", "0.01 against 0.02, 1e-06 m are allowed")],
         ),
         ({"a": 1}, {"a": 1.0}, []),
+        ({"a": 1}, {"a": 2}, [("a", "1 against 2, 0 are allowed")]),
+        ({"a": 1000.0}, {"a": 1000.0009}, []),
+        ({"a": 1e-8}, {"a": 9e-7}, []),
+        (
+            {"a_px": 1000.0},
+            {"a_px": 1000.002},
+            [("a_px", "1000 against 1000, 0.001 px are allowed")],
+        ),
         ({"a": 1}, {"a": True}, [("a", "1 against True")]),
         ({"a": "x"}, {"a": "y"}, [("a", "'x' against 'y'")]),
         ({"a": [1]}, {"a": [1, 2]}, [("a", "[1] against [1, 2]")]),

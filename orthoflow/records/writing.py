@@ -76,7 +76,7 @@ def write_run(
     publish_products(run_folder, record.cells, _published(outcome, store))
     unfinished = run_folder / _UNFINISHED
     with writing_to(run_folder):
-        for leftover in run_folder.glob(f".{RECORD_FILE}.*"):
+        for leftover in run_folder.glob(f".*{RECORD_FILE}.*"):
             leftover.unlink()
         _write_record(unfinished, record, store, embed=embed)
         if before_finish is not None:

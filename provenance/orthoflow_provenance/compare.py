@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,11 @@ from orthoflow_provenance.model import JsonValue, PayloadLike
 
 Tolerances: TypeAlias = Mapping[str, tuple[float, str]]
 
-_EXACT: tuple[float, str] = (0.0, "1")
+_EXACT: Final = 0.0
+# Of numbers in the metadata, which say something about a product and are not the product itself:
+# other versions of numerical libraries round their last digits in another way.
+_STATED_SHARE: Final = 1e-6
+_UNITS: Final = ("mm", "m", "px", "deg")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +71,9 @@ def measure_payloads(
         right: the other.
         tolerances: field -> (limit, unit). A field is the last part of a name that is not a
             number: `depth_m` for the array `walls/0/depth_m`, and the same for numbers in the
-            metadata. Fields not named must be equal. NaN equals NaN.
+            metadata. Fields not named must be equal, but for fractions in the metadata, which
+            may differ by a millionth of the larger one, or by a millionth where that is below 1.
+            NaN equals NaN.
 
     Returns:
         All differences, also those within the limits, by name; empty when the products are equal.
@@ -78,7 +84,7 @@ def measure_payloads(
             f"the products are {left.type_name} version {left.encoding_version} and "
             f"{right.type_name} version {right.encoding_version}"
         )
-        return (_unlike("type", _EXACT, problem),)
+        return (_unlike("type", (_EXACT, "1"), problem),)
     for name in sorted(left.arrays.keys() | right.arrays.keys()):
         tolerance = _tolerance(name, tolerances)
         if name not in left.arrays or name not in right.arrays:
@@ -109,10 +115,10 @@ def _array_differences(
         n_values += int(np.count_nonzero(distances > limit))
     if largest:
         problem = (
-            f"{n_values} of {left.size} values differ by more than {limit:g} {unit}, the "
+            f"{n_values} of {left.size} values differ by more than {_amount(limit, unit)}, the "
             f"largest by {largest:g}"
             if n_values
-            else f"differs by {largest:g} {unit} at most, {limit:g} are allowed"
+            else f"differs by {_amount(largest, unit)} at most, {limit:g} are allowed"
         )
         yield ArrayDifference(
             name=name,
@@ -154,7 +160,8 @@ def _json_differences(
         for index, (a, b) in enumerate(zip(left, right, strict=True)):
             yield from _json_differences(f"{name}/{index}", a, b, tolerances)
     elif _is_number(left) and _is_number(right):
-        yield from _number_differences(name, float(str(left)), float(str(right)), tolerance)
+        stated = _stated_tolerance(name, left, right, tolerances)
+        yield from _number_differences(name, float(str(left)), float(str(right)), stated)
     elif left != right or type(left) is not type(right):
         yield _unlike(name, tolerance, f"{left!r:.60} against {right!r:.60}")
 
@@ -171,7 +178,7 @@ def _number_differences(
             limit=limit,
             unit=unit,
             n_values=int(distance > limit),
-            problem=f"{left:g} against {right:g}, {limit:g} {unit} are allowed",
+            problem=f"{left:g} against {right:g}, {_amount(limit, unit)} are allowed",
         )
 
 
@@ -180,10 +187,34 @@ def _is_number(value: JsonValue) -> bool:
 
 
 def _tolerance(name: str, tolerances: Tolerances) -> tuple[float, str]:
-    for part in reversed(name.split("/")):
-        if not part.isdigit():
-            return tolerances.get(part, _EXACT)
-    return _EXACT
+    field = _field(name)
+    return tolerances.get(field, (_EXACT, _unit(field)))
+
+
+def _stated_tolerance(
+    name: str, left: JsonValue, right: JsonValue, tolerances: Tolerances
+) -> tuple[float, str]:
+    limit, unit = _tolerance(name, tolerances)
+    values = [value for value in (left, right) if isinstance(value, float)]
+    if _field(name) in tolerances or not values:
+        return limit, unit
+    return _STATED_SHARE * max(1.0, *(abs(value) for value in values)), unit
+
+
+def _field(name: str) -> str:
+    """The last part of a name that is not a number."""
+    parts = (part for part in reversed(name.split("/")) if not part.isdigit())
+    return next(parts, "")
+
+
+def _unit(field: str) -> str:
+    """The unit that the name of a field ends in, 1 when it ends in none."""
+    suffix = field.rpartition("_")[2]
+    return suffix if suffix in _UNITS else "1"
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{value:g}" if unit == "1" else f"{value:g} {unit}"
 
 
 def _unlike(name: str, tolerance: tuple[float, str], problem: str) -> ArrayDifference:
