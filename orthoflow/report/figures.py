@@ -36,10 +36,14 @@ class FigureGroup:
     pictures: tuple[Picture, ...]
 
 
-def figure_groups(run: Run) -> tuple[FigureGroup, ...]:
+def figure_groups(run: Run, *, share: float = 1.0) -> tuple[FigureGroup, ...]:
     """The figures of every cell, repeats of random methods left out; equal ones once.
 
     When they are too many for a page, the large ones are drawn smaller.
+
+    Args:
+        run: the run.
+        share: which part of a page's bytes they may take.
     """
     chosen: dict[tuple[str, str], RecordedFigure] = {}
     seen: set[bytes] = set()
@@ -48,7 +52,7 @@ def figure_groups(run: Run) -> tuple[FigureGroup, ...]:
             if figure.data not in seen:
                 seen.add(figure.data)
                 chosen[address, figure.name] = figure
-    fitted = dict(zip(chosen, _fitted(tuple(chosen.values())), strict=True))
+    fitted = dict(zip(chosen, _fitted(tuple(chosen.values()), share * _BYTES_MOST), strict=True))
     groups = []
     for address, cell in run.cells.items():
         pictures = tuple(
@@ -94,20 +98,20 @@ def _write_figure(stem: Path, figure: RecordedFigure) -> None:
     stem.with_name(stem.name + suffix).write_bytes(content)
 
 
-def _fitted(figures: tuple[RecordedFigure, ...]) -> Iterable[RecordedFigure]:
+def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[RecordedFigure]:
     """Figures as they are or, where all are too many bytes, drawn smaller."""
     n_bytes = sum(len(figure.data) for figure in figures)
-    if n_bytes <= _BYTES_MOST:
+    if n_bytes <= bytes_most:
         return figures
     fitted = figures
     # Bytes go about with the area: begin where it may be enough.
     sides = [
-        side for side in _SIDES_PX if (side / 1000) ** 2 <= 2 * _BYTES_MOST / n_bytes
+        side for side in _SIDES_PX if (side / 1000) ** 2 <= 2 * bytes_most / n_bytes
     ] or _SIDES_PX[-1:]
     for side_px in sides:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             fitted = tuple(pool.map(lambda figure, side=side_px: _smaller(figure, side), figures))
-        if sum(len(figure.data) for figure in fitted) <= _BYTES_MOST:
+        if sum(len(figure.data) for figure in fitted) <= bytes_most:
             break
     return fitted
 

@@ -15,7 +15,9 @@ from orthoflow.products import Camera, Cameras, Inspection, TieRole, Ties
 from orthoflow.records import Run
 from orthoflow.report.pictures import Picture, embedded_products
 
-_MARKS_MOST: Final = 600
+_MARKS_MOST: Final = 600  # in one drawing
+_MARKS_FEW: Final = 50
+_MARKS_IN_ALL: Final = 20_000  # on a page, about 130 bytes each
 # Drawn length of a vector of RMS length, as a share of the drawing's longer side.
 _RMS_SHARE: Final = 0.025
 _STEP_M: Final = 1e-3  # for derivatives; photos change by about a pixel over it
@@ -65,15 +67,17 @@ class Vectors:
     kinds: NDArray[np.str_]
 
 
-def overlays(run: Run, walls: Sequence[Picture]) -> Iterator[Overlay]:
+def overlays(run: Run, walls: Sequence[Picture], *, share: float = 1.0) -> Iterator[Overlay]:
     """Draw the ties of every orientation and the displacements of every inspection of a run.
 
     Args:
         run: the run.
         walls: pictures of its walls, which the drawings lie over.
+        share: which part of a page's bytes they may take.
     """
-    frames = _Frames.of(run, walls)
     places = embedded_products(run, "cameras")
+    n_places = len(places) + len(embedded_products(run, "inspection"))
+    frames = _Frames.of(run, walls, share=share / max(1, n_places))
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         cameras = Cameras.from_payload(payload)
         if cameras.ties is not None:
@@ -150,14 +154,16 @@ class _Frames:
         run: the run.
         known: digest of a walls product -> frames of its walls by their index.
         cells: digest of a walls product -> the cell whose pictures the page shows.
+        marks_most: in each drawing.
     """
 
     run: Run
     known: Mapping[str, Mapping[int, WallFrame]]
     cells: Mapping[str, str]
+    marks_most: int
 
     @staticmethod
-    def of(run: Run, pictures: Sequence[Picture]) -> _Frames:
+    def of(run: Run, pictures: Sequence[Picture], *, share: float) -> _Frames:
         """Take the frames from the pictures of walls."""
         known: dict[str, dict[int, WallFrame]] = {}
         cells: dict[str, str] = {}
@@ -168,7 +174,14 @@ class _Frames:
                 if product.type_name == "walls":
                     known.setdefault(product.digest, {})[picture.wall] = picture.frame
                     cells[product.digest] = picture.cell
-        return _Frames(run=run, known=known, cells=cells)
+        n_walls = max((len(frames) for frames in known.values()), default=1)
+        wanted = round(share * _MARKS_IN_ALL / n_walls)
+        return _Frames(
+            run=run,
+            known=known,
+            cells=cells,
+            marks_most=min(_MARKS_MOST, max(_MARKS_FEW, wanted)),
+        )
 
     def behind(self, address: str) -> tuple[str, Mapping[int, WallFrame]]:
         """Address and frames of the nearest walls that went into a cell."""
@@ -206,7 +219,8 @@ def _tie_overlays(address: str, cameras: Cameras, ties: Ties, frames: _Frames) -
                 lengths_m=lengths_m[here],
                 kinds=kinds[here],
             )
-            yield _overlay(address, walls_cell, wall, frame, vectors, what="ties of")
+            place = _Place(cell=address, walls_cell=walls_cell, wall=wall, frame=frame)
+            yield _overlay(place, vectors, what="ties of", marks_most=frames.marks_most)
 
 
 def _inspection_overlays(
@@ -225,31 +239,40 @@ def _inspection_overlays(
                 lengths_m=inspection.displacement_m[here],
                 kinds=np.full(len(here), "shown"),
             )
-            yield _overlay(
-                address, walls_cell, wall, frame, vectors, what="displacements in the orthoimage of"
-            )
+            place = _Place(cell=address, walls_cell=walls_cell, wall=wall, frame=frame)
+            what = "displacements in the orthoimage of"
+            yield _overlay(place, vectors, what=what, marks_most=frames.marks_most)
 
 
-def _overlay(
-    address: str, walls_cell: str, wall: int, frame: WallFrame, vectors: Vectors, *, what: str
-) -> Overlay:
+@dataclass(frozen=True, kw_only=True)
+class _Place:
+    """Where a drawing belongs."""
+
+    cell: str
+    walls_cell: str
+    wall: int
+    frame: WallFrame
+
+
+def _overlay(place: _Place, vectors: Vectors, *, what: str, marks_most: int) -> Overlay:
+    frame = place.frame
     judged = vectors.kinds != "rejected"
     magnification = magnification_for(frame, vectors.lengths_m[judged])
-    shown = _spread_evenly(vectors)
+    shown = _spread_evenly(vectors, marks_most)
     # Rejected ties may be metres off: a mark says that they are there, a vector would cross all.
     lengths_m = np.where((shown.kinds == "rejected")[:, None], 0.0, shown.lengths_m)
     shown = Vectors(pixels_wall=shown.pixels_wall, lengths_m=lengths_m, kinds=shown.kinds)
     caption = f"{_counts(vectors)}; vectors drawn {magnification:g} times as long" + (
         "" if len(shown.kinds) == len(vectors.kinds) else f", {len(shown.kinds)} of them shown"
     )
-    title = f"{what} wall {wall}, {address}"
+    title = f"{what} wall {place.wall}, {place.cell}"
     return Overlay(
         svg=draw_vectors(frame, shown, label=f"{title}: {caption}", magnification=magnification),
         title=title[0].upper() + title[1:],
         caption=caption,
-        cell=address,
-        walls_cell=walls_cell,
-        wall=wall,
+        cell=place.cell,
+        walls_cell=place.walls_cell,
+        wall=place.wall,
     )
 
 
@@ -263,11 +286,11 @@ def _counts(vectors: Vectors) -> str:
     return ", ".join(parts)
 
 
-def _spread_evenly(vectors: Vectors) -> Vectors:
+def _spread_evenly(vectors: Vectors, most: int) -> Vectors:
     n_vectors = len(vectors.kinds)
-    if n_vectors <= _MARKS_MOST:
+    if n_vectors <= most:
         return vectors
-    chosen = np.unique(np.linspace(0, n_vectors - 1, _MARKS_MOST).astype(np.int64))
+    chosen = np.unique(np.linspace(0, n_vectors - 1, most).astype(np.int64))
     return Vectors(
         pixels_wall=vectors.pixels_wall[chosen],
         lengths_m=vectors.lengths_m[chosen],

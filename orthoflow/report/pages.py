@@ -90,7 +90,10 @@ def write_report(runs: Sequence[Run], path: Path) -> None:
         RecordError: a record is damaged.
     """
     text = _template().render(
-        sections=[_section(run, f"r{index + 1}-", path.parent) for index, run in enumerate(runs)],
+        sections=[
+            _section(run, f"r{index + 1}-", path.parent, share=1 / len(runs))
+            for index, run in enumerate(runs)
+        ],
         comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
         differences=differences(compare_runs(*runs)) if len(runs) == 2 else None,
         title=", ".join(dict.fromkeys(run.record.name for run in runs)),
@@ -148,11 +151,15 @@ def _breakable(name: str) -> Markup:
     return Markup("_<wbr>").join(name.split("_"))
 
 
-def _section(run: Run, prefix: str, folder: Path) -> _Section:
+def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
     # The baseline's stand first: they are what the numbers beside them are of.
     baseline = {cell.address for cell in baseline_cells(run)}
-    orthoimages = sorted(orthoimage_pictures(run), key=lambda picture: picture.cell not in baseline)
-    walls = sorted(wall_pictures(run), key=lambda picture: picture.cell not in baseline)
+    orthoimages = sorted(
+        orthoimage_pictures(run, share=share), key=lambda picture: picture.cell not in baseline
+    )
+    walls = sorted(
+        wall_pictures(run, share=share), key=lambda picture: picture.cell not in baseline
+    )
     # Files are named from where the page will lie.
     from_page = Path(os.path.relpath(run.folder, folder))
     numbered = [
@@ -181,10 +188,10 @@ def _section(run: Run, prefix: str, folder: Path) -> _Section:
                 caption=overlay.caption,
                 ground=grounds.get((overlay.walls_cell, overlay.wall), ""),
             )
-            for overlay in overlays(run, walls)
+            for overlay in overlays(run, walls, share=share)
         ),
         planes=tuple(plane_tables(run)),
-        figures=figure_groups(run),
+        figures=figure_groups(run, share=share),
         # Built from escaped parts only, as the overlays are.
         diagram=Markup(run_diagram(run)),
         citations=citations(run),

@@ -68,26 +68,36 @@ def data_uri(content: bytes, media_type: str) -> str:
     return f"data:{media_type};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def side_px(n_pictures: int) -> int:
+def side_px(n_pictures: float) -> int:
     """Longest side of each of so many pictures, in pixels: the page stays small enough to send."""
     share = min(1.0, math.sqrt(_FULL_PICTURES / max(1, n_pictures)))
     return max(SHORTEST_SIDE_PX, round(LONGEST_SIDE_PX * share))
 
 
-def orthoimage_pictures(run: Run) -> Iterator[Picture]:
-    """Every orthoimage that the record holds; equal ones of several cells once."""
+def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
+    """Every orthoimage that the record holds; equal ones of several cells once.
+
+    Args:
+        run: the run.
+        share: which part of a page's bytes they may take.
+    """
     places = embedded_products(run, "orthoimages")
     # One product at a time: those of a large building fill the memory together.
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         product = Orthoimages.from_payload(payload)
         yield from _drawn(
             [_orthoimage(run, address, index, image) for index, image in enumerate(product.images)],
-            n_products=len(places),
+            n_products=len(places) / share,
         )
 
 
-def wall_pictures(run: Run) -> Iterator[Picture]:
-    """Intensity and depth of every wall raster that the record holds; equal ones once."""
+def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
+    """Intensity and depth of every wall raster that the record holds; equal ones once.
+
+    Args:
+        run: the run.
+        share: which part of a page's bytes they may take.
+    """
     places = embedded_products(run, "walls")
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         product = Walls.from_payload(payload)
@@ -97,7 +107,7 @@ def wall_pictures(run: Run) -> Iterator[Picture]:
                 source = product.intensity_source
                 drawings.append(_intensity(run, address, index, wall, wall.intensity, source))
             drawings.append(_depth(run, address, index, wall))
-        yield from _drawn(drawings, n_products=len(places))
+        yield from _drawn(drawings, n_products=len(places) / share)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +123,7 @@ class _Drawing:
     frame: WallFrame
 
 
-def _drawn(drawings: Sequence[_Drawing], *, n_products: int) -> Iterator[Picture]:
+def _drawn(drawings: Sequence[_Drawing], *, n_products: float) -> Iterator[Picture]:
     """Draw pictures side by side; encoding takes most of a report's time."""
     longest_side_px = side_px(n_products * len(drawings))
     with ThreadPoolExecutor(os.cpu_count()) as pool:
