@@ -9,8 +9,10 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.cli import program
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.products.planes import Planes
 from tests.laboratories import (
@@ -377,3 +379,22 @@ def test_two_bad_plugins_leave_every_other_workflow_alone(
     needy = with_steps("plane: {use: plane.ransac, in: {cloud: cloud.cloud}}")
     with pytest.raises(PluginError, match=r"plane.ransac is claimed by again 1.0 and laboratory"):
         load(needy, path, catalog)
+
+
+def test_the_traceback_of_a_broken_plugin_is_shown_on_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_distribution(
+        tmp_path, "broken", {"broken_hooks.py": "raise RuntimeError('no licence')"}
+    )
+    monkeypatch.syspath_prepend(folder)
+    shown = CliRunner().invoke(program, ["plugins", "show", "broken"])
+    assert shown.exit_code == 4
+    assert shown.output.startswith("plugin broken of broken 1.0 fails to load: RuntimeError: no")
+    assert "broken_hooks.py" in shown.output
+    assert "Traceback" in shown.output
+    listed = CliRunner().invoke(program, ["plugins", "list"])
+    assert listed.exit_code == 0
+    assert "plugin broken of broken 1.0 fails to load" in listed.output
+    assert "Traceback" not in listed.output
+    assert "plane     cloud" in listed.output

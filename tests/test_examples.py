@@ -17,6 +17,7 @@ from orthoflow.catalog import discover_catalog
 from orthoflow.cli import program
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
+from orthoflow.workflow.schema import workflow_schema
 
 IS_LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
 ROOT = Path(__file__).resolve().parents[1]
@@ -65,6 +66,14 @@ def test_a_kind_and_a_product_of_a_plugin_go_through_a_comparison_like_ours(crac
     orthoflow("run", "compare.yaml", "-o", "again", "--executor", "inline")
     compared = json.loads(orthoflow("compare", "run", "again", "--json"))
     assert "crack@crack=plain" in json.dumps(compared)
+
+
+@pytest.mark.usefixtures("cracks")
+def test_the_schema_has_a_plugins_parameters() -> None:
+    schema = workflow_schema(discover_catalog())
+    params = schema["$defs"]["params.crack.dark-lines"]["properties"]
+    assert params["width_max_m"]["description"] == "Wider dark strips are no cracks."
+    assert params["width_max_m"]["default"] == 0.02
 
 
 def test_a_method_of_a_plugins_own_kind_keeps_the_rules(cracks: Path) -> None:

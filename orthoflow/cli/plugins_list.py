@@ -13,7 +13,10 @@ from orthoflow.cli.tables import echo_json, echo_table
 @click.command("list", cls=Command)
 @json_option
 def plugins_list(*, as_json: bool) -> int:
-    """List every method, and what is wrong with plugins that do not load."""
+    """List every method and kind, and what is wrong with plugins that do not load.
+
+    `orthoflow plugins show PLUGIN` prints the traceback of one that is broken.
+    """
     catalog = discover_catalog()
     if as_json:
         echo_json(_as_json(catalog))
@@ -30,7 +33,23 @@ def plugins_list(*, as_json: bool) -> int:
             for entry in catalog.methods.values()
         ],
     )
+    click.echo()
+    echo_table(
+        ("kind", "takes", "gives", "distribution", "summary"),
+        [
+            (
+                name,
+                "its methods' own" if kind.spec.is_source else ", ".join(kind.spec.inputs),
+                "its methods' own" if kind.spec.is_source else ", ".join(kind.spec.outputs),
+                str(kind.distribution),
+                kind.spec.summary,
+            )
+            for name, kind in catalog.kinds.items()
+        ],
+    )
     problems = [
+        *(kind.problem for kind in catalog.kinds.values() if kind.problem),
+        *(product.problem for product in catalog.products.values() if product.problem),
         *(entry.problem for entry in catalog.methods.values() if entry.problem),
         *(str(broken) for broken in catalog.broken),
     ]
@@ -54,6 +73,20 @@ def _as_json(catalog: Catalog) -> dict[str, object]:
                 "summary": entry.spec.summary,
             }
             for entry in catalog.methods.values()
+        ],
+        "kinds": [
+            {
+                "name": name,
+                "state": kind.state,
+                "problem": kind.problem,
+                "distribution": kind.distribution.name,
+                "version": kind.distribution.version,
+                "in": dict(kind.spec.inputs),
+                "out": dict(kind.spec.outputs),
+                "is_source": kind.spec.is_source,
+                "summary": kind.spec.summary,
+            }
+            for name, kind in catalog.kinds.items()
         ],
         "broken": [
             {

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from orthoflow.catalog import MethodEntry, discover_catalog
-from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.catalog import BrokenPlugin, MethodEntry, discover_catalog
+from orthoflow.cli.failures import EXIT_GOOD, EXIT_PLUGIN_MISSING
 from orthoflow.cli.options import Command, json_option
 from orthoflow.cli.tables import echo_json, echo_table
 
@@ -23,6 +23,9 @@ _UNITS = {
     "_rad": "rad",
     "_s": "s",
     "_mib": "MiB",
+    "_grey": "grey levels",
+    "_cells": "cells",
+    "_share": "1",
 }
 
 
@@ -32,9 +35,15 @@ _UNITS = {
 def plugins_show(method_id: str, *, as_json: bool) -> int:
     """Show the method ID, e.g. plane.hough2d: parameters, ports, origin and citations.
 
-    Ends with 2 when there is no such method, with 4 when its plugin does not load.
+    Of a plugin that does not load, ID may be its name; its traceback is shown. Ends with 2 when
+    there is no such method, with 4 when its plugin does not load.
     """
-    entry = discover_catalog().method(method_id)
+    catalog = discover_catalog()
+    for broken in catalog.broken:
+        if method_id in (broken.entry_point, broken.distribution.name):
+            _print_broken(broken, as_json=as_json)
+            return EXIT_PLUGIN_MISSING
+    entry = catalog.method(method_id)
     description = describe_method(entry)
     if as_json:
         echo_json(description)
@@ -71,6 +80,17 @@ def describe_method(entry: MethodEntry) -> dict[str, object]:
         ],
         "out": [{"port": port, "product": type_name} for port, type_name, _ in _ports(method.Out)],
     }
+
+
+def _print_broken(broken: BrokenPlugin, *, as_json: bool) -> None:
+    if as_json:
+        echo_json({"state": "broken", "problem": str(broken), "traceback": broken.traceback})
+        return
+    click.echo(f"{broken}\n")
+    click.echo(f"distribution  {broken.distribution}")
+    click.echo("state         broken")
+    click.echo(f"module        {broken.module}\n")
+    click.echo(broken.traceback.rstrip())
 
 
 def _print(entry: MethodEntry, method: type[Method]) -> None:
