@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
@@ -14,7 +14,7 @@ from orthoflow.files.images import encode_jpeg
 from orthoflow.products import InputFiles, Product
 from orthoflow.testing import ConformanceCase, conformance_cases
 from orthoflow.testing.examples import example
-from tests import photo_files
+from tests import inspect_scenes, ortho_scenes, photo_files
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
 QUICK: dict[str, dict[str, object]] = {
@@ -31,7 +31,11 @@ EXPECTED_FAILURES: dict[str, dict[str, str]] = {
 }
 
 # What a source reads where the suite's own example, a scan, does not fit.
-FILES: dict[str, str] = {"read.photos": "photo.jpg", "read.checkpoints": "points.csv"}
+FILES: dict[str, str] = {
+    "read.photos": "photo.jpg",
+    "read.checkpoints": "points.csv",
+    "read.orthoimage": "wall.tif",
+}
 
 
 def inputs(method_id: str) -> Mapping[str, Product | InputFiles]:
@@ -40,6 +44,8 @@ def inputs(method_id: str) -> Mapping[str, Product | InputFiles]:
     if method_id == "inspect.truth":
         # None of them alone is required: it judges orthoimages, or planes where there are none.
         return {name: example(name) for name in ("orthoimages", "walls", "planes", "labels")}
+    if method_id in SCENES:
+        return SCENES[method_id]()
     return {}
 
 
@@ -47,10 +53,30 @@ def example_files(name: str) -> InputFiles:
     contents = {
         "photo.jpg": encode_jpeg(photo_files.picture()),
         "points.csv": b"name,x,y,z\nA,1,2,3\nB,4,5,6\n",
+        "wall.tif": inspect_scenes.orthoimage_file(),
     }
     folder = Path(mkdtemp(prefix="orthoflow-conformance-"))
     paths = photo_files.write(folder, {name: contents[name]})
     return InputFiles(name="files", paths=paths)
+
+
+def coloured_wall() -> Mapping[str, Product | InputFiles]:
+    """A wall and a board before it as bare points, and a photo of them."""
+    where = ortho_scenes.frame()
+    return {
+        "cloud": ortho_scenes.cloud(where, spacing_cells=2.0),
+        "photos": ortho_scenes.photos(ortho_scenes.rendered()),
+        "cameras": ortho_scenes.cameras(ortho_scenes.camera(where)),
+    }
+
+
+# What looks at scenes of its own, known exactly.
+SCENES: dict[str, Callable[[], Mapping[str, Product | InputFiles]]] = {
+    "inspect.surf": inspect_scenes.surf_inputs,
+    "inspect.checkpoints": inspect_scenes.checkpoint_inputs,
+    "register.similarity": inspect_scenes.register_inputs,
+    "colour.photos": coloured_wall,
+}
 
 
 def cases() -> list[ConformanceCase]:

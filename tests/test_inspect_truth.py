@@ -250,10 +250,11 @@ def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, trut
         )
     with pytest.raises(MethodError, match="is of wall 4, but there are 1 walls"):
         inspect(tmp_path, truth, replace(ortho, wall=4), wall)
-    small = replace(image.frame, width=2, height=2)
-    part = {name: getattr(wall, name)[:2, :2] for name in ("depth_m", "sigma_m", "count", "mask")}
-    with pytest.raises(MethodError, match=r"but its wall has \(2, 2\)"):
-        inspect(tmp_path, truth, ortho, replace(wall, frame=small, **part))
+    aside = replace(
+        image.frame, origin_world=image.frame.origin_world - 0.5 * image.frame.normal_world
+    )
+    with pytest.raises(MethodError, match=r"lies 0\.500 m before wall 0 and 0\.00 deg askew"):
+        inspect(tmp_path, truth, ortho, replace(wall, frame=aside))
     empty = InspectTruth.In(
         orthoimages=Orthoimages(images=()),
         walls=Walls(

@@ -145,6 +145,9 @@ def test_shares_of_all_states_are_reported(tmp_path: Path) -> None:
     assert metrics.pop("n_sources") == 2
     assert metrics.pop("n_overlap_patches") == 0
     assert 0.0 < metrics.pop("seam_share") < 1.0
+    # Colours of chance: their differences have a standard deviation of 70 grey levels.
+    assert 20.0 < metrics.pop("seam_step_rms_grey") < 150.0
+    assert metrics.pop("seam_step_mean_delta_e") > 10.0
     expected = {f"{state.name.lower()}_share": share(image.mask, state) for state in OrthoMask}
     assert metrics == pytest.approx(expected)
 

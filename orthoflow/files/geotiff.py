@@ -12,12 +12,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError, StoreError
+
+if TYPE_CHECKING:
+    from rasterio.transform import Affine
 
 LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["plane of the wall, metres",UNIT["metre",1.0],AXIS["X",EAST],AXIS["Y",NORTH]]'
@@ -33,6 +36,7 @@ class RasterFile:
         values: (rows, cols) for one band, (rows, cols, bands) for more; stored type.
         shown: (rows, cols) True where the dataset mask says that there is something.
         gsd_m: side of a cell in metres.
+        corner_m: X and Y of the outer corner of the top-left cell.
         tags: the dataset's tags.
         crs_wkt: coordinate system, as GDAL gives it.
         nodata: the value that means nothing, or None.
@@ -43,6 +47,7 @@ class RasterFile:
     values: NDArray[np.generic]
     shown: NDArray[np.bool_]
     gsd_m: float
+    corner_m: tuple[float, float] = (0.0, 0.0)
     tags: dict[str, str] = field(default_factory=dict)
     crs_wkt: str = ""
     nodata: float | None = None
@@ -129,7 +134,8 @@ def read_raster(path: Path) -> RasterFile:
     """Read a GeoTIFF that orthoflow or another program wrote.
 
     Raises:
-        InputError: the file is no GeoTIFF that GDAL can read.
+        InputError: the file is no GeoTIFF that GDAL can read, or its cells are not square and
+            upright.
     """
     import rasterio
     from rasterio.errors import RasterioError
@@ -140,7 +146,8 @@ def read_raster(path: Path) -> RasterFile:
             return RasterFile(
                 values=values[0] if len(values) == 1 else np.moveaxis(values, 0, 2),
                 shown=dataset.dataset_mask() > 0,
-                gsd_m=float(dataset.transform.a),
+                gsd_m=_gsd_m(path, dataset.transform),
+                corner_m=(float(dataset.transform.c), float(dataset.transform.f)),
                 tags=dict(dataset.tags()),
                 crs_wkt=dataset.crs.to_wkt() if dataset.crs else "",
                 nodata=dataset.nodata,
@@ -151,6 +158,23 @@ def read_raster(path: Path) -> RasterFile:
         raise InputError(
             f"{path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
         ) from error
+
+
+def _gsd_m(path: Path, transform: Affine) -> float:
+    """Side of square cells whose X grows to the right and whose Y grows upwards."""
+    side = float(transform.a)
+    limit = 1e-6 * abs(side)
+    if (
+        not side > 0.0
+        or max(abs(transform.b), abs(transform.d)) > limit
+        or (abs(transform.e + side) > limit)
+    ):
+        raise InputError(
+            f"{path.name} has cells that are not square and upright (geotransform "
+            f"{transform.to_gdal()}): export it again as metres in the plane of the wall, X to "
+            "the right, Y upwards"
+        )
+    return side
 
 
 def _placed(shape: tuple[int, ...], gsd_m: float) -> dict[str, object]:

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import StoreError
+from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.geometry import WallFrame
 from orthoflow.products import JsonValue, OrthoMask, SurfaceMask
 
@@ -48,6 +48,50 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
             "geotiff": "X = gsd_m * column, Y = -gsd_m * row, pixel is area",
         },
     }
+
+
+def frame_of_raster(
+    content: Mapping[str, object],
+    *,
+    corner_m: tuple[float, float],
+    gsd_m: float,
+    shape: tuple[int, int],
+    name: str,
+) -> WallFrame:
+    """Place a GeoTIFF in the world whose X and Y are metres in the plane of a wall.
+
+    Args:
+        content: `origin_world`, `u_world`, `v_world` (down), `normal_world` of that plane, as in
+            the sidecars that orthoflow writes; X counts along u, Y against v.
+        corner_m: X and Y of the outer corner of its top-left cell.
+        gsd_m: side of its cells.
+        shape: its rows and columns.
+        name: what to call it in an error.
+
+    Raises:
+        InputError: a vector is missing, or they are no frame.
+    """
+    vectors = {}
+    for key in ("origin_world", "u_world", "v_world", "normal_world"):
+        try:
+            vectors[key] = np.array(content.get(key), dtype=np.float64)
+        except (TypeError, ValueError):
+            vectors[key] = np.zeros(0)
+        if vectors[key].shape != (3,) or not np.isfinite(vectors[key]).all():
+            raise InputError(f"{name}: {key} must be three numbers, got {content.get(key)!r}")
+    u, v = vectors["u_world"], vectors["v_world"]
+    try:
+        return WallFrame(
+            origin_world=vectors["origin_world"] + corner_m[0] * u - corner_m[1] * v,
+            u_world=u,
+            v_world=v,
+            normal_world=vectors["normal_world"],
+            gsd_m=gsd_m,
+            width=shape[1],
+            height=shape[0],
+        )
+    except GeometryError as error:
+        raise InputError(f"{name}: {error}") from error
 
 
 def raster_tags(

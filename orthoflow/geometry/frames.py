@@ -65,6 +65,13 @@ class WallFrame:
             normal=self.normal_world, offset_m=float(self.normal_world @ self.origin_world)
         )
 
+    def has_cells_of(self, other: WallFrame) -> bool:
+        """Whether both have the same cells, to a thousandth of one at the corners."""
+        if self.shape != other.shape:
+            return False
+        apart = np.abs(self.corners_world() - other.corners_world()).max()
+        return bool(apart <= 1e-3 * self.gsd_m)
+
     def world_from_wall(
         self, pixels_wall: NDArray[np.float64], depths_m: NDArray[np.float64] | float = 0.0
     ) -> NDArray[np.float64]:

@@ -12,6 +12,12 @@ def orthoflow_kinds() -> list[KindSpec]:
         KindSpec(name="read", summary="files -> products", is_source=True),
         KindSpec(name="simulate", summary="scenes with exact truth", is_source=True),
         KindSpec(
+            name="register",
+            summary="bring a cloud into another coordinate system",
+            inputs={"cloud": "cloud", "points": "checkpoints", "control": "checkpoints"},
+            outputs={"cloud": "cloud", "inspection": "inspection"},
+        ),
+        KindSpec(
             name="plane",
             summary="find the planes of walls, floors and ceilings",
             inputs={"cloud": "cloud"},
@@ -36,6 +42,12 @@ def orthoflow_kinds() -> list[KindSpec]:
             outputs={"cameras": "cameras"},
         ),
         KindSpec(
+            name="colour",
+            summary="colour a cloud",
+            inputs={"cloud": "cloud", "photos": "photos", "cameras": "cameras"},
+            outputs={"cloud": "cloud"},
+        ),
+        KindSpec(
             name="ortho",
             summary="lay photos or the coloured cloud onto the walls",
             inputs={"walls": "walls", "cloud": "cloud", "photos": "photos", "cameras": "cameras"},
@@ -44,7 +56,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         KindSpec(
             name="mosaic",
             summary="join the layers of each wall",
-            inputs={"layers": "layers"},
+            inputs={"layers": "layers", "walls": "walls"},
             outputs={"orthoimages": "orthoimages"},
         ),
         KindSpec(
@@ -163,9 +175,19 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="surveyed points from CSV files",
         ),
         MethodSpec(
+            id="read.orthoimage",
+            target="orthoflow_plugins.read.orthoimage:ReadOrthoimage",
+            summary="GeoTIFF orthoimages of other programs, with the frame of their wall",
+        ),
+        MethodSpec(
             id="simulate.room",
             target="orthoflow_plugins.simulate.room:SimulateRoom",
             summary="a scanned and photographed room with relief and obstacle, and its truth",
+        ),
+        MethodSpec(
+            id="register.similarity",
+            target="orthoflow_plugins.register.similarity:RegisterSimilarity",
+            summary="shift, rotation and scale from pairs of points, with sigma0 and residuals",
         ),
         MethodSpec(
             id="plane.hough2d",
@@ -233,6 +255,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="all photos at once, tied to the walls and to each other, lenses refined",
         ),
         MethodSpec(
+            id="colour.photos",
+            target="orthoflow_plugins.colour.photos:ColourPhotos",
+            summary="each point takes the colour of the photo that shows it best",
+        ),
+        MethodSpec(
             id="ortho.pointcloud-direct",
             target="orthoflow_plugins.ortho.pointcloud_direct:PointcloudDirect",
             summary="the topmost point colours its cell",
@@ -251,5 +278,15 @@ def orthoflow_methods() -> list[MethodSpec]:
             id="inspect.truth",
             target="orthoflow_plugins.inspect.truth:InspectTruth",
             summary="compare orthoimages, walls and planes with a simulated scene",
+        ),
+        MethodSpec(
+            id="inspect.surf",
+            target="orthoflow_plugins.inspect.surf:InspectSurf",
+            summary="compare orthoimages with the laser's intensity, by SURF key points",
+        ),
+        MethodSpec(
+            id="inspect.checkpoints",
+            target="orthoflow_plugins.inspect.checkpoints:InspectCheckpoints",
+            summary="compare orthoimages with surveyed points: residuals, outliers, classes",
         ),
     ]

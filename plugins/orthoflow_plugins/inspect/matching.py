@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, fields
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-_PATCH: Final = 32
+PATCH_CELLS: Final = 32
 _SMOOTH_CELLS: Final = 1.0
 _LEAST_SHARE: Final = 0.3
 _LEAST_REGION: Final = 0.8
 _LEAST_WEIGHT: Final = 0.25
 _ROUNDS: Final = 12
+_AT_ONCE: Final = 2048
+# What least squares move so far was found at the wrong place.
+_STRAYED_CELLS: Final = 2.0
 _CONVERGED_CELLS: Final = 0.002
 # Smoothing makes neighbouring cells alike; so many cells count as one when precision is judged.
 _CELLS_PER_SAMPLE: Final = 4.0 * np.pi * _SMOOTH_CELLS**2
@@ -43,11 +47,26 @@ class PatchShifts:
         centre: (p, 2) float64 (column, row) of the patch's centre.
         shift: (p, 2) float64 cells along u and v, shown - true.
         sigma: (p, 2) float64 cells, standard deviations.
+        found: (p, 2) float64 cells, the displacement before it was refined.
+        correlation: (p,) float64 -1..1 of the two patches, NaN before they are refined.
     """
 
     centre: NDArray[np.float64]
     shift: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    found: NDArray[np.float64]
+    correlation: NDArray[np.float64]
+
+
+def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchShifts:
+    """Give patches at (p, 2) whose displacements (p, 2) are known roughly."""
+    return PatchShifts(
+        centre=centre,
+        shift=shift,
+        sigma=np.ones(shift.shape),
+        found=shift,
+        correlation=np.full(len(shift), np.nan),
+    )
 
 
 class _Patches(NamedTuple):
@@ -75,7 +94,49 @@ def measure_shifts(shown: GreyImage, true: GreyImage, *, reach_cells: int) -> Pa
     start = _whole_cell_shifts(first, second, reach_cells)
     if len(start.centre) == 0:
         return start
-    return _refined(first, second, start)
+    return _refined(first, second, start, _SIGMA_LIMIT_CELLS, math.inf)
+
+
+def refine_shifts(
+    shown: GreyImage,
+    true: GreyImage,
+    start: PatchShifts,
+    *,
+    sigma_most_cells: float,
+    focus_cells: float = math.inf,
+) -> PatchShifts:
+    """Refine displacements that are known to a cell or two, patch by patch.
+
+    Args:
+        shown: the image to judge, of about the contrast of the other.
+        true: the image it should be.
+        start: where patches of 32 x 32 cells lie, wholly inside the image, and how far they are
+            displaced at first.
+        sigma_most_cells: patches told less exactly are left out.
+        focus_cells: cells count by a Gaussian of this width about the patch's middle.
+
+    Returns:
+        The patches that converge within two cells of the start.
+    """
+    first, second = _smoothed(shown), _smoothed(true)
+    parts = [
+        _refined(
+            first,
+            second,
+            unrefined(start.centre[k : k + _AT_ONCE], start.shift[k : k + _AT_ONCE]),
+            sigma_most_cells,
+            focus_cells,
+        )
+        for k in range(0, len(start.centre), _AT_ONCE)
+    ]
+    if not parts:
+        return start
+    return PatchShifts(
+        **{
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(PatchShifts)
+        }
+    )
 
 
 def _smoothed(image: GreyImage) -> GreyImage:
@@ -102,7 +163,7 @@ def _gauss(values: NDArray[np.float64] | NDArray[np.bool_]) -> NDArray[np.float6
 
 def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchShifts:
     """Find each patch to a whole cell, among those that have enough valid cells."""
-    row, column = np.nonzero(_patch_counts(shown.valid) >= _LEAST_SHARE * _PATCH**2)
+    row, column = np.nonzero(_patch_counts(shown.valid) >= _LEAST_SHARE * PATCH_CELLS**2)
     grey = _windows(shown.grey, row, column, 0)
     valid = _windows(shown.valid, row, column, 0)
     # What comes in from beyond the border is not valid.
@@ -113,30 +174,29 @@ def _whole_cell_shifts(shown: GreyImage, true: GreyImage, reach: int) -> PatchSh
         for right in range(-reach, reach + 1):
             part = (
                 slice(None),
-                slice(reach - down, reach - down + _PATCH),
-                slice(reach - right, reach - right + _PATCH),
+                slice(reach - down, reach - down + PATCH_CELLS),
+                slice(reach - right, reach - right + PATCH_CELLS),
             )
             both = valid & true_valid[part]
             counts = np.count_nonzero(both, axis=(1, 2))
             squares = np.einsum("pij,pij->p", both, (grey - true_grey[part]) ** 2)
             mean = np.where(
-                counts >= _LEAST_SHARE * _PATCH**2, squares / np.maximum(counts, 1), np.inf
+                counts >= _LEAST_SHARE * PATCH_CELLS**2, squares / np.maximum(counts, 1), np.inf
             )
             better = mean < best
             best[better] = mean[better]
             shift[better] = (right, down)
     found = np.isfinite(best)
-    return PatchShifts(
-        centre=np.column_stack([column + 0.5, row + 0.5])[found] * _PATCH,
-        shift=shift[found],
-        sigma=np.ones((np.count_nonzero(found), 2)),
-    )
+    centre = np.column_stack([column + 0.5, row + 0.5])[found] * PATCH_CELLS
+    return unrefined(centre, shift[found])
 
 
 def _patch_counts(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    n_rows, n_columns = (size // _PATCH for size in mask.shape)
-    tiles = mask[: n_rows * _PATCH, : n_columns * _PATCH]
-    counts: NDArray[np.int64] = tiles.reshape(n_rows, _PATCH, n_columns, _PATCH).sum(axis=(1, 3))
+    n_rows, n_columns = (size // PATCH_CELLS for size in mask.shape)
+    tiles = mask[: n_rows * PATCH_CELLS, : n_columns * PATCH_CELLS]
+    counts: NDArray[np.int64] = tiles.reshape(n_rows, PATCH_CELLS, n_columns, PATCH_CELLS).sum(
+        axis=(1, 3)
+    )
     return counts
 
 
@@ -147,75 +207,151 @@ def _windows(
     values: NDArray[_Value], row: NDArray[np.int64], column: NDArray[np.int64], rim: int
 ) -> NDArray[_Value]:
     """Patches (p, n, n) with a rim round each; `values` has the rim round it."""
-    side = _PATCH + 2 * rim
+    side = PATCH_CELLS + 2 * rim
     cells = np.arange(side)
-    rows = row[:, None, None] * _PATCH + cells[:, None]
-    columns = column[:, None, None] * _PATCH + cells
+    rows = row[:, None, None] * PATCH_CELLS + cells[:, None]
+    columns = column[:, None, None] * PATCH_CELLS + cells
     windows: NDArray[_Value] = values[rows, columns]
     return windows
 
 
-def _cut_patches(shown: GreyImage, centre: NDArray[np.float64]) -> _Patches:
-    row, column = np.mgrid[0:_PATCH, 0:_PATCH].reshape(2, -1)
-    rows = (centre[:, 1:2] - _PATCH / 2).astype(np.int64) + row
-    columns = (centre[:, :1] - _PATCH / 2).astype(np.int64) + column
+def _cut_patches(
+    shown: GreyImage, centre: NDArray[np.float64], focus_cells: float = math.inf
+) -> _Patches:
+    row, column = np.mgrid[0:PATCH_CELLS, 0:PATCH_CELLS].reshape(2, -1)
+    rows = (centre[:, 1:2] - PATCH_CELLS / 2).astype(np.int64) + row
+    columns = (centre[:, :1] - PATCH_CELLS / 2).astype(np.int64) + column
+    aside = (row - 0.5 * (PATCH_CELLS - 1)) ** 2 + (column - 0.5 * (PATCH_CELLS - 1)) ** 2
     return _Patches(
         rows=rows.astype(np.float64),
         columns=columns.astype(np.float64),
         grey=shown.grey[rows, columns],
-        weight=shown.valid[rows, columns].astype(np.float64),
+        weight=shown.valid[rows, columns].astype(np.float64)
+        * np.exp(-0.5 * aside / focus_cells**2),
     )
 
 
-def _refined(shown: GreyImage, true: GreyImage, start: PatchShifts) -> PatchShifts:
-    patches = _cut_patches(shown, start.centre)
+def _refined(
+    shown: GreyImage,
+    true: GreyImage,
+    start: PatchShifts,
+    sigma_most_cells: float,
+    focus_cells: float,
+) -> PatchShifts:
+    patches = _cut_patches(shown, start.centre, focus_cells)
     sampler = _Sampler(true)
     shift, step = start.shift.copy(), np.full(start.shift.shape, np.inf)
     sigma = np.full(start.shift.shape, np.inf)
+    correlation = np.zeros(len(shift))
     for _ in range(_ROUNDS):
-        active = np.flatnonzero(np.abs(step).max(axis=1) > _CONVERGED_CELLS)
+        strayed = np.abs(shift - start.shift).max(axis=1) >= _STRAYED_CELLS
+        active = np.flatnonzero((np.abs(step).max(axis=1) > _CONVERGED_CELLS) & ~strayed)
         if active.size == 0:
             break
         part = _Patches(*(array[active] for array in patches))
         expected, design, inside = sampler.at(part, shift[active])
-        step[active], sigma[active] = _normal_step(
-            design, part.grey - expected, part.weight * inside
-        )
+        weight = part.weight * inside
+        step[active], sigma[active] = _normal_step(design, part.grey - expected, weight)
+        correlation[active] = _correlations(part.grey, expected, weight)
         # Half a cell at most: the linear model holds no further.
         shift[active] += np.clip(step[active], -0.5, 0.5)
     good = (
         (np.abs(step).max(axis=1) < 5.0 * _CONVERGED_CELLS)
-        & (sigma.max(axis=1) < _SIGMA_LIMIT_CELLS)
-        & (np.abs(shift - start.shift).max(axis=1) < 2.0)
+        & (sigma.max(axis=1) < sigma_most_cells)
+        & (np.abs(shift - start.shift).max(axis=1) < _STRAYED_CELLS)
     )
-    return PatchShifts(centre=start.centre[good], shift=shift[good], sigma=sigma[good])
+    return PatchShifts(
+        centre=start.centre[good],
+        shift=shift[good],
+        sigma=sigma[good],
+        found=start.shift[good],
+        correlation=correlation[good],
+    )
+
+
+def _correlations(
+    first: NDArray[np.float64], second: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Correlation coefficients (p,) of patches (p, n) by their weights."""
+    total = np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
+    one = first - (weight * first).sum(axis=1, keepdims=True) / total
+    other = second - (weight * second).sum(axis=1, keepdims=True) / total
+    spread = (weight * one**2).sum(axis=1) * (weight * other**2).sum(axis=1)
+    found: NDArray[np.float64] = (weight * one * other).sum(axis=1) / np.sqrt(spread + 1e-12)
+    return found
 
 
 class _Sampler:
-    """The true image between its cells: grey by cubic splines, slopes and validity linearly."""
+    """The true image between its cells, by cubic B-splines (Unser 1999); validity by all cells.
+
+    All cells of a patch lie at one fraction of a cell, so that four weights per axis do.
+    """
 
     def __init__(self, true: GreyImage) -> None:
         from scipy.ndimage import spline_filter
 
-        self._spline = spline_filter(true.grey, order=3)
-        self._slope_v: NDArray[np.float64] = np.gradient(true.grey, axis=0)
-        self._slope_u: NDArray[np.float64] = np.gradient(true.grey, axis=1)
-        self._valid = true.valid.astype(np.float64)
+        self._spline: NDArray[np.float64] = spline_filter(true.grey, order=3)
+        self._valid = true.valid
 
     def at(
         self, patches: _Patches, shift: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
         """Expected grey (p, n), its derivatives (p, n, 3), and where the truth is valid (p, n)."""
-        from scipy.ndimage import map_coordinates
-
-        at = [patches.rows - shift[:, 1:2], patches.columns - shift[:, :1]]
-        expected = map_coordinates(self._spline, at, order=3, prefilter=False, mode="nearest")
-        slope_u = map_coordinates(self._slope_u, at, order=1, mode="nearest")
-        slope_v = map_coordinates(self._slope_v, at, order=1, mode="nearest")
-        valid = map_coordinates(self._valid, at, order=1, mode="constant", cval=0.0)
+        first = np.column_stack([patches.rows[:, 0], patches.columns[:, 0]]) - shift[:, ::-1]
+        whole = np.floor(first)
+        part = first - whole
+        window, valid = self._windows(whole.astype(np.int64))
+        down, right = _spline_weights(part[:, 0]), _spline_weights(part[:, 1])
+        rows, row_slopes = (_filtered(window, weights, 1) for weights in down)
+        expected, slope_u = (_filtered(rows, weights, 2) for weights in right)
+        slope_v = _filtered(row_slopes, right[0], 2)
+        flat = (len(shift), -1)
         # The derivative of true(x - shift) by the shift is minus the slope.
-        design = np.stack([-slope_u, -slope_v, np.ones_like(expected)], axis=-1)
-        return expected, design, valid > 0.999
+        design = np.empty((*expected.reshape(flat).shape, 3))
+        design[..., 0], design[..., 1] = -slope_u.reshape(flat), -slope_v.reshape(flat)
+        design[..., 2] = 1.0
+        return expected.reshape(flat), design, valid.reshape(flat)
+
+    def _windows(self, corner: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Coefficients (p, 35, 35) about patches from their corners, and valid cells (p, 32, 32).
+
+        A cell between others is valid when all four are.
+        """
+        steps = np.arange(-1, PATCH_CELLS + 2)
+        rows, columns = corner[:, :1] + steps, corner[:, 1:] + steps
+        n_rows, n_columns = self._valid.shape
+        inside_v = (rows >= 0) & (rows < n_rows)
+        inside_u = (columns >= 0) & (columns < n_columns)
+        rows = np.clip(rows, 0, n_rows - 1)[:, :, None]
+        columns = np.clip(columns, 0, n_columns - 1)[:, None, :]
+        valid = self._valid[rows, columns] & inside_v[:, :, None] & inside_u[:, None, :]
+        both = valid[:, 1:-2] & valid[:, 2:-1]
+        return self._spline[rows, columns], both[:, :, 1:-2] & both[:, :, 2:-1]
+
+
+def _spline_weights(part: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights (2, p, 4) of the coefficients about a place for its value and its derivative."""
+    t = part
+    s = 1.0 - t
+    value = [s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3]
+    slope = [-3.0 * s**2, 9.0 * t**2 - 12.0 * t, 12.0 * s - 9.0 * s**2, 3.0 * t**2]
+    weights: NDArray[np.float64] = np.moveaxis(np.array([value, slope]), 1, 2) / 6.0
+    return weights
+
+
+def _filtered(
+    window: NDArray[np.float64], weights: NDArray[np.float64], axis: int
+) -> NDArray[np.float64]:
+    """Sum four neighbours along an axis of (p, rows, columns), weights (p, 4)."""
+    size = window.shape[axis] - 3
+    parts = (
+        window[:, tap : tap + size] if axis == 1 else window[:, :, tap : tap + size]
+        for tap in range(4)
+    )
+    total = next(parts) * weights[:, 0, None, None]
+    for tap, part in enumerate(parts, start=1):
+        total += weights[:, tap, None, None] * part
+    return total
 
 
 def _normal_step(

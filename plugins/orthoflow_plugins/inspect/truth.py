@@ -20,7 +20,6 @@ from orthoflow.products import (
     Planes,
     PointLabels,
     Truth,
-    Wall,
     Walls,
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
@@ -101,6 +100,7 @@ class InspectTruth(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Compare the photos, then wall by wall, then all together."""
         from orthoflow_plugins.inspect.poses import pose_findings
+        from orthoflow_plugins.inspect.reporting import report
         from orthoflow_plugins.inspect.samples import pooled
         from orthoflow_plugins.inspect.sampling import sampling_rule
         from orthoflow_plugins.inspect.scores import found_planes, label_findings, sample_findings
@@ -146,7 +146,7 @@ class InspectTruth(Method):
             findings += found_planes(inputs.planes, inputs.truth.planes)
         if inputs.labels is not None:
             findings += label_findings(inputs.labels, inputs.truth)
-        _report(findings, inputs.orthoimages.images[0].wall, ctx)
+        report(findings, inputs.orthoimages.images[0].wall, ctx)
         details: dict[str, JsonValue] = {
             "patch_cells": 32,
             "colour_share_compared": rule.colour_share,
@@ -213,12 +213,13 @@ class _Truth:
 
     def judge(self, image: Orthoimage) -> _Verdict:
         """Compare one wall."""
+        from orthoflow_plugins.inspect.placing import wall_of
         from orthoflow_plugins.inspect.samples import wall_errors
         from orthoflow_plugins.inspect.sampling import sampling
         from orthoflow_plugins.inspect.sources import trace_sources
 
         inputs = self.inputs
-        wall = _wall_of(image, self.walls)
+        wall = wall_of(image, self.walls)
         chosen = sampling(image, self.rule)
         true = self._true_orthoimage(image, chosen)
         sources = None
@@ -250,21 +251,6 @@ class _Truth:
             cores=self.cores,
         )
         return render(truth.scene, image.frame, rendering)
-
-
-def _wall_of(image: Orthoimage, walls: Walls) -> Wall:
-    if not 0 <= image.wall < len(walls.walls):
-        raise MethodError(
-            f"orthoimage {image.name} is of wall {image.wall}, but there are "
-            f"{len(walls.walls)} walls: wire the walls that the orthoimages were made from"
-        )
-    wall = walls.walls[image.wall]
-    if wall.frame.shape != image.frame.shape:
-        raise MethodError(
-            f"orthoimage {image.name} has {image.frame.shape} cells, but its wall has "
-            f"{wall.frame.shape}: wire the walls that the orthoimages were made from"
-        )
-    return wall
 
 
 def _detail_deg(truth: Truth, name: str, default: float) -> float:
@@ -326,18 +312,6 @@ def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
             f"{image.name}: true displacement of cells that photos painted, black 0 to yellow "
             f"{DISPLACEMENT_SPAN_CELLS:g} cells of {1e3 * image.frame.gsd_m:g} mm.",
         )
-
-
-def _report(findings: list[Finding], main: int, ctx: StepContext) -> None:
-    """Report the first wall by plain names, all walls with `all_`, the rest as it is called."""
-    per_wall = {finding.name for finding in findings if finding.wall >= 0}
-    for finding in findings:
-        if finding.wall == main:
-            ctx.metric(finding.name, finding.value, finding.unit)
-        elif finding.wall < 0 and finding.name in per_wall:
-            ctx.metric(f"all_{finding.name}", finding.value, finding.unit)
-        elif finding.wall < 0 and "[" not in finding.name:
-            ctx.metric(finding.name, finding.value, finding.unit)
 
 
 def _inspection(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry import WallFrame
 from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask
+
+# Preferences (rows, cols) of layers that paint a wall together, larger is better.
+Preferring = Callable[[Sequence[Layer]], Sequence[NDArray[np.float32]]]
 
 NOBODY: Final = -1
 # A cell takes the highest of these that a layer gives it. Occluded: no source paints it, although
@@ -44,7 +46,9 @@ class Choice:
     source: NDArray[np.int16]
 
 
-def joined(layers: tuple[Layer, ...], name: str, *, island_cells_min: int) -> Orthoimage:
+def joined(
+    layers: tuple[Layer, ...], name: str, *, island_cells_min: int, prefer: Preferring
+) -> Orthoimage:
     """Join the layers of one wall.
 
     Args:
@@ -52,13 +56,14 @@ def joined(layers: tuple[Layer, ...], name: str, *, island_cells_min: int) -> Or
         name: of the wall.
         island_cells_min: smaller patches from one source are painted from the source around
             them, where that one sees them too.
+        prefer: says which layer paints a cell that several show as well.
 
     Raises:
         MethodError: the layers do not share one frame.
     """
     first = layers[0]
     for layer in layers[1:]:
-        if not _is_same_frame(layer.frame, first.frame):
+        if not layer.frame.has_cells_of(first.frame):
             raise MethodError(
                 f"the layers {first.source} and {layer.source} of {name} lie on different rasters: "
                 "all layers of a wall must come from the same walls"
@@ -66,8 +71,8 @@ def joined(layers: tuple[Layer, ...], name: str, *, island_cells_min: int) -> Or
     # What paints nothing is no source; it still tells what is hidden.
     painters = [layer for layer in layers if (layer.mask == LayerMask.PAINTED).any()]
     others = [layer for layer in layers if all(layer is not painter for painter in painters)]
-    ordered = [*painters, *others]
-    choice = best_views(ordered)
+    preferred = prefer(painters) if painters else []
+    choice = best_views([*painters, *others], [*preferred, *(layer.quality for layer in others)])
     if island_cells_min > 1 and len(painters) > 1:
         choice = without_islands(choice, painters, island_cells_min)
     rgb = np.zeros((*first.frame.shape, 3), dtype=np.uint8)
@@ -85,18 +90,18 @@ def joined(layers: tuple[Layer, ...], name: str, *, island_cells_min: int) -> Or
     )
 
 
-def best_views(layers: Sequence[Layer]) -> Choice:
-    """Give each cell to the layer with the best quality, the first of equals."""
+def best_views(layers: Sequence[Layer], preferences: Sequence[NDArray[np.float32]]) -> Choice:
+    """Give each cell to the layer that is preferred there, the first of equals."""
     shape = layers[0].frame.shape
     best = np.zeros(shape, dtype=np.float32)
     rank = np.zeros(shape, dtype=np.uint8)
     source = np.full(shape, NOBODY, dtype=np.int16)
-    for index, layer in enumerate(layers):
+    for index, (layer, preference) in enumerate(zip(layers, preferences, strict=True)):
         states = _ranks(layer)
         is_painted = layer.mask == LayerMask.PAINTED
-        wins = (states > rank) | (is_painted & (states == rank) & (layer.quality > best))
+        wins = (states > rank) | (is_painted & (states == rank) & (preference > best))
         rank[wins] = states[wins]
-        best[wins] = layer.quality[wins]
+        best[wins] = preference[wins]
         source[wins & is_painted] = index
     return Choice(rank=rank, source=source)
 
@@ -143,13 +148,3 @@ def _ranks(layer: Layer) -> NDArray[np.uint8]:
         is_filled = (layer.filled > 0) & (layer.mask == LayerMask.PAINTED)
         ranks[is_filled] = _RANKED.index(OrthoMask.FILLED)
     return ranks
-
-
-def _is_same_frame(frame: WallFrame, other: WallFrame) -> bool:
-    return (
-        frame.shape == other.shape
-        and frame.gsd_m == other.gsd_m
-        and np.array_equal(frame.origin_world, other.origin_world)
-        and np.array_equal(frame.u_world, other.u_world)
-        and np.array_equal(frame.v_world, other.v_world)
-    )

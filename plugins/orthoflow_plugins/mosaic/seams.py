@@ -2,28 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import groupby
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Layer, Layers, Orthoimage, Orthoimages, OrthoMask
+from orthoflow.products import (
+    JsonValue,
+    Layer,
+    LayerMask,
+    Layers,
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    Wall,
+    Walls,
+)
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.mosaic.colours import SeamSteps, balanced, estimate_gains, seam_steps
+from orthoflow_plugins.mosaic.cutting import depth_edges
 from orthoflow_plugins.mosaic.joining import joined
 from orthoflow_plugins.mosaic.overlaps import displacements_cells
+from orthoflow_plugins.mosaic.preferring import SeamRule, preferences, require_sources
 from orthoflow_plugins.mosaic.source_maps import caption, is_seam, source_map
 
 
 class MosaicSeams(Method):
     """Take each cell from the layer that shows it best, its colour untouched.
 
-    A single layer passes through. Of several the one with the best quality paints a cell, the
-    first among equals; a cell that one layer measured is never taken from another's filling. Small
+    A single layer passes through. Of several the one that `seams` prefers paints a cell, the first
+    among equals; a cell that one layer measured is never taken from another's filling. Small
     patches from one source are given to the source around them where that one sees them too.
+
+    `best-view` goes by incidence, resolution and distance to the photo's border, cell by cell;
+    `voronoi` lays seams into the middle of overlaps, `graph-cut` where photos look alike and, with
+    the walls wired, off their depth edges; `priority` goes by a given order of photos. How far the
+    photos of an overlap lie apart, and how far colours step along the seams, is reported.
     """
 
     id: ClassVar[str] = "mosaic.seams"
@@ -31,11 +52,23 @@ class MosaicSeams(Method):
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.4",
+        "Kwatra et al. 2003, doi:10.1145/882262.882264 (graph-cut seams)",
     )
 
     class Params(MethodParams):
-        """How the choice between layers is kept calm."""
+        """How the choice between layers is made and kept calm."""
 
+        seams: SeamRule = Field(
+            "best-view", description="Which layer paints what several of them show."
+        )
+        priority: tuple[str, ...] = Field(
+            (), description="Names of photos, the most wanted first, for `seams: priority`."
+        )
+        gains: Literal["none", "global"] = Field(
+            "none",
+            description="none: colours stay as the photos have them; global: the light of each "
+            "photo is multiplied by one number per channel, so that overlaps agree.",
+        )
         island_cells_min: int = Field(
             default=100,
             ge=1,
@@ -44,9 +77,10 @@ class MosaicSeams(Method):
         )
 
     class In(Ports):
-        """Layers of all walls."""
+        """Layers of all walls, and the walls themselves for seams off their depth edges."""
 
         layers: Layers
+        walls: Walls | None = None
 
     class Out(Ports):
         """One orthoimage per wall."""
@@ -58,17 +92,76 @@ class MosaicSeams(Method):
         layers = sorted(inputs.layers.layers, key=lambda layer: layer.wall)
         if not layers:
             raise MethodError("there is no layer to make an orthoimage of, at least one is needed")
-        images: list[Orthoimage] = []
-        shifts: list[NDArray[np.float64]] = []
-        for wall, members in groupby(layers, key=lambda layer: layer.wall):
+        require_sources(layers, params.priority)
+        verdicts: list[_Joined] = []
+        for index, members in groupby(layers, key=lambda layer: layer.wall):
             group: tuple[Layer, ...] = tuple(members)
-            name = _name(inputs.layers, wall)
-            ctx.progress(wall / (layers[-1].wall + 1), name)
-            images.append(joined(group, name, island_cells_min=params.island_cells_min))
-            shifts.append(displacements_cells(group))
-            _show(ctx, images[-1])
-        _report(ctx, images, np.concatenate(shifts))
-        return self.Out(orthoimages=Orthoimages(images=tuple(images)))
+            name = _name(inputs.layers, index)
+            ctx.progress(index / (layers[-1].wall + 1), name)
+            verdicts.append(_join(group, name, params, _wall(inputs.walls, index)))
+            _show(ctx, verdicts[-1].image)
+        _report(ctx, verdicts)
+        gains: dict[str, JsonValue] = {
+            item.image.name: dict(item.gains) for item in verdicts if item.gains
+        }
+        details: dict[str, JsonValue] = {"gains": gains} if gains else {}
+        images = tuple(item.image for item in verdicts)
+        return self.Out(orthoimages=Orthoimages(images=images, details=details))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Joined:
+    """One wall, and how well its sources agree.
+
+    Attributes:
+        image: the orthoimage.
+        shifts_cells: (n, 2) displacements between the photos of overlaps.
+        steps: of colours along seams.
+        n_edge_seam: cells of seams at depth edges, None when the surface is not known.
+        gains: per source and channel, when colours were balanced.
+    """
+
+    image: Orthoimage
+    shifts_cells: NDArray[np.float64]
+    steps: SeamSteps
+    n_edge_seam: int | None = None
+    gains: dict[str, JsonValue] = field(default_factory=dict)
+
+
+def _join(
+    group: tuple[Layer, ...], name: str, params: MosaicSeams.Params, wall: Wall | None
+) -> _Joined:
+    painters = [layer for layer in group if (layer.mask == LayerMask.PAINTED).any()]
+    gains: dict[str, JsonValue] = {}
+    if params.gains == "global" and len(painters) > 1:
+        numbers = estimate_gains(painters)
+        painters = balanced(painters, numbers)
+        gains = {
+            layer.source: [round(float(value), 4) for value in gain]
+            for layer, gain in zip(painters, numbers, strict=True)
+        }
+        others = [layer for layer in group if not (layer.mask == LayerMask.PAINTED).any()]
+        group = (*painters, *others)
+    image = joined(
+        group,
+        name,
+        island_cells_min=params.island_cells_min,
+        prefer=partial(preferences, rule=params.seams, priority=params.priority, wall=wall),
+    )
+    n_edge_seam = None
+    if wall is not None:
+        n_edge_seam = int(np.count_nonzero(is_seam(image.source) & depth_edges(wall.depth_m)))
+    return _Joined(
+        image=image,
+        shifts_cells=displacements_cells(group),
+        steps=seam_steps(image.source, painters),
+        n_edge_seam=n_edge_seam,
+        gains=gains,
+    )
+
+
+def _wall(walls: Walls | None, index: int) -> Wall | None:
+    return walls.walls[index] if walls is not None and index < len(walls.walls) else None
 
 
 def _name(layers: Layers, wall: int) -> str:
@@ -82,7 +175,8 @@ def _show(ctx: StepContext, image: Orthoimage) -> None:
         ctx.figure(f"wall_{image.wall}_sources", source_map(image), caption(image))
 
 
-def _report(ctx: StepContext, images: list[Orthoimage], shifts_cells: NDArray[np.float64]) -> None:
+def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
+    images = [item.image for item in verdicts]
     n_cells = sum(image.mask.size for image in images)
     ctx.metric("n_orthoimages", len(images), "1")
     for state in OrthoMask:
@@ -92,8 +186,25 @@ def _report(ctx: StepContext, images: list[Orthoimage], shifts_cells: NDArray[np
     n_shown = sum(np.count_nonzero(image.source >= 0) for image in images)
     n_seam = sum(np.count_nonzero(is_seam(image.source)) for image in images)
     ctx.metric("seam_share", n_seam / max(1, n_shown), "1")
+    edges = [item.n_edge_seam for item in verdicts if item.n_edge_seam is not None]
+    if edges and n_seam:
+        ctx.metric("seam_on_depth_edge_share", sum(edges) / n_seam, "1")
+    shifts_cells = np.concatenate([item.shifts_cells for item in verdicts])
     ctx.metric("n_overlap_patches", len(shifts_cells), "1")
     if len(shifts_cells):
         rms = np.sqrt(np.mean(shifts_cells**2, axis=0))
         ctx.metric("overlap_u_rms_cells", rms[0], "cells")
         ctx.metric("overlap_v_rms_cells", rms[1], "cells")
+    grey = np.concatenate([item.steps.grey for item in verdicts])
+    if len(grey):
+        delta_e = np.concatenate([item.steps.delta_e for item in verdicts])
+        ctx.metric("seam_step_rms_grey", float(np.sqrt(np.mean(grey**2))), "grey")
+        ctx.metric("seam_step_mean_delta_e", float(delta_e.mean()), "1")
+    _report_gains(ctx, verdicts)
+
+
+def _report_gains(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
+    gains = np.array([gain for item in verdicts for gain in item.gains.values()], dtype=np.float64)
+    if len(gains):
+        ctx.metric("gain_min", float(gains.min()), "1")
+        ctx.metric("gain_max", float(gains.max()), "1")

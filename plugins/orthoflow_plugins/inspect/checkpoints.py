@@ -1,0 +1,339 @@
+"""`inspect.checkpoints`: orthoimages against surveyed points."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame
+from orthoflow.products import (
+    CheckPoints,
+    Finding,
+    Inspection,
+    JsonValue,
+    Orthoimage,
+    Orthoimages,
+    Truth,
+    Wall,
+    Walls,
+)
+from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.inspect.check_table import check_findings
+from orthoflow_plugins.inspect.crossings import find_crossing
+from orthoflow_plugins.inspect.displacements import rms
+from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow_plugins.inspect.placing import wall_of
+from orthoflow_plugins.inspect.point_places import ShownPoint, find_by_truth, point_on_surface
+from orthoflow_plugins.inspect.sampling import shown
+from orthoflow_plugins.inspect.vectors import enlargement, vector_map
+
+_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
+_NOWHERE: Final = np.full(3, np.nan)
+
+
+class InspectCheckpoints(Method):
+    """Measure how far surveyed points lie off in the orthoimages (skarlatos2012, Table 1).
+
+    A point counts where it was measured (`wall`, `u_px`, `v_px` of the check-point file), where
+    a black and white quadrant target is recognised, or, in a simulated room, where its surroundings
+    are found by the scene's truth. Without orthoimages the intensity of the walls is the picture.
+    RMS and standard deviation are of the lengths of residuals; outliers are those beyond twice the
+    RMS, of all (`once`) or of what is left (`iterated`). Classes of points (flat, vertical ...) are
+    told apart by a prefix. `x` is along u, to the right, `y` along v, down, shown - surveyed.
+    Targets are carried back into space, on the plane through the depths around them (`3d`).
+    """
+
+    id: ClassVar[str] = "inspect.checkpoints"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "loose"
+    citations: ClassVar[tuple[str, ...]] = (
+        "Skarlatos and Kiparissi 2012 (direct orthoimages from point clouds, 4.5, Table 1)",
+    )
+
+    class Params(MethodParams):
+        """How points are found that nobody measured."""
+
+        search_m: float = Field(
+            0.03, gt=0.0, le=1.0, description="How far from its place a point is looked for."
+        )
+        target_radius_m: float = Field(
+            0.04, gt=0.0, le=1.0, description="Radius of quadrant targets that counts."
+        )
+
+    class In(Ports):
+        """The pictures, and the points."""
+
+        checkpoints: CheckPoints
+        walls: Walls
+        orthoimages: Orthoimages | None = None
+        truth: Truth | None = None
+
+    class Out(Ports):
+        """The residuals."""
+
+        inspection: Inspection
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Find every point, then sum up."""
+        pictures = _pictures(inputs)
+        finder = _Finder(pictures=pictures, inputs=inputs, params=params)
+        points = []
+        for index in range(len(inputs.checkpoints.names)):
+            ctx.progress(index / len(inputs.checkpoints.names), inputs.checkpoints.names[index])
+            points.append(finder.find(index))
+        found = [k for k, point in enumerate(points) if np.isfinite(point.place).all()]
+        if not found:
+            raise MethodError(
+                f"none of the {len(points)} check points was found in an orthoimage: measure them "
+                "(columns wall, u_px, v_px), or check that scan and points have one coordinate "
+                "system (inspect.checkpoints)"
+            )
+        gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
+        shift_m = np.array(
+            [gsd_m[points[k].wall] * (points[k].place - points[k].expected) for k in found]
+        )
+        classes = [inputs.checkpoints.classes[k] for k in found]
+        findings = _findings(shift_m, classes, max(gsd_m.values()))
+        findings += _findings_in_space([points[k] for k in found], inputs.checkpoints, found)
+        ctx.metric("n_points", len(points), "1")
+        for finding in findings:
+            ctx.metric(finding.name, finding.value, finding.unit)
+        _draw(pictures, [points[k] for k in found], ctx)
+        names = tuple(dict.fromkeys(classes))
+        return self.Out(
+            inspection=Inspection(
+                wall=np.array([points[k].wall for k in found], dtype=np.int32),
+                points_world=inputs.checkpoints.points_world[found],
+                displacement_m=shift_m,
+                kind=np.array([names.index(name) for name in classes], dtype=np.uint8),
+                kinds=tuple(name or "check point" for name in names),
+                findings=tuple(findings),
+                details={"points": _table(points, inputs.checkpoints, gsd_m)},
+            )
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Picture:
+    """What points are looked for in; `image` is drawn beneath the residuals."""
+
+    wall: int
+    frame: WallFrame
+    grey: GreyImage
+    surface: Wall
+    image: Orthoimage
+
+
+def _pictures(inputs: InspectCheckpoints.In) -> list[_Picture]:
+    pictures = []
+    if inputs.orthoimages is not None:
+        for image in inputs.orthoimages.images:
+            shows = shown(image)
+            grey = np.where(shows, image.rgb @ _LUMINANCE, 0.0)
+            pictures.append(
+                _Picture(
+                    wall=image.wall,
+                    frame=image.frame,
+                    grey=GreyImage(grey=grey, valid=shows, region=shows),
+                    surface=wall_of(image, inputs.walls),
+                    image=image,
+                )
+            )
+    else:
+        for index, wall in enumerate(inputs.walls.walls):
+            if wall.intensity is not None:
+                pictures.append(_intensity_picture(index, wall, wall.intensity))
+    if not pictures:
+        raise MethodError(
+            "there is no picture to find check points in: wire orthoimages, or walls with "
+            "intensity (inspect.checkpoints)"
+        )
+    return pictures
+
+
+def _intensity_picture(index: int, wall: Wall, intensity: NDArray[np.float32]) -> _Picture:
+    known = np.isfinite(intensity)
+    grey = 255.0 * np.where(known, intensity, 0.0).astype(np.float64)
+    return _Picture(
+        wall=index,
+        frame=wall.frame,
+        grey=GreyImage(grey=grey, valid=known, region=known),
+        surface=wall,
+        image=Orthoimage(
+            frame=wall.frame,
+            wall=index,
+            name=wall.name,
+            rgb=np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2),
+            mask=known.astype(np.uint8),
+            source=np.where(known, 0, -1).astype(np.int16),
+            sources=("intensity",),
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Finder:
+    """Finds one point after the other."""
+
+    pictures: Sequence[_Picture]
+    inputs: InspectCheckpoints.In
+    params: InspectCheckpoints.Params
+
+    def find(self, index: int) -> ShownPoint:
+        """Where a point is shown, and how that is known."""
+        points = self.inputs.checkpoints
+        world = points.points_world[index]
+        wall = int(points.wall[index])
+        picture = self._picture_of(world, wall if wall >= 0 else None)
+        if picture is None:
+            nowhere = _NOWHERE[:2]
+            return ShownPoint(
+                how="outside", wall=-1, expected=nowhere, place=nowhere, point_world=_NOWHERE
+            )
+        expected = picture.frame.wall_from_world(world[None])[0, :2]
+        if wall >= 0:
+            return ShownPoint(
+                how="measured",
+                wall=wall,
+                expected=expected,
+                place=points.pixels_wall[index],
+                point_world=_NOWHERE,
+            )
+        if self.inputs.truth is not None:
+            return self._by_truth(picture, expected, self.inputs.truth)
+        return self._target(picture, expected)
+
+    def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> _Picture | None:
+        """The picture that a point belongs to: the nearest wall whose rectangle it lies before."""
+        best, nearest = None, np.inf
+        walls = self.inputs.walls
+        for picture in self.pictures:
+            if wall is not None and picture.wall == wall:
+                return picture
+            column, row, depth = picture.frame.wall_from_world(world[None])[0]
+            inside = 0 <= column < picture.frame.width and 0 <= row < picture.frame.height
+            within = -walls.buffer_behind_m <= depth <= walls.buffer_front_m
+            if wall is None and inside and within and abs(depth) < nearest:
+                best, nearest = picture, abs(float(depth))
+        return best
+
+    def _by_truth(
+        self, picture: _Picture, expected: NDArray[np.float64], truth: Truth
+    ) -> ShownPoint:
+        walls = self.inputs.walls
+        place = find_by_truth(
+            picture.grey,
+            picture.frame,
+            expected,
+            truth,
+            buffers_m=(walls.buffer_front_m, walls.buffer_behind_m),
+            search_cells=int(np.clip(np.ceil(self.params.search_m / picture.frame.gsd_m), 2, 12)),
+        )
+        return ShownPoint(
+            how="not found" if place is None else "truth",
+            wall=picture.wall,
+            expected=expected,
+            place=_NOWHERE[:2] if place is None else place,
+            point_world=_NOWHERE,
+        )
+
+    def _target(self, picture: _Picture, expected: NDArray[np.float64]) -> ShownPoint:
+        gsd_m = picture.frame.gsd_m
+        crossing = find_crossing(
+            picture.grey,
+            expected,
+            search_cells=self.params.search_m / gsd_m,
+            radius_cells=self.params.target_radius_m / gsd_m,
+        )
+        if crossing is None:
+            return ShownPoint(
+                how="not found",
+                wall=picture.wall,
+                expected=expected,
+                place=_NOWHERE[:2],
+                point_world=_NOWHERE,
+            )
+        point = point_on_surface(picture.surface, crossing.place, self.params.target_radius_m)
+        return ShownPoint(
+            how="target",
+            wall=picture.wall,
+            expected=expected,
+            place=crossing.place,
+            point_world=_NOWHERE if point is None else point,
+        )
+
+
+def _findings(shift_m: NDArray[np.float64], classes: Sequence[str], gsd_m: float) -> list[Finding]:
+    findings = check_findings(shift_m, gsd_m)
+    names = [name for name in dict.fromkeys(classes) if name]
+    for name in names if len(names) > 1 or "" in classes else ():
+        chosen = np.array([one == name for one in classes])
+        prefix = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+        findings += check_findings(shift_m[chosen], gsd_m, prefix=f"{prefix}_")
+    return findings
+
+
+def _findings_in_space(
+    points: Sequence[ShownPoint], surveyed: CheckPoints, found: Sequence[int]
+) -> list[Finding]:
+    """How far the points that were carried back into space lie off."""
+    apart = np.array(
+        [
+            np.linalg.norm(point.point_world - surveyed.points_world[k])
+            for point, k in zip(points, found, strict=True)
+        ]
+    )
+    apart = 1e3 * apart[np.isfinite(apart)]
+    if not len(apart):
+        return []
+    return [
+        Finding(name="n_3d", value=float(len(apart)), unit="1"),
+        Finding(name="rms_3d_mm", value=rms(apart), unit="mm"),
+        Finding(name="max_3d_mm", value=float(apart.max()), unit="mm"),
+    ]
+
+
+def _draw(pictures: Sequence[_Picture], points: Sequence[ShownPoint], ctx: StepContext) -> None:
+    for picture in pictures:
+        mine = [point for point in points if point.wall == picture.wall]
+        if not mine:
+            continue
+        places = np.array([point.place for point in mine])
+        shifts = places - np.array([point.expected for point in mine])
+        times = enlargement(shifts, picture.image)
+        ctx.figure(
+            f"wall_{picture.wall}_residuals",
+            vector_map(picture.image, places, shifts),
+            f"{picture.image.name}: check points, shown - surveyed, {times:g} times enlarged; "
+            "yellow over the median, red over twice the median.",
+        )
+
+
+def _table(
+    points: Sequence[ShownPoint], surveyed: CheckPoints, gsd_m: dict[int, float]
+) -> list[JsonValue]:
+    rows: list[JsonValue] = []
+    for k, point in enumerate(points):
+        row: dict[str, JsonValue] = {
+            "name": surveyed.names[k],
+            "class": surveyed.classes[k],
+            "how": point.how,
+        }
+        if np.isfinite(point.place).all():
+            shift_mm = 1e3 * gsd_m[point.wall] * (point.place - point.expected)
+            row |= {
+                "wall": point.wall,
+                "u_px": round(float(point.place[0]), 3),
+                "v_px": round(float(point.place[1]), 3),
+                "x_mm": round(float(shift_mm[0]), 3),
+                "y_mm": round(float(shift_mm[1]), 3),
+            }
+        rows.append(row)
+    return rows

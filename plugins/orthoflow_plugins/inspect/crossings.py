@@ -1,0 +1,196 @@
+"""Centres of black and white quadrant targets, found in a picture to hundredths of a cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow_plugins.inspect.matching import GreyImage
+
+_ROUNDS: Final = 20
+_CONVERGED_CELLS: Final = 1e-3
+_LEAST_VALID_SHARE: Final = 0.5
+# A quarter turn must swap dark and bright, half a turn must change nothing.
+_LEAST_ALIKE: Final = 0.6
+_SMOOTH_CELLS: Final = 1.2
+_LEAST_WEIGHT: Final = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crossing:
+    """Where the quadrants of a target meet.
+
+    Attributes:
+        place: (2,) float64 column, row.
+        alike: correlation of the target with itself after half a turn.
+        swapped: minus the correlation after a quarter turn.
+    """
+
+    place: NDArray[np.float64]
+    alike: float
+    swapped: float
+
+
+def find_crossing(
+    picture: GreyImage, near: NDArray[np.float64], *, search_cells: float, radius_cells: float
+) -> Crossing | None:
+    """Find the centre of a target near a place.
+
+    The crossing is a saddle of the smoothed picture, found to a cell where the Hessian's
+    determinant is lowest. Least squares then move it until the picture, turned by half about it, is
+    itself: every part of the four edges counts, and their direction does not matter.
+
+    Args:
+        picture: grey, with cells that count.
+        near: (2,) column, row.
+        search_cells: how far from there is looked.
+        radius_cells: of the target, or of as much of it as shall count.
+
+    Returns:
+        The crossing, or None where nothing looks like one.
+    """
+    margin = int(np.ceil(search_cells + radius_cells)) + 3
+    corner = np.floor(near).astype(np.int64) - margin
+    window = _window(picture, corner, 2 * margin + 1)
+    start = _saddle(window, near - corner, search_cells, radius_cells)
+    if start is None:
+        return None
+    place = _symmetric(window, start, radius_cells)
+    if place is None or np.linalg.norm(place - (near - corner)) > search_cells + 1.0:
+        return None
+    alike = _turned_correlation(window, place, radius_cells, half=True)
+    swapped = -_turned_correlation(window, place, radius_cells, half=False)
+    if min(alike, swapped) < _LEAST_ALIKE:
+        return None
+    return Crossing(place=place + corner, alike=alike, swapped=swapped)
+
+
+def _window(picture: GreyImage, corner: NDArray[np.int64], side: int) -> GreyImage:
+    """A square part, not valid beyond the border, its voids closed from around them."""
+    grey, valid = np.zeros((side, side)), np.zeros((side, side), dtype=np.bool_)
+    rows, columns = picture.grey.shape
+    top, left = max(0, int(corner[1])), max(0, int(corner[0]))
+    bottom, right = min(rows, int(corner[1]) + side), min(columns, int(corner[0]) + side)
+    if top < bottom and left < right:
+        inside = (
+            slice(top - int(corner[1]), bottom - int(corner[1])),
+            slice(left - int(corner[0]), right - int(corner[0])),
+        )
+        part = (slice(top, bottom), slice(left, right))
+        valid[inside] = picture.valid[part]
+        grey[inside] = np.where(picture.valid[part], picture.grey[part], 0.0)
+    return _closed(grey, valid)
+
+
+def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
+    """Smooth a picture by planes fitted about each cell to the valid ones.
+
+    Means alone would lean towards the side of an edge that has fewer holes (Knutsson and Westin
+    1993, normalised convolution of first order).
+    """
+    from scipy.ndimage import correlate1d
+
+    steps = np.arange(-4, 5) / _SMOOTH_CELLS
+    gauss = np.exp(-0.5 * steps**2)
+    powers = [gauss * steps**power for power in range(3)]
+
+    def moment(values: NDArray[np.float64], down: int, right: int) -> NDArray[np.float64]:
+        along = correlate1d(values, powers[down], axis=0, mode="constant")
+        both: NDArray[np.float64] = correlate1d(along, powers[right], axis=1, mode="constant")
+        return both
+
+    weight = valid.astype(np.float64)
+    orders = ((0, 0), (1, 0), (0, 1))
+    normal = np.empty((*grey.shape, 3, 3))
+    for i, one in enumerate(orders):
+        for j, other in enumerate(orders):
+            normal[..., i, j] = moment(weight, one[0] + other[0], one[1] + other[1])
+    right_side = np.stack([moment(weight * grey, *order) for order in orders], axis=-1)
+    total = normal[..., 0, 0]
+    enough = total > _LEAST_WEIGHT * gauss.sum() ** 2
+    # A little of the identity keeps cells apart from all others solvable.
+    normal += 1e-6 * np.eye(3)
+    level = np.linalg.solve(normal, right_side[..., None])[..., 0, 0]
+    return GreyImage(grey=np.where(enough, level, 0.0), valid=enough, region=valid)
+
+
+def _saddle(
+    window: GreyImage, near: NDArray[np.float64], search: float, radius: float
+) -> NDArray[np.float64] | None:
+    """The strongest saddle (2,) = column, row within the search, to a cell."""
+    from scipy.ndimage import gaussian_filter
+
+    width = max(1.5, 0.3 * radius)
+    share = gaussian_filter(window.valid.astype(np.float64), width)
+    middle = float(np.mean(window.grey[window.valid])) if window.valid.any() else 0.0
+    level = np.where(window.valid, window.grey, middle)
+    second = [gaussian_filter(level, width, order=order) for order in ((2, 0), (0, 2), (1, 1))]
+    strength = second[2] ** 2 - second[0] * second[1]
+    rows, columns = np.mgrid[: level.shape[0], : level.shape[1]] + 0.5
+    outside = np.hypot(columns - near[0], rows - near[1]) > search
+    strength[outside | (share < _LEAST_VALID_SHARE)] = -np.inf
+    best = np.unravel_index(int(np.argmax(strength)), strength.shape)
+    if not strength[best] > 0.0:
+        return None
+    return np.array([best[1] + 0.5, best[0] + 0.5])
+
+
+def _symmetric(
+    window: GreyImage, start: NDArray[np.float64], radius: float
+) -> NDArray[np.float64] | None:
+    """Move the centre until half a turn about it changes least; None if it runs away."""
+    from scipy.ndimage import map_coordinates
+
+    aside = _disc(radius)
+    slopes = [np.gradient(window.grey, axis=axis) for axis in (1, 0)]
+    place = start.copy()
+    for _ in range(_ROUNDS):
+        ways = [(place + sign * aside - 0.5).T[::-1] for sign in (1.0, -1.0)]
+        greys = [map_coordinates(window.grey, way, order=3, mode="nearest") for way in ways]
+        valid = [
+            map_coordinates(window.valid.astype(np.float64), way, order=1, cval=0.0) > 0.99
+            for way in ways
+        ]
+        both = valid[0] & valid[1]
+        if np.count_nonzero(both) < _LEAST_VALID_SHARE * len(aside):
+            return None
+        design = np.column_stack(
+            [
+                map_coordinates(slope, ways[0], order=1, mode="nearest")
+                - map_coordinates(slope, ways[1], order=1, mode="nearest")
+                for slope in slopes
+            ]
+        )[both]
+        step = np.linalg.lstsq(design, (greys[1] - greys[0])[both], rcond=None)[0]
+        place = place + np.clip(step, -1.0, 1.0)
+        if np.linalg.norm(place - start) > radius:
+            return None
+        if np.abs(step).max() < _CONVERGED_CELLS:
+            break
+    return np.asarray(place)
+
+
+def _turned_correlation(
+    window: GreyImage, place: NDArray[np.float64], radius: float, *, half: bool
+) -> float:
+    from scipy.ndimage import map_coordinates
+
+    aside = _disc(radius)
+    turned = -aside if half else np.column_stack([-aside[:, 1], aside[:, 0]])
+    one, other = (
+        map_coordinates(window.grey, (place + way - 0.5).T[::-1], order=1, mode="nearest")
+        for way in (aside, turned)
+    )
+    spread = float(np.std(one) * np.std(other))
+    return float(np.mean((one - one.mean()) * (other - other.mean()))) / max(spread, 1e-12)
+
+
+def _disc(radius: float) -> NDArray[np.float64]:
+    """Offsets (n, 2) of half of a disc would do; the whole weighs both halves alike."""
+    side = np.arange(-np.floor(radius), np.floor(radius) + 1.0)
+    columns, rows = np.meshgrid(side, side)
+    inside = np.hypot(columns, rows) <= radius
+    return np.column_stack([columns[inside], rows[inside]])

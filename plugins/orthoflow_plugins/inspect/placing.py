@@ -1,0 +1,89 @@
+"""The wall that an orthoimage is of, on the orthoimage's own cells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import angle_between_deg
+from orthoflow.products import Orthoimage, SurfaceMask, Wall, Walls
+
+_SAME_DIRECTION_DEG: Final = 2.0
+
+_Value = TypeVar("_Value", bound=np.generic)
+
+
+def wall_of(image: Orthoimage, walls: Walls) -> Wall:
+    """Give the wall of an orthoimage; one that lies on other cells is laid onto the image's.
+
+    Orthoimages of other programs have grids of their own. Each of their cells takes what the
+    nearest cell of the wall holds, its depth counted from the image's own plane, and an intensity
+    between those of the four nearest.
+
+    Raises:
+        MethodError: there is no such wall, or it lies elsewhere.
+    """
+    if not 0 <= image.wall < len(walls.walls):
+        raise MethodError(
+            f"orthoimage {image.name} is of wall {image.wall}, but there are "
+            f"{len(walls.walls)} walls: wire the walls that the orthoimages were made from"
+        )
+    wall = walls.walls[image.wall]
+    return wall if wall.frame.has_cells_of(image.frame) else _laid_onto(image, wall, walls)
+
+
+def _laid_onto(image: Orthoimage, wall: Wall, walls: Walls) -> Wall:
+    """The wall on the image's cells, row by row, so that large images need little room."""
+    import cv2
+
+    frame = image.frame
+    middle = frame.corners_world().mean(axis=0)
+    aside = float(wall.frame.plane.distances_m(middle[None])[0])
+    angle = angle_between_deg(frame.normal_world, wall.frame.normal_world)
+    if angle > _SAME_DIRECTION_DEG or not (-walls.buffer_behind_m <= aside <= walls.buffer_front_m):
+        raise MethodError(
+            f"orthoimage {image.name} lies {aside:.3f} m before wall {image.wall} and "
+            f"{angle:.2f} deg askew: wire the walls that the orthoimages are of"
+        )
+    columns = np.arange(frame.width) + 0.5
+    taken = np.full(frame.shape, -1, dtype=np.int64)
+    depth = np.full(frame.shape, np.nan, dtype=np.float32)
+    intensity = None if wall.intensity is None else np.empty(frame.shape, dtype=np.float32)
+    for row in range(frame.height):
+        points = frame.world_from_wall(np.column_stack([columns, np.full(frame.width, row + 0.5)]))
+        exact = wall.frame.wall_from_world(points)[:, :2]
+        if wall.intensity is not None and intensity is not None:
+            at = (exact - 0.5).astype(np.float32).T[:, None]
+            intensity[row] = cv2.remap(
+                wall.intensity, at[0], at[1], cv2.INTER_LINEAR, borderValue=(np.nan,)
+            )[0]
+        places = np.floor(exact).astype(np.int64)
+        inside = np.all((places >= 0) & (places < (wall.frame.width, wall.frame.height)), axis=1)
+        cells = places[inside, 1] * wall.frame.width + places[inside, 0]
+        taken[row, inside] = cells
+        surface = wall.frame.world_from_wall(
+            (places[inside] + 0.5).astype(np.float64),
+            wall.depth_m.ravel()[cells].astype(np.float64),
+        )
+        depth[row, inside] = frame.wall_from_world(surface)[:, 2]
+    return replace(
+        wall,
+        frame=frame,
+        depth_m=depth,
+        sigma_m=_taken(wall.sigma_m, taken, np.nan),
+        count=_taken(wall.count, taken, 0),
+        mask=_taken(wall.mask, taken, int(SurfaceMask.VOID)),
+        intensity=intensity,
+        rgb=None,
+        rgb_mask=None,
+    )
+
+
+def _taken(values: NDArray[_Value], taken: NDArray[np.int64], nothing: float) -> NDArray[_Value]:
+    found: NDArray[_Value] = values.ravel()[np.maximum(taken, 0)]
+    found[taken < 0] = nothing
+    return found

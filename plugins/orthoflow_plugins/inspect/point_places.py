@@ -1,0 +1,183 @@
+"""Where check points are shown: measured, recognised as targets, or found by a scene's truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.scene_views import render_frame
+from orthoflow.products import Truth, Wall
+from orthoflow_plugins.inspect.matching import (
+    PATCH_CELLS,
+    GreyImage,
+    refine_shifts,
+    unrefined,
+)
+
+How = Literal["measured", "target", "truth", "not found", "outside"]
+
+_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
+# A point is what lies within a few cells about it, not the texture further off.
+_FOCUS_CELLS: Final = 5.0
+_LEAST_VALID: Final = 0.6
+_LEAST_CORRELATION: Final = 0.6
+_SIGMA_MOST_CELLS: Final = 0.4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownPoint:
+    """A check point in a picture.
+
+    Attributes:
+        how: how it was found, or why not.
+        wall: index of the wall, -1 outside of all.
+        expected: (2,) column, row where the survey has it.
+        place: (2,) column, row where it is shown, NaN when not found.
+        point_world: (3,) metres, the shown place on the surface; NaN when not known.
+    """
+
+    how: How
+    wall: int
+    expected: NDArray[np.float64]
+    place: NDArray[np.float64]
+    point_world: NDArray[np.float64]
+
+
+def find_by_truth(
+    picture: GreyImage,
+    frame: WallFrame,
+    expected: NDArray[np.float64],
+    truth: Truth,
+    *,
+    buffers_m: tuple[float, float],
+    search_cells: int,
+) -> NDArray[np.float64] | None:
+    """Find where the surroundings of a point are shown, known from a simulated scene.
+
+    Args:
+        picture: what is judged.
+        frame: its cells.
+        expected: (2,) column, row of the point.
+        truth: the scene.
+        buffers_m: in front of the wall and behind it, what belongs to the wall.
+        search_cells: how far is looked.
+
+    Returns:
+        (2,) column, row, or None where nothing correlates.
+    """
+    rim = search_cells + 4
+    side = PATCH_CELLS + 2 * rim
+    corner = np.floor(expected).astype(np.int64) - side // 2
+    part = replace(
+        frame,
+        origin_world=frame.world_from_wall(corner[None].astype(np.float64))[0],
+        width=side,
+        height=side,
+    )
+    true = render_frame(
+        truth.scene, part, buffer_front_m=buffers_m[0], buffer_behind_m=buffers_m[1]
+    )
+    known = np.asarray(np.isfinite(true.rgb).all(axis=2), dtype=np.bool_)
+    reference = GreyImage(
+        grey=np.where(known, np.nan_to_num(true.rgb) @ _LUMINANCE, 0.0), valid=known, region=known
+    )
+    shown = _part(picture, corner, side)
+    whole = _whole_shift(shown, reference, rim, search_cells)
+    if whole is None:
+        return None
+    # The patch is cut where the point is shown, so that it is the point that counts.
+    centre = np.full(2, side // 2) + whole
+    found = refine_shifts(
+        shown,
+        reference,
+        unrefined(centre[None].astype(np.float64), whole[None].astype(np.float64)),
+        sigma_most_cells=_SIGMA_MOST_CELLS,
+        focus_cells=_FOCUS_CELLS,
+    )
+    if len(found.shift) == 0 or found.correlation[0] < _LEAST_CORRELATION:
+        return None
+    return np.asarray(expected + found.shift[0])
+
+
+def point_on_surface(
+    wall: Wall, place: NDArray[np.float64], radius_m: float
+) -> NDArray[np.float64] | None:
+    """World point (3,) of a place, on the plane through the depths around it; None without any.
+
+    The plane is fitted robustly: a target on its holder is flat where the wall about it is not.
+    """
+    radius = radius_m / wall.frame.gsd_m
+    low = np.maximum(np.floor(place - radius).astype(np.int64), 0)
+    high = np.ceil(place + radius).astype(np.int64)
+    part = (slice(low[1], high[1]), slice(low[0], high[0]))
+    depth = wall.depth_m[part].astype(np.float64)
+    rows, columns = np.nonzero(np.isfinite(depth))
+    aside = np.column_stack([columns + 0.5 + low[0], rows + 0.5 + low[1]]) - place
+    near = np.hypot(aside[:, 0], aside[:, 1]) <= radius
+    aside, values = aside[near], depth[rows, columns][near]
+    if len(values) < 12:
+        return None
+    design = np.column_stack([np.ones(len(values)), aside])
+    kept = np.abs(values - np.median(values)) <= 0.02
+    for _ in range(8):
+        if np.count_nonzero(kept) < 12:
+            return None
+        plane = np.linalg.lstsq(design[kept], values[kept], rcond=None)[0]
+        off = values - design @ plane
+        spread = 1.4826 * float(np.median(np.abs(off[kept])))
+        kept = np.abs(off) <= max(2.5 * spread, 1e-4)
+    return np.asarray(wall.frame.world_from_wall(place[None], float(plane[0]))[0])
+
+
+def _part(picture: GreyImage, corner: NDArray[np.int64], side: int) -> GreyImage:
+    """A square part of a picture, not valid beyond its border."""
+    padded = np.zeros((side, side)), np.zeros((side, side), dtype=np.bool_)
+    rows = corner[1] + np.arange(side)
+    columns = corner[0] + np.arange(side)
+    inside = ((rows >= 0) & (rows < picture.grey.shape[0]))[:, None] & (
+        (columns >= 0) & (columns < picture.grey.shape[1])
+    )[None]
+    cells = np.ix_(
+        np.clip(rows, 0, picture.grey.shape[0] - 1), np.clip(columns, 0, picture.grey.shape[1] - 1)
+    )
+    padded[0][:] = np.where(inside, picture.grey[cells], 0.0)
+    padded[1][:] = inside & picture.valid[cells]
+    return GreyImage(grey=padded[0], valid=padded[1], region=padded[1])
+
+
+def _whole_shift(
+    shown: GreyImage, true: GreyImage, rim: int, search: int
+) -> NDArray[np.int64] | None:
+    """Whole cells (right, down) by which the middle of `true` lies off in `shown`."""
+    middle = slice(rim, rim + PATCH_CELLS)
+    down, right = np.mgrid[:PATCH_CELLS, :PATCH_CELLS] - 0.5 * (PATCH_CELLS - 1)
+    focus = np.exp(-0.5 * (down**2 + right**2) / _FOCUS_CELLS**2)
+    pattern = true.grey[middle, middle]
+    best, best_shift = _LEAST_CORRELATION - 0.2, None
+    for row in range(-search, search + 1):
+        for column in range(-search, search + 1):
+            part = (
+                slice(rim + row, rim + row + PATCH_CELLS),
+                slice(rim + column, rim + column + PATCH_CELLS),
+            )
+            weight = focus * (shown.valid[part] & true.valid[middle, middle])
+            if weight.sum() < _LEAST_VALID * focus.sum():
+                continue
+            likeness = _weighted_correlation(shown.grey[part], pattern, weight)
+            if likeness > best:
+                best, best_shift = likeness, np.array([column, row], dtype=np.int64)
+    return best_shift
+
+
+def _weighted_correlation(
+    one: NDArray[np.float64], other: NDArray[np.float64], weight: NDArray[np.float64]
+) -> float:
+    total = weight.sum()
+    first = one - (weight * one).sum() / total
+    second = other - (weight * other).sum() / total
+    spread = (weight * first**2).sum() * (weight * second**2).sum()
+    return float((weight * first * second).sum() / np.sqrt(spread + 1e-12))

@@ -1,0 +1,256 @@
+"""`inspect.surf`: an orthoimage against the laser's intensity, by SURF key points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import MethodError
+from orthoflow.products import Finding, Inspection, Orthoimage, Orthoimages, Wall, Walls
+from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.inspect.displacements import displacement_findings
+from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs
+from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow_plugins.inspect.placing import wall_of
+from orthoflow_plugins.inspect.reporting import report
+from orthoflow_plugins.inspect.sampling import shown
+from orthoflow_plugins.inspect.vectors import enlargement, vector_map
+
+_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
+# The intensity is laid so far aside to see how exactly the comparison tells that.
+FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
+_FLOOR_CELLS: Final = 600
+_FEWEST_PAIRS: Final = 10
+
+
+class InspectSurf(Method):
+    """Measure how far an orthoimage lies off the laser's intensity of the same wall.
+
+    The inspection of markiewicz2015: SURF key points of both images are paired, and the distances
+    of pairs are the error (Table 2), drawn as a map (Figure 25). Both images lie on one grid, so a
+    pair is looked for within a radius only; each pair is then refined by least squares, because
+    SURF alone is good to a cell, no better than what it should measure. The intensity compared
+    with itself, laid half a cell aside, says how exact the comparison is at best: its floor. `x`
+    is along u, to the right, `y` along v, down; displacements are shown - true. Metrics of the
+    first wall have no prefix, `all_` is of all walls; `surf_` are of the pairs before refinement.
+
+    What stands in for a missing intensity is the grey of colours, and when these come from the
+    same photos the comparison says nothing: then it is refused, or told with a warning.
+    """
+
+    id: ClassVar[str] = "inspect.surf"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "loose"
+    citations: ClassVar[tuple[str, ...]] = (
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71114870 (4.4, Table 2, Figure 25)",
+        "Bay, Ess, Tuytelaars, Van Gool 2008, Speeded-Up Robust Features (SURF)",
+        "Gruen 1985, Adaptive least squares correlation (refinement)",
+    )
+
+    class Params(MethodParams):
+        """How far is looked, and what happens where the comparison says nothing."""
+
+        radius_cells: float = Field(
+            40.0,
+            ge=30.0,
+            le=200.0,
+            description="Largest displacement that is looked for: wide enough for gross errors.",
+        )
+        unfit: Literal["refuse", "warn"] = Field(
+            "refuse",
+            description="refuse: fail where there is no laser intensity or too little in common; "
+            "warn: go on without these numbers.",
+        )
+
+    class In(Ports):
+        """The orthoimages, and the walls they are of."""
+
+        orthoimages: Orthoimages
+        walls: Walls
+
+    class Out(Ports):
+        """The displacements."""
+
+        inspection: Inspection
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Compare wall by wall, then put all together."""
+        images = inputs.orthoimages.images
+        if not images:
+            raise MethodError("there is no orthoimage to inspect, at least one is needed")
+        reason = _unfit(inputs)
+        verdicts = []
+        for place, image in enumerate(images if reason is None else ()):
+            ctx.progress(place / len(images), f"wall {image.name}")
+            verdicts.append(_compare(image, wall_of(image, inputs.walls), params.radius_cells))
+        fit = [item for item in verdicts if len(item.pairs) >= _FEWEST_PAIRS]
+        if reason is None and not fit:
+            most = max(len(item.pairs) for item in verdicts)
+            reason = (
+                f"orthoimage and intensity have too little in common: {most} pairs of SURF key "
+                f"points in one wall, at least {_FEWEST_PAIRS} are needed"
+            )
+        if reason is not None:
+            if params.unfit == "refuse":
+                raise MethodError(f"{reason} (inspect.surf; `unfit: warn` goes on without)")
+            ctx.warn(f"not inspected: {reason}")
+        findings = [finding for item in fit for finding in item.findings()]
+        if fit:
+            findings += _together(fit)
+            report(findings, fit[0].image.wall, ctx)
+        for item in fit:
+            item.draw(ctx)
+        ctx.metric("n_walls_inspected", len(fit), "1")
+        return self.Out(inspection=_inspection(fit, findings, reason))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Verdict:
+    """The pairs of one wall, and those of its intensity with itself."""
+
+    image: Orthoimage
+    pairs: KeyPairs
+    floor: KeyPairs
+
+    def findings(self) -> list[Finding]:
+        """The wall's numbers."""
+        wall = self.image.wall
+        gsd_m = self.image.frame.gsd_m
+        counts = [
+            ("n_pairs", float(len(self.pairs))),
+            ("n_key_points", float(self.pairs.n_points[0])),
+            ("n_key_points_intensity", float(self.pairs.n_points[1])),
+            ("matched_kept_share", len(self.pairs) / max(1, self.pairs.n_matched)),
+            ("floor_n_pairs", float(len(self.floor))),
+        ]
+        return [
+            *(Finding(name=name, value=value, unit="1", wall=wall) for name, value in counts),
+            *_numbers([self], wall, gsd_m),
+        ]
+
+    def draw(self, ctx: StepContext) -> None:
+        """Draw the displacements (markiewicz2015, Figure 25)."""
+        times = enlargement(self.pairs.shift, self.image)
+        ctx.figure(
+            f"wall_{self.image.wall}_displacements",
+            vector_map(self.image, self.pairs.places, self.pairs.shift),
+            f"{self.image.name}: orthoimage against intensity, displacements {times:g} times "
+            "enlarged; yellow over the median, red over twice the median.",
+        )
+
+
+def _unfit(inputs: InspectSurf.In) -> str | None:
+    """Why the walls hold nothing to compare with, or None."""
+    if inputs.walls.intensity_source == "laser":
+        return None
+    if inputs.walls.intensity_source == "luminance":
+        return (
+            "the walls have no laser intensity: the grey of the scan's colours stands in for it, "
+            "and what was coloured by the same photos agrees with them however wrong they lie"
+        )
+    return "the walls have neither intensity nor colour to compare with"
+
+
+def _compare(image: Orthoimage, wall: Wall, radius: float) -> _Verdict:
+    if wall.intensity is None:
+        raise MethodError(f"wall {wall.name} has no intensity to compare with")
+    shows = shown(image)
+    known = np.isfinite(wall.intensity)
+    picture = GreyImage(
+        grey=np.where(shows, image.rgb @ _LUMINANCE, 0.0), valid=shows, region=shows
+    )
+    # Laser intensities span decades; their roots look more like what a camera sees.
+    intensity = GreyImage(
+        grey=255.0 * np.sqrt(np.where(known, np.maximum(wall.intensity, 0.0), 0.0)),
+        valid=known,
+        region=known,
+    )
+    pairs = find_key_pairs(picture, intensity, radius_cells=radius)
+    return _Verdict(image=image, pairs=pairs, floor=_floor(intensity, radius))
+
+
+def _floor(intensity: GreyImage, radius: float) -> KeyPairs:
+    """Pairs of the intensity with itself laid aside, their errors as displacements."""
+    import cv2
+
+    intensity = _fullest_part(intensity)
+    right, down = FLOOR_SHIFT_CELLS
+    rows, columns = intensity.grey.shape
+    move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
+    # Averaging two of four cells would smooth one image only; cubic keeps most of the detail.
+    grey = cv2.warpAffine(
+        intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC
+    )
+    whole = cv2.warpAffine(
+        intensity.valid.astype(np.float32), move, (columns, rows), flags=cv2.INTER_LINEAR
+    )
+    valid = np.asarray(whole) > 0.999
+    aside = GreyImage(grey=np.asarray(grey, dtype=np.float64), valid=valid, region=valid)
+    pairs = find_key_pairs(aside, intensity, radius_cells=radius)
+    return replace(
+        pairs,
+        shift=pairs.shift - FLOOR_SHIFT_CELLS,
+        found=pairs.found - FLOOR_SHIFT_CELLS,
+    )
+
+
+def _fullest_part(image: GreyImage) -> GreyImage:
+    """The tile with most valid cells: some hundred pairs say what a floor is."""
+    rows, columns = image.grey.shape
+    tiles = [
+        (slice(row, row + _FLOOR_CELLS), slice(column, column + _FLOOR_CELLS))
+        for row in range(0, rows, _FLOOR_CELLS)
+        for column in range(0, columns, _FLOOR_CELLS)
+    ]
+    best = max(tiles, key=lambda tile: int(np.count_nonzero(image.valid[tile])))
+    return GreyImage(grey=image.grey[best], valid=image.valid[best], region=image.region[best])
+
+
+def _numbers(items: list[_Verdict], wall: int, gsd_m: float) -> list[Finding]:
+    def joined(which: str, what: str) -> list[NDArray[np.float64]]:
+        return [item.image.frame.gsd_m * getattr(getattr(item, which), what) for item in items]
+
+    findings = displacement_findings(np.concatenate(joined("pairs", "shift")), gsd_m, wall)
+    for prefix, which, what in (
+        ("surf_", "pairs", "found"),
+        ("floor_", "floor", "shift"),
+        ("surf_floor_", "floor", "found"),
+    ):
+        shift = np.concatenate(joined(which, what))
+        if len(shift):
+            wanted = {f"{prefix}rmse_{axis}_mm" for axis in "xy"}
+            numbers = displacement_findings(shift, gsd_m, wall, prefix=prefix)
+            findings += [finding for finding in numbers if finding.name in wanted]
+    return findings
+
+
+def _together(items: list[_Verdict]) -> list[Finding]:
+    n_pairs = float(sum(len(item.pairs) for item in items))
+    coarsest = max(item.image.frame.gsd_m for item in items)
+    return [
+        Finding(name="n_pairs", value=n_pairs, unit="1"),
+        *_numbers(items, -1, coarsest),
+    ]
+
+
+def _inspection(items: list[_Verdict], findings: list[Finding], reason: str | None) -> Inspection:
+    points = [item.image.frame.world_from_wall(item.pairs.places) for item in items]
+    shifts = [item.image.frame.gsd_m * item.pairs.shift for item in items]
+    walls = [np.full(len(item.pairs), item.image.wall, dtype=np.int32) for item in items]
+    n_points = sum(len(item.pairs) for item in items)
+    return Inspection(
+        wall=np.concatenate([np.zeros(0, dtype=np.int32), *walls]),
+        points_world=np.concatenate([np.zeros((0, 3)), *points]),
+        displacement_m=np.concatenate([np.zeros((0, 2)), *shifts]),
+        kind=np.zeros(n_points, dtype=np.uint8),
+        kinds=("SURF pair",),
+        findings=tuple(findings),
+        details={
+            "floor_shift_cells": list(FLOOR_SHIFT_CELLS),
+            "not_inspected_because": reason or "",
+        },
+    )

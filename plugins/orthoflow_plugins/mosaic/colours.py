@@ -1,0 +1,138 @@
+"""Colours of overlapping layers: steps along seams, and gains that make them smaller."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.products import Layer, LayerMask
+
+# Overlaps are compared on every so manieth cell: a few thousand colours say what a gain is.
+_SAMPLES_MOST: Final = 20_000
+_LEAST_SAMPLES: Final = 100
+# Clipped and almost black pixels say nothing of exposure.
+_DARKEST, _BRIGHTEST = 10, 245
+# As much as a tenth of what an overlap says, so that a chain of photos does not drift.
+_PRIOR: Final = 0.1
+_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeamSteps:
+    """What changes where one source follows another.
+
+    Attributes:
+        grey: (n,) float64 difference in luminance of both sources in a cell at a seam.
+        delta_e: (n,) float64 distance of both colours in CIE L*a*b* (1976).
+    """
+
+    grey: NDArray[np.float64]
+    delta_e: NDArray[np.float64]
+
+
+def seam_steps(source: NDArray[np.int16], layers: Sequence[Layer]) -> SeamSteps:
+    """Compare both sources in the cells on the left of or above seams that both paint.
+
+    Args:
+        source: (rows, cols) index of the layer that paints each cell, -1 for none.
+        layers: what the index counts.
+    """
+    nothing = np.zeros((0, 3), dtype=np.uint8)
+    firsts, seconds = [nothing], [nothing]
+    for axis in (0, 1):
+        here = source[:-1] if axis == 0 else source[:, :-1]
+        there = source[1:] if axis == 0 else source[:, 1:]
+        rows, columns = np.nonzero((here != there) & (here >= 0) & (there >= 0))
+        mine, other = here[rows, columns], there[rows, columns]
+        for index, layer in enumerate(layers):
+            chosen = (other == index) & (layer.mask[rows, columns] == LayerMask.PAINTED)
+            seconds.append(layer.rgb[rows[chosen], columns[chosen]])
+            first = np.zeros((np.count_nonzero(chosen), 3), dtype=np.uint8)
+            for owner, painter in enumerate(layers):
+                is_mine = mine[chosen] == owner
+                first[is_mine] = painter.rgb[rows[chosen][is_mine], columns[chosen][is_mine]]
+            firsts.append(first)
+    one, another = np.concatenate(firsts), np.concatenate(seconds)
+    grey = (one.astype(np.float64) - another) @ _LUMINANCE
+    return SeamSteps(
+        grey=grey, delta_e=np.linalg.norm(_lab(one) - _lab(another), axis=1).astype(np.float64)
+    )
+
+
+def balanced(layers: Sequence[Layer], gains: NDArray[np.float64]) -> list[Layer]:
+    """Multiply the light of each layer by its gains (k, 3), per channel."""
+    return [
+        replace(layer, rgb=_with_gain(layer.rgb, gain))
+        for layer, gain in zip(layers, gains, strict=True)
+    ]
+
+
+def estimate_gains(layers: Sequence[Layer]) -> NDArray[np.float64]:
+    """Gains (k, 3) per layer and channel that make overlaps most alike, in linear light.
+
+    Least squares of the logarithms over all pairs of layers (median ratio of each), with a prior
+    of 1 for every gain.
+    """
+    count = len(layers)
+    normal = _PRIOR * np.eye(count)
+    right = np.zeros((count, 3))
+    for i, j in combinations(range(count), 2):
+        ratio = _median_log_ratio(layers[i], layers[j])
+        if ratio is None:
+            continue
+        # Wanted: log g_i + log c_i = log g_j + log c_j.
+        normal[i, i] += 1.0
+        normal[j, j] += 1.0
+        normal[i, j] -= 1.0
+        normal[j, i] -= 1.0
+        right[i] -= ratio
+        right[j] += ratio
+    gains: NDArray[np.float64] = np.exp(np.linalg.solve(normal, right))
+    return gains
+
+
+def _median_log_ratio(first: Layer, second: Layer) -> NDArray[np.float64] | None:
+    """Median of log(first / second) per channel in linear light, None without an overlap."""
+    both = np.flatnonzero((first.mask == LayerMask.PAINTED) & (second.mask == LayerMask.PAINTED))
+    both = both[:: max(1, len(both) // _SAMPLES_MOST)]
+    one, other = (layer.rgb.reshape(-1, 3)[both] for layer in (first, second))
+    usable = np.all(
+        (np.minimum(one, other) >= _DARKEST) & (np.maximum(one, other) <= _BRIGHTEST), axis=1
+    )
+    if np.count_nonzero(usable) < _LEAST_SAMPLES:
+        return None
+    light = _linear_light()
+    ratio: NDArray[np.float64] = np.median(
+        np.log(light[one[usable]]) - np.log(light[other[usable]]), axis=0
+    )
+    return ratio
+
+
+def _linear_light() -> NDArray[np.float64]:
+    """Light of each of the 256 levels of sRGB (IEC 61966-2-1), 0..1."""
+    level = np.arange(256) / 255.0
+    light: NDArray[np.float64] = np.where(
+        level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4
+    )
+    return light
+
+
+def _with_gain(rgb: NDArray[np.uint8], gain: NDArray[np.float64]) -> NDArray[np.uint8]:
+    light = np.clip(_linear_light()[:, None] * gain, 0.0, 1.0)
+    level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    table = np.rint(255.0 * level).astype(np.uint8)
+    return np.stack([table[rgb[..., band], band] for band in range(3)], axis=-1)
+
+
+def _lab(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    import cv2
+
+    if len(rgb) == 0:
+        return np.zeros((0, 3), dtype=np.float32)
+    levels = rgb[None].astype(np.float32) / np.float32(255.0)
+    return np.asarray(cv2.cvtColor(levels, cv2.COLOR_RGB2Lab)[0], dtype=np.float32)

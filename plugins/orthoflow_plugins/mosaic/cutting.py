@@ -1,0 +1,176 @@
+"""Seams by graph cuts: where two photos look alike, and not along depth edges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.products import Layer, LayerMask, Wall
+
+# Cuts are made on a smaller picture of about so many cells.
+_CELLS_MOST: Final = 30_000
+_SWEEPS: Final = 2
+# A seam across a depth edge costs as much as one between black and white.
+_DEPTH_EDGE_COST: Final = 1.0
+_DEPTH_EDGE_M: Final = 0.03
+# Even where layers are equal a long seam costs more than a short one.
+_LENGTH_COST: Final = 0.01
+_VIEW_WEIGHT: Final = 0.1
+# What a layer does not paint it cannot take.
+_FORBIDDEN: Final = 1e3
+_UNITS: Final = 1000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scene:
+    """The reduced layers: colours (k, rows, cols, 3) 0..1, views (k, rows, cols), edges.
+
+    `views` is the cost of a layer in a cell, `edges` what a seam there costs besides.
+    """
+
+    colours: NDArray[np.float32]
+    views: NDArray[np.float64]
+    edges: NDArray[np.float64]
+
+
+def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> NDArray[np.int16]:
+    """Give each cell the layer that a graph cut chooses, -1 where none paints it.
+
+    Boykov, Veksler and Zabih 2001: each layer in turn may take over cells of the others where that
+    lowers the sum of seam costs (colour difference of both layers on both sides, Kwatra et al.
+    2003, plus depth edges) and of view costs. The cut is made at a reduced scale.
+
+    Args:
+        layers: of one wall.
+        wall: its surface, for depth edges, or None.
+    """
+    shape = layers[0].frame.shape
+    factor = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS_MOST)))
+    scene = _reduced(layers, wall, factor)
+    labels = np.argmin(scene.views, axis=0)
+    for _ in range(_SWEEPS):
+        before = labels
+        for alpha in range(len(layers)):
+            labels = _expanded(scene, labels, alpha)
+        if np.array_equal(labels, before):
+            break
+    labels = np.where(scene.views.min(axis=0) < _FORBIDDEN, labels, -1)
+    large = np.repeat(np.repeat(labels, factor, axis=0), factor, axis=1)
+    return large[: shape[0], : shape[1]].astype(np.int16)
+
+
+def _reduced(layers: Sequence[Layer], wall: Wall | None, factor: int) -> _Scene:
+    painted = np.stack([_means(layer.mask == LayerMask.PAINTED, factor) for layer in layers])
+    colours = np.stack(
+        [
+            np.stack([_means(layer.rgb[..., band], factor) for band in range(3)], axis=-1)
+            / np.maximum(share, 1e-3)[..., None]
+            for layer, share in zip(layers, painted, strict=True)
+        ]
+    )
+    quality = np.stack([_means(layer.quality, factor) for layer in layers])
+    best = np.maximum(quality.max(axis=0), 1e-12)
+    views = np.where(painted > 0.5, _VIEW_WEIGHT * (1.0 - quality / best), _FORBIDDEN)
+    edges = np.zeros(views.shape[1:])
+    if wall is not None:
+        steps = depth_edges(wall.depth_m)
+        edges = np.where(_means(steps, factor) > 0.0, _DEPTH_EDGE_COST, 0.0)
+    return _Scene(colours=(colours / 255.0).astype(np.float32), views=views, edges=edges)
+
+
+def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Cells whose right or lower neighbour lies 3 cm nearer or farther."""
+    edges = np.zeros(depth_m.shape, dtype=np.bool_)
+    edges[:, :-1] |= np.abs(np.diff(depth_m, axis=1)) > _DEPTH_EDGE_M
+    edges[:-1] |= np.abs(np.diff(depth_m, axis=0)) > _DEPTH_EDGE_M
+    return edges
+
+
+def _means(
+    values: NDArray[np.bool_] | NDArray[np.uint8] | NDArray[np.float32], factor: int
+) -> NDArray[np.float64]:
+    """Means of squares of cells; those at the rim are of what is there."""
+    rows, columns = (-(-side // factor) * factor for side in values.shape)
+    padded = np.pad(
+        values.astype(np.float64),
+        ((0, rows - values.shape[0]), (0, columns - values.shape[1])),
+        mode="edge",
+    )
+    blocks = padded.reshape(rows // factor, factor, columns // factor, factor)
+    means: NDArray[np.float64] = blocks.mean(axis=(1, 3))
+    return means
+
+
+def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
+    """Let one layer take over cells: the best of all such moves, by a minimum cut."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+    count = labels.size
+    source, sink = count, count + 1
+    flat = labels.ravel()
+    cells = np.arange(count)
+    # Unary costs of keeping (0) and of taking alpha (1).
+    keep = scene.views.reshape(len(scene.views), -1)[flat, cells].copy()
+    take = scene.views[alpha].ravel().copy()
+    starts, ends, between = [], [], []
+    grid = cells.reshape(labels.shape)
+    for one, other in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
+        p, q = one.ravel(), other.ravel()
+        kept = _seam_cost(scene, p, q, flat[p], flat[q])
+        right = _seam_cost(scene, p, q, flat[p], np.full(len(p), alpha))
+        left = _seam_cost(scene, p, q, np.full(len(p), alpha), flat[q])
+        # Kolmogorov and Zabih 2004: A + (C - A) p - C q + (B + C - A) (1 - p) q.
+        np.add.at(take, p, left - kept)
+        np.add.at(take, q, -left)
+        starts.append(p)
+        ends.append(q)
+        between.append(np.maximum(right + left - kept, 0.0))
+    low = np.minimum(keep, take)
+    starts += [np.full(count, source), cells]
+    ends += [cells, np.full(count, sink)]
+    # A cell on the sink's side takes alpha and cuts its link from the source.
+    between += [take - low, keep - low]
+    # Edges from p to q are cut where p keeps and q takes: p on the source's side.
+    capacity = np.minimum(np.concatenate(between), 4.0 * _FORBIDDEN) * _UNITS
+    graph = coo_matrix(
+        (
+            np.rint(capacity).astype(np.int32),
+            (np.concatenate(starts), np.concatenate(ends)),
+        ),
+        shape=(count + 2, count + 2),
+    ).tocsr()
+    flow = maximum_flow(graph, source, sink).flow
+    rest = graph - flow
+    rest.data = np.maximum(rest.data, 0)
+    rest.eliminate_zeros()
+    reached = breadth_first_order(rest, source, return_predecessors=False)
+    keeps = np.zeros(count + 2, dtype=np.bool_)
+    keeps[reached] = True
+    moved = np.where(keeps[:count], flat, alpha)
+    return moved.reshape(labels.shape)
+
+
+def _seam_cost(
+    scene: _Scene,
+    p: NDArray[np.int64],
+    q: NDArray[np.int64],
+    label_p: NDArray[np.int64],
+    label_q: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Cost (n,) of neighbours with these labels: 0 for equal ones."""
+    colours = scene.colours.reshape(len(scene.colours), -1, 3)
+    views = scene.views.reshape(len(scene.views), -1)
+    edges = scene.edges.ravel()
+    cost = _LENGTH_COST + edges[p] + edges[q]
+    for cell in (p, q):
+        apart = np.abs(colours[label_p, cell] - colours[label_q, cell]).mean(axis=1)
+        # Where only one of them paints there is nothing to compare, and no step to be seen.
+        both = (views[label_p, cell] < _FORBIDDEN) & (views[label_q, cell] < _FORBIDDEN)
+        cost = cost + np.where(both, apart, 0.0)
+    return np.where(label_p == label_q, 0.0, cost)

@@ -1,0 +1,155 @@
+"""`read.orthoimage`: orthoimages that another program made, to be inspected beside ours."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import InputError
+from orthoflow.files.geotiff import RasterFile, read_raster
+from orthoflow.files.sidecars import frame_of_raster
+from orthoflow.products import InputFiles, Orthoimage, Orthoimages, OrthoMask
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+
+_IMAGES: Final = (".tif", ".tiff")
+
+
+class ReadOrthoimage(Method):
+    """Read orthoimages from GeoTIFF files whose X and Y are metres in the plane of a wall.
+
+    Where that plane lies in the world says a JSON file of the same name among the input's files
+    (`wall.tif`, `wall.json`), with `origin_world`, `u_world`, `v_world`, `normal_world` as beside
+    every raster that orthoflow writes: a copy of `wall_0_intensity.json` will do. Files of
+    orthoflow itself need none. X and Y of the GeoTIFF count from that origin, so another size,
+    cell size or part of the wall is no obstacle. `wall` in the JSON file says which wall it is of.
+    """
+
+    id: ClassVar[str] = "read.orthoimage"
+    result_version: ClassVar[int] = 1
+    determinism = "exact"
+    citations: ClassVar[tuple[str, ...]] = ()
+
+    class Params(MethodParams):
+        """What the files do not say themselves."""
+
+        wall: int = Field(
+            0, ge=0, description="Wall that images are of whose JSON file does not say it."
+        )
+
+    class In(Ports):
+        """The GeoTIFF files, and the JSON files that place them."""
+
+        files: InputFiles
+
+    class Out(Ports):
+        """The images, by wall."""
+
+        orthoimages: Orthoimages
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Read all files; see the class."""
+        paths = [
+            path
+            for path in inputs.files.paths
+            if path.suffix.lower() in _IMAGES and not path.stem.endswith("_mask")
+        ]
+        if not paths:
+            raise InputError(
+                f"the input {inputs.files.name} holds no GeoTIFF: expected orthoimages, .tif"
+            )
+        images: dict[int, Orthoimage] = {}
+        for path in paths:
+            image = _read(path, inputs.files.paths, params.wall)
+            if image.wall in images:
+                raise InputError(
+                    f"{path.name} and {images[image.wall].sources[0]} are both of wall "
+                    f"{image.wall}: name another `wall` in the JSON file of one of them"
+                )
+            images[image.wall] = image
+            ctx.log(f"{path.name}: wall {image.wall}, cells of {1e3 * image.frame.gsd_m:g} mm")
+        ctx.metric("n_orthoimages", len(images), "1")
+        shown = sum(int(np.count_nonzero(image.mask)) for image in images.values())
+        total = sum(image.mask.size for image in images.values())
+        ctx.metric("painted_share", shown / total, "1")
+        return self.Out(
+            orthoimages=Orthoimages(images=tuple(images[wall] for wall in sorted(images)))
+        )
+
+
+def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
+    raster = read_raster(path)
+    place = _place(path, among, raster)
+    said = place.get("wall", wall)
+    if not isinstance(said, int) or said < 0:
+        raise InputError(f"{path.stem}.json: wall must be the number of a wall, got {said!r}")
+    rgb = _rgb(path, raster)
+    shown = raster.shown if raster.shown.ndim == 2 else raster.shown[..., 0]
+    frame = frame_of_raster(
+        place,
+        corner_m=raster.corner_m,
+        gsd_m=raster.gsd_m,
+        shape=(rgb.shape[0], rgb.shape[1]),
+        name=path.name,
+    )
+    return Orthoimage(
+        frame=frame,
+        wall=said,
+        name=str(place.get("name", path.stem)),
+        rgb=np.where(shown[..., None], rgb, np.uint8(0)),
+        mask=np.where(shown, OrthoMask.PAINTED, OrthoMask.NONE).astype(np.uint8),
+        source=np.where(shown, 0, -1).astype(np.int16),
+        sources=(path.name,),
+    )
+
+
+def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, object]:
+    """What the JSON file beside an image says, or the tag that orthoflow writes."""
+    for other in among:
+        if other.stem == path.stem and other.suffix.lower() == ".json":
+            return _json(other.name, _text(other))
+    if "frame" in raster.tags:
+        tags = {"name": raster.tags.get("name", path.stem)}
+        return _json(path.name, raster.tags["frame"]) | tags
+    raise InputError(
+        f"{path.name} does not say where it lies in the world: put {path.stem}.json with "
+        "origin_world, u_world, v_world and normal_world among the files, e.g. a copy of the "
+        "wall_<k>_intensity.json that orthoflow wrote"
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path.name} cannot be read: {error}") from error
+
+
+def _json(name: str, text: str) -> dict[str, object]:
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{name}: no JSON, {error}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{name}: expected a JSON object with origin_world, u_world ...")
+    return content
+
+
+def _rgb(path: Path, raster: RasterFile) -> NDArray[np.uint8]:
+    """Colours (rows, cols, 3); a fourth band is transparency, 16 bits become 8."""
+    values = raster.values
+    bands = values[..., None] if values.ndim == 2 else values
+    if bands.shape[2] not in (1, 3, 4) or bands.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"{path.name} has {bands.shape[2]} bands of {bands.dtype}: expected grey, RGB or RGBA "
+            "of 8 or 16 bits"
+        )
+    colours = np.repeat(bands, 3, axis=2) if bands.shape[2] == 1 else bands[..., :3]
+    if colours.dtype == np.uint16:
+        return np.rint(colours.astype(np.float64) / 257.0).astype(np.uint8)
+    return np.ascontiguousarray(colours).astype(np.uint8)

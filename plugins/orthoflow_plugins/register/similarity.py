@@ -1,0 +1,161 @@
+"""`register.similarity`: bring a cloud into the coordinate system of surveyed points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import GeometryError, MethodError
+from orthoflow.geometry.similarity import Similarity, fit_similarity
+from orthoflow.products import CheckPoints, Finding, Inspection, JsonValue, PointCloud
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+
+_AT_ONCE: Final = 1 << 20
+
+
+class RegisterSimilarity(Method):
+    """Fit shift, rotation and scale to pairs of points, and move the cloud by them.
+
+    The seven-parameter transformation of skarlatos2012: `points` are places in the cloud's own
+    coordinates, `control` the surveyed ones; equal names make a pair. All pairs count alike;
+    `sigma0_mm` is the standard deviation of one coordinate, `left_out_rms_mm` the distance of each
+    control point from where the other pairs put it, which no pair can flatter.
+    """
+
+    id: ClassVar[str] = "register.similarity"
+    result_version: ClassVar[int] = 1
+    determinism = "loose"
+    citations: ClassVar[tuple[str, ...]] = (
+        "Umeyama 1991, doi:10.1109/34.88573 (least squares of a similarity)",
+        "Skarlatos and Kiparissi 2012 (4.3, seven-parameter transformation)",
+    )
+
+    class Params(MethodParams):
+        """What is estimated."""
+
+        with_scale: bool = Field(
+            default=True,
+            description="Estimate a scale, for clouds from photos; a scanner's is 1.",
+        )
+
+    class In(Ports):
+        """The cloud, and the same points in both coordinate systems."""
+
+        cloud: PointCloud
+        points: CheckPoints
+        control: CheckPoints
+
+    class Out(Ports):
+        """The cloud in the control's system, and the residuals there."""
+
+        cloud: PointCloud
+        inspection: Inspection
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Pair, fit, move."""
+        names = [name for name in inputs.points.names if name in inputs.control.names]
+        source, target = (
+            product.points_world[[product.names.index(name) for name in names]]
+            for product in (inputs.points, inputs.control)
+        )
+        n_free = 3 * len(names) - (7 if params.with_scale else 6)
+        if n_free < 1:
+            raise MethodError(
+                f"{len(names)} names are in both lists of points ({', '.join(names) or 'none'}), "
+                "at least 3 pairs are needed (register.similarity)"
+            )
+        try:
+            fitted = fit_similarity(source, target, with_scale=params.with_scale)
+            left_out = _left_out(source, target, with_scale=params.with_scale)
+        except GeometryError as error:
+            raise MethodError(f"{error} (register.similarity)") from error
+        residual_m = fitted.apply(source) - target
+        findings = _findings(residual_m, left_out, n_free, fitted)
+        for finding in findings:
+            ctx.metric(finding.name, finding.value, finding.unit)
+        details = _details(names, residual_m, fitted)
+        inspection = Inspection(
+            wall=np.full(len(names), -1, dtype=np.int32),
+            points_world=target,
+            displacement_m=residual_m[:, :2].copy(),
+            kind=np.zeros(len(names), dtype=np.uint8),
+            kinds=("control",),
+            findings=tuple(findings),
+            details=details,
+        )
+        return self.Out(cloud=_moved(inputs.cloud, fitted, ctx), inspection=inspection)
+
+
+def _left_out(
+    source: NDArray[np.float64], target: NDArray[np.float64], *, with_scale: bool
+) -> NDArray[np.float64]:
+    """Distance (n,) of each point from where the others put it; empty with three pairs."""
+    if len(source) < 4:
+        return np.zeros(0)
+    apart = []
+    for k in range(len(source)):
+        others = np.arange(len(source)) != k
+        fitted = fit_similarity(source[others], target[others], with_scale=with_scale)
+        apart.append(np.linalg.norm(fitted.apply(source[k : k + 1])[0] - target[k]))
+    return np.array(apart)
+
+
+def _findings(
+    residual_m: NDArray[np.float64],
+    left_out: NDArray[np.float64],
+    n_free: int,
+    fitted: Similarity,
+) -> list[Finding]:
+    length_mm = 1e3 * np.linalg.norm(residual_m, axis=1)
+    numbers = [
+        ("n_pairs", float(len(residual_m)), "1"),
+        ("sigma0_mm", 1e3 * float(np.sqrt(np.sum(residual_m**2) / n_free)), "mm"),
+        ("rms_mm", float(np.sqrt(np.mean(length_mm**2))), "mm"),
+        ("max_mm", float(length_mm.max()), "mm"),
+        ("scale_ppm", 1e6 * (fitted.scale - 1.0), "ppm"),
+    ]
+    if len(left_out):
+        numbers.append(("left_out_rms_mm", 1e3 * float(np.sqrt(np.mean(left_out**2))), "mm"))
+    return [Finding(name=name, value=value, unit=unit) for name, value, unit in numbers]
+
+
+def _details(
+    names: list[str], residual_m: NDArray[np.float64], fitted: Similarity
+) -> dict[str, JsonValue]:
+    residuals: list[JsonValue] = [
+        {
+            "name": name,
+            **{f"d{axis}_mm": round(1e3 * float(d), 4) for axis, d in zip("xyz", row, strict=True)},
+        }
+        for name, row in zip(names, residual_m, strict=True)
+    ]
+    return {
+        "target_from_source": {
+            "scale": fitted.scale,
+            "rotation": [[float(value) for value in row] for row in fitted.rotation],
+            "translation_m": [float(value) for value in fitted.translation],
+        },
+        "residuals": residuals,
+    }
+
+
+def _moved(cloud: PointCloud, fitted: Similarity, ctx: StepContext) -> PointCloud:
+    """The cloud in target coordinates; offsets from the moved origin keep their digits."""
+    origin = fitted.apply(cloud.origin[None])[0]
+    turn = fitted.scale * fitted.rotation
+    offsets = {
+        name: np.asarray(ctx.allocate("cloud", name, cloud.x.shape, np.float32)) for name in "xyz"
+    }
+    for start in range(0, len(cloud), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        old = np.column_stack([cloud.x[part], cloud.y[part], cloud.z[part]]).astype(np.float64)
+        for axis, name in enumerate("xyz"):
+            offsets[name][part] = old @ turn[axis]
+    stations = None if cloud.stations is None else fitted.apply(cloud.stations)
+    return replace(
+        cloud, origin=origin, x=offsets["x"], y=offsets["y"], z=offsets["z"], stations=stations
+    )

@@ -1,0 +1,80 @@
+"""`colour.photos`: points take the colours of photos that really see them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.colour.photos import ColourPhotos
+
+from orthoflow.errors import MethodError
+from orthoflow.products import Cameras, Photos, PointCloud
+from tests import ortho_scenes
+from tests import raster_scenes as scenes
+from tests.ortho_scenes import BLUE, BOARD, NOTHING
+
+
+def coloured(
+    folder: Path, cloud: PointCloud, photos: Photos, cameras: Cameras, **params: object
+) -> tuple[PointCloud, dict[str, float]]:
+    ctx = scenes.context(folder)
+    inputs = ColourPhotos.In(cloud=cloud, photos=photos, cameras=cameras)
+    out = ColourPhotos().run(inputs, ColourPhotos.Params.model_validate(params), ctx)
+    return out.cloud, {metric.name: metric.value for metric in ctx.metrics}
+
+
+def test_points_take_the_colour_of_what_the_photo_sees_there(tmp_path: Path) -> None:
+    where = ortho_scenes.frame()
+    viewer = ortho_scenes.camera(where)
+    photos = ortho_scenes.photos(ortho_scenes.rendered())
+    cloud, metrics = coloured(
+        tmp_path,
+        ortho_scenes.cloud(where),
+        photos,
+        ortho_scenes.cameras(viewer),
+        tolerance_m=0.01,
+    )
+    assert cloud.rgb is not None
+    points = cloud.points_world()
+    truth = ortho_scenes.cast(
+        where, np.broadcast_to(viewer.centre_world, points.shape), points - viewer.centre_world
+    )
+    # What the photo cannot see is left out: all but a rim of half a depth pixel.
+    off_m = 0.004 * np.linalg.norm(
+        where.wall_from_world(points)[:, :2] - truth.places[:, :2], axis=1
+    )
+    seen = off_m < 0.01
+    assert seen.mean() > 0.97
+    assert 0.5 < metrics["coloured_share"] < 1.0
+    # Blue tells the surface; a few points lie at its rims, between two pixels.
+    wanted = BLUE[truth.surface]
+    same = np.abs(cloud.rgb[:, 2].astype(int) - wanted) <= 3
+    assert same[seen].mean() > 0.97
+    assert (truth.surface[seen] == BOARD).any()
+    assert not (truth.surface == NOTHING).any()
+
+
+def test_unseen_points_may_stay_in_grey(tmp_path: Path) -> None:
+    where = ortho_scenes.frame()
+    photos = ortho_scenes.photos(ortho_scenes.rendered())
+    cameras = ortho_scenes.cameras(ortho_scenes.camera(where))
+    bare = ortho_scenes.cloud(where)
+    kept, metrics = coloured(tmp_path, bare, photos, cameras, unseen="grey", tolerance_m=0.01)
+    assert len(kept) == len(bare)
+    assert kept.rgb is not None
+    grey = np.all(kept.rgb == 128, axis=1).mean()
+    assert grey == pytest.approx(1.0 - metrics["coloured_share"], abs=0.01)
+
+
+def test_photos_that_are_not_oriented_or_look_elsewhere_are_refused(tmp_path: Path) -> None:
+    where = ortho_scenes.frame()
+    photos = ortho_scenes.photos(ortho_scenes.rendered())
+    viewer = ortho_scenes.camera(where)
+    lost = Cameras(cameras=(replace(ortho_scenes.cameras(viewer).cameras[0], status="lost"),))
+    with pytest.raises(MethodError, match="none of the photos is oriented"):
+        coloured(tmp_path, ortho_scenes.cloud(where), photos, lost)
+    away = ortho_scenes.cloud(ortho_scenes.frame(at_survey=True))
+    with pytest.raises(MethodError, match="no photo sees any point"):
+        coloured(tmp_path, away, photos, ortho_scenes.cameras(viewer))

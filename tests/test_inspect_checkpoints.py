@@ -1,0 +1,253 @@
+"""`inspect.checkpoints` finds points, tells how far they lie off, and sums up as the paper did."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.inspect.check_table import (
+    check_findings,
+    outliers_at_once,
+    outliers_iterated,
+)
+from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
+from orthoflow_plugins.inspect.crossings import find_crossing
+from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow_plugins.plane.given import GivenPlane
+from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.read.scan import ReadScan
+from orthoflow_plugins.simulate.room import SimulateRoom
+from scipy.ndimage import gaussian_filter
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import frame_over
+from orthoflow.geometry.scene_views import render_frame
+from orthoflow.products import (
+    CheckPoints,
+    InputFiles,
+    Inspection,
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    Truth,
+    Walls,
+)
+from orthoflow.sdk import StepContext
+from tests import inspect_scenes
+from tests.inspect_scenes import BUFFER_M, GSD_M, points_at
+from tests.raster_scenes import UP
+from tests.road.conftest import IS_LONG
+
+
+def context(folder: Path) -> StepContext:
+    return StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
+
+
+def inspect(
+    folder: Path,
+    points: CheckPoints,
+    walls: Walls,
+    image: Orthoimage | None = None,
+    truth: Truth | None = None,
+    **params: object,
+) -> tuple[dict[str, float], Inspection, StepContext]:
+    inputs = InspectCheckpoints.In(
+        checkpoints=points,
+        walls=walls,
+        orthoimages=None if image is None else Orthoimages(images=(image,)),
+        truth=truth,
+    )
+    ctx = context(folder)
+    out = InspectCheckpoints().run(inputs, InspectCheckpoints.Params.model_validate(params), ctx)
+    return {item.name: item.value for item in ctx.metrics}, out.inspection, ctx
+
+
+def test_measured_points_give_their_residuals_by_class(tmp_path: Path) -> None:
+    walls = inspect_scenes.walls()
+    places = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0], [120.0, 150.0]])
+    surveyed = walls.walls[0].frame.world_from_wall(places, 0.01)
+    off = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, -2.0], [0.0, -2.0]])
+    points = points_at(
+        surveyed, classes=("flat", "flat", "vertical edge", "vertical edge"), pixels=places + off
+    )
+    metrics, found, ctx = inspect(tmp_path, points, walls, inspect_scenes.displaced(0, 0))
+    np.testing.assert_allclose(found.displacement_m, GSD_M * off, atol=1e-9)
+    assert metrics["flat_rmse_x_mm"] == pytest.approx(1e3 * GSD_M)
+    assert metrics["flat_rmse_y_mm"] == pytest.approx(0.0, abs=1e-6)
+    assert metrics["vertical_edge_rms_mm"] == pytest.approx(2e3 * GSD_M)
+    assert metrics["mean_y_mm"] == pytest.approx(-1e3 * GSD_M)
+    assert metrics["flat_mean_shift_share"] == pytest.approx(1.0)
+    assert metrics["n_found"] == metrics["n_points"] == 4
+    assert [figure.name for figure in ctx.figures] == ["wall_0_residuals"]
+    table = found.details["points"]
+    assert isinstance(table, list)
+    assert table[2] == {
+        "name": "P2",
+        "class": "vertical edge",
+        "how": "measured",
+        "wall": 0,
+        "u_px": 300.0,
+        "v_px": 218.0,
+        "x_mm": 0.0,
+        "y_mm": -8.0,
+    }
+
+
+def test_the_papers_table_fits_the_iterated_rule_only() -> None:
+    # skarlatos2012, Table 1, point cloud: 30 points, RMS 4.39 cm, 2 outliers, 4.00 cm without.
+    length = np.append(np.full(28, 0.0400), [0.0805, 0.0806])
+    assert np.sqrt(np.mean(length**2)) == pytest.approx(0.0439, abs=5e-5)
+    assert outliers_at_once(length).sum() == 0
+    assert outliers_iterated(length).sum() == 2
+    shift_m = length[:, None] * np.array([0.6, 0.8])
+    numbers = {finding.name: finding.value for finding in check_findings(shift_m, 0.02)}
+    assert numbers["rms_mm"] == pytest.approx(43.9, abs=0.05)
+    assert numbers["rms_after_iterated_mm"] == pytest.approx(40.0)
+    assert numbers["rms_after_once_mm"] == pytest.approx(numbers["rms_mm"])
+    assert numbers["n_outliers_iterated"] == 2
+
+
+def target(centre: tuple[float, float], turned_deg: float) -> NDArray[np.float64]:
+    """Quadrants of 40 cells about a centre, as a camera of one cell's sharpness sees them."""
+    fine = (np.arange(400) + 0.5) / 4.0
+    columns, rows = np.meshgrid(fine - centre[0], fine - centre[1])
+    turn = np.radians(turned_deg)
+    one = columns * np.cos(turn) + rows * np.sin(turn)
+    other = rows * np.cos(turn) - columns * np.sin(turn)
+    bright = np.where(one * other > 0.0, 220.0, 40.0)
+    bright[np.hypot(columns, rows) > 40.0] = 130.0
+    smooth = gaussian_filter(bright, 3.0)
+    return np.asarray(smooth.reshape(100, 4, 100, 4).mean(axis=(1, 3)))
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 20.0, 33.0])
+def test_the_centre_of_a_target_is_found_in_noise_and_holes(turned_deg: float) -> None:
+    rng = np.random.default_rng(3)
+    # A border of fine cells, so that the drawn edges lie just there.
+    centre = (52.25, 47.75)
+    grey = target(centre, turned_deg) + rng.normal(scale=6.0, size=(100, 100))
+    valid = rng.random((100, 100)) > 0.3
+    picture = GreyImage(grey=grey, valid=valid, region=valid)
+    found = find_crossing(picture, np.array([47.0, 52.0]), search_cells=12.0, radius_cells=30.0)
+    assert found is not None
+    np.testing.assert_allclose(found.place, centre, atol=0.06)  # cells
+    edge = np.where(np.mgrid[:100, :100][1] < 50, 40.0, 220.0)
+    plain = GreyImage(grey=edge, valid=valid, region=valid)
+    assert (
+        find_crossing(plain, np.array([50.0, 50.0]), search_cells=12.0, radius_cells=30.0) is None
+    )
+
+
+def test_what_is_not_found_is_said(tmp_path: Path) -> None:
+    walls = inspect_scenes.walls()
+    far = points_at(np.array([[50.0, 50.0, 50.0]]))
+    with pytest.raises(MethodError, match="none of the 1 check points was found"):
+        inspect(tmp_path, far, walls)
+    with pytest.raises(MethodError, match="there is no picture to find check points in"):
+        inspect(tmp_path, far, inspect_scenes.walls(source="none"))
+
+
+def test_points_of_a_simulated_room_are_found_by_its_truth(tmp_path: Path) -> None:
+    params = SimulateRoom.Params(scan_step_m=0.05, panorama_step_m=0.15)
+    room = SimulateRoom().run(SimulateRoom.In(), params, context(tmp_path))
+    gsd_m, shift = 0.01, np.array([1.4, -0.6])
+    planes = room.truth.planes
+    frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=gsd_m)
+    moved = gsd_m * (shift[0] * frame.u_world + shift[1] * frame.v_world)
+    true = render_frame(
+        room.truth.scene,
+        replace(frame, origin_world=frame.origin_world - moved),
+        buffer_front_m=BUFFER_M,
+        buffer_behind_m=BUFFER_M,
+    )
+    known = true.rectangle >= 0
+    image = Orthoimage(
+        frame=frame,
+        wall=0,
+        name="main wall",
+        rgb=np.nan_to_num(true.rgb).round().astype(np.uint8),
+        mask=np.where(known, OrthoMask.PAINTED, OrthoMask.NO_SURFACE).astype(np.uint8),
+        source=np.zeros(frame.shape, dtype=np.int16),
+        sources=("truth",),
+    )
+    wall = replace(
+        inspect_scenes.walls().walls[0],
+        frame=frame,
+        depth_m=true.depth_m,
+        sigma_m=np.zeros(frame.shape, dtype=np.float32),
+        count=np.ones(frame.shape, dtype=np.uint32),
+        mask=known.astype(np.uint8),
+        intensity=None,
+    )
+    walls = Walls(
+        walls=(wall,),
+        up=UP,
+        intensity_source="none",
+        buffer_front_m=BUFFER_M,
+        buffer_behind_m=BUFFER_M,
+    )
+    metrics, found, _ = inspect(tmp_path, room.checkpoints, walls, image, room.truth)
+    assert metrics["n_found"] >= 0.7 * metrics["n_points"]
+    assert {"flat", "vertical edge"} == set(found.kinds)
+    for axis, cells in zip("xy", shift, strict=True):
+        assert metrics[f"mean_{axis}_mm"] == pytest.approx(1e3 * gsd_m * cells, abs=0.1e3 * gsd_m)
+        assert metrics[f"nmad_{axis}_mm"] < 0.1e3 * gsd_m
+
+
+TLS_PATCHES = ("T1.1", "T1.2", "T1.3", "T2.1", "T2.2", "T2.3", "T3.1", "T3.2")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param(("T2.1", "T3.1"), id="two"),
+        pytest.param(
+            TLS_PATCHES,
+            id="all",
+            marks=(
+                pytest.mark.long,
+                pytest.mark.skipif(not IS_LONG, reason="all eight patches: .ci/run --long"),
+            ),
+        ),
+    ],
+)
+def test_targets_of_a_real_scan_are_found_and_carried_back_into_space(
+    tmp_path: Path, shared_data: Path, names: tuple[str, ...]
+) -> None:
+    folder = shared_data / "tls-targets-sp1"
+    centres = json.loads((folder / "target_centers_SP1.json").read_text())
+    errors_mm = []
+    for name in names:
+        points = np.array([centres[name[:2]][int(name[3]) - 1]])
+        walls = _intensity_of(folder / f"{name}.txt", tmp_path)
+        metrics, _, _ = inspect(tmp_path, points_at(points), walls)
+        assert metrics["n_3d"] == 1
+        errors_mm.append(metrics["max_3d_mm"])
+    assert max(errors_mm) <= 0.5
+    assert np.sqrt(np.mean(np.square(errors_mm))) <= 0.3
+
+
+def _intensity_of(path: Path, scratch: Path) -> Walls:
+    """The intensity of a patch on the plane through it, scanned from the origin."""
+    files = InputFiles(name="scan", paths=(path,))
+    params = ReadScan.Params(view_from=(0.0, 0.0, 0.0))
+    cloud = ReadScan().run(ReadScan.In(files=files), params, context(scratch)).cloud
+    points = cloud.points_world()
+    near = np.ones(len(points), dtype=np.bool_)
+    for _ in range(10):
+        middle = points[near].mean(axis=0)
+        normal = np.linalg.svd(points[near] - middle, full_matrices=False)[2][2]
+        off = (points - middle) @ normal
+        near = np.abs(off) < max(4.0 * float(np.median(np.abs(off[near]))), 0.001)
+    normal = -normal * np.sign(normal @ middle)
+    given = GivenPlane.Params(
+        normal=tuple(float(value) for value in normal), offset_m=float(normal @ middle)
+    )
+    planes = GivenPlane().run(GivenPlane.In(cloud=cloud), given, context(scratch)).planes
+    grid = RasterGrid.Params(gsd_m=0.001)
+    return RasterGrid().run(RasterGrid.In(cloud=cloud, planes=planes), grid, context(scratch)).walls

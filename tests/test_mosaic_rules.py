@@ -1,0 +1,138 @@
+"""`mosaic.seams`: where seams lie by each rule, and what gains do to colours."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.mosaic.colours import estimate_gains
+from orthoflow_plugins.mosaic.seams import MosaicSeams
+
+from orthoflow.errors import MethodError
+from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, Wall, Walls
+from tests import inspect_scenes
+from tests import raster_scenes as scenes
+
+SHAPE = (40, 120)
+
+
+def layer(
+    name: str, columns: tuple[int, int], rgb: NDArray[np.uint8] | int, quality: float = 1.0
+) -> Layer:
+    """A layer that paints some columns of the wall."""
+    painted = np.zeros(SHAPE, dtype=np.bool_)
+    painted[:, columns[0] : columns[1]] = True
+    colour = np.broadcast_to(np.asarray(rgb, dtype=np.uint8), (*SHAPE, 3))
+    return Layer(
+        frame=inspect_scenes.frame(shape=SHAPE),
+        wall=0,
+        source=name,
+        rgb=np.where(painted[..., None], colour, np.uint8(0)),
+        mask=np.where(painted, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8),
+        quality=np.where(painted, np.float32(quality), np.float32(0.0)),
+    )
+
+
+def mosaic(
+    folder: Path, *layers: Layer, walls: Walls | None = None, **params: object
+) -> tuple[Orthoimage, dict[str, float], dict[str, object]]:
+    ctx = scenes.context(folder)
+    out = MosaicSeams().run(
+        MosaicSeams.In(layers=Layers(layers=layers), walls=walls),
+        MosaicSeams.Params.model_validate({"island_cells_min": 1} | params),
+        ctx,
+    )
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    return out.orthoimages.images[0], metrics, dict(out.orthoimages.details)
+
+
+def seam_columns(image: Orthoimage) -> NDArray[np.int64]:
+    """First column of the second source in each row."""
+    return np.argmax(image.source == 1, axis=1)
+
+
+def test_voronoi_seams_lie_in_the_middle_of_overlaps(tmp_path: Path) -> None:
+    # The first ends at column 80, the second begins at column 40; both end at the rim alike.
+    left, right = layer("left", (0, 80), 10, quality=9.0), layer("right", (40, 120), 20)
+    image, _, _ = mosaic(tmp_path, left, right, seams="voronoi")
+    middle = slice(18, 22)  # farther from the rim above and below than from the seam
+    assert (image.source[middle, :58] == 0).all()
+    assert (image.source[middle, 62:] == 1).all()
+    best, _, _ = mosaic(tmp_path, left, right)
+    assert (seam_columns(best) == 80).all()
+
+
+def test_the_order_of_photos_goes_before_their_quality(tmp_path: Path) -> None:
+    left, right = layer("left", (0, 80), 10, quality=9.0), layer("right", (40, 120), 20)
+    image, _, _ = mosaic(tmp_path, left, right, seams="priority", priority=["right"])
+    assert (seam_columns(image) == 40).all()
+    with pytest.raises(MethodError, match="priority names rigth, but the layers are of left, ri"):
+        mosaic(tmp_path, left, right, seams="priority", priority=["rigth"])
+
+
+def textures() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two pictures that agree in columns 64 to 67 only."""
+    rng = np.random.default_rng(4)
+    one, other = (rng.integers(0, 256, (*SHAPE, 3)).astype(np.uint8) for _ in range(2))
+    other[:, 64:68] = one[:, 64:68]
+    return one, other
+
+
+def test_a_graph_cut_runs_where_the_photos_agree(tmp_path: Path) -> None:
+    one, other = textures()
+    left, right = layer("left", (0, 100), one), layer("right", (20, 120), other)
+    image, cut, _ = mosaic(tmp_path, left, right, seams="graph-cut")
+    columns = seam_columns(image)
+    assert ((columns >= 65) & (columns <= 67)).all()
+    assert cut["seam_step_rms_grey"] == 0.0
+    assert cut["seam_step_mean_delta_e"] == 0.0
+    assert (image.source[:, :65] == 0).all()
+    _, middle, _ = mosaic(tmp_path, left, right, seams="voronoi")
+    assert middle["seam_step_rms_grey"] > 40.0
+
+
+def test_a_graph_cut_keeps_off_depth_edges(tmp_path: Path) -> None:
+    left, right = layer("left", (0, 100), 10), layer("right", (20, 120), 10)
+    depth = np.zeros(SHAPE, dtype=np.float32)
+    depth[:, 60:63] = 0.1
+    wall = inspect_scenes.walls().walls[0]
+    small = {
+        field.name: getattr(wall, field.name)[: SHAPE[0], : SHAPE[1]]
+        for field in dataclasses.fields(Wall)
+        if isinstance(getattr(wall, field.name), np.ndarray)
+    }
+    stepped = dataclasses.replace(
+        wall, frame=left.frame, **(small | {"depth_m": depth, "intensity": None})
+    )
+    walls = dataclasses.replace(inspect_scenes.walls(), walls=(stepped,))
+    _, cut, _ = mosaic(tmp_path, left, right, walls=walls, seams="graph-cut")
+    assert cut["seam_on_depth_edge_share"] == 0.0
+    # The first photo is better up to where it ends, and that is where the edge is moved to.
+    depth[:] = 0.0
+    depth[:, 100:] = 0.1
+    _, best, _ = mosaic(tmp_path, left, right, walls=walls)
+    assert best["seam_on_depth_edge_share"] == 1.0
+
+
+def test_gains_bring_overlaps_together_and_are_reported(tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    light = rng.uniform(0.1, 0.5, (*SHAPE, 3))
+    bright, dark = (
+        np.rint(255.0 * (scale * light) ** (1.0 / 2.2)).astype(np.uint8) for scale in (1.0, 0.6)
+    )
+    left, right = layer("left", (0, 100), bright), layer("right", (20, 120), dark)
+    plain, before, details = mosaic(tmp_path, left, right)
+    assert details == {}
+    np.testing.assert_array_equal(plain.rgb[:, :100], bright[:, :100])
+    _, after, details = mosaic(tmp_path, left, right, gains="global")
+    assert after["seam_step_rms_grey"] < 0.25 * before["seam_step_rms_grey"]
+    gains = estimate_gains([left, right])
+    # The prior takes back a few percent of the ratio.
+    np.testing.assert_allclose(gains[1] / gains[0], 1.0 / 0.6, rtol=0.06)
+    np.testing.assert_allclose(gains[0] * gains[1], 1.0, rtol=1e-6)
+    assert set(details) == {"gains"}
+    assert after["gain_max"] == pytest.approx(gains.max(), abs=1e-3)
+    assert after["gain_min"] == pytest.approx(gains.min(), abs=1e-3)
