@@ -163,7 +163,7 @@ def test_the_same_kind_announced_twice_with_the_same_ports_is_fine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kind = (
-        "KindSpec(name='mosaic', summary='mine', inputs={'layers': 'layers'}, "
+        "KindSpec(name='mosaic', summary='mine', inputs={'layers': 'layers', 'walls': 'walls'}, "
         "outputs={'orthoimages': 'orthoimages'})"
     )
     catalog = with_plugin("alike", hooks(kinds=kind), tmp_path, monkeypatch)
@@ -182,10 +182,10 @@ def test_a_product_type_claimed_twice_cannot_be_used(
 @pytest.mark.parametrize(
     ("kinds", "problem"),
     [
-        ("", "method colour.mine of lonely0 1.0 is of kind colour, which no plugin announces"),
+        ("", "method sculpt.mine of lonely0 1.0 is of kind sculpt, which no plugin announces"),
         (
-            "KindSpec(name='colour', summary='-', inputs={'x': 'unheard'}, outputs={})",
-            "kind colour of lonely1 1.0 has ports of product types that no plugin announces: unh",
+            "KindSpec(name='sculpt', summary='-', inputs={'x': 'unheard'}, outputs={})",
+            "kind sculpt of lonely1 1.0 has ports of product types that no plugin announces: unh",
         ),
     ],
 )
@@ -193,11 +193,11 @@ def test_a_method_without_a_usable_kind_is_broken(
     kinds: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = "lonely1" if kinds else "lonely0"
-    text = hooks(methods=method("colour.mine", "a:B"), kinds=kinds)
+    text = hooks(methods=method("sculpt.mine", "a:B"), kinds=kinds)
     catalog = with_plugin(name, text, tmp_path, monkeypatch)
-    assert catalog.methods["colour.mine"].state == "broken"
+    assert catalog.methods["sculpt.mine"].state == "broken"
     with pytest.raises(PluginError, match=problem):
-        catalog.method("colour.mine")
+        catalog.method("sculpt.mine")
 
 
 def test_an_unknown_method_gets_a_suggestion_of_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,6 +63,7 @@ class ColourPhotos(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Colour photo by photo, keeping the best of each point."""
+        inputs.cloud.require_points(2)
         oriented = {camera.photo: camera for camera in inputs.cameras.cameras}
         chosen = [
             (photo, oriented[photo.name].viewing())

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.scene_views import render_frame
 from orthoflow.products import Truth, Wall
 from orthoflow_plugins.inspect.matching import (
     PATCH_CELLS,
@@ -69,6 +68,8 @@ def find_by_truth(
     Returns:
         (2,) column, row, or None where nothing correlates.
     """
+    from orthoflow.geometry.scene_views import render_frame
+
     rim = search_cells + 4
     side = PATCH_CELLS + 2 * rim
     corner = np.floor(expected).astype(np.int64) - side // 2

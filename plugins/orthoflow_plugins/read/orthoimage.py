@@ -64,7 +64,8 @@ class ReadOrthoimage(Method):
                 f"the input {inputs.files.name} holds no GeoTIFF: expected orthoimages, .tif"
             )
         images: dict[int, Orthoimage] = {}
-        for path in paths:
+        for place, path in enumerate(paths):
+            ctx.progress(place / len(paths), path.name)
             image = _read(path, inputs.files.paths, params.wall)
             if image.wall in images:
                 raise InputError(

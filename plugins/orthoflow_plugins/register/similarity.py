@@ -57,6 +57,7 @@ class RegisterSimilarity(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Pair, fit, move."""
+        inputs.cloud.require_points(2)
         names = [name for name in inputs.points.names if name in inputs.control.names]
         source, target = (
             product.points_world[[product.names.index(name) for name in names]]
@@ -151,6 +152,7 @@ def _moved(cloud: PointCloud, fitted: Similarity, ctx: StepContext) -> PointClou
         name: np.asarray(ctx.allocate("cloud", name, cloud.x.shape, np.float32)) for name in "xyz"
     }
     for start in range(0, len(cloud), _AT_ONCE):
+        ctx.progress(start / len(cloud), "moving the cloud")
         part = slice(start, start + _AT_ONCE)
         old = np.column_stack([cloud.x[part], cloud.y[part], cloud.z[part]]).astype(np.float64)
         for axis, name in enumerate("xyz"):
