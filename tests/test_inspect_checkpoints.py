@@ -152,9 +152,9 @@ def test_what_is_not_found_is_said(tmp_path: Path) -> None:
 
 
 def test_points_of_a_simulated_room_are_found_by_its_truth(tmp_path: Path) -> None:
-    params = SimulateRoom.Params(scan_step_m=0.05, panorama_step_m=0.15)
+    params = SimulateRoom.Params(scan_step_m=0.1, panorama_step_m=0.3)
     room = SimulateRoom().run(SimulateRoom.In(), params, context(tmp_path))
-    gsd_m, shift = 0.01, np.array([1.4, -0.6])
+    gsd_m, shift = 0.012, np.array([1.4, -0.6])
     planes = room.truth.planes
     frame = frame_over(planes.corners[0], planes.normal[0], gsd_m=gsd_m)
     moved = gsd_m * (shift[0] * frame.u_world + shift[1] * frame.v_world)
