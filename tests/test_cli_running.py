@@ -154,7 +154,11 @@ def test_embed_makes_a_record_that_verifies(tmp_path: Path) -> None:
     ("method", "code", "sentence"),
     [
         ("paint.fail", 1, "paint failed: no colour sticks to this plane"),
-        ("paint.lacking", 4, "paint failed: method paint.lacking needs no_such_library"),
+        (
+            "paint.lacking",
+            4,
+            "paint failed: method paint.lacking of workshop 1.0 needs no_such_library",
+        ),
     ],
 )
 def test_a_failed_cell_leaves_a_record_a_report_and_its_exit_code(
