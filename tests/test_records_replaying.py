@@ -1,0 +1,83 @@
+"""A replay takes seeds, repeats and parameters as recorded, whatever today's code would derive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine import RunOptions, RunOutcome, Store, execute, plan_run
+from orthoflow.records import Run, write_run
+from orthoflow.records.replaying import plan_replay
+from orthoflow.workflow import expand_cells, expansion, load_workflow
+from tests.engine_world import World, toy_world
+
+WORKFLOW = """
+orthoflow: 1
+name: toy
+seed: 7
+steps:
+  first: {use: make.range, params: {count: 200}}
+  draw:
+    in: {numbers: first.numbers}
+    variants:
+      once: {use: work.noise}
+      often: {use: work.noise, repeat: 3}
+  last: {use: work.add, in: {numbers: draw.numbers}}
+compare: {design: product, baseline: {draw: once}}
+"""
+INLINE = RunOptions(executor="inline")
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def recorded(world: World) -> Run:
+    path = world.folder / "toy.yaml"
+    path.write_text(WORKFLOW)
+    catalog = world.catalog()
+    workflow = load_workflow(path, catalog)
+    plan = plan_run(expand_cells(workflow, catalog), workflow, catalog, world.store, INLINE)
+    outcome = execute(plan, world.folder / "run", world.store)
+    return write_run(outcome, plan, workflow, world.folder / "run", world.store)
+
+
+def digests(outcome: RunOutcome) -> dict[str, str]:
+    return {
+        address: result.outputs["numbers"].digest for address, result in outcome.results.items()
+    }
+
+
+def test_seeds_of_repeats_are_those_of_the_record(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = recorded(world)
+    assert len({cell.seed for cell in run.record.cells if cell.step == "draw"}) == 3
+    # A later version that derives seeds in another way would draw other numbers.
+    monkeypatch.setattr(expansion, "derive_seed", lambda *_: 0)
+    store = Store(world.folder / "fresh")
+    replay = plan_replay(run, world.catalog(), store, INLINE)
+    outcome = execute(replay.plan, world.folder / "again", store)
+    assert digests(outcome) == {
+        address: cell.outputs["numbers"].digest for address, cell in run.cells.items()
+    }
+    assert not outcome.cached
+    made = write_run(outcome, replay.plan, replay.workflow, world.folder / "again", store)
+    assert made.record.workflow_resolved == run.record.workflow_resolved
+    assert [cell.repeat for cell in made.record.cells] == [cell.repeat for cell in run.record.cells]
+    assert replay.notes == ()
+
+
+def test_another_code_of_a_method_is_noted_and_not_refused(world: World) -> None:
+    (world.site / "toy_plugin-1.0.dist-info" / "direct_url.json").write_text("{}")
+    run = recorded(world)
+    works = world.site / "toy_plugin" / "works.py"
+    works.write_text(works.read_text() + "\nCHANGED = True\n")
+    replay = plan_replay(run, world.catalog(), Store(world.folder / "fresh"), INLINE)
+    assert "work.noise: its code is not that of the record, though both say result version 1" in (
+        replay.notes
+    )
