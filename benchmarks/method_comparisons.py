@@ -5,9 +5,8 @@
 
 Each recipe runs into `FOLDER/<recipe>` on its simulated room, as `orthoflow run <recipe>.yaml` does
 it, unless that folder holds a finished run; a single report of all of them goes to
-`FOLDER/report.html`. Best values are bold where a metric has a good side. Times are wall times on
-the machine that ran it, compiling included, so they say which method is expensive, not how fast it
-is: docs/performance.md measures that.
+`FOLDER/report.html`. Best values are bold where a metric has a good side. Processor seconds include
+compiling where a kernel was new; docs/performance.md measures speed.
 """
 
 from __future__ import annotations
@@ -15,15 +14,17 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from orthoflow.records import Run, open_run
 from orthoflow.report import write_report
-from orthoflow.report.comparisons import ComparisonTable, Row, comparison_table
-from orthoflow.report.rankings import Mark, Value
+from orthoflow.report.combinations import Combination, combinations_of
+from orthoflow.report.numbers import number, number_with_spread
+from orthoflow.report.rankings import Mark, Value, rank
+from orthoflow.report.senses import sense_of
 
-RECIPES = ("plane-methods", "orient-methods", "ortho-methods")
+RECIPES = ("plane-methods", "orient-methods")
 # Metrics of each table and what stands over them; the record has many more.
 COLUMNS: dict[str, dict[str, str]] = {
     "plane-methods": {
@@ -35,7 +36,6 @@ COLUMNS: dict[str, dict[str, str]] = {
         "check.label_recall": "recall",
         "check.label_iou_mean": "IoU, all planes",
         "check.true_planes_found": "planes found",
-        "plane.detection_s": "detection / s",
     },
     "orient-methods": {
         "orient.n_oriented": "photos oriented",
@@ -48,6 +48,10 @@ COLUMNS: dict[str, dict[str, str]] = {
         "check.pose_error_over_sigma": "true over stated error",
         "check.rmse_u_mm": "orthoimage u / mm",
         "check.rmse_v_mm": "orthoimage v / mm",
+        "check.nmad_u_mm": "typical u / mm",
+        "check.nmad_v_mm": "typical v / mm",
+        "check.completeness_seen_by_both": "painted",
+        "orient.cpu_s": "processor / s",
     },
 }
 
@@ -60,10 +64,7 @@ def main() -> None:
     runs = [finished_run(options.folder, recipe) for recipe in options.recipe or RECIPES]
     for run in runs:
         print(f"\n### {run.record.name}, run {run.record.run_id}\n")
-        table = comparison_table([run])
-        if table is None:
-            raise SystemExit(f"{run.path} compares nothing")
-        print("\n".join(markdown(table, COLUMNS.get(run.record.name, {}))))
+        print("\n".join(markdown(combinations_of(run), COLUMNS[run.record.name])))
     write_report(runs, options.folder / "report.html")
 
 
@@ -77,29 +78,42 @@ def finished_run(folder: Path, recipe: str) -> Run:
     return open_run(target)
 
 
-def markdown(table: ComparisonTable, names: dict[str, str]) -> list[str]:
-    """Print the wanted columns, all of them when none is named."""
-    keys = [f"{column.step}.{column.metric}" for column in table.columns]
-    wanted = [key for key in names if key in keys] or keys
-    header = [*table.steps, *(names.get(key, key) for key in wanted), "time / s", "memory / MiB"]
-    lines = [_line(header), _line(["---"] * len(table.steps) + ["---:"] * (len(wanted) + 2))]
-    return lines + [_line(_places(row, [keys.index(key) for key in wanted])) for row in table.rows]
+def markdown(combinations: Sequence[Combination], names: Mapping[str, str]) -> list[str]:
+    """Print a table: a row per combination, a column per metric, the best in bold."""
+    steps = tuple(dict.fromkeys(step for one in combinations for step in one.assignment))
+    columns = [
+        rank([value_of(one, key) for one in combinations], sense_of(key.partition(".")[2]))
+        for key in names
+    ]
+    header = [*steps, *names.values()]
+    lines = [line(header), line(["---"] * len(steps) + ["---:"] * len(names))]
+    for index, one in enumerate(combinations):
+        variants = [one.assignment.get(step, "-") for step in steps]
+        if one.failure is not None:
+            lines.append(line([*variants, f"failed: {one.failure.error_message}"]))
+        else:
+            lines.append(line([*variants, *(printed(column[index]) for column in columns)]))
+    return lines
 
 
-def _places(row: Row, columns: Sequence[int]) -> list[str]:
-    if row.failure:
-        return [*row.variants, f"failed: {row.failure}"]
-    told = [row.values[index] for index in columns]
-    return [*row.variants, *(_printed(value) for value in (*told, row.time, row.memory))]
+def value_of(one: Combination, key: str) -> Value:
+    measured = one.measured(*key.split("."))
+    if measured is None:
+        return Value()
+    if measured.n_repeats > 1:
+        text = number_with_spread(measured.value, measured.spread)
+    else:
+        text = number(measured.value, significant=3)
+    return Value(text=text, sort=measured.value, spread=measured.spread)
 
 
-def _printed(value: Value) -> str:
+def printed(value: Value) -> str:
     if not value.text:
         return "-"
     return f"**{value.text}**" if value.mark is Mark.BEST else value.text
 
 
-def _line(places: Sequence[str]) -> str:
+def line(places: Sequence[str]) -> str:
     return f"| {' | '.join(places)} |"
 
 

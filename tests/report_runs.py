@@ -110,7 +110,7 @@ def environment(name: str = "e1", *, threads: int = 2) -> RecordedEnvironment:
         cpu="toy",
         cores=2,
         threads=threads,
-        git_commit="",
+        git_commit=40 * "c" + "+changes",
         packages={"numpy": "2.1"},
     )
 

@@ -255,6 +255,7 @@ def test_equal_values_have_no_winner() -> None:
         ("completeness_seen_by_both", Sense.MORE),
         ("pose_error_over_sigma", Sense.ONE),
         ("raw_omega_deg", Sense.NEITHER),
+        ("raw_offset_mm", Sense.LESS),
         ("n_points", Sense.NEITHER),
         ("sigma0_px", Sense.NEITHER),
     ],

@@ -22,7 +22,8 @@ class Sense(Enum):
 _PATTERNS: Final[tuple[tuple[str, Sense], ...]] = (
     ("*error_over_sigma*", Sense.ONE),
     # These ask for words like rms, but describe the data or say what the method believes.
-    ("raw_[opr]*", Sense.NEITHER),
+    ("raw_omega_deg", Sense.NEITHER),
+    ("raw_phi_deg", Sense.NEITHER),
     ("sigma0*", Sense.NEITHER),
     ("*wrong_share", Sense.LESS),
     ("*completeness*", Sense.MORE),
@@ -40,7 +41,7 @@ _PATTERNS: Final[tuple[tuple[str, Sense], ...]] = (
     ("raw_angle_deg", Sense.LESS),
     ("raw_offset_mm", Sense.LESS),
     ("*_error_*", Sense.LESS),
-    ("*_nmad_*", Sense.LESS),
+    ("*nmad_*", Sense.LESS),
     ("*_s", Sense.LESS),
     ("*_mib", Sense.LESS),
 )

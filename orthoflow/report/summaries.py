@@ -16,6 +16,8 @@ _SHARPER_COMPLETENESS: Final = "completeness_seen_by_both"
 QUALITY: Final[Mapping[str, str]] = {
     "rmse_u_mm": "error along u (right), RMS",
     "rmse_v_mm": "error along v (down), RMS",
+    "nmad_u_mm": "typical error along u (NMAD)",
+    "nmad_v_mm": "typical error along v (NMAD)",
     _SHARPER_COMPLETENESS: "painted, of what a station and a photo see",
     "n_oriented": "photos oriented",
     "sigma_wall_mm_worst": "expected error on the wall, worst photo",
