@@ -222,9 +222,9 @@ def test_runs_on_different_data_are_not_ranked_together() -> None:
     ]
     table = comparison_table(runs)
     assert table is not None
-    assert [(row.run_id, row.values[0].group, row.values[0].mark) for row in table.rows] == [
-        ("r1", "1", Mark.NONE),
-        ("r2", "2", Mark.NONE),
+    assert [(row.run, row.values[0].group, row.values[0].mark) for row in table.rows] == [
+        ("toy <run>, r1", "a", Mark.NONE),
+        ("toy <run>, r2", "b", Mark.NONE),
     ]
 
 

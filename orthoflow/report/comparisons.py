@@ -40,7 +40,7 @@ class Row:
     """One combination.
 
     Attributes:
-        run_id: the run it belongs to.
+        run: the run it belongs to, its workflow and id.
         variants: variant of each varied step; a dash where the step has no part in it.
         is_baseline: the workflow calls it its baseline.
         failure: where and why it failed, empty when it did not.
@@ -50,7 +50,7 @@ class Row:
         remark: what was cached and what else to know, in words.
     """
 
-    run_id: str
+    run: str
     variants: tuple[str, ...]
     is_baseline: bool
     failure: str
@@ -148,7 +148,7 @@ def _row(
         dict.fromkeys(origins.letters(one.run, cell.environment) for cell in varied)
     )
     return Row(
-        run_id=one.run.record.run_id,
+        run=f"{one.run.record.name}, {one.run.record.run_id}",
         variants=tuple(one.assignment.get(step, "-") for step in steps),
         is_baseline=one.is_baseline,
         failure=f"{failed.address}: {failed.error_message}" if failed else "",

@@ -11,11 +11,11 @@ from orthoflow.records import RecordedEnvironment, Run
 
 @dataclass(frozen=True, kw_only=True)
 class Origins:
-    """Letters for the environments, numbers for the data of one or more runs.
+    """Capital letters for the environments, small ones for the data of one or more runs.
 
     Attributes:
         environments: id -> letter.
-        data: identity of a run's data -> number.
+        data: identity of a run's data -> letter.
         legend: what each sign in use stands for; empty when nothing needs to be told apart.
     """
 
@@ -31,7 +31,8 @@ class Origins:
         }
         letters = {key: _letter(index) for index, key in enumerate(environments)}
         sources = dict.fromkeys(_data_of(run) for run in runs)
-        numbers = {key: str(index + 1) for index, key in enumerate(sources)}
+        # No digits: raised behind a number they would look like powers.
+        small = {key: _letter(index).lower() for index, key in enumerate(sources)}
         legend: dict[str, str] = {}
         if len(environments) > 1:
             legend |= {
@@ -40,17 +41,17 @@ class Origins:
             }
         if len(sources) > 1:
             legend |= {
-                numbers[key]: "data of run "
+                small[key]: "data of run "
                 + ", ".join(run.record.run_id for run in runs if _data_of(run) == key)
                 for key in sources
             }
-        return Origins(environments=letters, data=numbers, legend=legend)
+        return Origins(environments=letters, data=small, legend=legend)
 
     def letters(self, run: Run, environment: str) -> str:
         """Give the sign of a value; empty when all values are of one kind."""
         letter = self.environments.get(environment, "?") if len(self.environments) > 1 else ""
-        number = self.data[_data_of(run)] if len(self.data) > 1 else ""
-        return letter + number
+        small = self.data[_data_of(run)] if len(self.data) > 1 else ""
+        return letter + small
 
 
 def environment_words(environment: RecordedEnvironment) -> str:
