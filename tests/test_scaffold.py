@@ -117,7 +117,7 @@ def test_a_new_plugin_installs_and_passes_its_tests_at_once(
         (tmp_path, [*run, *named]),
         (
             tmp_path / f"own-{kind}",
-            [*run, "pip", "install", "-q", "--no-deps", "--no-build-isolation", "-e", "."],
+            [*run, "pip", "install", "-q", "--no-deps", "-e", "."],
         ),
         (tmp_path / f"own-{kind}", [*run, "pytest", "-q", "-p", "no:dash", "-W", "error"]),
     ]

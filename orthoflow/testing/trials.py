@@ -11,7 +11,7 @@ import numpy as np
 from orthoflow.engine.store import digest_of
 from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method, Metric, StepContext, StepEvent
-from orthoflow.sdk.context import Figure
+from orthoflow.sdk.context import Drawing, Figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,19 +59,27 @@ class _WatchedContext(StepContext):
     """Remembers every fraction that it was told."""
 
     fractions: list[float] = field(default_factory=list)
+    draws: bool = True
+
+    def figure(self, name: str, content: bytes | Drawing, caption: str = "") -> None:
+        if self.draws:
+            super().figure(name, content, caption)
 
     def progress(self, fraction: float, text: str = "") -> None:
         self.fractions.append(float(fraction))
         super().progress(fraction, text)
 
 
-def run_trial(trial: Trial, scratch: Path, *, is_cancelled: bool = False) -> TrialRun:
+def run_trial(
+    trial: Trial, scratch: Path, *, is_cancelled: bool = False, draws: bool = True
+) -> TrialRun:
     """Run a method once in an empty scratch folder.
 
     Args:
         trial: what to run.
         scratch: made when it is not there.
         is_cancelled: the step was cancelled before it began.
+        draws: keep figures; drawing takes longer than many a method.
 
     Raises:
         OrthoflowError: what the method raises.
@@ -85,6 +93,7 @@ def run_trial(trial: Trial, scratch: Path, *, is_cancelled: bool = False) -> Tri
         scratch=scratch,
         listen=events.append,
         is_cancelled=lambda: is_cancelled,
+        draws=draws,
     )
     method = trial.method
     returned = method().run(method.In(**trial.inputs), method.Params(**trial.params), ctx)
