@@ -46,7 +46,7 @@ class InspectSurf(Method):
     result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
-        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71114870 (4.4, Table 2, Figure 25)",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4, Table 2, Figure 25)",
         "Bay, Ess, Tuytelaars, Van Gool 2008, Speeded-Up Robust Features (SURF)",
         "Gruen 1985, Adaptive least squares correlation (refinement)",
     )

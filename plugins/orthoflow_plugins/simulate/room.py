@@ -54,7 +54,7 @@ class SimulateRoom(Method):
     result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "seeded"
     citations: ClassVar[tuple[str, ...]] = (
-        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71114870 (the kind of room)",
+        "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (the kind of room)",
     )
 
     class Params(MethodParams):
