@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.products import Photo, Ties
 from tests import matching_scenes as ms
@@ -23,7 +24,7 @@ PERIOD_M: Final = 0.15
 SIZE_PX: Final = (1200, 900)
 NOISE_PX: Final = 0.8
 NOISE_M: Final = 0.001
-_ENCODED: Final = ms.encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
+_ENCODED: Final = encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
 _CORNERS: Final = 0.5 * np.array([[-1, 0, 1], [-1, 0, -1], [1, 0, -1], [1, 0, 1]]) * (4.0, 0.0, 3.0)
 
 

@@ -13,6 +13,7 @@ from orthoflow_plugins.orient.direct_linear import direct_linear, relief
 from orthoflow_plugins.orient.dlt import OrientDlt
 
 from orthoflow.errors import GeometryError
+from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.products import Cameras, Photo, Photos, Ties
 from orthoflow.sdk import StepContext
@@ -21,7 +22,7 @@ from tests.scenes import SURVEY_SHIFT_M
 
 SIZE_PX = (4000, 3000)
 # A grey photo: what it shows is in the ties.
-ENCODED = ms.encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
+ENCODED = encode_png(np.zeros((SIZE_PX[1] // 10, SIZE_PX[0] // 10), np.uint8))
 
 
 def camera(*, k1: float = -0.08, full: bool = False) -> ViewingCamera:

@@ -15,7 +15,7 @@ from orthoflow_plugins.orient.splitting import hull_area, withheld
 from orthoflow_plugins.orient.wall_errors import known_walls, sigmas_on_wall, wall_error
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import decode_image
+from orthoflow.files.images import decode_image, encode_png
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties
@@ -25,7 +25,7 @@ from tests.scenes import SURVEY_SHIFT_M
 
 PIXEL = Photo(
     name="a.png",
-    encoded=ms.encode_png(np.zeros((640, 900), np.uint8)),
+    encoded=encode_png(np.zeros((640, 900), np.uint8)),
     width=900,
     height=640,
 )
@@ -288,7 +288,7 @@ def test_a_mirrored_photo_is_refused(tmp_path: Path) -> None:
     scene = ms.textured_wall(1)
     camera = ms.camera_before(scene)
     photo = ms.photo_of(scene, camera)
-    mirrored = ms.encode_png(np.ascontiguousarray(decode_image(photo.encoded)[:, ::-1, 0]))
+    mirrored = encode_png(np.ascontiguousarray(decode_image(photo.encoded)[:, ::-1, 0]))
     photos = ms.photos(replace(photo, encoded=mirrored))
     inputs = MatchSift.In(photos=photos, walls=ms.walls_of(scene))
     ties = MatchSift().run(inputs, MatchSift.Params(), context(tmp_path)).ties
