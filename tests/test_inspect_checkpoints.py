@@ -249,5 +249,6 @@ def _intensity_of(path: Path, scratch: Path) -> Walls:
         normal=tuple(float(value) for value in normal), offset_m=float(normal @ middle)
     )
     planes = GivenPlane().run(GivenPlane.In(cloud=cloud), given, context(scratch)).planes
-    grid = RasterGrid.Params(gsd_m=0.001)
+    # As fine as the points lie.
+    grid = RasterGrid.Params(gsd_m=0.0013)
     return RasterGrid().run(RasterGrid.In(cloud=cloud, planes=planes), grid, context(scratch)).walls

@@ -36,6 +36,8 @@ from orthoflow_plugins.inspect.vectors import enlargement, vector_map
 
 _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 _NOWHERE: Final = np.full(3, np.nan)
+# Targets are not quite flat: only so much of their radius says how deep the centre lies.
+_DEPTH_SHARE: Final = 0.5
 
 
 class InspectCheckpoints(Method):
@@ -260,7 +262,8 @@ class _Finder:
                 place=_NOWHERE[:2],
                 point_world=_NOWHERE,
             )
-        point = point_on_surface(picture.surface, crossing.place, self.params.target_radius_m)
+        radius_m = _DEPTH_SHARE * self.params.target_radius_m
+        point = point_on_surface(picture.surface, crossing.place, radius_m)
         return ShownPoint(
             how="target",
             wall=picture.wall,

@@ -24,7 +24,7 @@ _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 _FOCUS_CELLS: Final = 5.0
 _LEAST_VALID: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
-_SIGMA_MOST_CELLS: Final = 0.4
+_SIGMA_MOST_CELLS: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
