@@ -23,6 +23,7 @@ def run_forked(arguments: Sequence[str], *, event: int | None, seconds: float | 
     """Run the command line in a fork of this process, killed or not; give its exit code."""
     process = os.fork()
     if process == 0:
+        signal.alarm(300)  # a run that hangs ends the test, not the patience of whoever waits
         _be_the_run(arguments, event)
     if seconds is not None:
         time.sleep(seconds)
