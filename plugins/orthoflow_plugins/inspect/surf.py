@@ -18,6 +18,7 @@ from orthoflow_plugins.inspect.matching import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
 from orthoflow_plugins.inspect.reporting import report
 from orthoflow_plugins.inspect.sampling import shown
+from orthoflow_plugins.inspect.sharpness import sharpness_findings
 from orthoflow_plugins.inspect.vectors import enlargement, vector_map
 
 _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
@@ -115,6 +116,7 @@ class _Verdict:
     image: Orthoimage
     pairs: KeyPairs
     floor: KeyPairs
+    quality: tuple[Finding, ...] = ()
 
     def findings(self) -> list[Finding]:
         """The wall's numbers."""
@@ -130,6 +132,7 @@ class _Verdict:
         return [
             *(Finding(name=name, value=value, unit="1", wall=wall) for name, value in counts),
             *_numbers([self], wall, gsd_m),
+            *self.quality,
         ]
 
     def draw(self, ctx: StepContext) -> None:
@@ -170,7 +173,20 @@ def _compare(image: Orthoimage, wall: Wall, radius: float) -> _Verdict:
         region=known,
     )
     pairs = find_key_pairs(picture, intensity, radius_cells=radius)
-    return _Verdict(image=image, pairs=pairs, floor=_floor(intensity, radius))
+    return _Verdict(
+        image=image,
+        pairs=pairs,
+        floor=_floor(intensity, radius),
+        quality=(_completeness(image, wall), *sharpness_findings(picture, image.wall)),
+    )
+
+
+def _completeness(image: Orthoimage, wall: Wall) -> Finding:
+    """How much of the scanned surface the image shows."""
+    surface = np.isfinite(wall.depth_m)
+    both = np.count_nonzero(surface & shown(image))
+    share = both / max(1, int(np.count_nonzero(surface)))
+    return Finding(name="completeness", value=share, unit="1", wall=image.wall)
 
 
 def _floor(intensity: GreyImage, radius: float) -> KeyPairs:
