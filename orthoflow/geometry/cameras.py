@@ -16,6 +16,7 @@ _CONVERGED: Final = 1e-12
 # What lies no farther before the projection centre counts as behind the camera.
 _NEAREST_M: Final = 1e-9
 _PROJECTED_AT_ONCE: Final = 1 << 15
+_UNTURNED: Final = np.eye(3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +47,8 @@ class ViewingCamera:
     translation: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6):
+        # The other way round, so that NaN does not pass.
+        if not np.abs(self.rotation @ self.rotation.T - _UNTURNED).max() <= 1e-6:
             raise GeometryError("a camera's rotation must be orthonormal")
         if np.linalg.det(self.rotation) < 0.0:
             raise GeometryError("a camera's rotation has determinant -1: it mirrors the world")

@@ -34,10 +34,11 @@ def honest_covariance(
     n_free = len(plain)
     if names.size <= n_free:
         return plain
-    pulls = np.zeros((names.size, n_free))
-    np.add.at(pulls, group, np.einsum("nij,ni->nj", jacobian, residuals))
-    normals = np.zeros((names.size, n_free, n_free))
-    np.add.at(normals, group, np.einsum("nij,nik->njk", jacobian, jacobian))
+    order = np.argsort(group, kind="stable")
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    jacobian, residuals = jacobian[order], residuals[order]
+    pulls = np.add.reduceat(np.einsum("nij,ni->nj", jacobian, residuals), starts)
+    normals = np.add.reduceat(np.einsum("nij,nik->njk", jacobian, jacobian), starts)
     left_out = np.linalg.pinv(np.eye(n_free) - normals @ cofactors) @ pulls[:, :, None]
     moves = (cofactors @ left_out)[:, :, 0]
     return widened(plain, (names.size - 1) / names.size * moves.T @ moves)

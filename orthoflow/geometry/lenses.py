@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.rotations import cross_matrices, rotation_from_vector
+from orthoflow.geometry.rotations import rotation_from_vector
 
 POSE_PARAMETERS: Final = 6
 # Which of the five distortion coefficients k1, k2, p1, p2, k3 a name means.
@@ -116,8 +116,8 @@ def stepped(camera: ViewingCamera, step: NDArray[np.float64], lens: LensFreedom)
 
 def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFreedom) -> Linear:
     """Project points (n, 3), with derivatives."""
-    turned = points @ camera.rotation.T
-    x, y, z = (turned + camera.translation).T
+    turned = (camera.rotation @ points.T).T
+    x, y, z = turned.T + camera.translation[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         # Behind the camera there is no pixel: NaN makes its cost infinite.
         z = np.where(z > 1e-9, z, np.nan)
@@ -131,7 +131,8 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
     ad_by_a = radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
     ad_by_b = a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
     bd_by_b = radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
-    by_point = np.empty((len(points), 2, 3))
+    # Points along the last axis of memory: every operation below goes over all of them.
+    by_point = np.empty((2, 3, len(points))).transpose(2, 0, 1)
     by_point[:, 0, 0] = camera.fx * ad_by_a / z
     by_point[:, 0, 1] = camera.fx * ad_by_b / z
     by_point[:, 0, 2] = -camera.fx * (ad_by_a * a + ad_by_b * b) / z
@@ -146,18 +147,27 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
         "p1": (2.0 * a * b, r2 + 2.0 * b * b),
         "p2": (r2 + 2.0 * a * a, 2.0 * a * b),
     }
-    columns = [-by_point @ cross_matrices(turned), by_point]
-    for name in lens.names:
+    n_free = POSE_PARAMETERS + len(lens.names)
+    by_parameters = np.empty((2, n_free, len(points))).transpose(2, 0, 1)
+    # Derivative by a turn: -by_point times the cross product's matrix, written out.
+    for axis in range(3):
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        by_parameters[:, :, axis] = (
+            by_point[:, :, last] * turned[:, None, after]
+            - by_point[:, :, after] * turned[:, None, last]
+        )
+    by_parameters[:, :, 3:6] = by_point
+    for column, name in enumerate(lens.names, start=POSE_PARAMETERS):
         if name in lens_columns:
             along, down = lens_columns[name]
-            columns.append(np.column_stack([camera.fx * along, camera.fy * down])[:, :, None])
+            by_parameters[:, 0, column] = camera.fx * along
+            by_parameters[:, 1, column] = camera.fy * down
         else:
-            axis = np.array([[1.0], [0.0]] if name == "cx" else [[0.0], [1.0]])
-            columns.append(np.broadcast_to(axis, (len(points), 2, 1)))
+            by_parameters[:, :, column] = (1.0, 0.0) if name == "cx" else (0.0, 1.0)
     return Linear(
         pixels=np.column_stack([camera.fx * ad + camera.cx, camera.fy * bd + camera.cy]),
         by_camera_point=by_point,
-        by_parameters=np.concatenate(columns, axis=2),
+        by_parameters=by_parameters,
     )
 
 

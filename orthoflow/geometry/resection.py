@@ -28,7 +28,9 @@ from orthoflow.geometry.lenses import (
 from orthoflow.geometry.rotations import cross_matrix
 
 _ITERATIONS: Final = 40
-_CONVERGED: Final = 1e-12
+# A step that gains so little of some hundred points' squares moved no parameter by more than a
+# hundredth of its standard deviation, and the next one would by far less.
+_CONVERGED: Final = 1e-7
 _DAMPING_START: Final = 1e-6
 _DAMPING_MOST: Final = 1e8
 
@@ -123,16 +125,29 @@ def adjust(
     Raises:
         GeometryError: too few points, or they do not determine the pose.
     """
-    lens = LensFreedom() if lens is None else lens
-    n_free = POSE_PARAMETERS + lens.sigmas.size
-    if 2 * len(seen) < n_free + 2:
-        raise GeometryError(f"a resection with {n_free} unknowns got only {len(seen)} points")
-    # Relative to the middle of the points: survey coordinates would cost digits.
-    middle = seen.points_world.mean(axis=0)
-    local = replace(seen, points_world=seen.points_world - middle)
-    problem = _Problem(local, lens, start if prior is None else prior, soft_limit)
-    camera = problem.solve(start.shifted(middle))
-    normal, errors = problem.normal_matrix(camera), problem.whitened(camera)
+    camera = fitted(seen, start, prior=prior, lens=lens, soft_limit=soft_limit)
+    prior = start if prior is None else prior
+    return stated(seen, camera, prior=prior, lens=lens, groups=groups, soft_limit=soft_limit)
+
+
+def stated(
+    seen: SeenPoints,
+    camera: ViewingCamera,
+    *,
+    prior: ViewingCamera | None = None,
+    lens: LensFreedom | None = None,
+    groups: NDArray[np.intp] | None = None,
+    soft_limit: float = math.inf,
+) -> Resection:
+    """Say how good the camera is that `fitted` found, with the same arguments as `adjust`.
+
+    Raises:
+        GeometryError: too few points, or they do not determine the pose.
+    """
+    middle, problem = _problem(seen, camera if prior is None else prior, lens, soft_limit)
+    lens, n_free = problem.lens, problem.n_free
+    errors = problem.errors(camera.shifted(middle))
+    normal = problem.normal(errors)
     try:
         cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError as error:
@@ -145,7 +160,6 @@ def adjust(
         errors.jacobian, errors.residuals, cofactors, groups, sigma0=sigma0
     )
     factor = float(np.trace(np.linalg.solve(cofactors, covariance))) / n_free
-    camera = camera.shifted(-middle)
     to_world = moved_origin(camera, middle, n_free)
     return Resection(
         camera=camera,
@@ -156,13 +170,45 @@ def adjust(
     )
 
 
+def fitted(
+    seen: SeenPoints,
+    start: ViewingCamera,
+    *,
+    prior: ViewingCamera | None = None,
+    lens: LensFreedom | None = None,
+    soft_limit: float = math.inf,
+) -> ViewingCamera:
+    """Give the camera that `adjust` finds, without saying how good it is.
+
+    Raises:
+        GeometryError: too few points, or they do not determine the pose.
+    """
+    middle, problem = _problem(seen, start if prior is None else prior, lens, soft_limit)
+    return problem.solve(start.shifted(middle)).shifted(-middle)
+
+
+def first_step(
+    seen: SeenPoints, camera: ViewingCamera, lens: LensFreedom, *, soft_limit: float = math.inf
+) -> NDArray[np.float64]:
+    """Give how an adjustment of more unknowns would first change a camera (6 + free,).
+
+    Raises:
+        GeometryError: too few points, or they do not determine the pose.
+    """
+    middle, problem = _problem(seen, camera, lens, soft_limit)
+    local = camera.shifted(middle)
+    return problem.step(local, problem.errors(local), damping=0.0)
+
+
 def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
     """Tell how points fit a camera, each against its own expected deviation."""
     middle = seen.points_world.mean(axis=0) if len(seen) else np.zeros(3)
     near = camera.shifted(middle)
-    pixels = near.project(seen.points_world - middle)[:, :2]
-    residuals = seen.pixels_photo - pixels
     linear = linearised(near, seen.points_world - middle, LensFreedom())
+    # Beyond the fold of a lens model there is no pixel.
+    folds = camera.distortion.any()
+    pixels = near.project(seen.points_world - middle)[:, :2] if folds else linear.pixels
+    residuals = seen.pixels_photo - pixels
     with np.errstate(invalid="ignore"):
         whitened = whiten(_pixel_covariances(linear, seen), residuals[:, :, None])[:, :, 0]
         normalised = np.linalg.norm(whitened, axis=1)
@@ -215,9 +261,10 @@ def whiten(covariances: NDArray[np.float64], columns: NDArray[np.float64]) -> ND
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Whitened:
-    residuals: NDArray[np.float64]  # (n, 2)
+class _Errors:
+    residuals: NDArray[np.float64]  # (n, 2), in units of their standard deviation
     jacobian: NDArray[np.float64]  # (n, 2, p)
+    cost: float
 
 
 class _Problem:
@@ -226,80 +273,96 @@ class _Problem:
     def __init__(
         self, seen: SeenPoints, lens: LensFreedom, prior: ViewingCamera, soft_limit: float
     ) -> None:
-        self._seen, self._lens, self._prior = seen, lens, prior
+        self.lens, self.n_free = lens, POSE_PARAMETERS + lens.sigmas.size
+        self._seen, self._prior = seen, prior
         self._soft_limit = soft_limit
         self._prior_weights = 1.0 / lens.sigmas**2
 
     def solve(self, camera: ViewingCamera) -> ViewingCamera:
         damping = _DAMPING_START
-        cost = self._cost(camera)
-        if not math.isfinite(cost):
+        errors = self.errors(camera)
+        if not math.isfinite(errors.cost):
             raise GeometryError("a resection starts from a camera that cannot see its points")
         for _ in range(_ITERATIONS):
-            errors = self.whitened(camera)
-            normal = self._normal(errors)
-            right = np.einsum("nij,ni->j", errors.jacobian, errors.residuals)
-            right[POSE_PARAMETERS:] += self._prior_weights * self._from_prior(camera)
             while damping < _DAMPING_MOST:
-                damped = normal + damping * np.diag(np.diag(normal))
-                step = np.linalg.lstsq(damped, right, rcond=None)[0]
-                moved = stepped(camera, step, self._lens)
-                new_cost = self._cost(moved)
-                if new_cost <= cost:
+                moved = stepped(camera, self.step(camera, errors, damping=damping), self.lens)
+                after = self.errors(moved)
+                if after.cost <= errors.cost:
                     break
                 damping *= 10.0
             else:
                 return camera
-            gain = cost - new_cost
-            camera, cost, damping = moved, new_cost, max(damping * 0.1, 1e-12)
-            if gain <= _CONVERGED * max(cost, 1e-30):
+            gain = errors.cost - after.cost
+            camera, errors, damping = moved, after, max(damping * 0.1, 1e-12)
+            if gain <= _CONVERGED * max(errors.cost, 1e-30):
                 break
         return camera
 
-    def whitened(self, camera: ViewingCamera) -> _Whitened:
-        """Residuals and derivatives in units of their standard deviation."""
+    def step(
+        self, camera: ViewingCamera, errors: _Errors, *, damping: float
+    ) -> NDArray[np.float64]:
+        normal = self.normal(errors)
+        right = np.einsum("nij,ni->j", errors.jacobian, errors.residuals)
+        right[POSE_PARAMETERS:] += self._prior_weights * self._from_prior(camera)
+        damped = normal + damping * np.diag(np.diag(normal))
+        step: NDArray[np.float64] = np.linalg.lstsq(damped, right, rcond=None)[0]
+        return step
+
+    def errors(self, camera: ViewingCamera) -> _Errors:
+        """Residuals and derivatives in units of their standard deviation, far ones softened."""
         seen = self._seen
-        linear = linearised(camera, seen.points_world, self._lens)
+        linear = linearised(camera, seen.points_world, self.lens)
         residuals = seen.pixels_photo - linear.pixels
-        both = np.concatenate([residuals[:, :, None], linear.by_parameters], axis=2)
+        both = np.empty((2, 1 + self.n_free, len(seen))).transpose(2, 0, 1)
+        both[:, :, 0], both[:, :, 1:] = residuals, linear.by_parameters
         both = whiten(_pixel_covariances(linear, seen), both)
-        length = np.linalg.norm(both[:, :, 0], axis=1)
-        weight = np.minimum(1.0, self._soft_limit / np.maximum(length, 1e-12))
-        both *= np.sqrt(weight)[:, None, None]
-        return _Whitened(residuals=both[:, :, 0], jacobian=both[:, :, 1:])
+        squares = (both[:, :, 0] ** 2).sum(axis=1)
+        limit, loss = self._soft_limit, squares
+        if not math.isinf(limit):
+            length = np.sqrt(squares)
+            loss = np.where(length <= limit, squares, limit * (2.0 * length - limit))
+            weight = np.minimum(1.0, limit / np.maximum(length, 1e-12))
+            both *= np.sqrt(weight)[:, None, None]
+        prior = float((self._prior_weights * self._from_prior(camera) ** 2).sum())
+        return _Errors(
+            residuals=both[:, :, 0], jacobian=both[:, :, 1:], cost=float(loss.sum()) + prior
+        )
 
-    def normal_matrix(self, camera: ViewingCamera) -> NDArray[np.float64]:
-        return self._normal(self.whitened(camera))
-
-    def _normal(self, errors: _Whitened) -> NDArray[np.float64]:
-        flat = errors.jacobian.reshape(-1, errors.jacobian.shape[2])
+    def normal(self, errors: _Errors) -> NDArray[np.float64]:
+        along, down = errors.jacobian.transpose(1, 2, 0)
         # Not by BLAS: its sums depend on the number of threads.
-        normal: NDArray[np.float64] = np.einsum("ij,ik->jk", flat, flat)
+        normal: NDArray[np.float64] = np.einsum("jn,kn->jk", along, along)
+        normal += np.einsum("jn,kn->jk", down, down)
         free = np.arange(POSE_PARAMETERS, len(normal))
         normal[free, free] += self._prior_weights
         return normal
 
-    def _cost(self, camera: ViewingCamera) -> float:
-        linear = linearised(camera, self._seen.points_world, self._lens)
-        residuals = self._seen.pixels_photo - linear.pixels
-        covariances = _pixel_covariances(linear, self._seen)
-        length = np.linalg.norm(whiten(covariances, residuals[:, :, None])[:, :, 0], axis=1)
-        limit = self._soft_limit
-        if math.isinf(limit):
-            loss = length**2
-        else:
-            loss = np.where(length <= limit, length**2, limit * (2.0 * length - limit))
-        prior = float((self._prior_weights * self._from_prior(camera) ** 2).sum())
-        return float(loss.sum()) + prior
-
     def _from_prior(self, camera: ViewingCamera) -> NDArray[np.float64]:
         """Prior - current value of the free interior parameters."""
-        return lens_values(self._prior, self._lens) - lens_values(camera, self._lens)
+        return lens_values(self._prior, self.lens) - lens_values(camera, self.lens)
+
+
+def _problem(
+    seen: SeenPoints, prior: ViewingCamera, lens: LensFreedom | None, soft_limit: float
+) -> tuple[NDArray[np.float64], _Problem]:
+    """The adjustment relative to the middle of the points, and that middle.
+
+    Survey coordinates would cost digits.
+    """
+    freedom = LensFreedom() if lens is None else lens
+    n_free = POSE_PARAMETERS + freedom.sigmas.size
+    if 2 * len(seen) < n_free + 2:
+        raise GeometryError(f"a resection with {n_free} unknowns got only {len(seen)} points")
+    middle = seen.points_world.mean(axis=0)
+    local = replace(seen, points_world=seen.points_world - middle)
+    return middle, _Problem(local, freedom, prior, soft_limit)
 
 
 def _pixel_covariances(linear: Linear, seen: SeenPoints) -> NDArray[np.float64]:
-    by_point = linear.by_camera_point
-    covariances = (seen.sigma_m**2)[:, None, None] * (by_point @ by_point.transpose(0, 2, 1))
-    covariances[:, [0, 1], [0, 1]] += (seen.sigma_px**2)[:, None]
-    result: NDArray[np.float64] = covariances
-    return result
+    along, down = linear.by_camera_point[:, 0], linear.by_camera_point[:, 1]
+    from_pixel, from_point = seen.sigma_px**2, seen.sigma_m**2
+    covariances = np.empty((len(seen), 2, 2))
+    covariances[:, 0, 0] = from_pixel + from_point * (along**2).sum(axis=1)
+    covariances[:, 1, 1] = from_pixel + from_point * (down**2).sum(axis=1)
+    covariances[:, 0, 1] = covariances[:, 1, 0] = from_point * (along * down).sum(axis=1)
+    return covariances

@@ -18,8 +18,11 @@ from orthoflow.geometry.resection import (
     Resection,
     SeenPoints,
     adjust,
+    first_step,
+    fitted,
     misfit,
     pixels_by_point,
+    stated,
 )
 from orthoflow.products import Intrinsics, JsonValue, Photo
 from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior, viewing
@@ -27,6 +30,8 @@ from orthoflow_plugins.orient.robust import RobustPose, SamplingRule, robust_pos
 from orthoflow_plugins.orient.splitting import GROUPS, image_cells
 
 _ROUNDS: Final = 8
+# A standard deviation of unit weight that changes by less changes no tie's weight to speak of.
+_SETTLED_SHARE: Final = 0.01
 # Median length of a two-dimensional standard normal deviation.
 _MEDIAN_LENGTH: Final = 1.1774
 _SIGMA0_RANGE: Final = (0.1, 3.0)
@@ -41,6 +46,8 @@ _LEAST_FOR_LENS: Final = 8
 # A calibration that is off by more than both is another lens's.
 _FOCAL_OFF_LEAST: Final = 0.03
 _FOCAL_OFF_SIGMAS: Final = 5.0
+# A first step far below that saves the rest of the adjustment.
+_FOCAL_STEP_LEAST: Final = 0.5 * _FOCAL_OFF_LEAST
 _LEAST_FOR_FOCAL: Final = 25
 _OTHER_LENS: Final = LensFreedom(focal_sigma=0.35, k1_sigma=0.1)
 
@@ -137,8 +144,11 @@ def calibration_doubt(found: Estimate, control: SeenPoints) -> str:
     camera = found.resection.camera
     if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
         return ""
-    cells = image_cells(control.pixels_photo, (camera.width, camera.height), GROUPS)
     try:
+        step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
+        if abs(step[POSE_PARAMETERS]) < _FOCAL_STEP_LEAST:
+            return ""
+        cells = image_cells(control.pixels_photo, (camera.width, camera.height), GROUPS)
         free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
     except GeometryError:
         return ""
@@ -173,7 +183,7 @@ def robust_start(
     agreeing = np.zeros(len(seen), dtype=np.bool_)
     agreeing[control] = best[0].agreeing
     # Points that appear twice say nothing new to a pose of six unknowns.
-    if len(np.unique(seen.points_world[agreeing].round(4), axis=0)) < 5:
+    if len(set(map(tuple, seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
     pose, intrinsics = best
     lens = viewing(intrinsics)
@@ -198,28 +208,29 @@ def adjusted(
     Raises:
         GeometryError: the ties that agree do not determine the camera.
     """
-    cells = image_cells(seen.pixels_photo, (photo.width, photo.height), GROUPS)
     camera, agreeing, unit = start.camera, start.agreeing, 1.0
-    for nth in range(_ROUNDS):
+    for _ in range(_ROUNDS):
         used = agreeing & ~is_check
         lens = start.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
-        resection = adjust(
-            seen.take(used),
-            # A lens that may not change is the one known beforehand.
-            camera if lens.sigmas.size else posed(start.prior, camera),
-            prior=start.prior,
-            lens=lens,
-            groups=cells[used],
-            soft_limit=SOFT_LIMIT * unit,
-        )
-        camera = resection.camera
+        control, soft_limit = seen.take(used), SOFT_LIMIT * unit
+        # A lens that may not change is the one known beforehand.
+        begin = camera if lens.sigmas.size else posed(start.prior, camera)
+        camera = fitted(control, begin, prior=start.prior, lens=lens, soft_limit=soft_limit)
         fit = misfit(seen, camera)
-        unit = unit_deviation(fit.normalised[used])
+        before, unit = unit, unit_deviation(fit.normalised[used])
         limit = without_chance(fit.normalised[~is_check], rule.rejection_sigma * unit)
         again = fit.normalised <= limit
-        if np.array_equal(again & ~is_check, used) and nth >= 2:
+        if np.array_equal(again & ~is_check, used) and abs(unit / before - 1.0) < _SETTLED_SHARE:
             break
         agreeing = again
+    resection = stated(
+        control,
+        camera,
+        prior=start.prior,
+        lens=lens,
+        groups=image_cells(control.pixels_photo, (photo.width, photo.height), GROUPS),
+        soft_limit=soft_limit,
+    )
     return Estimate(
         resection=resection,
         intrinsics=intrinsics_of(resection, start.source),

@@ -27,9 +27,9 @@ class OrientPnp(Method):
     determinism: ClassVar[Determinism] = "seeded"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.6, 4.3",
-        "chum2003: Locally optimized RANSAC, doi:10.1007/978-3-540-45243-0_31",
-        "persson2018: Lambda twist (P3P), doi:10.1007/978-3-030-01225-0_20",
-        "schoenberger2016: Structure-from-motion revisited (COLMAP), doi:10.1109/CVPR.2016.445",
+        "raguram2013: USAC, universal random sample consensus, doi:10.1109/TPAMI.2012.257",
+        "torr2000: MLESAC (and MSAC), doi:10.1006/cviu.1999.0832",
+        "ke2017: An efficient algebraic solution to P3P, doi:10.1109/CVPR.2017.491",
     )
 
     class Params(OrientParams):
@@ -53,5 +53,5 @@ class OrientPnp(Method):
 
     @classmethod
     def tools(cls) -> dict[str, str]:
-        """COLMAP finds the first pose."""
-        return {name: version(name) for name in ("pycolmap", "scipy")}
+        """OpenCV finds the first pose."""
+        return {name: version(name) for name in ("opencv-python-headless", "scipy")}

@@ -12,7 +12,6 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 
 _LEAST: Final = 4
-_TRIALS_LEAST: Final = 200
 _CONFIDENCE: Final = 0.99999
 
 
@@ -50,7 +49,7 @@ def robust_pose(
     lens: ViewingCamera,
     rule: SamplingRule,
 ) -> RobustPose | None:
-    """Find the pose that most ties agree with (LO-RANSAC on P3P, as COLMAP has it).
+    """Find the pose that most ties agree with (MSAC on P3P: Torr & Zisserman 2000).
 
     Args:
         pixels_photo: (n, 2).
@@ -61,42 +60,45 @@ def robust_pose(
     Returns:
         None when no pose is found.
     """
-    import pycolmap
+    import cv2
 
     usable = _undistorted(pixels_photo, lens)
     inside: NDArray[np.bool_] = np.asarray(np.isfinite(usable).all(axis=1))
     if inside.sum() < _LEAST:
         return None
     middle = points_world.mean(axis=0)
-    # Pixels without distortion have a pinhole's pixel frame; lens models of other programs differ
-    # in their last coefficients.
-    pinhole = pycolmap.Camera(
-        model="PINHOLE",
-        width=lens.width,
-        height=lens.height,
-        params=[lens.fx, lens.fy, lens.cx, lens.cy],
-    )
-    options: Any = {
-        "ransac": {
-            "max_error": rule.threshold_px,
-            "confidence": _CONFIDENCE,
-            "min_num_trials": _TRIALS_LEAST,
-            "max_num_trials": rule.n_trials_most,
-            "random_seed": rule.seed,
-        }
-    }
-    # One thread: the sums of several come in any order.
-    found: dict[str, Any] | None = pycolmap.estimate_and_refine_absolute_pose(
-        usable[inside], points_world[inside] - middle, pinhole, options
-    )
-    if found is None:
+    # OpenCV's (0, 0) is the centre of the first pixel, ours (0.5, 0.5).
+    pixels = np.ascontiguousarray(usable[inside] - 0.5)
+    points = np.ascontiguousarray(points_world[inside] - middle)
+    matrix = np.array([[lens.fx, 0.0, lens.cx - 0.5], [0.0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
+    call: Any = cv2.solvePnPRansac
+    try:
+        found, _, turn, shift, agreed = call(points, pixels, matrix, None, params=_usac(rule))
+    except cv2.error:  # no sample has a solution
         return None
-    matrix = found["cam_from_world"].matrix()
+    if not found or agreed is None:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
     agreeing = np.zeros(len(inside), dtype=np.bool_)
-    agreeing[np.flatnonzero(inside)] = found["inlier_mask"]
-    left, _, right = np.linalg.svd(matrix[:, :3])
-    local = replace(lens, rotation=left @ right, translation=matrix[:, 3])
+    agreeing[np.flatnonzero(inside)[np.asarray(agreed).ravel()]] = True
     return RobustPose(camera=local.shifted(-middle), agreeing=agreeing)
+
+
+def _usac(rule: SamplingRule) -> Any:
+    """OpenCV's universal sampling, one thread: several give another result each time."""
+    import cv2
+
+    params: Any = cv2.UsacParams()
+    params.threshold = rule.threshold_px
+    params.maxIterations = rule.n_trials_most
+    params.confidence = _CONFIDENCE
+    params.randomGeneratorState = rule.seed
+    params.isParallel = False
+    params.score = cv2.SCORE_METHOD_MSAC
+    # The adjustment that follows does what a local optimisation would do in thrice the time.
+    params.loMethod = cv2.LOCAL_OPTIM_NULL
+    return params
 
 
 def _undistorted(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDArray[np.float64]:
