@@ -10,11 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient.direct_linear import direct_linear, relief
-from orthoflow_plugins.orient.dlt import OrientDlt
+from orthoflow_plugins.orient.dlt import OrientDlt, estimate_dlt
+from orthoflow_plugins.orient.estimating import Estimate, EstimationRule
+from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
 from orthoflow.errors import GeometryError
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Cameras, Photo, Photos, Ties
 from orthoflow.sdk import StepContext
 from tests import matching_scenes as ms
@@ -157,6 +160,29 @@ def test_stated_errors_hold_where_the_model_does(tmp_path: Path, seed: int) -> N
     assert found.sigma_wall_m is not None
     # Length of a two-dimensional error is root two of a coordinate's; chance lets it vary.
     assert 0.2 < np.sqrt(np.mean(errors**2) / 2.0) * pixel_m / found.sigma_wall_m < 3.0
+
+
+def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider() -> None:
+    true = replace(camera(), distortion=np.array([-0.08, 0.02, 0.0, 0.0, 0.0]))
+    rule = EstimationRule(rejection_sigma=3.5, threshold_px=None, n_trials_most=2000, seed=1)
+    ratios = []
+    for seed in range(6):
+        ties = ties_of(true, seed, noise_px=0.7)
+        seen = SeenPoints(
+            pixels_photo=ties.pixels_photo,
+            points_world=ties.points_world,
+            sigma_px=ties.sigma_px,
+            sigma_m=ties.sigma_m,
+        )
+        is_check = np.arange(len(seen)) % 5 == 0
+        found = estimate_dlt(photos().photos[0], seen, is_check, rule, distortion="k1")
+        assert isinstance(found, Estimate)
+        stated = wall_error(found.resection, known_walls(ties, np.ones(len(seen), np.bool_)))
+        assert stated is not None
+        errors = frame_errors_px(found.resection.camera, true)
+        ratios.append(np.sqrt(np.mean(errors**2) / 2.0) * 2.6 / 3200.0 / stated.rms_m)
+    # Measured: 1.6; without what the full model would move, 3.3.
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 2.4
 
 
 @pytest.mark.parametrize(
