@@ -15,7 +15,7 @@ from orthoflow_plugins.match.neighbours import (
     mutual_matches,
     mutual_matches_within,
 )
-from orthoflow_plugins.match.pictures import filled_smoothly, points_on_wall, shrunk
+from orthoflow_plugins.match.pictures import filled_smoothly, photo_grey, points_on_wall, shrunk
 from orthoflow_plugins.match.rematching import Expectation, rematched
 from orthoflow_plugins.match.sift import MatchSift
 from scipy.spatial.distance import cdist
@@ -112,6 +112,40 @@ def test_neighbours_are_those_of_brute_force(seed: int) -> None:
     expected = np.flatnonzero(mutual & (ratio <= 0.8))
     np.testing.assert_array_equal(found.first, expected)
     np.testing.assert_array_equal(found.second, nearest[expected])
+
+
+def test_the_approximate_search_finds_nearly_all_that_the_exact_one_does(
+    scene: ms.TexturedWall,
+) -> None:
+    pictures = [
+        photo_grey(ms.photo_of(scene, camera))
+        for camera in (ms.camera_before(scene), ms.camera_before(scene, centre=(1.6, -2.3, 1.0)))
+    ]
+    first, second = (find_features(picture, RULE).descriptors for picture in pictures)
+    assert min(len(first), len(second)) > 2000
+    found = []
+    for is_exact in (True, False):
+        matches = mutual_matches(first, second, ratio_most=0.85, is_exact=is_exact)
+        found.append(set(zip(matches.first.tolist(), matches.second.tolist(), strict=True)))
+    exact, approximate = found
+    assert len(exact) > 500
+    # A second best that was missed lets a few pass that are not distinct.
+    assert len(exact & approximate) > 0.9 * len(exact)
+    assert len(approximate - exact) < 0.1 * len(exact)
+
+
+@pytest.mark.parametrize("upscales_precisely", [True, False], ids=["precise", "as OpenCV sets it"])
+def test_key_points_lie_where_they_are(*, upscales_precisely: bool) -> None:
+    places = np.array([(u, v) for u in np.linspace(30.3, 370.7, 7) for v in (40.1, 200.6, 360.4)])
+    columns, rows = np.meshgrid(np.arange(400) + 0.5, np.arange(400) + 0.5)
+    picture = np.full((400, 400), 60.0)
+    for u, v in places:
+        picture += 120.0 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2.0 * 4.0**2))
+    rule = replace(RULE, upscales_precisely=upscales_precisely)
+    found = find_features(np.rint(picture).astype(np.uint8), rule).pixels
+    nearest = found[np.linalg.norm(found[None] - places[:, None], axis=2).argmin(axis=1)]
+    # OpenCV's default puts them a quarter of a pixel too far to the right and down.
+    np.testing.assert_allclose(np.median(nearest - places, axis=0), 0.0, atol=0.03)
 
 
 @pytest.mark.parametrize("seed", range(3))

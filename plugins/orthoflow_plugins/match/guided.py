@@ -26,7 +26,8 @@ class MatchGuided(Method):
     Only what the photo shows of a wall is searched, within a small radius (the mask of
     markiewicz2015 taken to its end), in oriented gradients, which survive that a laser sees another
     colour than a camera. The pose is refitted and the photo warped again until held-out ties stop
-    improving. Photos without a pose give no ties.
+    improving. Photos without a pose are looked for on what the others show of the walls, then
+    traced like these; those not found there give no ties.
     """
 
     id: ClassVar[str] = "match.guided"
@@ -78,6 +79,11 @@ class MatchGuided(Method):
         n_rounds_max: int = Field(
             default=4, ge=1, le=10, description="Photos are warped and measured at most so often."
         )
+        finds_missing: bool = Field(
+            default=True,
+            description="Whether photos without a pose are looked for on what the others show of "
+            "the walls.",
+        )
 
     class In(Ports):
         """Photos, the rastered walls, and where the photos were taken, roughly."""
@@ -93,6 +99,7 @@ class MatchGuided(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Trace every oriented photo on the walls."""
+        from orthoflow_plugins.match.recovering import recovered_traces
         from orthoflow_plugins.match.targets import target_of
         from orthoflow_plugins.match.tracing import trace_photo
 
@@ -123,6 +130,12 @@ class MatchGuided(Method):
             pieces += found.pieces
             if not any(len(piece) for piece in found.pieces):
                 ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
+        if params.finds_missing:
+            recovered = recovered_traces(photos, oriented, targets, list(traces.values()), rule)
+            for name, found in recovered.items():
+                ctx.log(f"photo {name}: found by what other photos show of the walls")
+                traces[name] = found
+                pieces += found.pieces
         ties = ties_of(
             pieces,
             photos,

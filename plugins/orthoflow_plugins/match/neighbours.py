@@ -1,4 +1,4 @@
-"""Nearest descriptors, exact: matrix products in blocks, several times as fast as brute force."""
+"""Pairs of descriptors that are each other's nearest, and clearly so."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-# Entries of a block of distances: 12 MB, which a processor's cache holds while they are searched.
-_BLOCK_ENTRIES: Final = 3_000_000
+from orthoflow_plugins.match.nearest import nearest, two_nearest, two_nearest_roughly
+
 # Pairs whose descriptors are gathered at once: 2 x 32 MB.
 _PAIRS_AT_ONCE: Final = 65_536
 
@@ -81,7 +81,11 @@ class Window:
 
 
 def mutual_matches(
-    first: NDArray[np.float32], second: NDArray[np.float32], *, ratio_most: float
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    *,
+    ratio_most: float,
+    is_exact: bool = True,
 ) -> Matches:
     """Pair descriptors that are each other's nearest and clearly nearer than the next.
 
@@ -89,28 +93,19 @@ def mutual_matches(
         first: (n, d) whole numbers, small enough that products are exact in float32.
         second: (m, d) likewise.
         ratio_most: largest distance of the best over the distance of the second best (Lowe 2004).
+        is_exact: whether all pairs are compared, or only those that are roughly alike.
     """
     if not (len(first) and len(second)):
         return _nothing()
-    left, right = _left(first), _right(second)
-    nearest = np.empty(len(first), dtype=np.intp)
-    best = np.empty(len(first), dtype=np.float32)
-    next_best = np.full(len(first), np.inf, dtype=np.float32)
-    for rows in _blocks(len(first), len(second)):
-        distances = left[rows] @ right
-        index = distances.argmin(axis=1)
-        own = np.arange(len(index))
-        nearest[rows], best[rows] = index, distances[own, index]
-        if len(second) > 1:
-            distances[own, index] = np.inf
-            next_best[rows] = distances.min(axis=1)
-    ratio = _ratio(best, next_best)
+    search = two_nearest if is_exact else two_nearest_roughly
+    found = search(first, second)
+    ratio = _ratio(found.best, found.next_best)
     # Few are distinct, so that only they are looked up backwards.
     distinct = np.flatnonzero(ratio <= ratio_most)
-    asked, place = np.unique(nearest[distinct], return_inverse=True)
-    back = best_matches(second[asked], first)[place]
+    asked, place = np.unique(found.index[distinct], return_inverse=True)
+    back = nearest(second[asked], first)[place]
     kept = distinct[back == distinct]
-    return Matches(first=kept, second=nearest[kept], ratio=ratio[kept])
+    return Matches(first=kept, second=found.index[kept], ratio=ratio[kept])
 
 
 def mutual_matches_within(
@@ -145,29 +140,6 @@ def mutual_matches_within(
     is_back[back] = True
     kept = is_back[best] & (ratio <= ratio_most)
     return Matches(first=i[best[kept]], second=j[best[kept]], ratio=ratio[kept])
-
-
-def best_matches(asked: NDArray[np.float32], among: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Index (n,) of the nearest of `among` (m, d), at least one, for each of `asked` (n, d)."""
-    left, right = _left(asked), _right(among)
-    parts = [(left[rows] @ right).argmin(axis=1) for rows in _blocks(len(asked), len(among))]
-    return np.concatenate([np.empty(0, dtype=np.intp), *parts])
-
-
-def _left(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Rows whose product with `_right` is the squared distance: (-2 a, |a|^2, 1) (b, 1, |b|^2)."""
-    squares = (descriptors * descriptors).sum(axis=1)
-    return np.column_stack([-2.0 * descriptors, squares, np.ones_like(squares)])
-
-
-def _right(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    squares = (descriptors * descriptors).sum(axis=1)
-    return np.vstack([descriptors.T, np.ones_like(squares), squares])
-
-
-def _blocks(n_rows: int, n_columns: int) -> list[slice]:
-    rows = max(1, _BLOCK_ENTRIES // n_columns)
-    return [slice(start, min(start + rows, n_rows)) for start in range(0, n_rows, rows)]
 
 
 def _distances(

@@ -10,9 +10,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.products import Wall
 from orthoflow_plugins.match.features import FeatureRule, Features, find_features
 from orthoflow_plugins.match.neighbours import Matches, mutual_matches
-from orthoflow_plugins.match.pictures import equalised, shrunk
+from orthoflow_plugins.match.pictures import equalised, shrunk, wall_picture
 from orthoflow_plugins.match.rematching import Expectation, rematched
 
 # A photo is tried at this size first, then at twice, until a wall is recognised.
@@ -24,6 +25,7 @@ _FIRST_ON_WALL: Final = 4000
 _LOOSE_SHARE: Final = 0.02
 # A factor of 1.4 between pixels and cells is nothing to key points that have a size of their own.
 _LOG_SCALE_APART: Final = 0.35
+_VOID_MARGIN_CELLS: Final = 3
 _SEED: Final = 1
 
 
@@ -37,6 +39,7 @@ class PairingRule:
         n_verified_least: ties that agree with one homography, for a wall to count as shown.
         longest_side_px: larger photos are shrunk to this.
         clip_limit: of the local equalisation.
+        is_exact: whether all pairs of key points are compared, or only those roughly alike.
     """
 
     features: FeatureRule
@@ -44,6 +47,7 @@ class PairingRule:
     n_verified_least: int
     longest_side_px: int
     clip_limit: float
+    is_exact: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +92,15 @@ class PhotoPairs:
     def n_verified(self) -> int:
         """Ties that agree, over the walls shown."""
         return sum(int(pair.agreeing.sum()) for pair in self.pairs if pair.is_shown)
+
+
+def wall_features(wall: Wall, rule: PairingRule) -> Features | None:
+    """Key points of a wall's intensity; None where it shows nothing."""
+    picture = wall_picture(wall, clip_limit=rule.clip_limit, void_margin_cells=_VOID_MARGIN_CELLS)
+    if picture is None:
+        return None
+    usable = picture.usable & np.isfinite(wall.depth_m)
+    return find_features(picture.grey, rule.features, usable)
 
 
 def pair_photo(
@@ -167,7 +180,10 @@ class _Seeker:
             if wall is None:
                 continue
             matches = mutual_matches(
-                key_points.features.descriptors, wall.descriptors, ratio_most=self.rule.ratio_most
+                key_points.features.descriptors,
+                wall.descriptors,
+                ratio_most=self.rule.ratio_most,
+                is_exact=self.rule.is_exact,
             )
             if len(matches):
                 sets = (key_points.features, wall)

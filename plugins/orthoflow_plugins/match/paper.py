@@ -18,17 +18,17 @@ from orthoflow.products import Photo, Wall, Walls
 from orthoflow_plugins.match.assembling import TiePiece
 from orthoflow_plugins.match.features import FeatureRule, Features, find_features
 from orthoflow_plugins.match.key_point_ties import key_point_ties
-from orthoflow_plugins.match.neighbours import best_matches
+from orthoflow_plugins.match.nearest import nearest
 from orthoflow_plugins.match.pictures import photo_grey, wall_picture
 from orthoflow_plugins.match.warping import project_walls
 
 _VOID_MARGIN_CELLS: Final = 3
-# OpenCV's own values; its key points are a quarter of a pixel off.
+# OpenCV's own values.
 PAPER_FEATURES: Final = FeatureRule(
     n_most=50_000,
     contrast_threshold=0.04,
     edge_threshold=10.0,
-    is_unbiased=False,
+    upscales_precisely=False,
     is_rooted=False,
 )
 
@@ -79,7 +79,7 @@ def paper_pieces(
             chosen = _within(features, masks[place])
         if chosen is None or not len(chosen) or not len(in_photo):
             continue
-        best = best_matches(chosen.descriptors, in_photo.descriptors)
+        best = nearest(chosen.descriptors, in_photo.descriptors)
         pieces.append(key_point_ties((index, place), wall, (in_photo.take(best), chosen)))
     return pieces
 

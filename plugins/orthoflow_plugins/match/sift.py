@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from orthoflow.products import JsonValue, Photos, TieRole, Ties, Wall, Walls
+from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of, without_twins
-from orthoflow_plugins.match.features import FeatureRule, Features, find_features
+from orthoflow_plugins.match.features import FeatureRule, Features
 from orthoflow_plugins.match.key_point_ties import key_point_ties
-from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo
+from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features
-from orthoflow_plugins.match.pictures import (
-    photo_grey,
-    require_intensity,
-    wall_picture,
-)
+from orthoflow_plugins.match.pictures import photo_grey, require_intensity
 from orthoflow_plugins.match.versions import opencv_version
 from orthoflow_plugins.match.workers import in_order
-
-_VOID_MARGIN_CELLS: Final = 3
 
 
 class MatchSift(Method):
@@ -60,6 +54,11 @@ class MatchSift(Method):
             gt=0,
             le=1,
             description="Largest distance of the best match over the second best.",
+        )
+        search: Literal["exact", "approximate"] = Field(
+            default="exact",
+            description="approximate: descriptors are compared only with those in lists of similar "
+            "ones, which is several times as fast with many key points and misses some matches.",
         )
         contrast_threshold_factor: float = Field(
             default=0.02,
@@ -109,7 +108,7 @@ class MatchSift(Method):
             return self.Out(ties=_paper(photos, walls, ctx))
         rule = _rule(params)
         ctx.progress(0.0, "key points of the walls")
-        on_walls = list(in_order(lambda wall: _wall_features(wall, rule), walls.walls, ctx.cores))
+        on_walls = list(in_order(lambda wall: wall_features(wall, rule), walls.walls, ctx.cores))
         pieces: list[TiePiece] = []
         notes: dict[str, JsonValue] = {}
         paired = in_order(
@@ -156,15 +155,8 @@ def _rule(params: MatchSift.Params) -> PairingRule:
         n_verified_least=params.n_verified_min,
         longest_side_px=params.longest_side_max_px,
         clip_limit=params.equalise_clip_factor,
+        is_exact=params.search == "exact",
     )
-
-
-def _wall_features(wall: Wall, rule: PairingRule) -> Features | None:
-    picture = wall_picture(wall, clip_limit=rule.clip_limit, void_margin_cells=_VOID_MARGIN_CELLS)
-    if picture is None:
-        return None
-    usable = picture.usable & np.isfinite(wall.depth_m)
-    return find_features(picture.grey, rule.features, usable)
 
 
 def _pieces(

@@ -1,0 +1,224 @@
+"""Photos that nobody could orient yet, found by what oriented photos show of the same walls.
+
+Where a laser sees another colour than a camera, a photo may share too few key points with the
+intensity of a wall. With another photo of the wall it shares hundreds. So the oriented photos are
+painted on the walls, the missing one is matched with that picture, and its pose follows; then it is
+traced on the scan as any other photo, so that its ties are known from the scan alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Camera, Photo, Photos, Wall
+from orthoflow_plugins.match.features import FeatureRule, Features
+from orthoflow_plugins.match.key_point_ties import key_point_ties
+from orthoflow_plugins.match.pairing import PairingRule, PhotoPairs, pair_photo, wall_features
+from orthoflow_plugins.match.pictures import photo_grey
+from orthoflow_plugins.match.targets import WallTarget
+from orthoflow_plugins.match.tracing import Trace, TracingRule, trace_photo
+
+# Two photos of one wall share hundreds of key points; fewer than so many may be a repeated motif.
+_AGREEING_LEAST: Final = 24
+_POSE_LIMIT_SHARE: Final = 0.002
+_POSE_TRIALS: Final = 2000
+_SEED: Final = 1
+# As `match.sift` has them.
+_SEEKING: Final = PairingRule(
+    features=FeatureRule(n_most=8000, contrast_threshold=0.02, edge_threshold=10.0),
+    ratio_most=0.85,
+    n_verified_least=8,
+    longest_side_px=4000,
+    clip_limit=3.0,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaintedWall:
+    """A wall as photos show it.
+
+    Attributes:
+        wall: the wall, its intensity from the photos, NaN where none shows it.
+        features: key points of that picture, None where there is none.
+    """
+
+    wall: Wall
+    features: Features | None
+
+
+def recovered_traces(
+    photos: Photos,
+    oriented: Mapping[str, Camera],
+    targets: Sequence[WallTarget],
+    traces: Sequence[Trace],
+    rule: TracingRule,
+) -> dict[str, Trace]:
+    """Trace photos without a pose from the one that the traced photos give them.
+
+    Args:
+        photos: all photos.
+        oriented: cameras of those with a pose, by name.
+        targets: the walls.
+        traces: of the oriented photos.
+        rule: how photos are traced.
+
+    Returns:
+        By name, for each photo that was found.
+    """
+    recovered: dict[str, Trace] = {}
+    known = [trace for trace in traces if trace.n_ties]
+    missing = [k for k, photo in enumerate(photos.photos) if photo.name not in oriented]
+    is_new = bool(known)
+    while is_new and missing:
+        # What was found shows more of the walls, for the next round.
+        painted = painted_walls([*known, *recovered.values()], [t.wall for t in targets])
+        before = len(recovered)
+        for index in missing:
+            photo = photos.photos[index]
+            found = _recovered(index, photo, painted, lens_of(photo, oriented), (targets, rule))
+            if found is not None:
+                recovered[photo.name] = found
+        missing = [k for k in missing if photos.photos[k].name not in recovered]
+        is_new = len(recovered) > before
+    return recovered
+
+
+def _recovered(
+    index: int,
+    photo: Photo,
+    painted: Sequence[PaintedWall],
+    lens: ViewingCamera | None,
+    how: tuple[Sequence[WallTarget], TracingRule],
+) -> Trace | None:
+    if lens is None:
+        return None
+    grey = photo_grey(photo)
+    pose = recovered_pose(grey, painted, lens)
+    found = None if pose is None else trace_photo(index, grey, pose, *how)
+    return found if found is not None and found.n_ties else None
+
+
+def painted_walls(traces: Sequence[Trace], walls: Sequence[Wall]) -> list[PaintedWall]:
+    """Paint oriented photos on the walls, in each cell the one that shows the wall largest."""
+    painted = []
+    for index, wall in enumerate(walls):
+        grey = np.full(wall.frame.shape, np.nan, dtype=np.float32)
+        views = [trace.view for trace in traces if trace.view.projections[index] is not None]
+        sizes = [getattr(view.projections[index], "pixels_per_cell", 0.0) for view in views]
+        for nth in np.argsort(sizes, kind="stable"):
+            projection = views[nth].projections[index]
+            assert projection is not None  # noqa: S101 - only such views were taken
+            shown = views[nth].on_wall(index, projection)
+            part = grey[projection.part]
+            part[np.isfinite(shown)] = shown[np.isfinite(shown)]
+        as_shown = replace(wall, intensity=grey / np.float32(255.0))
+        features = wall_features(as_shown, _SEEKING) if np.isfinite(grey).any() else None
+        painted.append(PaintedWall(wall=as_shown, features=features))
+    return painted
+
+
+def recovered_pose(
+    grey: NDArray[np.uint8],
+    painted: Sequence[PaintedWall],
+    lens: ViewingCamera,
+) -> ViewingCamera | None:
+    """Find the pose of a photo by painted walls; None where they do not show what it shows.
+
+    Args:
+        grey: (height, width) of the photo.
+        painted: the walls.
+        lens: its interior orientation, roughly; the pose is ignored.
+    """
+    pairs = pair_photo(grey, [each.features for each in painted], _SEEKING)
+    if pairs.n_verified < _AGREEING_LEAST:
+        return None
+    pixels, points = _agreeing(pairs, painted)
+    if len(pixels) < _AGREEING_LEAST:
+        return None
+    return _pose(pixels, points, lens, _POSE_LIMIT_SHARE * max(grey.shape))
+
+
+def lens_of(photo: Photo, oriented: Mapping[str, Camera]) -> ViewingCamera | None:
+    """Give a photo's lens: calibrated, as it came out for a photo of the same camera, or by EXIF.
+
+    Returns:
+        The lens at the origin; None when nothing is known of it.
+    """
+    alike = [
+        camera.intrinsics
+        for camera in oriented.values()
+        if camera.intrinsics is not None
+        and (camera.intrinsics.width, camera.intrinsics.height) == (photo.width, photo.height)
+        and (photo.exif_focal_px is None or _is_near(camera.intrinsics.fx, photo.exif_focal_px))
+    ]
+    known = photo.intrinsics or next(iter(alike), None)
+    if known is None:
+        return None
+    return ViewingCamera(
+        width=known.width,
+        height=known.height,
+        fx=known.fx,
+        fy=known.fy,
+        cx=known.cx,
+        cy=known.cy,
+        distortion=np.array(known.distortion, dtype=np.float64),
+        rotation=np.eye(3),
+        translation=np.zeros(3),
+    )
+
+
+def _is_near(focal_px: float, exif_focal_px: float) -> bool:
+    return abs(focal_px / exif_focal_px - 1.0) < 0.1
+
+
+def _agreeing(
+    pairs: PhotoPairs, painted: Sequence[PaintedWall]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels (n, 2) and world points (n, 3) of the matches that agree."""
+    pixels, points = [np.empty((0, 2))], [np.empty((0, 3))]
+    for pair in pairs.pairs:
+        features = painted[pair.wall].features
+        if not pair.is_shown or features is None:
+            continue
+        matches = pair.matches.take(pair.agreeing)
+        sets = (pairs.features.take(matches.first), features.take(matches.second))
+        piece = key_point_ties((0, pair.wall), painted[pair.wall].wall, sets, scale=pairs.scale)
+        pixels.append(piece.pixels_photo)
+        points.append(piece.points_world)
+    return np.concatenate(pixels), np.concatenate(points)
+
+
+def _pose(
+    pixels: NDArray[np.float64],
+    points: NDArray[np.float64],
+    lens: ViewingCamera,
+    limit_px: float,
+) -> ViewingCamera | None:
+    """Pose that most points agree with, good enough to trace the photo from."""
+    import cv2
+
+    params: Any = cv2.UsacParams()
+    params.threshold = limit_px
+    params.maxIterations = _POSE_TRIALS
+    params.randomGeneratorState = _SEED
+    params.score = cv2.SCORE_METHOD_MSAC
+    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    middle = points.mean(axis=0)
+    # OpenCV's (0, 0) is the centre of the first pixel, ours (0.5, 0.5).
+    matrix = np.array([[lens.fx, 0.0, lens.cx - 0.5], [0.0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
+    straight: Any = cv2.undistortPoints(pixels[:, None] - 0.5, matrix, lens.distortion, P=matrix)
+    call: Any = cv2.solvePnPRansac
+    found, _, turn, shift, agreed = call(
+        points - middle, straight[:, 0], matrix, None, params=params
+    )
+    if not found or agreed is None or len(agreed) < _AGREEING_LEAST:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    pose = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
+    return pose.shifted(-middle)
