@@ -1,0 +1,86 @@
+"""How long six photos of 6 MP take to be oriented on a wall of 3 million cells, step by step.
+
+    python benchmarks/orientation_time.py [--cores 2] [--gap easy] [--exif] [--seed 1]
+
+A simulated room, made before the clock starts; then what the shipped recipes do: `match.sift`, a
+bundle with wide gates, `match.guided`, the bundle that counts. The first run with an empty cache of
+numba compiles some seconds more. Wall time needs an idle machine, CPU seconds do not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from orientation_truth import ROUGHLY, room
+from orthoflow_plugins.match.guided import MatchGuided
+from orthoflow_plugins.match.sift import MatchSift
+from orthoflow_plugins.orient.bundle import OrientColmapBundle
+
+from orthoflow.products import Cameras, Photos, Ties
+from orthoflow.sdk import StepContext
+
+T = TypeVar("T")
+
+
+class Clock:
+    """Prints how long each step took, and sums it up."""
+
+    def __init__(self) -> None:
+        self.wall_s = self.cpu_s = 0.0
+
+    def timed(self, name: str, step: Callable[[], T]) -> T:
+        """Run a step."""
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = step()
+        wall_s, cpu_s = time.perf_counter() - wall, time.process_time() - cpu
+        print(f"{name:24s} {wall_s:7.1f} s {cpu_s:7.1f} CPU s", flush=True)
+        self.wall_s, self.cpu_s = self.wall_s + wall_s, self.cpu_s + cpu_s
+        return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--gap", default="easy", help="spectral gap: easy or hard")
+    parser.add_argument("--exif", action="store_true", help="lenses from EXIF alone")
+    parser.add_argument("--seed", type=int, default=1)
+    chosen = parser.parse_args()
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: chosen.cores])
+    size = argparse.Namespace(layout="quick", gsd_m=0.0026, photo_gsd_m=0.00085)
+    photos, walls, _ = room(chosen.seed, chosen.gap, size)
+    if chosen.exif:
+        photos = Photos(photos=tuple(replace(each, intrinsics=None) for each in photos.photos))
+    pixels = [photo.width * photo.height / 1e6 for photo in photos.photos]
+    cells = [wall.frame.width * wall.frame.height / 1e6 for wall in walls.walls]
+    print(f"{len(pixels)} photos of {np.median(pixels):.1f} MP, wall of {max(cells):.1f} M cells")
+
+    def context() -> StepContext:
+        folder = Path(tempfile.mkdtemp())
+        return StepContext(rng=np.random.default_rng(1), cores=chosen.cores, scratch=folder)
+
+    def oriented(ties: Ties, **gates: float) -> Cameras:
+        inputs = OrientColmapBundle.In(ties=ties, photos=photos)
+        params = OrientColmapBundle.Params.model_validate(gates)
+        return OrientColmapBundle().run(inputs, params, context()).cameras
+
+    clock, sift, guided = Clock(), MatchSift(), MatchGuided()
+    seen = sift.In(photos=photos, walls=walls)
+    ties = clock.timed("match.sift", lambda: sift.run(seen, sift.Params(), context())).ties
+    first = clock.timed("bundle, wide gates", lambda: oriented(ties, **ROUGHLY))
+    known = guided.In(photos=photos, walls=walls, cameras=first)
+    again = clock.timed("match.guided", lambda: guided.run(known, guided.Params(), context())).ties
+    last = clock.timed("bundle", lambda: oriented(again))
+    n_ok = sum(camera.status == "ok" for camera in last.cameras)
+    print(f"{n_ok} oriented, {clock.wall_s:.1f} s, {clock.cpu_s:.1f} CPU s")
+
+
+if __name__ == "__main__":
+    main()
