@@ -39,9 +39,17 @@ def honest_covariance(
     jacobian, residuals = jacobian[order], residuals[order]
     pulls = np.add.reduceat(np.einsum("nij,ni->nj", jacobian, residuals), starts)
     normals = np.add.reduceat(np.einsum("nij,nik->njk", jacobian, jacobian), starts)
-    left_out = np.linalg.pinv(np.eye(n_free) - normals @ cofactors) @ pulls[:, :, None]
+    left_out = _inverses(np.eye(n_free) - normals @ cofactors) @ pulls[:, :, None]
     moves = (cofactors @ left_out)[:, :, 0]
     return widened(plain, (names.size - 1) / names.size * moves.T @ moves)
+
+
+def _inverses(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverses (n, p, p); pseudo-inverses where a group alone fixes a parameter."""
+    try:
+        return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.pinv(matrices), dtype=np.float64)
 
 
 def widened(plain: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -122,31 +122,16 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
         # Behind the camera there is no pixel: NaN makes its cost infinite.
         z = np.where(z > 1e-9, z, np.nan)
         a, b = x / z, y / z
-    k1, k2, p1, p2, k3 = camera.distortion
-    r2 = a * a + b * b
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-    ad = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
-    bd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
-    ad_by_a = radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
-    ad_by_b = a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
-    bd_by_b = radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
+    bent = _bent(a, b, camera.distortion)
+    ad, bd = bent.a, bent.b
     # Points along the last axis of memory: every operation below goes over all of them.
     by_point = np.empty((2, 3, len(points))).transpose(2, 0, 1)
-    by_point[:, 0, 0] = camera.fx * ad_by_a / z
-    by_point[:, 0, 1] = camera.fx * ad_by_b / z
-    by_point[:, 0, 2] = -camera.fx * (ad_by_a * a + ad_by_b * b) / z
-    by_point[:, 1, 0] = camera.fy * ad_by_b / z
-    by_point[:, 1, 1] = camera.fy * bd_by_b / z
-    by_point[:, 1, 2] = -camera.fy * (ad_by_b * a + bd_by_b * b) / z
-    lens_columns = {
-        "focal": (ad, bd),
-        "aspect": (0.0 * a, bd),
-        "k1": (a * r2, b * r2),
-        "k2": (a * r2 * r2, b * r2 * r2),
-        "p1": (2.0 * a * b, r2 + 2.0 * b * b),
-        "p2": (r2 + 2.0 * a * a, 2.0 * a * b),
-    }
+    by_point[:, 0, 0] = camera.fx * bent.a_by_a / z
+    by_point[:, 0, 1] = camera.fx * bent.a_by_b / z
+    by_point[:, 0, 2] = -camera.fx * (bent.a_by_a * a + bent.a_by_b * b) / z
+    by_point[:, 1, 0] = camera.fy * bent.a_by_b / z
+    by_point[:, 1, 1] = camera.fy * bent.b_by_b / z
+    by_point[:, 1, 2] = -camera.fy * (bent.b_by_b * b + bent.a_by_b * a) / z
     n_free = POSE_PARAMETERS + len(lens.names)
     by_parameters = np.empty((2, n_free, len(points))).transpose(2, 0, 1)
     # Derivative by a turn: -by_point times the cross product's matrix, written out.
@@ -157,6 +142,7 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
             - by_point[:, :, after] * turned[:, None, last]
         )
     by_parameters[:, :, 3:6] = by_point
+    lens_columns = _lens_columns(a, b, bent) if lens.names else {}
     for column, name in enumerate(lens.names, start=POSE_PARAMETERS):
         if name in lens_columns:
             along, down = lens_columns[name]
@@ -169,6 +155,48 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
         by_camera_point=by_point,
         by_parameters=by_parameters,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Bent:
+    """Rays x / z and y / z after the distortion, with derivatives; 1 and 0 without one."""
+
+    a: NDArray[np.float64]
+    b: NDArray[np.float64]
+    a_by_a: NDArray[np.float64] | float
+    a_by_b: NDArray[np.float64] | float  # and of b by a
+    b_by_b: NDArray[np.float64] | float
+
+
+def _bent(a: NDArray[np.float64], b: NDArray[np.float64], distortion: NDArray[np.float64]) -> _Bent:
+    if not distortion.any():
+        return _Bent(a=a, b=b, a_by_a=1.0, a_by_b=0.0, b_by_b=1.0)
+    k1, k2, p1, p2, k3 = distortion
+    r2 = a * a + b * b
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+    return _Bent(
+        a=a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
+        b=b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
+        a_by_a=radial + a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a,
+        a_by_b=a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b,
+        b_by_b=radial + b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a,
+    )
+
+
+def _lens_columns(
+    a: NDArray[np.float64], b: NDArray[np.float64], bent: _Bent
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Derivatives of the bent ray by what of a lens is not its centre."""
+    r2 = a * a + b * b
+    return {
+        "focal": (bent.a, bent.b),
+        "aspect": (0.0 * a, bent.b),
+        "k1": (a * r2, b * r2),
+        "k2": (a * r2 * r2, b * r2 * r2),
+        "p1": (2.0 * a * b, r2 + 2.0 * b * b),
+        "p2": (r2 + 2.0 * a * a, 2.0 * a * b),
+    }
 
 
 def _factor(logarithm: float) -> float:

@@ -31,7 +31,7 @@ from orthoflow_plugins.orient.splitting import GROUPS, image_cells
 
 _ROUNDS: Final = 8
 # A standard deviation of unit weight that changes by less changes no tie's weight to speak of.
-_SETTLED_SHARE: Final = 0.01
+_SETTLED_SHARE: Final = 0.02
 # Median length of a two-dimensional standard normal deviation.
 _MEDIAN_LENGTH: Final = 1.1774
 _SIGMA0_RANGE: Final = (0.1, 3.0)
@@ -208,7 +208,8 @@ def adjusted(
     Raises:
         GeometryError: the ties that agree do not determine the camera.
     """
-    camera, agreeing, unit = start.camera, start.agreeing, 1.0
+    camera, agreeing = start.camera, start.agreeing
+    unit = unit_deviation(misfit(seen, camera).normalised[agreeing & ~is_check])
     for _ in range(_ROUNDS):
         used = agreeing & ~is_check
         lens = start.freedom if used.sum() >= start.n_least_for_lens else LensFreedom()
