@@ -52,6 +52,6 @@ def test_a_failed_method_leaves_its_cells_failed_and_nothing_else(run: Run) -> N
 def test_every_combination_has_its_accuracy(run: Run, plane: str) -> None:
     found = {row.cell: row.value for row in run.metrics() if row.metric == "rmse_u_mm"}
     for orient in ORIENTATIONS:
-        # Measured: about a third of a cell of 6 mm.
-        assert found[f"check@plane={plane},orient={orient},ortho=backward"] < 6.0
-    assert found[f"check@plane={plane},ortho=direct"] < 6.0
+        # Measured: 0.27 (bundle) to 0.53 mm (dlt), and 0.60 mm directly, on cells of 6 mm.
+        assert found[f"check@plane={plane},orient={orient},ortho=backward"] < 1.0
+    assert found[f"check@plane={plane},ortho=direct"] < 1.2
