@@ -11,13 +11,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
+from orthoflow.geometry.compiling import kernel_part
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints
 
 # Blocks whose boxes are tried against the slabs at once.
 CHUNK_BLOCKS: Final = 64
+# Axes of a slab. Of a type, since each plain number would have a version compiled for itself.
+ALONG_NORMAL: Final = np.int64(0)
+ALONG_U: Final = np.int64(1)
+ALONG_V: Final = np.int64(2)
 
 
-@compiled
+@kernel_part
 def _spread_boxes(
     boxes: NDArray[np.float32], first: int, count: int, spread: NDArray[np.float32]
 ) -> None:
@@ -30,7 +35,7 @@ def _spread_boxes(
             spread[3 + axis, b] = half * (high - low)
 
 
-@compiled
+@kernel_part
 def _meet(
     spread: NDArray[np.float32],
     slabs: NDArray[np.float64],
@@ -62,7 +67,7 @@ def _meet(
             meeting[k, b] = min(before, here)
 
 
-@compiled
+@kernel_part
 def meet_chunk(
     boxes: NDArray[np.float32],
     block: int,
@@ -86,7 +91,7 @@ def meet_chunk(
         _meet(spread, slabs, bounds, k, meeting)
 
 
-@compiled
+@kernel_part
 def centre_block(
     points: BlockedPoints, block: int, middle: NDArray[np.float64], local: NDArray[np.float32]
 ) -> None:
@@ -106,13 +111,13 @@ def centre_block(
         local[2, i] = zs[i] - mz
 
 
-@compiled
+@kernel_part
 def place_along(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bundle these in
     local: NDArray[np.float32],
     middle: NDArray[np.float64],
     slabs: NDArray[np.float64],
     k: int,
-    row: int,
+    row: np.int64,
     scale: float,
     low: float,
     values: NDArray[np.float32],

@@ -12,74 +12,43 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
-from orthoflow.geometry.voxel_kernels import BRICK_SIDE
+from orthoflow.geometry.voxel_kernels import VOXELS, place_keys
 
 # Steps along a side of a cell: 20 micrometres in cells of two centimetres.
 STEPS_PER_CELL: Final = 1024
 # Sums of a cell: points, steps along a, b, c, then their products aa, ab, ac, bb, bc, cc.
 N_SUMS: Final = 10
+# Bits of the sum of a block's steps, and of the sum of its products of steps; a little more.
+_FIELD_BITS: Final = 18
+_PRODUCT_BITS: Final = 32
 
 
-@compiled
-def place_points(
+@kernel_part
+def _place_steps(
     points: BlockedPoints,
     start: int,
     frame: NDArray[np.float32],
-    shape: tuple[int, int, int],
-    where: NDArray[np.int32],
-) -> int:
-    """Set brick, voxel and steps of a block's points; gives the number of points.
-
-    Args:
-        points: (n,) offsets in blocks.
-        start: first point of the block.
-        frame: (3, 4) voxel of a point: `frame @ p - frame[:, 3]`.
-        shape: bricks along a, b, c.
-        where: (5, BLOCK_POINTS) set: brick (-1 outside), voxel within it, and -512..511 from the
-            middle of the voxel along a, b, c.
-    """
-    x, y, z = points.x, points.y, points.z
-    a0, a1, a2, a3 = frame[0, 0], frame[0, 1], frame[0, 2], frame[0, 3]
-    b0, b1, b2, b3 = frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3]
-    c0, c1, c2, c3 = frame[2, 0], frame[2, 1], frame[2, 2], frame[2, 3]
-    top_a = np.float32(shape[0] * BRICK_SIDE)
-    top_b = np.float32(shape[1] * BRICK_SIDE)
-    top_c = np.float32(shape[2] * BRICK_SIDE)
-    zero, fine = np.float32(0.0), np.float32(STEPS_PER_CELL)
-    half, low = np.int32(STEPS_PER_CELL // 2), np.int32(BRICK_SIDE - 1)
-    width, depth, side = np.int32(shape[1]), np.int32(shape[2]), np.int32(BRICK_SIDE)
-    count = min(BLOCK_POINTS, x.size - start)
-    # Without branches, so that the processor takes several points at once.
-    for i in range(count):
-        px, py, pz = x[start + i], y[start + i], z[start + i]
-        a = a0 * px + a1 * py + a2 * pz - a3
-        b = b0 * px + b1 * py + b2 * pz - b3
-        c = c0 * px + c1 * py + c2 * pz - c3
-        within = (a >= zero) & (a < top_a) & (b >= zero) & (b < top_b)
-        within = within & (c >= zero) & (c < top_c)
-        a = a if within else zero
-        b = b if within else zero
-        c = c if within else zero
-        p, q, r = np.int32(a), np.int32(b), np.int32(c)
-        brick = ((p >> np.int32(3)) * width + (q >> np.int32(3))) * depth + (r >> np.int32(3))
-        where[0, i] = brick if within else np.int32(-1)
-        where[1, i] = ((p & low) * side + (q & low)) * side + (r & low)
-        where[2, i] = np.int32((a - np.float32(p)) * fine) - half
-        where[3, i] = np.int32((b - np.float32(q)) * fine) - half
-        where[4, i] = np.int32((c - np.float32(r)) * fine) - half
-    return count
+    axis: int,
+    steps: NDArray[np.int64],
+) -> None:
+    """Set (BLOCK_POINTS,) steps of a block's points from the low side of their cells."""
+    stop = min(start + BLOCK_POINTS, points.x.size)
+    xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
+    a0, a1, a2, a3 = frame[axis, 0], frame[axis, 1], frame[axis, 2], frame[axis, 3]
+    fine = np.float32(STEPS_PER_CELL)
+    for i in range(xs.size):
+        a = a0 * xs[i] + a1 * ys[i] + a2 * zs[i] - a3
+        steps[i] = np.int64(np.int32((a - np.float32(np.int32(a))) * fine))
 
 
-@compiled
+@kernel_part
 def _cell(
-    brick: int,
-    voxel: int,
-    bricks: NDArray[np.int32],
-    numbers: NDArray[np.int32],
-    n_used: NDArray[np.int64],
+    key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32], n_used: NDArray[np.int64]
 ) -> int:
-    """Give the number of a cell, a new one if it had none."""
+    """Give the number of the cell with a key of `place_keys`, a new one if it had none."""
+    brick, voxel = key // VOXELS, key % VOXELS
     slot = bricks[brick]
     if slot < 0:
         slot = np.int32(n_used[0])
@@ -92,6 +61,53 @@ def _cell(
         n_used[1] += 1
         numbers[slot, voxel] = number
     return int(number)
+
+
+@kernel_part
+def _pack(steps: NDArray[np.int64], packed: NDArray[np.int64]) -> None:
+    """Pack what each point of a block adds into four numbers, so that a run of points is four sums.
+
+    Args:
+        steps: (3, BLOCK_POINTS) see `_place_steps`; the sum of those of a block has 18 bits, that
+            of their products 28.
+        packed: (4, BLOCK_POINTS) set: one and a, b, c; aa and bb; cc and ab; ac and bc.
+    """
+    fields, products, one = np.int64(_FIELD_BITS), np.int64(_PRODUCT_BITS), np.int64(1)
+    a, b, c = steps[0], steps[1], steps[2]
+    first, second, third, fourth = packed[0], packed[1], packed[2], packed[3]
+    for i in range(BLOCK_POINTS):
+        first[i] = (((((one << fields) + a[i]) << fields) + b[i]) << fields) + c[i]
+    for i in range(BLOCK_POINTS):
+        second[i] = ((a[i] * a[i]) << products) + b[i] * b[i]
+    for i in range(BLOCK_POINTS):
+        third[i] = ((c[i] * c[i]) << products) + a[i] * b[i]
+    for i in range(BLOCK_POINTS):
+        fourth[i] = ((a[i] * c[i]) << products) + b[i] * c[i]
+
+
+@kernel_part
+def _add_run(
+    run: tuple[np.int64, np.int64, np.int64, np.int64], sums: NDArray[np.int64], k: int
+) -> None:
+    """Add the packed sums of a run of points to the moments of cell k, from the cell's middle."""
+    fields, products = np.int64(_FIELD_BITS), np.int64(_PRODUCT_BITS)
+    steps, squares, mixed, others = run
+    field, product = (np.int64(1) << fields) - 1, (np.int64(1) << products) - 1
+    n = steps >> (3 * fields)
+    a, b, c = (steps >> (2 * fields)) & field, (steps >> fields) & field, steps & field
+    half = np.int64(STEPS_PER_CELL // 2)
+    square = half * half * n
+    sums[k, 0] += n
+    sums[k, 1] += a - half * n
+    sums[k, 2] += b - half * n
+    sums[k, 3] += c - half * n
+    # Sum (s - h) (t - h) = sum st - h (sum s + sum t) + h h n.
+    sums[k, 4] += (squares >> products) - 2 * half * a + square
+    sums[k, 5] += (mixed & product) - half * (a + b) + square
+    sums[k, 6] += (others >> products) - half * (a + c) + square
+    sums[k, 7] += (squares & product) - 2 * half * b + square
+    sums[k, 8] += (others & product) - half * (b + c) + square
+    sums[k, 9] += (mixed >> products) - 2 * half * c + square
 
 
 @compiled
@@ -123,40 +139,31 @@ def gather_cells(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bu
     Returns:
         The first point that was not added: the number of points, unless the tables are full.
     """
-    where = np.empty((5, BLOCK_POINTS), dtype=np.int32)
+    keys = np.empty(BLOCK_POINTS, dtype=np.int64)
+    steps = np.zeros((3, BLOCK_POINTS), dtype=np.int64)
+    packed = np.empty((4, BLOCK_POINTS), dtype=np.int64)
+    first, second, third, fourth = packed[0], packed[1], packed[2], packed[3]
     while start < points.x.size:
         if n_used[0] + BLOCK_POINTS > numbers.shape[0] or n_used[1] + BLOCK_POINTS > sums.shape[0]:
             return start
-        count = place_points(points, start, frame, shape, where)
-        i = 0
-        while i < count:
-            brick, voxel = where[0, i], where[1, i]
-            n = a = b = c = aa = ab = ac = bb = bc = cc = np.int64(0)
-            while i < count and where[0, i] == brick and where[1, i] == voxel:
-                p, q, r = np.int64(where[2, i]), np.int64(where[3, i]), np.int64(where[4, i])
-                n += 1
-                a += p
-                b += q
-                c += r
-                aa += p * p
-                ab += p * q
-                ac += p * r
-                bb += q * q
-                bc += q * r
-                cc += r * r
-                i += 1
-            if brick >= 0:
-                k = _cell(brick, voxel, bricks, numbers, n_used)
-                sums[k, 0] += n
-                sums[k, 1] += a
-                sums[k, 2] += b
-                sums[k, 3] += c
-                sums[k, 4] += aa
-                sums[k, 5] += ab
-                sums[k, 6] += ac
-                sums[k, 7] += bb
-                sums[k, 8] += bc
-                sums[k, 9] += cc
+        count = place_keys(points, start, frame, shape, keys)
+        for axis in range(3):
+            _place_steps(points, start, frame, axis, steps[axis])
+        _pack(steps, packed)
+        key = keys[0]
+        p = q = r = s = np.int64(0)
+        for i in range(count):
+            if keys[i] != key:
+                if key >= 0:
+                    _add_run((p, q, r, s), sums, _cell(key, bricks, numbers, n_used))
+                key = keys[i]
+                p = q = r = s = np.int64(0)
+            p += first[i]
+            q += second[i]
+            r += third[i]
+            s += fourth[i]
+        if key >= 0:
+            _add_run((p, q, r, s), sums, _cell(key, bricks, numbers, n_used))
         start += BLOCK_POINTS
     return points.x.size
 
@@ -179,18 +186,16 @@ def merge_cells(
         for voxel in range(other_numbers.shape[1]):
             other = other_numbers[slot, voxel]
             if other >= 0:
-                k = _cell(brick, voxel, bricks, numbers, n_used)
+                k = _cell(brick * VOXELS + voxel, bricks, numbers, n_used)
                 for place in range(N_SUMS):
                     sums[k, place] += other_sums[other, place]
 
 
-@compiled
-def _known_cell(
-    brick: int, voxel: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]
-) -> int:
-    """Give the number of a cell, -1 if it has none."""
-    slot = bricks[brick] if brick >= 0 else -1
-    return numbers[slot, voxel] if slot >= 0 else -1
+@kernel_part
+def _known_cell(key: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
+    """Give the number of the cell with a key of `place_keys`, -1 if it has none."""
+    slot = bricks[key // VOXELS] if key >= 0 else -1
+    return numbers[slot, key % VOXELS] if slot >= 0 else -1
 
 
 @compiled
@@ -202,12 +207,12 @@ def find_cells(
     found: NDArray[np.int32],
 ) -> None:
     """Set (n,) found to the cell of each point, -1 outside."""
-    where = np.empty((5, BLOCK_POINTS), dtype=np.int32)
+    keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     flat = bricks.reshape(bricks.size)
     for start in range(0, points.x.size, BLOCK_POINTS):
-        count = place_points(points, start, frame, bricks.shape, where)
+        count = place_keys(points, start, frame, bricks.shape, keys)
         for i in range(count):
-            found[start + i] = _known_cell(where[0, i], where[1, i], flat, numbers)
+            found[start + i] = _known_cell(keys[i], flat, numbers)
 
 
 @compiled
@@ -220,10 +225,10 @@ def claim_cells(
     claims: NDArray[np.int8],
 ) -> None:
     """Give each point to the plane that owns its cell; owners (cells,) are -1 for none."""
-    where = np.empty((5, BLOCK_POINTS), dtype=np.int32)
+    keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     flat = bricks.reshape(bricks.size)
     for start in range(0, points.x.size, BLOCK_POINTS):
-        count = place_points(points, start, frame, bricks.shape, where)
+        count = place_keys(points, start, frame, bricks.shape, keys)
         for i in range(count):
-            cell = _known_cell(where[0, i], where[1, i], flat, numbers)
+            cell = _known_cell(keys[i], flat, numbers)
             claims[start + i] = owners[cell] if cell >= 0 else -1

@@ -27,11 +27,15 @@ def distance_histograms(
         histograms: (h, bins) points per bin of 0..reach; added to.
     """
     n_bins = histograms.shape[1]
-    per_m = np.float32(n_bins / reach_m)
+    per_m, top = np.float32(n_bins / reach_m), np.float32(n_bins)
+    xs, ys, zs = points[0], points[1], points[2]
+    bins = np.empty(points.shape[1], dtype=np.int32)
     for h in range(planes.shape[0]):
         a, b, c = planes[h, 0] * per_m, planes[h, 1] * per_m, planes[h, 2] * per_m
         d = planes[h, 3] * per_m
-        for i in range(points.shape[1]):
-            place = abs(a * points[0, i] + b * points[1, i] + c * points[2, i] - d)
-            if place < n_bins:
-                histograms[h, int(place)] += 1
+        # Apart from the counting, so that the processor takes several points at once.
+        for i in range(bins.size):
+            bins[i] = np.int32(min(abs(a * xs[i] + b * ys[i] + c * zs[i] - d), top))
+        for i in range(bins.size):
+            if bins[i] < n_bins:
+                histograms[h, bins[i]] += 1

@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.box_kernels import centre_block, place_along
+from orthoflow.geometry.box_kernels import (
+    ALONG_NORMAL,
+    centre_block,
+    place_along,
+)
+from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.plane_kernels import HISTOGRAM_BINS, STEPS_PER_TOLERANCE
 from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
 
 
-@compiled
+@kernel_part
 def _list_owners(
     claims: NDArray[np.int8], owners: NDArray[np.int64], seen: NDArray[np.uint8]
 ) -> int:
@@ -30,7 +35,7 @@ def _list_owners(
     return count
 
 
-@compiled
+@kernel_part
 def _add_distances(
     claims: NDArray[np.int8],
     k: int,
@@ -82,7 +87,7 @@ def _add_distances(
     sums[k, 5] += squares_fit
 
 
-@compiled
+@kernel_part
 def _reaches_further(
     boxes: NDArray[np.float32],
     block: int,
@@ -102,7 +107,7 @@ def _reaches_further(
     return False
 
 
-@compiled
+@kernel_part
 def _reach(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bundle these in
     points: BlockedPoints,
     block: int,
@@ -165,7 +170,7 @@ def measure_deviations(
             continue
         centre_block(points, block, middle, local)
         for k in owners[:n_owners]:
-            place_along(local, middle, slabs, k, 0, 1.0, 0.0, distances)
+            place_along(local, middle, slabs, k, ALONG_NORMAL, 1.0, 0.0, distances)
             _add_distances(held, k, distances, limits, places, sums, histogram)
             if _reaches_further(points.boxes, block, slabs, extents, k):
                 _reach(points, block, held, distances, slabs, limits, extents, k)

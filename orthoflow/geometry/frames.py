@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
-from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.directions import across, basis_from_up
 from orthoflow.geometry.planes import Plane
 
 # Below this angle between normal and up a plane counts as a floor or ceiling: "right for the
@@ -119,9 +119,9 @@ def wall_axes(normal: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[n
         first = basis_from_up(up)[0]
         u = first - (first @ normal) * normal
     else:
-        u = np.cross(up, normal)
+        u = across(up, normal)
     u = u / np.linalg.norm(u)
-    return np.vstack([u, np.cross(u, normal)])
+    return np.array([u, across(u, normal)])
 
 
 def frame_over(

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.point_kernels import compiled
 from orthoflow.geometry.region_kernels import flattest
 
@@ -16,13 +17,13 @@ VERTICAL: Final = 1
 LEVEL: Final = 2
 
 _STEPS_MOST: Final = 20
-# A fit has settled when a point ten metres away moves by less than this.
-_SETTLED_M: Final = 2e-6
+# A fit has settled when a point ten metres away moves by less than this share of the tolerance.
+_SETTLED_SHARE: Final = 5e-4
 # Points nearer to a line than this (root mean square) do not say how the plane lies about it.
 _LINE_WIDTH_M: Final = 1e-4
 
 
-@compiled
+@kernel_part
 def robust_moments(
     points: NDArray[np.float64], plane: NDArray[np.float64], tolerance_m: float
 ) -> NDArray[np.float64]:
@@ -56,7 +57,7 @@ def robust_moments(
     return sums
 
 
-@compiled
+@kernel_part
 def _without_rise(sums: NDArray[np.float64], up: NDArray[np.float64]) -> None:
     """Replace moments by those that have up as their widest direction, so that no normal leans."""
     mean, second, across = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
@@ -124,6 +125,6 @@ def refine_robustly(
             plane[i] = sign * fitted[i]
         moved_m = abs(offset_m - plane[3])
         plane[3] = offset_m
-        if max(10.0 * np.sqrt(turn), moved_m) < _SETTLED_M:
+        if max(10.0 * np.sqrt(turn), moved_m) < _SETTLED_SHARE * tolerance_m:
             break
     return True

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.point_kernels import (
     BLOCK_POINTS,
     BlockedPoints,
@@ -95,7 +96,7 @@ def vote_points(
                 votes[angle, int(position)] += 1
 
 
-@compiled
+@kernel_part
 def _misses(box: NDArray[np.float32], slab: NDArray[np.float64], reach_m: float) -> bool:
     """Whether no point of a block's box lies within the reach of the slab's plane."""
     centre = -slab[3]
@@ -106,7 +107,7 @@ def _misses(box: NDArray[np.float32], slab: NDArray[np.float64], reach_m: float)
     return bool(abs(centre) > half)
 
 
-@compiled
+@kernel_part
 def _misses_rectangle(
     box: NDArray[np.float32], slab: NDArray[np.float64], bounds: NDArray[np.float64]
 ) -> bool:
@@ -121,7 +122,7 @@ def _misses_rectangle(
     return False
 
 
-@compiled
+@kernel_part
 def _measure(
     points: BlockedPoints, start: int, slab: NDArray[np.float64], distances: NDArray[np.float64]
 ) -> None:
@@ -135,12 +136,12 @@ def _measure(
         distances[i - start] = n0 * x[i] + n1 * y[i] + n2 * z[i] - n3
 
 
-@compiled
+@kernel_part
 def _distance(slab: NDArray[np.float64], x: float, y: float, z: float) -> float:
     return float(abs(slab[0] * x + slab[1] * y + slab[2] * z - slab[3]))
 
 
-@compiled
+@kernel_part
 def _within(
     slab: NDArray[np.float64], bounds: NDArray[np.float64], x: float, y: float, z: float
 ) -> bool:

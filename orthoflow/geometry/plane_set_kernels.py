@@ -13,15 +13,25 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.box_kernels import CHUNK_BLOCKS, centre_block, meet_chunk, place_along
+from orthoflow.geometry.box_kernels import (
+    ALONG_NORMAL,
+    ALONG_U,
+    ALONG_V,
+    CHUNK_BLOCKS,
+    centre_block,
+    meet_chunk,
+    place_along,
+)
+from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.plane_kernels import STEPS_PER_TOLERANCE
 from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
 
-# What a point adds to its cell, packed into one number so that a run of points is one sum: itself,
-# and whether it lies within the inner and the fit tolerance. A block has fewer points than a bit
-# field holds.
-_INNER_BIT: Final = 10
-_FIT_BIT: Final = 20
+# What a point adds to its cell, packed into one number so that a run of points is one sum: its
+# distance in steps from the lower limit of the fit tolerance, if it is within, itself, and whether
+# it lies within the inner and the fit tolerance. A block has fewer points than a bit field holds.
+_FIND_BIT: Final = 32
+_INNER_BIT: Final = 42
+_FIT_BIT: Final = 52
 _FIELD: Final = 1023
 
 
@@ -36,8 +46,8 @@ class _Scratch(NamedTuple):
         nearest: distance from the owner.
         owner: slab of each point, -1 for none.
         cells: cell of each point, -1 for none.
-        steps: distance from the owner in steps.
         packed: what the point counts for.
+        squares: squared distance from the owner in steps, if it is within the fit tolerance.
     """
 
     local: NDArray[np.float32]
@@ -48,11 +58,11 @@ class _Scratch(NamedTuple):
     nearest: NDArray[np.float32]
     owner: NDArray[np.int32]
     cells: NDArray[np.int32]
-    steps: NDArray[np.int32]
-    packed: NDArray[np.int32]
+    packed: NDArray[np.int64]
+    squares: NDArray[np.int64]
 
 
-@compiled
+@kernel_part
 def _new_scratch() -> _Scratch:
     return _Scratch(
         np.zeros((3, BLOCK_POINTS), dtype=np.float32),
@@ -63,12 +73,12 @@ def _new_scratch() -> _Scratch:
         np.empty(BLOCK_POINTS, dtype=np.float32),
         np.empty(BLOCK_POINTS, dtype=np.int32),
         np.empty(BLOCK_POINTS, dtype=np.int32),
-        np.empty(BLOCK_POINTS, dtype=np.int32),
-        np.empty(BLOCK_POINTS, dtype=np.int32),
+        np.empty(BLOCK_POINTS, dtype=np.int64),
+        np.empty(BLOCK_POINTS, dtype=np.int64),
     )
 
 
-@compiled
+@kernel_part
 def _any_near(distances: NDArray[np.float32], find_m: float) -> bool:
     """Whether any point of a block lies within the tolerance."""
     limit, count = np.float32(find_m), np.int32(0)
@@ -77,7 +87,7 @@ def _any_near(distances: NDArray[np.float32], find_m: float) -> bool:
     return bool(count > 0)
 
 
-@compiled
+@kernel_part
 def _take_nearer(
     u: NDArray[np.float32],
     v: NDArray[np.float32],
@@ -101,7 +111,7 @@ def _take_nearer(
         nearest[i] = here if holds else before
 
 
-@compiled
+@kernel_part
 def _place(
     u: NDArray[np.float32],
     v: NDArray[np.float32],
@@ -123,58 +133,72 @@ def _place(
         cells[i] = cell if owner[i] == mine else cells[i]
 
 
-@compiled
+@kernel_part
 def _weigh(
     nearest: NDArray[np.float32],
     inner_m: float,
     fit_m: float,
-    steps: NDArray[np.int32],
-    packed: NDArray[np.int32],
+    packed: NDArray[np.int64],
+    squares: NDArray[np.int64],
 ) -> None:
-    """Set what each point of a block adds: distance in steps if it is near enough, and bits."""
+    """Set what each point of a block adds: packed numbers, and its squared distance in steps."""
     inner, fit = np.float32(inner_m), np.float32(fit_m)
     to_steps = np.float32(STEPS_PER_TOLERANCE / fit_m)
-    zero, half, far = np.float32(0.0), np.float32(0.5), np.float32(STEPS_PER_TOLERANCE)
+    half, far = np.float32(0.5), np.float32(STEPS_PER_TOLERANCE)
+    zero, none, shift = np.float32(0.0), np.int64(0), np.int64(STEPS_PER_TOLERANCE)
     for i in range(BLOCK_POINTS):
         size = abs(nearest[i])
-        distance = nearest[i] if size <= fit else zero
+        fits = size <= fit
+        distance = nearest[i] if fits else zero
         # Rounded to the nearest whole number: truncation of a positive one.
-        steps[i] = np.int32(distance * to_steps + (far + half)) - np.int32(STEPS_PER_TOLERANCE)
-        bits = np.int32(1)
-        bits += np.int32(1 << _INNER_BIT) if size <= inner else np.int32(0)
-        bits += np.int32(1 << _FIT_BIT) if size <= fit else np.int32(0)
+        steps = np.int64(np.int32(distance * to_steps + (far + half)))
+        bits = np.int64(1) << _FIND_BIT
+        bits += np.int64(1) << _INNER_BIT if size <= inner else none
+        bits += (np.int64(1) << _FIT_BIT) + steps if fits else none
         packed[i] = bits
+        squares[i] = (steps - shift) * (steps - shift)
 
 
-@compiled
+@kernel_part
+def _add_run(
+    cell: int,
+    packed: np.int64,
+    squares: np.int64,
+    counts: NDArray[np.int32],
+    sums: NDArray[np.int64],
+) -> None:
+    """Add the packed sum of a run of points to their cell."""
+    n_fit = packed >> _FIT_BIT
+    counts[cell, 0] += (packed >> _FIND_BIT) & _FIELD
+    counts[cell, 1] += (packed >> _INNER_BIT) & _FIELD
+    counts[cell, 2] += n_fit
+    sums[cell, 0] += (packed & ((1 << _FIND_BIT) - 1)) - n_fit * STEPS_PER_TOLERANCE
+    sums[cell, 1] += squares
+
+
+@kernel_part
 def _add(
     count: int,
     cells: NDArray[np.int32],
-    steps: NDArray[np.int32],
-    packed: NDArray[np.int32],
+    packed: NDArray[np.int64],
+    squares: NDArray[np.int64],
     counts: NDArray[np.int32],
     sums: NDArray[np.int64],
 ) -> None:
     """Add the points of a block to their cells; a scan's neighbours share one, so runs are few."""
-    i = 0
-    while i < count:
-        cell = cells[i]
-        bits, total, squares = np.int64(0), np.int64(0), np.int64(0)
-        while i < count and cells[i] == cell:
-            step = np.int64(steps[i])
-            bits += packed[i]
-            total += step
-            squares += step * step
-            i += 1
-        if cell >= 0:
-            counts[cell, 0] += bits & _FIELD
-            counts[cell, 1] += (bits >> _INNER_BIT) & _FIELD
-            counts[cell, 2] += bits >> _FIT_BIT
-            sums[cell, 0] += total
-            sums[cell, 1] += squares
+    cell, total, total_squares = cells[0], np.int64(0), np.int64(0)
+    for i in range(count):
+        if cells[i] != cell:
+            if cell >= 0:
+                _add_run(cell, total, total_squares, counts, sums)
+            cell, total, total_squares = cells[i], np.int64(0), np.int64(0)
+        total += packed[i]
+        total_squares += squares[i]
+    if cell >= 0:
+        _add_run(cell, total, total_squares, counts, sums)
 
 
-@compiled
+@kernel_part
 def _list_active(
     meeting: NDArray[np.int32],
     place: int,
@@ -195,7 +219,7 @@ def _list_active(
     return n_active, n_wanted, int(active[0]) if n_active == 1 and holds else -1
 
 
-@compiled
+@kernel_part
 def _own_block(
     scratch: _Scratch,
     slabs: NDArray[np.float64],
@@ -215,20 +239,20 @@ def _own_block(
     local, middle, owner, nearest = scratch.local, scratch.middle, scratch.owner, scratch.nearest
     if holder >= 0:
         owner[:] = holder
-        place_along(local, middle, slabs, holder, 0, 1.0, 0.0, nearest)
+        place_along(local, middle, slabs, holder, ALONG_NORMAL, 1.0, 0.0, nearest)
         return
     owner[:] = -1
     nearest[:] = np.inf
     for k in active:
-        place_along(local, middle, slabs, k, 0, 1.0, 0.0, scratch.distances)
+        place_along(local, middle, slabs, k, ALONG_NORMAL, 1.0, 0.0, scratch.distances)
         if not _any_near(scratch.distances, bounds[k, 0]):
             continue
-        place_along(local, middle, slabs, k, 1, 1.0, 0.0, scratch.u)
-        place_along(local, middle, slabs, k, 2, 1.0, 0.0, scratch.v)
+        place_along(local, middle, slabs, k, ALONG_U, 1.0, 0.0, scratch.u)
+        place_along(local, middle, slabs, k, ALONG_V, 1.0, 0.0, scratch.v)
         _take_nearer(scratch.u, scratch.v, scratch.distances, bounds, k, owner, nearest)
 
 
-@compiled
+@kernel_part
 def _sum_block(
     scratch: _Scratch,
     count: int,
@@ -243,11 +267,18 @@ def _sum_block(
     scratch.cells[:] = -1
     for k in active:
         if rasters[k, 3] > 0.0:
-            place_along(local, middle, slabs, k, 1, rasters[k, 2], rasters[k, 0], u)
-            place_along(local, middle, slabs, k, 2, rasters[k, 2], rasters[k, 1], v)
+            place_along(local, middle, slabs, k, ALONG_U, rasters[k, 2], rasters[k, 0], u)
+            place_along(local, middle, slabs, k, ALONG_V, rasters[k, 2], rasters[k, 1], v)
             _place(u, v, rasters, k, scratch.owner, scratch.cells)
-    _weigh(scratch.nearest, rasters[0, 7], rasters[0, 6], scratch.steps, scratch.packed)
-    _add(count, scratch.cells, scratch.steps, scratch.packed, counts, sums)
+    _weigh(scratch.nearest, rasters[0, 7], rasters[0, 6], scratch.packed, scratch.squares)
+    _add(count, scratch.cells, scratch.packed, scratch.squares, counts, sums)
+
+
+@kernel_part
+def _claim(owner: NDArray[np.int32], claims: NDArray[np.int8]) -> None:
+    """Set the claims of a block's points."""
+    for i in range(claims.size):
+        claims[i] = np.int8(owner[i])
 
 
 @compiled
@@ -299,8 +330,7 @@ def assign_points(
         if is_summing:
             _sum_block(scratch, stop - start, slabs, rasters, active, counts, sums)
             continue
-        for i in range(stop - start):
-            claims[start + i] = scratch.owner[i]
+        _claim(scratch.owner, claims[start:stop])
 
 
 @compiled
@@ -314,5 +344,15 @@ def name_labels(
         names: (256,) name of each byte.
         labels: (n,) set.
     """
-    for i in range(claims.size):
-        labels[i] = names[claims[i]]
+    for start in range(0, claims.size, BLOCK_POINTS):
+        stop = min(start + BLOCK_POINTS, claims.size)
+        held, named = claims[start:stop], labels[start:stop]
+        first, differing = held[0], np.uint8(0)
+        for i in range(held.size):
+            differing |= held[i] ^ first
+        if differing == 0:
+            # Most blocks of a scan are a short piece of one wall.
+            named[:] = names[first]
+            continue
+        for i in range(held.size):
+            named[i] = names[held[i]]

@@ -18,6 +18,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.compiling import kernel_part
+
 # Small enough that a block of a scan column is a short piece of one surface, so that its box tells
 # most planes apart; large enough that boxes of 48 million points fit into the processor's cache.
 BLOCK_POINTS: Final = 256
@@ -121,7 +123,7 @@ class Boxes:
 
     Attributes:
         boxes: (blocks, 6) float32, smallest and largest x, y, z offsets of each block.
-        n_unusable: coordinates that are NaN or infinite.
+        n_unusable: sides of boxes that are NaN or infinite.
     """
 
     boxes: NDArray[np.float32]
@@ -150,7 +152,8 @@ def box_blocks(offsets: Offsets, *, parts: int) -> Boxes:
     unusable = np.zeros(parts, dtype=np.int64)
 
     def find(part: int, piece: slice) -> None:
-        unusable[part] = _set_boxes(piece_of(blocked(offsets, boxes), piece))
+        points = piece_of(blocked(offsets, boxes), piece)
+        unusable[part] = _set_boxes(points, points.boxes.view(np.int32))
 
     each_part(n_points, parts, find)
     return Boxes(boxes=boxes, n_unusable=int(unusable.sum()))
@@ -175,7 +178,8 @@ def count_over_plan(offsets: Offsets, grid: PlanGrid, *, parts: int) -> PlanCoun
 
     def count(part: int, piece: slice) -> None:
         points = piece_of(blocked(offsets, boxes), piece)
-        unusable[part] = _count_over_plan(points, frame, cells[part], heights[part])
+        sides = points.boxes.view(np.int32)
+        unusable[part] = _count_over_plan(points, sides, frame, cells[part], heights[part])
 
     each_part(n_points, parts, count)
     return PlanCounts(
@@ -185,45 +189,47 @@ def count_over_plan(offsets: Offsets, grid: PlanGrid, *, parts: int) -> PlanCoun
     )
 
 
-@compiled
-def _unusable(values: NDArray[np.float32]) -> int:
-    """Count the values that are NaN or infinite: all bits of the exponent are set."""
-    bits = values.view(np.int32)
-    exponent, one, none = np.int32(0x7F800000), np.int32(1), np.int32(0)
-    bad = np.int32(0)
-    for i in range(bits.size):
-        bad += one if (bits[i] & exponent) == exponent else none
-    return int(bad)
+@kernel_part
+def _set_box(points: BlockedPoints, block: int, sides: NDArray[np.int32]) -> int:
+    """Set the box of a block, and give at how many of its sides values are NaN or infinite.
 
+    Bits of floats, those of negative ones turned over, are in the order of their values: whole
+    numbers are compared several at once, which floats with their NaN are not. What is not finite
+    lies at the ends of that order.
 
-@compiled
-def _set_box(points: BlockedPoints, block: int) -> int:
-    """Set the box of a block, and give how many of its coordinates are unusable."""
-    boxes = points.boxes
+    Args:
+        points: (n,) offsets in blocks.
+        block: which block.
+        sides: (blocks, 6) the boxes as bits.
+    """
     start = block * BLOCK_POINTS
     stop = min(start + BLOCK_POINTS, points.x.size)
+    turned, sign = np.int32(0x7FFFFFFF), np.int32(31)
+    infinite = np.int32(0x7F800000)
     bad = 0
     for axis in range(3):
-        values = (points.x, points.y, points.z)[axis][start:stop]
-        low = high = values[0]
-        for i in range(values.size):
-            low = min(low, values[i])
-            high = max(high, values[i])
-        boxes[block, 2 * axis], boxes[block, 2 * axis + 1] = low, high
-        bad += _unusable(values)
+        bits = (points.x, points.y, points.z)[axis][start:stop].view(np.int32)
+        low, high = turned, np.int32(-0x80000000)
+        for i in range(bits.size):
+            ordered = np.int32(bits[i] ^ ((bits[i] >> sign) & turned))
+            low = min(low, ordered)
+            high = max(high, ordered)
+        bad += int(low < -infinite) + int(high >= infinite)
+        sides[block, 2 * axis] = low ^ ((low >> sign) & turned)
+        sides[block, 2 * axis + 1] = high ^ ((high >> sign) & turned)
     return bad
 
 
 @compiled
-def _set_boxes(points: BlockedPoints) -> int:
-    """Set the boxes of all blocks, and give how many coordinates are unusable."""
+def _set_boxes(points: BlockedPoints, sides: NDArray[np.int32]) -> int:
+    """Set the boxes of all blocks, and give at how many sides values are unusable."""
     bad = 0
-    for block in range(points.boxes.shape[0]):
-        bad += _set_box(points, block)
+    for block in range(sides.shape[0]):
+        bad += _set_box(points, block, sides)
     return bad
 
 
-@compiled
+@kernel_part
 def _place_block(
     points: BlockedPoints,
     block: int,
@@ -260,35 +266,36 @@ def _place_block(
         storey[i - start] = level if within else nowhere
 
 
-@compiled
+@kernel_part
 def _add_runs(places: NDArray[np.int32], count: int, table: NDArray[np.int32]) -> None:
     """Count places into a table, none of them negative; a scan's neighbours share one."""
-    i = 0
-    while i < count:
-        first, place = i, places[i]
-        while i < count and places[i] == place:
-            i += 1
-        if place >= 0:
-            table[place] += i - first
+    first, place = 0, places[0]
+    for i in range(1, count):
+        if places[i] != place:
+            if place >= 0:
+                table[place] += i - first
+            first, place = i, places[i]
+    if place >= 0:
+        table[place] += count - first
 
 
 @compiled
 def _count_over_plan(
     points: BlockedPoints,
+    sides: NDArray[np.int32],
     frame: NDArray[np.float32],
     cells: NDArray[np.int32],
     heights: NDArray[np.int32],
 ) -> int:
-    """Add to cells and heights, set the boxes, and give the number of unusable points."""
-    boxes = points.boxes
+    """Add to cells and heights, set the boxes, and give at how many sides values are unusable."""
     flat = cells.reshape(cells.size)
     cell = np.empty(BLOCK_POINTS, dtype=np.int32)
     storey = np.empty(BLOCK_POINTS, dtype=np.int32)
     bad = 0
-    for block in range(boxes.shape[0]):
+    for block in range(sides.shape[0]):
         start = block * BLOCK_POINTS
         stop = min(start + BLOCK_POINTS, points.x.size)
-        bad += _set_box(points, block)
+        bad += _set_box(points, block, sides)
         _place_block(points, block, frame, cells.shape, heights.size, cell, storey)
         _add_runs(cell, stop - start, flat)
         _add_runs(storey, stop - start, heights)

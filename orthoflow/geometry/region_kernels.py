@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cell_kernels import STEPS_PER_CELL
+from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.point_kernels import compiled
 from orthoflow.geometry.voxel_kernels import BRICK_SIDE
 
@@ -23,7 +24,7 @@ _REFIT_SHARE: Final = 0.2
 _SWEEPS_MOST: Final = 3
 
 
-@compiled
+@kernel_part
 def cell_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
     """Give the number of the cell at a place, -1 where none is."""
     if a < 0 or b < 0 or c < 0:

@@ -12,9 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
 
 BRICK_SIDE: Final = 8
+VOXELS: Final = BRICK_SIDE**3
 # A vote is counted in quarters, so that it can be shared between two bins without a rounding that
 # would not cancel when it is taken back.
 VOTE_SHARES: Final = 4
@@ -22,45 +24,71 @@ VOTE_SHARES: Final = 4
 _TILE: Final = 16
 
 
-@compiled
-def _place_block(
+@kernel_part
+def place_keys(
     points: BlockedPoints,
     start: int,
     frame: NDArray[np.float32],
     shape: tuple[int, int, int],
-    brick: NDArray[np.int32],
-    voxel: NDArray[np.int32],
+    keys: NDArray[np.int64],
 ) -> int:
-    """Set brick (-1 outside) and voxel of a block's points, without branches; gives their number.
+    """Set the voxel of a block's points; gives their number.
 
-    Apart from the counting, so that the processor takes several points at once.
+    Apart from the counting and without branches, so that the processor takes several points at
+    once. Each of these loops writes one array: with more, the compiler gives up that.
+
+    Args:
+        points: (n,) offsets in blocks.
+        start: first point of the block.
+        frame: (3, 4) voxel of a point: `frame @ p - frame[:, 3]`.
+        shape: bricks along a, b, c.
+        keys: (BLOCK_POINTS,) set: brick times VOXELS plus the voxel within it, -1 outside.
     """
-    x, y, z = points.x, points.y, points.z
+    stop = min(start + BLOCK_POINTS, points.x.size)
+    xs, ys, zs = points.x[start:stop], points.y[start:stop], points.z[start:stop]
     a0, a1, a2, a3 = frame[0, 0], frame[0, 1], frame[0, 2], frame[0, 3]
     b0, b1, b2, b3 = frame[1, 0], frame[1, 1], frame[1, 2], frame[1, 3]
     c0, c1, c2, c3 = frame[2, 0], frame[2, 1], frame[2, 2], frame[2, 3]
-    zero, nowhere, low = np.float32(0.0), np.int32(-1), np.int32(BRICK_SIDE - 1)
+    zero, low = np.float32(0.0), np.int32(BRICK_SIDE - 1)
     top_a = np.float32(shape[0] * BRICK_SIDE)
     top_b = np.float32(shape[1] * BRICK_SIDE)
     top_c = np.float32(shape[2] * BRICK_SIDE)
-    n_b, n_c = np.int32(shape[1]), np.int32(shape[2])
-    side = np.int32(BRICK_SIDE)
-    count = min(BLOCK_POINTS, x.size - start)
-    for i in range(count):
-        px, py, pz = x[start + i], y[start + i], z[start + i]
-        a = a0 * px + a1 * py + a2 * pz - a3
-        b = b0 * px + b1 * py + b2 * pz - b3
-        c = c0 * px + c1 * py + c2 * pz - c3
+    n_b, n_c, side = np.int32(shape[1]), np.int32(shape[2]), np.int32(BRICK_SIDE)
+    voxels, nowhere = np.int64(VOXELS), np.int64(-1)
+    for i in range(xs.size):
+        a = a0 * xs[i] + a1 * ys[i] + a2 * zs[i] - a3
+        b = b0 * xs[i] + b1 * ys[i] + b2 * zs[i] - b3
+        c = c0 * xs[i] + c1 * ys[i] + c2 * zs[i] - c3
         within = (a >= zero) & (a < top_a) & (b >= zero) & (b < top_b)
         within = within & (c >= zero) & (c < top_c)
         p = np.int32(a if within else zero)
         q = np.int32(b if within else zero)
         r = np.int32(c if within else zero)
         # A side of eight: whole bricks are three bits further up.
-        place = ((p >> np.int32(3)) * n_b + (q >> np.int32(3))) * n_c + (r >> np.int32(3))
-        brick[i] = place if within else nowhere
-        voxel[i] = ((p & low) * side + (q & low)) * side + (r & low)
-    return count
+        brick = np.int32(((p >> np.int32(3)) * n_b + (q >> np.int32(3))) * n_c + (r >> np.int32(3)))
+        voxel = np.int32(((p & low) * side + (q & low)) * side + (r & low))
+        keys[i] = brick * voxels + voxel if within else nowhere
+    return xs.size
+
+
+@kernel_part
+def _add_voxels(
+    key: int,
+    count: int,
+    bricks: NDArray[np.int32],
+    counts: NDArray[np.int32],
+    n_used: NDArray[np.int64],
+) -> None:
+    """Add a number of points to a voxel, whose brick is made if it is new."""
+    if key < 0:
+        return
+    brick = key // VOXELS
+    row = bricks[brick]
+    if row < 0:
+        row = np.int32(n_used[0])
+        n_used[0] += 1
+        bricks[brick] = row
+    counts[row, key % VOXELS] += count
 
 
 @compiled
@@ -81,37 +109,29 @@ def gather_voxels(
         frame: (3, 4) voxel of a point: `frame @ p - frame[:, 3]`.
         shape: bricks along a, b, c.
         bricks: (a * b * c,) row of each brick, -1 without points; changed.
-        counts: (rows, BRICK_SIDE ** 3) points; added to.
+        counts: (rows, VOXELS) points; added to.
         n_used: (1,) rows in use; changed.
 
     Returns:
         The first point that was not counted: the number of points, unless the table is full.
     """
-    brick = np.empty(BLOCK_POINTS, dtype=np.int32)
-    voxel = np.empty(BLOCK_POINTS, dtype=np.int32)
+    keys = np.empty(BLOCK_POINTS, dtype=np.int64)
     while start < points.x.size:
         if n_used[0] + BLOCK_POINTS > counts.shape[0]:
             return start
-        count = _place_block(points, start, frame, shape, brick, voxel)
-        i = 0
-        while i < count:
+        count = place_keys(points, start, frame, shape, keys)
+        first, key = 0, keys[0]
+        for i in range(1, count):
             # A scan's neighbours share a voxel: runs of them are added at once.
-            first, b, v = i, brick[i], voxel[i]
-            while i < count and brick[i] == b and voxel[i] == v:
-                i += 1
-            if b < 0:
-                continue
-            row = bricks[b]
-            if row < 0:
-                row = np.int32(n_used[0])
-                n_used[0] += 1
-                bricks[b] = row
-            counts[row, v] += i - first
+            if keys[i] != key:
+                _add_voxels(key, i - first, bricks, counts, n_used)
+                first, key = i, keys[i]
+        _add_voxels(key, count - first, bricks, counts, n_used)
         start += BLOCK_POINTS
     return points.x.size
 
 
-@compiled
+@kernel_part
 def _add_sheared(
     image: NDArray[np.int32],
     spans: NDArray[np.int32],
@@ -138,7 +158,7 @@ def _add_sheared(
     return low, high
 
 
-@compiled
+@kernel_part
 def _share_out(
     line: NDArray[np.int32],
     piece: tuple[int, int],
@@ -170,7 +190,7 @@ def _share_out(
         line[i] = 0
 
 
-@compiled
+@kernel_part
 def _span_rows(
     image: NDArray[np.int32], window: tuple[int, int, int, int], spans: NDArray[np.int32]
 ) -> None:
@@ -188,7 +208,7 @@ def _span_rows(
         spans[row, 0], spans[row, 1] = first, last
 
 
-@compiled
+@kernel_part
 def _turn_image(
     image: NDArray[np.int32], window: tuple[int, int, int, int], turned: NDArray[np.int32]
 ) -> None:
@@ -200,7 +220,7 @@ def _turn_image(
                     turned[column, row] = image[row, column]
 
 
-@compiled
+@kernel_part
 def _count_upright(
     places: NDArray[np.float32],
     weights: NDArray[np.int32],
@@ -317,22 +337,31 @@ def best_bins(
     width = 2 * half + 1
     gap = width + 1
     running = np.zeros(n_bins + 2 * (half + gap) + 1, dtype=np.int64)
+    windows = np.empty(n_bins + 2 * gap, dtype=np.int64)
+    line = np.empty(n_bins, dtype=np.int64)
+    before, middle, after = windows[:n_bins], windows[gap:], windows[2 * gap :]
+    # Loops of one step each, so that the processor takes several bins at once.
     for d in rows:
-        for k in range(running.size - 1):
-            place = k - half - gap
-            inside = votes[d, place] if 0 <= place < n_bins else 0
-            running[k + 1] = running[k] + inside
-        scores[d], places[d] = -1, 0
-        for place in range(n_bins):
-            if barred[d, place]:
-                continue
-            start = place + gap
-            here = running[start + width] - running[start]
-            before = running[start + width - gap] - running[start - gap]
-            after = running[start + width + gap] - running[start + gap]
-            score = here - min(before, after)
-            if score > scores[d]:
-                scores[d], places[d] = score, place
+        row, is_barred = votes[d], barred[d]
+        total = np.int64(0)
+        for k in range(n_bins):
+            total += row[k]
+            running[half + gap + 1 + k] = total
+        running[half + gap + 1 + n_bins :] = total
+        low, high = running[: windows.size], running[width:]
+        for k in range(windows.size):
+            windows[k] = high[k] - low[k]
+        best = np.int64(-1)
+        for k in range(n_bins):
+            score = middle[k] - min(before[k], after[k])
+            line[k] = np.int64(-1) if is_barred[k] != 0 else score
+        for k in range(n_bins):
+            best = max(best, line[k])
+        scores[d], places[d] = best, 0
+        for k in range(n_bins):
+            if best >= 0 and line[k] == best:
+                places[d] = k
+                break
 
 
 @compiled

@@ -35,6 +35,8 @@ _BLOCK_CELLS: Final = 8
 _BLOCK_LEAST: Final = 12
 _CHANCE_SIGMAS: Final = 3.0
 _STEPS_MOST: Final = 30
+# A fit has settled when none of its cells moves by more than this.
+SETTLED_M: Final = 1e-7
 # What a surface is never flatter than, so that a perfectly flat simulation has weights too.
 _FLATTEST_M: Final = 2e-5
 _UNKNOWNS: Final[dict[Freedom, tuple[int, ...]]] = {
@@ -91,6 +93,7 @@ def adjust_plane(
     *,
     fit_m: float,
     freedom: Freedom,
+    settled_m: float = SETTLED_M,
 ) -> AdjustedPlane | None:
     """Fit the plane to the mean distances of cells; to second order this is total least squares.
 
@@ -100,6 +103,7 @@ def adjust_plane(
         cells: (rows, columns) bool, which of them belong.
         fit_m: tolerance the sums were made with.
         freedom: what may change.
+        settled_m: the fit ends when no cell moves by more.
 
     Returns:
         The plane, or None where the cells do not fix it.
@@ -126,7 +130,7 @@ def adjust_plane(
         rows=rows,
         columns=columns,
     )
-    solved = _solve(observed)
+    solved = _solve(observed, settled_m)
     if solved is None:
         return None
     change = np.zeros(3)
@@ -169,17 +173,21 @@ def _usual_nearby(own_m2: NDArray[np.float64], placed: _Placed) -> NDArray[np.fl
     overall = float(np.median(own_m2[several])) if several.any() else float(own_m2.mean())
     across = int(placed.columns.max()) // _BLOCK_CELLS + 1
     block = placed.rows // _BLOCK_CELLS * across + placed.columns // _BLOCK_CELLS
-    order = np.lexsort([own_m2, block])
-    _, first, member, count = np.unique(
-        block[order], return_index=True, return_inverse=True, return_counts=True
-    )
-    middle = own_m2[order][first + count // 2]
-    usual = np.empty(len(own_m2))
-    usual[order] = np.where(count >= _BLOCK_LEAST, middle, overall)[member]
-    return np.maximum(usual, 0.1 * overall)
+    n_blocks = across * (int(placed.rows.max()) // _BLOCK_CELLS + 1)
+    order = np.argsort(own_m2)
+    # Sixteen bits, so that the sort takes no comparisons.
+    narrow = block[order].astype(np.uint16 if n_blocks <= 65536 else np.int64)
+    order = order[np.argsort(narrow, kind="stable")]
+    count = np.bincount(block, minlength=n_blocks)
+    first = np.cumsum(count) - count
+    held = count >= _BLOCK_LEAST
+    middle = np.full(n_blocks, overall)
+    middle[held] = own_m2[order[(first + count // 2)[held]]]
+    usual: NDArray[np.float64] = np.maximum(middle[block], 0.1 * overall)
+    return usual
 
 
-def _solve(observed: CellHeights) -> CellFit | None:
+def _solve(observed: CellHeights, settled_m: float) -> CellFit | None:
     """Weighted least squares with the cells' own variance estimated along; outliers lose weight."""
     design, heights_m = observed.design, observed.heights_m
     solution = np.zeros(design.shape[1])
@@ -200,7 +208,7 @@ def _solve(observed: CellHeights) -> CellFit | None:
             return None
         moved_m = float(np.abs(design @ (updated - solution)).max())
         solution = updated
-        if moved_m < 1e-7:
+        if moved_m < settled_m:
             break
     return replace(fit, solution=solution)
 
@@ -215,7 +223,7 @@ def _densest_layer(heights_m: NDArray[np.float64]) -> tuple[float, float]:
     held = max(2, int(_LAYER_SHARE * len(ordered)))
     lengths = ordered[held - 1 :] - ordered[: len(ordered) - held + 1]
     first = int(np.argmin(lengths))
-    middle = float(np.median(ordered[first : first + held]))
+    middle = 0.5 * float(ordered[first + (held - 1) // 2] + ordered[first + held // 2])
     return middle, float(lengths[first]) / _LAYER_SIGMAS
 
 

@@ -104,6 +104,7 @@ class ConsensusProposer:
         self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
         drawn = self._shuffled[:_DRAWN_MOST]
         self._order = drawn[curve_order(points_m[drawn])]
+        self._ordered_m = points_m[self._order] - self._centre_m
         corners = sample.box_corners()
         self._box_m = corners.max(axis=0) - corners.min(axis=0)
         self._drawn_for = -1
@@ -149,27 +150,31 @@ class ConsensusProposer:
     def _draw(self, remainder: Remainder) -> None:
         claims = remainder.sample_claims
         points_m = remainder.sample.offsets_m
-        free = self._order[claims[self._order] < 0]
+        free = np.flatnonzero(claims[self._order] < 0)
         earlier = self._pool
         self._pool = None
         if len(free) < 3:
             return
         count = self._search.n_hypotheses if earlier is None else self._search.n_hypotheses // 2
         drawn = draw_hypotheses(
-            points_m[free] - self._centre_m, count, self._search.model, remainder.up, self._rng
+            self._ordered_m.take(free, axis=0), count, self._search.model, remainder.up, self._rng
         )
         hypotheses = _joined(drawn, None if earlier is None else earlier.hypotheses)
         hypotheses = hypotheses.chosen(self._leans_well(hypotheses, remainder.up))
         hypotheses = hypotheses.chosen(~self._near_any(hypotheses, self._barred))
         if len(hypotheses) == 0:
             return
-        asked = self._shuffled[claims[self._shuffled] < 0]
+        # Among the first of them there nearly always are enough.
+        asked = self._shuffled[: 4 * _SECOND_POINTS]
+        asked = asked[claims[asked] < 0]
+        if len(asked) < _SECOND_POINTS:
+            asked = self._shuffled[claims[self._shuffled] < 0]
         parts = remainder.parts
-        first = self._score(hypotheses, points_m[asked[:_FIRST_POINTS]] - self._centre_m, parts)
+        asked_m = points_m.take(asked[:_SECOND_POINTS], axis=0) - self._centre_m
+        first = self._score(hypotheses, asked_m[:_FIRST_POINTS], parts)
         n_kept = max(_SECOND_LEAST, round(_SECOND_SHARE * len(hypotheses)))
         kept = self._distinct(hypotheses, np.argsort(-first.value, kind="stable"), n_kept)
         hypotheses = hypotheses.chosen(kept)
-        asked_m = points_m[asked[:_SECOND_POINTS]] - self._centre_m
         second = self._score(hypotheses, asked_m, parts)
         ranked = np.argsort(-second.value, kind="stable")
         self._pool = _Pool(
@@ -215,29 +220,42 @@ class ConsensusProposer:
         """(h,) whether hypotheses are much the same as one of some."""
         if not others:
             return np.zeros(len(hypotheses), dtype=bool)
-        normals = np.concatenate([one.normals for one in others])
-        offsets_m = np.concatenate([one.offsets_m for one in others])
-        cosines = hypotheses.normals @ normals.T
-        apart_m = np.abs(hypotheses.offsets_m[:, None] - np.copysign(1.0, cosines) * offsets_m)
+        joined = Hypotheses(
+            normals=np.concatenate([one.normals for one in others]),
+            offsets_m=np.concatenate([one.offsets_m for one in others]),
+        )
+        any_near: NDArray[np.bool_] = np.logical_or.reduce(self._near(hypotheses, joined), axis=1)
+        return any_near
+
+    def _near(self, hypotheses: Hypotheses, others: Hypotheses) -> NDArray[np.bool_]:
+        """(h, o) whether hypotheses are much the same as others."""
+        cosines = hypotheses.normals @ others.normals.T
+        apart_m = np.abs(
+            hypotheses.offsets_m[:, None] - np.copysign(1.0, cosines) * others.offsets_m
+        )
         near: NDArray[np.bool_] = (np.abs(cosines) > math.cos(math.radians(_BARRED_DEG))) & (
             apart_m < _BARRED_TOLERANCES * self._search.find_m
         )
-        any_near: NDArray[np.bool_] = np.logical_or.reduce(near, axis=1)
-        return any_near
+        return near
 
     def _distinct(
         self, hypotheses: Hypotheses, ranked: NDArray[np.intp], n_most: int
     ) -> NDArray[np.intp]:
         """The best of some ranked hypotheses, no more than `_ALIKE_MOST` of them much the same."""
-        kept: list[np.intp] = []
-        alike = np.zeros(len(hypotheses), dtype=np.int64)
-        for index in ranked:
-            if alike[index] < _ALIKE_MOST:
-                kept.append(index)
-                alike += self._near_any(hypotheses, [hypotheses.chosen(np.array([index]))])
-                if len(kept) == n_most:
-                    break
-        return np.array(kept, dtype=np.intp)
+        # The best ones nearly always hold enough that differ.
+        for n_asked in (min(len(ranked), _ALIKE_MOST * n_most), len(ranked)):
+            asked = ranked[:n_asked]
+            some = hypotheses.chosen(asked)
+            near = self._near(some, some)
+            kept: list[int] = []
+            alike = np.zeros(n_asked, dtype=np.int64)
+            for place in range(n_asked):
+                if alike[place] < _ALIKE_MOST and len(kept) < n_most:
+                    kept.append(place)
+                    alike += near[place]
+            if len(kept) == n_most:
+                break
+        return asked[kept]
 
     def _is_worth_it(self, scores: Scores, place: int, remainder: Remainder) -> bool:
         if self._search.scoring == "a-contrario" and scores.value[place] <= 0.0:

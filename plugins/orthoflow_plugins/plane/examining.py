@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow_plugins.plane.adjustment import AdjustedPlane, adjust_plane
+from orthoflow_plugins.plane.adjustment import SETTLED_M, AdjustedPlane, adjust_plane
 from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, Rules, freedom_of
 from orthoflow_plugins.plane.fitting import Freedom
 from orthoflow_plugins.plane.footprints import (
@@ -37,6 +37,8 @@ _BENT_SHARE: Final = 0.5
 # may move without asking for another.
 _LOOKS_MOST: Final = 3
 _SETTLED_SHARE: Final = 0.1
+# Planes of a sample are fitted to all points later.
+_SETTLED_ON_SAMPLE_M: Final = 2e-5
 
 
 def examine(candidate: Candidate, remainder: Remainder, rules: Rules) -> FoundPlane | None:
@@ -90,11 +92,24 @@ def _look(
         fit_m=rules.fit_m,
         parts=remainder.parts,
     )
-    return judged(raster, sums, rules, freedom, n_least=rules.least_share * len(remainder.claims))
+    return judged(
+        raster,
+        sums,
+        rules,
+        freedom,
+        n_least=rules.least_share * len(remainder.claims),
+        settled_m=_SETTLED_ON_SAMPLE_M,
+    )
 
 
 def judged(
-    raster: SurfaceRaster, sums: CellSums, rules: Rules, freedom: Freedom, *, n_least: float
+    raster: SurfaceRaster,
+    sums: CellSums,
+    rules: Rules,
+    freedom: Freedom,
+    *,
+    n_least: float,
+    settled_m: float = SETTLED_M,
 ) -> Look | None:
     """Say which cells belong to a plane and how it fits them; None when it is none."""
     place = footprint(raster, crowded_cells(sums), sums, joins_parts=rules.joins_parts)
@@ -102,7 +117,9 @@ def judged(
         return None
     if _is_strip(place, raster) or _is_smear(place, raster, sums):
         return None
-    adjusted = adjust_plane(raster, sums, place.cells, fit_m=rules.fit_m, freedom=freedom)
+    adjusted = adjust_plane(
+        raster, sums, place.cells, fit_m=rules.fit_m, freedom=freedom, settled_m=settled_m
+    )
     if adjusted is None or _is_bent(adjusted):
         return None
     return Look(footprint=place, adjusted=adjusted)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.plane_kernels import sum_cells
 from orthoflow.geometry.point_kernels import BlockedPoints, each_part, piece_of
+from orthoflow_plugins.plane.neighbouring import closed, summed_around
 
 CELL_LEAST_M: Final = 0.05
 _CELLS_MOST: Final = 1_000_000
@@ -181,16 +182,13 @@ def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
     A cell needs three points, and more of them in the inner slab than chance would put there; and
     three of its eight neighbours must agree, which scattered clutter does not manage.
     """
-    from scipy import ndimage
-
     wanted = _CROWDED_SHARE * sums.n_find + 0.5 * np.sqrt(sums.n_find)
     crowded = (sums.n_find >= 3) & (sums.n_inner >= wanted)
     if crowded.any():
         # Far below the usual density a cell is a stray echo beside the wall, not the wall.
         crowded &= sums.n_find >= 0.02 * np.median(sums.n_find[crowded])
-    ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
-    neighbours = ndimage.convolve(crowded.astype(np.int32), ring, mode="constant")
-    result: NDArray[np.bool_] = crowded & (neighbours >= 3)
+    # The cell itself is one of those around it.
+    result: NDArray[np.bool_] = crowded & (summed_around(crowded.astype(np.int64)) >= 4)
     return result
 
 
@@ -214,8 +212,7 @@ def footprint(
 
     if not belongs.any():
         return None
-    padded = np.pad(belongs, 2)
-    joined = ndimage.binary_closing(padded, np.ones((5, 5), dtype=bool))[2:-2, 2:-2]
+    joined = closed(belongs, 2)
     names, n_parts = ndimage.label(joined | belongs, np.ones((3, 3), dtype=int))
     sizes = np.bincount(names[belongs], minlength=n_parts + 1)
     kept = np.flatnonzero(sizes >= _PART_SHARE * belongs.sum())

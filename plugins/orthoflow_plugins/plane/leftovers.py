@@ -6,10 +6,13 @@ share of a cell's points a plane took; where it is all of the cloud, it knows th
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.point_kernels import PlanCounts, PlanGrid
+from orthoflow_plugins.plane.neighbouring import summed_around
 from orthoflow_plugins.plane.remainders import Remainder
 
 
@@ -37,33 +40,33 @@ class PlanLeftovers:
         self._cell = np.where(over, places[:, 0] * grid.shape[1] + places[:, 1], n_cells)
         self._storey = np.where(within, places[:, 2], grid.shape[2])
         # A sample has too few points per cell to ask one alone.
-        self._reach = 0 if whole.sample.n_represented <= 1.0 else 1
+        self._asks_around = whole.sample.n_represented > 1.0
+        self._cells_asked = self._counted(self._cell, plan.cells.shape)
+        self._heights_asked = self._counted(self._storey, plan.heights.shape)
 
     def cells(self, claims: NDArray[np.int8]) -> NDArray[np.int64]:
         """(e1, e2) points left per plan cell, given the claims of the sample."""
-        return _left(self._plan.cells, self._cell, claims < 0, self._reach)
+        return self._left(self._plan.cells, self._cell, self._cells_asked, claims)
 
     def heights(self, claims: NDArray[np.int8]) -> NDArray[np.int64]:
         """(storeys,) points left per storey, given the claims of the sample."""
-        return _left(self._plan.heights, self._storey, claims < 0, self._reach)
+        return self._left(self._plan.heights, self._storey, self._heights_asked, claims)
 
+    def _counted(self, place: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64]:
+        counts = np.bincount(place, minlength=math.prod(shape) + 1)[:-1].reshape(shape)
+        return summed_around(counts) if self._asks_around else counts
 
-def _left(
-    counts: NDArray[np.int64], place: NDArray[np.int64], free: NDArray[np.bool_], reach: int
-) -> NDArray[np.int64]:
-    from scipy import ndimage
-
-    if free.all():
-        return counts
-    asked, left = (
-        np.bincount(chosen, minlength=counts.size + 1)[:-1].reshape(counts.shape)
-        for chosen in (place, place[free])
-    )
-    if reach:
-        asked, left = (
-            ndimage.convolve(number, np.ones((3,) * counts.ndim, dtype=int), mode="constant")
-            for number in (asked, left)
-        )
-    share = np.divide(left, asked, out=np.ones(counts.shape), where=asked > 0)
-    remaining: NDArray[np.int64] = np.rint(counts * share).astype(np.int64)
-    return remaining
+    def _left(
+        self,
+        counts: NDArray[np.int64],
+        place: NDArray[np.int64],
+        asked: NDArray[np.int64],
+        claims: NDArray[np.int8],
+    ) -> NDArray[np.int64]:
+        taken = np.flatnonzero(claims >= 0)
+        if len(taken) == 0:
+            return counts
+        left = asked - self._counted(place[taken], counts.shape)
+        share = np.divide(left, asked, out=np.ones(counts.shape), where=asked > 0)
+        remaining: NDArray[np.int64] = np.rint(counts * share).astype(np.int64)
+        return remaining

@@ -65,7 +65,8 @@ class Remainder:
     def free_sample_m(self) -> NDArray[np.float64]:
         """(m, 3) offsets of the sample points that no plane has; kept until the next claim."""
         if self._free is None or self._free[0] != len(self.takings):
-            self._free = (len(self.takings), self.sample.offsets_m[self.sample_claims < 0])
+            free = np.flatnonzero(self.sample_claims < 0)
+            self._free = (len(self.takings), self.sample.offsets_m.take(free, axis=0))
         return self._free[1]
 
     @property

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.plane_set_kernels import assign_points, name_labels
-from orthoflow.geometry.point_kernels import each_part, piece_of
+from orthoflow.geometry.point_kernels import each_part, in_threads, piece_of
 from orthoflow_plugins.plane.candidates import FoundPlane, Rules
 from orthoflow_plugins.plane.examining import Look, carried, judged
 from orthoflow_plugins.plane.footprints import INNER_SHARE, CellSums, SurfaceRaster, cell_for
@@ -38,26 +39,48 @@ def settle(found: list[FoundPlane], whole: Remainder, rules: Rules) -> list[Foun
         whole: the cloud; its claims serve as scratch.
         rules: when a plane counts.
     """
-    n_least = rules.least_share * len(whole.claims)
     unsettled = [True] * len(found)
     for _ in range(_PASSES_MOST):
         rasters = [_raster(item, whole, rules.find_m) for item in found]
         measured = _measured(found, rasters, unsettled, whole, rules)
+        looks = _judged(found, rasters, measured, unsettled, whole, rules)
         kept: list[FoundPlane] = []
         moves: list[bool] = []
-        for item, raster, sums, is_new in zip(found, rasters, measured, unsettled, strict=True):
+        for item, raster, look, is_new in zip(found, rasters, looks, unsettled, strict=True):
             if not is_new:
                 kept.append(item)
                 moves.append(False)
-                continue
-            look = judged(raster, sums, rules, item.freedom, n_least=n_least)
-            if look is not None:
+            elif look is not None:
                 kept.append(_settled(item, raster, look, whole))
                 moves.append(look.adjusted.moved_m > _SETTLED_SHARE * rules.fit_m)
         found, unsettled = kept, moves
         if not any(unsettled):
             break
     return found
+
+
+def _judged(
+    found: list[FoundPlane],
+    rasters: list[SurfaceRaster],
+    measured: list[CellSums],
+    wanted: list[bool],
+    whole: Remainder,
+    rules: Rules,
+) -> list[Look | None]:
+    """What the sums say of each plane that is wanted, several planes at a time."""
+    looks: list[Look | None] = [None] * len(found)
+    n_least = rules.least_share * len(whole.claims)
+
+    def judge(first: int) -> None:
+        for index in range(first, len(found), whole.parts):
+            if wanted[index]:
+                freedom = found[index].freedom
+                looks[index] = judged(
+                    rasters[index], measured[index], rules, freedom, n_least=n_least
+                )
+
+    in_threads([partial(judge, first) for first in range(whole.parts)])
+    return looks
 
 
 def label(found: list[FoundPlane], whole: Remainder, find_m: float) -> None:

@@ -81,11 +81,12 @@ class CellFit:
 
     def stepped(self, observed: CellHeights) -> NDArray[np.float64] | None:
         """Solution with the weights of this one; None where the cells do not fix it."""
-        design, weights = observed.design, self.weights(observed)
-        normal_matrix = design.T @ (weights[:, None] * design)
-        if np.linalg.cond(normal_matrix) > 1e12:
+        weighted = self.weights(observed) * observed.design.T
+        normal_matrix = weighted @ observed.design
+        extremes = np.abs(np.linalg.eigvalsh(normal_matrix))
+        if extremes.max() > 1e12 * extremes.min():
             return None
-        solution = np.linalg.solve(normal_matrix, design.T @ (weights * observed.heights_m))
+        solution = np.linalg.solve(normal_matrix, weighted @ observed.heights_m)
         return np.asarray(solution, dtype=np.float64)
 
 
