@@ -101,5 +101,6 @@ def _log_choose(
 ) -> NDArray[np.float64]:
     from scipy.special import gammaln
 
-    logarithm: NDArray[np.float64] = gammaln(np.add(n, 1.0)) - gammaln(np.add(k, 1.0))
-    return logarithm - gammaln(np.subtract(n, k) + 1.0)
+    apart = gammaln(np.subtract(n, k) + 1.0)
+    logarithm: NDArray[np.float64] = gammaln(np.add(n, 1.0)) - gammaln(np.add(k, 1.0)) - apart
+    return logarithm
