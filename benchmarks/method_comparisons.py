@@ -24,7 +24,7 @@ from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Value, rank
 from orthoflow.report.senses import sense_of
 
-RECIPES = ("plane-methods", "orient-methods")
+RECIPES = ("plane-methods", "orient-methods", "ortho-methods")
 # Metrics of each table and what stands over them; the record has many more.
 COLUMNS: dict[str, dict[str, str]] = {
     "plane-methods": {
@@ -52,6 +52,17 @@ COLUMNS: dict[str, dict[str, str]] = {
         "check.nmad_v_mm": "typical v / mm",
         "check.completeness_seen_by_both": "painted",
         "orient.cpu_s": "processor / s",
+    },
+    "ortho-methods": {
+        "check.rmse_u_mm": "orthoimage u / mm",
+        "check.rmse_v_mm": "orthoimage v / mm",
+        "check.completeness": "painted",
+        "check.colour_rmse_grey": "colour error / grey levels",
+        "surf.rmse_x_mm": "SURF x / mm",
+        "surf.rmse_y_mm": "SURF y / mm",
+        "surf.edge_width_cells": "edge width / cells",
+        "points.rms_mm": "check points / mm",
+        "ortho.cpu_s": "processor / s",
     },
 }
 
