@@ -26,8 +26,10 @@ _LEAST_VALID_SHARE: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 0.5
 # A pair is believed when so many of its nearest ones agree with it.
-_NEIGHBOURS: Final = 8
+_NEIGHBOURS: Final = 16
+_WITNESS_CELLS: Final = 8.0
 _AGREEING: Final = 2
+_AGREEING_SHARE: Final = 0.25
 _AGREE_CELLS: Final = 1.0
 
 
@@ -106,9 +108,13 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
     n_near = min(_NEIGHBOURS, len(places) - 1)
     if n_near < _AGREEING:
         return np.zeros(len(places), dtype=np.bool_)
-    _, near = cKDTree(places).query(places, k=n_near + 1)
-    apart = np.linalg.norm(shift[near[:, 1:]] - shift[:, None], axis=2)
-    agreed: NDArray[np.bool_] = np.count_nonzero(apart <= _AGREE_CELLS, axis=1) >= _AGREEING
+    away, near = cKDTree(places).query(places, k=n_near + 1)
+    apart = np.linalg.norm(shift[near] - shift[:, None], axis=2)
+    # The same place found at several scales is one witness, not several.
+    agrees = (apart <= _AGREE_CELLS) & (away > _WITNESS_CELLS)
+    # A motif that repeats lets two or three pairs err alike, but not a quarter of a neighbourhood.
+    needed = max(_AGREEING, _AGREEING_SHARE * n_near)
+    agreed: NDArray[np.bool_] = np.count_nonzero(agrees, axis=1) >= needed
     return agreed
 
 
