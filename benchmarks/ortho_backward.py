@@ -26,10 +26,11 @@ from orthoflow_plugins.ortho.dsm_backward_painting import (
     paint,
     view_of,
 )
-from orthoflow_plugins.ortho.dsm_backward_surfaces import noise_m, relief_of
+from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.products import PointCloud, Wall, Walls
 
 GSD_M = 0.003
@@ -155,7 +156,7 @@ def main() -> None:
                 frame=raster.frame,
                 relief=relief_of(raster),
                 front_m=walls.buffer_front_m,
-                tolerance_m=3.0 * noise_m(raster) + 0.5 * GSD_M,
+                tolerance_m=3.0 * depth_noise_m(raster.depth_m) + 0.5 * GSD_M,
             )
             return paint(
                 photo,

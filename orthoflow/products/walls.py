@@ -58,6 +58,8 @@ class Wall:
             colour.
         rgb: (rows, cols, 3) uint8, or None.
         rgb_mask: uint8, 1 where rgb holds a colour; None without rgb.
+        percentiles_m: (rows, cols, k) float32 metres, percentiles of the depths in the cell (which
+            ones say the details of `Walls`), NaN in cells without points; None if not wanted.
     """
 
     frame: WallFrame
@@ -70,6 +72,7 @@ class Wall:
     intensity: NDArray[np.float32] | None = None
     rgb: NDArray[np.uint8] | None = None
     rgb_mask: NDArray[np.uint8] | None = None
+    percentiles_m: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         _check_rasters(
@@ -82,6 +85,7 @@ class Wall:
             intensity=self.intensity,
             rgb=self.rgb,
             rgb_mask=self.rgb_mask,
+            percentiles_m=self.percentiles_m,
         )
 
 
@@ -103,6 +107,7 @@ class Walls(Product):
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "depth_m": Tolerance(limit=1e-4, unit="m"),
         "sigma_m": Tolerance(limit=1e-4, unit="m"),
+        "percentiles_m": Tolerance(limit=1e-4, unit="m"),
         "intensity": Tolerance(limit=1e-3, unit="1"),
         "rgb": Tolerance(limit=2, unit="grey"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),

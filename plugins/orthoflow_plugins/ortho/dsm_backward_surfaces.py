@@ -1,17 +1,12 @@
-"""What of a wall's surface hides what: its depth without spikes, its noise, bounds per block."""
+"""What of a wall's surface hides what: its depth without spikes, bounds per block."""
 
 from __future__ import annotations
-
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.visibility_kernels import BLOCK_CELLS, NOTHING_M, Relief
 from orthoflow.products import Wall
-
-_MEDIAN_TO_SIGMA: Final = 1.4826
-_NOISE_SAMPLES: Final = 300_000
 
 
 def relief_of(wall: Wall) -> Relief:
@@ -30,18 +25,6 @@ def relief_of(wall: Wall) -> Relief:
         bottoms=_per_block(known, np.inf, largest=False),
         highest_m=float(occluding.max(initial=NOTHING_M)),
     )
-
-
-def noise_m(wall: Wall) -> float:
-    """Standard deviation of a depth, told from how neighbours in a row scatter about a line.
-
-    The median of second differences does not see edges; a wall without three measured neighbours
-    has no noise that could be told.
-    """
-    rows = wall.depth_m[:: max(1, wall.depth_m.size // _NOISE_SAMPLES)]
-    bends = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
-    known = np.abs(bends[np.isfinite(bends)])
-    return float(np.median(known)) * _MEDIAN_TO_SIGMA / np.sqrt(6.0) if known.size else 0.0
 
 
 def _without_spikes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
