@@ -71,6 +71,11 @@ class DsmBackward(Method):
             description="Average over what a cell covers where the photo is finer than the wall "
             "(not with nearest).",
         )
+        visibility: Literal["full", "none"] = Field(
+            default="full",
+            description="What hides cells: relief and cloud (full), or nothing, for comparison and "
+            "for flat walls with nothing before them.",
+        )
         incidence_max_deg: float = Field(
             default=80.0, gt=0, lt=90, description="Cells seen more obliquely are not painted."
         )
@@ -118,7 +123,9 @@ class DsmBackward(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Take photo by photo, and lay each onto every wall it sees."""
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
-        if inputs.cloud is None:
+        if params.visibility == "none":
+            ctx.warn("visibility none: cells that a photo cannot see are painted as well")
+        elif inputs.cloud is None:
             ctx.warn(
                 "no cloud is wired to ortho.dsm-backward: things that stand free before a wall "
                 "hide nothing, and photos paint them onto it"
@@ -149,7 +156,7 @@ class _Studio:
             resampling=params.resampling,
             is_filtered=params.antialias,
             incidence_max_deg=params.incidence_max_deg,
-            erosion_cells=params.erosion_cells,
+            erosion_cells=params.erosion_cells if params.visibility == "full" else 0,
             border_share=params.border_share,
         )
         self._surfaces: list[Surface] = [self._surface(wall) for wall in inputs.walls.walls]
@@ -165,7 +172,7 @@ class _Studio:
         from orthoflow_plugins.ortho.dsm_backward_occluders import find_occluders
 
         started = time.perf_counter()
-        if self._inputs.cloud is not None:
+        if self._inputs.cloud is not None and self._params.visibility == "full":
             self._occluders = find_occluders(
                 self._inputs.cloud,
                 self._inputs.walls,
@@ -214,12 +221,14 @@ class _Studio:
     def _surface(self, wall: Wall) -> Surface:
         from orthoflow.geometry.depth_noise import depth_noise_m
         from orthoflow_plugins.ortho.dsm_backward_painting import Surface
-        from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of
+        from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
 
         tolerance_m = self._params.tolerance_sigma * depth_noise_m(wall.depth_m)
         return Surface(
             frame=wall.frame,
-            relief=relief_of(wall),
+            relief=relief_of(wall)
+            if self._params.visibility == "full"
+            else transparent_relief_of(wall),
             front_m=self._inputs.walls.buffer_front_m,
             tolerance_m=tolerance_m + self._params.tolerance_cells * wall.frame.gsd_m,
         )
