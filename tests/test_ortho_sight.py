@@ -1,4 +1,4 @@
-"""Where the backward projection finds cells in a photo, block by block, against the exact camera."""
+"""Where the backward projection finds cells in a photo, against the exact camera."""
 
 from __future__ import annotations
 
