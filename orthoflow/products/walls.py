@@ -165,6 +165,7 @@ class Layers(Product):
     Attributes:
         layers: grouped by wall in the order of `Walls`, then by source.
         names: name of each wall, by its index.
+        icc_profile: colour profile that all sources share, or None: sRGB, or not known.
         details: what else the method says, JSON.
     """
 
@@ -178,6 +179,7 @@ class Layers(Product):
 
     layers: tuple[Layer, ...]
     names: tuple[str, ...] = ()
+    icc_profile: bytes | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
 
@@ -189,7 +191,7 @@ class Orthoimage:
         frame: where the cells lie.
         wall: index of the wall in `Walls`.
         name: label of the wall.
-        rgb: (rows, cols, 3) uint8 sRGB, 0 where nothing is shown.
+        rgb: (rows, cols, 3) uint8 as the sources have them, 0 where nothing is shown.
         mask: uint8 `OrthoMask`; painted and filled cells are shown.
         source: int16 index into `sources`, -1 where nothing painted the cell.
         sources: what painted it, e.g. photo names, or `cloud`.
@@ -219,6 +221,7 @@ class Orthoimages(Product):
 
     Attributes:
         images: one per wall.
+        icc_profile: colour profile of the colours, or None: sRGB, or not known.
         details: what else the method says, JSON.
     """
 
@@ -229,6 +232,7 @@ class Orthoimages(Product):
     }
 
     images: tuple[Orthoimage, ...]
+    icc_profile: bytes | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ from orthoflow_plugins.ortho.oriented_photos import (
     bare_layer,
     oriented_photos,
     pixels_of,
+    shared_profile,
     weighted_median,
 )
 
@@ -137,8 +139,8 @@ class DsmBackward(Method):
         for place, (photo, camera) in enumerate(oriented):
             ctx.progress(place / len(oriented), photo.name)
             studio.lay(photo, camera)
-        layers = studio.finish()
-        return self.Out(layers=layers)
+        profile = shared_profile([photo for photo, _ in oriented], ctx)
+        return self.Out(layers=replace(studio.finish(), icc_profile=profile))
 
 
 class _Studio:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from orthoflow_plugins.ortho.oriented_photos import (
     bare_layer,
     oriented_photos,
     pixels_of,
+    shared_profile,
 )
 
 if TYPE_CHECKING:
@@ -140,7 +142,9 @@ class DsmForward(Method):
             seconds["painting_s"] += time.perf_counter() - looked
             ctx.log(f"{photo.name}: paints {', '.join(painted) or 'no wall'}")
         names = tuple(wall.name for wall in inputs.walls.walls)
-        return self.Out(layers=_finished(layers, surfaces, names, ctx, seconds))
+        profile = shared_profile([photo for photo, _ in oriented], ctx)
+        finished = _finished(layers, surfaces, names, ctx, seconds)
+        return self.Out(layers=replace(finished, icc_profile=profile))
 
 
 def _surfaces(walls: Walls, params: DsmForward.Params) -> list[Surface]:

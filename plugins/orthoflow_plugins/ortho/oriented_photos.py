@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
+from orthoflow.files.containers import icc_profile
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Layer, LayerMask, Photo, Photos, Walls
+from orthoflow.sdk import StepContext
 
 NO_SOURCE: Final = "no photo"
 UNSEEN_WALLS: Final = (
@@ -55,6 +58,17 @@ def pixels_of(photo: Photo, camera: Camera) -> NDArray[np.uint8]:
             f"{viewing.width} x {viewing.height}: wire the photos that were oriented"
         )
     return pixels
+
+
+def shared_profile(photos: Sequence[Photo], ctx: StepContext) -> bytes | None:
+    """The ICC profile that all photos have; None where they have none, or not the same."""
+    profiles = {icc_profile(photo.encoded) for photo in photos}
+    if len(profiles) > 1:
+        ctx.warn(
+            f"the photos have {len(profiles)} different colour profiles, or some have none: the "
+            "orthoimages get none, and colours may step where photos meet"
+        )
+    return profiles.pop() if len(profiles) == 1 else None
 
 
 def bare_layer(
