@@ -186,9 +186,9 @@ class _Brush:
             is_filtered=self._rule.is_filtered,
             into=rgb[tile],
         )
-        is_bare = np.not_equal(sight.mask, PAINTED)
-        if is_bare.any():
-            colours[is_bare] = 0
+        bare = np.flatnonzero(np.not_equal(sight.mask, PAINTED))
+        if bare.size:
+            colours[np.divmod(bare, sight.mask.shape[1])] = 0
         quality[tile] = sight.quality
         self.painting.footprints[tile[0].start, tile[1].start] = footprint
 

@@ -32,10 +32,10 @@ def relief_of(wall: Wall) -> Relief:
         around = slice(max(0, first - _HALO_CELLS), min(rows, first + _BAND_CELLS + _HALO_CELLS))
         own = slice(first - around.start, min(rows, first + _BAND_CELLS) - around.start)
         heights_m = _without_spikes(depth[around])[own]
-        is_void = heights_m == np.float32(NOTHING_M)
         part = occluding[first : first + _BAND_CELLS]
-        np.copyto(part, np.rint(heights_m / np.float32(step_m)), where=~is_void, casting="unsafe")
-        part[is_void] = NOTHING
+        # Void is far below what 16 bits hold, and ends at their lowest number.
+        scaled = np.maximum(heights_m, np.float32(NOTHING * step_m)) * np.float32(1.0 / step_m)
+        np.copyto(part, np.rint(scaled, out=scaled), casting="unsafe")
         block = slice(first // BLOCK_CELLS, -(-(first + part.shape[0]) // BLOCK_CELLS))
         tops[block] = _per_block(heights_m, largest=True)
     # Kernels are compiled once, for arrays that cannot be written to.
@@ -109,9 +109,12 @@ def _without_spikes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 def _per_block(values: NDArray[np.float32], *, largest: bool) -> NDArray[np.float32]:
     """The extreme of each block, NaN where all of it is."""
     rows, columns = values.shape
-    # `fmax` and `fmin` pass over NaN.
+    # `fmax` and `fmin` pass over NaN. Whole blocks of rows at once are what numpy does fast.
     reduce = np.fmax if largest else np.fmin
-    down = reduce.reduceat(values, np.arange(0, rows, BLOCK_CELLS), axis=0)
+    whole = rows - rows % BLOCK_CELLS
+    down = reduce.reduce(values[:whole].reshape(-1, BLOCK_CELLS, columns), axis=1)
+    if whole < rows:
+        down = np.vstack([down, reduce.reduce(values[whole:], axis=0)])
     across = reduce.reduceat(down, np.arange(0, columns, BLOCK_CELLS), axis=1)
     return np.asarray(across, dtype=np.float32)
 
