@@ -170,9 +170,9 @@ def look_at_plain_block(
     relief: Relief,
     sight: Sight,
     place: tuple[int, int, int, int, int, int],
+    block: tuple[tuple[int, int], tuple[int, int]],
     depths: tuple[float, float],
     nodes: NDArray[np.float64],
-    ramp: NDArray[np.float32],
 ) -> int:
     """Fill in the cells of a block that a photo surely sees where they are known.
 
@@ -183,11 +183,11 @@ def look_at_plain_block(
         view: the camera before the wall.
         relief: the wall.
         sight: of the tile, filled in part.
-        place: first row and column of the block on the wall, its rows and columns, and first row
-            and column in the tile.
+        place: first row and column on the wall of the part of the block that is in the tile, its
+            rows and columns, and first row and column in the tile.
+        block: first and last row, and first and last column, of the whole block.
         depths: those of the nodes.
         nodes: of `span_block`.
-        ramp: 0, 1, 2 ... as numbers of 32 bits.
 
     Returns:
         How many of the cells are known.
@@ -196,12 +196,15 @@ def look_at_plain_block(
     low, per_depth = np.float32(depths[0]), 1.0 / (depths[1] - depths[0])
     width, height = np.float32(view.camera[21]), np.float32(view.camera[22])
     per_border, one, nothing = np.float32(1.0 / view.border_px), np.float32(1.0), np.float32(0.0)
-    per_row, per_column = 1.0 / max(1, n_rows - 1), 1.0 / max(1, n_columns - 1)
+    rows, columns = block
+    per_row = 1.0 / max(1, rows[1] - rows[0])
+    per_column = 1.0 / max(1, columns[1] - columns[0])
+    ramp = (np.arange(n_columns) + (first_column - columns[0])).astype(np.float32)
     # Level, slope and bend along the row, and level and slope of what depth adds, of three values.
     c = np.empty((3, 5), dtype=np.float32)
     n_known = 0
     for i in range(n_rows):
-        weights = _parabola(i * per_row)
+        weights = _parabola((first_row + i - rows[0]) * per_row)
         for k in range(3):
             f0, f1, f2, g0, g2 = 0.0, 0.0, 0.0, 0.0, 0.0
             for r in range(3):

@@ -112,8 +112,8 @@ def look_at_cells(
         first_column: column likewise.
     """
     end_row, end_column = first_row + sight.mask.shape[0], first_column + sight.mask.shape[1]
+    n_rows, n_columns = relief.depth.shape
     lanes, box, nodes = np.empty((5, BLOCK_CELLS)), np.empty(4), np.empty((2, 3, 3, 4))
-    ramp = np.arange(BLOCK_CELLS).astype(np.float32)
     summary = sight.summary
     summary[:] = 0.0
     summary[0], summary[1] = math.inf, -math.inf
@@ -128,9 +128,15 @@ def look_at_cells(
             bottom = np.float64(relief.bottoms[block_row, block_column])
             crest = np.float64(relief.crests[block_row, block_column])
             depths = (bottom, max(crest, bottom + _LEAST_SPAN_M))
-            rows, columns = (begin, finish - 1), (start, end - 1)
+            # The whole block counts, whatever part of it is in the tile: tiles must not show.
+            rows = (block_row * BLOCK_CELLS, min(n_rows, (block_row + 1) * BLOCK_CELLS) - 1)
+            columns = (
+                block_column * BLOCK_CELLS,
+                min(n_columns, (block_column + 1) * BLOCK_CELLS) - 1,
+            )
             if (
-                bottom <= crest
+                not view.is_exact
+                and bottom <= crest
                 and depths[1] < view.height_m
                 and span_block(view, depths, rows, columns, nodes)
                 and is_plain_block(view, buffer, depths[1], rows, columns, nodes, box)
@@ -143,7 +149,9 @@ def look_at_cells(
                     begin - first_row,
                     start - first_column,
                 )
-                n_seen = look_at_plain_block(view, relief, sight, place, depths, nodes, ramp)
+                n_seen = look_at_plain_block(
+                    view, relief, sight, place, (rows, columns), depths, nodes
+                )
                 if bottom + view.tolerance_m < top:
                     n_seen -= hide_low_cells(view, relief, sight, place, top)
                 if n_seen:

@@ -55,6 +55,7 @@ class WallView(NamedTuple):
         tolerance_m: how far a surface must be above a ray to hide it.
         cosine_least: cells seen at a smaller cosine of incidence count as hidden.
         border_px: quality falls to 0 over this distance from the image border.
+        is_exact: project every cell by itself.
     """
 
     camera: NDArray[np.float64]
@@ -66,6 +67,7 @@ class WallView(NamedTuple):
     tolerance_m: float
     cosine_least: float
     border_px: float
+    is_exact: bool
 
 
 class Relief(NamedTuple):

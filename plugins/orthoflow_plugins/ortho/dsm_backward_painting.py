@@ -108,6 +108,8 @@ def view_of(camera: ViewingCamera, surface: Surface, rule: SightRule) -> WallVie
         tolerance_m=float(surface.tolerance_m),
         cosine_least=math.cos(math.radians(rule.incidence_max_deg)),
         border_px=max(1.0, rule.border_share * min(camera.width, camera.height)),
+        # The nearest pixel is another one a hundredth of a pixel farther on.
+        is_exact=rule.resampling == "nearest",
     )
 
 

@@ -152,7 +152,7 @@ def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
     held = 1e-3 * np.eye(n_scans + 2)
     held[0, 0] = 1e3
     wanted, weights = table[:, 2], np.ones(len(table))
-    solution = np.zeros(n_scans + 2)
+    solution: NDArray[np.float64] = np.zeros(n_scans + 2)
     for _ in range(_ROUNDS):
         normal = design.T @ (design * weights[:, np.newaxis]) + held
         solution = np.linalg.solve(normal, design.T @ (weights * wanted))
