@@ -155,7 +155,9 @@ def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
     solution: NDArray[np.float64] = np.zeros(n_scans + 2)
     for _ in range(_ROUNDS):
         normal = design.T @ (design * weights[:, np.newaxis]) + held
-        solution = np.linalg.solve(normal, design.T @ (weights * wanted))
+        solution = np.asarray(
+            np.linalg.solve(normal, design.T @ (weights * wanted)), dtype=np.float64
+        )
         weights = 1.0 / np.maximum(np.abs(wanted - design @ solution), _FLOOR)
     return _Trend(
         scales=solution[:n_scans],
