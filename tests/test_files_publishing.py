@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import csv
+import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -127,6 +129,50 @@ def test_geotiffs_lie_in_metres_with_rows_downwards(tmp_path: Path, frame: WallF
         assert dataset.count == 3
 
 
+def test_the_world_file_says_what_the_geotiff_says(tmp_path: Path, frame: WallFrame) -> None:
+    import rasterio
+    from affine import loadsw
+
+    publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
+    placed = loadsw((tmp_path / "wall_3_ortho.tfw").read_text())
+    with rasterio.open(tmp_path / "wall_3_ortho.tif") as dataset:
+        assert placed.almost_equals(dataset.transform, 1e-12)
+
+
+def test_the_profile_of_the_photos_goes_into_the_file(tmp_path: Path, frame: WallFrame) -> None:
+    import rasterio
+
+    profile = bytes(range(256)) * 3
+    for name, given in (("with", profile), ("without", None)):
+        folder = tmp_path / name
+        folder.mkdir()
+        product = Orthoimages(images=(orthoimage(frame),), icc_profile=given)
+        publishing.publish_orthoimages(product, folder, DIGEST)
+        with rasterio.open(folder / "wall_3_ortho.tif") as dataset:
+            told = dataset.tags(ns="COLOR_PROFILE").get("SOURCE_ICC_PROFILE")
+            content = dataset.tags()["content"]
+        assert told == (None if given is None else base64.b64encode(profile).decode())
+        assert content == (
+            "orthoimage, sRGB" if given is None else "orthoimage, ICC profile of the photos"
+        )
+
+
+def test_percentiles_get_rasters_of_their_own(tmp_path: Path, frame: WallFrame) -> None:
+    plain = walls(frame, None)
+    layered = np.stack([plain.walls[0].depth_m - 0.01, plain.walls[0].depth_m + 0.01], axis=2)
+    product = dataclasses.replace(
+        plain,
+        walls=(dataclasses.replace(plain.walls[0], percentiles_m=layered),),
+        details={"percentiles": [5.0, 97.5]},
+    )
+    publishing.publish_walls(product, tmp_path, DIGEST)
+    low = geotiff.read_raster(tmp_path / "wall_0_depth_p5_0.tif")
+    high = geotiff.read_raster(tmp_path / "wall_0_depth_p97_5.tif")
+    np.testing.assert_array_equal(low.values, layered[:, :, 0])
+    np.testing.assert_array_equal(high.values, layered[:, :, 1])
+    assert high.tags["content"].startswith("percentile 97.5")
+
+
 def test_the_sidecar_places_the_raster_in_the_world(tmp_path: Path, frame: WallFrame) -> None:
     publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
     sidecar = json.loads((tmp_path / "wall_3_ortho.json").read_text())
@@ -153,7 +199,7 @@ def test_publishing_twice_gives_the_same_bytes(tmp_path: Path, frame: WallFrame)
         contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
     assert contents[0] == contents[1]
     assert set(contents[0]) == {
-        *(f"wall_3_ortho{suffix}" for suffix in (".tif", ".json", ".png")),
+        *(f"wall_3_ortho{suffix}" for suffix in (".tif", ".tfw", ".json", ".png")),
         *(f"wall_3_ortho_mask{suffix}" for suffix in (".tif", ".json")),
         *(f"wall_0_depth{suffix}" for suffix in (".tif", ".json", ".png")),
         *(f"wall_0_intensity{suffix}" for suffix in (".tif", ".json", ".png")),

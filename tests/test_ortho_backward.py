@@ -257,7 +257,7 @@ def test_threads_and_tiles_do_not_show(tmp_path: Path, monkeypatch: pytest.Monke
     folder = tmp_path / "tiles"
     folder.mkdir()
     monkeypatch.setattr(dsm_backward_painting, "TILE_CELLS", 50)
-    tiled = run(inputs, context(folder), resampling="nearest").layers[0]
+    tiled = run(inputs, context(folder)).layers[0]
     for layer in found[1:]:
         np.testing.assert_array_equal(layer.mask, found[0].mask)
         np.testing.assert_array_equal(layer.rgb, found[0].rgb)

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.raster.grid import RasterGrid, scan_step_m
+from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.raster.scan_steps import scan_step_m
 
 from orthoflow.errors import MethodError, OrthoflowError
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
 from tests import raster_scenes as scenes
 
-SURFACES = ["median", "nearest", "topmost", "mean"]
+SURFACES = ["median", "centre", "topmost", "mean"]
 
 
 def rastered(
@@ -86,7 +87,7 @@ def cell_with(depths_m: list[float], folder: Path, **params: object) -> Wall:
 
 @pytest.mark.parametrize(
     ("surface", "depth_m"),
-    [("nearest", 0.015), ("topmost", 0.25), ("mean", 0.0754), ("median", 0.012)],
+    [("centre", 0.015), ("topmost", 0.25), ("mean", 0.0754), ("median", 0.012)],
 )
 def test_surfaces_choose_as_they_say(tmp_path: Path, surface: str, depth_m: float) -> None:
     # Median: the layer at 1 cm has three points, the one at 25 cm a stray one, the one behind one.

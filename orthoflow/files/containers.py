@@ -1,8 +1,9 @@
-"""Look into photo files without decoding them: format, wholeness, and where the EXIF block is."""
+"""Look into photo files without decoding them: format, wholeness, EXIF block, colour profile."""
 
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -16,6 +17,10 @@ _MARKER: Final = re.compile(rb"\xff([\x01-\xcf\xd8-\xfe])")
 _END: Final = 0xD9
 _SCAN: Final = 0xDA
 _APP1: Final = 0xE1
+_APP2: Final = 0xE2
+_ICC_MAGIC: Final = b"ICC_PROFILE\x00"
+# Profiles of cameras take some kilobytes; a packed one that grows beyond this is none.
+_ICC_MOST: Final = 1 << 24
 _WITHOUT_LENGTH: Final = frozenset({0x01, *range(0xD0, 0xD9)})
 
 
@@ -77,6 +82,42 @@ def exif_block(encoded: bytes) -> bytes | None:
                 if segment.kind == _APP1 and content.startswith(_EXIF_MAGIC):
                     return content[len(_EXIF_MAGIC) + 1 :]
     return None
+
+
+def icc_profile(encoded: bytes) -> bytes | None:
+    """Give the ICC colour profile of a JPEG or PNG file; None without a whole one.
+
+    Layout as in ICC.1:2022, annex B: a JPEG may hold it in several numbered segments.
+    """
+    match image_format(encoded):
+        case "PNG":
+            for segment in _png_chunks(encoded):
+                if segment.kind == b"iCCP":
+                    return _unpacked(encoded[segment.start : segment.end])
+        case "JPEG":
+            parts: dict[int, bytes] = {}
+            count = 0
+            for segment in _jpeg_segments(encoded):
+                if segment.kind == _SCAN:
+                    break
+                content = encoded[segment.start : segment.end]
+                if segment.kind == _APP2 and content.startswith(_ICC_MAGIC) and len(content) > 14:
+                    number, count = content[12], content[13]
+                    parts[number] = content[14:]
+            if parts and sorted(parts) == list(range(1, count + 1)):
+                return b"".join(parts[number] for number in sorted(parts))
+    return None
+
+
+def _unpacked(content: bytes) -> bytes | None:
+    """Profile of a PNG chunk: a name, the method of compression, and the compressed profile."""
+    _, _, packed = content.partition(b"\x00")
+    unpacking = zlib.decompressobj()
+    try:
+        profile = unpacking.decompress(packed[1:], _ICC_MOST)
+    except zlib.error:
+        return None
+    return profile if profile and unpacking.eof else None
 
 
 def _jpeg_segments(encoded: bytes) -> Iterator[_Segment]:

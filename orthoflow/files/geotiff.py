@@ -6,6 +6,7 @@ and CAD programs measure metres on the wall. Equal rasters give equal bytes.
 
 from __future__ import annotations
 
+import base64
 import math
 import warnings
 from collections.abc import Iterator, Mapping
@@ -97,15 +98,17 @@ def write_orthoimage(
     *,
     gsd_m: float,
     tags: Mapping[str, str],
+    icc_profile: bytes | None = None,
 ) -> None:
     """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
 
     Args:
         path: file to write; its folder exists.
-        rgb: (rows, cols, 3) sRGB.
+        rgb: (rows, cols, 3).
         shown: (rows, cols) True where the image shows something (painted or filled).
         gsd_m: side of a cell in metres.
         tags: text to keep with the image.
+        icc_profile: what the colours mean; None for sRGB or unknown.
 
     Raises:
         StoreError: the file cannot be written.
@@ -127,7 +130,18 @@ def write_orthoimage(
         "resampling": "AVERAGE",
     }
     bands = np.moveaxis(rgb, 2, 0)
-    _write(path, bands, shown, profile | _placed(shown.shape, gsd_m), tags)
+    placed = profile | _placed(shown.shape, gsd_m)
+    _write(path, bands, shown, placed, tags, icc_profile=icc_profile)
+
+
+def world_file_text(gsd_m: float) -> str:
+    """Give the world file of a wall's raster, for programs that read no GeoTIFF tags.
+
+    Six lines: step along a row, two rotations, step down a column, and the centre of the first
+    cell.
+    """
+    numbers = (gsd_m, 0.0, 0.0, -gsd_m, 0.5 * gsd_m, -0.5 * gsd_m)
+    return "".join(f"{number!r}\n" for number in numbers)
 
 
 def read_raster(path: Path) -> RasterFile:
@@ -195,6 +209,8 @@ def _write(
     shown: NDArray[np.bool_] | None,
     profile: Mapping[str, object],
     tags: Mapping[str, str],
+    *,
+    icc_profile: bytes | None = None,
 ) -> None:
     from rasterio.enums import ColorInterp
     from rasterio.errors import RasterioError
@@ -209,6 +225,9 @@ def _write(
                 if shown is not None:
                     dataset.write_mask(shown)
                 dataset.update_tags(AREA_OR_POINT="Area", **tags)
+                if icc_profile is not None:
+                    text = base64.b64encode(icc_profile).decode()
+                    dataset.update_tags(ns="COLOR_PROFILE", SOURCE_ICC_PROFILE=text)
             # Python writes the file: GDAL only logs a disk that gets full at closing.
             with path.open("wb") as target:
                 target.write(memory.getbuffer())

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.calibration import write_calibration
-from orthoflow.files.geotiff import write_orthoimage, write_raster
+from orthoflow.files.geotiff import world_file_text, write_orthoimage, write_raster
 from orthoflow.files.images import preview_png, stretch_to_grey
 from orthoflow.files.sidecars import (
     ORTHO_MASK_MEANINGS,
@@ -94,31 +94,59 @@ def publish_planes(product: Planes, folder: Path, digest: str) -> None:
 
 
 def publish_walls(product: Walls, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_depth.tif`, `wall_<k>_intensity.tif` if any, sidecars and previews."""
+    """Write `wall_<k>_depth.tif`, `wall_<k>_intensity.tif` if any, sidecars and previews.
+
+    Percentiles of the depths follow as `wall_<k>_depth_p<percent>.tif` where they were wanted.
+    """
+    told = product.details.get("percentiles")
+    percents = told if isinstance(told, list) else []
     for index, wall in enumerate(product.walls):
         details: dict[str, JsonValue] = {
             "plane_index": wall.plane_index,
             "intensity_source": product.intensity_source,
             "buffer": {"front_m": product.buffer_front_m, "behind_m": product.buffer_behind_m},
         }
-        _publish_band(folder / f"wall_{index}_depth", wall.depth_m, wall, digest, details)
+        depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
+        stem = f"wall_{index}_depth"
+        _publish_band(folder / stem, wall.depth_m, wall, digest, details | {"content": depth})
+        if wall.percentiles_m is not None:
+            for k, percent in enumerate(percents):
+                _publish_band(
+                    folder / f"{stem}_p{percent}".replace(".", "_"),
+                    np.ascontiguousarray(wall.percentiles_m[:, :, k]),
+                    wall,
+                    digest,
+                    details | {"content": f"percentile {percent} of the cell's points: {depth}"},
+                )
         if wall.intensity is not None:
-            _publish_band(folder / f"wall_{index}_intensity", wall.intensity, wall, digest, details)
+            content = f"intensity 0..1 ({product.intensity_source}); NaN = nothing"
+            stem = f"wall_{index}_intensity"
+            _publish_band(
+                folder / stem, wall.intensity, wall, digest, details | {"content": content}
+            )
 
 
 def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_ortho.tif`, the raster of its mask, sidecars and a preview."""
+    """Write `wall_<k>_ortho.tif`, its world file, the raster of its mask, sidecars, a preview."""
     for image in product.images:
         shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
         stem = f"wall_{image.wall}_ortho"
         gsd_m = image.frame.gsd_m
-        tags = raster_tags(
-            image.frame, digest=digest, name=image.name, content="orthoimage, sRGB", extra={}
+        colours = "sRGB" if product.icc_profile is None else "ICC profile of the photos"
+        content = f"orthoimage, {colours}"
+        tags = raster_tags(image.frame, digest=digest, name=image.name, content=content, extra={})
+        write_orthoimage(
+            folder / f"{stem}.tif",
+            image.rgb,
+            shown,
+            gsd_m=gsd_m,
+            tags=tags,
+            icc_profile=product.icc_profile,
         )
-        write_orthoimage(folder / f"{stem}.tif", image.rgb, shown, gsd_m=gsd_m, tags=tags)
+        write_text(folder / f"{stem}.tfw", world_file_text(gsd_m))
         mask_tags = tags | {"content": "mask of the orthoimage"}
         write_raster(folder / f"{stem}_mask.tif", image.mask, gsd_m=gsd_m, tags=mask_tags)
-        _write_ortho_sidecars(folder, stem, image, digest)
+        _write_ortho_sidecars(folder, stem, image, {"content": content}, digest)
         write_bytes(folder / f"{stem}.png", preview_png(image.rgb, shown))
 
 
@@ -194,14 +222,10 @@ def _publish_band(
     details: dict[str, JsonValue],
 ) -> None:
     """Write one float raster of a wall with its sidecar and preview."""
-    is_depth = values is wall.depth_m
-    meaning = (
-        "depth in metres along the normal, positive towards the viewer; NaN = nothing"
-        if is_depth
-        else f"intensity 0..1 ({details['intensity_source']}); NaN = nothing"
-    )
+    content = str(details["content"])
+    is_depth = content.startswith(("depth", "percentile"))
     tags = raster_tags(
-        wall.frame, digest=digest, name=wall.name, content=meaning, extra={"unit": "m"}
+        wall.frame, digest=digest, name=wall.name, content=content, extra={"unit": "m"}
     )
     if not is_depth:
         tags |= {"unit": "1", "intensity_source": str(details["intensity_source"])}
@@ -212,7 +236,6 @@ def _publish_band(
         | details
         | {
             "name": wall.name,
-            "content": meaning,
             "mask": mask_meanings(SURFACE_MASK_MEANINGS),
             "mask_counts": _counts(wall.mask),
             "product_digest": digest,
@@ -222,7 +245,9 @@ def _publish_band(
     write_bytes(stem.with_suffix(".png"), picture)
 
 
-def _write_ortho_sidecars(folder: Path, stem: str, image: Orthoimage, digest: str) -> None:
+def _write_ortho_sidecars(
+    folder: Path, stem: str, image: Orthoimage, about: Mapping[str, JsonValue], digest: str
+) -> None:
     content = frame_json(image.frame) | {
         "wall": image.wall,
         "name": image.name,
@@ -233,7 +258,7 @@ def _write_ortho_sidecars(folder: Path, stem: str, image: Orthoimage, digest: st
         "mask_raster": f"{stem}_mask.tif",
         "product_digest": digest,
     }
-    write_json(folder / f"{stem}.json", content | {"content": "orthoimage, sRGB"})
+    write_json(folder / f"{stem}.json", {**content, **about})
     write_json(folder / f"{stem}_mask.json", content | {"content": "mask of the orthoimage"})
 
 

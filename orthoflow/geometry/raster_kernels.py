@@ -181,6 +181,53 @@ def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner
 
 
 @compiled
+def keep_nearest_around(
+    entries: Entries,
+    offsets: Offsets,
+    wall_from_offset: NDArray[np.float64],
+    winners: NDArray[np.void],
+    width: int,
+    owners: int,
+    owner: int,
+) -> None:
+    """Let the point nearest the centre win, of the cell itself or its eight neighbours.
+
+    Args:
+        entries: one chunk.
+        offsets: of the whole cloud.
+        wall_from_offset: (3, 4) as in `Target`.
+        winners: (cells,) of `WINNER`, updated; points count in the cell that they lie in.
+        width: columns of the raster.
+        owners: a power of two, how many threads share the cells.
+        owner: whose cells to visit.
+    """
+    m = wall_from_offset
+    height = winners.size // width
+    for block in range(entries.n_inside.size):
+        first = block * BLOCK
+        for k in range(first, first + entries.n_inside[block]):
+            cell, point = entries.cells[k], entries.points[k]
+            x, y, z = float(offsets.x[point]), float(offsets.y[point]), float(offsets.z[point])
+            u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+            v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+            row, column = cell // width, cell % width
+            for r in range(max(0, row - 1), min(height, row + 2)):
+                for c in range(max(0, column - 1), min(width, column + 2)):
+                    place = r * width + c
+                    if (place >> _RUN_SHIFT) & (owners - 1) != owner:
+                        continue
+                    winner = winners[place]
+                    if place == cell:
+                        winner.n_points += np.uint32(1)
+                    du, dv = u - c - 0.5, v - r - 0.5
+                    square = np.float32(du * du + dv * dv)
+                    if square < winner.square:
+                        winner.depth_m = entries.depths_m[k]
+                        winner.square = square
+                        winner.point = point
+
+
+@compiled
 def count_points(entries: Entries, n_points: NDArray[np.uint32], owners: int, owner: int) -> None:
     """Count the points of each cell."""
     for block in range(entries.n_inside.size):

@@ -15,7 +15,8 @@ from orthoflow.geometry.point_kernels import Offsets
 
 # Side of the square blocks of cells that share one bound on how high rays have to be followed.
 BLOCK_CELLS: Final = 32
-# Height of void cells in `Relief.occluding`: they hide nothing, nor do mixtures with them.
+# Void cells in `Relief.occluding`: they hide nothing, nor do mixtures with them.
+NOTHING: Final = np.int16(-32768)
 NOTHING_M: Final = -1.0e6
 # Counts stay below this, so that sums over 3 x 3 x 3 voxels fit into 16 bits.
 COUNT_MOST: Final = 2000
@@ -54,6 +55,7 @@ class WallView(NamedTuple):
         tolerance_m: how far a surface must be above a ray to hide it.
         cosine_least: cells seen at a smaller cosine of incidence count as hidden.
         border_px: quality falls to 0 over this distance from the image border.
+        is_exact: project every cell by itself.
     """
 
     camera: NDArray[np.float64]
@@ -65,6 +67,7 @@ class WallView(NamedTuple):
     tolerance_m: float
     cosine_least: float
     border_px: float
+    is_exact: bool
 
 
 class Relief(NamedTuple):
@@ -72,16 +75,22 @@ class Relief(NamedTuple):
 
     Attributes:
         depth: (rows, cols) float32 metres, NaN where void.
-        occluding: (rows, cols) float32 the same without spikes, `NOTHING_M` where void.
-        tops: (blocks, blocks) float32, the highest `occluding` in 3 x 3 blocks.
+        occluding: (rows, cols) int16 the same without spikes, in steps of `step_m`, `NOTHING`
+            where void; half the memory of float32, and far finer than what counts as hidden.
+        step_m: of `occluding`.
+        tops: (blocks, blocks) float32, the highest `occluding` in 3 x 3 blocks, metres.
         bottoms: (blocks, blocks) float32, the lowest depth in a block, infinite in a void one.
-        highest_m: the highest `occluding` of all.
+        crests: (blocks, blocks) float32, the highest depth in a block, minus infinity in a void
+            one.
+        highest_m: the highest `occluding` of all; `NOTHING_M` and no ray is followed.
     """
 
     depth: NDArray[np.float32]
-    occluding: NDArray[np.float32]
+    occluding: NDArray[np.int16]
+    step_m: float
     tops: NDArray[np.float32]
     bottoms: NDArray[np.float32]
+    crests: NDArray[np.float32]
     highest_m: float
 
 
@@ -101,11 +110,13 @@ class Sight(NamedTuple):
     """What a photo sees of a tile of cells, filled by `look_at_cells`.
 
     Attributes:
-        u: (rows, cols) float32 photo pixels, first centre at 0.5; only where painted. v likewise.
+        u: (rows, cols) float32 photo pixels, first centre at 0.5, a number everywhere, but a place
+            only where painted. v likewise.
         mask: (rows, cols) uint8 states.
         quality: (rows, cols) float32 photo pixels per cell times the falling off at the border.
-        summary: (8,) float64 over painted cells: smallest and largest u, smallest and largest v,
-            their number, sums of columns, rows and depths.
+        summary: (8,) float64 over painted cells: bounds of u and of v (smallest, largest each),
+            their number, sums of columns, rows and depths (where a whole block is seen, those of
+            its middle).
     """
 
     u: NDArray[np.float32]
@@ -253,131 +264,10 @@ def is_hidden_by_relief(view: WallView, relief: Relief, row: int, column: int, t
             second_row, second_column = first_row, first_column
         if first_row < 0 or first_column < 0 or second_row >= rows or second_column >= columns:
             return False
-        here = (1.0 - share) * relief.occluding[first_row, first_column]
-        here += share * relief.occluding[second_row, second_column]
-        if here > height:
+        one = relief.occluding[first_row, first_column]
+        other = relief.occluding[second_row, second_column]
+        if min(one, other) == NOTHING:
+            continue
+        if ((1.0 - share) * one + share * other) * relief.step_m > height:
             return True
     return False
-
-
-@compiled
-def project_row(
-    view: WallView, relief: Relief, row: int, first_column: int, lanes: NDArray[np.float64]
-) -> None:
-    """Project some cells of a row; nothing here branches, so several go at once.
-
-    Args:
-        view: the camera before the wall.
-        relief: the wall.
-        row: of the cells.
-        first_column: of the first cell.
-        lanes: (5, n) filled with u (-1 where the camera cannot see), v, depth along the axis where
-            the ray leaves the slab that the raster describes, cosine of incidence, and photo
-            pixels per cell.
-    """
-    # The formula of `camera_kernels.project_point`, which branches: without branches, and with the
-    # camera in variables of its own, it takes a third of the time. A test holds the two together.
-    camera, gsd_m = view.camera, view.gsd_m
-    xu, xv, xn, tx = camera[0], camera[1], camera[2], camera[9]
-    yu, yv, yn, ty = camera[3], camera[4], camera[5], camera[10]
-    zu, zv, zn, tz = camera[6], camera[7], camera[8], camera[11]
-    fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
-    k1, k2, p1, p2, k3 = camera[16], camera[17], camera[18], camera[19], camera[20]
-    farthest = camera[23] * camera[23]
-    height_m, free_m, tolerance_m = view.height_m, view.height_m - view.front_m, view.tolerance_m
-    foot, down = view.column, (view.row - row) * gsd_m
-    y, depths = (row + 0.5) * gsd_m, relief.depth[row]
-    us, vs, leaves, cosines, pixels = lanes[0], lanes[1], lanes[2], lanes[3], lanes[4]
-    for k in range(lanes.shape[1]):
-        column, depth = float(first_column + k), float(depths[first_column + k])
-        x = (column + 0.5) * gsd_m
-        zc = zu * x + zv * y + zn * depth + tz
-        per_zc = 1.0 / zc
-        a = (xu * x + xv * y + xn * depth + tx) * per_zc
-        b = (yu * x + yv * y + yn * depth + ty) * per_zc
-        r2 = a * a + b * b
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        ad = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
-        bd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
-        us[k] = fx * ad + cx if (zc > 1e-9) & (r2 <= farthest) else -1.0
-        vs[k] = fy * bd + cy
-        lift, across = height_m - depth, (foot - column) * gsd_m
-        leaves[k] = zc * free_m / lift - tolerance_m
-        cosine = lift / math.sqrt(lift * lift + across * across + down * down)
-        cosines[k] = cosine
-        pixels[k] = cosine * fx * fy * gsd_m * gsd_m * per_zc * per_zc
-
-
-@compiled
-def look_at_cells(
-    view: WallView,
-    relief: Relief,
-    buffer: DepthBuffer,
-    sight: Sight,
-    first_row: int,
-    first_column: int,
-) -> None:
-    """Project the cells of a tile into a photo and tell which of them it sees.
-
-    Args:
-        view: the camera before the wall.
-        relief: the whole wall.
-        buffer: what else stands before the camera.
-        sight: filled; its shape is the tile's.
-        first_row: row of the wall where the tile begins.
-        first_column: column likewise.
-    """
-    end_row, end_column = first_row + sight.mask.shape[0], first_column + sight.mask.shape[1]
-    width, image_height = view.camera[21], view.camera[22]
-    per_pixel, per_border = 1.0 / buffer.reduction, 1.0 / view.border_px
-    u_least, u_most, v_least, v_most = math.inf, -math.inf, math.inf, -math.inf
-    n_painted, columns, rows, depths = 0, 0, 0, 0.0
-    lanes = np.empty((5, BLOCK_CELLS))
-    for block_row in range(first_row // BLOCK_CELLS, (end_row - 1) // BLOCK_CELLS + 1):
-        for block_column in range(first_column // BLOCK_CELLS, (end_column - 1) // BLOCK_CELLS + 1):
-            top = highest_in_the_way(view, relief, block_row, block_column)
-            start = max(first_column, block_column * BLOCK_CELLS)
-            end = min(end_column, (block_column + 1) * BLOCK_CELLS)
-            for row in range(
-                max(first_row, block_row * BLOCK_CELLS),
-                min(end_row, (block_row + 1) * BLOCK_CELLS),
-            ):
-                i, part = row - first_row, slice(start - first_column, end - first_column)
-                project_row(view, relief, row, start, lanes[:, : end - start])
-                mask, quality = sight.mask[i, part], sight.quality[i, part]
-                for k in range(end - start):
-                    depth, u, v = float(relief.depth[row, start + k]), lanes[0, k], lanes[1, k]
-                    quality[k] = 0.0
-                    if math.isnan(depth):
-                        mask[k] = NO_SURFACE
-                        continue
-                    if not (0.0 <= u < width and 0.0 <= v < image_height):
-                        mask[k] = OUTSIDE
-                        continue
-                    mask[k] = OCCLUDED
-                    if lanes[3, k] <= view.cosine_least:
-                        continue
-                    if buffer.nearest[int(v * per_pixel), int(u * per_pixel)] < lanes[2, k]:
-                        continue
-                    if depth + view.tolerance_m < top and is_hidden_by_relief(
-                        view, relief, row, start + k, top
-                    ):
-                        continue
-                    mask[k] = PAINTED
-                    aside = min(width - u, u)
-                    above = min(image_height - v, v)
-                    inside = (min(above, aside)) * per_border
-                    quality[k] = lanes[4, k] * (min(1.0, inside))
-                    sight.u[i, part.start + k] = u
-                    sight.v[i, part.start + k] = v
-                    u_least, u_most = min(u_least, u), max(u_most, u)
-                    v_least, v_most = min(v_least, v), max(v_most, v)
-                    n_painted += 1
-                    columns += start + k
-                    rows += row
-                    depths += depth
-    # One by one: numba compiles seconds of text formatting for the errors of a tuple's assignment.
-    sight.summary[0], sight.summary[1] = u_least, u_most
-    sight.summary[2], sight.summary[3] = v_least, v_most
-    sight.summary[4], sight.summary[5] = n_painted, columns
-    sight.summary[6], sight.summary[7] = rows, depths

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane
 from orthoflow.products.product import JsonValue, Product, Tolerance
+
+_USUAL_TOLERANCE_M: Final = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +80,18 @@ class Planes(Product):
 
     def __len__(self) -> int:
         return len(self.offset)
+
+    @property
+    def tolerance_m(self) -> float:
+        """Distance within which points counted when the planes were found.
+
+        A method that does not say so in its details is taken to have used that of markiewicz2015.
+        """
+        for name in ("find_tolerance_m", "tolerance_m"):
+            told = self.details.get(name)
+            if isinstance(told, float | int) and told > 0.0:
+                return float(told)
+        return _USUAL_TOLERANCE_M
 
     def plane(self, index: int) -> Plane:
         """Give one of the planes, 0 the one with the largest support."""

@@ -58,6 +58,8 @@ class Wall:
             colour.
         rgb: (rows, cols, 3) uint8, or None.
         rgb_mask: uint8, 1 where rgb holds a colour; None without rgb.
+        percentiles_m: (rows, cols, k) float32 metres, percentiles of the depths in the cell (which
+            ones say the details of `Walls`), NaN in cells without points; None if not wanted.
     """
 
     frame: WallFrame
@@ -70,6 +72,7 @@ class Wall:
     intensity: NDArray[np.float32] | None = None
     rgb: NDArray[np.uint8] | None = None
     rgb_mask: NDArray[np.uint8] | None = None
+    percentiles_m: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         _check_rasters(
@@ -82,6 +85,7 @@ class Wall:
             intensity=self.intensity,
             rgb=self.rgb,
             rgb_mask=self.rgb_mask,
+            percentiles_m=self.percentiles_m,
         )
 
 
@@ -103,6 +107,7 @@ class Walls(Product):
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "depth_m": Tolerance(limit=1e-4, unit="m"),
         "sigma_m": Tolerance(limit=1e-4, unit="m"),
+        "percentiles_m": Tolerance(limit=1e-4, unit="m"),
         "intensity": Tolerance(limit=1e-3, unit="1"),
         "rgb": Tolerance(limit=2, unit="grey"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),
@@ -160,6 +165,7 @@ class Layers(Product):
     Attributes:
         layers: grouped by wall in the order of `Walls`, then by source.
         names: name of each wall, by its index.
+        icc_profile: colour profile that all sources share, or None: sRGB, or not known.
         details: what else the method says, JSON.
     """
 
@@ -173,6 +179,7 @@ class Layers(Product):
 
     layers: tuple[Layer, ...]
     names: tuple[str, ...] = ()
+    icc_profile: bytes | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
 
@@ -184,7 +191,7 @@ class Orthoimage:
         frame: where the cells lie.
         wall: index of the wall in `Walls`.
         name: label of the wall.
-        rgb: (rows, cols, 3) uint8 sRGB, 0 where nothing is shown.
+        rgb: (rows, cols, 3) uint8 as the sources have them, 0 where nothing is shown.
         mask: uint8 `OrthoMask`; painted and filled cells are shown.
         source: int16 index into `sources`, -1 where nothing painted the cell.
         sources: what painted it, e.g. photo names, or `cloud`.
@@ -214,6 +221,7 @@ class Orthoimages(Product):
 
     Attributes:
         images: one per wall.
+        icc_profile: colour profile of the colours, or None: sRGB, or not known.
         details: what else the method says, JSON.
     """
 
@@ -224,6 +232,7 @@ class Orthoimages(Product):
     }
 
     images: tuple[Orthoimage, ...]
+    icc_profile: bytes | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
 

@@ -270,6 +270,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="each cell of a wall looks up its colour in the photos that see it",
         ),
         MethodSpec(
+            id="ortho.dsm-forward",
+            target="orthoflow_plugins.ortho.dsm_forward:DsmForward",
+            summary="each pixel of a photo is thrown onto the wall it shows",
+        ),
+        MethodSpec(
             id="mosaic.seams",
             target="orthoflow_plugins.mosaic.seams:MosaicSeams",
             summary="one orthoimage per wall from its layers",

@@ -106,7 +106,10 @@ class MosaicSeams(Method):
         }
         details: dict[str, JsonValue] = {"gains": gains} if gains else {}
         images = tuple(item.image for item in verdicts)
-        return self.Out(orthoimages=Orthoimages(images=images, details=details))
+        profile = inputs.layers.icc_profile
+        return self.Out(
+            orthoimages=Orthoimages(images=images, icc_profile=profile, details=details)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

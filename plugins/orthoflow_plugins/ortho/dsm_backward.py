@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -11,7 +12,6 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.files.images import decode_image
 from orthoflow.products import (
     Camera,
     Cameras,
@@ -25,14 +25,20 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.ortho.oriented_photos import (
+    UNSEEN_WALLS,
+    bare_layer,
+    oriented_photos,
+    pixels_of,
+    shared_profile,
+    weighted_median,
+)
 
 if TYPE_CHECKING:
     from orthoflow.geometry.visibility_kernels import DepthBuffer
     from orthoflow_plugins.ortho.dsm_backward_occluders import Occluders
     from orthoflow_plugins.ortho.dsm_backward_painting import Painting, SightRule, Surface
     from orthoflow_plugins.ortho.dsm_backward_sampling import Footprint
-
-NO_SOURCE = "no photo"
 
 
 class DsmBackward(Method):
@@ -66,6 +72,11 @@ class DsmBackward(Method):
             default=True,
             description="Average over what a cell covers where the photo is finer than the wall "
             "(not with nearest).",
+        )
+        visibility: Literal["full", "none"] = Field(
+            default="full",
+            description="What hides cells: relief and cloud (full), or nothing, for comparison and "
+            "for flat walls with nothing before them.",
         )
         incidence_max_deg: float = Field(
             default=80.0, gt=0, lt=90, description="Cells seen more obliquely are not painted."
@@ -113,8 +124,10 @@ class DsmBackward(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Take photo by photo, and lay each onto every wall it sees."""
-        oriented = _oriented(inputs)
-        if inputs.cloud is None:
+        oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
+        if params.visibility == "none":
+            ctx.warn("visibility none: cells that a photo cannot see are painted as well")
+        elif inputs.cloud is None:
             ctx.warn(
                 "no cloud is wired to ortho.dsm-backward: things that stand free before a wall "
                 "hide nothing, and photos paint them onto it"
@@ -126,8 +139,8 @@ class DsmBackward(Method):
         for place, (photo, camera) in enumerate(oriented):
             ctx.progress(place / len(oriented), photo.name)
             studio.lay(photo, camera)
-        layers = studio.finish()
-        return self.Out(layers=layers)
+        profile = shared_profile([photo for photo, _ in oriented], ctx)
+        return self.Out(layers=replace(studio.finish(), icc_profile=profile))
 
 
 class _Studio:
@@ -145,7 +158,7 @@ class _Studio:
             resampling=params.resampling,
             is_filtered=params.antialias,
             incidence_max_deg=params.incidence_max_deg,
-            erosion_cells=params.erosion_cells,
+            erosion_cells=params.erosion_cells if params.visibility == "full" else 0,
             border_share=params.border_share,
         )
         self._surfaces: list[Surface] = [self._surface(wall) for wall in inputs.walls.walls]
@@ -161,7 +174,7 @@ class _Studio:
         from orthoflow_plugins.ortho.dsm_backward_occluders import find_occluders
 
         started = time.perf_counter()
-        if self._inputs.cloud is not None:
+        if self._inputs.cloud is not None and self._params.visibility == "full":
             self._occluders = find_occluders(
                 self._inputs.cloud,
                 self._inputs.walls,
@@ -174,8 +187,7 @@ class _Studio:
     def lay(self, photo: Photo, camera: Camera) -> None:
         """Lay a photo onto all walls."""
         started = time.perf_counter()
-        pixels = decode_image(photo.encoded, photo.name)
-        _require_size(photo, camera, pixels)
+        pixels = pixels_of(photo, camera)
         decoded = time.perf_counter()
         buffer = self._depth_buffer(camera)
         looked = time.perf_counter()
@@ -196,10 +208,7 @@ class _Studio:
             MethodError: no photo paints any wall.
         """
         if not self._layers:
-            raise MethodError(
-                "no oriented photo sees a wall: their cameras stand behind the walls, look past "
-                "them, or something hides the walls; look at cameras.json and planes.json"
-            )
+            raise MethodError(UNSEEN_WALLS)
         walls = self._inputs.walls.walls
         painted = {layer.wall for layer in self._layers}
         bare = [index for index in range(len(walls)) if index not in painted]
@@ -212,13 +221,16 @@ class _Studio:
         return Layers(layers=tuple(layers), names=tuple(wall.name for wall in walls))
 
     def _surface(self, wall: Wall) -> Surface:
+        from orthoflow.geometry.depth_noise import depth_noise_m
         from orthoflow_plugins.ortho.dsm_backward_painting import Surface
-        from orthoflow_plugins.ortho.dsm_backward_surfaces import noise_m, relief_of
+        from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
 
-        tolerance_m = self._params.tolerance_sigma * noise_m(wall)
+        tolerance_m = self._params.tolerance_sigma * depth_noise_m(wall.depth_m)
         return Surface(
             frame=wall.frame,
-            relief=relief_of(wall),
+            relief=relief_of(wall)
+            if self._params.visibility == "full"
+            else transparent_relief_of(wall),
             front_m=self._inputs.walls.buffer_front_m,
             tolerance_m=tolerance_m + self._params.tolerance_cells * wall.frame.gsd_m,
         )
@@ -287,16 +299,7 @@ class _Studio:
 
     def _bare_layer(self, index: int) -> Layer:
         surface = self._surfaces[index]
-        is_void = np.isnan(surface.relief.depth)
-        mask = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE).astype(np.uint8)
-        return Layer(
-            frame=surface.frame,
-            wall=index,
-            source=NO_SOURCE,
-            rgb=np.zeros((*mask.shape, 3), dtype=np.uint8),
-            mask=self._reached.get(index, mask),
-            quality=np.zeros(mask.shape, dtype=np.float32),
-        )
+        return bare_layer(surface.frame, index, surface.relief.depth, self._reached.get(index))
 
     def _report(self, layers: list[Layer]) -> None:
         ctx = self._ctx
@@ -314,44 +317,7 @@ class _Studio:
         n_cells = np.array([footprint.n_cells for footprint in self._footprints])
         gsds = np.array([footprint.photo_gsd_m for footprint in self._footprints])
         angles = np.array([footprint.obliquity_deg for footprint in self._footprints])
-        ctx.metric("photo_gsd_mm", 1e3 * _weighted_median(gsds, n_cells), "mm")
-        ctx.metric("obliquity_deg", _weighted_median(angles, n_cells), "deg")
+        ctx.metric("photo_gsd_mm", 1e3 * weighted_median(gsds, n_cells), "mm")
+        ctx.metric("obliquity_deg", weighted_median(angles, n_cells), "deg")
         for name, seconds in self._seconds.items():
             ctx.metric(name, seconds, "s")
-
-
-def _oriented(inputs: DsmBackward.In) -> list[tuple[Photo, Camera]]:
-    """The photos that have a pose, with it.
-
-    Raises:
-        MethodError: there is none, there are no walls, or a camera has no photo.
-    """
-    if not inputs.walls.walls:
-        raise MethodError("there are no walls to lay photos onto: choose planes to raster")
-    photos = {photo.name: photo for photo in inputs.photos.photos}
-    cameras = [camera for camera in inputs.cameras.cameras if camera.status == "ok"]
-    if not cameras:
-        reasons = "; ".join(f"{item.photo}: {item.status}" for item in inputs.cameras.cameras)
-        raise MethodError(f"no photo is oriented, so none can be laid onto a wall: {reasons}")
-    missing = [camera.photo for camera in cameras if camera.photo not in photos]
-    if missing:
-        raise MethodError(
-            f"the cameras know {', '.join(missing)}, which the photos do not hold: wire the "
-            "photos that were oriented"
-        )
-    return [(photos[camera.photo], camera) for camera in cameras]
-
-
-def _require_size(photo: Photo, camera: Camera, pixels: NDArray[np.uint8]) -> None:
-    viewing = camera.viewing()
-    if pixels.shape[:2] != (viewing.height, viewing.width):
-        raise MethodError(
-            f"{photo.name} has {pixels.shape[1]} x {pixels.shape[0]} pixels, but its camera "
-            f"{viewing.width} x {viewing.height}: wire the photos that were oriented"
-        )
-
-
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.int64]) -> float:
-    order = np.argsort(values, kind="stable")
-    totals = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(totals, totals[-1] / 2.0)])

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from threading import Lock
+from threading import Lock, local
 from typing import Final
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.sight_kernels import look_at_cells
 from orthoflow.geometry.visibility_kernels import (
     OCCLUDED,
     PAINTED,
@@ -21,7 +22,6 @@ from orthoflow.geometry.visibility_kernels import (
     Relief,
     Sight,
     WallView,
-    look_at_cells,
 )
 from orthoflow_plugins.ortho.dsm_backward_sampling import (
     Footprint,
@@ -108,6 +108,8 @@ def view_of(camera: ViewingCamera, surface: Surface, rule: SightRule) -> WallVie
         tolerance_m=float(surface.tolerance_m),
         cosine_least=math.cos(math.radians(rule.incidence_max_deg)),
         border_px=max(1.0, rule.border_share * min(camera.width, camera.height)),
+        # The nearest pixel is another one a hundredth of a pixel farther on.
+        is_exact=rule.resampling == "nearest",
     )
 
 
@@ -165,10 +167,9 @@ class _Brush:
         self._rule = rule
         self._allocate = allocate
         self._lock = Lock()
+        self._scratch = local()
 
     def paint_tile(self, tile: tuple[slice, slice]) -> None:
-        import cv2
-
         sight = self._look(tile)
         self.painting.mask[tile] = sight.mask
         if not sight.summary[4]:
@@ -179,15 +180,17 @@ class _Brush:
             return
         footprint = footprint_of(self._view, sight)
         rgb, quality = self._canvas()
-        is_painted = np.equal(sight.mask, PAINTED).view(np.uint8)
         colours = sample(
             self._photo,
             sight,
             footprint,
             self._rule.resampling,
             is_filtered=self._rule.is_filtered,
+            into=rgb[tile],
         )
-        rgb[tile] = cv2.copyTo(colours, is_painted)
+        bare = np.flatnonzero(np.not_equal(sight.mask, PAINTED))
+        if bare.size:
+            colours[np.divmod(bare, sight.mask.shape[1])] = 0
         quality[tile] = sight.quality
         self.painting.footprints[tile[0].start, tile[1].start] = footprint
 
@@ -200,16 +203,11 @@ class _Brush:
             min(size, part.stop + reach) - start
             for size, part, start in zip(self._surface.frame.shape, tile, first, strict=True)
         )
-        sight = Sight(
-            u=np.zeros(shape, dtype=np.float32),
-            v=np.zeros(shape, dtype=np.float32),
-            mask=np.empty(shape, dtype=np.uint8),
-            quality=np.empty(shape, dtype=np.float32),
-            summary=np.empty(8),
-        )
+        sight = self._blank_sight(shape[0], shape[1])
         look_at_cells(self._view, self._surface.relief, self._buffer, sight, first[0], first[1])
-        if reach and sight.summary[4]:
-            is_near = _near_patches(sight.mask == OCCLUDED, self._rule.erosion_cells)
+        is_hidden = np.equal(sight.mask, OCCLUDED) if reach and sight.summary[4] else None
+        if is_hidden is not None and is_hidden.any():
+            is_near = _near_patches(is_hidden, self._rule.erosion_cells)
             is_near &= sight.mask == PAINTED
             sight.mask[is_near] = OCCLUDED
             sight.quality[is_near] = 0.0
@@ -217,7 +215,7 @@ class _Brush:
             slice(part.start - start, part.stop - start)
             for part, start in zip(tile, first, strict=True)
         )
-        # Twelve bits tell views apart well enough, and pack to half the size.
+        # Twenty bits tell views apart well enough, and pack to half the size.
         sight.quality.view(np.uint32)[...] &= np.uint32(0xFFFFF000)
         return Sight(
             u=sight.u[rows, columns],
@@ -226,6 +224,18 @@ class _Brush:
             quality=sight.quality[rows, columns],
             summary=sight.summary,
         )
+
+    def _blank_sight(self, rows: int, columns: int) -> Sight:
+        """Give arrays for a tile that this thread has used before: fresh memory takes time."""
+        if not hasattr(self._scratch, "floats"):
+            side = TILE_CELLS + 2 * (self._rule.erosion_cells + 1)
+            self._scratch.floats = np.empty((3, side * side), dtype=np.float32)
+            self._scratch.mask = np.empty(side * side, dtype=np.uint8)
+        u, v, quality = (
+            plane[: rows * columns].reshape(rows, columns) for plane in self._scratch.floats
+        )
+        mask = self._scratch.mask[: rows * columns].reshape(rows, columns)
+        return Sight(u=u, v=v, mask=mask, quality=quality, summary=np.empty(8))
 
     def _canvas(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         with self._lock:

@@ -73,6 +73,7 @@ def sample(
     resampling: Resampling,
     *,
     is_filtered: bool,
+    into: NDArray[np.uint8],
 ) -> NDArray[np.uint8]:
     """Colours (rows, cols, 3) of a tile's cells; those of cells that are not painted mean nothing.
 
@@ -82,6 +83,7 @@ def sample(
         footprint: how many pixels a cell covers.
         resampling: `nearest` gives the pixel's own colour and filters nothing.
         is_filtered: average over what a cell covers where the photo is finer than the wall.
+        into: (rows, cols, 3) where to write the colours, which are given back.
     """
     import cv2
 
@@ -89,7 +91,7 @@ def sample(
         crop, corner = _crop(photo, sight, reach=0)
         # Whole positions: the pixel that a place lies in, and nothing for OpenCV to round.
         u, v = np.floor(sight.u), np.floor(sight.v)
-        return _remapped(crop, u - corner[0], v - corner[1], resampling)
+        return _remapped(crop, u - corner[0], v - corner[1], resampling, into)
     sigmas = [
         0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if is_filtered else 0.0
         for pixels in (footprint.pixels_across, footprint.pixels_down)
@@ -107,7 +109,7 @@ def sample(
         crop = np.asarray(blurred, dtype=np.uint8)
     # OpenCV has (0, 0) at the centre of the first pixel.
     u, v = sight.u - (corner[0] + np.float32(0.5)), sight.v - (corner[1] + np.float32(0.5))
-    return _remapped(crop, u, v, resampling)
+    return _remapped(crop, u, v, resampling, into)
 
 
 def _remapped(
@@ -115,6 +117,7 @@ def _remapped(
     u: NDArray[np.float32],
     v: NDArray[np.float32],
     resampling: Resampling,
+    into: NDArray[np.uint8],
 ) -> NDArray[np.uint8]:
     import cv2
 
@@ -124,9 +127,8 @@ def _remapped(
         "cubic": cv2.INTER_CUBIC,
         "lanczos": cv2.INTER_LANCZOS4,
     }
-    return np.asarray(
-        cv2.remap(crop, u, v, flags[resampling], borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8
-    )
+    flag, border = flags[resampling], cv2.BORDER_REPLICATE
+    return np.asarray(cv2.remap(crop, u, v, flag, dst=into, borderMode=border), dtype=np.uint8)
 
 
 def _crop(

@@ -1,4 +1,4 @@
-"""`ortho.pointcloud-direct`: the topmost coloured point paints its cell (skarlatos2012)."""
+"""`ortho.pointcloud-direct`: the topmost coloured points paint their cells (skarlatos2012)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.ortho.gaps import Inpainting, fillable_gaps, inpainted
+from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, colours_of
 from orthoflow_plugins.ortho.previews import filling_preview
 
 
@@ -32,8 +33,8 @@ class PointcloudDirect(Method):
     """Paint each cell of a wall with the colour of the topmost point in it; fill small gaps.
 
     Of the points inside the wall's buffer the one with the largest depth wins, ties go to the
-    point nearer the centre of the cell, then to the lower index. Gaps are void cells with few void
-    cells around them; what is filled is marked as filled.
+    point nearer the centre of the cell, then to the lower index; `colouring` has other rules. Gaps
+    are void cells with few void cells around them; what is filled is marked as filled.
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
@@ -54,6 +55,21 @@ class PointcloudDirect(Method):
             default=(7, 23, 46),
             description="Most void cells in the 3x3, 5x5 and 7x7 windows around a void cell, "
             "itself and cells outside the image included, for it to be filled.",
+        )
+        colouring: Colouring = Field(
+            default="topmost",
+            description="Colour of a cell: of its topmost point; of the point nearest its centre "
+            "on the topmost surface; gaussian mean of that surface by distance to the centre; "
+            "median of its n_top highest points.",
+        )
+        layer_m: float = Field(
+            default=0.02,
+            gt=0,
+            description="Points so far below the topmost one lie on its surface (not with "
+            "topmost).",
+        )
+        n_top: int = Field(
+            default=5, ge=1, le=50, description="Points that the median takes at most."
         )
         inpaint: Inpainting = Field(
             default="telea", description="How gaps are filled: telea, navier-stokes, none."
@@ -77,13 +93,19 @@ class PointcloudDirect(Method):
         """Project the cloud onto each wall, then fill its gaps."""
         inputs.cloud.require_points(3)
         colours = _colours(inputs.cloud, ctx)
+        rule = ColourRule(
+            colouring=params.colouring,
+            layer_m=params.layer_m,
+            n_top=params.n_top,
+            threads=ctx.cores,
+        )
         layers: list[Layer] = []
         seconds = np.zeros(2)
         best_preview: tuple[int, bytes] | None = None
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
             started = time.perf_counter()
-            projection = _project(inputs, colours, wall, threads=ctx.cores)
+            projection = _project(inputs, colours, wall, rule)
             projected = time.perf_counter()
             layers.append(_filled(projection, wall, k, params))
             seconds += (projected - started, time.perf_counter() - projected)
@@ -113,22 +135,16 @@ def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
 
 
 def _project(
-    inputs: PointcloudDirect.In, colours: NDArray[np.uint8], wall: Wall, *, threads: int
+    inputs: PointcloudDirect.In, colours: NDArray[np.uint8], wall: Wall, rule: ColourRule
 ) -> _Projection:
-    from orthoflow.geometry.raster_kernels import NO_POINT
-    from orthoflow.geometry.rastering import topmost_points
-
-    cloud, walls = inputs.cloud, inputs.walls
+    walls = inputs.walls
     slab = Slab(frame=wall.frame, front_m=walls.buffer_front_m, behind_m=walls.buffer_behind_m)
-    winners = topmost_points(cloud, slab, threads=threads)
-    has_point = winners["point"] != NO_POINT
-    rgb = np.zeros((slab.n_cells, 3), dtype=np.uint8)
-    rgb[has_point] = colours[winners["point"][has_point]]
+    found = colours_of(inputs.cloud, colours, slab, rule)
     shape = wall.frame.shape
     return _Projection(
-        rgb=rgb.reshape(*shape, 3),
-        is_void=~has_point.reshape(shape),
-        distance_cells=np.sqrt(winners["square"]).reshape(shape),
+        rgb=found.rgb.reshape(*shape, 3),
+        is_void=~found.has_point.reshape(shape),
+        distance_cells=found.distance_cells.reshape(shape),
     )
 
 

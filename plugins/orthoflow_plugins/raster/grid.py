@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,15 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.raster.balancing import balanced
 from orthoflow_plugins.raster.previews import depth_preview
 from orthoflow_plugins.raster.rules import Surface, SurfaceRule
+from orthoflow_plugins.raster.scan_steps import scan_step_m
 from orthoflow_plugins.raster.selection import Constraint, WallChoice, chosen_planes, frame_of
 
 if TYPE_CHECKING:
@@ -56,8 +59,11 @@ class RasterGrid(Method):
         gsd_m: float = Field(
             default=0.005, gt=0, description="Side of a cell; not finer than the scan's step."
         )
-        buffer_m: float = Field(
-            default=0.15, gt=0, description="Points so far from the plane, on both sides, count."
+        buffer_m: float | None = Field(
+            default=None,
+            gt=0,
+            description="Points so far from the plane, on both sides, count; unset, three times "
+            "the tolerance with which the planes were found (markiewicz2015: 3 x 5 cm).",
         )
         buffer_front_m: float | None = Field(
             default=None, ge=0, description="Reach towards the viewer instead of buffer_m."
@@ -67,14 +73,29 @@ class RasterGrid(Method):
         )
         surface: Surface = Field(
             default="median",
-            description="Depth of a cell: median of its best supported layer; the point nearest "
-            "its centre (markiewicz2015); the topmost point (skarlatos2012); or the mean of all.",
+            description="Depth of a cell: median of its best supported layer; the same denoised, "
+            "with steps kept; of the nearest point, also of the next cells (markiewicz2015); of "
+            "its point nearest the centre; of the topmost point (skarlatos2012); mean of all; or "
+            "tin, a net of triangles, which closes windows (for comparison).",
+        )
+        denoise_cells: int = Field(
+            default=4, ge=0, le=20, description="Reach of the filter of surface denoised."
         )
         layer_m: float = Field(
             default=0.02,
             gt=0,
             description="Depth step within a cell that separates two layers, of which the median "
             "takes the one with more points.",
+        )
+        percentiles: tuple[Annotated[float, Field(ge=0, le=100)], ...] = Field(
+            default=(),
+            max_length=9,
+            description="Percentiles of the depths of a cell's points, rasters of their own.",
+        )
+        balance_intensity: bool = Field(
+            default=False,
+            description="Take out of the intensity what range, incidence and the scan itself "
+            "change, told from where scans overlap.",
         )
         recover_gap_cells: int = Field(
             default=2,
@@ -120,12 +141,14 @@ class RasterGrid(Method):
         cloud.require_points(3)
         slabs = _slabs(planes, params)
         rasters: list[_Raster] = []
+        source = _intensity_source(cloud)
+        if params.balance_intensity:
+            cloud = balanced(cloud, list(slabs.values()), ctx)
         for k, (index, slab) in enumerate(slabs.items()):
             ctx.progress(k / len(slabs), planes.names[index])
             rasters.append(_raster(cloud, slab, params, threads=ctx.cores, plane=(planes, index)))
         walls = tuple(raster.wall for raster in rasters)
-        _require_points_near(walls, params)
-        source = _intensity_source(cloud)
+        _require_points_near(walls, next(iter(slabs.values())))
         _warn(ctx, params, rasters, source)
         _report(ctx, params, rasters)
         slab = next(iter(slabs.values()))
@@ -139,6 +162,7 @@ class RasterGrid(Method):
                 details={
                     "surface": params.surface,
                     "scan_step_m": [raster.scan_step_m for raster in rasters],
+                    "percentiles": list(params.percentiles),
                 },
             )
         )
@@ -150,8 +174,9 @@ def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
     Raises:
         MethodError: the rasters would not fit into memory.
     """
-    front = params.buffer_m if params.buffer_front_m is None else params.buffer_front_m
-    behind = params.buffer_m if params.buffer_behind_m is None else params.buffer_behind_m
+    both = 3.0 * planes.tolerance_m if params.buffer_m is None else params.buffer_m
+    front = both if params.buffer_front_m is None else params.buffer_front_m
+    behind = both if params.buffer_behind_m is None else params.buffer_behind_m
     choice = WallChoice(
         constraint=params.constraint,
         min_area_m2=params.min_area_m2,
@@ -197,11 +222,19 @@ def _raster(
     from orthoflow.geometry.rastering import lenders_in_gaps
     from orthoflow_plugins.raster.surfaces import surface_of
 
-    rule = SurfaceRule(surface=params.surface, layer_m=params.layer_m, threads=threads)
+    rule = SurfaceRule(
+        surface=params.surface,
+        layer_m=params.layer_m,
+        denoise_cells=params.denoise_cells,
+        percentiles=params.percentiles,
+        threads=threads,
+    )
     surface = surface_of(cloud, slab, rule)
-    mask = np.where(surface.count > 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8)
+    is_known = np.isfinite(surface.depth_m)
+    mask = np.where(surface.count > 0, SurfaceMask.MEASURED, SurfaceMask.RECOVERED).astype(np.uint8)
+    mask[~is_known] = SurfaceMask.VOID
     lent = lenders_in_gaps(
-        surface.count.reshape(slab.frame.shape) > 0, params.recover_gap_cells, threads=threads
+        is_known.reshape(slab.frame.shape), params.recover_gap_cells, threads=threads
     )
     _recover(surface, mask, lent)
     planes, index = plane
@@ -218,6 +251,9 @@ def _raster(
         intensity=None if intensity is None else intensity.reshape(shape),
         rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
         rgb_mask=None if surface.rgb is None else (mask > 0).astype(np.uint8).reshape(shape),
+        percentiles_m=None
+        if surface.percentiles_m is None
+        else surface.percentiles_m.reshape(*shape, -1),
     )
     return _Raster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=params.gsd_m))
 
@@ -239,38 +275,12 @@ def _grey(rgb: NDArray[np.uint8] | None, mask: NDArray[np.uint8]) -> NDArray[np.
     return grey.astype(np.float32)
 
 
-def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
-    """Distance between neighbouring points on the wall, estimated from the points per cell.
-
-    Cells are joined, 2 x 2, until a block that holds points holds at least four on average: from
-    then on chance hardly leaves a block of scanned surface empty, so that the blocks show the
-    scanned area.
-
-    Args:
-        count: (rows, cols) points per cell.
-        gsd_m: side of a cell in metres.
-
-    Returns:
-        Side of the square that each point has for itself, metres; 0 without points.
-    """
-    blocks, side_m = count.astype(np.int64), gsd_m
-    while blocks.any():
-        per_block = blocks.sum() / np.count_nonzero(blocks)
-        if per_block >= 4.0 or blocks.size == 1:
-            return float(side_m / np.sqrt(per_block))
-        rows, columns = blocks.shape
-        even = np.pad(blocks, ((0, rows % 2), (0, columns % 2)))
-        blocks = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
-        side_m *= 2.0
-    return 0.0
-
-
-def _require_points_near(walls: tuple[Wall, ...], params: RasterGrid.Params) -> None:
+def _require_points_near(walls: tuple[Wall, ...], slab: Slab) -> None:
     if not any(wall.count.any() for wall in walls):
         raise MethodError(
             f"no point of the cloud lies inside the rectangle and the buffer of a wall "
-            f"(buffer_m = {params.buffer_m:g}): the planes do not belong to this cloud, or the "
-            "buffer is too small"
+            f"({slab.front_m:g} m in front, {slab.behind_m:g} m behind): the planes do not belong "
+            "to this cloud, or buffer_m is too small"
         )
 
 
@@ -307,6 +317,8 @@ def _report(ctx: StepContext, params: RasterGrid.Params, rasters: list[_Raster])
     ctx.metric("points_per_cell", float(np.median(per_cell)), "1")
     ctx.metric("scan_step_mm", 1000.0 * rasters[0].scan_step_m, "mm")
     ctx.metric("gsd_mm", 1000.0 * params.gsd_m, "mm")
+    noise_m = depth_noise_m(walls[0].depth_m)
+    ctx.metric("depth_noise_mm", 1000.0 * noise_m, "mm")
     if spread_m.size:
         ctx.metric("sigma_median_mm", 1000.0 * float(np.median(spread_m)), "mm")
     for state in SurfaceMask:

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import raster_kernels as kernels
-from orthoflow.geometry.raster_kernels import NO_POINT
+from orthoflow.geometry.point_kernels import read_only
+from orthoflow.geometry.raster_kernels import Entries
 from orthoflow.geometry.rastering import (
     empty_winners,
     entries_inside,
     in_parts,
     share_cells,
     spread_m,
+    wall_from_offset,
 )
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
+from orthoflow_plugins.raster.denoising import denoised
 from orthoflow_plugins.raster.rules import SurfaceRule
 
 
@@ -32,6 +36,7 @@ class CellSurface:
         count: uint32.
         intensity: float32, NaN where void, or None.
         rgb: (cells, 3) uint8, 0 where void, or None.
+        percentiles_m: (cells, k) float32, NaN in cells without points, or None.
     """
 
     depth_m: NDArray[np.float32]
@@ -39,34 +44,81 @@ class CellSurface:
     count: NDArray[np.uint32]
     intensity: NDArray[np.float32] | None
     rgb: NDArray[np.uint8] | None
+    percentiles_m: NDArray[np.float32] | None = None
 
 
 def surface_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """Lay a cloud into the raster of a wall."""
-    if rule.surface in {"nearest", "topmost"}:
-        return _surface_of_winners(cloud, slab, rule)
-    return _surface_of_all(cloud, slab, rule)
+    if rule.surface in {"nearest", "centre", "topmost", "tin"}:
+        surface = _surface_of_winners(cloud, slab, rule)
+    else:
+        surface = _surface_of_all(cloud, slab, rule)
+    if not rule.percentiles:
+        return surface
+    return replace(surface, percentiles_m=_percentiles_m(cloud, slab, surface.count, rule))
 
 
 def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """One pass: the winning point gives depth, intensity and colour."""
     winners, moments = empty_winners(slab.n_cells), np.zeros((slab.n_cells, 2))
-    keep = kernels.keep_topmost if rule.surface == "topmost" else kernels.keep_nearest
     for entries in entries_inside(cloud, slab, threads=rule.threads):
         share_cells(
             rule.threads,
-            partial(keep, entries, winners),
+            _contest(cloud, slab, rule, entries, winners),
             partial(kernels.add_moments, entries, moments),
         )
     sigma_m = spread_m(winners["n_points"], moments)
-    has_point = winners["point"] != NO_POINT
+    # A nearest neighbour may lie in the next cell; a cell without a point of its own stays void.
+    has_point = winners["n_points"] > 0
     points = winners["point"][has_point]
-    return CellSurface(
+    surface = CellSurface(
         depth_m=np.where(has_point, winners["depth_m"], np.float32(np.nan)),
         sigma_m=sigma_m,
         count=winners["n_points"].copy(),
         intensity=_gathered_intensity(cloud, points, has_point),
         rgb=_gathered_rgb(cloud, points, has_point),
+    )
+    return _triangulated(cloud, slab, points, surface) if rule.surface == "tin" else surface
+
+
+def _contest(
+    cloud: PointCloud, slab: Slab, rule: SurfaceRule, entries: Entries, winners: NDArray[np.void]
+) -> Callable[[int, int], None]:
+    if rule.surface == "topmost":
+        return partial(kernels.keep_topmost, entries, winners)
+    if rule.surface == "nearest":
+        return partial(
+            kernels.keep_nearest_around,
+            entries,
+            read_only(cloud.x, cloud.y, cloud.z),
+            wall_from_offset(slab.frame, cloud.origin),
+            winners,
+            slab.frame.width,
+        )
+    return partial(kernels.keep_nearest, entries, winners)
+
+
+def _triangulated(
+    cloud: PointCloud, slab: Slab, points: NDArray[np.uint32], surface: CellSurface
+) -> CellSurface:
+    """Replace a surface by the net through the points nearest to the centres of their cells."""
+    from orthoflow_plugins.raster.triangulating import interpolated
+
+    offsets = np.stack([values[points] for values in (cloud.x, cloud.y, cloud.z)])
+    matrix = wall_from_offset(slab.frame, cloud.origin)
+    places = (matrix[:2, :3] @ offsets.astype(np.float64)).T + matrix[:2, 3]
+    measured = np.flatnonzero(surface.count)
+    channels: list[NDArray[np.generic]] = [surface.depth_m[measured, np.newaxis]]
+    if surface.intensity is not None:
+        channels.append(surface.intensity[measured, np.newaxis])
+    if surface.rgb is not None:
+        channels.append(surface.rgb[measured])
+    found = interpolated(places, channels, slab.frame.shape)
+    return replace(
+        surface,
+        depth_m=np.ascontiguousarray(found[0][:, 0]),
+        intensity=None if surface.intensity is None else np.ascontiguousarray(found[1][:, 0]),
+        rgb=None if surface.rgb is None else np.rint(np.nan_to_num(found[-1])).astype(np.uint8),
     )
 
 
@@ -102,9 +154,11 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
     with np.errstate(invalid="ignore"):
         depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
     sigma_m = spread_m(count, moments)
-    if rule.surface == "median":
+    if rule.surface != "mean":
         layer_m = rule.layer_m
         depth_m = _medians_m(cloud, slab, count, rule)
+    if rule.surface == "denoised":
+        depth_m = denoised(depth_m.reshape(slab.frame.shape), rule.denoise_cells).ravel()
     intensity, rgb = _averaged_values(cloud, slab, depth_m, layer_m=layer_m, threads=rule.threads)
     return CellSurface(
         depth_m=depth_m,
@@ -115,21 +169,54 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
     )
 
 
+def _grouped_m(
+    cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], *, threads: int
+) -> NDArray[np.float32]:
+    """The depths of all points inside, those of a cell beside each other, cell after cell."""
+    ends = np.cumsum(count, dtype=np.int64)
+    cursors = ends - count
+    grouped_m = np.empty(int(ends[-1]), dtype=np.float32)
+    for entries in entries_inside(cloud, slab, threads=threads):
+        share_cells(threads, partial(kernels.sort_into_cells, entries, cursors, grouped_m))
+    return grouped_m
+
+
 def _medians_m(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], rule: SurfaceRule
 ) -> NDArray[np.float32]:
+    grouped_m = _grouped_m(cloud, slab, count, threads=rule.threads)
+    return _sorted_medians_m(grouped_m, count, rule)
+
+
+def _sorted_medians_m(
+    grouped_m: NDArray[np.float32], count: NDArray[np.uint32], rule: SurfaceRule
+) -> NDArray[np.float32]:
+    """Medians of the cells' best supported layers; sorts the depths of each cell in place."""
+    medians_m = np.empty(count.size, dtype=np.float32)
     ends = np.cumsum(count, dtype=np.int64)
-    cursors = ends - count
-    sorted_m = np.empty(int(ends[-1]), dtype=np.float32)
-    for entries in entries_inside(cloud, slab, threads=rule.threads):
-        share_cells(rule.threads, partial(kernels.sort_into_cells, entries, cursors, sorted_m))
-    medians_m = np.empty(slab.n_cells, dtype=np.float32)
-    in_parts(
-        slab.n_cells,
-        rule.threads,
-        partial(kernels.median_depths, ends, sorted_m, rule.layer_m, medians_m),
-    )
+    task = partial(kernels.median_depths, ends, grouped_m, rule.layer_m, medians_m)
+    in_parts(count.size, rule.threads, task)
     return medians_m
+
+
+def _percentiles_m(
+    cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], rule: SurfaceRule
+) -> NDArray[np.float32]:
+    """Percentiles (cells, k) of all points of a cell, linear between two of them as numpy's."""
+    grouped_m = _grouped_m(cloud, slab, count, threads=rule.threads)
+    _sorted_medians_m(grouped_m, count, rule)
+    measured = np.flatnonzero(count)
+    n_points = count[measured].astype(np.int64)
+    first = (np.cumsum(count, dtype=np.int64) - count)[measured]
+    percentiles_m = np.full((count.size, len(rule.percentiles)), np.nan, dtype=np.float32)
+    for k, percent in enumerate(rule.percentiles):
+        place = (n_points - 1) * (percent / 100.0)
+        lower = np.floor(place).astype(np.int64)
+        upper = np.minimum(lower + 1, n_points - 1)
+        share = place - lower
+        low_m, high_m = grouped_m[first + lower], grouped_m[first + upper]
+        percentiles_m[measured, k] = low_m + share * (high_m - low_m)
+    return percentiles_m
 
 
 def _averaged_values(

@@ -1,0 +1,314 @@
+"""`ortho.dsm-forward`: every pixel of a photo is thrown onto the wall that it shows."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import MethodError
+from orthoflow.products import Cameras, Layer, LayerMask, Layers, Photos, PointCloud, Walls
+from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.ortho.oriented_photos import (
+    UNSEEN_WALLS,
+    bare_layer,
+    oriented_photos,
+    pixels_of,
+    shared_profile,
+)
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.cameras import ViewingCamera
+    from orthoflow.geometry.visibility_kernels import DepthBuffer, Relief
+    from orthoflow_plugins.ortho.dsm_backward_painting import Surface
+
+
+class DsmForward(Method):
+    """Follow the ray of each pixel to where it first meets the surface, and paint that cell.
+
+    Pixels that meet the same cell compete, the one that meets it nearest to the centre wins and
+    is painted untouched: nothing is interpolated. What stands before the slab of the raster hides
+    the wall as in `ortho.dsm-backward`. A photo that is coarser than the wall leaves cells between
+    its pixels; narrow gaps take the colour of the nearest painted cell and are marked as filled.
+    """
+
+    id: ClassVar[str] = "ortho.dsm-forward"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "exact"
+    citations: ClassVar[tuple[str, ...]] = (
+        "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7",
+    )
+
+    class Params(MethodParams):
+        """When a pixel counts, and which gaps between pixels are filled."""
+
+        incidence_max_deg: float = Field(
+            default=80.0, gt=0, lt=90, description="Pixels that look more obliquely do not paint."
+        )
+        fill_gap_cells: int = Field(
+            default=1,
+            ge=0,
+            le=20,
+            description="Cells that no pixel met are filled where no disc of this radius fits into "
+            "the gap; 0 fills nothing.",
+        )
+        tolerance_sigma: float = Field(
+            default=3.0,
+            ge=0,
+            description="A depth step counts as an edge above so many standard deviations of depth "
+            "and tolerance_cells.",
+        )
+        tolerance_cells: float = Field(
+            default=0.5, ge=0, description="The same in cells, for what the raster cannot hold."
+        )
+        occluder_points_min: int = Field(
+            default=6,
+            ge=1,
+            description="Points of the cloud with fewer about them, themselves included, are "
+            "outliers and hide nothing.",
+        )
+        border_share: float = Field(
+            default=0.05,
+            ge=0,
+            le=0.5,
+            description="Quality falls to 0 over this share of a photo's shorter side.",
+        )
+
+    class In(Ports):
+        """The walls, the cloud they were made from, and the oriented photos."""
+
+        walls: Walls
+        photos: Photos
+        cameras: Cameras
+        cloud: PointCloud | None = None
+
+    class Out(Ports):
+        """A layer for each wall and photo that paints on it."""
+
+        layers: Layers
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Take photo by photo, and throw each onto every wall it sees."""
+        from orthoflow_plugins.ortho.dsm_backward_occluders import (
+            depth_buffer,
+            find_occluders,
+            nothing_in_the_way,
+        )
+
+        oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
+        viewers = [camera.viewing() for _, camera in oriented]
+        seconds: defaultdict[str, float] = defaultdict(float)
+        started = time.perf_counter()
+        occluders = None
+        if inputs.cloud is None:
+            ctx.warn(
+                "no cloud is wired to ortho.dsm-forward: things that stand free before a wall "
+                "hide nothing, and photos paint them onto it"
+            )
+        else:
+            inputs.cloud.require_points(3)
+            occluders = find_occluders(
+                inputs.cloud,
+                inputs.walls,
+                viewers,
+                n_least=params.occluder_points_min,
+                threads=ctx.cores,
+            )
+        seconds["occluders_s"] = time.perf_counter() - started
+        surfaces = _surfaces(inputs.walls, params)
+        layers: list[Layer] = []
+        for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
+            ctx.progress(place / len(oriented), photo.name)
+            pixels = pixels_of(photo, camera)
+            started = time.perf_counter()
+            buffer = (
+                nothing_in_the_way(viewer) if occluders is None else depth_buffer(occluders, viewer)
+            )
+            looked = time.perf_counter()
+            painted = []
+            for index, surface in enumerate(surfaces):
+                layer = _layer(
+                    (index, photo.name), pixels, viewer, surface, buffer, params, threads=ctx.cores
+                )
+                if layer is not None:
+                    layers.append(layer)
+                    painted.append(inputs.walls.walls[index].name)
+            seconds["occluders_s"] += looked - started
+            seconds["painting_s"] += time.perf_counter() - looked
+            ctx.log(f"{photo.name}: paints {', '.join(painted) or 'no wall'}")
+        names = tuple(wall.name for wall in inputs.walls.walls)
+        profile = shared_profile([photo for photo, _ in oriented], ctx)
+        finished = _finished(layers, surfaces, names, ctx, seconds)
+        return self.Out(layers=replace(finished, icc_profile=profile))
+
+
+def _surfaces(walls: Walls, params: DsmForward.Params) -> list[Surface]:
+    from orthoflow.geometry.depth_noise import depth_noise_m
+    from orthoflow_plugins.ortho.dsm_backward_painting import Surface
+    from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of
+
+    return [
+        Surface(
+            frame=wall.frame,
+            relief=relief_of(wall),
+            front_m=walls.buffer_front_m,
+            tolerance_m=params.tolerance_sigma * depth_noise_m(wall.depth_m)
+            + params.tolerance_cells * wall.frame.gsd_m,
+        )
+        for wall in walls.walls
+    ]
+
+
+def _layer(
+    label: tuple[int, str],
+    pixels: NDArray[np.uint8],
+    viewer: ViewingCamera,
+    surface: Surface,
+    buffer: DepthBuffer,
+    params: DsmForward.Params,
+    *,
+    threads: int,
+) -> Layer | None:
+    """Throw a photo onto one wall; None where no pixel meets it."""
+    from orthoflow.geometry.forward_kernels import NO_PIXEL, Catch, throw_pixels
+    from orthoflow.geometry.rastering import lenders_in_gaps
+    from orthoflow_plugins.ortho.dsm_backward_painting import SightRule, view_of
+
+    rule = SightRule(
+        resampling="nearest",
+        is_filtered=False,
+        incidence_max_deg=params.incidence_max_deg,
+        erosion_cells=0,
+        border_share=params.border_share,
+    )
+    view = view_of(viewer, surface, rule)
+    if view.height_m <= float(surface.relief.bottoms.min()):
+        return None
+    shape = surface.frame.shape
+    catch = Catch(
+        pixel=np.full(shape, NO_PIXEL, dtype=np.int32),
+        square=np.full(shape, np.inf, dtype=np.float32),
+    )
+    relief: Relief = surface.relief
+    if not throw_pixels(view, relief, buffer, _ray_lattice(viewer, surface), catch):
+        return None
+    is_painted = catch.pixel != NO_PIXEL
+    seen, quality = _worth(viewer, surface, border_px=view.border_px)
+    lent = lenders_in_gaps(is_painted, params.fill_gap_cells, threads=threads)
+    is_gap = ~np.isnan(relief.depth.ravel()[lent[:, 0]]) & seen.ravel()[lent[:, 0]]
+    gaps, lenders = lent[is_gap].T
+    taken = np.maximum(catch.pixel, 0).ravel()
+    taken[gaps] = taken[lenders]
+    filled = np.zeros(shape, dtype=np.uint8)
+    filled.ravel()[gaps] = 1
+    is_shown = is_painted | (filled > 0)
+    rgb = pixels.reshape(-1, 3)[taken].reshape(*shape, 3)
+    rgb[~is_shown] = 0
+    mask = np.where(seen, LayerMask.OCCLUDED, LayerMask.OUTSIDE)
+    mask[np.isnan(relief.depth)] = LayerMask.NO_SURFACE
+    mask[is_shown] = LayerMask.PAINTED
+    return Layer(
+        frame=surface.frame,
+        wall=label[0],
+        source=label[1],
+        rgb=rgb,
+        mask=mask.astype(np.uint8),
+        quality=np.where(is_shown, quality, np.float32(0.0)),
+        filled=filled,
+    )
+
+
+def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
+    """Rays (n, m, 3) of every sixteenth pixel: columns, rows, metres of height per metre."""
+    from orthoflow.geometry.forward_kernels import RAY_STEP_PX
+
+    frame = surface.frame
+    counts = (viewer.height // RAY_STEP_PX + 2, viewer.width // RAY_STEP_PX + 2)
+    rows, columns = np.indices(counts) * float(RAY_STEP_PX)
+    # The last row and column lie outside the image, where a lens model may fold back.
+    places = np.column_stack(
+        [np.minimum(columns.ravel(), viewer.width), np.minimum(rows.ravel(), viewer.height)]
+    )
+    axes = np.column_stack(
+        [frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world]
+    )
+    rays = (viewer.rays_camera(places) @ viewer.rotation @ axes).reshape(*counts, 3)
+    return np.ascontiguousarray(_stretched(_stretched(rays, viewer.height, 0), viewer.width, 1))
+
+
+def _stretched(rays: NDArray[np.float64], size_px: int, axis: int) -> NDArray[np.float64]:
+    """Move the rays at the image's border on to where the lattice has its last place."""
+    from orthoflow.geometry.forward_kernels import RAY_STEP_PX
+
+    moved = np.moveaxis(rays.copy(), axis, 0)
+    border = size_px / RAY_STEP_PX
+    whole = int(np.ceil(border))
+    inner = whole - 1
+    moved[whole] = moved[inner] + (moved[whole] - moved[inner]) / (border - inner)
+    moved[whole + 1 :] = moved[whole]
+    return np.moveaxis(moved, 0, axis)
+
+
+def _worth(
+    viewer: ViewingCamera, surface: Surface, *, border_px: float
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """Which cells lie in the photo, and how many of its pixels each covers."""
+    frame, depth = surface.frame, surface.relief.depth
+    seen = np.zeros(frame.shape, dtype=np.bool_)
+    quality = np.zeros(frame.shape, dtype=np.float32)
+    columns = np.arange(frame.width) + 0.5
+    area_px = viewer.fx * viewer.fy * frame.gsd_m**2
+    for row in range(frame.height):
+        places = np.column_stack([columns, np.full(frame.width, row + 0.5)])
+        points = frame.world_from_wall(places, depth[row].astype(np.float64))
+        u, v, distance = viewer.project(points).T
+        towards = viewer.centre_world - points
+        with np.errstate(invalid="ignore"):
+            cosine = towards @ frame.normal_world / np.linalg.norm(towards, axis=1)
+            seen[row] = (u >= 0) & (u < viewer.width) & (v >= 0) & (v < viewer.height)
+            border = np.minimum(np.minimum(u, viewer.width - u), np.minimum(v, viewer.height - v))
+            worth = cosine * area_px / distance**2 * np.clip(border / border_px, 0.0, 1.0)
+        quality[row] = np.where(seen[row], np.nan_to_num(worth), 0.0)
+    return seen, np.maximum(quality, 0.0)
+
+
+def _finished(
+    layers: list[Layer],
+    surfaces: list[Surface],
+    names: tuple[str, ...],
+    ctx: StepContext,
+    seconds: dict[str, float],
+) -> Layers:
+    """Order the layers by wall, add an empty one for each wall that nothing paints, and report.
+
+    Raises:
+        MethodError: no photo paints any wall.
+    """
+    if not layers:
+        raise MethodError(UNSEEN_WALLS)
+    ctx.metric("n_layers", len(layers), "1")
+    n_surface = n_painted = n_filled = 0
+    complete = list(layers)
+    for index, surface in enumerate(surfaces):
+        own = [layer for layer in layers if layer.wall == index]
+        n_surface += int(np.count_nonzero(~np.isnan(surface.relief.depth)))
+        if not own:
+            ctx.warn(f"no photo shows {names[index]}: the orthoimage stays empty")
+            complete.append(bare_layer(surface.frame, index, surface.relief.depth))
+            continue
+        n_painted += int(np.count_nonzero(sum(layer.mask == LayerMask.PAINTED for layer in own)))
+        n_filled += sum(
+            int(np.count_nonzero(layer.filled)) for layer in own if layer.filled is not None
+        )
+    n_shown = sum(int(np.count_nonzero(layer.mask == LayerMask.PAINTED)) for layer in layers)
+    ctx.metric("painted_share", n_painted / max(1, n_surface), "1")
+    ctx.metric("filled_share", n_filled / max(1, n_shown), "1")
+    for name, value in seconds.items():
+        ctx.metric(name, value, "s")
+    complete.sort(key=lambda layer: layer.wall)
+    return Layers(layers=tuple(complete), names=names)

@@ -1,0 +1,186 @@
+"""The colour of a cell from the points that lie on its topmost surface.
+
+skarlatos2012 takes the topmost point and proposes for the future to weigh points by their distance
+to the centre of the cell; the other rules are that proposal, and two that average.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import PointCloud
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.raster_kernels import Entries
+
+Colouring = Literal["topmost", "centre", "gaussian", "median"]
+
+# Standard deviation of the Gauss in cells: a point in the corner of its cell counts a seventh.
+_SIGMA_CELLS: Final = 0.36
+_NO_COLOUR: Final = 999
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColourRule:
+    """How a cell is coloured by its points.
+
+    Attributes:
+        colouring: `topmost` point; the one nearest the `centre` on the topmost surface; `gaussian`
+            weighted mean of that surface; `median` of its highest points.
+        layer_m: points so far below the topmost one still lie on its surface.
+        n_top: how many points the median takes at most.
+        threads: how many threads work.
+    """
+
+    colouring: Colouring
+    layer_m: float
+    n_top: int
+    threads: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellColours:
+    """Colours of the cells of a wall, flat.
+
+    Attributes:
+        rgb: (cells, 3) uint8, 0 where void.
+        has_point: (cells,).
+        distance_cells: (cells,) from the centre to the point that stands for the cell: the
+            coloured one, or the topmost one of those averaged; infinite where void.
+    """
+
+    rgb: NDArray[np.uint8]
+    has_point: NDArray[np.bool_]
+    distance_cells: NDArray[np.float32]
+
+
+def colours_of(
+    cloud: PointCloud, values: NDArray[np.uint8], slab: Slab, rule: ColourRule
+) -> CellColours:
+    """Colour the cells of a wall.
+
+    Args:
+        cloud: the points.
+        values: (n, 3) colours, or (n, 1) greys, of the points.
+        slab: the wall, and which points count.
+        rule: how.
+    """
+    from orthoflow.geometry.raster_kernels import NO_POINT
+    from orthoflow.geometry.rastering import topmost_points
+
+    winners = topmost_points(cloud, slab, threads=rule.threads)
+    has_point = winners["point"] != NO_POINT
+    floors_m = winners["depth_m"] - np.float32(rule.layer_m)
+    if rule.colouring == "centre":
+        winners = _most_central(cloud, slab, floors_m, threads=rule.threads)
+    rgb = np.zeros((slab.n_cells, 3), dtype=np.uint8)
+    if rule.colouring == "gaussian":
+        rgb[has_point] = _weighted_means(cloud, values, slab, floors_m, rule)[has_point]
+    elif rule.colouring == "median":
+        _lay_medians(rgb, cloud, values, slab, floors_m, rule)
+    else:
+        rgb[has_point] = values[winners["point"][has_point]]
+    return CellColours(rgb=rgb, has_point=has_point, distance_cells=np.sqrt(winners["square"]))
+
+
+def _most_central(
+    cloud: PointCloud, slab: Slab, floors_m: NDArray[np.float32], *, threads: int
+) -> NDArray[np.void]:
+    """The points on the topmost surface that lie nearest to the centres of their cells."""
+    from orthoflow.geometry.raster_kernels import keep_nearest
+    from orthoflow.geometry.rastering import empty_winners, entries_inside, share_cells
+
+    winners = empty_winners(slab.n_cells)
+    for entries in entries_inside(cloud, slab, threads=threads):
+        slots = _slots(entries)
+        is_below = entries.depths_m[slots] < floors_m[entries.cells[slots]]
+        entries.squares[slots[is_below]] = np.inf
+        share_cells(threads, partial(keep_nearest, entries, winners))
+    return winners
+
+
+@dataclass(frozen=True)
+class _TopPoints:
+    """Points of one chunk on the topmost surface of their cells, all (n,)."""
+
+    cells: NDArray[np.int32]
+    depths_m: NDArray[np.float32]
+    squares: NDArray[np.float32]
+    points: NDArray[np.uint32]
+
+
+def _on_top(
+    cloud: PointCloud, slab: Slab, floors_m: NDArray[np.float32], *, threads: int
+) -> Iterator[_TopPoints]:
+    from orthoflow.geometry.rastering import entries_inside
+
+    for entries in entries_inside(cloud, slab, threads=threads):
+        slots = _slots(entries)
+        slots = slots[entries.depths_m[slots] >= floors_m[entries.cells[slots]]]
+        yield _TopPoints(
+            entries.cells[slots],
+            entries.depths_m[slots],
+            entries.squares[slots],
+            entries.points[slots],
+        )
+
+
+def _slots(entries: Entries) -> NDArray[np.int64]:
+    """Slots of a chunk that hold a point."""
+    from orthoflow.geometry.raster_kernels import BLOCK
+
+    is_used = np.arange(BLOCK) < entries.n_inside[:, np.newaxis]
+    return np.flatnonzero(is_used)
+
+
+def _weighted_means(
+    cloud: PointCloud,
+    values: NDArray[np.uint8],
+    slab: Slab,
+    floors_m: NDArray[np.float32],
+    rule: ColourRule,
+) -> NDArray[np.uint8]:
+    totals = np.zeros((slab.n_cells, values.shape[1] + 1))
+    for top in _on_top(cloud, slab, floors_m, threads=rule.threads):
+        weights = np.exp(top.squares.astype(np.float64) / (-2.0 * _SIGMA_CELLS**2))
+        np.add.at(totals[:, -1], top.cells, weights)
+        for channel in range(values.shape[1]):
+            shades = weights * values[top.points, channel]
+            np.add.at(totals[:, channel], top.cells, shades)
+    means = totals[:, :-1] / np.maximum(totals[:, -1:], 1e-300)
+    return np.asarray(np.rint(means), dtype=np.uint8)
+
+
+def _lay_medians(
+    rgb: NDArray[np.uint8],
+    cloud: PointCloud,
+    values: NDArray[np.uint8],
+    slab: Slab,
+    floors_m: NDArray[np.float32],
+    rule: ColourRule,
+) -> None:
+    """Write the median colour, channel by channel, of each cell's highest points into `rgb`."""
+    chunks = list(_on_top(cloud, slab, floors_m, threads=rule.threads))
+    cells = np.concatenate([chunk.cells for chunk in chunks])
+    depths_m = np.concatenate([chunk.depths_m for chunk in chunks])
+    points = np.concatenate([chunk.points for chunk in chunks])
+    order = np.lexsort((points, -depths_m, cells))
+    cells, points = cells[order], points[order]
+    is_first = np.append(True, cells[1:] != cells[:-1])
+    first = np.flatnonzero(is_first)
+    sizes = np.minimum(np.diff(np.append(first, cells.size)), rule.n_top)
+    shades = np.full((first.size, rule.n_top, values.shape[1]), _NO_COLOUR, dtype=np.int16)
+    for rank in range(rule.n_top):
+        has_rank = sizes > rank
+        shades[has_rank, rank] = values[points[first[has_rank] + rank]]
+    shades.sort(axis=1)
+    rows = np.arange(first.size)
+    twice = shades[rows, (sizes - 1) // 2] + shades[rows, sizes // 2]
+    rgb[cells[first]] = (twice + 1) // 2

@@ -1,0 +1,166 @@
+"""Intensities of several scans brought to one scale, told from where the scans overlap.
+
+What a scanner calls intensity falls with range and incidence, and each scan may have a scale of its
+own. At a place that two scans show, the surface is the same: the ratio of their intensities tells
+the three apart, whatever the texture is. On a single wall range and incidence go together (cosine
+times range is how far the station is from the plane), so that only their joint effect is known,
+which is all that this wall needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import PointCloud
+from orthoflow.sdk import StepContext
+
+# Places are squares of this side: many points of each scan, and still one colour mostly.
+_PLACE_M: Final = 0.05
+_POINTS_MOST: Final = 2_000_000
+_PLACES_LEAST: Final = 20
+_COSINE_LEAST: Final = 0.05
+# At this range and square on, the first scan keeps its intensities.
+_RANGE_M: Final = 3.0
+_DARKEST: Final = 1.0e-4
+# Rounds of weights by the L1 norm, and where a residual of log intensity stops to gain weight.
+_ROUNDS: Final = 20
+_FLOOR: Final = 0.01
+_CHUNK: Final = 1 << 21
+
+
+@dataclass(frozen=True)
+class _Trend:
+    """log intensity = scale of the scan + range * log(metres) + incidence * log(cosine) + texture.
+
+    Attributes:
+        scales: (scans,) of which the first is 0.
+        range_power: how intensity changes with range.
+        cosine_power: how it changes with the cosine of incidence.
+    """
+
+    scales: NDArray[np.float64]
+    range_power: float
+    cosine_power: float
+
+
+def balanced(cloud: PointCloud, slabs: list[Slab], ctx: StepContext) -> PointCloud:
+    """Give the cloud with intensities as if all scans had been taken alike.
+
+    Points on a wall are corrected by the incidence on it, all others are left as they are. Where
+    no two scans overlap the cloud stays as it is, and that is said.
+    """
+    if cloud.intensity is None or cloud.scan is None or cloud.stations is None:
+        ctx.warn("intensities stay as they are: balancing takes scans with known stations")
+        return cloud
+    samples = [_places(cloud, slab) for slab in slabs]
+    table = np.vstack(samples)
+    n_scans = len(cloud.stations)
+    trend = _trend(table, n_scans)
+    if trend is None:
+        ctx.warn("intensities stay as they are: no two scans overlap on the walls")
+        return cloud
+    ctx.metric("intensity_range_power", trend.range_power, "1")
+    ctx.metric("intensity_cosine_power", trend.cosine_power, "1")
+    ctx.metric("intensity_scale_spread", float(np.ptp(np.exp(trend.scales))), "1")
+    intensity = np.array(cloud.intensity, dtype=np.float32)
+    for slab in slabs:
+        for first in range(0, len(cloud), _CHUNK):
+            looks = _looks(cloud, slab, np.arange(first, min(first + _CHUNK, len(cloud))))
+            inside = looks.points
+            change = (
+                trend.scales[looks.scan]
+                + trend.range_power * np.log(looks.range_m / _RANGE_M)
+                + trend.cosine_power * np.log(looks.cosine)
+            )
+            intensity[inside] = np.clip(cloud.intensity[inside] * np.exp(-change), 0.0, 1.0)
+    return replace(cloud, intensity=intensity)
+
+
+@dataclass(frozen=True)
+class _Looks:
+    """How scans saw the points in a slab; all (n,)."""
+
+    points: NDArray[np.int64]
+    place: NDArray[np.int64]
+    scan: NDArray[np.int64]
+    range_m: NDArray[np.float64]
+    cosine: NDArray[np.float64]
+
+
+def _looks(cloud: PointCloud, slab: Slab, points: NDArray[np.int64]) -> _Looks:
+    if cloud.scan is None or cloud.stations is None:
+        raise AssertionError("balancing was asked of a cloud without stations")
+    frame = slab.frame
+    from_corner = cloud.origin - frame.origin_world
+    offsets = np.column_stack([cloud.x[points], cloud.y[points], cloud.z[points]])
+    world = offsets.astype(np.float64) + from_corner
+    u, v, depth = world @ frame.u_world, world @ frame.v_world, world @ frame.normal_world
+    size = frame.gsd_m * np.array([frame.width, frame.height])
+    inside = (u >= 0) & (u < size[0]) & (v >= 0) & (v < size[1])
+    inside &= (depth >= -slab.behind_m) & (depth <= slab.front_m)
+    scan = cloud.scan[points[inside]].astype(np.int64)
+    rays = (cloud.stations - frame.origin_world)[scan] - world[inside]
+    range_m = np.maximum(np.linalg.norm(rays, axis=1), 1e-3)
+    cosine = np.clip(np.abs(rays @ frame.normal_world) / range_m, _COSINE_LEAST, 1.0)
+    per_row = int(np.ceil(size[0] / _PLACE_M)) + 1
+    place = np.floor(v[inside] / _PLACE_M) * per_row + np.floor(u[inside] / _PLACE_M)
+    return _Looks(points[inside], place.astype(np.int64), scan, range_m, cosine)
+
+
+def _places(cloud: PointCloud, slab: Slab) -> NDArray[np.float64]:
+    """Rows of differences between two scans at one place.
+
+    Returns:
+        (n, 5): scan, other scan, and by how much the means of log intensity, log range and log
+        cosine of the first are larger.
+    """
+    if cloud.intensity is None:
+        raise AssertionError("balancing was asked of a cloud without intensity")
+    every = max(1, len(cloud) // _POINTS_MOST)
+    looks = _looks(cloud, slab, np.arange(0, len(cloud), every))
+    n_scans = 0 if cloud.stations is None else len(cloud.stations)
+    keys, members = np.unique(looks.place * n_scans + looks.scan, return_inverse=True)
+    counts = np.bincount(members)
+    logs = (
+        np.log(np.maximum(cloud.intensity[looks.points].astype(np.float64), _DARKEST)),
+        np.log(looks.range_m),
+        np.log(looks.cosine),
+    )
+    means = np.column_stack([np.bincount(members, values) / counts for values in logs])
+    # Scans of one place stand beside each other in the order of the keys.
+    pairs = np.flatnonzero(keys[1:] // n_scans == keys[:-1] // n_scans)
+    scans = np.column_stack([keys[pairs] % n_scans, keys[pairs + 1] % n_scans])
+    return np.column_stack([scans, means[pairs] - means[pairs + 1]])
+
+
+def _trend(table: NDArray[np.float64], n_scans: int) -> _Trend | None:
+    """Fit the differences by the L1 norm, which edges of the texture do not pull far."""
+    if len(table) < _PLACES_LEAST:
+        return None
+    first, second = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    design = np.zeros((len(table), n_scans + 2))
+    rows = np.arange(len(table))
+    design[rows, first] += 1.0
+    design[rows, second] -= 1.0
+    design[:, n_scans:] = table[:, 3:]
+    # The first scan is the scale of all, and a scan that overlaps none keeps its own.
+    held = 1e-3 * np.eye(n_scans + 2)
+    held[0, 0] = 1e3
+    wanted, weights = table[:, 2], np.ones(len(table))
+    solution: NDArray[np.float64] = np.zeros(n_scans + 2)
+    for _ in range(_ROUNDS):
+        normal = design.T @ (design * weights[:, np.newaxis]) + held
+        solution = np.asarray(
+            np.linalg.solve(normal, design.T @ (weights * wanted)), dtype=np.float64
+        )
+        weights = 1.0 / np.maximum(np.abs(wanted - design @ solution), _FLOOR)
+    return _Trend(
+        scales=solution[:n_scans],
+        range_power=float(solution[n_scans]),
+        cosine_power=float(solution[n_scans + 1]),
+    )

@@ -1,0 +1,76 @@
+"""The colouring rules of `ortho.pointcloud-direct`, against a loop over the cells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+
+from orthoflow.products import Layer, LayerMask
+from tests import raster_scenes as scenes
+from tests.test_ortho_direct import bare_walls
+
+N_TOP = 3
+
+
+def painted(folder: Path, colouring: str, cores: int = 2) -> tuple[Layer, dict[int, list[int]]]:
+    """A wall with two layers of random colours, and its points by cell."""
+    known = scenes.leaning_wall(shape=(20, 30))
+    rng = np.random.default_rng(8)
+    n_points = 2000
+    places = rng.uniform([0, 0], [30, 20], (n_points, 2))
+    depths_m = rng.choice([-0.06, 0.05], n_points) + rng.uniform(0.0, 0.009, n_points)
+    rgb = rng.integers(0, 256, (n_points, 3), dtype=np.uint8)
+    cloud = scenes.cloud_of(known.world(*places.T, depths_m), rgb=rgb)
+    chosen = PointcloudDirect.Params.model_validate(
+        {"colouring": colouring, "n_top": N_TOP, "inpaint": "none"}
+    )
+    inputs = PointcloudDirect.In(walls=bare_walls(known), cloud=cloud)
+    ctx = scenes.context(folder, cores=cores)
+    layer = PointcloudDirect().run(inputs, chosen, ctx).layers.layers[0]
+    tops: dict[int, list[int]] = {}
+    cells = np.floor(places[:, 1]).astype(int) * 30 + np.floor(places[:, 0]).astype(int)
+    for cell in np.unique(cells):
+        own = np.flatnonzero(cells == cell)
+        own = own[np.argsort(-depths_m[own], kind="stable")]
+        tops[int(cell)] = [int(k) for k in own if depths_m[own[0]] - depths_m[k] <= 0.02]
+    return layer, {
+        cell: _expected(colouring, np.array(own), places, rgb) for cell, own in tops.items()
+    }
+
+
+def _expected(
+    colouring: str, own: NDArray[np.int64], places: NDArray[np.float64], rgb: NDArray[np.uint8]
+) -> list[int]:
+    squares = ((places[own] % 1.0 - 0.5) ** 2).sum(axis=1)
+    if colouring == "topmost":
+        colour = rgb[own[0]].astype(float)
+    elif colouring == "centre":
+        colour = rgb[own[np.argmin(squares)]].astype(float)
+    elif colouring == "gaussian":
+        weights = np.exp(-squares / (2 * 0.36**2))
+        colour = weights @ rgb[own] / weights.sum()
+    else:
+        colour = np.floor(np.median(rgb[own[:N_TOP]], axis=0) + 0.5)
+    return [round(float(value)) for value in colour]
+
+
+@pytest.mark.parametrize("colouring", ["topmost", "centre", "gaussian", "median"])
+def test_colours_follow_their_rule(tmp_path: Path, colouring: str) -> None:
+    layer, expected = painted(tmp_path, colouring)
+    shown = layer.mask.ravel() == LayerMask.PAINTED
+    np.testing.assert_array_equal(np.flatnonzero(shown), sorted(expected))
+    colours = np.array([expected[cell] for cell in sorted(expected)])
+    # One grey level: positions went through float32 offsets.
+    assert np.abs(layer.rgb.reshape(-1, 3)[shown].astype(int) - colours).max() <= 1
+
+
+@pytest.mark.parametrize("colouring", ["centre", "gaussian", "median"])
+def test_threads_do_not_show_in_colours(tmp_path: Path, colouring: str) -> None:
+    one, _ = painted(tmp_path, colouring, cores=1)
+    two, _ = painted(tmp_path, colouring, cores=2)
+    np.testing.assert_array_equal(one.rgb, two.rgb)
+    np.testing.assert_array_equal(one.quality, two.quality)

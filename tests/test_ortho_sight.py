@@ -1,0 +1,110 @@
+"""Where the backward projection finds cells in a photo, against the exact camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.ortho.dsm_backward_occluders import nothing_in_the_way
+from orthoflow_plugins.ortho.dsm_backward_painting import SightRule, Surface, view_of
+from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.sight_kernels import look_at_cells
+from orthoflow.geometry.visibility_kernels import OCCLUDED, PAINTED, Sight
+from orthoflow.products import LayerMask
+from tests import ortho_scenes as scenes
+from tests.raster_scenes import context
+
+RULE = SightRule(
+    resampling="bilinear",
+    is_filtered=False,
+    incidence_max_deg=80.0,
+    erosion_cells=0,
+    border_share=0.05,
+)
+
+
+def noisy_depths() -> NDArray[np.float32]:
+    rng = np.random.default_rng(6)
+    depths = scenes.depth_m() + rng.normal(0.0, 0.002, scenes.SHAPE).astype(np.float32)
+    depths[rng.random(scenes.SHAPE) < 0.01] = np.nan
+    return depths
+
+
+def seen(camera: ViewingCamera, *, is_transparent: bool) -> Sight:
+    where = scenes.frame()
+    wall = scenes.walls(where, noisy_depths()).walls[0]
+    surface = Surface(
+        frame=where,
+        relief=transparent_relief_of(wall) if is_transparent else relief_of(wall),
+        front_m=scenes.BUFFER_M,
+        tolerance_m=0.008,
+    )
+    height, width = scenes.SHAPE
+    sight = Sight(
+        u=np.empty((height, width), dtype=np.float32),
+        v=np.empty((height, width), dtype=np.float32),
+        mask=np.empty((height, width), dtype=np.uint8),
+        quality=np.empty((height, width), dtype=np.float32),
+        summary=np.empty(8),
+    )
+    view = view_of(camera, surface, RULE)
+    look_at_cells(view, surface.relief, nothing_in_the_way(camera), sight, 0, 0)
+    return sight
+
+
+@pytest.mark.parametrize("aside_m", [-0.7, 0.0, 1.4])
+@pytest.mark.parametrize("is_transparent", [True, False], ids=["none", "full"])
+def test_places_are_exact_to_a_twentieth_of_a_pixel(aside_m: float, is_transparent: bool) -> None:
+    where = scenes.frame()
+    camera = scenes.camera(where, aside_m=aside_m)
+    sight = seen(camera, is_transparent=is_transparent)
+    painted = sight.mask == PAINTED
+    rows, columns = np.nonzero(painted)
+    depths = noisy_depths()[painted].astype(np.float64)
+    points = where.world_from_wall(np.column_stack([columns, rows]) + 0.5, depths)
+    exact = camera.project(points)
+    assert painted.mean() > 0.7
+    # Parabolas stray by at most 0.02 px, float32 by less than 0.001.
+    np.testing.assert_allclose(sight.u[painted], exact[:, 0], atol=0.05)
+    np.testing.assert_allclose(sight.v[painted], exact[:, 1], atol=0.05)
+    towards = camera.centre_world - points
+    cosine = towards @ where.normal_world / np.linalg.norm(towards, axis=1)
+    area = camera.fx * camera.fy * where.gsd_m**2
+    inside = np.minimum.reduce(
+        [exact[:, 0], camera.width - exact[:, 0], exact[:, 1], camera.height - exact[:, 1]]
+    )
+    border = 0.05 * min(camera.width, camera.height)
+    worth = cosine * area / exact[:, 2] ** 2 * np.clip(inside / border, 0.0, 1.0)
+    np.testing.assert_allclose(sight.quality[painted], worth, rtol=2e-3, atol=2e-3)
+
+
+def test_without_visibility_only_void_and_the_frame_of_the_photo_count() -> None:
+    where = scenes.frame()
+    camera = scenes.camera(where, aside_m=1.4)
+    sight, hidden = seen(camera, is_transparent=True), seen(camera, is_transparent=False)
+    assert (hidden.mask == OCCLUDED).sum() > 100
+    assert not (sight.mask == OCCLUDED).any()
+    differs = sight.mask != hidden.mask
+    assert (hidden.mask[differs] == OCCLUDED).all()
+    assert (sight.mask[differs] == PAINTED).all()
+
+
+def test_visibility_none_paints_the_board_and_says_so(tmp_path: Path) -> None:
+    where = scenes.frame()
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=scenes.photos(scenes.rendered()),
+        cameras=scenes.cameras(scenes.camera(where)),
+        cloud=scenes.cloud(where),
+    )
+    ctx = context(tmp_path)
+    params = DsmBackward.Params(visibility="none", resampling="nearest")
+    (layer,) = DsmBackward().run(inputs, params, ctx).layers.layers
+    assert (layer.rgb[..., 2] == scenes.BLUE[scenes.BOARD]).sum() > 1000
+    assert not (layer.mask == LayerMask.OCCLUDED).any()
+    assert any("visibility none" in warning for warning in ctx.warnings)

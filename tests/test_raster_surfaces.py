@@ -1,0 +1,226 @@
+"""The rules of `raster.grid` that look beyond one cell, and what they make of noise and steps."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.raster.denoising import denoised
+from orthoflow_plugins.raster.grid import RasterGrid
+from scipy.spatial import cKDTree
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.products import PointCloud, SurfaceMask, Walls
+from orthoflow.sdk import StepContext
+from tests import raster_scenes as scenes
+
+NOISE_M = 0.002
+
+
+def rastered(
+    cloud: PointCloud, known: scenes.KnownWall, ctx: StepContext, **params: object
+) -> Walls:
+    inputs = RasterGrid.In(cloud=cloud, planes=known.planes())
+    chosen = RasterGrid.Params.model_validate({"gsd_m": known.gsd_m, **params})
+    return RasterGrid().run(inputs, chosen, ctx).walls
+
+
+def scattered(
+    known: scenes.KnownWall, *, per_cell: float, seed: int = 4, noise_m: float = 0.0
+) -> tuple[PointCloud, NDArray[np.float64], NDArray[np.float64]]:
+    """Points all over a wall with steps, their columns and rows (n, 2), and depths."""
+    rng = np.random.default_rng(seed)
+    rows, columns = known.shape
+    n_points = int(per_cell * rows * columns)
+    places = rng.uniform([0, 0], [columns, rows], (n_points, 2))
+    depths_m = scenes.relief_m(places[:, 0]) + noise_m * rng.normal(size=n_points)
+    grey = np.full((n_points, 3), 120, dtype=np.uint8)
+    intensity = rng.random(n_points, dtype=np.float32)
+    cloud = scenes.cloud_of(known.world(*places.T, depths_m), rgb=grey, intensity=intensity)
+    return cloud, places, depths_m
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_nearest_takes_the_nearest_point_wherever_it_lies(tmp_path: Path, cores: int) -> None:
+    known = scenes.leaning_wall(shape=(40, 60))
+    cloud, places, _ = scattered(known, per_cell=1.5)
+    ctx = scenes.context(tmp_path, cores=cores)
+    wall = rastered(cloud, known, ctx, surface="nearest", recover_gap_cells=0).walls[0]
+    columns, rows = scenes.cell_centres(known.shape)
+    nearest = cKDTree(places).query(np.column_stack([columns, rows]))[1].reshape(known.shape)
+    measured = wall.count > 0
+    is_elsewhere = (
+        np.floor(places[nearest]).astype(int)
+        != np.stack([columns.astype(int), rows.astype(int)], axis=1).reshape(*known.shape, 2)
+    ).any(axis=-1)
+    assert (is_elsewhere & measured).any()
+    assert cloud.intensity is not None
+    assert wall.intensity is not None
+    np.testing.assert_array_equal(wall.intensity[measured], cloud.intensity[nearest[measured]])
+    assert np.isnan(wall.depth_m[~measured]).all()
+    assert wall.count.sum() == len(places)
+
+
+def test_denoising_takes_the_noise_and_leaves_the_steps(tmp_path: Path) -> None:
+    known = scenes.leaning_wall(shape=(120, 160))
+    cloud, _, _ = scattered(known, per_cell=2.25, noise_m=NOISE_M)
+    columns, _ = scenes.cell_centres(known.shape)
+    true_m = scenes.relief_m(columns).reshape(known.shape)
+    rms_mm = {}
+    for surface in ("median", "denoised"):
+        wall = rastered(cloud, known, scenes.context(tmp_path), surface=surface).walls[0]
+        measured = wall.mask == SurfaceMask.MEASURED
+        errors = (wall.depth_m - true_m)[measured]
+        rms_mm[surface] = 1e3 * float(np.sqrt(np.mean(errors**2)))
+        # Steps of 8 and 10 cm every ten cells stay where they are, to the cell.
+        assert np.abs(errors).max() < 0.02
+    # A cell has about two points, sqrt(1/2) of 2 mm and some cells with one.
+    assert 1.2 < rms_mm["median"] < 2.0
+    assert rms_mm["denoised"] < 0.45 * rms_mm["median"]
+
+
+def test_denoising_leaves_a_quiet_raster_and_voids_alone() -> None:
+    rng = np.random.default_rng(1)
+    noisy = rng.normal(0.0, NOISE_M, (60, 80)).astype(np.float32)
+    assert depth_noise_m(noisy) == pytest.approx(NOISE_M, rel=0.05)
+    noisy[20:30, 40:50] = np.nan
+    filtered = denoised(noisy, 4)
+    np.testing.assert_array_equal(np.isnan(filtered), np.isnan(noisy))
+    assert depth_noise_m(filtered) < 0.2 * NOISE_M
+    quiet = np.where(np.arange(80) > 40, np.float32(0.05), np.float32(0.0)) * np.ones(
+        (60, 1), dtype=np.float32
+    )
+    np.testing.assert_array_equal(denoised(quiet, 4), quiet)
+    np.testing.assert_array_equal(denoised(noisy, 0), noisy)
+
+
+def test_a_net_of_triangles_closes_windows_and_slopes_over_steps(tmp_path: Path) -> None:
+    known = scenes.leaning_wall(shape=(40, 60))
+    cloud, places, depths_m = scattered(known, per_cell=3.0)
+    in_window = (np.abs(places[:, 0] - 25.0) < 8.0) & (np.abs(places[:, 1] - 20.0) < 8.0)
+    kept = np.flatnonzero(~in_window)
+    assert cloud.rgb is not None
+    assert cloud.intensity is not None
+    holed = dataclasses.replace(
+        cloud,
+        x=cloud.x[kept],
+        y=cloud.y[kept],
+        z=cloud.z[kept],
+        rgb=cloud.rgb[kept],
+        intensity=cloud.intensity[kept],
+    )
+    grid = rastered(holed, known, scenes.context(tmp_path)).walls[0]
+    net = rastered(holed, known, scenes.context(tmp_path), surface="tin").walls[0]
+    window = (slice(16, 24), slice(21, 29))
+    assert (grid.mask[window] == SurfaceMask.VOID).all()
+    assert (net.mask[window] == SurfaceMask.RECOVERED).all()
+    known_depths = np.unique(np.round(depths_m, 6))
+
+    def between(values: NDArray[np.float32]) -> float:
+        far = np.abs(values[..., None] - known_depths).min(axis=-1) > 0.01
+        return float(np.mean(far[np.isfinite(values)]))
+
+    assert between(grid.depth_m) == 0.0
+    assert between(net.depth_m) > 0.05
+    np.testing.assert_array_equal(net.count, grid.count)
+    assert net.rgb is not None
+    assert (net.rgb[net.mask > 0] == 120).all()
+
+
+def test_a_net_that_no_points_span_is_refused(tmp_path: Path) -> None:
+    known = scenes.leaning_wall(shape=(40, 60))
+    line = known.world(np.arange(5) + 0.5, np.full(5, 3.5), np.zeros(5))
+    with pytest.raises(MethodError, match="points that span triangles"):
+        rastered(scenes.cloud_of(line), known, scenes.context(tmp_path), surface="tin")
+
+
+def test_percentiles_are_numpys(tmp_path: Path) -> None:
+    known = scenes.upright_wall()
+    rng = np.random.default_rng(9)
+    depths_m = rng.normal(0.0, 0.03, 57)
+    points = known.world(rng.uniform(3, 4, 57), rng.uniform(4, 5, 57), depths_m)
+    walls = rastered(
+        scenes.cloud_of(points), known, scenes.context(tmp_path), percentiles=[0, 10, 50, 97.5]
+    )
+    wall = walls.walls[0]
+    assert wall.percentiles_m is not None
+    np.testing.assert_allclose(
+        wall.percentiles_m[4, 3], np.percentile(depths_m, [0, 10, 50, 97.5]), atol=1e-6
+    )
+    assert np.isnan(wall.percentiles_m[4, 4]).all()
+    assert walls.details["percentiles"] == [0, 10, 50, 97.5]
+
+
+def test_the_buffer_is_three_tolerances_of_the_planes_unless_set(tmp_path: Path) -> None:
+    known = scenes.leaning_wall(shape=(40, 60))
+    cloud, _, _ = scattered(known, per_cell=1.0)
+
+    def buffers(details: dict[str, object], **params: object) -> tuple[float, float]:
+        planes = dataclasses.replace(known.planes(), details=details)
+        inputs = RasterGrid.In(cloud=cloud, planes=planes)
+        chosen = RasterGrid.Params.model_validate({"gsd_m": known.gsd_m, **params})
+        walls = RasterGrid().run(inputs, chosen, scenes.context(tmp_path)).walls
+        return walls.buffer_front_m, walls.buffer_behind_m
+
+    assert buffers({}) == pytest.approx((0.15, 0.15))
+    assert buffers({"find_tolerance_m": 0.1}) == pytest.approx((0.3, 0.3))
+    assert buffers({"tolerance_m": 0.04}, buffer_front_m=0.2) == pytest.approx((0.2, 0.12))
+    assert buffers({"tolerance_m": 0.04}, buffer_m=0.25) == pytest.approx((0.25, 0.25))
+
+
+def two_scans(known: scenes.KnownWall) -> tuple[PointCloud, NDArray[np.float64]]:
+    """A textured wall from two stations, the second at 0.7 of the scale; reflectance (n,)."""
+    n_points = 60_000
+    rng = np.random.default_rng(2)
+    rows, columns = known.shape
+    places = rng.uniform([0, 0], [columns, rows], (n_points, 2))
+    world = known.world(*places.T, np.zeros(n_points))
+    reflectance = np.where((places // 40).sum(axis=1) % 2 > 0, 0.6, 0.3)
+    middle = known.world(np.array([columns / 2]), np.array([rows / 2]), np.zeros(1))[0]
+    u, _ = known.axes
+    stations = np.array([middle + 3.0 * known.normal - 2.0 * u, middle + 5.0 * known.normal + u])
+    scan = rng.integers(0, 2, n_points).astype(np.uint16)
+    rays = stations[scan] - world
+    range_m = np.linalg.norm(rays, axis=1)
+    cosine = rays @ known.normal / range_m
+    seen = reflectance * np.array([1.0, 0.7])[scan] * (range_m / 3.0) ** -0.5 * cosine
+    cloud = scenes.cloud_of(world, intensity=seen.astype(np.float32))
+    return dataclasses.replace(
+        cloud, scan=scan, stations=stations, stations_source="file"
+    ), reflectance
+
+
+def test_intensities_of_overlapping_scans_are_brought_to_one_scale(tmp_path: Path) -> None:
+    known = dataclasses.replace(scenes.leaning_wall(shape=(300, 400)), gsd_m=0.01)
+    cloud, _ = two_scans(known)
+    ctx = scenes.context(tmp_path)
+    wall = rastered(cloud, known, ctx, surface="centre", balance_intensity=True).walls[0]
+    assert wall.intensity is not None
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    # On one wall only the two together can be told: -0.5 for range, 1 for the cosine.
+    joint = metrics["intensity_range_power"] - metrics["intensity_cosine_power"]
+    assert joint == pytest.approx(-1.5, abs=0.05)
+    shown = wall.intensity[np.isfinite(wall.intensity)]
+    near_either = np.minimum(np.abs(shown - 0.3), np.abs(shown - 0.6))
+    assert np.quantile(near_either, 0.99) < 0.015
+
+
+def test_one_scan_cannot_be_balanced_and_that_is_said(tmp_path: Path) -> None:
+    known = scenes.leaning_wall(shape=(40, 60))
+    cloud, _, _ = scattered(known, per_cell=1.0)
+    ctx = scenes.context(tmp_path)
+    rastered(cloud, known, ctx, balance_intensity=True)
+    assert any("scans with known stations" in warning for warning in ctx.warnings)
+    alone = dataclasses.replace(
+        cloud,
+        scan=np.zeros(len(cloud), dtype=np.uint16),
+        stations=known.top_left[None] + 3.0 * known.normal,
+        stations_source="file",
+    )
+    ctx = scenes.context(tmp_path)
+    rastered(alone, known, ctx, balance_intensity=True)
+    assert any("no two scans overlap" in warning for warning in ctx.warnings)
