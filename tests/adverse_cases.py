@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Photo, Ties
-from tests import matching_scenes as ms
+from orthoflow.products import Intrinsics, Photo, Ties
 from tests.scenes import SURVEY_SHIFT_M
 
 WALL_M: Final = (4.0, 3.0)
@@ -94,7 +93,7 @@ def adverse_case(kind: str, seed: int) -> AdverseCase:
     rng = np.random.default_rng([list(KINDS).index(kind), seed])
     is_solvable, build = KINDS[kind]
     draft = build(rng)
-    known, factor = ms.intrinsics_of(draft.camera), draft.calibrated_factor
+    known, factor = Intrinsics.of(draft.camera), draft.calibrated_factor
     return AdverseCase(
         kind=kind,
         is_solvable=is_solvable,

@@ -79,7 +79,7 @@ def known_ties(
 
 
 def calibrated(camera: ViewingCamera) -> Photos:
-    return ms.photos(replace(PIXEL, intrinsics=ms.intrinsics_of(camera)))
+    return ms.photos(replace(PIXEL, intrinsics=Intrinsics.of(camera)))
 
 
 def orient(ties: Ties, photos: Photos, ctx: StepContext, **params: object) -> Cameras:
@@ -522,7 +522,7 @@ def test_real_photos_of_the_fountain_are_where_the_reference_has_them(
         encoded=(folder / "images" / f"{name}.jpg").read_bytes(),
         width=3072,
         height=2048,
-        intrinsics=ms.intrinsics_of(camera),
+        intrinsics=Intrinsics.of(camera),
     )
     photos = ms.photos(photo)
     ties = (

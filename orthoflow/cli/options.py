@@ -63,6 +63,30 @@ def selection_options(command: _Decorated) -> _Decorated:
     return command
 
 
+def output_option(name: str) -> Callable[[_Decorated], _Decorated]:
+    """Add `-o`; `name` is the folder's name where none is given."""
+    return click.option(
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path, file_okay=False),
+        metavar="RUNDIR",
+        help=f"Folder of this run.  [default: runs/{name}]",
+    )
+
+
+def execution_options(command: _Decorated) -> _Decorated:
+    """Add how steps run: `--jobs --executor`."""
+    command = click.option(
+        "--executor",
+        type=click.Choice(["local", "inline"]),
+        default="local",
+        help="A process per step, or all in this one (for debugging).",
+    )(command)
+    return click.option(
+        "--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time."
+    )(command)
+
+
 def store_option(command: _Decorated) -> _Decorated:
     """Add `--store`."""
     return click.option(

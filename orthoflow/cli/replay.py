@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
-from orthoflow.cli.options import DEFAULT_STORE, Command, input_option, json_option
+from orthoflow.cli.options import (
+    DEFAULT_STORE,
+    Command,
+    execution_options,
+    input_option,
+    json_option,
+    output_option,
+)
 from orthoflow.cli.product_tables import echo_distances
 from orthoflow.cli.sessions import current_session
 from orthoflow.cli.tables import echo_json
@@ -28,26 +35,14 @@ if TYPE_CHECKING:
 @click.command(cls=Command)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @input_option
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="RUNDIR",
-    help="Folder of the replay.  [default: runs/<name>-replay-<run id>]",
-)
+@output_option("<name>-replay-<run id>")
 @click.option(
     "--store",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
     help="Folder of stored results; without it an empty one, so that all is computed anew.",
 )
-@click.option("--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time.")
-@click.option(
-    "--executor",
-    type=click.Choice(["local", "inline"]),
-    default="local",
-    help="A process per step, or all in this one (for debugging).",
-)
+@execution_options
 @json_option
 def replay(
     run: Path,

@@ -12,6 +12,8 @@ import click
 from orthoflow.cli.failures import silence_stdout
 from orthoflow.cli.options import (
     Command,
+    execution_options,
+    output_option,
     selection_options,
     store_option,
     workflow_arguments,
@@ -25,21 +27,9 @@ if TYPE_CHECKING:
 
 @click.command(cls=Command)
 @workflow_arguments
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="RUNDIR",
-    help="Folder of this run.  [default: runs/<name>-<run id>]",
-)
+@output_option("<name>-<run id>")
 @selection_options
-@click.option("--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time.")
-@click.option(
-    "--executor",
-    type=click.Choice(["local", "inline"]),
-    default="local",
-    help="A process per step, or all in this one (for debugging).",
-)
+@execution_options
 @store_option
 @click.option("--embed", is_flag=True, help="Put every product into the record, also point clouds.")
 def run(

@@ -31,7 +31,6 @@ from ruamel.yaml.scalarbool import ScalarBoolean
 
 from orthoflow.errors import GeometryError, InputError
 from orthoflow.files.sidecars import write_text
-from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Calibration, Intrinsics
 
 _OPENCV_SHIFT: Final = 0.5
@@ -340,20 +339,9 @@ def _folds(camera: Intrinsics) -> bool:
     u = np.linspace(0.0, camera.width, 9)
     v = np.linspace(0.0, camera.height, 9)
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    viewing = ViewingCamera(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        distortion=np.array(camera.distortion, dtype=np.float64),
-        rotation=np.eye(3),
-        translation=np.zeros(3),
-    )
     try:
         with np.errstate(all="ignore"):
-            rays = viewing.rays_camera(pixels)
+            rays = camera.posed().rays_camera(pixels)
     except (GeometryError, np.linalg.LinAlgError):
         return True
     # The search may end on the far side of the fold: the radius must grow all the way to the ray.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,43 @@ class Intrinsics:
     cy: float
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     source: str = "calibration"
+
+    @classmethod
+    def of(cls, camera: ViewingCamera, *, source: str = "calibration") -> Self:
+        """Give the interior orientation of a camera."""
+        return cls(
+            width=camera.width,
+            height=camera.height,
+            fx=camera.fx,
+            fy=camera.fy,
+            cx=camera.cx,
+            cy=camera.cy,
+            distortion=tuple(camera.distortion.tolist()),
+            source=source,
+        )
+
+    def posed(
+        self,
+        rotation: NDArray[np.float64] | None = None,
+        translation: NDArray[np.float64] | None = None,
+    ) -> ViewingCamera:
+        """Give the camera with this lens at a pose; without one, at the origin of its own axes.
+
+        Args:
+            rotation: (3, 3), camera_from_world.
+            translation: (3,) metres, camera_from_world.
+        """
+        return ViewingCamera(
+            width=self.width,
+            height=self.height,
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx,
+            cy=self.cy,
+            distortion=np.array(self.distortion, dtype=np.float64),
+            rotation=np.eye(3) if rotation is None else rotation,
+            translation=np.zeros(3) if translation is None else translation,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,17 +207,7 @@ class Camera:
         rotation, translation = self.rotation_camera_from_world, self.translation_camera_from_world
         if self.intrinsics is None or rotation is None or translation is None:
             raise ProductError(f"photo {self.photo} is not oriented: {self.status}")
-        return ViewingCamera(
-            width=self.intrinsics.width,
-            height=self.intrinsics.height,
-            fx=self.intrinsics.fx,
-            fy=self.intrinsics.fy,
-            cx=self.intrinsics.cx,
-            cy=self.intrinsics.cy,
-            distortion=np.array(self.intrinsics.distortion, dtype=np.float64),
-            rotation=rotation,
-            translation=translation,
-        )
+        return self.intrinsics.posed(rotation, translation)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ from orthoflow.products import (
     Calibration,
     Cameras,
     CheckPoints,
+    Intrinsics,
     Photos,
     PointCloud,
     Product,
@@ -26,7 +27,6 @@ from orthoflow.testing.textured_walls import (
     TexturedWall,
     camera_before,
     cloud_of,
-    intrinsics_of,
     oriented,
     photo_of,
     textured_wall,
@@ -78,7 +78,7 @@ def _cameras() -> Cameras:
 @cache
 def _calibration() -> Calibration:
     camera = next(iter(photographing_cameras().values()))
-    return Calibration(patterns=("*",), intrinsics=(intrinsics_of(camera),))
+    return Calibration(patterns=("*",), intrinsics=(Intrinsics.of(camera),))
 
 
 @cache

@@ -180,19 +180,6 @@ def camera_before(
     )
 
 
-def intrinsics_of(camera: ViewingCamera) -> Intrinsics:
-    """Give a camera's interior orientation."""
-    return Intrinsics(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        distortion=tuple(camera.distortion.tolist()),
-    )
-
-
 def photo_of(
     scene: TexturedWall, camera: ViewingCamera, *, name: str = "a.png", calibrated: bool = True
 ) -> Photo:
@@ -221,7 +208,7 @@ def photo_of(
         width=camera.width,
         height=camera.height,
         exif_focal_px=None if calibrated else 1.02 * camera.fx,
-        intrinsics=intrinsics_of(camera) if calibrated else None,
+        intrinsics=Intrinsics.of(camera) if calibrated else None,
     )
 
 
@@ -230,7 +217,7 @@ def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
     return Camera(
         photo=name,
         status="ok",
-        intrinsics=intrinsics_of(camera),
+        intrinsics=Intrinsics.of(camera),
         rotation_camera_from_world=camera.rotation,
         translation_camera_from_world=camera.translation,
     )

@@ -82,7 +82,7 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
         (("--to", "colmap", "--cell", "wall"), "the cell wall holds no orientations; those"),
         (("--to", "colmap", "--cell", "wal"), "has no cell 'wal'"),
         (("--to", "colmap", "-o", "run"), "run exists already and is not empty"),
-        (("--to", "dwg"), "'dwg' is not 'colmap'"),
+        (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', 'ro-crate'"),
     ],
     ids=["no orientations", "no such cell", "folder in use", "no such format"],
 )

@@ -17,7 +17,7 @@ SMALL = (
     *("--set", "room.scan_step_m=0.004", "--set", "room.photo_gsd_m=0.003"),
     *("--set", "wall.gsd_m=0.006", "--executor", "inline"),
 )
-WAYS = ("backward", "exact", "filled")
+WAYS = ("backward", "forward", "exact", "centre", "filled")
 
 
 @pytest.fixture(scope="module")

@@ -158,19 +158,7 @@ def lens_of(photo: Photo, oriented: Mapping[str, Camera]) -> ViewingCamera | Non
         and (photo.exif_focal_px is None or _is_near(camera.intrinsics.fx, photo.exif_focal_px))
     ]
     known = photo.intrinsics or next(iter(alike), None)
-    if known is None:
-        return None
-    return ViewingCamera(
-        width=known.width,
-        height=known.height,
-        fx=known.fx,
-        fy=known.fy,
-        cx=known.cx,
-        cy=known.cy,
-        distortion=np.array(known.distortion, dtype=np.float64),
-        rotation=np.eye(3),
-        translation=np.zeros(3),
-    )
+    return None if known is None else known.posed()
 
 
 def _is_near(focal_px: float, exif_focal_px: float) -> bool:

@@ -25,7 +25,7 @@ from orthoflow.geometry.resection import (
     stated,
 )
 from orthoflow.products import Intrinsics, JsonValue, Photo
-from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior, viewing
+from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior
 from orthoflow_plugins.orient.robust import RobustPose, SamplingRule, robust_pose
 from orthoflow_plugins.orient.splitting import GROUPS, image_cells
 
@@ -186,7 +186,7 @@ def robust_start(
     if len(set(map(tuple, seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
     pose, intrinsics = best
-    lens = viewing(intrinsics)
+    lens = intrinsics.posed()
     return Start(
         camera=posed(lens, pose.camera),
         prior=lens,
@@ -253,7 +253,7 @@ def _starts(
     # A lens known only roughly misplaces even right ties.
     slack = 1.0 if prior.source not in ("exif", "none") else 2.0
     for intrinsics in prior.guesses:
-        lens = viewing(intrinsics)
+        lens = intrinsics.posed()
         threshold = rule.threshold_px
         if threshold is None:
             threshold = slack * rule.rejection_sigma * _expected_px(seen)

@@ -13,7 +13,7 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, lens_values
 from orthoflow.products import JsonValue, Photo
 from orthoflow_plugins.orient.block import Block, Lens
-from orthoflow_plugins.orient.lenses import lens_prior, viewing
+from orthoflow_plugins.orient.lenses import lens_prior
 
 Sharing = Literal["focal-group", "shared", "per-photo"]
 Refined = Literal["uncalibrated", "all", "none"]
@@ -162,7 +162,7 @@ def _uncertainty(photo: Photo) -> float:
 
 def _lens(photo: Photo, cameras: Sequence[ViewingCamera], refined: Refined) -> Lens:
     known = lens_prior(photo)
-    prior = viewing(known.guesses[0])
+    prior = known.guesses[0].posed()
     longest = max(photo.width, photo.height)
     if known.source == "none":
         prior = replace(prior, fx=_median_focal(cameras), fy=_median_focal(cameras))

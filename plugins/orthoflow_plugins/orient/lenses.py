@@ -5,9 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
-from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import Resection
 from orthoflow.products import Intrinsics, Photo
@@ -61,34 +58,10 @@ def lens_prior(photo: Photo) -> LensPrior:
     )
 
 
-def viewing(intrinsics: Intrinsics) -> ViewingCamera:
-    """Give the lens as a camera at the origin of its own axes."""
-    return ViewingCamera(
-        width=intrinsics.width,
-        height=intrinsics.height,
-        fx=intrinsics.fx,
-        fy=intrinsics.fy,
-        cx=intrinsics.cx,
-        cy=intrinsics.cy,
-        distortion=np.array(intrinsics.distortion, dtype=np.float64),
-        rotation=np.eye(3),
-        translation=np.zeros(3),
-    )
-
-
 def intrinsics_of(resection: Resection, source: str) -> Intrinsics:
     """Give the interior orientation after an adjustment; `source` is what it was known from."""
-    camera = resection.camera
-    return Intrinsics(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        distortion=tuple(float(value) for value in camera.distortion),
-        source="estimated" if resection.lens.sigmas.size or source == "none" else source,
-    )
+    was_estimated = resection.lens.sigmas.size or source == "none"
+    return Intrinsics.of(resection.camera, source="estimated" if was_estimated else source)
 
 
 def _unmeasured(photo: Photo, focal_sigma: float) -> LensFreedom:

@@ -12,19 +12,8 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.products import (
-    Camera,
-    Cameras,
-    Layer,
-    LayerMask,
-    Layers,
-    Photo,
-    Photos,
-    PointCloud,
-    Wall,
-    Walls,
-)
-from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow.products import Camera, Layer, LayerMask, Layers, Photo
+from orthoflow.sdk import Determinism, Method, Ports, StepContext
 from orthoflow_plugins.ortho.oriented_photos import (
     UNSEEN_WALLS,
     bare_layer,
@@ -32,6 +21,12 @@ from orthoflow_plugins.ortho.oriented_photos import (
     pixels_of,
     shared_profile,
     weighted_median,
+)
+from orthoflow_plugins.ortho.sights import (
+    PhotosOnWalls,
+    SightParams,
+    occluders_before,
+    surfaces_of,
 )
 
 if TYPE_CHECKING:
@@ -61,7 +56,7 @@ class DsmBackward(Method):
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7, 4.4",
     )
 
-    class Params(MethodParams):
+    class Params(SightParams):
         """How colours are taken, and when a cell counts as seen."""
 
         resampling: Literal["nearest", "bilinear", "cubic", "lanczos"] = Field(
@@ -78,44 +73,15 @@ class DsmBackward(Method):
             description="What hides cells: relief and cloud (full), or nothing, for comparison and "
             "for flat walls with nothing before them.",
         )
-        incidence_max_deg: float = Field(
-            default=80.0, gt=0, lt=90, description="Cells seen more obliquely are not painted."
-        )
         erosion_cells: int = Field(
             default=1,
             ge=0,
             le=20,
             description="Cells so near to a hidden patch are not painted: edges smear there.",
         )
-        tolerance_sigma: float = Field(
-            default=3.0,
-            ge=0,
-            description="A surface hides a cell when it is above the ray by more than so many "
-            "standard deviations of depth, and tolerance_cells.",
-        )
-        tolerance_cells: float = Field(
-            default=0.5, ge=0, description="The same in cells, for what the raster cannot hold."
-        )
-        occluder_points_min: int = Field(
-            default=6,
-            ge=1,
-            description="Points of the cloud with fewer about them, themselves included, are "
-            "outliers and hide nothing.",
-        )
-        border_share: float = Field(
-            default=0.05,
-            ge=0,
-            le=0.5,
-            description="Quality falls to 0 over this share of a photo's shorter side.",
-        )
 
-    class In(Ports):
+    class In(PhotosOnWalls):
         """The walls, the cloud they were made from, and the oriented photos."""
-
-        walls: Walls
-        photos: Photos
-        cameras: Cameras
-        cloud: PointCloud | None = None
 
     class Out(Ports):
         """A layer for each wall and photo that paints on it."""
@@ -127,13 +93,6 @@ class DsmBackward(Method):
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
         if params.visibility == "none":
             ctx.warn("visibility none: cells that a photo cannot see are painted as well")
-        elif inputs.cloud is None:
-            ctx.warn(
-                "no cloud is wired to ortho.dsm-backward: things that stand free before a wall "
-                "hide nothing, and photos paint them onto it"
-            )
-        else:
-            inputs.cloud.require_points(3)
         studio = _Studio(inputs, params, ctx)
         studio.find_occluders([camera for _, camera in oriented])
         for place, (photo, camera) in enumerate(oriented):
@@ -161,7 +120,9 @@ class _Studio:
             erosion_cells=params.erosion_cells if params.visibility == "full" else 0,
             border_share=params.border_share,
         )
-        self._surfaces: list[Surface] = [self._surface(wall) for wall in inputs.walls.walls]
+        self._surfaces: list[Surface] = surfaces_of(
+            inputs.walls, params, hides=params.visibility == "full"
+        )
         self._occluders: Occluders | None = None
         self._layers: list[Layer] = []
         self._footprints: list[Footprint] = []
@@ -171,16 +132,14 @@ class _Studio:
 
     def find_occluders(self, cameras: list[Camera]) -> None:
         """Get the cloud ready to be looked at."""
-        from orthoflow_plugins.ortho.dsm_backward_occluders import find_occluders
-
         started = time.perf_counter()
-        if self._inputs.cloud is not None and self._params.visibility == "full":
-            self._occluders = find_occluders(
-                self._inputs.cloud,
-                self._inputs.walls,
+        if self._params.visibility == "full":
+            self._occluders = occluders_before(
+                self._inputs,
                 [camera.viewing() for camera in cameras],
-                n_least=self._params.occluder_points_min,
-                threads=self._ctx.cores,
+                self._params,
+                self._ctx,
+                method=DsmBackward.id,
             )
         self._seconds["occluders_s"] += time.perf_counter() - started
 
@@ -219,21 +178,6 @@ class _Studio:
         layers.sort(key=lambda layer: layer.wall)
         self._report(layers)
         return Layers(layers=tuple(layers), names=tuple(wall.name for wall in walls))
-
-    def _surface(self, wall: Wall) -> Surface:
-        from orthoflow.geometry.depth_noise import depth_noise_m
-        from orthoflow_plugins.ortho.dsm_backward_painting import Surface
-        from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
-
-        tolerance_m = self._params.tolerance_sigma * depth_noise_m(wall.depth_m)
-        return Surface(
-            frame=wall.frame,
-            relief=relief_of(wall)
-            if self._params.visibility == "full"
-            else transparent_relief_of(wall),
-            front_m=self._inputs.walls.buffer_front_m,
-            tolerance_m=tolerance_m + self._params.tolerance_cells * wall.frame.gsd_m,
-        )
 
     def _depth_buffer(self, camera: Camera) -> DepthBuffer:
         from orthoflow_plugins.ortho.dsm_backward_occluders import (

@@ -12,14 +12,20 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Cameras, Layer, LayerMask, Layers, Photos, PointCloud, Walls
-from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow.products import Layer, LayerMask, Layers
+from orthoflow.sdk import Determinism, Method, Ports, StepContext
 from orthoflow_plugins.ortho.oriented_photos import (
     UNSEEN_WALLS,
     bare_layer,
     oriented_photos,
     pixels_of,
     shared_profile,
+)
+from orthoflow_plugins.ortho.sights import (
+    PhotosOnWalls,
+    SightParams,
+    occluders_before,
+    surfaces_of,
 )
 
 if TYPE_CHECKING:
@@ -44,12 +50,9 @@ class DsmForward(Method):
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7",
     )
 
-    class Params(MethodParams):
+    class Params(SightParams):
         """When a pixel counts, and which gaps between pixels are filled."""
 
-        incidence_max_deg: float = Field(
-            default=80.0, gt=0, lt=90, description="Pixels that look more obliquely do not paint."
-        )
         fill_gap_cells: int = Field(
             default=1,
             ge=0,
@@ -57,35 +60,9 @@ class DsmForward(Method):
             description="Cells that no pixel met are filled where no disc of this radius fits into "
             "the gap; 0 fills nothing.",
         )
-        tolerance_sigma: float = Field(
-            default=3.0,
-            ge=0,
-            description="A depth step counts as an edge above so many standard deviations of depth "
-            "and tolerance_cells.",
-        )
-        tolerance_cells: float = Field(
-            default=0.5, ge=0, description="The same in cells, for what the raster cannot hold."
-        )
-        occluder_points_min: int = Field(
-            default=6,
-            ge=1,
-            description="Points of the cloud with fewer about them, themselves included, are "
-            "outliers and hide nothing.",
-        )
-        border_share: float = Field(
-            default=0.05,
-            ge=0,
-            le=0.5,
-            description="Quality falls to 0 over this share of a photo's shorter side.",
-        )
 
-    class In(Ports):
+    class In(PhotosOnWalls):
         """The walls, the cloud they were made from, and the oriented photos."""
-
-        walls: Walls
-        photos: Photos
-        cameras: Cameras
-        cloud: PointCloud | None = None
 
     class Out(Ports):
         """A layer for each wall and photo that paints on it."""
@@ -94,33 +71,15 @@ class DsmForward(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Take photo by photo, and throw each onto every wall it sees."""
-        from orthoflow_plugins.ortho.dsm_backward_occluders import (
-            depth_buffer,
-            find_occluders,
-            nothing_in_the_way,
-        )
+        from orthoflow_plugins.ortho.dsm_backward_occluders import depth_buffer, nothing_in_the_way
 
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
         viewers = [camera.viewing() for _, camera in oriented]
         seconds: defaultdict[str, float] = defaultdict(float)
         started = time.perf_counter()
-        occluders = None
-        if inputs.cloud is None:
-            ctx.warn(
-                "no cloud is wired to ortho.dsm-forward: things that stand free before a wall "
-                "hide nothing, and photos paint them onto it"
-            )
-        else:
-            inputs.cloud.require_points(3)
-            occluders = find_occluders(
-                inputs.cloud,
-                inputs.walls,
-                viewers,
-                n_least=params.occluder_points_min,
-                threads=ctx.cores,
-            )
+        occluders = occluders_before(inputs, viewers, params, ctx, method=self.id)
         seconds["occluders_s"] = time.perf_counter() - started
-        surfaces = _surfaces(inputs.walls, params)
+        surfaces = surfaces_of(inputs.walls, params)
         layers: list[Layer] = []
         for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
             ctx.progress(place / len(oriented), photo.name)
@@ -145,23 +104,6 @@ class DsmForward(Method):
         profile = shared_profile([photo for photo, _ in oriented], ctx)
         finished = _finished(layers, surfaces, names, ctx, seconds)
         return self.Out(layers=replace(finished, icc_profile=profile))
-
-
-def _surfaces(walls: Walls, params: DsmForward.Params) -> list[Surface]:
-    from orthoflow.geometry.depth_noise import depth_noise_m
-    from orthoflow_plugins.ortho.dsm_backward_painting import Surface
-    from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of
-
-    return [
-        Surface(
-            frame=wall.frame,
-            relief=relief_of(wall),
-            front_m=walls.buffer_front_m,
-            tolerance_m=params.tolerance_sigma * depth_noise_m(wall.depth_m)
-            + params.tolerance_cells * wall.frame.gsd_m,
-        )
-        for wall in walls.walls
-    ]
 
 
 def _layer(

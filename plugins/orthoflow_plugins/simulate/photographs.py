@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_jpeg
-from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.photo_views import SceneCameras
 from orthoflow.products import Calibration, Camera, Cameras, Intrinsics, JsonValue, Photo, Photos
 from orthoflow.sdk import StepContext
@@ -75,9 +74,7 @@ def calibration_of(shots: tuple[Shot, ...], *, is_known: bool) -> Calibration:
     """Give the calibration of the one camera; empty when it is not known or there is no photo."""
     if not (shots and is_known):
         return Calibration(patterns=(), intrinsics=())
-    return Calibration(
-        patterns=("*",), intrinsics=(_intrinsics(shots[0].camera, source="calibration"),)
-    )
+    return Calibration(patterns=("*",), intrinsics=(Intrinsics.of(shots[0].camera),))
 
 
 def true_cameras(
@@ -99,7 +96,7 @@ def true_cameras(
             Camera(
                 photo=shot.name,
                 status="ok",
-                intrinsics=_intrinsics(shot.camera, source="truth"),
+                intrinsics=Intrinsics.of(shot.camera, source="truth"),
                 rotation_camera_from_world=rotation,
                 translation_camera_from_world=shot.camera.translation - rotation @ shift_world_m,
             )
@@ -119,19 +116,6 @@ def shot_details(shots: tuple[Shot, ...]) -> list[JsonValue]:
         }
         for shot in shots
     ]
-
-
-def _intrinsics(camera: ViewingCamera, *, source: str) -> Intrinsics:
-    return Intrinsics(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        distortion=tuple(float(value) for value in camera.distortion),
-        source=source,
-    )
 
 
 def _developed(
