@@ -16,7 +16,7 @@ import pytest
 from orthoflow.engine import RunOutcome, collect_garbage
 from orthoflow.errors import StoreError
 from tests.engine_world import World, start_coordinator, toy_world
-from tests.road.conftest import IS_LONG
+from tests.long_loops import IS_LONG
 
 STEPS = """
 steps:

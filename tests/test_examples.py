@@ -18,8 +18,8 @@ from orthoflow.cli import program
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
 from orthoflow.workflow.schema import workflow_schema
+from tests.long_loops import IS_LONG
 
-IS_LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 

@@ -39,8 +39,8 @@ from orthoflow.products import (
 from orthoflow.sdk import StepContext
 from tests import inspect_scenes
 from tests.inspect_scenes import BUFFER_M, GSD_M, points_at
+from tests.long_loops import IS_LONG
 from tests.raster_scenes import UP
-from tests.road.conftest import IS_LONG
 
 
 def context(folder: Path) -> StepContext:
@@ -151,6 +151,8 @@ def test_what_is_not_found_is_said(tmp_path: Path) -> None:
         inspect(tmp_path, far, inspect_scenes.walls(source="none"))
 
 
+@pytest.mark.long
+@pytest.mark.skipif(not IS_LONG, reason="a room of many points: .ci/run --long")
 def test_points_of_a_simulated_room_are_found_by_its_truth(tmp_path: Path) -> None:
     params = SimulateRoom.Params(scan_step_m=0.1, panorama_step_m=0.3)
     room = SimulateRoom().run(SimulateRoom.In(), params, context(tmp_path))

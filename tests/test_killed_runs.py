@@ -15,7 +15,7 @@ import pytest
 
 from orthoflow.engine import Store
 from orthoflow.records import open_run, verify_run
-from tests.road.conftest import IS_LONG
+from tests.long_loops import IS_LONG
 from tests.workshop_runs import workshop_environment, write_studio
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,7 +12,7 @@ from orthoflow.products import Camera
 from orthoflow.sdk import StepContext
 from tests import matching_scenes as ms
 from tests.adverse_cases import GSD_M, KINDS, AdverseCase, adverse_case, every_case
-from tests.road.conftest import IS_LONG
+from tests.long_loops import IS_LONG
 
 
 def oriented(case: AdverseCase, folder: Path) -> Camera:

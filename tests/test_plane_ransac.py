@@ -16,8 +16,8 @@ from pydantic import ValidationError
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import PointCloud
 from orthoflow.sdk import StepContext
+from tests.long_loops import IS_LONG
 from tests.plane_scenes import ROOM, cloud_of, sampled
-from tests.road.conftest import IS_LONG
 
 STATION = np.array([[0.3, -0.2, 0.1]])
 UP = np.array([0.0, 0.0, 1.0])

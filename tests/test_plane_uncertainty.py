@@ -15,9 +15,9 @@ from scipy import ndimage
 from orthoflow.geometry import Plane, angle_between_deg, wall_axes
 from orthoflow.geometry.plane_kernels import STEPS_PER_TOLERANCE
 from orthoflow.products import Planes
+from tests.long_loops import IS_LONG
 from tests.plane_scenes import context
 from tests.random_rooms import random_room
-from tests.road.conftest import IS_LONG
 
 FIT_M = 0.015
 UP = np.array([0.0, 0.0, 1.0])

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.long_loops import IS_LONG
 from tests.road.conftest import metrics_of
 
-IS_LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "plugins" / "README.md").read_text()
 COMMANDS = [

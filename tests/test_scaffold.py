@@ -18,8 +18,8 @@ from orthoflow.scaffold import Project, write_project
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
 from orthoflow.workflow import load_workflow
+from tests.long_loops import IS_LONG
 
-IS_LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = sorted(discover_catalog().kinds)
 

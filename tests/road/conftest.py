@@ -19,8 +19,6 @@ from orthoflow.engine.store import Store
 
 ROOT = Path(__file__).resolve().parents[2]
 STRANGER = ROOT / "tests" / "third_party" / "orthoflow-stranger"
-# More of the same, or what needs the machine for itself: `.ci/run --long`.
-IS_LONG = os.environ.get("ORTHOFLOW_LONG_TESTS") == "1"
 CHECKOUT = tuple(str(ROOT / part) for part in ("", "plugins", "provenance"))
 
 

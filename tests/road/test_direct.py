@@ -12,7 +12,8 @@ import pytest
 import orthoflow
 from orthoflow.files.geotiff import read_raster
 from orthoflow.geometry import angle_between_deg
-from tests.road.conftest import IS_LONG, Shell, metrics_of
+from tests.long_loops import IS_LONG
+from tests.road.conftest import Shell, metrics_of
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
 SMALL = ("--set", "room.scan_step_m=0.008", "--set", "wall.gsd_m=0.012")

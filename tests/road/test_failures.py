@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.road.conftest import IS_LONG, Shell
+from tests.long_loops import IS_LONG
+from tests.road.conftest import Shell
 
 Write = Callable[[str, str], Path]
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from orthoflow.records import Run, open_run, verify_run
-from tests.road.conftest import IS_LONG, ROOT, Shell
+from tests.long_loops import IS_LONG
+from tests.road.conftest import ROOT, Shell
 
 pytestmark = [
     pytest.mark.long,

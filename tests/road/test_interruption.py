@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 import orthoflow
-from tests.road.conftest import IS_LONG, Shell
+from tests.long_loops import IS_LONG
+from tests.road.conftest import Shell
 
 RUN = (
     *("run", "direct.yaml", "--until", "wall"),

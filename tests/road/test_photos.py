@@ -15,7 +15,8 @@ import orthoflow
 from orthoflow.files.calibration import write_calibration
 from orthoflow.products import Calibration, Photos, PointCloud, Truth
 from orthoflow.records import Run
-from tests.road.conftest import IS_LONG, Shell, metrics_of
+from tests.long_loops import IS_LONG
+from tests.road.conftest import Shell, metrics_of
 from tests.scan_files import write_las
 
 # Half of the shipped recipe's points and pixels: scan step 4 mm, photos 3 mm, cells 6 mm.

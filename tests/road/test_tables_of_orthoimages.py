@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.road.conftest import IS_LONG, Shell, metrics_of
+from tests.long_loops import IS_LONG
+from tests.road.conftest import Shell, metrics_of
 
 pytestmark = [
     pytest.mark.long,

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from orthoflow.workflow import shipped_workflow
-from tests.road.conftest import IS_LONG, Shell, metrics_of, without_variants
+from tests.long_loops import IS_LONG
+from tests.road.conftest import Shell, metrics_of, without_variants
 
 pytestmark = pytest.mark.long  # some of the variants in a normal run
 ONLY_LONG = (
