@@ -12,6 +12,9 @@ from tests.road.conftest import Shell, metrics_of, without_variants
 
 pytestmark = pytest.mark.long  # some of the variants in a normal run
 ONLY_LONG = (
+    "hough2d-unit",
+    "hough2d-canny",
+    "hough2d-raw",
     "hough2d-1in20",
     "hough3d-1in20",
     "hough3d-full",
