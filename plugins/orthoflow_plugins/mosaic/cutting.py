@@ -108,7 +108,7 @@ def _means(
 
 def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
     """Let one layer take over cells: the best of all such moves, by a minimum cut."""
-    from scipy.sparse import coo_matrix
+    from scipy.sparse import coo_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
     count = labels.size
@@ -138,10 +138,10 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
     between += [take - low, keep - low]
     # Edges from p to q are cut where p keeps and q takes: p on the source's side.
     capacity = np.minimum(np.concatenate(between), 4.0 * _FORBIDDEN) * _UNITS
-    graph = coo_matrix(
+    graph = coo_array(
         (
             np.rint(capacity).astype(np.int32),
-            (np.concatenate(starts), np.concatenate(ends)),
+            (np.concatenate(starts).astype(np.int32), np.concatenate(ends).astype(np.int32)),
         ),
         shape=(count + 2, count + 2),
     ).tocsr()
