@@ -8,7 +8,7 @@ from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec, hookimpl
 WORKS = ["add", "noise", "sign", "slow", "segfault", "abort", "eat", "hang", "stubborn", "quit",
          "leave", "raises", "refuses", "unreadable", "needs_library", "no_memory", "full_disk",
          "changes_input", "wrong_type", "wrong_out", "bad_param", "draws", "chatty", "unstorable",
-         "spawns", "threads", "fills_mapped"]
+         "spawns", "spawns_and_waits", "threads", "fills_mapped"]
 
 @hookimpl
 def orthoflow_kinds():
@@ -250,6 +250,12 @@ def unstorable(values, params, ctx):
 def spawns(values, params, ctx):
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     return np.array([float(child.pid)])
+
+@work("exact")
+def spawns_and_waits(values, params, ctx):
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    ctx.log(f"started {child.pid}")
+    child.wait()
 
 @work("exact")
 def threads(values, params, ctx):

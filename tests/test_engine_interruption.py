@@ -56,11 +56,6 @@ def wait_for(world: World, folder: str, event: str, address: str) -> None:
     pytest.fail(f"{address} never {event}")
 
 
-def children(process_id: int) -> list[int]:
-    text = Path(f"/proc/{process_id}/task/{process_id}/children").read_text()
-    return [int(word) for word in text.split()]
-
-
 def is_alive(process_id: int) -> bool:
     try:
         return Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
@@ -107,17 +102,22 @@ def test_a_finished_step_is_not_computed_again_after_a_kill(world: World) -> Non
     assert [event["event"] for event in events(world, "run")].count("resumed") == 1
 
 
-def test_steps_die_with_their_coordinator(world: World) -> None:
-    process = start_coordinator(world, STEPS.replace("steps: 6", "steps: 2000"), "run")
-    wait_for(world, "run", "started", "second")
-    time.sleep(0.3)
-    (child,) = children(process.pid)
+def test_steps_and_what_they_started_die_with_their_coordinator(world: World) -> None:
+    steps = STEPS.replace("work.slow", "work.spawns_and_waits")
+    process = start_coordinator(world, steps, "run")
+    log = world.folder / "run" / "logs" / "second.log"
+    deadline = time.monotonic() + 60
+    while not (log.exists() and log.read_text().endswith("\n")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    grandchild = int(log.read_text().removeprefix("started "))
+    step = int(Path(f"/proc/{grandchild}/stat").read_text().rpartition(")")[2].split()[1])
     process.kill()
     process.communicate()
     deadline = time.monotonic() + 5
-    while is_alive(child) and time.monotonic() < deadline:
+    while (is_alive(step) or is_alive(grandchild)) and time.monotonic() < deadline:
         time.sleep(0.02)
-    assert not is_alive(child)
+    assert not is_alive(step)
+    assert not is_alive(grandchild)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)

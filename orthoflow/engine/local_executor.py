@@ -18,6 +18,7 @@ from typing import Final
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.endings import describe_exit, describe_memory, describe_timeout
 from orthoflow.engine.executors import TaskEnd, Tell
+from orthoflow.engine.group_guard import GroupGuard
 from orthoflow.engine.memory import process_memory
 from orthoflow.engine.memory_guard import MemoryGuard, oom_kills
 from orthoflow.engine.result_files import result_from_json
@@ -79,6 +80,7 @@ class LocalExecutor:
     _running: dict[str, _Running] = field(default_factory=dict)
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
     _guard: MemoryGuard = field(default_factory=MemoryGuard)
+    _group_guard: GroupGuard = field(default_factory=GroupGuard)
 
     def start(self, task: Task) -> None:
         """Spawn the process of a task.
@@ -108,6 +110,7 @@ class LocalExecutor:
             oom_kills=oom_kills(),
         )
         self._running[task.address] = run
+        self._group_guard.watch(process.pid)
         self._selector.register(run.pipe, selectors.EVENT_READ, run)
         self._selector.register(run.process_descriptor, selectors.EVENT_READ, run)
 
@@ -132,6 +135,7 @@ class LocalExecutor:
             _signal_group(run, signal.SIGKILL)
             self._forget(run)
         self._selector.close()
+        self._group_guard.close()
 
     def _spawn(self, task: Task, pipe: int, log: int) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
@@ -218,6 +222,7 @@ class LocalExecutor:
         )
 
     def _forget(self, run: _Running) -> None:
+        self._group_guard.forget(run.process.pid)
         run.process.wait()
         for descriptor in (run.pipe, run.process_descriptor):
             with contextlib.suppress(KeyError):

@@ -12,10 +12,11 @@ from orthoflow_provenance.model import RecordedFile, RecordedInput
 
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.workflow import Workflow, resolve_input_files
+from orthoflow.workflow.input_options import override_inputs, read_input_options
 from orthoflow.workflow.model import WorkflowInputSpec
 from orthoflow.workflow.positions import Table, read_yaml
 from orthoflow.workflow.problems import ProblemLog
-from orthoflow.workflow.sections import override_inputs, read_inputs
+from orthoflow.workflow.sections import read_inputs
 
 # A run lies in runs/<name>/ below the folder of its workflow, when nobody says otherwise.
 _FOLDERS_ABOVE: Final = 3
@@ -109,7 +110,7 @@ class _Places:
 
 def _places(workflow: Workflow, run_folder: Path, given: Sequence[str]) -> dict[str, _Places]:
     log = ProblemLog(file="")
-    overridden = override_inputs(workflow.inputs, given, log)
+    overridden = override_inputs(workflow.inputs, read_input_options(given, log), log)
     log.raise_any()
     specs = {name: spec for name, spec in overridden.items() if spec.is_given}
     by_hand = resolve_input_files(dataclasses.replace(workflow, inputs=specs))

@@ -17,13 +17,14 @@ from orthoflow.workflow.expectations import (
     expect_text,
     expect_whole_number,
 )
+from orthoflow.workflow.input_options import override_inputs, read_input_options
 from orthoflow.workflow.model import Comparison, StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.overrides import CallName, assign_overrides
 from orthoflow.workflow.parameters import resolve_params
 from orthoflow.workflow.positions import Entry, Table, read_yaml
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.recipes import find_workflow
-from orthoflow.workflow.sections import check_baseline, override_inputs, read_compare, read_inputs
+from orthoflow.workflow.sections import check_baseline, read_compare, read_inputs
 from orthoflow.workflow.steps import DraftStep, read_steps
 from orthoflow.workflow.wiring import check_wiring
 
@@ -167,17 +168,18 @@ class _Reader:
                 step_names = tuple(entry.key for entry in steps_entry.value)
         check_wiring(steps, step_names, tuple(specs), self.log)
         compare = self._compare(table.get("compare"), steps, step_names)
+        given = read_input_options(input_options, self.log)
         return Workflow(
             name=self._name(table),
             path=self.path,
             source=self.source,
             seed=self._seed(table.get("seed")),
-            inputs=override_inputs(specs, input_options, self.log),
+            inputs=override_inputs(specs, given, self.log),
             steps=self._steps(steps, sets),
             compare=compare,
             overrides=(
                 *(f"--set {text}" for text in sets),
-                *(f"--input {_without_folder(text)}" for text in input_options),
+                *(option.without_folder for option in given),
             ),
         )
 
@@ -250,8 +252,3 @@ class _Reader:
                 is_varied=draft.is_varied,
             )
         return steps
-
-
-def _without_folder(option: str) -> str:
-    name, mark, path = option.partition("=")
-    return f"{name}{mark}{Path(path).name}"

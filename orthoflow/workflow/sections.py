@@ -49,32 +49,6 @@ def read_inputs(value: Value, folder: Path, log: ProblemLog) -> dict[str, Workfl
     return specs
 
 
-def override_inputs(
-    specs: Mapping[str, WorkflowInputSpec], options: Sequence[str], log: ProblemLog
-) -> dict[str, WorkflowInputSpec]:
-    """Put `--input NAME=PATH` over the file's inputs; several of one name add up.
-
-    Paths are relative to the working directory.
-    """
-    changed = dict(specs)
-    for option in options:
-        name, mark, path = option.partition("=")
-        if not mark or not path or not name:
-            log.add_option(f"--input {option}", "expected NAME=PATH")
-        elif name not in specs:
-            known = ", ".join(specs) or "none"
-            log.add_option(
-                f"--input {option}",
-                f"there is no input {name}{did_you_mean(name, specs)}; inputs: {known}",
-            )
-        else:
-            before = changed[name].files if changed[name].is_given else ()
-            changed[name] = replace(
-                specs[name], files=(*before, path), folder=Path.cwd(), is_given=True
-            )
-    return changed
-
-
 def read_compare(
     value: Value, steps: Sequence[DraftStep], step_names: Sequence[str], log: ProblemLog
 ) -> Comparison | None:
