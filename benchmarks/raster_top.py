@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.geometry import frame_over
-from orthoflow.geometry.raster_kernels import NO_POINT
-from orthoflow.geometry.rastering import topmost_points
+from orthoflow.geometry.rastering import topmost_points, values_of_winners
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
@@ -79,10 +78,8 @@ def one_pass(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float
 
 def with_ours(cloud: PointCloud, slab: Slab, threads: int) -> tuple[NDArray, NDArray]:
     winners = topmost_points(cloud, slab, threads=threads)
-    has_point = winners["point"] != NO_POINT
-    intensity = np.full(has_point.size, np.nan, dtype=np.float32)
-    intensity[has_point] = cloud.intensity[winners["point"][has_point]]
-    return winners["depth_m"], intensity
+    intensity = values_of_winners(winners, cloud.intensity[:, None], np.nan, threads=threads)
+    return winners["depth_m"], intensity[:, 0]
 
 
 def with_maximum_at(cloud: PointCloud, slab: Slab) -> tuple[NDArray, NDArray]:

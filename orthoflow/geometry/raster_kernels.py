@@ -1,24 +1,22 @@
 """Compiled passes that lay points into the cells of a raster.
 
-A pass works on one chunk of the cloud after the other. `project_points` transforms a chunk and
-keeps what falls into the raster, in the order of the points; the other passes then run over the
-kept entries, each thread on the cells it owns. Every cell is therefore visited in the order of the
+A pass works on one chunk of the cloud after the other. `raster_entry_kernels` transforms a chunk
+and keeps what falls into the raster, in the order of the points; the passes then run over the kept
+entries, each thread on the cells it owns. Every cell is therefore visited in the order of the
 points whatever the number of threads, and no result depends on it, sums of floats included.
 """
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.point_kernels import Offsets, compiled
+from orthoflow.geometry.raster_entry_kernels import BLOCK, Entries
 
-# Points handled by one task; an entry slot exists for each, so that tasks never wait for another.
-BLOCK: Final = 8192
-# Points transformed together; their positions stay in the first-level cache.
-_LANE: Final = 512
 # Cells are dealt out to threads in runs of 2^17, some dozens of rows: a scan runs along columns or
 # rows, and a thread that meets its own points in long runs is not slowed by the others'.
 _RUN_SHIFT: Final = 17
@@ -28,106 +26,49 @@ NO_POINT: Final = np.uint32(0xFFFFFFFF)
 WINNER: Final = np.dtype([("depth_m", "f4"), ("square", "f4"), ("point", "u4"), ("n_points", "u4")])
 
 
-class Target(NamedTuple):
-    """The raster that points are laid into.
-
-    Attributes:
-        wall_from_offset: (3, 4) float64; rows give column, row and depth in metres of an offset.
-        behind_m: smallest depth that counts.
-        front_m: largest depth that counts.
-        height: number of rows.
-        width: number of columns.
-    """
-
-    wall_from_offset: NDArray[np.float64]
-    behind_m: float
-    front_m: float
-    height: int
-    width: int
-
-
-class Entries(NamedTuple):
-    """Points of one chunk that fall into the raster, `n_inside[b]` from slot `b * BLOCK` on.
-
-    Attributes:
-        cells: int32, row * width + column.
-        depths_m: float32.
-        squares: float32, squared distance to the centre of the cell, in cells.
-        points: uint32, index in the cloud.
-        n_inside: int64, entries per block.
-    """
-
-    cells: NDArray[np.int32]
-    depths_m: NDArray[np.float32]
-    squares: NDArray[np.float32]
-    points: NDArray[np.uint32]
-    n_inside: NDArray[np.int64]
+@numba.njit(cache=True, inline="always")
+def is_own(cell, owners, owner):  # type: ignore[no-untyped-def]  # numba infers the types
+    """Tell whether a thread owns a cell; owners are a power of two."""
+    return (cell >> _RUN_SHIFT) & (owners - 1) == owner
 
 
 @compiled
-def project_points(
-    offsets: Offsets, first: int, target: Target, entries: Entries, first_block: int, end_block: int
-) -> None:
-    """Fill blocks of `entries` with the points of a chunk inside the raster and its buffer.
+def empty_cells(winners: NDArray[np.void], first: int, end: int) -> None:
+    """Make some cells of `WINNER` such that nobody has won them yet."""
+    for cell in range(first, end):
+        winner = winners[cell]
+        winner.depth_m = np.float32(-np.inf)
+        winner.square = np.float32(np.inf)
+        winner.point = NO_POINT
+        winner.n_points = np.uint32(0)
 
-    Both ends of the buffer are inside. A cell owns its left and upper edge.
+
+@compiled
+def take_values(
+    winners: NDArray[np.void],
+    values: NDArray[np.generic],
+    nothing: float,
+    taken: NDArray[np.generic],
+    first: int,
+    end: int,
+) -> None:
+    """Give some cells the values of the points that won them.
 
     Args:
-        offsets: of the chunk.
-        first: index in the cloud of the chunk's first point.
-        target: the raster.
-        entries: overwritten.
-        first_block: first block to fill.
-        end_block: the block after the last one.
+        winners: (cells,) of `WINNER`.
+        values: (points of the cloud, channels).
+        nothing: for cells without a point of their own.
+        taken: (cells, channels), overwritten.
+        first: first cell.
+        end: the cell after the last one.
     """
-    u, v, depth = np.empty(_LANE), np.empty(_LANE), np.empty(_LANE)
-    is_inside = np.empty(_LANE, dtype=np.bool_)
-    for block in range(first_block, end_block):
-        slot = begin = block * BLOCK
-        end = min(offsets.x.size, begin + BLOCK)
-        for lane in range(begin, end, _LANE):
-            n_lane = min(_LANE, end - lane)
-            _transform(offsets, lane, n_lane, target, (u, v, depth), is_inside)
-            for k in range(n_lane):
-                if not is_inside[k]:
-                    continue
-                column, row = np.int32(u[k]), np.int32(v[k])
-                du, dv = u[k] - column - 0.5, v[k] - row - 0.5
-                entries.cells[slot] = row * target.width + column
-                entries.depths_m[slot] = depth[k]
-                entries.squares[slot] = du * du + dv * dv
-                entries.points[slot] = first + lane + k
-                slot += 1
-        entries.n_inside[block] = slot - begin
-
-
-@compiled
-def _transform(
-    offsets: Offsets,
-    first: int,
-    n_points: int,
-    target: Target,
-    position: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
-    is_inside: NDArray[np.bool_],
-) -> None:
-    """Transform at most `_LANE` points; without branches, so that it vectorises."""
-    us, vs, depths = position
-    m = target.wall_from_offset
-    u0, u1, u2, u3 = m[0, 0], m[0, 1], m[0, 2], m[0, 3]
-    v0, v1, v2, v3 = m[1, 0], m[1, 1], m[1, 2], m[1, 3]
-    d0, d1, d2, d3 = m[2, 0], m[2, 1], m[2, 2], m[2, 3]
-    behind_m, front_m = target.behind_m, target.front_m
-    width, height = np.float64(target.width), np.float64(target.height)
-    x, y, z = offsets.x[first:], offsets.y[first:], offsets.z[first:]
-    for k in range(n_points):
-        # float64 on purpose: the pass waits for memory, not for arithmetic.
-        px, py, pz = np.float64(x[k]), np.float64(y[k]), np.float64(z[k])
-        u = u0 * px + u1 * py + u2 * pz + u3
-        v = v0 * px + v1 * py + v2 * pz + v3
-        depth = d0 * px + d1 * py + d2 * pz + d3
-        us[k], vs[k], depths[k] = u, v, depth
-        is_in_raster = (u >= 0.0) & (u < width) & (v >= 0.0) & (v < height)
-        is_inside[k] = is_in_raster & (depth >= behind_m) & (depth <= front_m)
+    for cell in range(first, end):
+        winner = winners[cell]
+        if winner.n_points == 0:
+            taken[cell, :] = nothing
+            continue
+        for channel in range(values.shape[1]):
+            taken[cell, channel] = values[winner.point, channel]
 
 
 @compiled
@@ -144,7 +85,7 @@ def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
-            if (cell >> _RUN_SHIFT) & (owners - 1) != owner:
+            if not is_own(cell, owners, owner):
                 continue
             winner = winners[cell]
             winner.n_points += np.uint32(1)
@@ -170,7 +111,7 @@ def keep_nearest(entries: Entries, winners: NDArray[np.void], owners: int, owner
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
-            if (cell >> _RUN_SHIFT) & (owners - 1) != owner:
+            if not is_own(cell, owners, owner):
                 continue
             winner = winners[cell]
             winner.n_points += np.uint32(1)
@@ -214,7 +155,7 @@ def keep_nearest_around(
             for r in range(max(0, row - 1), min(height, row + 2)):
                 for c in range(max(0, column - 1), min(width, column + 2)):
                     place = r * width + c
-                    if (place >> _RUN_SHIFT) & (owners - 1) != owner:
+                    if not is_own(place, owners, owner):
                         continue
                     winner = winners[place]
                     if place == cell:
@@ -234,7 +175,7 @@ def count_points(entries: Entries, n_points: NDArray[np.uint32], owners: int, ow
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
-            if (cell >> _RUN_SHIFT) & (owners - 1) == owner:
+            if is_own(cell, owners, owner):
                 n_points[cell] += np.uint32(1)
 
 
@@ -245,7 +186,7 @@ def add_moments(entries: Entries, moments: NDArray[np.float64], owners: int, own
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
-            if (cell >> _RUN_SHIFT) & (owners - 1) == owner:
+            if is_own(cell, owners, owner):
                 depth = np.float64(entries.depths_m[k])
                 moments[cell, 0] += depth
                 moments[cell, 1] += depth * depth
@@ -272,7 +213,7 @@ def sort_into_cells(
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
-            if (cell >> _RUN_SHIFT) & (owners - 1) != owner:
+            if not is_own(cell, owners, owner):
                 continue
             sorted_m[cursors[cell]] = entries.depths_m[k]
             cursors[cell] += 1
@@ -368,7 +309,7 @@ def add_values(
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
-            if (cell >> _RUN_SHIFT) & (owners - 1) != owner:
+            if not is_own(cell, owners, owner):
                 continue
             if abs(entries.depths_m[k] - depths_m[cell]) > layer_m:
                 continue

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,15 @@ from orthoflow.geometry import raster_gap_kernels as gaps
 from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.point_kernels import Offsets, in_threads, read_only
-from orthoflow.geometry.raster_kernels import WINNER, Entries, Target
+from orthoflow.geometry.raster_entry_kernels import BLOCK, Entries, Target, project_points
+from orthoflow.geometry.raster_kernels import WINNER
 from orthoflow.geometry.slabs import OffsetPoints, Slab
 
 # 2^20 points: their entries (16 MB) stay in the processor's cache between the passes, and threads
 # wait for each other seldom.
 _CHUNK: Final = 1 << 20
+
+_Value = TypeVar("_Value", bound=np.generic)
 
 
 def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -53,10 +56,10 @@ def entries_inside(points: OffsetPoints, slab: Slab, *, threads: int) -> Iterato
     buffers = _empty_entries(size)
     for first in range(0, x.size, size):
         part = slice(first, min(first + size, x.size))
-        n_blocks = -(-(part.stop - part.start) // kernels.BLOCK)
+        n_blocks = -(-(part.stop - part.start) // BLOCK)
         entries = buffers._replace(n_inside=buffers.n_inside[:n_blocks])
         chunk = Offsets(x[part], y[part], z[part])
-        in_parts(n_blocks, threads, partial(kernels.project_points, chunk, first, target, entries))
+        in_parts(n_blocks, threads, partial(project_points, chunk, first, target, entries))
         yield entries
 
 
@@ -90,16 +93,35 @@ def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> NDArray
     Returns:
         (cells,) of `raster_kernels.WINNER`; `point` is `NO_POINT` where the cell is void.
     """
-    winners = empty_winners(slab.n_cells)
+    winners = empty_winners(slab.n_cells, threads=threads)
     for entries in entries_inside(points, slab, threads=threads):
         share_cells(threads, partial(kernels.keep_topmost, entries, winners))
     return winners
 
 
-def empty_winners(n_cells: int) -> NDArray[np.void]:
+def empty_winners(n_cells: int, *, threads: int) -> NDArray[np.void]:
     """Give cells that nobody has won yet."""
-    nobody = np.array((-np.inf, np.inf, kernels.NO_POINT, 0), dtype=WINNER)
-    return np.full(n_cells, nobody, dtype=WINNER)
+    winners = np.empty(n_cells, dtype=WINNER)
+    in_parts(n_cells, threads, partial(kernels.empty_cells, winners))
+    return winners
+
+
+def values_of_winners(
+    winners: NDArray[np.void], values: NDArray[_Value], nothing: float, *, threads: int
+) -> NDArray[_Value]:
+    """Values (cells, channels) of the points that won the cells.
+
+    Args:
+        winners: (cells,) of `raster_kernels.WINNER`.
+        values: (n, channels) of the points of the cloud.
+        nothing: for cells without a point of their own.
+        threads: how many threads work.
+    """
+    taken = np.empty((winners.size, values.shape[1]), dtype=values.dtype)
+    seen = np.asarray(values).view(np.ndarray)
+    seen.flags.writeable = False
+    in_parts(winners.size, threads, partial(kernels.take_values, winners, seen, nothing, taken))
+    return taken
 
 
 def spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -184,8 +206,8 @@ def lenders_in_gaps(
 
 
 def _empty_entries(n_points: int) -> Entries:
-    n_blocks = -(-n_points // kernels.BLOCK)
-    slots = n_blocks * kernels.BLOCK
+    n_blocks = -(-n_points // BLOCK)
+    slots = n_blocks * BLOCK
     return Entries(
         cells=np.empty(slots, dtype=np.int32),
         depths_m=np.empty(slots, dtype=np.float32),

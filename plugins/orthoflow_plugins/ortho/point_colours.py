@@ -18,7 +18,7 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 
 if TYPE_CHECKING:
-    from orthoflow.geometry.raster_kernels import Entries
+    from orthoflow.geometry.raster_entry_kernels import Entries
 
 Colouring = Literal["topmost", "centre", "gaussian", "median"]
 
@@ -73,7 +73,7 @@ def colours_of(
         rule: how.
     """
     from orthoflow.geometry.raster_kernels import NO_POINT
-    from orthoflow.geometry.rastering import topmost_points
+    from orthoflow.geometry.rastering import topmost_points, values_of_winners
 
     winners = topmost_points(cloud, slab, threads=rule.threads)
     has_point = winners["point"] != NO_POINT
@@ -86,7 +86,7 @@ def colours_of(
     elif rule.colouring == "median":
         _lay_medians(rgb, cloud, values, slab, floors_m, rule)
     else:
-        rgb[has_point] = values[winners["point"][has_point]]
+        rgb[:] = values_of_winners(winners, values, 0, threads=rule.threads)
     return CellColours(rgb=rgb, has_point=has_point, distance_cells=np.sqrt(winners["square"]))
 
 
@@ -97,7 +97,7 @@ def _most_central(
     from orthoflow.geometry.raster_kernels import keep_nearest
     from orthoflow.geometry.rastering import empty_winners, entries_inside, share_cells
 
-    winners = empty_winners(slab.n_cells)
+    winners = empty_winners(slab.n_cells, threads=threads)
     for entries in entries_inside(cloud, slab, threads=threads):
         slots = _slots(entries)
         is_below = entries.depths_m[slots] < floors_m[entries.cells[slots]]
@@ -134,7 +134,7 @@ def _on_top(
 
 def _slots(entries: Entries) -> NDArray[np.int64]:
     """Slots of a chunk that hold a point."""
-    from orthoflow.geometry.raster_kernels import BLOCK
+    from orthoflow.geometry.raster_entry_kernels import BLOCK
 
     is_used = np.arange(BLOCK) < entries.n_inside[:, np.newaxis]
     return np.flatnonzero(is_used)

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.point_kernels import read_only
-from orthoflow.geometry.raster_kernels import Entries
+from orthoflow.geometry.raster_entry_kernels import Entries
 from orthoflow.geometry.rastering import (
     empty_winners,
     entries_inside,
     in_parts,
     share_cells,
     spread_m,
+    values_of_winners,
     wall_from_offset,
 )
 from orthoflow.geometry.slabs import Slab
@@ -60,24 +61,26 @@ def surface_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
 
 def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """One pass: the winning point gives depth, intensity and colour."""
-    winners, moments = empty_winners(slab.n_cells), np.zeros((slab.n_cells, 2))
+    winners = empty_winners(slab.n_cells, threads=rule.threads)
+    moments = np.zeros((slab.n_cells, 2))
     for entries in entries_inside(cloud, slab, threads=rule.threads):
         share_cells(
             rule.threads,
             _contest(cloud, slab, rule, entries, winners),
             partial(kernels.add_moments, entries, moments),
         )
-    sigma_m = spread_m(winners["n_points"], moments)
+    taken = partial(values_of_winners, winners, threads=rule.threads)
+    intensity, rgb = cloud.intensity, cloud.rgb
     # A nearest neighbour may lie in the next cell; a cell without a point of its own stays void.
     has_point = winners["n_points"] > 0
-    points = winners["point"][has_point]
     surface = CellSurface(
         depth_m=np.where(has_point, winners["depth_m"], np.float32(np.nan)),
-        sigma_m=sigma_m,
+        sigma_m=spread_m(winners["n_points"], moments),
         count=winners["n_points"].copy(),
-        intensity=_gathered_intensity(cloud, points, has_point),
-        rgb=_gathered_rgb(cloud, points, has_point),
+        intensity=None if intensity is None else taken(intensity[:, np.newaxis], np.nan)[:, 0],
+        rgb=None if rgb is None else taken(rgb, 0),
     )
+    points = winners["point"][has_point]
     return _triangulated(cloud, slab, points, surface) if rule.surface == "tin" else surface
 
 
@@ -120,26 +123,6 @@ def _triangulated(
         intensity=None if surface.intensity is None else np.ascontiguousarray(found[1][:, 0]),
         rgb=None if surface.rgb is None else np.rint(np.nan_to_num(found[-1])).astype(np.uint8),
     )
-
-
-def _gathered_intensity(
-    cloud: PointCloud, points: NDArray[np.uint32], has_point: NDArray[np.bool_]
-) -> NDArray[np.float32] | None:
-    if cloud.intensity is None:
-        return None
-    intensity = np.full(has_point.size, np.nan, dtype=np.float32)
-    intensity[has_point] = cloud.intensity[points]
-    return intensity
-
-
-def _gathered_rgb(
-    cloud: PointCloud, points: NDArray[np.uint32], has_point: NDArray[np.bool_]
-) -> NDArray[np.uint8] | None:
-    if cloud.rgb is None:
-        return None
-    rgb = np.zeros((has_point.size, 3), dtype=np.uint8)
-    rgb[has_point] = cloud.rgb[points]
-    return rgb
 
 
 def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
