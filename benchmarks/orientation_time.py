@@ -52,9 +52,10 @@ def main() -> None:
     parser.add_argument("--gap", default="easy", help="spectral gap: easy or hard")
     parser.add_argument("--exif", action="store_true", help="lenses from EXIF alone")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--gsd-m", type=float, default=0.00215, help="cell of the wall")
     chosen = parser.parse_args()
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: chosen.cores])
-    size = argparse.Namespace(layout="quick", gsd_m=0.0026, photo_gsd_m=0.00085)
+    size = argparse.Namespace(layout="quick", gsd_m=chosen.gsd_m, photo_gsd_m=0.00085)
     photos, walls, _ = room(chosen.seed, chosen.gap, size)
     if chosen.exif:
         photos = Photos(photos=tuple(replace(each, intrinsics=None) for each in photos.photos))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_plugins.inspect.reporting import report
 from orthoflow_plugins.inspect.samples import depth_step_band
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.simulate.room import SimulateRoom
@@ -15,6 +16,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
 from orthoflow.products import (
+    Finding,
     Orthoimage,
     Orthoimages,
     OrthoMask,
@@ -309,3 +311,22 @@ def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
 def test_nothing_to_inspect_is_refused(tmp_path: Path, truth: Truth) -> None:
     with pytest.raises(MethodError, match="nothing to inspect: wire orthoimages and walls, or pla"):
         inspect_planes(tmp_path, truth, None, None)
+
+
+def test_every_wall_tells_its_displacement(tmp_path: Path) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    findings = [
+        Finding(name=name, value=value, unit="mm", wall=wall)
+        for wall, name, value in (
+            (2, "rmse_u_mm", 1.0),
+            (0, "rmse_u_mm", 2.0),
+            (-1, "rmse_u_mm", 3.0),
+            (0, "plane_angle_deg", 4.0),
+        )
+    ]
+    report(findings, 2, context)
+    assert {metric.name: metric.value for metric in context.metrics} == {
+        "rmse_u_mm": 1.0,
+        "wall_0_rmse_u_mm": 2.0,
+        "all_rmse_u_mm": 3.0,
+    }

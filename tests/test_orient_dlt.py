@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.orient.direct_linear import direct_linear, relief
-from orthoflow_plugins.orient.dlt import OrientDlt, estimate_dlt
+from orthoflow_plugins.orient.dlt import Distortion, OrientDlt, estimate_dlt
 from orthoflow_plugins.orient.estimating import Estimate, EstimationRule
 from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
@@ -162,10 +162,13 @@ def test_stated_errors_hold_where_the_model_does(tmp_path: Path, seed: int) -> N
     assert 0.2 < np.sqrt(np.mean(errors**2) / 2.0) * pixel_m / found.sigma_wall_m < 3.0
 
 
-def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider() -> None:
+@pytest.mark.parametrize("distortion", ["none", "k1"])
+def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider(
+    distortion: Distortion,
+) -> None:
     true = replace(camera(), distortion=np.array([-0.08, 0.02, 0.0, 0.0, 0.0]))
     rule = EstimationRule(rejection_sigma=3.5, threshold_px=None, n_trials_most=2000, seed=1)
-    ratios = []
+    ratios, at_worst = [], []
     for seed in range(6):
         ties = ties_of(true, seed, noise_px=0.7)
         seen = SeenPoints(
@@ -175,14 +178,17 @@ def test_a_lens_with_more_distortion_than_the_model_has_is_stated_wider() -> Non
             sigma_m=ties.sigma_m,
         )
         is_check = np.arange(len(seen)) % 5 == 0
-        found = estimate_dlt(photos().photos[0], seen, is_check, rule, distortion="k1")
+        found = estimate_dlt(photos().photos[0], seen, is_check, rule, distortion=distortion)
         assert isinstance(found, Estimate)
         stated = wall_error(found.resection, known_walls(ties, np.ones(len(seen), np.bool_)))
         assert stated is not None
-        errors = frame_errors_px(found.resection.camera, true)
-        ratios.append(np.sqrt(np.mean(errors**2) / 2.0) * 2.6 / 3200.0 / stated.rms_m)
-    # Measured: 1.6; without what the full model would move, 3.3.
-    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 2.4
+        errors_m = frame_errors_px(found.resection.camera, true) * 2.6 / 3200.0 / np.sqrt(2.0)
+        ratios.append(np.sqrt(np.mean(errors_m**2)) / stated.rms_m)
+        at_worst.append(errors_m.max() / stated.worst_m)
+    # Measured: 1.37 and 1.28, at the worst place 1.54 and 1.53; unless the fuller model is asked,
+    # 8 and 3.3.
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.8
+    assert np.sqrt(np.mean(np.square(at_worst))) < 2.5
 
 
 @pytest.mark.parametrize(

@@ -228,6 +228,19 @@ def test_runs_on_different_data_are_not_ranked_together() -> None:
     ]
 
 
+def test_runs_of_one_workflow_are_told_apart_by_their_options() -> None:
+    cells = cell("plane", metrics=metrics(rms_mm=1.0))
+    runs = [
+        run(cells, run_id=f"r{walls}", overrides=(f"--set wall.n={walls}",)) for walls in (1, 4)
+    ]
+    table = comparison_table(runs)
+    assert table is not None
+    assert [row.run for row in table.rows] == [
+        "toy <run> --set wall.n=1, r1",
+        "toy <run> --set wall.n=4, r4",
+    ]
+
+
 def test_a_value_within_the_spread_of_the_best_is_no_loser() -> None:
     values = [
         Value(text="a", sort=1.0, spread=0.2),

@@ -148,7 +148,7 @@ def _row(
         dict.fromkeys(origins.letters(one.run, cell.environment) for cell in varied)
     )
     return Row(
-        run=f"{one.run.record.name}, {one.run.record.run_id}",
+        run=_run_label(one.run),
         variants=tuple(one.assignment.get(step, "-") for step in steps),
         is_baseline=one.is_baseline,
         failure=f"{failed.address}: {failed.error_message}" if failed else "",
@@ -161,6 +161,11 @@ def _row(
         ),
         remark=_remark(one),
     )
+
+
+def _run_label(run: Run) -> str:
+    """The workflow with the options that it was run with, and the run's id."""
+    return f"{' '.join((run.record.name, *run.record.overrides))}, {run.record.run_id}"
 
 
 def _value(measured: Measured | None, run: Run, origins: Origins) -> Value:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -15,13 +14,12 @@ from pydantic import Field
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.lenses import LensFreedom
-from orthoflow.geometry.resection import SeenPoints, adjust, predicted_covariances
+from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Cameras, Photo, Photos, Ties
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.direct_linear import direct_linear, relief
 from orthoflow_plugins.orient.estimating import (
-    SOFT_LIMIT,
     Estimate,
     EstimationRule,
     Start,
@@ -29,10 +27,10 @@ from orthoflow_plugins.orient.estimating import (
     no_pose,
     robust_start,
 )
+from orthoflow_plugins.orient.lens_lack import with_what_is_missing
 from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.photowise import each_by_itself
 from orthoflow_plugins.orient.reporting import told
-from orthoflow_plugins.orient.splitting import GROUPS, image_cells
 
 Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
 
@@ -52,8 +50,6 @@ _LEAST: Final[Mapping[Distortion, int]] = {"none": 12, "k1": 16, _FULL: 24}
 _RELIEF_SIGMAS: Final = 10.0
 # Flatter control leaves the eleven parameters to the rounding of its coordinates.
 _CONDITION_MOST: Final = 5000.0
-# Ties that deviate so many times more than they should show what the lens model lacks.
-_SIGMA0_MOST: Final = 1.5
 
 
 class OrientDlt(Method):
@@ -66,7 +62,7 @@ class OrientDlt(Method):
     """
 
     id: ClassVar[str] = "orient.dlt"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "seeded"
     citations: ClassVar[tuple[str, ...]] = (
         "abdelaziz1971: Direct linear transformation, doi:10.14358/PERS.81.2.103",
@@ -127,12 +123,11 @@ def estimate_dlt(
         linear = direct_linear(control.pixels_photo, control.points_world, size_px)
         if linear.condition > _CONDITION_MOST:
             return _flat(control, f"the equations have condition {linear.condition:.0f}")
-        share = _PINNED_CENTRE_SHARE if distortion == _FULL else _CENTRE_SHARE
         start = Start(
             camera=linear.camera,
             prior=replace(linear.camera, cx=0.5 * photo.width, cy=0.5 * photo.height),
             agreeing=robust.agreeing,
-            freedom=replace(_FREEDOMS[distortion], centre_sigma_px=share * max(size_px)),
+            freedom=_freedom(distortion, size_px),
             source="dlt",
             n_least_for_lens=_LEAST[distortion],
         )
@@ -141,7 +136,14 @@ def estimate_dlt(
         return f"{error}: use orient.pnp or orient.colmap-bundle"
     estimate = replace(estimate, details={"skew_px": linear.skew_px, "condition": linear.condition})
     control = seen.take(estimate.agreeing & ~is_check)
-    return estimate if distortion == _FULL else _with_what_is_missing(estimate, control, start)
+    if distortion == _FULL or len(control) < _LEAST[_FULL]:
+        return estimate
+    return with_what_is_missing(estimate, control, start, _freedom(_FULL, size_px))
+
+
+def _freedom(distortion: Distortion, size_px: tuple[int, int]) -> LensFreedom:
+    share = _PINNED_CENTRE_SHARE if distortion == _FULL else _CENTRE_SHARE
+    return replace(_FREEDOMS[distortion], centre_sigma_px=share * max(size_px))
 
 
 def _too_few(n_control: int, distortion: Distortion) -> str:
@@ -151,58 +153,6 @@ def _too_few(n_control: int, distortion: Distortion) -> str:
         f"only {n_control} control ties agree with one pose, a DLT with distortion "
         f'"{distortion}" needs {_LEAST[distortion]}'
     )
-
-
-def _with_what_is_missing(estimate: Estimate, control: SeenPoints, start: Start) -> Estimate:
-    """Widen what a poorer lens model states by how far the full one would move the photo.
-
-    Its residuals show hardly a tenth of what it lacks: the other parameters take up the rest, and
-    bend the photo between and beyond the ties. With k2 = 0.02 unknown, photos were off by 3.3 times
-    the error that k1 alone states.
-    """
-    model = estimate.resection
-    size_px = (model.camera.width, model.camera.height)
-    freedom = replace(_FREEDOMS[_FULL], centre_sigma_px=_PINNED_CENTRE_SHARE * max(size_px))
-    if len(control) < _LEAST[_FULL]:
-        return estimate
-    try:
-        full = adjust(
-            control,
-            model.camera,
-            prior=start.prior,
-            lens=freedom,
-            groups=image_cells(control.pixels_photo, size_px, GROUPS),
-            soft_limit=SOFT_LIMIT * max(model.sigma0, 1.0),
-        )
-    except GeometryError:
-        return estimate
-    points = control.points_world
-    moved = full.camera.project(points)[:, :2] - model.camera.project(points)[:, :2]
-    stated, by_chance = (
-        0.5 * float(np.trace(predicted_covariances(each, points), axis1=1, axis2=2).mean())
-        for each in (model, full)
-    )
-    missing = max(0.0, 0.5 * float((moved**2).sum(axis=1).mean()) - by_chance)
-    factor = 1.0 + missing / stated
-    wider = replace(
-        model,
-        covariance=factor * model.covariance,
-        variance_factor=factor * model.variance_factor,
-    )
-    return replace(estimate, resection=wider, notes=_misfit_notes(estimate, missing, factor))
-
-
-def _misfit_notes(estimate: Estimate, missing_px2: float, factor: float) -> tuple[str, ...]:
-    sigma0 = estimate.resection.sigma0
-    if sigma0 <= _SIGMA0_MOST and factor <= _SIGMA0_MOST**2:
-        return ()
-    note = (
-        f"its ties deviate {sigma0:.1f} times as much as they should, and distortion {_FULL} would "
-        f"move its points by {math.sqrt(missing_px2):.1f} px: its lens has distortion that a DLT "
-        "without that does not describe, worst at the corners; the stated error is "
-        f"{math.sqrt(factor):.1f} times as large for it"
-    )
-    return (note,)
 
 
 def too_flat(control: SeenPoints) -> str:
