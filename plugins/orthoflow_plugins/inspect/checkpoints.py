@@ -14,6 +14,7 @@ from pydantic import Field
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.products import (
+    Cameras,
     CheckPoints,
     Finding,
     Inspection,
@@ -28,13 +29,13 @@ from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.inspect.check_table import check_findings
 from orthoflow_plugins.inspect.crossings import find_crossing
 from orthoflow_plugins.inspect.displacements import rms
+from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.matching import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
 from orthoflow_plugins.inspect.point_places import ShownPoint, find_by_truth, point_on_surface
-from orthoflow_plugins.inspect.sampling import shown
+from orthoflow_plugins.inspect.reporting import report
 from orthoflow_plugins.inspect.vectors import enlargement, vector_map
 
-_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 _NOWHERE: Final = np.full(3, np.nan)
 # Targets are not quite flat: only so much of their radius says how deep the centre lies.
 _DEPTH_SHARE: Final = 0.5
@@ -53,7 +54,7 @@ class InspectCheckpoints(Method):
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Skarlatos and Kiparissi 2012 (direct orthoimages from point clouds, 4.5, Table 1)",
@@ -76,6 +77,7 @@ class InspectCheckpoints(Method):
         walls: Walls
         orthoimages: Orthoimages | None = None
         truth: Truth | None = None
+        cameras: Cameras | None = None
 
     class Out(Ports):
         """The residuals."""
@@ -104,9 +106,10 @@ class InspectCheckpoints(Method):
         classes = [inputs.checkpoints.classes[k] for k in found]
         findings = _findings(shift_m, classes, max(gsd_m.values()))
         findings += _findings_in_space([points[k] for k in found], inputs.checkpoints, found)
+        if inputs.orthoimages is not None:
+            findings += _findings_of_images(pictures, inputs.cameras)
         ctx.metric("n_points", len(points), "1")
-        for finding in findings:
-            ctx.metric(finding.name, finding.value, finding.unit)
+        report(findings, pictures[0].wall, ctx)
         _draw(pictures, [points[k] for k in found], ctx)
         names = tuple(dict.fromkeys(classes))
         return self.Out(
@@ -134,24 +137,23 @@ class _Picture:
 
 
 def _pictures(inputs: InspectCheckpoints.In) -> list[_Picture]:
-    pictures = []
     if inputs.orthoimages is not None:
-        for image in inputs.orthoimages.images:
-            shows = shown(image)
-            grey = np.where(shows, image.rgb @ _LUMINANCE, 0.0)
-            pictures.append(
-                _Picture(
-                    wall=image.wall,
-                    frame=image.frame,
-                    grey=GreyImage(grey=grey, valid=shows, region=shows),
-                    surface=wall_of(image, inputs.walls),
-                    image=image,
-                )
+        pictures = [
+            _Picture(
+                wall=image.wall,
+                frame=image.frame,
+                grey=grey_of(image),
+                surface=wall_of(image, inputs.walls),
+                image=image,
             )
+            for image in inputs.orthoimages.images
+        ]
     else:
-        for index, wall in enumerate(inputs.walls.walls):
-            if wall.intensity is not None:
-                pictures.append(_intensity_picture(index, wall, wall.intensity))
+        pictures = [
+            _intensity_picture(index, wall, wall.intensity)
+            for index, wall in enumerate(inputs.walls.walls)
+            if wall.intensity is not None
+        ]
     if not pictures:
         raise MethodError(
             "there is no picture to find check points in: wire orthoimages, or walls with "
@@ -300,6 +302,17 @@ def _findings_in_space(
         Finding(name="n_3d", value=float(len(apart)), unit="1"),
         Finding(name="rms_3d_mm", value=rms(apart), unit="mm"),
         Finding(name="max_3d_mm", value=float(apart.max()), unit="mm"),
+    ]
+
+
+def _findings_of_images(pictures: Sequence[_Picture], cameras: Cameras | None) -> list[Finding]:
+    return [
+        finding
+        for picture in pictures
+        for finding in (
+            completeness(picture.image, picture.surface),
+            *quality_findings(picture.image, picture.surface, picture.grey, cameras),
+        )
     ]
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Truth, Wall
+from orthoflow_plugins.inspect.image_quality import LUMINANCE
 from orthoflow_plugins.inspect.matching import (
     PATCH_CELLS,
     GreyImage,
@@ -19,7 +20,6 @@ from orthoflow_plugins.inspect.matching import (
 
 How = Literal["measured", "target", "truth", "not found", "outside"]
 
-_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 # A point is what lies within a few cells about it, not the texture further off.
 _FOCUS_CELLS: Final = 5.0
 _LEAST_VALID: Final = 0.6
@@ -84,7 +84,7 @@ def find_by_truth(
     )
     known = np.asarray(np.isfinite(true.rgb).all(axis=2), dtype=np.bool_)
     reference = GreyImage(
-        grey=np.where(known, np.nan_to_num(true.rgb) @ _LUMINANCE, 0.0), valid=known, region=known
+        grey=np.where(known, np.nan_to_num(true.rgb) @ LUMINANCE, 0.0), valid=known, region=known
     )
     shown = _part(picture, corner, side)
     whole = _whole_shift(shown, reference, rim, search_cells)

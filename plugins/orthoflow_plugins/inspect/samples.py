@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.scene_views import TrueOrthoimage
 from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask, Wall
+from orthoflow_plugins.inspect.image_quality import LUMINANCE
 from orthoflow_plugins.inspect.matching import GreyImage, PatchShifts, measure_shifts
 from orthoflow_plugins.inspect.sampling import Sampling
 
@@ -19,7 +20,6 @@ STEP_M: Final = 0.004
 STEP_BAND_CELLS: Final = 2
 # A colour so far outside of all true colours within one cell has no business there.
 GROSS_GREY: Final = 40.0
-_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,8 +186,8 @@ def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -
     # Two centimetres is far beyond any fair error; further off is reported as gross colour.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
     greys = np.zeros((2, *known.shape))
-    greys[0][known] = image.rgb[known] @ _LUMINANCE
-    greys[1][known] = true.rgb[known].astype(np.float64) @ _LUMINANCE
+    greys[0][known] = image.rgb[known] @ LUMINANCE
+    greys[1][known] = true.rgb[known].astype(np.float64) @ LUMINANCE
     return measure_shifts(
         GreyImage(grey=greys[0], valid=painted & known, region=(painted | filled) & known),
         GreyImage(grey=greys[1], valid=known, region=known),

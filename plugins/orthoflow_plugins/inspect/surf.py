@@ -10,18 +10,24 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Finding, Inspection, Orthoimage, Orthoimages, Wall, Walls
+from orthoflow.products import (
+    Cameras,
+    Finding,
+    Inspection,
+    Orthoimage,
+    Orthoimages,
+    Wall,
+    Walls,
+)
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.inspect.displacements import displacement_findings
+from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs
 from orthoflow_plugins.inspect.matching import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
 from orthoflow_plugins.inspect.reporting import report
-from orthoflow_plugins.inspect.sampling import shown
-from orthoflow_plugins.inspect.sharpness import sharpness_findings
 from orthoflow_plugins.inspect.vectors import enlargement, vector_map
 
-_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 # The intensity is laid so far aside to see how exactly the comparison tells that.
 FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
@@ -44,7 +50,7 @@ class InspectSurf(Method):
     """
 
     id: ClassVar[str] = "inspect.surf"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4, Table 2, Figure 25)",
@@ -68,10 +74,11 @@ class InspectSurf(Method):
         )
 
     class In(Ports):
-        """The orthoimages, and the walls they are of."""
+        """The orthoimages, the walls they are of, and the cameras that tell of stretches."""
 
         orthoimages: Orthoimages
         walls: Walls
+        cameras: Cameras | None = None
 
     class Out(Ports):
         """The displacements."""
@@ -87,7 +94,8 @@ class InspectSurf(Method):
         verdicts = []
         for place, image in enumerate(images if reason is None else ()):
             ctx.progress(place / len(images), f"wall {image.name}")
-            verdicts.append(_compare(image, wall_of(image, inputs.walls), params.radius_cells))
+            wall = wall_of(image, inputs.walls)
+            verdicts.append(_compare(image, wall, inputs.cameras, params.radius_cells))
         fit = [item for item in verdicts if len(item.pairs) >= _FEWEST_PAIRS]
         if reason is None and not fit:
             most = max(len(item.pairs) for item in verdicts)
@@ -158,14 +166,11 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
     return "the walls have neither intensity nor colour to compare with"
 
 
-def _compare(image: Orthoimage, wall: Wall, radius: float) -> _Verdict:
+def _compare(image: Orthoimage, wall: Wall, cameras: Cameras | None, radius: float) -> _Verdict:
     if wall.intensity is None:
         raise MethodError(f"wall {wall.name} has no intensity to compare with")
-    shows = shown(image)
     known = np.isfinite(wall.intensity)
-    picture = GreyImage(
-        grey=np.where(shows, image.rgb @ _LUMINANCE, 0.0), valid=shows, region=shows
-    )
+    picture = grey_of(image)
     # Laser intensities span decades; their roots look more like what a camera sees.
     intensity = GreyImage(
         grey=255.0 * np.sqrt(np.where(known, np.maximum(wall.intensity, 0.0), 0.0)),
@@ -177,16 +182,11 @@ def _compare(image: Orthoimage, wall: Wall, radius: float) -> _Verdict:
         image=image,
         pairs=pairs,
         floor=_floor(intensity, radius),
-        quality=(_completeness(image, wall), *sharpness_findings(picture, image.wall)),
+        quality=(
+            completeness(image, wall),
+            *quality_findings(image, wall, picture, cameras),
+        ),
     )
-
-
-def _completeness(image: Orthoimage, wall: Wall) -> Finding:
-    """How much of the scanned surface the image shows."""
-    surface = np.isfinite(wall.depth_m)
-    both = np.count_nonzero(surface & shown(image))
-    share = both / max(1, int(np.count_nonzero(surface)))
-    return Finding(name="completeness", value=share, unit="1", wall=image.wall)
 
 
 def _floor(intensity: GreyImage, radius: float) -> KeyPairs:

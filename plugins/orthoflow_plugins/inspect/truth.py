@@ -57,7 +57,7 @@ class InspectTruth(Method):
     """
 
     id: ClassVar[str] = "inspect.truth"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Gruen 1985, Adaptive least squares correlation (patch matching)",
@@ -163,6 +163,7 @@ class _Verdict:
 
     errors: WallErrors
     sources: SourceErrors | None
+    quality: tuple[Finding, ...]
 
     def findings(self, wall: int) -> list[Finding]:
         """The wall's numbers."""
@@ -171,6 +172,7 @@ class _Verdict:
 
         is_traced = self.sources is not None
         numbers = sample_findings(self.errors.samples, wall, sources_are_traced=is_traced)
+        numbers += self.quality
         return numbers + ([] if self.sources is None else source_findings([self.sources], wall))
 
 
@@ -213,6 +215,7 @@ class _Truth:
 
     def judge(self, image: Orthoimage) -> _Verdict:
         """Compare one wall."""
+        from orthoflow_plugins.inspect.image_quality import grey_of, quality_findings
         from orthoflow_plugins.inspect.placing import wall_of
         from orthoflow_plugins.inspect.samples import wall_errors
         from orthoflow_plugins.inspect.sampling import sampling
@@ -229,7 +232,11 @@ class _Truth:
             )
         if sources is not None and not sources.traced.any():
             sources = None
-        return _Verdict(errors=wall_errors(image, wall, true, chosen), sources=sources)
+        return _Verdict(
+            errors=wall_errors(image, wall, true, chosen),
+            sources=sources,
+            quality=tuple(quality_findings(image, wall, grey_of(image), inputs.cameras)),
+        )
 
     def _true_orthoimage(self, image: Orthoimage, chosen: Sampling) -> TrueOrthoimage:
         from orthoflow.geometry.scene_views import Rendering, render

@@ -1,0 +1,123 @@
+"""How far pixels are drawn out, from views whose stretch is known by algebra."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from orthoflow_plugins.inspect.stretches import cells_per_pixel, stretch_findings
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.products import Camera, Cameras, Intrinsics, Orthoimage, OrthoMask, Wall
+
+SIDE = 40
+GSD_M = 0.01
+UP = np.array([0.0, 0.0, 1.0])
+# u along x, v down; the viewer stands at negative y. Far from the origin, as surveys are.
+FRAME = WallFrame(
+    origin_world=np.array([5.0e6, 4.0e5, 100.0]),
+    u_world=np.array([1.0, 0.0, 0.0]),
+    v_world=np.array([0.0, 0.0, -1.0]),
+    normal_world=np.array([0.0, -1.0, 0.0]),
+    gsd_m=GSD_M,
+    width=SIDE,
+    height=SIDE,
+)
+MIDDLE = FRAME.world_from_wall(np.array([[SIDE / 2, SIDE / 2]]))[0]
+DISTANCE_M = 100.0
+
+
+def wall(depth_m: np.ndarray) -> Wall:
+    ones = np.ones(FRAME.shape, dtype=np.uint8)
+    return Wall(
+        frame=FRAME,
+        plane_index=0,
+        name="wall",
+        depth_m=depth_m.astype(np.float32),
+        sigma_m=np.full(FRAME.shape, np.nan, dtype=np.float32),
+        count=ones.astype(np.uint32),
+        mask=ones,
+    )
+
+
+def image() -> Orthoimage:
+    return Orthoimage(
+        frame=FRAME,
+        wall=0,
+        name="wall",
+        rgb=np.zeros((*FRAME.shape, 3), dtype=np.uint8),
+        mask=np.full(FRAME.shape, OrthoMask.PAINTED, dtype=np.uint8),
+        source=np.zeros(FRAME.shape, dtype=np.int16),
+        sources=("a.jpg",),
+    )
+
+
+def camera(turn_deg: float, cells_per_pixel: float) -> tuple[Intrinsics, ViewingCamera]:
+    """Far away, so that the view is nearly parallel; to the right of the wall's normal."""
+    turn = math.radians(turn_deg)
+    centre = MIDDLE + DISTANCE_M * np.array([math.sin(turn), -math.cos(turn), 0.0])
+    rotation = looking_at(centre, MIDDLE, UP)
+    inner = Intrinsics(
+        fx=DISTANCE_M / (cells_per_pixel * GSD_M),
+        fy=DISTANCE_M / (cells_per_pixel * GSD_M),
+        cx=500.0,
+        cy=500.0,
+        distortion=(0.0, 0.0, 0.0, 0.0, 0.0),
+        width=1000,
+        height=1000,
+        source="calibration",
+    )
+    return inner, inner.posed(rotation, -rotation @ centre)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 30.0, 60.0])
+def test_a_flat_wall_is_stretched_by_the_cosine_of_the_view(turn_deg: float) -> None:
+    _, viewing = camera(turn_deg, 0.7)
+    spread = cells_per_pixel(image(), wall(np.zeros(FRAME.shape)), ("a.jpg", viewing))
+    assert len(spread) == SIDE * SIDE
+    # The wall is 0.4 m wide and 100 m away: 0.4 % of perspective.
+    np.testing.assert_allclose(spread, 0.7 / math.cos(math.radians(turn_deg)), rtol=5e-3)
+
+
+@pytest.mark.parametrize(("slope_deg", "turn_deg"), [(40.0, 30.0), (-40.0, 30.0), (20.0, 60.0)])
+def test_a_slope_is_stretched_by_its_own_view(slope_deg: float, turn_deg: float) -> None:
+    # Stepping one cell to the right and tan(slope) forward moves cos(turn) - tan(slope) sin(turn)
+    # cells along the photo, which is taken from the right.
+    columns = np.arange(SIDE) * GSD_M * math.tan(math.radians(slope_deg))
+    _, viewing = camera(turn_deg, 1.0)
+    spread = cells_per_pixel(image(), wall(np.tile(columns, (SIDE, 1))), ("a.jpg", viewing))
+    turn = math.radians(turn_deg)
+    shown = math.cos(turn) - math.tan(math.radians(slope_deg)) * math.sin(turn)
+    expected = max(1.0, 1.0 / shown) if shown > 0.0 else math.inf
+    np.testing.assert_allclose(spread, expected, rtol=2e-2)
+
+
+def test_a_depth_step_is_no_slope() -> None:
+    depth = np.zeros(FRAME.shape)
+    depth[:, SIDE // 2 :] = 0.5
+    _, viewing = camera(45.0, 1.0)
+    spread = cells_per_pixel(image(), wall(depth), ("a.jpg", viewing))
+    np.testing.assert_allclose(spread, math.sqrt(2.0), rtol=2e-2)
+
+
+def test_shares_count_cells_of_pixels_over_two_and_over_five_cells() -> None:
+    # Of ten columns eight slope away on both sides, so far that the view meets their back.
+    depth = np.zeros(FRAME.shape)
+    depth[:, 10:20] = np.arange(10) * GSD_M * 3.0
+    depth[:, 20:] = depth[0, 19]
+    inner, viewing = camera(45.0, 1.5)
+    known = Camera(
+        photo="a.jpg",
+        status="ok",
+        intrinsics=inner,
+        rotation_camera_from_world=viewing.rotation,
+        translation_camera_from_world=viewing.translation,
+    )
+    cameras = Cameras(cameras=(known,))
+    found = {f.name: f.value for f in stretch_findings(image(), wall(depth), cameras)}
+    # 1.5 cells over cos 45 are 2.1: everything is stretched, the slope is smeared.
+    assert found["stretch_share"] == 1.0
+    assert found["smear_share"] == pytest.approx(8 / SIDE)
+    assert stretch_findings(image(), wall(depth), None) == []
