@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import laspy
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -77,15 +78,37 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
     assert (quick.folder / "run" / "colmap" / "images.txt").is_file()
 
 
+def test_the_cloud_is_exported_by_plane_from_record_and_store(quick: Shell) -> None:
+    run = orthoflow.open_run(quick.folder / "run")
+    cloud, labels = run.product("room", "cloud"), run.product("plane", "labels")
+    said = f": plane.laz: {len(cloud)} points on {labels.plane_index.max() + 1} planes of plane"
+    ended = quick("export", "run", "--to", "laz", "-o", "planes")
+    assert ended.code == 0, ended.said
+    assert ended.out.rstrip().endswith(said)
+    read = laspy.read(quick.folder / "planes" / "plane.laz")
+    np.testing.assert_array_equal(read["plane"], labels.plane_index)
+    np.testing.assert_allclose(read.xyz, cloud.points_world(), atol=0.51e-4)
+    # Without --embed the record only names the cloud.
+    assert quick("run", "quickstart.yaml", *SMALL, "-o", "lean").code == 0
+    lean = quick("export", "lean", "--to", "laz", "--store", quick.store)
+    assert lean.code == 0, lean.said
+    written = (quick.folder / "lean" / "laz" / "plane.laz").read_bytes()
+    assert written == (quick.folder / "planes" / "plane.laz").read_bytes()
+    lost = quick("export", "lean", "--to", "laz", "--store", "elsewhere", "-o", "lost")
+    assert lost.code == 2
+    assert "neither in its record nor in the store elsewhere" in lost.said
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (("--to", "colmap", "--cell", "wall"), "the cell wall holds no orientations; those"),
         (("--to", "colmap", "--cell", "wal"), "has no cell 'wal'"),
+        (("--to", "laz", "--cell", "wall"), "the cell wall holds no labels of points; those"),
         (("--to", "colmap", "-o", "run"), "run exists already and is not empty"),
-        (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', 'ro-crate'"),
+        (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', 'laz', 'ro-crate'"),
     ],
-    ids=["no orientations", "no such cell", "folder in use", "no such format"],
+    ids=["no orientations", "no such cell", "no labels", "folder in use", "no such format"],
 )
 def test_an_export_that_cannot_be_says_why(
     quick: Shell, arguments: tuple[str, ...], sentence: str

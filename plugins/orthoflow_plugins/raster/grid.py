@@ -32,6 +32,8 @@ _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 _BYTES_KEPT: Final = 25
 _BYTES_WORKING: Final = 90
 _MEMORY_SHARE: Final = 0.75
+# Neighbours in the scan may lie so many widths of a narrow gap's radius apart.
+_SPAN_GAPS: Final = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,11 +45,12 @@ class _Raster:
 class RasterGrid(Method):
     """Lay the cloud into a raster on each wall: depth, spread, count, intensity, colour.
 
-    Narrow gaps are closed with the nearest measured cell; wider ones, such as windows, stay void.
+    Narrow gaps are closed: between neighbours of the scan's own rows and columns where these are
+    known, else with the nearest measured cell. Wider ones, such as windows, stay void.
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.4, 4.2",
@@ -103,6 +106,14 @@ class RasterGrid(Method):
             le=50,
             description="Void cells are recovered where no disc of this radius fits into the gap; "
             "0 recovers nothing.",
+        )
+        recover_scan_steps: int = Field(
+            default=2,
+            ge=0,
+            le=10,
+            description="Where the scan's rows and columns are known, void cells between points so "
+            "many rows or columns apart are recovered first, linear between them, if the points "
+            "lie on one surface (layer_m) and at most four times recover_gap_cells apart.",
         )
         constraint: Constraint = Field(
             default="any", description="Raster only vertical, only horizontal, or any planes."
@@ -220,6 +231,7 @@ def _raster(
     plane: tuple[Planes, int],
 ) -> _Raster:
     from orthoflow.geometry.rastering import lenders_in_gaps
+    from orthoflow_plugins.raster.scan_neighbours import SpanRule, recover_between_neighbours
     from orthoflow_plugins.raster.surfaces import surface_of
 
     rule = SurfaceRule(
@@ -233,10 +245,17 @@ def _raster(
     is_known = np.isfinite(surface.depth_m)
     mask = np.where(surface.count > 0, SurfaceMask.MEASURED, SurfaceMask.RECOVERED).astype(np.uint8)
     mask[~is_known] = SurfaceMask.VOID
+    spans = SpanRule(
+        steps=params.recover_scan_steps,
+        side_cells=_SPAN_GAPS * params.recover_gap_cells,
+        layer_m=params.layer_m,
+        threads=threads,
+    )
+    mask[recover_between_neighbours(cloud, slab, surface, spans)] = SurfaceMask.RECOVERED
     lent = lenders_in_gaps(
         is_known.reshape(slab.frame.shape), params.recover_gap_cells, threads=threads
     )
-    _recover(surface, mask, lent)
+    _recover(surface, mask, lent[mask[lent[:, 0]] == SurfaceMask.VOID])
     planes, index = plane
     shape = slab.frame.shape
     intensity = _grey(surface.rgb, mask) if surface.intensity is None else surface.intensity

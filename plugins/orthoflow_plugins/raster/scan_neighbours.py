@@ -1,0 +1,142 @@
+"""Void cells that the scan's own grid spans: its rows and columns say what lies side by side.
+
+A point that the scanner missed lies between its neighbours in the scan, whatever the raster makes
+of their distance. So a gap between points that are neighbours, or nearly, and on one surface is
+recovered between them; one that the scanner looked through is not, since no neighbours span it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.point_kernels import read_only
+from orthoflow.geometry.rastering import entries_inside, wall_from_offset
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import PointCloud
+from orthoflow_plugins.raster.surfaces import CellSurface
+
+# A scan with more rows times columns than this has numbers that are no grid (2 GB of indices).
+_GRID_CELLS_MOST: Final = 1 << 28
+
+_Number = TypeVar("_Number", np.float32, np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpanRule:
+    """What neighbours of a scan may span.
+
+    Attributes:
+        steps: rows or columns between them, at most; 0 spans nothing.
+        side_cells: how far apart they lie on the wall, at most.
+        layer_m: how far apart their depths are, at most.
+        threads: how many threads work.
+    """
+
+    steps: int
+    side_cells: int
+    layer_m: float
+    threads: int
+
+
+def recover_between_neighbours(
+    cloud: PointCloud, slab: Slab, surface: CellSurface, rule: SpanRule
+) -> NDArray[np.bool_]:
+    """Fill void cells of a surface between neighbours in the scans' grids, linear between them.
+
+    Args:
+        cloud: with rows and columns; without them nothing is filled.
+        slab: of the wall.
+        surface: filled in place; its spreads stay unknown and its counts 0.
+        rule: what neighbours are.
+
+    Returns:
+        (cells,) which were filled.
+    """
+    from orthoflow.geometry.scan_grid_kernels import CellValues, Reach, ScanGrid, recover_between
+
+    was_void = ~np.isfinite(surface.depth_m)
+    is_void = was_void.reshape(slab.frame.shape).copy()
+    if rule.steps == 0 or cloud.row is None or cloud.column is None or not is_void.any():
+        return np.zeros(was_void.size, dtype=np.bool_)
+    no_intensity, no_rgb = np.empty(0, dtype=np.float32), np.empty((0, 3), dtype=np.uint8)
+    intensity = _unchanged(no_intensity if cloud.intensity is None else cloud.intensity)
+    rgb = _unchanged(no_rgb if cloud.rgb is None else cloud.rgb)
+    values = CellValues(
+        surface.depth_m,
+        no_intensity.copy() if surface.intensity is None else surface.intensity,
+        no_rgb.copy() if surface.rgb is None else surface.rgb,
+    )
+    matrix = wall_from_offset(slab.frame, cloud.origin)
+    offsets = read_only(cloud.x, cloud.y, cloud.z)
+    reach = Reach(rule.steps, float(rule.side_cells), rule.layer_m)
+    near = _near(is_void, rule.side_cells)
+    for points in _grids(cloud, slab, surface, near, rule):
+        recover_between(ScanGrid(points, offsets, matrix), intensity, rgb, reach, is_void, values)
+    return was_void & ~is_void.ravel()
+
+
+def _unchanged(values: NDArray[_Number]) -> NDArray[_Number]:
+    """An array in the one form that kernels are compiled for."""
+    view = np.asarray(values).view(np.ndarray)
+    view.flags.writeable = False
+    return view
+
+
+def _near(is_void: NDArray[np.bool_], reach_cells: int) -> NDArray[np.bool_]:
+    """Cells (flat) whose points may span a void cell."""
+    import cv2
+
+    window = np.ones((2 * reach_cells + 1,) * 2, dtype=np.uint8)
+    return np.asarray(cv2.dilate(is_void.view(np.uint8), window), dtype=np.bool_).ravel()
+
+
+def _grids(
+    cloud: PointCloud,
+    slab: Slab,
+    surface: CellSurface,
+    near: NDArray[np.bool_],
+    rule: SpanRule,
+) -> Iterator[NDArray[np.int64]]:
+    """For each scan the indices of its points beside void cells, by row and column."""
+    chosen = _points_beside_voids(cloud, slab, surface, near, rule)
+    if cloud.row is None or cloud.column is None:
+        raise AssertionError("a grid was asked of a cloud without rows and columns")
+    scans = np.zeros(len(chosen), dtype=np.uint16) if cloud.scan is None else cloud.scan[chosen]
+    for scan in np.unique(scans):
+        points = chosen[scans == scan]
+        rows, columns = cloud.row[points], cloud.column[points]
+        shape = (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)
+        if shape[0] * shape[1] > _GRID_CELLS_MOST:
+            continue
+        grid = np.full(shape, -1, dtype=np.int64)
+        grid[rows - rows.min(), columns - columns.min()] = points
+        yield grid
+
+
+def _points_beside_voids(
+    cloud: PointCloud,
+    slab: Slab,
+    surface: CellSurface,
+    near: NDArray[np.bool_],
+    rule: SpanRule,
+) -> NDArray[np.uint32]:
+    """Indices of the points that lie on the surface of a cell near a void one."""
+    from orthoflow.geometry.raster_kernels import BLOCK
+
+    found = [np.empty(0, dtype=np.uint32)]
+    for entries in entries_inside(cloud, slab, threads=rule.threads):
+        for block, n_inside in enumerate(entries.n_inside):
+            part = slice(block * BLOCK, block * BLOCK + int(n_inside))
+            cells = entries.cells[part]
+            beside = near[cells]
+            if not beside.any():
+                continue
+            cells, depths_m = cells[beside], entries.depths_m[part][beside]
+            on_surface = np.abs(depths_m - surface.depth_m[cells]) <= rule.layer_m
+            found.append(entries.points[part][beside][on_surface])
+    return np.concatenate(found)

@@ -1,0 +1,121 @@
+"""Missing points are recovered between their neighbours in the scan's own grid, and no others."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.raster.grid import RasterGrid
+
+from orthoflow.products import PointCloud, SurfaceMask, Wall
+from tests import raster_scenes as scenes
+
+KNOWN = scenes.upright_wall(shape=(40, 60))
+# Per cell: steep, but points two steps apart still lie within layer_m.
+SLOPE_M = 0.004
+
+
+def rastered(cloud: PointCloud, folder: Path, **params: object) -> Wall:
+    inputs = RasterGrid.In(cloud=cloud, planes=KNOWN.planes())
+    chosen = RasterGrid.Params.model_validate({"gsd_m": KNOWN.gsd_m, "buffer_m": 1.0} | params)
+    return RasterGrid().run(inputs, chosen, scenes.context(folder)).walls.walls[0]
+
+
+def depth_m(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    return SLOPE_M * columns
+
+
+def scanned(
+    step_cells: float, *, missing: NDArray[np.bool_] | None = None, depths: str = "slope"
+) -> PointCloud:
+    """A scan whose rows and columns lie so far apart on the wall, turned by a few degrees."""
+    n = int(120 / step_cells)
+    row, column = (grid.ravel() for grid in np.mgrid[:n, :n])
+    turned = np.radians(7.0)
+    u = 0.3 + step_cells * (np.cos(turned) * column + np.sin(turned) * (row - n / 3))
+    v = 0.3 + step_cells * (np.cos(turned) * row - np.sin(turned) * column)
+    kept = (u > 0) & (u < KNOWN.shape[1]) & (v > 0) & (v < KNOWN.shape[0])
+    if missing is not None:
+        kept &= ~missing[np.clip(v, 0, 39.9).astype(int), np.clip(u, 0, 59.9).astype(int)]
+    u, v, row, column = u[kept], v[kept], row[kept], column[kept]
+    depths_m = depth_m(u) if depths == "slope" else np.where(u < 30.0, 0.0, 0.1)
+    cloud = scenes.cloud_of(
+        KNOWN.world(u, v, depths_m),
+        intensity=(0.2 + 0.01 * u).astype(np.float32),
+        rgb=np.repeat(np.rint(2.0 * v)[:, None], 3, axis=1).astype(np.uint8),
+    )
+    # Twelve thousand and more: grids start anywhere.
+    return dataclasses.replace(
+        cloud, row=(row + 12_000).astype(np.uint32), column=column.astype(np.uint32)
+    )
+
+
+def test_a_coarse_scan_is_recovered_linear_between_its_points(tmp_path: Path) -> None:
+    wall = rastered(scanned(2.4), tmp_path, surface="topmost")
+    recovered = wall.mask == SurfaceMask.RECOVERED
+    # The rim is not between points.
+    inner = np.zeros(KNOWN.shape, dtype=bool)
+    inner[4:-4, 4:-4] = True
+    assert (wall.mask[inner] != SurfaceMask.VOID).all()
+    assert np.mean(recovered[inner]) > 0.7
+    rows, columns = np.nonzero(recovered & inner)
+    expected_m = depth_m(columns.astype(np.float64) + 0.5)
+    np.testing.assert_allclose(wall.depth_m[rows, columns], expected_m, atol=1e-6)
+    assert wall.intensity is not None
+    assert wall.rgb is not None
+    np.testing.assert_allclose(
+        wall.intensity[rows, columns], 0.2 + 0.01 * (columns + 0.5), atol=1e-6
+    )
+    # Rounded where the points are coloured, and once more where they are mixed.
+    np.testing.assert_allclose(wall.rgb[rows, columns, 0], 2.0 * (rows + 0.5), atol=1.01)
+    assert (wall.count[recovered] == 0).all()
+    assert np.isnan(wall.sigma_m[recovered]).all()
+
+
+def test_single_missing_points_are_recovered_better_than_by_their_nearest_cell(
+    tmp_path: Path,
+) -> None:
+    missing = np.random.default_rng(4).random(KNOWN.shape) < 0.08
+    errors_m = []
+    for steps in (2, 0):
+        wall = rastered(
+            scanned(0.9, missing=missing), tmp_path, surface="centre", recover_scan_steps=steps
+        )
+        rows, columns = np.nonzero(wall.mask == SurfaceMask.RECOVERED)
+        errors_m.append(
+            np.abs(wall.depth_m[rows, columns] - depth_m(columns.astype(np.float64) + 0.5))
+        )
+    assert np.median(errors_m[0]) < 1e-6
+    # A neighbour's depth is off by the slope.
+    assert np.median(errors_m[1]) > 0.1 * SLOPE_M
+
+
+def test_what_the_scanner_looked_through_stays_void(tmp_path: Path) -> None:
+    window = np.zeros(KNOWN.shape, dtype=bool)
+    window[10:30, 20:40] = True
+    wall = rastered(scanned(0.9, missing=window), tmp_path)
+    assert (wall.mask[11:29, 21:39] == SurfaceMask.VOID).all()
+
+
+def test_a_depth_step_is_not_bridged(tmp_path: Path) -> None:
+    wall = rastered(scanned(2.4, depths="step"), tmp_path, surface="topmost")
+    known = wall.depth_m[np.isfinite(wall.depth_m)]
+    assert set(known.round(4).tolist()) == {0.0, np.float32(0.1).item()}
+
+
+@pytest.mark.parametrize("change", ["no grid", "no steps", "no gaps"])
+def test_without_grid_or_reach_nothing_is_spanned(tmp_path: Path, change: str) -> None:
+    cloud = scanned(2.4)
+    params: dict[str, object] = {"surface": "topmost", "recover_gap_cells": 1}
+    if change == "no grid":
+        cloud = dataclasses.replace(cloud, row=None, column=None)
+    elif change == "no steps":
+        params["recover_scan_steps"] = 0
+    else:
+        params["recover_gap_cells"] = 0
+    wall = rastered(cloud, tmp_path, **params)
+    # Cells in the middle between four points, too far for a gap of one cell.
+    assert np.mean(wall.mask[4:-4, 4:-4] == SurfaceMask.VOID) > 0.1
