@@ -279,6 +279,7 @@ def three_planes() -> Planes:
         ({"constraint": "horizontal"}, [0]),
         ({"n_walls_max": 1}, [0]),
         ({"min_area_m2": 100.0}, [0]),
+        ({"ranks": [2, 0]}, [0, 2]),
     ],
     ids=str,
 )

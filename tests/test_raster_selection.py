@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster.selection import WallChoice, chosen_planes
 
+from orthoflow.errors import MethodError
 from orthoflow.products import Planes
 
 CHOICE = WallChoice(
@@ -96,3 +97,10 @@ def test_a_plane_is_not_covered_by_one_that_was_left_out_itself() -> None:
     # The third lies within the second's buffer, but not within the first's.
     three = planes(MAIN, (0.10, 0.0, 5.0, 0.0), (0.20, 0.0, 5.0, 0.0))
     assert chosen_planes(three, CHOICE) == [0, 2]
+
+
+def test_a_rank_that_no_plane_has_is_refused() -> None:
+    two = planes(MAIN, (0.5, 0.0, 5.0, 0.0))
+    assert chosen_planes(two, replace(CHOICE, ranks=(1,))) == [1]
+    with pytest.raises(MethodError, match=r"ranks names plane 2, but 2 planes were found, 0 to 1"):
+        chosen_planes(two, replace(CHOICE, ranks=(1, 2)))

@@ -126,6 +126,11 @@ class RasterGrid(Method):
         n_walls_max: int = Field(
             default=12, ge=1, le=1000, description="At most so many planes, by support."
         )
+        ranks: tuple[Annotated[int, Field(ge=0)], ...] = Field(
+            default=(),
+            description="Raster exactly these planes, by their place in planes.json, where 0 has "
+            "the most support; empty: as constraint, min_area_m2, n_walls_max, skip_covered say.",
+        )
         skip_covered: bool = Field(
             default=True,
             description="Leave out a plane that lies within the buffer of a larger parallel wall, "
@@ -195,6 +200,7 @@ def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
         skip_covered=params.skip_covered,
         front_m=front,
         behind_m=behind,
+        ranks=params.ranks,
     )
     slabs = {
         index: Slab(

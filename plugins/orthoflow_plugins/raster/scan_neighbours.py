@@ -126,7 +126,7 @@ def _points_beside_voids(
     rule: SpanRule,
 ) -> NDArray[np.uint32]:
     """Indices of the points that lie on the surface of a cell near a void one."""
-    from orthoflow.geometry.raster_kernels import BLOCK
+    from orthoflow.geometry.raster_entry_kernels import BLOCK
 
     found = [np.empty(0, dtype=np.uint32)]
     for entries in entries_inside(cloud, slab, threads=rule.threads):

@@ -33,6 +33,7 @@ class WallChoice:
         skip_covered: leave out planes that a larger wall shows as its relief.
         front_m: reach of a wall towards the viewer.
         behind_m: reach behind it.
+        ranks: these planes and no others, whatever else is said; empty for no such choice.
     """
 
     constraint: Constraint
@@ -41,16 +42,25 @@ class WallChoice:
     skip_covered: bool
     front_m: float
     behind_m: float
+    ranks: tuple[int, ...] = ()
 
 
 def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
     """Indices of the planes to raster, by support, largest first.
 
     Raises:
-        MethodError: no plane has the wanted direction, or there is none at all.
+        MethodError: no plane has the wanted direction or rank, or there is none at all.
     """
     if len(planes) == 0:
         raise MethodError("no plane was found in the cloud, at least one is needed for a wall")
+    if choice.ranks:
+        missing = sorted(rank for rank in choice.ranks if rank >= len(planes))
+        if missing:
+            raise MethodError(
+                f"ranks names plane {missing[0]}, but {len(planes)} planes were found, 0 to "
+                f"{len(planes) - 1}: look at planes.json"
+            )
+        return sorted(set(choice.ranks))
     fitting = [k for k in range(len(planes)) if _fits(planes, k, choice.constraint)]
     if not fitting:
         raise MethodError(
