@@ -1,4 +1,4 @@
-"""Pictures of an orientation: ties on the photo, and histograms of residuals (Figures 17, 18)."""
+"""Pictures of an orientation: ties on the photos, and the predicted error on the walls."""
 
 from __future__ import annotations
 
@@ -112,39 +112,3 @@ def _error_map(shares: NDArray[np.float64]) -> bytes:
     size = (_MAP_ZOOM * shares.shape[1], _MAP_ZOOM * shares.shape[0])
     enlarged = cv2.resize(bgr, size, interpolation=cv2.INTER_NEAREST)
     return encode_webp(np.asarray(enlarged, dtype=np.uint8)[:, :, ::-1])
-
-
-def draw_residuals(
-    ctx: StepContext, residuals_px: NDArray[np.float64], role: NDArray[np.uint8]
-) -> None:
-    """Draw histograms of the residuals of all oriented photos, with Gauss curves."""
-    from matplotlib.figure import Figure
-
-    kinds = [
-        kind
-        for kind in (TieRole.CONTROL, TieRole.CHECK)
-        if np.isfinite(residuals_px[role == kind]).all(axis=1).sum() > 2
-    ]
-    if not kinds:
-        return
-    figure = Figure(figsize=(7.0, 2.6 * len(kinds)), layout="constrained")
-    panels = figure.subplots(len(kinds), 2, squeeze=False)
-    for kind, row in zip(kinds, panels, strict=True):
-        values = residuals_px[role == kind]
-        values = values[np.isfinite(values).all(axis=1)]
-        for axis, (label, axes) in enumerate(zip("uv", row, strict=True)):
-            mean, deviation = values[:, axis].mean(), max(values[:, axis].std(), 1e-9)
-            # One outline instead of forty bars, each of which takes its time to draw.
-            axes.stairs(*np.histogram(values[:, axis], bins=40), fill=True, color="#9db8d2")
-            grid = np.linspace(values[:, axis].min(), values[:, axis].max(), 200)
-            curve = np.exp(-0.5 * ((grid - mean) / deviation) ** 2)
-            width = np.ptp(values[:, axis]) / 40 or 1.0
-            area = len(values) * width / (deviation * np.sqrt(2.0 * np.pi))
-            axes.plot(grid, area * curve, color="#b03a2e", linewidth=1.0)
-            axes.set_title(
-                f"{kind.name.lower()} {label}: {len(values)} ties, SD {deviation:.2f} px",
-                fontsize=9,
-            )
-            axes.set_xlabel("observed - computed [px]", fontsize=8)
-            axes.tick_params(labelsize=7)
-    ctx.figure("residuals", figure, "Residuals of all oriented photos, with normal distributions.")

@@ -9,7 +9,8 @@ import numpy as np
 
 from orthoflow.products import Cameras, JsonValue, Photo, TieRole, Ties
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.figures import draw_residuals, draw_ties, draw_wall_errors
+from orthoflow_plugins.orient.figures import draw_ties, draw_wall_errors
+from orthoflow_plugins.orient.histograms import PhotoResiduals, draw_residuals
 from orthoflow_plugins.orient.photowise import Oriented, of_photo
 from orthoflow_plugins.orient.residual_tables import COLUMNS_SAID
 
@@ -40,7 +41,14 @@ def told(
         draw_ties(ctx, photo, ties.pixels_photo[mine], role[mine], status)
     _measure(ctx, found)
     draw_wall_errors(ctx, [item.case for item in found if item.case is not None])
-    draw_residuals(ctx, residuals, role)
+    draw_residuals(
+        ctx,
+        [
+            PhotoResiduals(name=item.camera.photo, residuals_px=item.residuals_px, role=item.role)
+            for item in found
+            if item.camera.status == "ok"
+        ],
+    )
     said: dict[str, JsonValue] = {
         "photos": {item.camera.photo: item.entry for item in found},
         "residual_table": [row for item in found for row in item.table],
