@@ -13,7 +13,7 @@ from orthoflow.products import Photo
 
 # Larger photos are shrunk: SIFT takes 0.23 GB per million pixels, and thousands of key points at
 # half the resolution tie photos as well as more at full.
-_SIDE_MOST_PX: Final = 2400
+_SIDE_MOST_PX: Final = 1600
 _CONTRAST_THRESHOLD: Final = 0.02
 _SPREAD_CELLS: Final = 16
 # Squared RootSIFT entries in units of 1/512: their sums stay below 2^24, so that float32 products
@@ -58,18 +58,21 @@ def photo_features(photo: Photo, n_most: int) -> PhotoFeatures:
     sift: Any = cv2.SIFT_create(  # type: ignore[attr-defined]  # missing in OpenCV's stubs
         contrastThreshold=_CONTRAST_THRESHOLD, enable_precise_upscale=True
     )
-    found, raw = sift.detectAndCompute(np.ascontiguousarray(grey), None)
+    grey = np.ascontiguousarray(grey)
+    found = sift.detect(grey, None)
     if not found:
         return no_features()
     points = np.array([(*p.pt, p.size, p.angle, p.response) for p in found], dtype=np.float64)
     # Threads find key points in any order; the image alone orders them.
     order = np.lexsort(points.T[:4])
     order = order[_spread(points[order], grey.shape, n_most)]
+    # Described are those that stay: of a rich picture, one in ten.
+    raw = sift.compute(grey, [found[at] for at in order.tolist()])[1]
     # OpenCV's (0, 0) is the centre of the first pixel, ours (0.5, 0.5).
     return PhotoFeatures(
         pixels=(points[order, :2] + 0.5) * ratios,
         scale=scale,
-        descriptors=_root(np.asarray(raw, dtype=np.float32)[order]),
+        descriptors=_root(np.asarray(raw, dtype=np.float32)),
     )
 
 
