@@ -62,6 +62,8 @@ COLUMNS: dict[str, dict[str, str]] = {
         "surf.rmse_y_mm": "SURF y / mm",
         "surf.edge_width_cells": "edge width / cells",
         "points.rms_mm": "check points / mm",
+        "points.flat_rms_mm": "flat points / mm",
+        "points.vertical_edge_rms_mm": "vertical edges / mm",
         "ortho.cpu_s": "processor / s",
     },
 }

@@ -147,7 +147,10 @@ def test_embed_makes_a_record_that_verifies(tmp_path: Path) -> None:
     done = orthoflow(tmp_path, "run", "studio.yaml", "--embed", "-o", "r", "--executor", "inline")
     assert done.returncode == 0, done.stderr
     checked = orthoflow(tmp_path, "verify", "r")
-    assert (checked.returncode, checked.stdout) == (0, "verified: 2 products, seal ok\n")
+    assert (checked.returncode, checked.stdout) == (
+        0,
+        "verified: 2 products, seal ok, 10 published files unchanged\n",
+    )
 
 
 @pytest.mark.parametrize(

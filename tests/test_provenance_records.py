@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from orthoflow_provenance.digests import payload_digest, sha256_text
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.model import (
+    PublishedFile,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
@@ -136,6 +137,9 @@ RECORD = st.builds(
         unique_by=lambda entry: entry.id,
     ).map(tuple),
     cells=st.lists(CELL, max_size=3, unique_by=lambda cell: cell.address).map(tuple),
+    published=st.lists(
+        st.builds(PublishedFile, path=TEXT, size_bytes=SHORT, sha256=TEXT), max_size=3
+    ).map(tuple),
 )
 
 
@@ -290,7 +294,7 @@ def test_a_newer_format_is_refused_with_a_sentence(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     with h5py.File(path, "r+") as file:
         file.attrs["format_version"] = np.bytes_(b"2.0")
-    message = r"run\.h5 has format version 2\.0, this program reads version 1\.0: use a newer"
+    message = r"run\.h5 has format version 2\.0, this program reads version 1\.1: use a newer"
     with pytest.raises(RecordFormatError, match=message):
         read_record(path)
     (finding,) = verify_record(path)

@@ -12,12 +12,13 @@ import pytest
 
 from orthoflow.errors import StoreError
 from orthoflow.records import Run
-from orthoflow.report import write_page, write_report
+from orthoflow.report import write_figures, write_page, write_report
 from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.figures import figure_groups
 from orthoflow.report.numbers import number_with_unit
 from orthoflow.report.overlays import magnification_for, residuals_on_wall
+from orthoflow.report.pages import cited
 from orthoflow.report.pictures import Picture, depth_colours, side_px
 from orthoflow.report.rankings import Mark, Value, rank
 from orthoflow.report.senses import Sense, sense_of
@@ -63,6 +64,21 @@ def test_the_page_needs_no_network_and_escapes_what_methods_say(
     assert "the grid is &lt;coarse&gt;" in page
 
 
+@pytest.mark.parametrize(
+    ("text", "doi"),
+    [
+        ("Hough (doi:10.3390/rs71215869).", "10.3390/rs71215869"),
+        ("Borrmann, doi:10.1007/3DRes.02(2011)3 (pole)", "10.1007/3DRes.02(2011)3"),
+        ("SIFT, doi:10.1023/B:VISI.0000029664.99615.94", "10.1023/B:VISI.0000029664.99615.94"),
+        ("Crate (see doi:10.1/a(b)).", "10.1/a(b)"),
+    ],
+)
+def test_a_citation_links_its_whole_doi(text: str, doi: str) -> None:
+    page = str(cited(text))
+    assert f'">doi:{doi}</a>' in page
+    assert re.sub(r"<[^>]*>", "", page) == text
+
+
 def test_several_runs_share_one_page_with_a_common_table(compared: Run, tmp_path: Path) -> None:
     write_report([compared, compared], tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
@@ -86,9 +102,9 @@ def test_figures_lie_beside_the_page_as_png_and_svg(compared: Run, tmp_path: Pat
         "figures/graph.svg",
         "figures/check@plane=fine/error_map.png",
         "figures/check@plane=fine/chart.png",
-        "figures/check@plane=coarse/error_map.png",
-        "figures/check@plane=coarse/chart.png",
     }
+    assert write_figures(compared, tmp_path / "all", compared.cells) == 4
+    assert len(list((tmp_path / "all").glob("check@plane=coarse/*.png"))) == 2
     for path in tmp_path.rglob("figures/**/*.png"):
         assert path.read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "figures" / "graph.svg").read_text().startswith("<svg xmlns=")

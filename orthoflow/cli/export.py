@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Command, store_option
+from orthoflow.cli.options import Command, input_option, store_option
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError, StoreError
 
@@ -30,15 +32,23 @@ _SAID: Final = {
 @click.option(
     "--to",
     "target",
-    type=click.Choice(["colmap", "csv", "laz", "ro-crate"]),
-    required=True,
+    type=click.Choice(["colmap", "csv", "figures", "laz", "ro-crate"]),
     help="The format to write.",
 )
+@click.option(
+    "--embed",
+    is_flag=True,
+    help="Write a record that needs nothing beside it: with every product and input file in it; "
+    "alone, or in the place of the record with --to ro-crate.",
+)
+@input_option
+@store_option
 @click.option(
     "--cell",
     metavar="ADDRESS",
     help="colmap: the cell whose orientations are meant; without it the last one that oriented "
-    "photos. laz: the cell that found the planes; without it the last one that did.",
+    "photos. laz: the cell that found the planes; without it the last one that did. figures: the "
+    "only cell that is meant.",
 )
 @click.option(
     "--license",
@@ -53,40 +63,65 @@ _SAID: Final = {
     metavar="FOLDER",
     help="Where to write it, a new or empty folder; without it RUN's own folder of that name.",
 )
-@store_option
-def export(
-    run: Path,
-    target: str,
-    cell: str | None,
-    license_text: str | None,
-    output: Path | None,
-    store: Path,
-) -> int:
+def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
     """Write the results of RUN, a run folder or its run.h5, for other programs.
 
     colmap: the oriented photos with their lenses and ties as a text model that COLMAP opens. csv:
-    tables of cells, metrics, parameters, inputs, products and environments. laz: the cloud, each
-    point in the colour of its plane, from the store unless the run was made with --embed. ro-crate:
-    record, report and products as a Provenance Run Crate, for archives.
+    tables of cells, metrics, parameters, inputs, products and environments. figures: every figure
+    as PNG or SVG. laz: the cloud, each point in the colour of its plane, from the store unless the
+    run was made with --embed. ro-crate: record, report and products as a Provenance Run Crate, for
+    archives. --embed: run.h5 alone, which verifies and replays without any other file; what it
+    lacks so far comes from the store and from the input files, looked for by content or given with
+    --input.
     """
     from orthoflow.records import open_run
 
-    if cell is not None and target not in {"colmap", "laz"}:
-        raise ArgumentError(f"--cell belongs to --to colmap or laz, not to --to {target}")
-    if license_text is not None and target != "ro-crate":
-        raise ArgumentError(f"--license belongs to --to ro-crate, not to --to {target}")
+    chosen = _Choices(**choices)
+    chosen.check(target)
     opened = open_run(run)
-    folder = output if output is not None else opened.folder / target
+    name = target or "embedded"
+    folder = output if output is not None else opened.folder / name
     if target == "colmap":
-        said = _export_colmap(opened, folder, cell)
+        said = _export_colmap(opened, folder, chosen.cell)
     elif target == "csv":
         said = _export_csv(opened, folder)
+    elif target == "figures":
+        said = _export_figures(opened, folder, chosen.cell)
     elif target == "laz":
-        said = _export_laz(opened, folder, cell, store)
+        said = _export_laz(opened, folder, chosen)
+    elif target == "ro-crate":
+        said = _export_crate(opened, folder, chosen)
     else:
-        said = _export_crate(opened, folder, license_text)
-    click.echo(f"{target}: {folder}: {said}")
+        said = _export_embedded(opened, folder, chosen)
+    click.echo(f"{name}: {folder}: {said}")
     return EXIT_GOOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Choices:
+    """The options that belong to some formats only."""
+
+    cell: str | None
+    license_text: str | None
+    embed: bool
+    inputs: Sequence[str]
+    store: Path
+
+    def check(self, target: str | None) -> None:
+        """Refuse options that do not belong to the format."""
+        if target is None and not self.embed:
+            raise ArgumentError(
+                "say what to write: --to colmap, csv, figures, laz or ro-crate, or --embed"
+            )
+        said = f"--to {target}" if target else "--embed"
+        if self.cell is not None and target not in {"colmap", "figures", "laz"}:
+            raise ArgumentError(f"--cell belongs to --to colmap, figures or laz, not to {said}")
+        if self.license_text is not None and target != "ro-crate":
+            raise ArgumentError(f"--license belongs to --to ro-crate, not to {said}")
+        if self.embed and target not in {None, "ro-crate"}:
+            raise ArgumentError(f"{said} writes no record, so nothing can be embedded with --embed")
+        if self.inputs and not self.embed:
+            raise ArgumentError(f"--input belongs to --embed, not to {said}")
 
 
 def _export_colmap(run: Run, folder: Path, cell: str | None) -> str:
@@ -110,27 +145,59 @@ def _export_csv(run: Run, folder: Path) -> str:
     return ", ".join(path.name for path in write_csv_tables(run, folder))
 
 
-def _export_crate(run: Run, folder: Path, license_text: str | None) -> str:
+def _export_figures(run: Run, folder: Path, cell: str | None) -> str:
+    from orthoflow.report import write_figures
+
+    addresses = run.cells if cell is None else (run.cell(cell).address,)
+    _make_empty(folder)
+    return f"{counted(write_figures(run, folder, addresses), 'figure')} and the graph"
+
+
+def _export_crate(run: Run, folder: Path, chosen: _Choices) -> str:
     from orthoflow.records.crates import NO_LICENSE, write_crate
 
     _make_empty(folder)
-    files = write_crate(run, folder, license_text=license_text or NO_LICENSE)
+    license_text = chosen.license_text or NO_LICENSE
+    if chosen.embed:
+        record = _embedded(run, folder, chosen)
+        files = write_crate(run, folder, license_text=license_text, record=record)
+    else:
+        files = write_crate(run, folder, license_text=license_text)
     return f"{counted(len(files), 'file')}, described in {files[0].name}"
 
 
-def _export_laz(run: Run, folder: Path, cell: str | None, store: Path) -> str:
+def _export_embedded(run: Run, folder: Path, chosen: _Choices) -> str:
+    _make_empty(folder)
+    record = _embedded(run, folder, chosen)
+    n_products = sum(len(cell.outputs) for cell in record.cells.values())
+    n_files = sum(len(entry.files) for entry in record.record.inputs)
+    return (
+        f"{record.path.name} with {counted(n_products, 'product')} and "
+        f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes"
+    )
+
+
+def _embedded(run: Run, folder: Path, chosen: _Choices) -> Run:
+    from orthoflow.engine import Store
+    from orthoflow.records import RECORD_FILE
+    from orthoflow.records.embedding import write_embedded
+
+    return write_embedded(run, folder / RECORD_FILE, Store(chosen.store), chosen.inputs)
+
+
+def _export_laz(run: Run, folder: Path, chosen: _Choices) -> str:
     from orthoflow.files.points.plane_clouds import write_plane_cloud
     from orthoflow.products import PointCloud, PointLabels
 
-    address, port = _output_of(run, "labels", cell)
+    address, port = _output_of(run, "labels", chosen.cell)
     recorded = run.cell(address)
     clouds = [item.digest for item in recorded.inputs.values() if item.type_name == "cloud"]
     if len(clouds) != 1:
         raise ArgumentError(
             f"the cell {address} labels no cloud of its own: it takes {len(clouds)} clouds"
         )
-    cloud = _product(run, clouds[0], PointCloud, store)
-    labels = _product(run, recorded.outputs[port].digest, PointLabels, store)
+    cloud = _product(run, clouds[0], PointCloud, chosen.store)
+    labels = _product(run, recorded.outputs[port].digest, PointLabels, chosen.store)
     _make_empty(folder)
     path = folder / f"{recorded.step}.laz"
     write_plane_cloud(path, cloud, labels)

@@ -56,24 +56,31 @@ def replay(
 ) -> int:
     """Make RUN, a run folder or its run.h5, again from its record and its input files.
 
-    Takes workflow, parameters and seeds as recorded, and looks for the inputs by content where
-    they were, beside the run, or where --input says. What is missing or not as it was is named
-    before anything runs. Says of every product whether it has the same bits, is equal within the
-    tolerance of its type, or differs, and ends with 3 when one differs.
+    Takes workflow, parameters and seeds as recorded. The inputs come from the record, if they are
+    in it, or are looked for by content where they were, beside the run, or where --input says.
+    What is missing or not as it was is named before anything runs. Says of every product whether
+    it has the same bits, is equal within the tolerance of its type, or differs, and ends with 3
+    when one differs.
     """
     from orthoflow.catalog import discover_catalog
     from orthoflow.engine import RunOptions, Store
     from orthoflow.engine.journal import new_run_id
     from orthoflow.records import open_run
+    from orthoflow.records.embedding import embedded_inputs
     from orthoflow.records.replaying import plan_replay
 
     options = RunOptions(jobs=jobs, executor=executor)
     original = open_run(run)
     run_id = new_run_id()
     folder = output or Path("runs") / f"{original.record.name}-replay-{run_id}"
-    with _store_folder(store, folder) as store_folder:
+    with (
+        _store_folder(store, folder) as store_folder,
+        embedded_inputs(original, folder.parent) as extracted,
+    ):
         opened = Store(store_folder)
-        planned = plan_replay(original, discover_catalog(), opened, options, inputs=inputs)
+        planned = plan_replay(
+            original, discover_catalog(), opened, options, inputs=inputs, extracted=extracted
+        )
         call = _Call(
             original=original,
             replay=planned,

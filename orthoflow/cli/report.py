@@ -23,7 +23,8 @@ from orthoflow.errors import ArgumentError
 def report(runs: tuple[str, ...], output: Path | None) -> int:
     """Write the HTML report of one or more runs, each a run folder or its run.h5.
 
-    Without -o it lies in the run's folder, with figures/ beside it: every figure as PNG or SVG.
+    Without -o it lies in the run's folder, with figures/ beside it: the figures as PNG or
+    SVG, of a comparison those of the baseline (`orthoflow export RUN --to figures` has all).
     """
     from orthoflow.records import REPORT_FILE, open_run
     from orthoflow.report import write_page, write_report

@@ -31,7 +31,11 @@ if TYPE_CHECKING:
 @selection_options
 @execution_options
 @store_option
-@click.option("--embed", is_flag=True, help="Put every product into the record, also point clouds.")
+@click.option(
+    "--embed",
+    is_flag=True,
+    help="Put everything into the record: also point clouds, photos and the input files.",
+)
 def run(
     workflow: str,
     sets: Sequence[str],

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import Command, json_option
 from orthoflow.cli.tables import counted, echo_json
+
+if TYPE_CHECKING:
+    from orthoflow.records import Verification
 
 
 @click.command(cls=Command)
@@ -17,8 +21,9 @@ from orthoflow.cli.tables import counted, echo_json
 def verify(run: Path, *, as_json: bool) -> int:
     """Check that the record of RUN, a run folder or its run.h5, is whole and unchanged.
 
-    Recomputes the seal, the digest of every product in the record, every cache key and the
-    digest of the workflow. Ends with 3 when something differs.
+    Recomputes the seal, the digest of every product and input file in the record, every cache
+    key and the digest of the workflow, and compares the published files beside the record with
+    theirs; one that is not there is noted. Ends with 3 when something differs.
     """
     from orthoflow.records import verify_run
 
@@ -30,13 +35,29 @@ def verify(run: Path, *, as_json: bool) -> int:
                 "record": str(verification.path),
                 "ok": not findings,
                 "products": verification.n_products,
+                "inputs": verification.n_inputs,
+                "published": verification.n_published,
                 "findings": list(findings),
+                "notes": list(verification.notes),
             }
         )
-    elif not findings:
-        click.echo(f"verified: {counted(verification.n_products, 'product')}, seal ok")
+        return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
+    for note in verification.notes:
+        click.echo(f"note: {note}")
+    if not findings:
+        click.echo(_summary(verification))
     else:
         for finding in findings:
             click.echo(finding)
         say_error(f"error: {verification.path} is not as it was written, see above")
     return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
+
+
+def _summary(verification: Verification) -> str:
+    parts = [counted(verification.n_products, "product")]
+    if verification.n_inputs:
+        parts.append(counted(verification.n_inputs, "input file"))
+    parts.append("seal ok")
+    if verification.n_published:
+        parts.append(f"{counted(verification.n_published, 'published file')} unchanged")
+    return f"verified: {', '.join(parts)}"

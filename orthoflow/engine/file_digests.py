@@ -63,7 +63,7 @@ class FileDigests:
             before = path.stat()
             identity = _identity(before)
             known = self._known.get(identity)
-            sha256 = known or _sha256(path)
+            sha256 = known or file_sha256(path)
             after = path.stat()
         except OSError as error:
             raise InputError(f"cannot read the input file {path}: {error.strerror}") from error
@@ -94,7 +94,12 @@ def _identity(stat: os.stat_result) -> str:
     return f"{stat.st_dev}:{stat.st_ino}:{stat.st_size}:{stat.st_mtime_ns}:{stat.st_ctime_ns}"
 
 
-def _sha256(path: Path) -> str:
+def file_sha256(path: Path) -> str:
+    """Give the SHA-256 of a file as 64 hexadecimal digits.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 

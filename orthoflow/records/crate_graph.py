@@ -246,6 +246,8 @@ class _Crate:
                     },
                 )
                 entity["exampleOfWork"] = _joined(entity["exampleOfWork"], examples)
+                if entry.embedded:
+                    entity["isPartOf"] = ref(RECORD_FILE)
         yield from found.values()
 
     def _products(self) -> Iterator[Entity]:

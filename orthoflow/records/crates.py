@@ -16,15 +16,19 @@ from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run
 NO_LICENSE: Final = "not stated: ask who made these results"
 
 
-def write_crate(run: Run, folder: Path, *, license_text: str = NO_LICENSE) -> tuple[Path, ...]:
+def write_crate(
+    run: Run, folder: Path, *, license_text: str = NO_LICENSE, record: Run | None = None
+) -> tuple[Path, ...]:
     """Write a run as an RO-Crate: record, report, products, workflow and their description.
 
     Input files are named by their digests, not copied: they may be large, and others' property.
+    An embedded record has them, see `write_embedded`.
 
     Args:
         run: the run.
-        folder: existing empty folder.
+        folder: existing folder, empty but for `record`.
         license_text: URL or name of the license of the results.
+        record: the run with another record, which lies in the folder already.
 
     Returns:
         The files, the description first.
@@ -45,16 +49,16 @@ def write_crate(run: Run, folder: Path, *, license_text: str = NO_LICENSE) -> tu
         }
         for name, text in texts.items():
             (folder / name).write_text(text, encoding="utf-8", newline="")
-        names = [*texts, *_copy_files(run, folder)]
-        crate = crate_metadata(run.record, names, license_text=license_text)
+        names = [*texts, *_copy_files(run, folder, record or run)]
+        crate = crate_metadata((record or run).record, names, license_text=license_text)
         path = folder / METADATA_FILE
         path.write_text(json.dumps(crate, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return (path, *(folder / name for name in names))
 
 
-def _copy_files(run: Run, folder: Path) -> list[str]:
+def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
     """Copy record, report and published files; give their paths in the crate."""
-    sources = {RECORD_FILE: run.path}
+    sources = {RECORD_FILE: record.path}
     report = run.folder / REPORT_FILE
     if report.is_file():
         sources[REPORT_FILE] = report
@@ -62,6 +66,8 @@ def _copy_files(run: Run, folder: Path) -> list[str]:
         for file in files:
             sources[f"{PRODUCTS_FOLDER}/{file.relative_to(run.products_folder).as_posix()}"] = file
     for name, source in sources.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(source, folder / name)
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source != target:
+            shutil.copyfile(source, target)
     return list(sources)

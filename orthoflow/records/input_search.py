@@ -42,11 +42,13 @@ def find_inputs(
     digests: FileDigests,
     *,
     given: Sequence[str] = (),
+    extracted: Mapping[str, tuple[Path, ...]] | None = None,
 ) -> InputSearch:
     """Look for files with the content and the name that a record states.
 
-    Looks where `given` says; else at the places that the workflow names, below the working
-    directory, the run's folder and the folders above it, and in these folders themselves.
+    Looks where `given` says; else among the `extracted`; else at the places that the workflow
+    names, below the working directory, the run's folder and the folders above it, and in these
+    folders themselves.
 
     Args:
         workflow: of the record.
@@ -54,12 +56,13 @@ def find_inputs(
         run_folder: the folder of the record.
         digests: remembers digests, so that each file is read once.
         given: `NAME=PATH`, each as behind `--input`.
+        extracted: input -> files that lay in the record itself.
 
     Raises:
         InvalidArgumentsError: `given` names no input of the workflow.
         InputError: there is nothing at a given path.
     """
-    places = _places(workflow, run_folder, given)
+    places = _places(workflow, run_folder, given, extracted or {})
     paths: dict[str, tuple[Path, ...]] = {}
     problems: list[str] = []
     for entry in recorded:
@@ -108,7 +111,12 @@ class _Places:
         yield from (folder / name for folder in self.folders)
 
 
-def _places(workflow: Workflow, run_folder: Path, given: Sequence[str]) -> dict[str, _Places]:
+def _places(
+    workflow: Workflow,
+    run_folder: Path,
+    given: Sequence[str],
+    extracted: Mapping[str, tuple[Path, ...]],
+) -> dict[str, _Places]:
     log = ProblemLog(file="")
     overridden = override_inputs(workflow.inputs, read_input_options(given, log), log)
     log.raise_any()
@@ -120,9 +128,10 @@ def _places(workflow: Workflow, run_folder: Path, given: Sequence[str]) -> dict[
     written = _written_specs(workflow)
     places: dict[str, _Places] = {}
     for name, spec in workflow.inputs.items():
-        files = by_hand.get(name)
+        by_name = by_hand.get(name)
+        files = by_name.paths if by_name is not None else extracted.get(name)
         if files is not None:
-            places[name] = _Places(files=files.paths)
+            places[name] = _Places(files=files)
             continue
         texts = (*spec.files, *(written[name].files if name in written else ()))
         named = [

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import shutil
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
-from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.model import PublishedFile, RecordedCell
 
 from orthoflow.engine.durability import writing_to
+from orthoflow.engine.file_digests import file_sha256
 from orthoflow.records.metrics import cell_metrics, write_metrics_csv
 
 PRODUCTS_FOLDER: Final = "products"
@@ -35,13 +38,16 @@ def publish_products(
     run_folder: Path,
     cells: Iterable[RecordedCell],
     files_of: Mapping[str, Mapping[str, tuple[Path, ...]]],
-) -> None:
+) -> tuple[PublishedFile, ...]:
     """Fill `products/` of a run folder; an older one, left by an interrupted run, is replaced.
 
     Args:
         run_folder: existing folder.
         cells: all cells of the run.
         files_of: address -> output port -> files in the store.
+
+    Returns:
+        What is there now, sorted by path.
 
     Raises:
         StoreError: a file cannot be copied, e.g. because the disk is full.
@@ -56,6 +62,21 @@ def publish_products(
                 _publish_cell(target / folder_name(cell.address), cell, files_of)
         rows = [row for cell in cells for row in cell_metrics(cell)]
         write_metrics_csv(target / METRICS_FILE, rows)
+        return _digested(run_folder, target)
+
+
+def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
+    paths = sorted(path for path in target.rglob("*") if path.is_file())
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        digests = list(pool.map(file_sha256, paths))
+    return tuple(
+        PublishedFile(
+            path=path.relative_to(run_folder).as_posix(),
+            size_bytes=path.stat().st_size,
+            sha256=digest,
+        )
+        for path, digest in zip(paths, digests, strict=True)
+    )
 
 
 def _publish_cell(

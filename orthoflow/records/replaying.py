@@ -54,7 +54,7 @@ class Replay:
         workflow: of the record, for the record of the replay.
         plan: its cells with the parameters and seeds as recorded.
         notes: what is not as it was and may change results: code, libraries, Python, processor.
-        is_embedded: the record has the arrays of every product.
+        is_embedded: the record has the arrays of every product and all input files.
     """
 
     workflow: Workflow
@@ -70,6 +70,7 @@ def plan_replay(
     options: RunOptions,
     *,
     inputs: Sequence[str] = (),
+    extracted: Mapping[str, tuple[Path, ...]] | None = None,
 ) -> Replay:
     """Check that a run can be made again, and plan it. Nothing is computed.
 
@@ -79,6 +80,7 @@ def plan_replay(
         store: where the replay keeps its results.
         options: of the replay.
         inputs: `NAME=PATH`, each as behind `--input`.
+        extracted: input -> files that lay in the record, see `embedded_inputs`.
 
     Raises:
         UnreplayableRunError: the record was changed, a method has another result version or takes
@@ -87,7 +89,7 @@ def plan_replay(
         InvalidArgumentsError: `inputs` names no input of the workflow.
         InputError: there is nothing at a given path.
     """
-    findings = verify_run(run.path).findings or tuple(_inconsistencies(run))
+    findings = verify_run(run.path, also_published=False).findings or tuple(_inconsistencies(run))
     if findings:
         raise UnreplayableRunError(
             tuple(f"{run.path} is not as it was written: {finding}" for finding in findings)
@@ -98,7 +100,9 @@ def plan_replay(
         if cell.status != "skipped":
             check.add(cell)
     digests = store.file_digests()
-    search = find_inputs(workflow, run.record.inputs, run.folder, digests, given=inputs)
+    search = find_inputs(
+        workflow, run.record.inputs, run.folder, digests, given=inputs, extracted=extracted
+    )
     if check.others or search.problems:
         raise UnreplayableRunError((*check.others, *check.missing, *search.problems))
     if check.missing:
@@ -112,10 +116,14 @@ def plan_replay(
         workflow=workflow,
         plan=plan,
         notes=tuple(dict.fromkeys((*_environment_notes(run), *_method_notes(run, plan)))),
-        is_embedded=all(
-            output.embedded for cell in run.record.cells for output in cell.outputs.values()
-        ),
+        is_embedded=_is_embedded(run),
     )
+
+
+def _is_embedded(run: Run) -> bool:
+    products = (output for cell in run.record.cells for output in cell.outputs.values())
+    inputs = (entry for entry in run.record.inputs if entry.files)
+    return all(item.embedded for item in products) and all(item.embedded for item in inputs)
 
 
 def _workflow(run: Run) -> Workflow:

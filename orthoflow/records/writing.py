@@ -9,7 +9,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Final, cast
 
-from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.errors import InputFileError, RecordFormatError
 from orthoflow_provenance.model import (
     RecordedCell,
     RecordedEnvironment,
@@ -25,7 +25,7 @@ from orthoflow_provenance.writer import write_record
 
 from orthoflow import __version__
 from orthoflow.engine.durability import sync_folder, writing_to
-from orthoflow.errors import StoreError
+from orthoflow.errors import InputError, StoreError
 from orthoflow.products.product import JsonValue
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import RECORD_FILE, Run
@@ -61,7 +61,7 @@ def write_run(
         workflow: the document behind the plan.
         run_folder: the folder, made when missing.
         store: holds the products and pictures of the run.
-        embed: put the arrays of every product into the record, also those of scan size.
+        embed: put every product into the record, also those of scan size, and the input files.
         before_finish: called with the run before the record gets its name, e.g. for the report.
 
     Returns:
@@ -69,16 +69,18 @@ def write_run(
 
     Raises:
         StoreError: the disk refuses, or the store lost a product of the run.
+        InputError: an input file to embed was changed during the run.
     """
     record = build_record(outcome, plan, workflow, store, embed=embed)
     with writing_to(run_folder):
         run_folder.mkdir(parents=True, exist_ok=True)
-    publish_products(run_folder, record.cells, _published(outcome, store))
+    published = publish_products(run_folder, record.cells, _published(outcome, store))
+    record = dataclasses.replace(record, published=published)
     unfinished = run_folder / _UNFINISHED
     with writing_to(run_folder):
         for leftover in run_folder.glob(f".*{RECORD_FILE}.*"):
             leftover.unlink()
-        _write_record(unfinished, record, store, embed=embed)
+        _write_record(unfinished, record, store, plan, embed=embed)
         if before_finish is not None:
             before_finish(Run(path=unfinished, record=read_record(unfinished)))
         finished = unfinished.replace(run_folder / RECORD_FILE)
@@ -86,9 +88,19 @@ def write_run(
     return Run(path=finished, record=record)
 
 
-def _write_record(path: Path, record: RunRecord, store: Store, *, embed: bool) -> None:
+def _write_record(
+    path: Path, record: RunRecord, store: Store, plan: RunPlan, *, embed: bool
+) -> None:
+    files = {
+        file.sha256: place
+        for given in plan.inputs.values()
+        if given is not None
+        for file, place in zip(given.files, given.paths, strict=True)
+    }
     try:
-        write_record(path, record, store.product_file, embed=embed)
+        write_record(path, record, store.product_file, embed=embed, input_file=files.get)
+    except InputFileError as error:
+        raise InputError(f"{error}: run again") from error
     except RecordFormatError as error:
         raise StoreError(
             f"the record cannot be assembled from the store {store.folder}: {error}; run again "
@@ -127,7 +139,7 @@ def build_record(
         workflow_source=workflow.source,
         workflow_resolved=resolved_json(workflow),
         overrides=tuple(workflow.overrides),
-        inputs=_recorded_inputs(plan),
+        inputs=_recorded_inputs(plan, embed=embed),
         environments=_recorded_environments(results),
         cells=cells,
     )
@@ -230,7 +242,7 @@ def _recorded_figure(figure: FigureRef, store: Store) -> RecordedFigure:
     )
 
 
-def _recorded_inputs(plan: RunPlan) -> tuple[RecordedInput, ...]:
+def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]:
     return tuple(
         RecordedInput(
             name=name,
@@ -238,6 +250,7 @@ def _recorded_inputs(plan: RunPlan) -> tuple[RecordedInput, ...]:
                 RecordedFile(name=file.name, size_bytes=file.size_bytes, sha256=file.sha256)
                 for file in (given.files if given is not None else ())
             ),
+            embedded=embed and given is not None,
         )
         for name, given in plan.inputs.items()
     )

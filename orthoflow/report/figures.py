@@ -12,6 +12,7 @@ from typing import Final
 from orthoflow.files.images import decode_image, encode_png, shrunk_webp
 from orthoflow.records import RecordedFigure, Run
 from orthoflow.records.published import folder_name
+from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.pictures import Picture, data_uri
 
@@ -70,8 +71,21 @@ def figure_groups(run: Run, *, share: float = 1.0) -> tuple[FigureGroup, ...]:
     return tuple(groups)
 
 
-def write_figures(run: Run, folder: Path) -> None:
-    """Write every figure of a run as a PNG or SVG file below `folder/<cell>/`, and its graph.
+def baseline_addresses(run: Run) -> tuple[str, ...]:
+    """The cells whose figures lie beside the page: of the baseline, and before all variants."""
+    baseline = {cell.address for cell in baseline_cells(run)}
+    return tuple(
+        address
+        for address, cell in run.cells.items()
+        if address in baseline or not (cell.assignment or cell.repeat)
+    )
+
+
+def write_figures(run: Run, folder: Path, addresses: Iterable[str]) -> int:
+    """Write the figures of cells as PNG or SVG files below `folder/<cell>/`, and the run's graph.
+
+    Returns:
+        How many figures.
 
     Raises:
         OSError: the folder cannot be written.
@@ -79,14 +93,16 @@ def write_figures(run: Run, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "graph.svg").write_text(run_diagram(run, stands_alone=True), encoding="utf-8")
     waiting: list[tuple[Path, RecordedFigure]] = []
-    for address, cell in run.cells.items():
+    for address in addresses:
         inside = folder / folder_name(address)
-        if cell.figures:
+        figures = run.cells[address].figures
+        if figures:
             inside.mkdir(exist_ok=True)
-        waiting.extend((inside / figure.name, figure) for figure in cell.figures)
+        waiting.extend((inside / figure.name, figure) for figure in figures)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         # Drained, so that an error in a thread is not lost.
         list(pool.map(lambda item: _write_figure(*item), waiting))
+    return len(waiting)
 
 
 def _write_figure(stem: Path, figure: RecordedFigure) -> None:

@@ -22,7 +22,13 @@ from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import differences
-from orthoflow.report.figures import FIGURES_FOLDER, FigureGroup, figure_groups, write_figures
+from orthoflow.report.figures import (
+    FIGURES_FOLDER,
+    FigureGroup,
+    baseline_addresses,
+    figure_groups,
+    write_figures,
+)
 from orthoflow.report.numbers import number_with_unit
 from orthoflow.report.origins import environment_words
 from orthoflow.report.overlays import overlays
@@ -31,7 +37,8 @@ from orthoflow.report.plane_tables import PlaneTable, plane_tables
 from orthoflow.report.sliders import sliders
 from orthoflow.report.summaries import Answer, Limit, answers, citations, limits
 
-_DOI: Final = re.compile(r"doi:\s*(10\.[^\s,;)]+[^\s,;).])")
+# Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
+_DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +73,8 @@ class _Section:
 def write_page(run: Run, path: Path) -> None:
     """Write the report of one run, and its figures as PNG and SVG files into `figures/` beside it.
 
+    Of a comparison these are the figures of the baseline; `write_figures` writes those of any cell.
+
     Raises:
         StoreError: a file cannot be written.
         RecordError: the record is damaged.
@@ -73,7 +82,7 @@ def write_page(run: Run, path: Path) -> None:
     write_report([run], path)
     folder = path.parent / FIGURES_FOLDER
     try:
-        write_figures(run, folder)
+        write_figures(run, folder, baseline_addresses(run))
     except OSError as error:
         raise StoreError(f"figures cannot be written to {folder}: {error.strerror}") from error
 
@@ -121,7 +130,7 @@ def _template() -> jinja2.Template:
     )
     environment.filters["with_unit"] = number_with_unit
     environment.filters["environment"] = environment_words
-    environment.filters["cited"] = _cited
+    environment.filters["cited"] = cited
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote
     # Ours, and no template: braces in them mean nothing.
@@ -134,7 +143,7 @@ def _packaged(name: str) -> str:
     return files("orthoflow.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
-def _cited(citation: str) -> Markup:
+def cited(citation: str) -> Markup:
     """Escape a citation and make its DOI a link: a page that links needs no network itself."""
     return Markup(
         _DOI.sub(

@@ -1,4 +1,4 @@
-"""The one error this package raises on purpose."""
+"""The errors this package raises on purpose."""
 
 from __future__ import annotations
 
@@ -9,3 +9,7 @@ class RecordFormatError(ValueError):
     The message is one sentence: what was found, what was expected, where, and the way out if there
     is one.
     """
+
+
+class InputFileError(RecordFormatError):
+    """An input file that is to be embedded is missing, or not the one that was digested."""

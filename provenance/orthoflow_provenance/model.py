@@ -91,10 +91,32 @@ class RecordedFile:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedInput:
-    """One workflow input; no files when it was optional and absent."""
+    """One workflow input; no files when it was optional and absent.
+
+    Attributes:
+        name: name in the workflow.
+        files: in the order of their names.
+        embedded: the bytes of the files are in the record.
+    """
 
     name: str
     files: tuple[RecordedFile, ...]
+    embedded: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedFile:
+    """One file that the run wrote for other programs.
+
+    Attributes:
+        path: from the folder of the record, with `/`.
+        size_bytes: its size.
+        sha256: hexadecimal digest of its bytes.
+    """
+
+    path: str
+    size_bytes: int
+    sha256: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,6 +234,7 @@ class RunRecord:
         inputs: the workflow's inputs.
         environments: each distinct one once.
         cells: in the order of the graph.
+        published: files beside the record, for other programs.
     """
 
     run_id: str
@@ -227,3 +250,4 @@ class RunRecord:
     inputs: tuple[RecordedInput, ...] = ()
     environments: tuple[RecordedEnvironment, ...] = ()
     cells: tuple[RecordedCell, ...] = ()
+    published: tuple[PublishedFile, ...] = ()

@@ -21,8 +21,10 @@ from orthoflow_provenance.encoding import (
     text_attribute,
 )
 from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.input_files import has_contents
 from orthoflow_provenance.model import (
     CellStatus,
+    PublishedFile,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
@@ -139,6 +141,7 @@ def record_of(file: h5py.File) -> RunRecord:
         inputs=_entries(file, layout.INPUTS, _input),
         environments=_entries(file, layout.ENVIRONMENTS, _environment),
         cells=_entries(file, layout.CELLS, _cell),
+        published=_published(file),
     )
 
 
@@ -158,7 +161,18 @@ def _input(name: str, group: h5py.Group) -> RecordedInput:
         RecordedFile(name=str(file), size_bytes=int(size), sha256=str(sha256))
         for file, size, sha256 in read_table(group, "files", layout.FILE_COLUMNS)
     )
-    return RecordedInput(name=name, files=files)
+    return RecordedInput(name=name, files=files, embedded=has_contents(group))
+
+
+def _published(file: h5py.File) -> tuple[PublishedFile, ...]:
+    with reading(f"/{layout.PUBLISHED}"):
+        is_there = layout.PUBLISHED in file
+    # Records of version 1.0 do not name them.
+    rows = read_table(file, layout.PUBLISHED, layout.PUBLISHED_COLUMNS) if is_there else ()
+    return tuple(
+        PublishedFile(path=str(path), size_bytes=int(size), sha256=str(sha256))
+        for path, size, sha256 in rows
+    )
 
 
 def _environment(name: str, group: h5py.Group) -> RecordedEnvironment:

@@ -21,7 +21,8 @@ from orthoflow_provenance.encoding import (
     text_attribute,
 )
 from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.model import RecordedCell, RecordedProduct, RunRecord
+from orthoflow_provenance.input_files import content_name, is_file_name
+from orthoflow_provenance.model import RecordedCell, RecordedInput, RecordedProduct, RunRecord
 from orthoflow_provenance.payloads import array_datasets, check_format, open_group
 from orthoflow_provenance.reader import record_of
 from orthoflow_provenance.safe import safe_open
@@ -78,6 +79,9 @@ def _findings(file: h5py.File) -> Iterator[Finding]:
         return
     yield from _workflow_findings(file, record)
     yield from _run_findings(record)
+    for entry in record.inputs:
+        yield from _input_findings(entry, contents)
+    yield from _published_findings(record)
     environments = {entry.id for entry in record.environments}
     outputs = {
         f"{cell.address}.{port}": product.digest
@@ -138,14 +142,33 @@ def _run_findings(record: RunRecord) -> Iterator[Finding]:
             place="/@status",
             problem=f"the run is {record.status}, which does not fit the status of its cells",
         )
-    for entry in record.inputs:
-        for file in entry.files:
-            if not _is_sha256(file.sha256) or file.size_bytes < 0 or "/" in file.name:
-                yield Finding(
-                    place=f"/{layout.INPUTS}/{entry.name}",
-                    problem=f"the file {file.name!r} needs a name without folder, a size and a "
-                    "SHA-256",
-                )
+
+
+def _input_findings(entry: RecordedInput, contents: ContentDigests) -> Iterator[Finding]:
+    place = f"/{layout.INPUTS}/{entry.name}"
+    for index, file in enumerate(entry.files):
+        if not (is_file_name(file.name) and _is_sha256(file.sha256) and file.size_bytes >= 0):
+            yield Finding(
+                place=place,
+                problem=f"the file {file.name!r} needs a name without folder, a size and a SHA-256",
+            )
+        if not entry.embedded:
+            continue
+        inside = f"{place}/{layout.INPUT_CONTENTS}/{content_name(index)}"
+        stated = ArrayFingerprint(dtype="|u1", shape=(file.size_bytes,), sha256=file.sha256)
+        if contents.arrays.get(inside) != stated:
+            yield Finding(place=inside, problem=f"does not hold the bytes of {file.name}")
+
+
+def _published_findings(record: RunRecord) -> Iterator[Finding]:
+    for file in record.published:
+        is_inside = all(map(is_file_name, file.path.split("/")))
+        if not (is_inside and _is_sha256(file.sha256) and file.size_bytes >= 0):
+            yield Finding(
+                place=f"/{layout.PUBLISHED}",
+                problem=f"the file {file.path!r} needs a path from the folder of the record, a "
+                "size and a SHA-256",
+            )
 
 
 def _cell_findings(cell: RecordedCell, environments: Set[str]) -> Iterator[Finding]:

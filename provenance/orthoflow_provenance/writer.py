@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
@@ -15,12 +17,14 @@ from orthoflow_provenance import layout
 from orthoflow_provenance.digests import canonical_json, sha256_text
 from orthoflow_provenance.encoding import (
     check_name,
+    int_attribute,
     set_attributes,
     storable_text,
     text_attribute,
     write_text,
 )
 from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.input_files import InputFile, embed_files
 from orthoflow_provenance.model import (
     RecordedCell,
     RecordedEnvironment,
@@ -46,6 +50,8 @@ def write_record(
     *,
     embed: bool = False,
     keep_folders: bool = False,
+    input_file: InputFile | None = None,
+    earlier: Path | None = None,
 ) -> str:
     """Write a record next to its final place and move it there when it is complete.
 
@@ -55,6 +61,8 @@ def write_record(
         product_file: digest -> file that `write_product_file` wrote, None when there is none.
         embed: put in the arrays of all outputs, not only of those marked `embedded`.
         keep_folders: leave absolute paths in logs, messages and options.
+        input_file: SHA-256 -> file with it, for the inputs marked `embedded`.
+        earlier: another record of this run; the outputs embedded in it are taken from there.
 
     Returns:
         The content digest, 64 hexadecimal digits.
@@ -67,13 +75,18 @@ def write_record(
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     written = record if keep_folders else _without_folders(record)
-    with create_file(part) as file:
-        _write_run(file, written)
+    with ExitStack() as stack:
+        shelf = _Shelf(
+            product_file=product_file,
+            earlier=stack.enter_context(safe_open(earlier)) if earlier else None,
+        )
+        file = stack.enter_context(create_file(part))
+        _write_run(file, written, input_file or _no_file)
         cells = create_group(file, layout.CELLS)
         for index, cell in enumerate(written.cells):
             group = _create_entry(cells, cell.address, "the cell", index)
             _write_cell(group, cell)
-            _write_products(group, cell, product_file, embed=embed)
+            _write_products(group, cell, shelf, embed=embed)
         content_sha256 = seal_file(file)
     part.replace(path)
     _sync_folder(path.parent)
@@ -101,7 +114,11 @@ def _without_folders(record: RunRecord) -> RunRecord:
     )
 
 
-def _write_run(file: h5py.File, record: RunRecord) -> None:
+def _no_file(_sha256: str) -> None:
+    """Know no input file."""
+
+
+def _write_run(file: h5py.File, record: RunRecord, input_file: InputFile) -> None:
     source = storable_text(record.workflow_source)
     set_attributes(
         file,
@@ -124,7 +141,12 @@ def _write_run(file: h5py.File, record: RunRecord) -> None:
     write_texts(workflow, "overrides", record.overrides)
     inputs = create_group(file, layout.INPUTS)
     for index, entry in enumerate(record.inputs):
-        _write_input(_create_entry(inputs, entry.name, "the input", index), entry)
+        group = _create_entry(inputs, entry.name, "the input", index)
+        _write_input(group, entry)
+        if entry.embedded:
+            embed_files(group, entry, input_file)
+    published = [(file.path, file.size_bytes, file.sha256) for file in record.published]
+    write_table(file, layout.PUBLISHED, layout.PUBLISHED_COLUMNS, published)
     environments = create_group(file, layout.ENVIRONMENTS)
     for index, environment in enumerate(record.environments):
         _write_environment(
@@ -213,9 +235,32 @@ def _write_figure(group: h5py.Group, figure: RecordedFigure, index: int) -> None
     )
 
 
-def _write_products(
-    group: h5py.Group, cell: RecordedCell, product_file: ProductFile, *, embed: bool
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Shelf:
+    """Where the products to embed are: in another record of the run, else each in a file."""
+
+    product_file: ProductFile
+    earlier: h5py.File | None
+
+    @contextmanager
+    def open(self, place: str, product: RecordedProduct) -> Iterator[h5py.Group]:
+        """Open the group of a product; `place` is where it is in a record of this run."""
+        if self.earlier is not None:
+            group = open_group(self.earlier, place)
+            if int_attribute(group, "embedded"):
+                yield group
+                return
+        path = self.product_file(product.digest)
+        if path is None:
+            raise RecordFormatError(
+                f"the product {product.digest} ({product.type_name}) for {place} is not in the "
+                "store any more: run the workflow again"
+            )
+        with safe_open(path) as source:
+            yield open_group(source, PRODUCT_GROUP)
+
+
+def _write_products(group: h5py.Group, cell: RecordedCell, shelf: _Shelf, *, embed: bool) -> None:
     _write_references(create_group(group, layout.CELL_INPUTS), cell.inputs)
     outputs = create_group(group, layout.CELL_OUTPUTS)
     _write_references(
@@ -224,7 +269,7 @@ def _write_products(
     for port, output in cell.outputs.items():
         if output.embedded or embed:
             check_name(port, "the port")
-            _embed(outputs, port, output, product_file)
+            _embed(outputs, port, output, shelf)
 
 
 def _write_references(group: h5py.Group, products: Mapping[str, RecordedProduct]) -> None:
@@ -242,23 +287,14 @@ def _write_references(group: h5py.Group, products: Mapping[str, RecordedProduct]
         )
 
 
-def _embed(
-    group: h5py.Group, port: str, product: RecordedProduct, product_file: ProductFile
-) -> None:
-    path = product_file(product.digest)
-    if path is None:
-        raise RecordFormatError(
-            f"the product {product.digest} ({product.type_name}) for {group.name}/{port} is not in "
-            "the store any more: run the workflow again"
-        )
-    with safe_open(path) as source:
-        stored = text_attribute(open_group(source, PRODUCT_GROUP), "digest")
+def _embed(group: h5py.Group, port: str, product: RecordedProduct, shelf: _Shelf) -> None:
+    with shelf.open(f"{group.name}/{port}", product) as source:
+        stored = text_attribute(source, "digest")
         if stored != product.digest:
-            raise RecordFormatError(
-                f"{path.name} must hold the product {product.digest}, got {stored}"
-            )
+            name = Path(source.file.filename).name
+            raise RecordFormatError(f"{name} must hold the product {product.digest}, got {stored}")
         # Copies chunks as they are; unpacking and packing again would be ten times slower.
-        source.copy(PRODUCT_GROUP, group, name=port)
+        source.file.copy(source, group, name=port)
     set_attributes(group[port], {"source": product.source, "embedded": 1})
 
 

@@ -1,0 +1,112 @@
+"""Records that need nothing beside them, and files beside a record that were changed."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from orthoflow_provenance.verify import verify_record
+
+from orthoflow.records import open_run
+from tests.studios import Studio, open_studio
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    """A folder with a run `first` whose plane a file says."""
+    with pytest.MonkeyPatch.context() as patch:
+        studio = open_studio(tmp_path_factory.mktemp("finished"), patch)
+        (studio.folder / "n.txt").write_text("1.5")
+        studio.run("first", "--input", "number=n.txt")
+        yield studio
+
+
+@pytest.fixture
+def studio(finished: Studio, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Studio:
+    """A folder of its own with the run, its input and its store."""
+    opened = open_studio(tmp_path, monkeypatch)
+    for name in ("first", ".orthoflow"):
+        shutil.copytree(finished.folder / name, tmp_path / name)
+    shutil.copyfile(finished.folder / "n.txt", tmp_path / "n.txt")
+    return opened
+
+
+def assert_record_alone_is_enough(studio: Studio, record: Path) -> None:
+    """Replay a record from a folder in which there is nothing else, without any store."""
+    alone = studio.folder / "alone"
+    alone.mkdir()
+    shutil.copyfile(record, alone / "run.h5")
+    for path in studio.folder.iterdir():
+        if path != alone:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    verified = studio("verify", "alone")
+    assert (verified.exit_code, verified.stdout.splitlines()[-1]) == (
+        0,
+        "verified: 2 products, 1 input file, seal ok",
+    )
+    assert "published files of the record are not beside it" in verified.stdout
+    said = studio.json("replay", "alone/run.h5", "-o", "again")
+    assert [row["verdict"] for row in said["products"]] == ["identical", "identical"]
+    assert sorted(path.name for path in studio.folder.iterdir()) == ["again", "alone"]
+
+
+def test_an_embedded_run_replays_from_its_record_alone(studio: Studio) -> None:
+    run = studio.run("whole", "--input", "number=n.txt", "--embed")
+    assert_record_alone_is_enough(studio, run.path)
+
+
+def test_a_run_is_embedded_afterwards(studio: Studio) -> None:
+    done = studio("export", "first", "--embed", "-o", "whole")
+    assert done.exit_code == 0, done.output
+    assert "run.h5 with 2 products and 1 input file, " in done.stdout
+    assert [path.name for path in (studio.folder / "whole").iterdir()] == ["run.h5"]
+    # What is embedded once can be embedded again, with neither store nor files.
+    shutil.rmtree(studio.folder / ".orthoflow")
+    (studio.folder / "n.txt").unlink()
+    assert studio("export", "whole", "--embed", "-o", "twice").exit_code == 0
+    first, second = (studio.folder / name / "run.h5" for name in ("whole", "twice"))
+    assert first.read_bytes() == second.read_bytes()
+    assert_record_alone_is_enough(studio, second)
+
+
+def test_a_crate_may_hold_the_embedded_record(studio: Studio) -> None:
+    done = studio("export", "first", "--to", "ro-crate", "--embed", "-o", "crate")
+    assert done.exit_code == 0, done.output
+    assert verify_record(studio.folder / "crate" / "run.h5") == ()
+    assert all(entry.embedded for entry in open_run("crate").record.inputs)
+    assert studio("verify", "crate").exit_code == 0
+
+
+def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
+    (studio.folder / "n.txt").write_text("1.6")
+    refused = studio("export", "first", "--embed", "-o", "whole")
+    assert refused.exit_code == 2
+    assert "input number: n.txt is not the n.txt of the record: it was changed" in refused.stderr
+    for words, sentence in (
+        (("--to", "csv", "--embed"), "writes no record"),
+        (("--to", "csv", "--input", "number=n.txt"), "--input belongs to --embed"),
+        ((), "say what to write: --to colmap, csv, figures, laz or ro-crate, or --embed"),
+    ):
+        refused = studio("export", "first", *words, "-o", "other")
+        assert (refused.exit_code, sentence in refused.stderr) == (2, True), refused.output
+
+
+def test_a_changed_published_file_is_named_and_does_not_hinder_a_replay(studio: Studio) -> None:
+    table = studio.folder / "first" / "products" / "metrics.csv"
+    told = studio.json("verify", "first")
+    assert (told["ok"], told["notes"]) == (True, [])
+    assert told["published"] == sum(path.is_file() for path in table.parent.rglob("*"))
+    table.write_text(table.read_text().replace("cell", "sell"))
+    refused = studio("verify", "first")
+    assert refused.exit_code == 3
+    assert "products/metrics.csv: changed since it was published" in refused.stdout
+    assert studio("replay", "first", "-o", "again").exit_code == 0
+
+
+def test_a_missing_published_file_is_noted(studio: Studio) -> None:
+    (studio.folder / "first" / "products" / "metrics.csv").unlink()
+    done = studio("verify", "first")
+    assert done.exit_code == 0
+    assert "published files are not in products/ any more: products/metrics.csv" in done.stdout
