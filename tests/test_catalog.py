@@ -397,4 +397,31 @@ def test_the_traceback_of_a_broken_plugin_is_shown_on_request(
     assert listed.exit_code == 0
     assert "plugin broken of broken 1.0 fails to load" in listed.output
     assert "Traceback" not in listed.output
+    assert "`orthoflow plugins show broken` prints its traceback" in listed.output
     assert "plane     cloud" in listed.output
+
+
+def test_a_method_whose_class_does_not_load_is_shown_with_its_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = {
+        "late_hooks.py": hooks(methods=method("plane.late", "late_method:Late")),
+        "late_method.py": "import no_such_library\n",
+    }
+    monkeypatch.syspath_prepend(write_distribution(tmp_path, "late", sources))
+    shown = CliRunner().invoke(program, ["plugins", "show", "plane.late"])
+    assert shown.exit_code == 4
+    sentence, _, rest = shown.output.partition("\n")
+    assert sentence == (
+        "method plane.late of late 1.0 cannot be loaded from late_method:Late: "
+        "ModuleNotFoundError: No module named 'no_such_library'; install what is missing, or "
+        "another version of late"
+    )
+    assert "state         broken" in rest
+    assert "late_method.py" in rest
+    assert "Traceback" in rest
+    answer = json.loads(
+        CliRunner().invoke(program, ["plugins", "show", "plane.late", "--json"]).output
+    )
+    assert (answer["state"], answer["distribution"]) == ("broken", "late")
+    assert "Traceback" in answer["traceback"]

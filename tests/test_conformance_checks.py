@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from orthoflow.catalog import discover_catalog
 from orthoflow.errors import ArgumentError
 from orthoflow.testing import ConformanceCase, ConformanceError, conformance_cases
 from tests.laboratories import write_distribution
@@ -209,6 +210,41 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
 }
 
+# Our own methods, with results that lie beside the truth: what each does, and what is said of it.
+BESIDE = """
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from orthoflow_plugins.mosaic.seams import MosaicSeams
+from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+
+
+class Cell(MosaicSeams):
+    id = "mosaic.cell"
+
+    def run(self, inputs, params, ctx):
+        made = super().run(inputs, params, ctx).orthoimages
+        images = tuple(replace(each, rgb=np.roll(each.rgb, 1, axis=1)) for each in made.images)
+        return self.Out(orthoimages=replace(made, images=images))
+
+
+class Row(PointcloudDirect):
+    id = "ortho.row"
+
+    def run(self, inputs, params, ctx):
+        made = super().run(inputs, params, ctx).layers
+        layers = tuple(replace(each, rgb=np.roll(each.rgb, 1, axis=0)) for each in made.layers)
+        return self.Out(layers=replace(made, layers=layers))
+
+"""
+BESIDE_SAYS = {
+    "mosaic.cell": ("mosaics-show-cells-in-place", "wall 0 at 0.006 m: colours lie "),
+    "ortho.row": ("cells-show-their-own-place", "rows beside their place"),
+}
+
 
 @pytest.fixture
 def cheats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,12 +259,19 @@ def cheats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         f'summary="For a test.")'
         for name in ("floor", *CHEATS)
     )
+    listing += "".join(
+        f', MethodSpec(id="{method_id}", target="beside:{method_id.partition(".")[2].title()}", '
+        'summary="For a test.")'
+        for method_id in BESIDE_SAYS
+    )
     hooks = (
         "from orthoflow.sdk.hooks import MethodSpec, hookimpl\n\n\n"
         f"@hookimpl\ndef orthoflow_methods():\n    return [{listing}]\n"
     )
     folder = write_distribution(
-        tmp_path / "site", "cheats", {"floors.py": HONEST + classes, "cheats_hooks.py": hooks}
+        tmp_path / "site",
+        "cheats",
+        {"floors.py": HONEST + classes, "beside.py": BESIDE, "cheats_hooks.py": hooks},
     )
     monkeypatch.syspath_prepend(folder)
     # A cheat that litters does so here too, where it runs in this process.
@@ -252,6 +295,15 @@ def test_a_broken_rule_is_noticed_and_named(cheat: str) -> None:
 
 
 @pytest.mark.usefixtures("cheats")
+@pytest.mark.parametrize("method_id", BESIDE_SAYS)
+def test_a_result_beside_the_truth_is_noticed(method_id: str) -> None:
+    check, sentence = BESIDE_SAYS[method_id]
+    with pytest.raises(ConformanceError) as caught:
+        case_of(method_id, check).run()
+    assert sentence in str(caught.value)
+
+
+@pytest.mark.usefixtures("cheats")
 @pytest.mark.parametrize("check", sorted({check for check, _, _ in CHEATS.values()}))
 def test_a_method_that_keeps_the_rules_passes(check: str) -> None:
     case_of("plane.floor", check).run()
@@ -271,20 +323,25 @@ def test_an_expected_failure_that_passes_is_reported() -> None:
 
 
 @pytest.mark.usefixtures("cheats")
-def test_a_result_that_moved_without_its_version_is_noticed(tmp_path: Path) -> None:
+def test_a_result_that_moved_without_its_version_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     golden = tmp_path / "golden.json"
+    cases = conformance_cases("plane.floor", golden=golden)
+    again = conformance_cases("plane.floor", golden=golden)
 
-    def problem(lift_m: float) -> str:
-        cases = conformance_cases("plane.floor", params={"lift_m": lift_m}, golden=golden)
+    def problem(cases: tuple[ConformanceCase, ...]) -> str:
         (case,) = (case for case in cases if case.check.name == "golden-digest-holds")
         return case.problem()
 
-    assert problem(0.0) == ""
+    assert problem(cases) == ""
     recorded = golden.read_text()
-    assert problem(0.0) == ""
-    assert problem(0.1) == (
-        "output planes is another one than golden.json has, but result_version is 1 still: raise "
-        "it, or find out why the result moved"
+    assert problem(cases) == ""
+    floor = discover_catalog().method("plane.floor").load()
+    monkeypatch.setattr(floor, "lift_m", lambda self, cloud, ctx: 0.1)
+    assert problem(again) == (
+        "output planes is another one than golden.json has (4 of 12 sampled values of corners "
+        "moved), but result_version is 1 still: raise it, or find out why the result moved"
     )
     assert golden.read_text() == recorded
 

@@ -13,7 +13,7 @@ from orthoflow.cli.tables import echo_json, echo_table
 @click.command("list", cls=Command)
 @json_option
 def plugins_list(*, as_json: bool) -> int:
-    """List every method and kind, and what is wrong with plugins that do not load.
+    """List methods, kinds and product types, and what is wrong with plugins that do not load.
 
     `orthoflow plugins show PLUGIN` prints the traceback of one that is broken.
     """
@@ -47,6 +47,14 @@ def plugins_list(*, as_json: bool) -> int:
             for name, kind in catalog.kinds.items()
         ],
     )
+    click.echo()
+    echo_table(
+        ("product", "distribution", "summary"),
+        [
+            (name, str(product.distribution), product.spec.summary)
+            for name, product in catalog.products.items()
+        ],
+    )
     problems = [
         *(kind.problem for kind in catalog.kinds.values() if kind.problem),
         *(product.problem for product in catalog.products.values() if product.problem),
@@ -57,6 +65,8 @@ def plugins_list(*, as_json: bool) -> int:
         click.echo("\nwhat is wrong:")
     for problem in problems:
         click.echo(f"- {problem}")
+    for broken in catalog.broken:
+        click.echo(f"`orthoflow plugins show {broken.entry_point}` prints its traceback")
     return EXIT_GOOD
 
 
@@ -87,6 +97,17 @@ def _as_json(catalog: Catalog) -> dict[str, object]:
                 "summary": kind.spec.summary,
             }
             for name, kind in catalog.kinds.items()
+        ],
+        "products": [
+            {
+                "name": name,
+                "state": product.state,
+                "problem": product.problem,
+                "distribution": product.distribution.name,
+                "version": product.distribution.version,
+                "summary": product.spec.summary,
+            }
+            for name, product in catalog.products.items()
         ],
         "broken": [
             {

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import traceback
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import click
 
-from orthoflow.catalog import BrokenPlugin, MethodEntry, discover_catalog
+from orthoflow.catalog import Catalog, DistributionInfo, MethodEntry, discover_catalog
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_PLUGIN_MISSING
 from orthoflow.cli.options import Command, json_option
 from orthoflow.cli.tables import echo_json, echo_table
+from orthoflow.errors import PluginError
 
 if TYPE_CHECKING:
     from orthoflow.sdk import Method, MethodParams, Ports
@@ -35,21 +38,61 @@ _UNITS = {
 def plugins_show(method_id: str, *, as_json: bool) -> int:
     """Show the method ID, e.g. plane.hough2d: parameters, ports, origin and citations.
 
-    Of a plugin that does not load, ID may be its name; its traceback is shown. Ends with 2 when
-    there is no such method, with 4 when its plugin does not load.
+    Of a plugin or a method that does not load, its traceback is shown; ID may then be the plugin's
+    name. Ends with 2 when there is no such method, with 4 when it cannot be used.
     """
     catalog = discover_catalog()
-    for broken in catalog.broken:
-        if method_id in (broken.entry_point, broken.distribution.name):
-            _print_broken(broken, as_json=as_json)
-            return EXIT_PLUGIN_MISSING
+    if failure := _failure(catalog, method_id):
+        _print_failure(failure, as_json=as_json)
+        return EXIT_PLUGIN_MISSING
     entry = catalog.method(method_id)
-    description = describe_method(entry)
     if as_json:
-        echo_json(description)
+        echo_json(describe_method(entry))
     else:
         _print(entry, entry.load())
     return EXIT_GOOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Failure:
+    """Why a plugin or a method cannot be loaded.
+
+    Attributes:
+        problem: one sentence.
+        distribution: who brought it.
+        target: the module or class that does not load.
+        traceback: of what it raised; empty when it loads and breaks a rule.
+    """
+
+    problem: str
+    distribution: DistributionInfo
+    target: str
+    traceback: str
+
+
+def _failure(catalog: Catalog, name: str) -> _Failure | None:
+    entry = catalog.methods.get(name)
+    if entry is None:
+        for broken in catalog.broken:
+            if name in (broken.entry_point, broken.distribution.name) or broken.mentions(name):
+                return _Failure(
+                    problem=str(broken),
+                    distribution=broken.distribution,
+                    target=broken.module,
+                    traceback=broken.traceback,
+                )
+    elif entry.state == "fine":
+        try:
+            entry.load()
+        except PluginError as error:
+            cause = error.__cause__
+            return _Failure(
+                problem=str(error),
+                distribution=entry.distribution,
+                target=entry.spec.target,
+                traceback="".join(traceback.format_exception(cause)) if cause else "",
+            )
+    return None
 
 
 def describe_method(entry: MethodEntry) -> dict[str, object]:
@@ -82,15 +125,25 @@ def describe_method(entry: MethodEntry) -> dict[str, object]:
     }
 
 
-def _print_broken(broken: BrokenPlugin, *, as_json: bool) -> None:
+def _print_failure(failure: _Failure, *, as_json: bool) -> None:
     if as_json:
-        echo_json({"state": "broken", "problem": str(broken), "traceback": broken.traceback})
+        echo_json(
+            {
+                "state": "broken",
+                "problem": failure.problem,
+                "distribution": failure.distribution.name,
+                "version": failure.distribution.version,
+                "target": failure.target,
+                "traceback": failure.traceback,
+            }
+        )
         return
-    click.echo(f"{broken}\n")
-    click.echo(f"distribution  {broken.distribution}")
+    click.echo(f"{failure.problem}\n")
+    click.echo(f"distribution  {failure.distribution}")
     click.echo("state         broken")
-    click.echo(f"module        {broken.module}\n")
-    click.echo(broken.traceback.rstrip())
+    click.echo(f"from          {failure.target}")
+    if failure.traceback:
+        click.echo(f"\n{failure.traceback.rstrip()}")
 
 
 def _print(entry: MethodEntry, method: type[Method]) -> None:

@@ -1,53 +1,187 @@
-"""Golden digests: what a method gave when its author last looked, per version and environment."""
+"""Golden results: what a method gave when its author last looked, to notice when results move.
+
+Bits of a result hang on more than the method: on the processor, and on the version of every library
+that computes. So the file keeps both the digest, which must come again where it was recorded, and a
+sample of the numbers, which must come again anywhere within the tolerances of the product types.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
+import re
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
 from pathlib import Path
+from typing import Final
 
-import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
+from orthoflow.engine.store import digest_of
+from orthoflow.errors import InputError
+from orthoflow.products import Product
 from orthoflow.sdk import Method
+from orthoflow.testing.samples import Sample, sample_of, sample_problem
+from orthoflow.testing.trials import Trial
+
+_CPU: Final = Path("/proc/cpuinfo")
 
 
-def environment_of(method: type[Method]) -> str:
-    """Name what the bits of a result may hang on besides the method: compare like with like."""
-    parts = {
-        "python": f"{sys.version_info.major}.{sys.version_info.minor}",
-        "numpy": np.__version__,
-        "machine": platform.machine(),
-        **method.tools(),
-    }
-    return ", ".join(f"{name} {version}" for name, version in parts.items())
+@dataclass(frozen=True, kw_only=True)
+class Fingerprint:
+    """What is kept of a product.
+
+    Attributes:
+        digest: of the whole.
+        sample: some numbers of each array, by name.
+    """
+
+    digest: str
+    sample: Mapping[str, Sample]
 
 
-def golden_problem(file: Path, method: type[Method], digests: Mapping[str, str]) -> str:
-    """Hold a result to the file, or add it where the file knows nothing of it.
+@dataclass(frozen=True, kw_only=True)
+class Golden:
+    """A method's recorded results, and what they were made of.
+
+    Attributes:
+        result_version: of the method.
+        tools: as the method declares them; with others it may give something else.
+        params: those that differ from the defaults, as JSON.
+        environment: digest of what bits hang on besides.
+        inputs: by port; files are left out.
+        outputs: by port.
+    """
+
+    result_version: int
+    tools: Mapping[str, str]
+    params: str
+    environment: str
+    inputs: Mapping[str, Fingerprint]
+    outputs: Mapping[str, Fingerprint]
+
+
+_FORMAT: Final = TypeAdapter(dict[str, Golden])
+
+
+def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> str:
+    """Hold results to the file, or put them there where it knows nothing to hold them to.
+
+    That is so when the method is new to it, its version, its tools or its parameters are others, or
+    the inputs moved, which are results of other methods.
 
     Args:
-        file: JSON: method id -> result version -> environment -> port -> digest.
-        method: the class.
-        digests: port -> digest of what it gave.
+        file: JSON by method id; made when it is not there.
+        trial: the method, with what it was tried on.
+        outputs: port -> what it gave.
 
     Returns:
-        One sentence when the result moved though `result_version` did not; else empty.
+        One sentence when a result moved though `result_version` did not; else empty.
+
+    Raises:
+        InputError: the file is something else.
     """
-    known = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    versions = known.setdefault(method.id, {})
-    environments = versions.setdefault(str(method.result_version), {})
-    before = environments.setdefault(environment_of(method), dict(digests))
-    moved = sorted(name for name in {*before, *digests} if before.get(name) != digests.get(name))
-    if moved:
-        return (
-            f"output {', '.join(moved)} is another one than {file.name} has, but result_version is "
-            f"{method.result_version} still: raise it, or find out why the result moved"
-        )
-    # An older version's results can never come again.
-    known[method.id] = {str(method.result_version): environments}
-    text = json.dumps(known, indent=2, sort_keys=True) + "\n"
-    if not file.is_file() or file.read_text(encoding="utf-8") != text:
-        file.write_text(text, encoding="utf-8")
+    known, now = _read(file), _golden(trial, outputs)
+    before = known.get(trial.method.id)
+    if before is None or _is_of_something_else(before, now, trial):
+        file.write_text(_text({**known, trial.method.id: now}), encoding="utf-8")
+        return ""
+    for port in sorted({*before.outputs, *now.outputs}):
+        if moved := _moved(before, now, port, trial.method, outputs.get(port)):
+            return (
+                f"output {port} is another one than {file.name} has ({moved}), but result_version "
+                f"is {now.result_version} still: raise it, or find out why the result moved"
+            )
     return ""
+
+
+def _golden(trial: Trial, outputs: Mapping[str, Product]) -> Golden:
+    return Golden(
+        result_version=trial.method.result_version,
+        tools=dict(trial.method.tools()),
+        params=json.dumps(dict(trial.params), sort_keys=True),
+        environment=_environment(),
+        inputs=_fingerprints(_products(trial)),
+        outputs=_fingerprints(outputs),
+    )
+
+
+def _products(trial: Trial) -> dict[str, Product]:
+    return {port: given for port, given in trial.inputs.items() if isinstance(given, Product)}
+
+
+def _fingerprints(products: Mapping[str, Product]) -> dict[str, Fingerprint]:
+    return {
+        port: Fingerprint(digest=digest_of(product), sample=sample_of(product))
+        for port, product in products.items()
+    }
+
+
+def _is_of_something_else(before: Golden, now: Golden, trial: Trial) -> bool:
+    if (before.result_version, before.tools) != (now.result_version, now.tools):
+        return True
+    if before.params != now.params or before.inputs.keys() != now.inputs.keys():
+        return True
+    return any(
+        sample_problem(before.inputs[port].sample, now.inputs[port].sample, product.tolerances)
+        for port, product in _products(trial).items()
+    )
+
+
+def _moved(
+    before: Golden, now: Golden, port: str, method: type[Method], product: Product | None
+) -> str:
+    """What differs, in a few words; empty where the result is the same."""
+    if port not in before.outputs or product is None:
+        return "one of them has none"
+    old, new = before.outputs[port], now.outputs[port]
+    if old.digest == new.digest:
+        return ""
+    problem = sample_problem(old.sample, new.sample, product.tolerances)
+    if problem or method.determinism == "loose" or not _must_be_alike(before, now):
+        return problem
+    return "in bits, not beyond the tolerances of its type, where libraries and processor are alike"
+
+
+def _must_be_alike(before: Golden, now: Golden) -> bool:
+    """Whether the same bits have to come out: the same went in, at the same place."""
+    return before.environment == now.environment and all(
+        before.inputs[port].digest == given.digest for port, given in now.inputs.items()
+    )
+
+
+@cache
+def _environment() -> str:
+    """Digest of Python, processor and every installed distribution."""
+    cpu = _CPU.read_text(encoding="utf-8").splitlines() if _CPU.is_file() else []
+    installed = {(found.metadata["Name"], found.version) for found in metadata.distributions()}
+    parts = [
+        sys.version,
+        platform.machine(),
+        *platform.libc_ver(),
+        *sorted({line for line in cpu if line.startswith(("model", "flags"))}),
+        *sorted(f"{name} {version}" for name, version in installed),
+    ]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def _read(file: Path) -> dict[str, Golden]:
+    if not file.is_file():
+        return {}
+    try:
+        return _FORMAT.validate_json(file.read_text(encoding="utf-8"))
+    except ValidationError as error:
+        raise InputError(
+            f"{file.name} is no file of golden results ({error.error_count()} mistakes): remove "
+            "it, and the next run writes another"
+        ) from error
+
+
+def _text(known: Mapping[str, Golden]) -> str:
+    text = json.dumps(_FORMAT.dump_python(dict(known)), indent=1, sort_keys=True)
+    # A line per list of numbers: what moved shows in a comparison of versions.
+    return re.sub(r"\[[^\[\]]+\]", lambda found: " ".join(found[0].split()), text) + "\n"

@@ -7,7 +7,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.products import Cameras, Layer, LayerMask, Layers, Planes, Product
+from orthoflow.products import (
+    Cameras,
+    Layer,
+    LayerMask,
+    Layers,
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    Planes,
+    Product,
+)
 from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.examples import example_room
 from orthoflow.testing.photographed import (
@@ -16,7 +26,13 @@ from orthoflow.testing.photographed import (
     photographing_cameras,
 )
 from orthoflow.testing.subjects import Subject, require
-from orthoflow.testing.textured_walls import cloud_of, places_of_cells, wall_error_m, walls_of
+from orthoflow.testing.textured_walls import (
+    TexturedWall,
+    cloud_of,
+    places_of_cells,
+    wall_error_m,
+    walls_of,
+)
 
 # Ties of 0.3 px and 1 mm at 2.5 m: single ones are off by 1.3 mm on the wall, a hundred together by
 # a tenth of that. A half pixel of the wrong convention is 1.5 mm.
@@ -24,6 +40,7 @@ _POSE_LIMIT_M: Final = 0.0008
 _CELL_SIZES_M: Final = (0.006, 0.01)
 _SHIFT_LIMIT_CELLS: Final = 0.2
 _PAINTED_SHARE: Final = 0.3
+_JOINED_SHARE: Final = 0.97
 
 
 def planes_follow_a_rigid_motion(subject: Subject) -> None:
@@ -88,19 +105,62 @@ def cells_show_their_own_place(subject: Subject) -> None:
         require(isinstance(layers, Layers) and layers.layers, "no layer was made")
         if isinstance(layers, Layers):
             for layer in layers.layers:
-                _check_layer(layer, 255.0 * scene.grey(*places_of_cells(layer.frame)))
+                _check_cells(scene, layer, layer.source, layer.mask == LayerMask.PAINTED)
 
 
-def _check_layer(layer: Layer, truth_grey: NDArray[np.float64]) -> None:
-    painted = layer.mask == LayerMask.PAINTED
-    where = f"{layer.source} at {layer.frame.gsd_m} m"
+def mosaics_show_cells_in_place(subject: Subject) -> None:
+    """Two layers that overlap become one orthoimage whose cells have the colour of their place."""
+    for gsd_m in _CELL_SIZES_M:
+        scene = photographed_scene(gsd_m)
+        given: dict[str, Product] = {"layers": _two_halves(scene), "walls": walls_of(scene)}
+        ports = {name: port.type_name for name, port in port_specs(subject.method.In).items()}
+        inputs = {name: given[kind] for name, kind in ports.items() if kind in given}
+        made = subject.run_on(f"mosaic{gsd_m}", **inputs).outputs["orthoimages"]
+        require(isinstance(made, Orthoimages) and made.images, "no orthoimage was made")
+        if isinstance(made, Orthoimages):
+            for image in made.images:
+                painted = image.mask == OrthoMask.PAINTED
+                _check_cells(scene, image, image.name, painted)
+                require(
+                    painted.mean() > _JOINED_SHARE,
+                    f"{image.name} at {gsd_m} m: {painted.mean():.0%} of the cells are painted, "
+                    "although the layers show all",
+                )
+
+
+def _two_halves(scene: TexturedWall) -> Layers:
+    """Layers of the left and the right 60 % of the wall, in its true colours."""
+    frame = scene.frame
+    grey = np.rint(255.0 * scene.grey(*places_of_cells(frame))).astype(np.uint8)
+    across = np.broadcast_to(np.arange(frame.width) / frame.width, frame.shape)
+    layers = []
+    for source, shown in (("left", across < 0.6), ("right", across > 0.4)):
+        mask = np.where(shown, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8)
+        layers.append(
+            Layer(
+                frame=frame,
+                wall=0,
+                source=source,
+                rgb=np.where(shown, grey, 0)[..., np.newaxis].repeat(3, axis=2),
+                mask=mask,
+                quality=shown.astype(np.float32),
+            )
+        )
+    return Layers(layers=tuple(layers), names=("wall 0",))
+
+
+def _check_cells(
+    scene: TexturedWall, image: Layer | Orthoimage, name: str, painted: NDArray[np.bool_]
+) -> None:
+    truth_grey = 255.0 * scene.grey(*places_of_cells(image.frame))
+    where = f"{name} at {image.frame.gsd_m} m"
     share = float(painted.mean())
     require(share > _PAINTED_SHARE, f"{where}: only {share:.0%} of the wall is painted")
     gradient: list[NDArray[np.float64]] = list(np.gradient(truth_grey))
     down, across = gradient
     # What is shown - true = gradient * displacement: one displacement for the layer, least squares.
     design = np.column_stack([across[painted], down[painted], np.ones(int(painted.sum()))])
-    difference = layer.rgb[..., 0][painted].astype(np.float64) - truth_grey[painted]
+    difference = image.rgb[..., 0][painted].astype(np.float64) - truth_grey[painted]
     shift_cells = np.linalg.solve(design.T @ design, design.T @ difference)[:2]
     require(
         bool(np.abs(shift_cells).max() < _SHIFT_LIMIT_CELLS),
@@ -112,8 +172,8 @@ def _check_layer(layer: Layer, truth_grey: NDArray[np.float64]) -> None:
 
 
 def finds_planes(method: type[Method]) -> bool:
-    """Whether the method looks for planes itself."""
-    return method.id.startswith("plane.") and method.id != "plane.given"
+    """Whether the method finds planes."""
+    return method.id.startswith("plane.")
 
 
 def orients_photos(method: type[Method]) -> bool:
@@ -124,3 +184,8 @@ def orients_photos(method: type[Method]) -> bool:
 def lays_onto_walls(method: type[Method]) -> bool:
     """Whether the method paints layers."""
     return method.id.startswith("ortho.")
+
+
+def joins_layers(method: type[Method]) -> bool:
+    """Whether the method makes orthoimages of layers."""
+    return method.id.startswith("mosaic.")

@@ -1,0 +1,160 @@
+"""Golden results: what moved is noticed, here to the last bit, on other machines beyond noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.products import Planes, Product
+from orthoflow.products.product import Tolerance
+from orthoflow.sdk import Method, MethodParams, Ports
+from orthoflow.testing import golden
+from orthoflow.testing.examples import example_room
+from orthoflow.testing.golden import golden_problem
+from orthoflow.testing.samples import sample_of, sample_problem
+from orthoflow.testing.trials import Trial
+
+
+class Mine(Method):
+    """A method whose results the tests make up."""
+
+    id = "plane.mine"
+    Params = MethodParams
+    In = Ports
+    Out = Ports
+
+
+class Loose(Mine):
+    """The same, which promises no bits."""
+
+    determinism = "loose"
+
+
+def planes(lift_m: float = 0.0) -> Planes:
+    _, truth = example_room()
+    return replace(truth, offset=truth.offset + lift_m)
+
+
+def trial(method: type[Method] = Mine, *, input_lift_m: float = 0.0, **params: object) -> Trial:
+    return Trial(method=method, inputs={"before": planes(input_lift_m)}, params=params)
+
+
+def other_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(golden, "_environment", lambda: "another")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """A golden file with the planes of the room."""
+    path = tmp_path / "golden.json"
+    assert golden_problem(path, trial(), {"planes": planes()}) == ""
+    return path
+
+
+MOVED = "output planes is another one than golden.json has (6 of 6 sampled values of offset moved)"
+BITS = (
+    "output planes is another one than golden.json has (in bits, not beyond the tolerances of its "
+    "type, where libraries and processor are alike)"
+)
+
+
+@pytest.mark.parametrize("is_elsewhere", [False, True], ids=["here", "elsewhere"])
+def test_a_result_that_moved_is_noticed_on_any_machine(
+    file: Path, monkeypatch: pytest.MonkeyPatch, is_elsewhere: bool
+) -> None:
+    if is_elsewhere:
+        other_machine(monkeypatch)
+    before = file.read_text()
+    assert golden_problem(file, trial(), {"planes": planes(2e-5)}).startswith(MOVED)
+    assert file.read_text() == before
+
+
+def test_last_bits_count_on_the_machine_that_recorded_them_only(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = {"planes": planes(1e-9)}
+    assert golden_problem(file, trial(), moved).startswith(BITS)
+    assert golden_problem(file, trial(Loose), moved) == ""
+    other_machine(monkeypatch)
+    assert golden_problem(file, trial(), moved) == ""
+
+
+def test_a_raised_version_or_another_tool_records_anew(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Mine, "result_version", 2)
+    assert golden_problem(file, trial(), {"planes": planes(0.1)}) == ""
+    assert golden_problem(file, trial(), {"planes": planes()}).startswith(MOVED)
+    monkeypatch.setattr(Mine, "tools", classmethod(lambda cls: {"library": "2.0"}))
+    assert golden_problem(file, trial(), {"planes": planes()}) == ""
+
+
+def test_a_result_of_something_else_records_anew(file: Path) -> None:
+    moved = {"planes": planes(0.1)}
+    assert golden_problem(file, trial(input_lift_m=1e-9), moved).startswith(MOVED)
+    assert golden_problem(file, trial(input_lift_m=1e-9), {"planes": planes(1e-9)}) == ""
+    assert golden_problem(file, trial(input_lift_m=0.1), moved) == ""
+    assert golden_problem(file, trial(input_lift_m=0.1), {"planes": planes()}).startswith(MOVED)
+    assert golden_problem(file, trial(input_lift_m=0.1, cell_m=0.2), {"planes": planes()}) == ""
+
+
+def test_an_output_that_appears_is_noticed(file: Path) -> None:
+    problem = golden_problem(file, trial(), {"planes": planes(), "walls": planes()})
+    assert problem.startswith("output walls is another one than golden.json has (one of them has")
+
+
+def test_another_file_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "golden.json"
+    path.write_text('{"plane.mine": {"1": {}}}')
+    with pytest.raises(InputError, match=r"golden.json is no file of golden results .*: remove it"):
+        golden_problem(path, trial(), {"planes": planes()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture(Product):
+    """A product of one raster."""
+
+    type_name = "picture"
+    tolerances: ClassVar[Mapping[str, Tolerance]] = {"rgb": Tolerance(limit=2, unit="grey")}
+    rgb: NDArray[np.uint8]
+
+
+def with_strays(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """One cell in a thousand of another colour, as where a rim falls to the other side."""
+    changed = rgb.copy()
+    changed.reshape(-1)[::1000] ^= 128
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("change", "is_noticed"),
+    [
+        (lambda rgb: rgb, False),
+        (with_strays, False),
+        (lambda rgb: rgb + np.uint8(1), False),
+        (lambda rgb: rgb + np.uint8(5), True),
+        (lambda rgb: rgb[:, ::-1], True),
+        (lambda rgb: rgb[::-1], True),
+        (lambda rgb: rgb[..., ::-1], True),
+        (lambda rgb: np.roll(rgb, 1, axis=1), True),
+        (lambda rgb: rgb[:-1], True),
+    ],
+    ids=[
+        *("same", "stray cells", "within the tolerance", "brighter", "mirrored", "upside down"),
+        *("channels swapped", "a column beside", "a row less"),
+    ],
+)
+def test_a_sample_tells_a_picture_that_moved_from_noise(
+    change: Callable[[NDArray[np.uint8]], NDArray[np.uint8]], is_noticed: bool
+) -> None:
+    rgb = np.random.default_rng(3).integers(0, 250, (90, 120, 3)).astype(np.uint8)
+    before, after = (sample_of(Picture(rgb=image)) for image in (rgb, change(rgb)))
+    problem = sample_problem(before, after, Picture.tolerances)
+    assert bool(problem) == is_noticed, problem
