@@ -285,6 +285,7 @@ def test_equal_values_have_no_winner() -> None:
         ("pose_error_over_sigma", Sense.ONE),
         ("raw_omega_deg", Sense.NEITHER),
         ("raw_offset_mm", Sense.LESS),
+        ("smear_share", Sense.LESS),
         ("n_points", Sense.NEITHER),
         ("sigma0_px", Sense.NEITHER),
     ],
