@@ -12,7 +12,12 @@ from orthoflow_plugins.inspect.matching import GreyImage
 
 _REACH_CELLS: Final = 8
 _STEP_CELLS: Final = 0.25
+_ALONG: Final = np.arange(-_REACH_CELLS, _REACH_CELLS + 0.5 * _STEP_CELLS, _STEP_CELLS)
+_PEAKS_MOST: Final = 4000
 _EDGES_MOST: Final = 400
+# Between valid cells only, but for rounding.
+_WHOLE: Final = 0.999
+_TILE_CELLS: Final = 2048
 _EDGES_LEAST: Final = 20
 _CONTRAST_GREY: Final = 30.0
 # Either side of an edge must be this even, as a share of its contrast.
@@ -48,23 +53,28 @@ def sharpness_findings(image: GreyImage, wall: int) -> list[Finding]:
 
 def _edge_profiles(image: GreyImage) -> NDArray[np.float64]:
     """Profiles (n, steps) across edges, 0 on the dark side and 1 on the bright one."""
-    from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter
+    from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
-    smooth = gaussian_filter(np.where(image.valid, image.grey, 0.0), 1.0)
-    down, right = np.gradient(smooth)
+    image = _fullest_part(image)
+    if not image.valid.any():
+        return np.zeros((0, _ALONG.size))
+    # Voids go on as what is nearest: neither do they make edges, nor do they ring into profiles.
+    grey = _closed(image)
+    smooth = gaussian_filter(grey, 1.0)
+    down, right = (np.asarray(part) for part in np.gradient(smooth))
     steep = np.hypot(down, right)
-    inside = minimum_filter(image.valid, size=2 * _REACH_CELLS + 3, mode="constant", cval=False)
-    peaks = inside & (steep == maximum_filter(steep, size=2 * _REACH_CELLS + 1))
+    peaks = image.valid & (steep == maximum_filter(steep, size=2 * _REACH_CELLS + 1))
     rows, columns = np.nonzero(peaks & (steep > 0.0))
-    order = np.argsort(-steep[rows, columns], kind="stable")[:_EDGES_MOST]
+    order = np.argsort(-steep[rows, columns], kind="stable")[:_PEAKS_MOST]
     rows, columns = rows[order], columns[order]
-    along = np.arange(-_REACH_CELLS, _REACH_CELLS + 0.5 * _STEP_CELLS, _STEP_CELLS)
     length = steep[rows, columns][:, None]
     at = [
-        rows[:, None] + along * down[rows, columns][:, None] / length,
-        columns[:, None] + along * right[rows, columns][:, None] / length,
+        rows[:, None] + _ALONG * down[rows, columns][:, None] / length,
+        columns[:, None] + _ALONG * right[rows, columns][:, None] / length,
     ]
-    values = map_coordinates(image.grey, at, order=3, mode="nearest")
+    whole = map_coordinates(image.valid.astype(np.float64), at, order=1, cval=0.0) > _WHOLE
+    kept = np.flatnonzero(whole.all(axis=1))[:_EDGES_MOST]
+    values = map_coordinates(grey, [part[kept] for part in at], order=3, mode="nearest")
     n_end = round(_END_CELLS / _STEP_CELLS)
     dark, bright = values[:, :n_end], values[:, -n_end:]
     low, high = dark.mean(axis=1), bright.mean(axis=1)
@@ -72,7 +82,33 @@ def _edge_profiles(image: GreyImage) -> NDArray[np.float64]:
     even = np.maximum(np.ptp(dark, axis=1), np.ptp(bright, axis=1)) <= _EVEN_SHARE * contrast
     kept = even & (contrast >= _CONTRAST_GREY)
     scaled = (values[kept] - low[kept, None]) / contrast[kept, None]
-    return _centred(scaled, along)
+    return _centred(scaled, _ALONG)
+
+
+def _fullest_part(image: GreyImage) -> GreyImage:
+    """The tile with most valid cells: a few million cells have edges enough."""
+    rows, columns = image.grey.shape
+    tiles = [
+        (slice(row, row + _TILE_CELLS), slice(column, column + _TILE_CELLS))
+        for row in range(0, rows, _TILE_CELLS)
+        for column in range(0, columns, _TILE_CELLS)
+    ]
+    best = max(tiles, key=lambda tile: int(np.count_nonzero(image.valid[tile])))
+    return GreyImage(grey=image.grey[best], valid=image.valid[best], region=image.region[best])
+
+
+def _closed(image: GreyImage) -> NDArray[np.float64]:
+    """Grey levels where every void cell has that of the nearest valid one."""
+    from scipy.ndimage import distance_transform_edt
+
+    grey = np.asarray(image.grey, dtype=np.float64)
+    if image.valid.all():
+        return grey
+    nearest = np.asarray(
+        distance_transform_edt(~image.valid, return_distances=False, return_indices=True)
+    )
+    closed: NDArray[np.float64] = grey[nearest[0], nearest[1]]
+    return closed
 
 
 def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,7 +18,6 @@ VERTICAL_EDGE: Final = "vertical edge"
 # The lattice of painted lines of a fresco, in periods (see `texture_kernels`).
 _LATTICE: Final = 0.9
 _CLEAR_M: Final = 0.04
-_MOST_OF_A_CLASS: Final = 24
 # Number of its plane in `scene.plane_index`: it is built first.
 _MAIN_WALL: Final = 0
 _INSIDE_M: Final = 0.004
@@ -53,8 +52,10 @@ def check_points(
     stations: NDArray[np.float64],
     world_from_room: NDArray[np.float64],
     shift_world_m: NDArray[np.float64],
+    *,
+    n_most: int,
 ) -> CheckPoints:
-    """Choose up to 24 check points of each class on the main wall.
+    """Choose check points of each class on the main wall.
 
     `flat` ones are crossings of the painted lines of a fresco, with 4 cm of bare wall around;
     `vertical edge` ones are front corners of mouldings. A station sees each of them.
@@ -65,10 +66,11 @@ def check_points(
         stations: (s, 3) metres, room frame.
         world_from_room: (3, 3) rotation.
         shift_world_m: (3,) world position of the room's origin.
+        n_most: so many of each class, or what there are.
     """
     chosen = {
-        FLAT: _spread(_crossings(scene, views, stations)),
-        VERTICAL_EDGE: _spread(_corners(scene, views, stations)),
+        FLAT: _spread(_crossings(scene, views, stations), n_most),
+        VERTICAL_EDGE: _spread(_corners(scene, views, stations), n_most),
     }
     points = np.concatenate(list(chosen.values())) @ world_from_room.T + shift_world_m
     names = [
@@ -155,13 +157,13 @@ def _are_level(scene: Scene, views: SceneCameras, spots: _Spots) -> NDArray[np.b
     return level
 
 
-def _spread(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """At most 24 points that lie far from each other: each next one is the farthest from all."""
-    if len(points) <= _MOST_OF_A_CLASS:
+def _spread(points: NDArray[np.float64], n_most: int) -> NDArray[np.float64]:
+    """Points that lie far from each other: each next one is the farthest from all."""
+    if len(points) <= n_most:
         return points
     chosen = [0]
     nearest = np.linalg.norm(points - points[0], axis=1)
-    while len(chosen) < _MOST_OF_A_CLASS:
+    while len(chosen) < n_most:
         chosen.append(int(np.argmax(nearest)))
         nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
     spread: NDArray[np.float64] = points[np.sort(chosen)]

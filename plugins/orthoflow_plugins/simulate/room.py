@@ -135,6 +135,12 @@ class SimulateRoom(Method):
             2, ge=1, le=8, description="A pixel is the mean of so many rays squared."
         )
         calibrated: bool = Field(default=True, description="The camera's calibration is known.")
+        check_points_most: int = Field(
+            24,
+            ge=1,
+            description="Check points on the main wall, at most so many on flat parts and as many "
+            "on vertical edges.",
+        )
         up: UpDirection = Field("z", description="World direction that is up.")
         shift_world_m: tuple[float, float, float] = Field(
             (0.0, 0.0, 0.0), description="World position of the room's origin, survey coordinates."
@@ -206,7 +212,7 @@ class SimulateRoom(Method):
             cloud=cloud,
             photos=calibrated(photos, calibration),
             calibration=calibration,
-            checkpoints=_check_points(delivery, views),
+            checkpoints=_check_points(delivery, views, params.check_points_most),
             truth=truth,
         )
 
@@ -249,7 +255,7 @@ def _with_cameras(truth: Truth, delivery: Delivery, shots: tuple[Shot, ...]) -> 
     )
 
 
-def _check_points(delivery: Delivery, views: SceneCameras) -> CheckPoints:
+def _check_points(delivery: Delivery, views: SceneCameras, n_most: int) -> CheckPoints:
     from orthoflow_plugins.simulate.marks import check_points
 
     return check_points(
@@ -258,6 +264,7 @@ def _check_points(delivery: Delivery, views: SceneCameras) -> CheckPoints:
         np.unique(delivery.scan.stations, axis=0),
         delivery.world_from_room,
         delivery.shift_world_m,
+        n_most=n_most,
     )
 
 
