@@ -1,6 +1,6 @@
 """Makes the reference records: small runs of toy methods, as every later version must read them.
 
-    python provenance/reference/make.py
+    python provenance/reference/make.py embedded     # or studio, comparison
 
 The methods are those of tests/workshop. What depends on the machine and the hour (environment,
 times, run ids) is replaced by constants, so that a record made again differs only where the format
@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,8 +20,17 @@ HERE: Final = Path(__file__).resolve().parent
 MINUTE: Final = "2026-01-02T03:04:"
 
 
-def make(name: str, sets: Sequence[str]) -> Path:
-    """Run the workflow of a name and write its record beside it."""
+# Record -> its workflow, what is set, and whether everything lies in it. studio and comparison were
+# made with format 1.0, embedded with 1.1.
+RECORDS: Final = {
+    "studio": ("studio", ("paint.grey=131",), False),
+    "comparison": ("comparison", (), False),
+    "embedded": ("studio", ("paint.grey=131",), True),
+}
+
+
+def make(name: str) -> Path:
+    """Run the workflow of a record and write the record beside it."""
     from orthoflow_provenance.model import RecordedEnvironment
     from orthoflow_provenance.writer import write_record
 
@@ -32,7 +40,8 @@ def make(name: str, sets: Sequence[str]) -> Path:
     from orthoflow.workflow import expand_cells, load_workflow
 
     catalog = discover_catalog()
-    workflow = load_workflow(HERE / f"{name}.yaml", catalog, sets=sets)
+    recipe, sets, embed = RECORDS[name]
+    workflow = load_workflow(HERE / f"{recipe}.yaml", catalog, sets=sets)
     environment = RecordedEnvironment(
         id=f"sha256:{'0' * 63}1",
         python="3.11.0",
@@ -48,7 +57,7 @@ def make(name: str, sets: Sequence[str]) -> Path:
         cells = expand_cells(workflow, catalog)
         plan = plan_run(cells, workflow, catalog, store, RunOptions(executor="inline"))
         outcome = execute(plan, Path(folder) / "run", store, run_id=f"reference-{name}")
-        record = build_record(outcome, plan, workflow, store)
+        record = build_record(outcome, plan, workflow, store, embed=embed)
         record = dataclasses.replace(
             record,
             started=f"{MINUTE}05.000Z",
@@ -71,11 +80,12 @@ def make(name: str, sets: Sequence[str]) -> Path:
             ),
         )
         target = HERE / f"{name}.h5"
-        write_record(target, record, store.product_file)
+        files = {file.sha256: HERE / file.name for item in record.inputs for file in item.files}
+        write_record(target, record, store.product_file, embed=embed, input_file=files.get)
     return target
 
 
 if __name__ == "__main__":
     sys.path[:0] = [str(ROOT / part) for part in ("", "plugins", "provenance", "tests/workshop")]
-    for path in (make("studio", ["paint.grey=131"]), make("comparison", [])):
+    for path in map(make, sys.argv[1:]):
         sys.stdout.write(f"{path.name}: {path.stat().st_size} bytes\n")
