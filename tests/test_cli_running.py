@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.records import open_run
+from tests.laboratories import write_distribution
 from tests.workshop_runs import command, orthoflow, workshop_environment, write_studio
 
 
@@ -438,22 +439,33 @@ def test_an_unknown_method_ends_with_2(tmp_path: Path) -> None:
     assert "did you mean paint.plain?" in done.stderr
 
 
-def test_a_broken_plugin_is_listed_and_harms_nobody(tmp_path: Path) -> None:
-    (tmp_path / "broken_plugin.py").write_text("import no_such_library\n", encoding="utf-8")
-    info = tmp_path / "broken-2.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 2.0\n")
-    (info / "entry_points.txt").write_text("[orthoflow.plugins]\nbad = broken_plugin\n")
-    environment = dict(workshop_environment())
-    environment["PYTHONPATH"] += os.pathsep + str(tmp_path)
-    done = subprocess.run(
-        command("plugins", "list", "--json"),
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    answer = json.loads(done.stdout)
-    assert [broken["distribution"] for broken in answer["broken"]] == ["broken"]
-    assert "no_such_library" in answer["broken"][0]["problem"]
-    assert "paint.plain" in {method["id"] for method in answer["methods"]}
+PAINTS = """
+from orthoflow.sdk import MethodSpec, hookimpl
+
+@hookimpl
+def orthoflow_methods():
+    return [MethodSpec(id="paint.twin", target="paints:Twin", summary="claimed twice")]
+"""
+
+
+def test_plugins_that_cannot_be_used_are_named_and_harm_nobody(tmp_path: Path) -> None:
+    fails = "import no_such_library\nid = 'paint.fallen'\n"
+    sources = {"fallen": fails, "one": PAINTS, "two": PAINTS}
+    plugins = [
+        write_distribution(tmp_path / name, name, {f"{name}_hooks.py": text})
+        for name, text in sources.items()
+    ]
+    twins = "method paint.twin is claimed by one 1.0 and two 1.0; uninstall all but one of them"
+    fallen = "plugin fallen of fallen 1.0 fails to load: ModuleNotFoundError: No module named"
+    listed = orthoflow(tmp_path, "plugins", "list", plugins=plugins)
+    assert listed.returncode == 0
+    assert f"- {twins}" in listed.stdout
+    assert f"- {fallen}" in listed.stdout
+    for method, sentence in (("paint.twin", twins), ("paint.fallen", fallen)):
+        write_studio(tmp_path, method)
+        checked = orthoflow(tmp_path, "check", "studio.yaml", plugins=plugins)
+        assert checked.returncode == 4
+        assert sentence in checked.stderr
+        assert "Traceback" not in checked.stderr
+    write_studio(tmp_path)
+    assert orthoflow(tmp_path, "check", "studio.yaml", plugins=plugins).returncode == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 WORKSHOP = Path(__file__).resolve().parent / "workshop"
@@ -22,9 +22,10 @@ steps:
 """
 
 
-def workshop_environment() -> Mapping[str, str]:
-    """The environment with the workshop installed."""
-    path = os.pathsep.join([str(WORKSHOP), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+def workshop_environment(*more: Path) -> Mapping[str, str]:
+    """The environment with the workshop installed, and the distributions in more folders."""
+    folders = [str(WORKSHOP), *map(str, more), os.environ.get("PYTHONPATH", "")]
+    path = os.pathsep.join(folders).rstrip(os.pathsep)
     return {**os.environ, "PYTHONPATH": path}
 
 
@@ -40,12 +41,14 @@ def command(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "orthoflow", *arguments]
 
 
-def orthoflow(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a command in a folder and wait for its end."""
+def orthoflow(
+    folder: Path, *arguments: str, plugins: Sequence[Path] = ()
+) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder and wait for its end; `plugins` are installed besides."""
     return subprocess.run(
         command(*arguments),
         cwd=folder,
-        env=workshop_environment(),
+        env=workshop_environment(*plugins),
         capture_output=True,
         text=True,
         check=False,
