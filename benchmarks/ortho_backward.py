@@ -41,6 +41,8 @@ from orthoflow.products import PointCloud, Wall, Walls
 
 GSD_M = 0.003
 UP = np.array([0.0, 0.0, 1.0])
+# What is worked out in float64 at once.
+BAND_ROWS = 256
 
 
 def wall(megacells: float) -> Walls:
@@ -48,9 +50,9 @@ def wall(megacells: float) -> Walls:
     rng = np.random.default_rng(1)
     rows = round(math.sqrt(megacells * 1e6 / 1.5))
     columns = round(1.5 * rows)
-    depth = rng.normal(0.0, 0.002, (rows, columns)).astype(np.float32)
-    depth += 0.05 * ((np.arange(columns) // 90) % 4 == 0)
-    depth[rng.random(depth.shape) < 0.001] = np.nan
+    depth = rng.standard_normal((rows, columns), dtype=np.float32) * np.float32(0.002)
+    depth += (0.05 * ((np.arange(columns) // 90) % 4 == 0)).astype(np.float32)
+    depth[rng.random(depth.shape, dtype=np.float32) < 0.001] = np.nan
     frame = WallFrame(
         origin_world=np.zeros(3),
         u_world=np.array([1.0, 0, 0]),
@@ -77,12 +79,17 @@ def wall(megacells: float) -> Walls:
 def cloud(walls: Walls) -> PointCloud:
     """The wall's cells as points, and a tenth as many on a board before it."""
     frame, depth = walls.walls[0].frame, walls.walls[0].depth_m
-    rows, columns = np.nonzero(np.isfinite(depth))
-    places = np.column_stack([columns, rows]) + 0.5
-    points = [frame.world_from_wall(places, depth[rows, columns].astype(np.float64))]
-    near = (rows < frame.height // 3) & (columns < frame.width // 3)
-    points.append(frame.world_from_wall(places[near], np.full(int(near.sum()), 0.6)))
-    x, y, z = (np.ascontiguousarray(a, dtype=np.float32) for a in np.vstack(points).T)
+    points = []
+    for first in range(0, frame.height, BAND_ROWS):
+        rows, columns = np.nonzero(np.isfinite(depth[first : first + BAND_ROWS]))
+        rows += first
+        places = np.column_stack([columns, rows]) + 0.5
+        heights = depth[rows, columns].astype(np.float64)
+        points.append(frame.world_from_wall(places, heights).astype(np.float32))
+        is_near = (rows < frame.height // 3) & (columns < frame.width // 3)
+        board = np.full(int(is_near.sum()), 0.6)
+        points.append(frame.world_from_wall(places[is_near], board).astype(np.float32))
+    x, y, z = (np.concatenate([part[:, axis] for part in points]) for axis in range(3))
     return PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=UP)
 
 
@@ -127,13 +134,14 @@ def peak_bytes(task: Callable[[], object]) -> int:
 
 def maps(walls: Walls, viewer: ViewingCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     frame, depth = walls.walls[0].frame, walls.walls[0].depth_m
-    rows, columns = np.mgrid[: frame.height, : frame.width] + 0.5
-    points = frame.world_from_wall(
-        np.column_stack([columns.ravel(), rows.ravel()]),
-        np.nan_to_num(depth).ravel().astype(np.float64),
-    )
-    pixels = viewer.project(points)[:, :2].astype(np.float32) - np.float32(0.5)
-    u, v = (np.ascontiguousarray(a).reshape(frame.shape) for a in pixels.T)
+    u, v = np.empty(frame.shape, dtype=np.float32), np.empty(frame.shape, dtype=np.float32)
+    for first in range(0, frame.height, BAND_ROWS):
+        band = slice(first, first + BAND_ROWS)
+        heights = np.nan_to_num(depth[band]).astype(np.float64)
+        rows, columns = np.indices(heights.shape) + 0.5
+        places = np.column_stack([columns.ravel(), rows.ravel() + first])
+        pixels = viewer.project(frame.world_from_wall(places, heights.ravel()))[:, :2] - 0.5
+        u[band], v[band] = pixels.T.reshape(2, *heights.shape)
     return u, v
 
 
@@ -169,7 +177,9 @@ def main() -> None:
         def task() -> object:
             surface = Surface(
                 frame=raster.frame,
-                relief=transparent_relief_of(raster) if is_seen_through else relief_of(raster),
+                relief=(transparent_relief_of if is_seen_through else relief_of)(
+                    raster, threads=options.threads
+                ),
                 front_m=walls.buffer_front_m,
                 tolerance_m=3.0 * depth_noise_m(raster.depth_m) + 0.5 * GSD_M,
             )

@@ -40,7 +40,7 @@ def seen(camera: ViewingCamera, *, is_transparent: bool) -> Sight:
     wall = scenes.walls(where, noisy_depths()).walls[0]
     surface = Surface(
         frame=where,
-        relief=transparent_relief_of(wall) if is_transparent else relief_of(wall),
+        relief=(transparent_relief_of if is_transparent else relief_of)(wall, threads=2),
         front_m=scenes.BUFFER_M,
         tolerance_m=0.008,
     )

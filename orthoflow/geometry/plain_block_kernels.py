@@ -8,14 +8,17 @@ plain, and `sight_kernels` asks each cell.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.camera_kernels import project_point
+from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.visibility_kernels import (
+    BLOCK_CELLS,
     NO_SURFACE,
+    OCCLUDED,
     PAINTED,
     DepthBuffer,
     Relief,
@@ -26,6 +29,12 @@ from orthoflow.geometry.visibility_kernels import (
 
 # How far interpolated places may be off, in photo pixels; `cv2.remap` knows 32nds of them.
 PARABOLA_PX: Final = 0.02
+# What `judge_block` finds.
+HIDDEN: Final = -1
+UNSURE: Final = 0
+SEEN: Final = 1
+# What describes a row of a block: see `_fit_block`.
+N_TERMS: Final = 15
 
 
 @compiled
@@ -109,7 +118,7 @@ def _parabola(x: float) -> tuple[float, float, float]:
 
 
 @compiled
-def is_plain_block(
+def judge_block(
     view: WallView,
     buffer: DepthBuffer,
     high: float,
@@ -117,7 +126,7 @@ def is_plain_block(
     columns: tuple[int, int],
     nodes: NDArray[np.float64],
     box: NDArray[np.float64],
-) -> bool:
+) -> int:
     """Tell whether a photo surely sees all known cells of a block, so that none need be asked.
 
     What counts for a cell is monotonous over the block or nearly linear, so that the nodes at the
@@ -131,21 +140,25 @@ def is_plain_block(
         columns: first and last column.
         nodes: of `span_block`.
         box: (4,) filled with the smallest and largest u, the smallest and largest v.
+
+    Returns:
+        `SEEN`, `HIDDEN` where the cloud surely hides all of them, or `UNSURE`.
     """
     farthest_row = max(abs(view.row - rows[0]), abs(view.row - rows[1])) * view.gsd_m
     farthest_column = max(abs(view.column - columns[0]), abs(view.column - columns[1])) * view.gsd_m
     lift = view.height_m - high
     aside = farthest_row * farthest_row + farthest_column * farthest_column
     if lift <= view.cosine_least * math.sqrt(lift * lift + aside):
-        return False
-    u_least, u_most, v_least, v_most, leaves = math.inf, -math.inf, math.inf, -math.inf, 0.0
+        return UNSURE
+    u_least, u_most, v_least, v_most = math.inf, -math.inf, math.inf, -math.inf
+    first, last = math.inf, 0.0
     for layer in range(2):
         for i in range(3):
             for j in range(3):
                 node = nodes[layer, i, j]
                 u_least, u_most = min(u_least, node[0]), max(u_most, node[0])
                 v_least, v_most = min(v_least, node[1]), max(v_most, node[1])
-                leaves = max(leaves, node[3])
+                first, last = min(first, node[3]), max(last, node[3])
     # Between the nodes edges bend, by far less than this.
     margin = 1.0 + 0.02 * max(u_most - u_least, v_most - v_least)
     box[0], box[1], box[2], box[3] = (
@@ -155,88 +168,200 @@ def is_plain_block(
         v_most + margin,
     )
     if box[0] < 0.0 or box[1] >= view.camera[21] or box[2] < 0.0 or box[3] >= view.camera[22]:
-        return False
-    per_pixel, nearest = 1.0 / buffer.reduction, leaves - view.tolerance_m
+        return UNSURE
+    nearest, farthest = np.float32(np.inf), np.float32(0.0)
+    per_pixel = 1.0 / buffer.reduction
     for row in range(int(box[2] * per_pixel), int(box[3] * per_pixel) + 1):
         for column in range(int(box[0] * per_pixel), int(box[1] * per_pixel) + 1):
-            if buffer.nearest[row, column] < nearest:
-                return False
-    return True
+            nearest = min(nearest, buffer.nearest[row, column])
+            farthest = max(farthest, buffer.nearest[row, column])
+    if nearest >= last - view.tolerance_m:
+        return SEEN
+    return HIDDEN if farthest < first - view.tolerance_m else UNSURE
+
+
+@compiled
+def look_at_hidden_block(
+    relief: Relief, sight: Sight, place: tuple[int, int, int, int, int, int]
+) -> None:
+    """Fill in the cells of a block that the cloud hides; see `look_at_plain_block`."""
+    first_row, first_column, n_rows, n_columns, tile_row, tile_column = place
+    for i in range(n_rows):
+        for j in range(n_columns):
+            depth = relief.depth[first_row + i, first_column + j]
+            at_row, at_column = tile_row + i, tile_column + j
+            sight.mask[at_row, at_column] = NO_SURFACE if math.isnan(depth) else OCCLUDED
+            sight.u[at_row, at_column] = 0.0
+            sight.v[at_row, at_column] = 0.0
+            sight.quality[at_row, at_column] = 0.0
+
+
+class BlockRoom(NamedTuple):
+    """The arrays of a tile that plain blocks fill, flat, and room for what is needed in between.
+
+    Attributes:
+        heights: (cells of the wall,) float32 metres.
+        u: (cells of the tile,) as in `Sight`; v, mask and quality likewise.
+        bends: (3, N_TERMS) of `_fit_block`; along (3, 5) likewise.
+        terms: (N_TERMS,) of one row.
+        rises: (BLOCK_CELLS,) metres above the lower of the two depths, 0 where void.
+        ramp: (BLOCK_CELLS,) 0, 1, 2, ...
+        wall_columns: columns of the wall; tile_columns those of the tile.
+    """
+
+    heights: NDArray[np.float32]
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    quality: NDArray[np.float32]
+    bends: NDArray[np.float64]
+    along: NDArray[np.float64]
+    terms: NDArray[np.float32]
+    rises: NDArray[np.float32]
+    ramp: NDArray[np.float32]
+    wall_columns: int
+    tile_columns: int
+
+
+@compiled
+def room_for_blocks(relief: Relief, sight: Sight) -> BlockRoom:
+    """Give the room that `look_at_plain_block` needs for the blocks of a tile."""
+    return BlockRoom(
+        relief.depth.reshape(relief.depth.size),
+        sight.u.reshape(sight.u.size),
+        sight.v.reshape(sight.v.size),
+        sight.mask.reshape(sight.mask.size),
+        sight.quality.reshape(sight.quality.size),
+        np.empty((3, N_TERMS)),
+        np.empty((3, 5)),
+        np.empty(N_TERMS, dtype=np.float32),
+        np.empty(BLOCK_CELLS, dtype=np.float32),
+        np.arange(BLOCK_CELLS).astype(np.float32),
+        relief.depth.shape[1],
+        sight.mask.shape[1],
+    )
 
 
 @compiled
 def look_at_plain_block(
     view: WallView,
-    relief: Relief,
-    sight: Sight,
+    room: BlockRoom,
     place: tuple[int, int, int, int, int, int],
     block: tuple[tuple[int, int], tuple[int, int]],
     depths: tuple[float, float],
     nodes: NDArray[np.float64],
+    box: NDArray[np.float64],
 ) -> int:
     """Fill in the cells of a block that a photo surely sees where they are known.
 
     Places and worth follow parabolas over the block and are linear in depth: the projection itself
-    would take several times as long.
+    would take several times as long. Each loop writes one array and has no branches: the processor
+    then takes eight cells at once. Handing rows to functions of their own would take longer.
 
     Args:
         view: the camera before the wall.
-        relief: the wall.
-        sight: of the tile, filled in part.
+        room: filled in part.
         place: first row and column on the wall of the part of the block that is in the tile, its
             rows and columns, and first row and column in the tile.
         block: first and last row, and first and last column, of the whole block.
         depths: those of the nodes.
         nodes: of `span_block`.
+        box: of `judge_block`.
 
     Returns:
         How many of the cells are known.
     """
     first_row, first_column, n_rows, n_columns, tile_row, tile_column = place
-    low, per_depth = np.float32(depths[0]), 1.0 / (depths[1] - depths[0])
-    width, height = np.float32(view.camera[21]), np.float32(view.camera[22])
-    per_border, one, nothing = np.float32(1.0 / view.border_px), np.float32(1.0), np.float32(0.0)
     rows, columns = block
     per_row = 1.0 / max(1, rows[1] - rows[0])
     per_column = 1.0 / max(1, columns[1] - columns[0])
-    ramp = (np.arange(n_columns) + (first_column - columns[0])).astype(np.float32)
-    # Level, slope and bend along the row, and level and slope of what depth adds, of three values.
-    c = np.empty((3, 5), dtype=np.float32)
-    n_known = 0
+    heights, us, vs, mask, quality = room.heights, room.u, room.v, room.mask, room.quality
+    bends, terms, rises, ramp = room.bends, room.terms, room.rises, room.ramp
+    _fit_block(nodes, per_column, 1.0 / (depths[1] - depths[0]), bends, room.along)
+    low, begin = np.float32(depths[0]), np.uintp(first_column - columns[0])
+    nothing = np.float32(0.0)
+    void, painted = np.uint8(NO_SURFACE), np.uint8(PAINTED)
+    n_void = 0
     for i in range(n_rows):
-        weights = _parabola((first_row + i - rows[0]) * per_row)
-        for k in range(3):
-            f0, f1, f2, g0, g2 = 0.0, 0.0, 0.0, 0.0, 0.0
-            for r in range(3):
-                weight = weights[r]
-                f0 += weight * nodes[0, r, 0, k]
-                f1 += weight * nodes[0, r, 1, k]
-                f2 += weight * nodes[0, r, 2, k]
-                g0 += weight * (nodes[1, r, 0, k] - nodes[0, r, 0, k])
-                g2 += weight * (nodes[1, r, 2, k] - nodes[0, r, 2, k])
-            c[k, 0] = f0
-            c[k, 1] = (4.0 * f1 - 3.0 * f0 - f2) * per_column
-            c[k, 2] = (2.0 * f0 - 4.0 * f1 + 2.0 * f2) * per_column * per_column
-            c[k, 3] = g0 * per_depth
-            c[k, 4] = (g2 - g0) * per_column * per_depth
-        u0, u1, u2, u3, u4 = c[0, 0], c[0, 1], c[0, 2], c[0, 3], c[0, 4]
-        v0, v1, v2, v3, v4 = c[1, 0], c[1, 1], c[1, 2], c[1, 3], c[1, 4]
-        q0, q1, q2, q3, q4 = c[2, 0], c[2, 1], c[2, 2], c[2, 3], c[2, 4]
-        heights = relief.depth[first_row + i, first_column : first_column + n_columns]
-        us = sight.u[tile_row + i, tile_column : tile_column + n_columns]
-        vs = sight.v[tile_row + i, tile_column : tile_column + n_columns]
-        mask = sight.mask[tile_row + i, tile_column : tile_column + n_columns]
-        quality = sight.quality[tile_row + i, tile_column : tile_column + n_columns]
+        y = (first_row + i - rows[0]) * per_row
+        for k in range(N_TERMS):
+            terms[k] = bends[0, k] + y * (bends[1, k] + y * bends[2, k])
+        # Unsigned places: they cannot be counted from the end, which would keep loops scalar.
+        on_wall = np.uintp((first_row + i) * room.wall_columns + first_column)
+        in_tile = np.uintp((tile_row + i) * room.tile_columns + tile_column)
         for j in range(n_columns):
-            x, depth = ramp[j], heights[j]
-            is_void = math.isnan(depth)
-            rise = nothing if is_void else depth - low
-            u = u0 + x * (u1 + x * u2) + rise * (u3 + x * u4)
-            v = v0 + x * (v1 + x * v2) + rise * (v3 + x * v4)
-            worth = q0 + x * (q1 + x * q2) + rise * (q3 + x * q4)
+            depth = heights[on_wall + np.uintp(j)]
+            rises[j] = nothing if math.isnan(depth) else depth - low
+        t0, t1, t2, t3, t4 = terms[0], terms[1], terms[2], terms[3], terms[4]
+        for j in range(n_columns):
+            x = ramp[begin + np.uintp(j)]
+            us[in_tile + np.uintp(j)] = t0 + x * (t1 + x * t2) + rises[j] * (t3 + x * t4)
+        t0, t1, t2, t3, t4 = terms[5], terms[6], terms[7], terms[8], terms[9]
+        for j in range(n_columns):
+            x = ramp[begin + np.uintp(j)]
+            vs[in_tile + np.uintp(j)] = t0 + x * (t1 + x * t2) + rises[j] * (t3 + x * t4)
+        t0, t1, t2, t3, t4 = terms[10], terms[11], terms[12], terms[13], terms[14]
+        for j in range(n_columns):
+            x, depth = ramp[begin + np.uintp(j)], heights[on_wall + np.uintp(j)]
+            worth = t0 + x * (t1 + x * t2) + rises[j] * (t3 + x * t4)
+            quality[in_tile + np.uintp(j)] = nothing if math.isnan(depth) else worth
+        for j in range(n_columns):
+            depth = heights[on_wall + np.uintp(j)]
+            mask[in_tile + np.uintp(j)] = void if math.isnan(depth) else painted
+        n_void_here = np.int32(0)
+        for j in range(n_columns):
+            n_void_here += np.int32(mask[in_tile + np.uintp(j)] == void)
+        n_void += int(n_void_here)
+    if min(box[0], box[2], view.camera[21] - box[1], view.camera[22] - box[3]) < view.border_px:
+        _fade(view, room, place)
+    return n_rows * n_columns - n_void
+
+
+@kernel_part
+def _fade(view: WallView, room: BlockRoom, place: tuple[int, int, int, int, int, int]) -> None:
+    """Let the quality of the cells of a block fall off at the border of the photo."""
+    us, vs, quality = room.u, room.v, room.quality
+    _, _, n_rows, n_columns, tile_row, tile_column = place
+    width, height = np.float32(view.camera[21]), np.float32(view.camera[22])
+    per_border, one = np.float32(1.0 / view.border_px), np.float32(1.0)
+    for i in range(n_rows):
+        first = np.uintp((tile_row + i) * room.tile_columns + tile_column)
+        for j in range(n_columns):
+            u, v = us[first + np.uintp(j)], vs[first + np.uintp(j)]
             inside = min(width - u, u, height - v, v) * per_border
-            us[j], vs[j] = u, v
-            mask[j] = NO_SURFACE if is_void else PAINTED
-            quality[j] = nothing if is_void else worth * min(one, inside)
-            n_known += 0 if is_void else 1
-    return n_known
+            quality[first + np.uintp(j)] *= min(one, inside)
+
+
+@kernel_part
+def _fit_block(
+    nodes: NDArray[np.float64],
+    per_column: float,
+    per_depth: float,
+    bends: NDArray[np.float64],
+    along: NDArray[np.float64],
+) -> None:
+    """Set the parabolas down a block of what describes its rows.
+
+    Args:
+        nodes: of `span_block`.
+        per_column: one over the distance of the first and last column.
+        per_depth: one over the distance of the two depths.
+        bends: (3, N_TERMS) set: level, slope and bend down the block of five terms each for u, v
+            and worth: level, slope and bend along the row, and level and slope of what a metre of
+            depth adds.
+        along: (3, 5) room for what is needed in between.
+    """
+    for k in range(3):
+        for r in range(3):
+            f0, f1, f2 = nodes[0, r, 0, k], nodes[0, r, 1, k], nodes[0, r, 2, k]
+            g0, g2 = nodes[1, r, 0, k] - f0, nodes[1, r, 2, k] - f2
+            along[r, 0] = f0
+            along[r, 1] = (4.0 * f1 - 3.0 * f0 - f2) * per_column
+            along[r, 2] = (2.0 * f0 - 4.0 * f1 + 2.0 * f2) * per_column * per_column
+            along[r, 3] = g0 * per_depth
+            along[r, 4] = (g2 - g0) * per_column * per_depth
+        for term in range(5):
+            first, middle, last = along[0, term], along[1, term], along[2, term]
+            bends[0, 5 * k + term] = first
+            bends[1, 5 * k + term] = 4.0 * middle - 3.0 * first - last
+            bends[2, 5 * k + term] = 2.0 * first - 4.0 * middle + 2.0 * last

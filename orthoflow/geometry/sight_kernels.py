@@ -9,12 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.plain_block_kernels import (
-    is_plain_block,
+    HIDDEN,
+    SEEN,
+    UNSURE,
+    judge_block,
+    look_at_hidden_block,
     look_at_plain_block,
+    room_for_blocks,
     span_block,
 )
 from orthoflow.geometry.visibility_kernels import (
     BLOCK_CELLS,
+    FINE_CELLS,
     NO_SURFACE,
     OCCLUDED,
     OUTSIDE,
@@ -114,6 +120,7 @@ def look_at_cells(
     end_row, end_column = first_row + sight.mask.shape[0], first_column + sight.mask.shape[1]
     n_rows, n_columns = relief.depth.shape
     lanes, box, nodes = np.empty((5, BLOCK_CELLS)), np.empty(4), np.empty((2, 3, 3, 4))
+    room = room_for_blocks(relief, sight)
     summary = sight.summary
     summary[:] = 0.0
     summary[0], summary[1] = math.inf, -math.inf
@@ -124,8 +131,15 @@ def look_at_cells(
         for block_column in range(first_column // BLOCK_CELLS, (end_column - 1) // BLOCK_CELLS + 1):
             start = max(first_column, block_column * BLOCK_CELLS)
             end = min(end_column, (block_column + 1) * BLOCK_CELLS)
-            top = highest_in_the_way(view, relief, block_row, block_column)
             bottom = np.float64(relief.bottoms[block_row, block_column])
+            top = highest_in_the_way(
+                view,
+                relief.tops,
+                bottom,
+                BLOCK_CELLS,
+                (block_row, block_column),
+                relief.highest_m,
+            )
             crest = np.float64(relief.crests[block_row, block_column])
             depths = (bottom, max(crest, bottom + _LEAST_SPAN_M))
             # The whole block counts, whatever part of it is in the tile: tiles must not show.
@@ -134,24 +148,27 @@ def look_at_cells(
                 block_column * BLOCK_CELLS,
                 min(n_columns, (block_column + 1) * BLOCK_CELLS) - 1,
             )
+            verdict = UNSURE
             if (
                 not view.is_exact
                 and bottom <= crest
                 and depths[1] < view.height_m
                 and span_block(view, depths, rows, columns, nodes)
-                and is_plain_block(view, buffer, depths[1], rows, columns, nodes, box)
             ):
-                place = (
-                    begin,
-                    start,
-                    finish - begin,
-                    end - start,
-                    begin - first_row,
-                    start - first_column,
-                )
-                n_seen = look_at_plain_block(
-                    view, relief, sight, place, (rows, columns), depths, nodes
-                )
+                verdict = judge_block(view, buffer, depths[1], rows, columns, nodes, box)
+            place = (
+                begin,
+                start,
+                finish - begin,
+                end - start,
+                begin - first_row,
+                start - first_column,
+            )
+            if verdict == HIDDEN:
+                look_at_hidden_block(relief, sight, place)
+                continue
+            if verdict == SEEN:
+                n_seen = look_at_plain_block(view, room, place, (rows, columns), depths, nodes, box)
                 if bottom + view.tolerance_m < top:
                     n_seen -= hide_low_cells(view, relief, sight, place, top)
                 if n_seen:
@@ -246,6 +263,8 @@ def hide_low_cells(
 ) -> int:
     """Follow the rays of those cells of a painted block that lie low enough to be hidden.
 
+    Small blocks within it are asked first: most of them are free.
+
     Args:
         view: the camera before the wall.
         relief: the wall.
@@ -257,13 +276,30 @@ def hide_low_cells(
         How many cells are hidden.
     """
     first_row, first_column, n_rows, n_columns, tile_row, tile_column = place
-    highest, n_hidden = top - view.tolerance_m, 0
-    for i in range(n_rows):
-        for j in range(n_columns):
-            if not relief.depth[first_row + i, first_column + j] < highest:
+    n_hidden = 0
+    for fine_row in range(first_row // FINE_CELLS, (first_row + n_rows - 1) // FINE_CELLS + 1):
+        begin = max(first_row, fine_row * FINE_CELLS)
+        finish = min(first_row + n_rows, (fine_row + 1) * FINE_CELLS)
+        for fine_column in range(
+            first_column // FINE_CELLS, (first_column + n_columns - 1) // FINE_CELLS + 1
+        ):
+            bottom = np.float64(relief.fine_bottoms[fine_row, fine_column])
+            if not bottom + view.tolerance_m < top:
                 continue
-            if is_hidden_by_relief(view, relief, first_row + i, first_column + j, top):
-                sight.mask[tile_row + i, tile_column + j] = OCCLUDED
-                sight.quality[tile_row + i, tile_column + j] = 0.0
-                n_hidden += 1
+            fine_top = highest_in_the_way(
+                view, relief.fine_tops, bottom, FINE_CELLS, (fine_row, fine_column), top
+            )
+            if not bottom + view.tolerance_m < fine_top:
+                continue
+            start = max(first_column, fine_column * FINE_CELLS)
+            end = min(first_column + n_columns, (fine_column + 1) * FINE_CELLS)
+            for row in range(begin, finish):
+                for column in range(start, end):
+                    if not relief.depth[row, column] < fine_top - view.tolerance_m:
+                        continue
+                    if is_hidden_by_relief(view, relief, row, column, fine_top):
+                        i, j = tile_row + row - first_row, tile_column + column - first_column
+                        sight.mask[i, j] = OCCLUDED
+                        sight.quality[i, j] = 0.0
+                        n_hidden += 1
     return n_hidden

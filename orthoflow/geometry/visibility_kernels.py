@@ -15,6 +15,8 @@ from orthoflow.geometry.point_kernels import Offsets
 
 # Side of the square blocks of cells that share one bound on how high rays have to be followed.
 BLOCK_CELLS: Final = 32
+# Side of the small blocks that are asked where a large one is not free; a part of a large one.
+FINE_CELLS: Final = 8
 # Void cells in `Relief.occluding`: they hide nothing, nor do mixtures with them.
 NOTHING: Final = np.int16(-32768)
 NOTHING_M: Final = -1.0e6
@@ -82,6 +84,8 @@ class Relief(NamedTuple):
         bottoms: (blocks, blocks) float32, the lowest depth in a block, infinite in a void one.
         crests: (blocks, blocks) float32, the highest depth in a block, minus infinity in a void
             one.
+        fine_tops: (fine blocks, fine blocks) as `tops`, for blocks of `FINE_CELLS`.
+        fine_bottoms: (fine blocks, fine blocks) as `bottoms`, for blocks of `FINE_CELLS`.
         highest_m: the highest `occluding` of all; `NOTHING_M` and no ray is followed.
     """
 
@@ -91,6 +95,8 @@ class Relief(NamedTuple):
     tops: NDArray[np.float32]
     bottoms: NDArray[np.float32]
     crests: NDArray[np.float32]
+    fine_tops: NDArray[np.float32]
+    fine_bottoms: NDArray[np.float32]
     highest_m: float
 
 
@@ -200,34 +206,51 @@ def splat_points(
 
 
 @compiled
-def highest_in_the_way(view: WallView, relief: Relief, block_row: int, block_column: int) -> float:
+def highest_in_the_way(
+    view: WallView,
+    tops: NDArray[np.float32],
+    bottom: float,
+    side: int,
+    block: tuple[int, int],
+    highest_m: float,
+) -> float:
     """Bound the height up to which rays from the cells of a block must be followed.
 
     At a fraction t of the way to the camera, no ray from the block is lower than the one from its
     lowest cell, and none is farther than half a block from the one from its centre. The samples
     are half a block apart, and each looks at 3 x 3 blocks: nothing in between is missed.
+
+    Args:
+        view: the camera before the wall.
+        tops: (blocks, blocks) metres, the highest in 3 x 3 blocks.
+        bottom: the lowest depth of the block.
+        side: of a block, in cells.
+        block: its row and column among the blocks.
+        highest_m: nothing that counts is higher.
     """
-    bottom = float(relief.bottoms[block_row, block_column])
     top = NOTHING_M
     if not bottom < view.height_m:
         return top
-    centre_row = (block_row + 0.5) * BLOCK_CELLS - 0.5
-    centre_column = (block_column + 0.5) * BLOCK_CELLS - 0.5
+    centre_row = (block[0] + 0.5) * side - 0.5
+    centre_column = (block[1] + 0.5) * side - 0.5
     down, across = view.row - centre_row, view.column - centre_column
-    n_steps = max(1, math.ceil(max(abs(down), abs(across)) / (0.5 * BLOCK_CELLS)))
-    n_block_rows, n_block_columns = relief.tops.shape
+    n_steps = max(1, math.ceil(max(abs(down), abs(across)) / (0.5 * side)))
+    per_step = 1.0 / n_steps
+    down_blocks, across_blocks = down * per_step / side, across * per_step / side
+    rise = (view.height_m - bottom) * per_step
+    at_row, at_column = centre_row / side, centre_column / side
+    n_block_rows, n_block_columns = tops.shape
     for k in range(n_steps + 1):
-        earliest = max(0.0, (k - 0.5) / n_steps)
-        height = bottom + earliest * (view.height_m - bottom) + view.tolerance_m
-        if height >= relief.highest_m:
+        height = bottom + max(0.0, k - 0.5) * rise + view.tolerance_m
+        if height >= highest_m:
             break
-        row = math.floor((centre_row + down * k / n_steps) / BLOCK_CELLS)
-        column = math.floor((centre_column + across * k / n_steps) / BLOCK_CELLS)
+        row = math.floor(at_row + k * down_blocks)
+        column = math.floor(at_column + k * across_blocks)
         if row < -1 or row > n_block_rows or column < -1 or column > n_block_columns:
             break
         row = min(max(row, 0), n_block_rows - 1)
         column = min(max(column, 0), n_block_columns - 1)
-        here = float(relief.tops[row, column])
+        here = float(tops[row, column])
         if here > height and here > top:
             top = here
     return top

@@ -121,7 +121,7 @@ class _Studio:
             border_share=params.border_share,
         )
         self._surfaces: list[Surface] = surfaces_of(
-            inputs.walls, params, hides=params.visibility == "full"
+            inputs.walls, params, threads=ctx.cores, hides=params.visibility == "full"
         )
         self._occluders: Occluders | None = None
         self._layers: list[Layer] = []

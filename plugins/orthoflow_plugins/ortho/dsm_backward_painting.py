@@ -14,10 +14,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.layer_kernels import Canvas, hand_over
 from orthoflow.geometry.sight_kernels import look_at_cells
 from orthoflow.geometry.visibility_kernels import (
     OCCLUDED,
-    PAINTED,
     DepthBuffer,
     Relief,
     Sight,
@@ -170,32 +170,30 @@ class _Brush:
         self._scratch = local()
 
     def paint_tile(self, tile: tuple[slice, slice]) -> None:
-        sight = self._look(tile)
-        self.painting.mask[tile] = sight.mask
+        sight, inner = self._look(tile)
         if not sight.summary[4]:
+            self.painting.mask[tile] = sight.mask[inner]
             return
-        if _crop_side(sight) > _CROP_MOST_PX and sight.mask.size > 1:
+        if _crop_side(sight) > _CROP_MOST_PX and sight.mask[inner].size > 1:
             for quarter in _quarters(tile):
                 self.paint_tile(quarter)
             return
         footprint = footprint_of(self._view, sight)
-        rgb, quality = self._canvas()
-        colours = sample(
+        canvas = self._canvas()
+        is_near = self._near_hidden(sight)
+        sample(
             self._photo,
-            sight,
+            sight._replace(u=sight.u[inner], v=sight.v[inner]),
             footprint,
             self._rule.resampling,
             is_filtered=self._rule.is_filtered,
-            into=rgb[tile],
+            into=canvas.rgb[tile],
         )
-        bare = np.flatnonzero(np.not_equal(sight.mask, PAINTED))
-        if bare.size:
-            colours[np.divmod(bare, sight.mask.shape[1])] = 0
-        quality[tile] = sight.quality
+        hand_over(sight, is_near, (inner[0].start, inner[1].start), canvas, tile)
         self.painting.footprints[tile[0].start, tile[1].start] = footprint
 
-    def _look(self, tile: tuple[slice, slice]) -> Sight:
-        """See a tile, and hide what is near to hidden cells of it or beside it."""
+    def _look(self, tile: tuple[slice, slice]) -> tuple[Sight, tuple[slice, slice]]:
+        """See a tile and so much around it as hides cells of it; say where in that the tile is."""
         reach = self._rule.erosion_cells
         reach += 1 if reach else 0  # what is a patch shows one cell farther out
         first = [max(0, part.start - reach) for part in tile]
@@ -205,25 +203,17 @@ class _Brush:
         )
         sight = self._blank_sight(shape[0], shape[1])
         look_at_cells(self._view, self._surface.relief, self._buffer, sight, first[0], first[1])
-        is_hidden = np.equal(sight.mask, OCCLUDED) if reach and sight.summary[4] else None
-        if is_hidden is not None and is_hidden.any():
-            is_near = _near_patches(is_hidden, self._rule.erosion_cells)
-            is_near &= sight.mask == PAINTED
-            sight.mask[is_near] = OCCLUDED
-            sight.quality[is_near] = 0.0
         rows, columns = (
             slice(part.start - start, part.stop - start)
             for part, start in zip(tile, first, strict=True)
         )
-        # Twenty bits tell views apart well enough, and pack to half the size.
-        sight.quality.view(np.uint32)[...] &= np.uint32(0xFFFFF000)
-        return Sight(
-            u=sight.u[rows, columns],
-            v=sight.v[rows, columns],
-            mask=sight.mask[rows, columns],
-            quality=sight.quality[rows, columns],
-            summary=sight.summary,
-        )
+        return sight, (rows, columns)
+
+    def _near_hidden(self, sight: Sight) -> NDArray[np.uint8]:
+        """Not 0 where a cell is too near to a hidden patch; empty where none is."""
+        if self._rule.erosion_cells and (sight.mask == OCCLUDED).any():
+            return _near_patches(sight.mask == OCCLUDED, self._rule.erosion_cells)
+        return np.empty((0, 0), dtype=np.uint8)
 
     def _blank_sight(self, rows: int, columns: int) -> Sight:
         """Give arrays for a tile that this thread has used before: fresh memory takes time."""
@@ -237,7 +227,7 @@ class _Brush:
         mask = self._scratch.mask[: rows * columns].reshape(rows, columns)
         return Sight(u=u, v=v, mask=mask, quality=quality, summary=np.empty(8))
 
-    def _canvas(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def _canvas(self) -> Canvas:
         with self._lock:
             painting, shape = self.painting, self._surface.frame.shape
             if painting.rgb is None or painting.quality is None:
@@ -245,10 +235,12 @@ class _Brush:
                 painting.quality = np.asarray(
                     self._allocate("quality", shape, np.float32), np.float32
                 )
-            return painting.rgb, painting.quality
+            # Kernels know plain arrays only, not mapped files.
+            rgb, quality = painting.rgb.view(np.ndarray), painting.quality.view(np.ndarray)
+            return Canvas(mask=painting.mask, quality=quality, rgb=rgb)
 
 
-def _near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+def _near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.uint8]:
     """Cells within a reach of hidden patches of 2 x 2 cells or more.
 
     A single hidden cell is one whose own depth is wrong; its neighbours are none the worse.
@@ -258,7 +250,7 @@ def _near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]
     square, window = np.ones((2, 2), dtype=np.uint8), np.ones((2 * reach + 1,) * 2, dtype=np.uint8)
     lowest = cv2.erode(is_hidden.view(np.uint8), square, anchor=(0, 0))
     patches = cv2.dilate(lowest, square, anchor=(1, 1))
-    return np.asarray(cv2.dilate(patches, window)).view(np.bool_)
+    return np.asarray(cv2.dilate(patches, window), dtype=np.uint8)
 
 
 def _crop_side(sight: Sight) -> float:

@@ -79,7 +79,7 @@ def sample(
 
     Args:
         photo: (height, width, 3).
-        sight: where the cells are in the photo.
+        sight: where the cells are in the photo; its places are used up.
         footprint: how many pixels a cell covers.
         resampling: `nearest` gives the pixel's own colour and filters nothing.
         is_filtered: average over what a cell covers where the photo is finer than the wall.
@@ -90,8 +90,8 @@ def sample(
     if resampling == "nearest":
         crop, corner = _crop(photo, sight, reach=0)
         # Whole positions: the pixel that a place lies in, and nothing for OpenCV to round.
-        u, v = np.floor(sight.u), np.floor(sight.v)
-        return _remapped(crop, u - corner[0], v - corner[1], resampling, into)
+        u, v = (np.floor(places, out=places) for places in (sight.u, sight.v))
+        return _remapped(crop, u, v, corner, resampling, into)
     sigmas = [
         0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if is_filtered else 0.0
         for pixels in (footprint.pixels_across, footprint.pixels_down)
@@ -108,17 +108,19 @@ def sample(
         )
         crop = np.asarray(blurred, dtype=np.uint8)
     # OpenCV has (0, 0) at the centre of the first pixel.
-    u, v = sight.u - (corner[0] + np.float32(0.5)), sight.v - (corner[1] + np.float32(0.5))
-    return _remapped(crop, u, v, resampling, into)
+    centre = (corner[0] + np.float32(0.5), corner[1] + np.float32(0.5))
+    return _remapped(crop, sight.u, sight.v, centre, resampling, into)
 
 
 def _remapped(
     crop: NDArray[np.uint8],
     u: NDArray[np.float32],
     v: NDArray[np.float32],
+    corner: tuple[np.float32, np.float32],
     resampling: Resampling,
     into: NDArray[np.uint8],
 ) -> NDArray[np.uint8]:
+    """Colours at places counted from a corner; the places are used up."""
     import cv2
 
     flags = {
@@ -127,6 +129,8 @@ def _remapped(
         "cubic": cv2.INTER_CUBIC,
         "lanczos": cv2.INTER_LANCZOS4,
     }
+    u -= corner[0]
+    v -= corner[1]
     flag, border = flags[resampling], cv2.BORDER_REPLICATE
     return np.asarray(cv2.remap(crop, u, v, flag, dst=into, borderMode=border), dtype=np.uint8)
 

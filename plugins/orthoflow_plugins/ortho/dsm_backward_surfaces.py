@@ -2,120 +2,82 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.visibility_kernels import BLOCK_CELLS, NOTHING, NOTHING_M, Relief
+from orthoflow.geometry.rastering import in_parts
+from orthoflow.geometry.relief_kernels import bound_blocks, take_spikes_away
+from orthoflow.geometry.visibility_kernels import (
+    BLOCK_CELLS,
+    FINE_CELLS,
+    NOTHING,
+    NOTHING_M,
+    Relief,
+)
 from orthoflow.products import Wall
 
-# Whole blocks of rows at once, so that no temporary is as large as the wall.
-_BAND_CELLS: Final = 16 * BLOCK_CELLS
-_HALO_CELLS: Final = 3
 # Heights fit into 16 bits with room for rounding.
 _STEPS: Final = 32_000
 
 
-def relief_of(wall: Wall) -> Relief:
+def relief_of(wall: Wall, *, threads: int) -> Relief:
     """Prepare a wall for looking at it from anywhere."""
-    depth = np.asarray(wall.depth_m, dtype=np.float32).view(np.ndarray)[:]
-    rows, columns = depth.shape
-    n_rows, n_columns = -(-rows // BLOCK_CELLS), -(-columns // BLOCK_CELLS)
-    tops = np.full((n_rows, n_columns), NOTHING_M, dtype=np.float32)
-    bottoms, crests = np.empty_like(tops), np.empty_like(tops)
-    bounds = _bounds_m(depth, bottoms, crests)
-    step_m = max(1e-6, max(abs(bound) for bound in bounds) / _STEPS)
-    occluding = np.empty(depth.shape, dtype=np.int16)
-    for first in range(0, rows, _BAND_CELLS):
-        # What is around a cell counts: three rows beside the band are enough for all its cells.
-        around = slice(max(0, first - _HALO_CELLS), min(rows, first + _BAND_CELLS + _HALO_CELLS))
-        own = slice(first - around.start, min(rows, first + _BAND_CELLS) - around.start)
-        heights_m = _without_spikes(depth[around])[own]
-        part = occluding[first : first + _BAND_CELLS]
-        # Void is far below what 16 bits hold, and ends at their lowest number.
-        scaled = np.maximum(heights_m, np.float32(NOTHING * step_m)) * np.float32(1.0 / step_m)
-        np.copyto(part, np.rint(scaled, out=scaled), casting="unsafe")
-        block = slice(first // BLOCK_CELLS, -(-(first + part.shape[0]) // BLOCK_CELLS))
-        tops[block] = _per_block(heights_m, largest=True)
+    relief = transparent_relief_of(wall, threads=threads)
+    step_m = max(1e-6, _largest_m(relief) / _STEPS)
+    occluding = np.empty(relief.depth.shape, dtype=np.int16)
+    fine_tops = np.empty_like(relief.fine_bottoms)
+    task = partial(take_spikes_away, relief.depth, step_m, occluding, fine_tops)
+    in_parts(fine_tops.shape[0], threads, task)
     # Kernels are compiled once, for arrays that cannot be written to.
-    for array in (depth, occluding):
-        array.flags.writeable = False
-    return Relief(
-        depth=depth,
+    occluding.flags.writeable = False
+    tops = _coarse(fine_tops, np.maximum)
+    return relief._replace(
         occluding=occluding,
         step_m=float(step_m),
         tops=_highest_around(tops),
-        bottoms=bottoms,
-        crests=crests,
+        fine_tops=_highest_around(fine_tops),
         highest_m=float(tops.max(initial=NOTHING_M)),
     )
 
 
-def transparent_relief_of(wall: Wall) -> Relief:
+def transparent_relief_of(wall: Wall, *, threads: int) -> Relief:
     """Prepare a wall that hides nothing of itself; takes no memory per cell."""
     depth = np.asarray(wall.depth_m, dtype=np.float32).view(np.ndarray)[:]
-    shape = tuple(-(-side // BLOCK_CELLS) for side in depth.shape)
-    bottoms = np.empty(shape, dtype=np.float32)
-    crests = np.empty_like(bottoms)
-    _bounds_m(depth, bottoms, crests)
+    depth.flags.writeable = False
+    shape = tuple(-(-side // FINE_CELLS) for side in depth.shape)
+    fine_bottoms = np.empty(shape, dtype=np.float32)
+    fine_crests = np.empty_like(fine_bottoms)
+    in_parts(shape[0], threads, partial(bound_blocks, depth, fine_bottoms, fine_crests))
     nothing = np.full((1, 1), NOTHING, dtype=np.int16)
-    for array in (depth, nothing):
-        array.flags.writeable = False
+    nothing.flags.writeable = False
+    bottoms = _coarse(fine_bottoms, np.minimum)
     return Relief(
         depth=depth,
         occluding=nothing,
         step_m=1.0,
-        tops=np.full(shape, NOTHING_M, dtype=np.float32),
+        tops=np.full(bottoms.shape, NOTHING_M, dtype=np.float32),
         bottoms=bottoms,
-        crests=crests,
+        crests=_coarse(fine_crests, np.maximum),
+        fine_tops=np.full((1, 1), NOTHING_M, dtype=np.float32),
+        fine_bottoms=fine_bottoms,
         highest_m=NOTHING_M,
     )
 
 
-def _bounds_m(
-    depth: NDArray[np.float32], bottoms: NDArray[np.float32], crests: NDArray[np.float32]
-) -> tuple[float, float]:
-    """Fill in the lowest and highest depth of each block; give those of the wall, 0 without any."""
-    for first in range(0, depth.shape[0], _BAND_CELLS):
-        band = depth[first : first + _BAND_CELLS]
-        block = slice(first // BLOCK_CELLS, -(-(first + band.shape[0]) // BLOCK_CELLS))
-        bottoms[block] = _per_block(band, largest=False)
-        crests[block] = _per_block(band, largest=True)
-    is_void = np.isnan(bottoms)
-    bounds = (0.0, 0.0) if is_void.all() else (float(np.nanmin(bottoms)), float(np.nanmax(crests)))
-    bottoms[is_void], crests[is_void] = np.inf, -np.inf
-    return bounds
+def _largest_m(relief: Relief) -> float:
+    """How far the surface is from its plane at most; 0 without any."""
+    bounds = np.concatenate([relief.bottoms.ravel(), relief.crests.ravel()])
+    return float(np.abs(bounds[np.isfinite(bounds)]).max(initial=0.0))
 
 
-def _without_spikes(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Close voids of one cell, then take away what is higher than all 2 x 2 cells it is in.
-
-    A single outlier in front of a wall would cast a long shadow, which nothing real casts.
-    """
-    import cv2
-
-    known = np.where(np.isnan(depth), np.float32(NOTHING_M), depth)
-    around = cv2.dilate(known, np.ones((3, 3), dtype=np.uint8))
-    closed = np.where(known == np.float32(NOTHING_M), around, known)
-    square = np.ones((2, 2), dtype=np.uint8)
-    lowest = cv2.erode(closed, square, anchor=(0, 0), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(
-        cv2.dilate(lowest, square, anchor=(1, 1), borderType=cv2.BORDER_REPLICATE),
-        dtype=np.float32,
-    )
-
-
-def _per_block(values: NDArray[np.float32], *, largest: bool) -> NDArray[np.float32]:
-    """The extreme of each block, NaN where all of it is."""
-    rows, columns = values.shape
-    # `fmax` and `fmin` pass over NaN. Whole blocks of rows at once are what numpy does fast.
-    reduce = np.fmax if largest else np.fmin
-    whole = rows - rows % BLOCK_CELLS
-    down = reduce.reduce(values[:whole].reshape(-1, BLOCK_CELLS, columns), axis=1)
-    if whole < rows:
-        down = np.vstack([down, reduce.reduce(values[whole:], axis=0)])
-    across = reduce.reduceat(down, np.arange(0, columns, BLOCK_CELLS), axis=1)
+def _coarse(fine: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:
+    """The extreme of each large block, from those of the small ones in it."""
+    per_block = BLOCK_CELLS // FINE_CELLS
+    down = reduce.reduceat(fine, np.arange(0, fine.shape[0], per_block), axis=0)
+    across = reduce.reduceat(down, np.arange(0, fine.shape[1], per_block), axis=1)
     return np.asarray(across, dtype=np.float32)
 
 

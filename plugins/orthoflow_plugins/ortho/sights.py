@@ -54,16 +54,19 @@ class SightParams(MethodParams):
     )
 
 
-def surfaces_of(walls: Walls, params: SightParams, *, hides: bool = True) -> list[Surface]:
+def surfaces_of(
+    walls: Walls, params: SightParams, *, threads: int, hides: bool = True
+) -> list[Surface]:
     """Give each wall as the surface that rays meet; with `hides` false its relief hides nothing."""
     from orthoflow.geometry.depth_noise import depth_noise_m
     from orthoflow_plugins.ortho.dsm_backward_painting import Surface
     from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
 
+    prepared = relief_of if hides else transparent_relief_of
     return [
         Surface(
             frame=wall.frame,
-            relief=relief_of(wall) if hides else transparent_relief_of(wall),
+            relief=prepared(wall, threads=threads),
             front_m=walls.buffer_front_m,
             tolerance_m=params.tolerance_sigma * depth_noise_m(wall.depth_m)
             + params.tolerance_cells * wall.frame.gsd_m,
