@@ -1,4 +1,9 @@
-"""Compiled passes that tell the narrow gaps of a raster from windows, and who lends them values."""
+"""Compiled passes that tell the narrow gaps of a raster from windows, and who lends them values.
+
+A disc holds a cell of a set where, in some column that it crosses, the cell of the set nearest to
+its middle row is within it. So distances down columns are found first; then each row asks the
+columns to its left and right. Both go along rows without branches, 32 cells at once.
+"""
 
 from __future__ import annotations
 
@@ -9,66 +14,87 @@ from orthoflow.geometry.point_kernels import compiled
 
 
 @compiled
-def nearest_within(
-    is_measured: NDArray[np.bool_],
-    offsets: NDArray[np.int64],
-    nearest: NDArray[np.int32],
-    first_row: int,
-    end_row: int,
+def find_distances_down(
+    is_in_set: NDArray[np.bool_], most: int, distances: NDArray[np.uint8], first: int, end: int
 ) -> None:
-    """Find the measured cell nearest to each cell of some rows.
+    """Find how far above or below the nearest cell of a set is, in some columns.
 
     Args:
-        is_measured: (rows, cols); no visited row or column is nearer to the border than the
-            largest offset.
-        offsets: (k, 2) rows and columns of a disc without its centre, nearest first.
-        nearest: (rows, cols) flat indices, written where a measured cell lies within the disc; a
-            measured cell is its own nearest.
-        first_row: first row to visit.
-        end_row: the row after the last one.
+        is_in_set: (rows, cols).
+        most: distances are not counted beyond this.
+        distances: (rows, cols) set.
+        first: first column.
+        end: the column after the last one.
     """
-    columns = is_measured.shape[1]
-    reach = np.abs(offsets).max()
-    for row in range(first_row, end_row):
-        for column in range(reach, columns - reach):
-            if is_measured[row, column]:
-                nearest[row, column] = row * columns + column
-                continue
-            for k in range(offsets.shape[0]):
-                r, c = row + offsets[k, 0], column + offsets[k, 1]
-                if is_measured[r, c]:
-                    nearest[row, column] = r * columns + c
-                    break
+    rows, far, zero = is_in_set.shape[0], np.uint8(most), np.uint8(0)
+    one = np.uint8(1)
+    for row in range(rows):
+        here, into = is_in_set[row, first:end], distances[row, first:end]
+        if row == 0:
+            for j in range(here.size):
+                into[j] = zero if here[j] else far
+            continue
+        above = distances[row - 1, first:end]
+        for j in range(here.size):
+            next_one = far if above[j] == far else np.uint8(above[j] + one)
+            into[j] = zero if here[j] else next_one
+    for row in range(rows - 2, -1, -1):
+        into, below = distances[row, first:end], distances[row + 1, first:end]
+        for j in range(into.size):
+            into[j] = np.uint8(below[j] + one) if into[j] > below[j] else into[j]
 
 
 @compiled
-def find_narrow_gaps(
-    is_measured: NDArray[np.bool_],
-    nearest: NDArray[np.int32],
-    offsets: NDArray[np.int64],
-    is_narrow: NDArray[np.bool_],
-    first_row: int,
-    end_row: int,
+def find_discs(
+    distances: NDArray[np.uint8],
+    heights: NDArray[np.uint8],
+    is_met: NDArray[np.bool_],
+    first: int,
+    end: int,
 ) -> None:
-    """Tell which void cells of some rows no disc covers that fits into the void.
+    """Tell about which cells of some rows a disc holds a cell of the set.
+
+    Args:
+        distances: (rows, cols + 2 radius) of `find_distances_down`, with columns more on both
+            sides.
+        heights: (2 radius + 1,) how far the disc reaches up and down in each of its columns.
+        is_met: (rows, cols) set.
+        first: first row.
+        end: the row after the last one.
+    """
+    columns = is_met.shape[1]
+    for row in range(first, end):
+        into = is_met[row]
+        into[:] = False
+        for k in range(heights.size):
+            beside, height = distances[row, k : k + columns], heights[k]
+            for j in range(columns):
+                into[j] |= beside[j] <= height
+
+
+@compiled
+def nearest_within(
+    is_measured: NDArray[np.bool_],
+    offsets: NDArray[np.int64],
+    lent: NDArray[np.int64],
+    first: int,
+    end: int,
+) -> None:
+    """Find the measured cell nearest to each of some void cells.
 
     Args:
         is_measured: (rows, cols).
-        nearest: (rows, cols) of `nearest_within` the same disc; -1 where a disc fits.
-        offsets: (k, 2) rows and columns of the disc without its centre.
-        is_narrow: (rows, cols), made true for such cells.
-        first_row: first row to visit, at least twice the disc's radius from the border.
-        end_row: the row after the last one.
+        offsets: (k, 2) rows and columns of a disc without its centre, nearest first; a measured
+            cell lies within it.
+        lent: (n, 2) flat indices of the void cell, and of the measured one, which is set.
+        first: first void cell.
+        end: the void cell after the last one.
     """
-    columns = nearest.shape[1]
-    reach = 2 * np.abs(offsets).max()
-    for row in range(first_row, end_row):
-        for column in range(reach, columns - reach):
-            if is_measured[row, column] or nearest[row, column] < 0:
-                continue
-            fits = False
-            for k in range(offsets.shape[0]):
-                if nearest[row + offsets[k, 0], column + offsets[k, 1]] < 0:
-                    fits = True
-                    break
-            is_narrow[row, column] = not fits
+    rows, columns = is_measured.shape
+    for i in range(first, end):
+        row, column = lent[i, 0] // columns, lent[i, 0] % columns
+        for k in range(offsets.shape[0]):
+            r, c = row + offsets[k, 0], column + offsets[k, 1]
+            if 0 <= r < rows and 0 <= c < columns and is_measured[r, c]:
+                lent[i, 1] = r * columns + c
+                break

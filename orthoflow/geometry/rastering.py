@@ -176,33 +176,35 @@ def lenders_in_gaps(
     """
     if radius_cells == 0:
         return np.empty((0, 2), dtype=np.int64)
-    offsets = disc_offsets(radius_cells)
-    frame = 2 * radius_cells
+    rows, columns = is_measured.shape
     # Framed with void, so that discs may lie half outside the raster.
-    padded: NDArray[np.bool_] = np.pad(is_measured, frame)
-    nearest = np.full(padded.shape, -1, dtype=np.int32)
-    is_narrow = np.zeros(padded.shape, dtype=np.bool_)
-
-    def look(first: int, end: int) -> None:
-        first_row, end_row = first + radius_cells, end + radius_cells
-        gaps.nearest_within(padded, offsets, nearest, first_row, end_row)
-
-    def judge(first: int, end: int) -> None:
-        first_row, end_row = first + frame, end + frame
-        gaps.find_narrow_gaps(padded, nearest, offsets, is_narrow, first_row, end_row)
-
-    in_parts(padded.shape[0] - frame, threads, look)
-    in_parts(is_measured.shape[0], threads, judge)
+    framed: NDArray[np.bool_] = np.pad(is_measured, radius_cells)
+    is_touched = _met_by_discs(framed, radius_cells, threads=threads)
+    is_open = _met_by_discs(~is_touched, radius_cells, threads=threads)
+    inner = np.s_[radius_cells : radius_cells + rows, radius_cells : radius_cells + columns]
+    is_narrow = np.logical_not(is_open[inner] | is_measured)
     void = np.flatnonzero(is_narrow)
-    width, padded_width = is_measured.shape[1], padded.shape[1]
+    lent = np.column_stack([void, void])
+    measured = np.ascontiguousarray(is_measured)
+    task = partial(gaps.nearest_within, measured, disc_offsets(radius_cells), lent)
+    in_parts(void.size, threads, task)
+    return lent
 
-    def unpadded(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        rows, columns = np.divmod(cells, padded_width)
-        flat: NDArray[np.int64] = (rows - frame) * width + columns - frame
-        return flat
 
-    lenders = nearest.ravel()[void].astype(np.int64)
-    return np.column_stack([unpadded(void), unpadded(lenders)])
+def _met_by_discs(
+    is_in_set: NDArray[np.bool_], radius_cells: int, *, threads: int
+) -> NDArray[np.bool_]:
+    """Cells (rows, cols) about which a disc holds a cell of a set; outside there is none."""
+    rows, columns = is_in_set.shape
+    steps = np.arange(-radius_cells, radius_cells + 1)
+    heights = np.floor(np.sqrt(radius_cells**2 - steps**2)).astype(np.uint8)
+    far = radius_cells + 1
+    distances = np.full((rows, columns + 2 * radius_cells), far, dtype=np.uint8)
+    inner = distances[:, radius_cells : radius_cells + columns]
+    in_parts(columns, threads, partial(gaps.find_distances_down, is_in_set, far, inner))
+    is_met = np.empty(is_in_set.shape, dtype=np.bool_)
+    in_parts(rows, threads, partial(gaps.find_discs, distances, heights, is_met))
+    return is_met
 
 
 def _empty_entries(n_points: int) -> Entries:
