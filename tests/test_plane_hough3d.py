@@ -14,7 +14,8 @@ from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVotin
 from orthoflow_plugins.plane.space_directions import directions_over
 
 from orthoflow.geometry import angle_between_deg
-from orthoflow.geometry.voxel_kernels import VOTE_SHARES, vote_planes
+from orthoflow.geometry.shear_kernels import VOTE_SHARES
+from orthoflow.geometry.voxel_kernels import vote_planes
 from orthoflow.products import Planes, PointCloud
 from tests.plane_scenes import ROOM, Rectangle, cloud_of, context, sampled
 

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane.coarser_cells import coarser
 from orthoflow_plugins.plane.preparing import prepare
 from orthoflow_plugins.plane.region import Region
 from orthoflow_plugins.plane.regions import Growth, grow
 from orthoflow_plugins.plane.surface_cells import Neighbourhood, SurfaceCells, surface_cells
 
 from orthoflow.geometry import angle_between_deg, basis_from_up
+from orthoflow.geometry.cell_kernels import STEPS_PER_CELL
 from orthoflow.sdk import StepContext
 from tests.plane_scenes import Rectangle, cloud_of, context, sampled
 
@@ -120,6 +122,42 @@ def test_a_region_is_fitted_by_total_least_squares_through_its_points() -> None:
     # A few cells at the edges do not join, and places are rounded to 50 micrometres.
     assert min(angle_between_deg(plane.normal, s * expected) for s in (1, -1)) < 0.002
     assert abs(plane.distances_m(points.mean(axis=0)[None])[0]) < 2e-5
+
+
+def test_wider_cells_have_the_moments_of_their_points() -> None:
+    points = sampled((WALL, NICHE))[::7]
+    cells = cells_of(points, CUBE)
+    wide = coarser(cells, np.arange(len(cells.counts)))
+    assert wide.cells.grid.cell_m == 2.0 * cells.grid.cell_m
+    cell_of = cells.cell_of(prepared_points(points))
+    inside = cell_of >= 0
+    wide_of = wide.of_member[cell_of[inside]]
+    count = np.bincount(wide_of)
+    np.testing.assert_array_equal(wide.cells.counts, count)
+    mean = (
+        np.column_stack([np.bincount(wide_of, column) for column in points[inside].T])
+        / count[:, None]
+    )
+    step_m = wide.cells.grid.cell_m / STEPS_PER_CELL
+    centroids = wide.cells.centroids() @ wide.cells.grid.basis
+    np.testing.assert_allclose(centroids, mean, atol=step_m)
+    # The kernels find each wide cell where its points are.
+    np.testing.assert_array_equal(wide.cells.cell_of(prepared_points(points))[inside], wide_of)
+
+
+def test_a_thinly_scanned_wall_beside_a_dense_one_is_one_region() -> None:
+    # A point per decimetre: neighbourhoods of 10 cm that suit the dense wall hold one of them.
+    thin = Rectangle("thin", (3.0, 1.0, 0.0), (0, 3.0, 0), (0, 0, 2.0), 2_400)
+    dense = Rectangle("dense", (0.0, 4.0, 0.0), (2.0, 0, 0), (0, 0, 2.0), 90_000)
+    wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, cell_m=0.1 / 3.0)
+    cells = cells_of(sampled((thin, dense), noise_m=0.002), wanted)
+    growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=400.0)
+    regions = grow(cells, growth, np.zeros(3))
+    assert len(regions.planes) == 2
+    of_thin = min(regions.planes, key=lambda region: regions.n_points[region])
+    assert regions.n_points[of_thin] > 0.9 * 2_400
+    normal = regions.planes[of_thin].normal
+    assert angle_between_deg(normal * np.sign(normal[0]), np.array([1.0, 0.0, 0.0])) < 0.05
 
 
 def test_a_step_of_three_centimetres_parts_regions() -> None:

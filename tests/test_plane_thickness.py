@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.ransac import Ransac
+from pydantic import ValidationError
 
+from orthoflow.errors import MethodError
 from orthoflow.products import PointCloud
 from orthoflow.sdk import StepContext
 from tests.plane_scenes import cloud_of, context
@@ -27,9 +29,11 @@ def wall(noise_m: NDArray[np.float64] | float, *, bow_m: float = 0.0) -> NDArray
     return np.column_stack([x, y, z])
 
 
-def detect(cloud: PointCloud, folder: Path) -> tuple[Any, StepContext, dict[str, float]]:
+def detect(
+    cloud: PointCloud, folder: Path, **params: object
+) -> tuple[Any, StepContext, dict[str, float]]:
     ctx = context(folder)
-    out = Ransac().run(Ransac.In(cloud=cloud), Ransac.Params(), ctx)
+    out = Ransac().run(Ransac.In(cloud=cloud), Ransac.Params(**params), ctx)
     return out, ctx, {metric.name: metric.value for metric in ctx.metrics}
 
 
@@ -83,14 +87,45 @@ def test_a_material_that_scatters_more_is_told_by_its_intensity(tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("charts")
+def test_named_materials_have_a_thickness_each_on_the_plane_and_along_a_row(
+    tmp_path: Path,
+) -> None:
+    fabric = wall(0.0)[:, 0] > 0.0
+    points = wall(np.where(fabric, 0.004, 0.001))
+    intensity = np.where(fabric, 0.2, 0.8) + np.random.default_rng(1).normal(0, 0.02, N_POINTS)
+    cloud = dataclasses.replace(
+        cloud_of(points),
+        intensity=intensity.astype(np.float32),
+        row=np.repeat(np.arange(30), N_POINTS // 30).astype(np.uint32),
+        column=np.zeros(N_POINTS, dtype=np.uint32),
+    )
+    names = {"fabric": (0.0, 0.5), "plaster": (0.5, 1.0), "glass": (0.99, 1.0)}
+    with pytest.raises(ValidationError, match=r"begin at 0.99, below 1 where"):
+        Ransac.Params(materials=names)
+    del names["glass"]
+    out, _, _ = detect(cloud, tmp_path, materials=names)
+    rows = [out.planes.details["thickness"][0]["material"], out.planes.details["scan_row"]]
+    for told, rel in ((rows[0], 0.05), (rows[1]["material"], 0.15)):
+        assert [item["name"] for item in told] == ["fabric", "plaster"]
+        assert told[0]["sigma_m"] == pytest.approx(0.004, rel=rel)
+        assert told[1]["sigma_m"] == pytest.approx(0.001, rel=rel)
+    assert rows[1]["n_points"] == 3000
+
+
+def test_materials_need_intensities(tmp_path: Path) -> None:
+    with pytest.raises(MethodError, match="intensity of the points, which the cloud has not"):
+        detect(cloud_of(wall(0.002)), tmp_path, materials={"fabric": (0.0, 0.5)})
+
+
+@pytest.mark.usefixtures("charts")
 def test_one_row_of_the_scan_is_drawn_where_rows_are_known(tmp_path: Path) -> None:
-    from orthoflow_plugins.plane import detecting, thickness
+    from orthoflow_plugins.plane import detecting, scan_rows
 
     rows = []
     cloud = cloud_of(wall(0.002), stations=STATION)
     row = np.repeat(np.arange(300), N_POINTS // 300).astype(np.uint32)
     cloud = dataclasses.replace(cloud, row=row, column=np.zeros(N_POINTS, dtype=np.uint32))
-    original = thickness.scan_row
+    original = scan_rows.scan_row
 
     def kept(*arguments: Any) -> Any:
         rows.append(original(*arguments))

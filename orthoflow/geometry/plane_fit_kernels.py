@@ -17,6 +17,8 @@ VERTICAL: Final = 1
 LEVEL: Final = 2
 
 _STEPS_MOST: Final = 20
+# Points within so many tolerances of a plane are kept while it is fitted to some of them.
+_REACH: Final = 2.0
 # A fit has settled when a point ten metres away moves by less than this share of the tolerance.
 _SETTLED_SHARE: Final = 5e-4
 # Points nearer to a line than this (root mean square) do not say how the plane lies about it.
@@ -40,9 +42,10 @@ def robust_moments(
     sums = np.zeros(10)
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        ratio = (plane[0] * x + plane[1] * y + plane[2] * z - plane[3]) / tolerance_m
-        if abs(ratio) >= 1.0:
+        distance_m = plane[0] * x + plane[1] * y + plane[2] * z - plane[3]
+        if abs(distance_m) >= tolerance_m:
             continue
+        ratio = distance_m / tolerance_m
         weight = (1.0 - ratio * ratio) ** 2
         sums[0] += weight
         sums[1] += weight * x
@@ -55,6 +58,31 @@ def robust_moments(
         sums[8] += weight * y * z
         sums[9] += weight * z * z
     return sums
+
+
+@kernel_part
+def _nearby(
+    points: NDArray[np.float64], plane: NDArray[np.float64], reach_m: float
+) -> NDArray[np.float64]:
+    """(k, 3) the points within reach of a plane, in their order."""
+    near = np.empty_like(points)
+    count = 0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        near[count, 0], near[count, 1], near[count, 2] = x, y, z
+        distance_m = plane[0] * x + plane[1] * y + plane[2] * z - plane[3]
+        # Without a branch: which points are near cannot be foretold.
+        count += np.int64(abs(distance_m) < reach_m)
+    return near[:count]
+
+
+@kernel_part
+def _furthest_m(points: NDArray[np.float64]) -> float:
+    """The largest distance of a point from the origin."""
+    largest = 0.0
+    for i in range(points.shape[0]):
+        largest = max(largest, points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2)
+    return float(np.sqrt(largest))
 
 
 @kernel_part
@@ -103,8 +131,17 @@ def refine_robustly(
         Whether more than a line of points supports it; if not, the plane means nothing.
     """
     fitted = np.empty(9)
-    for _ in range(_STEPS_MOST):
-        sums = robust_moments(points, plane, tolerance_m)
+    furthest_m = _furthest_m(points)
+    # Only points near the plane matter, and mostly it moves little: those near it are asked again
+    # only when it may have come within the tolerance of others.
+    near, asked, reach_m = points, plane.copy(), np.inf
+    for step in range(_STEPS_MOST):
+        turned = np.sqrt(np.sum((plane[:3] - asked[:3]) ** 2))
+        may_have_moved_m = turned * furthest_m + abs(plane[3] - asked[3])
+        if step == 1 or may_have_moved_m + tolerance_m > reach_m:
+            reach_m = _REACH * tolerance_m
+            near, asked = _nearby(points, plane, reach_m), plane.copy()
+        sums = robust_moments(near, plane, tolerance_m)
         if sums[0] <= 0.0:
             return False
         if freedom == VERTICAL:

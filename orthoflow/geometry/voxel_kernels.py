@@ -14,14 +14,10 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import kernel_part
 from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
+from orthoflow.geometry.shear_kernels import add_sheared, share_out, span_rows, turn_image
 
 BRICK_SIDE: Final = 8
 VOXELS: Final = BRICK_SIDE**3
-# A vote is counted in quarters, so that it can be shared between two bins without a rounding that
-# would not cancel when it is taken back.
-VOTE_SHARES: Final = 4
-# Side of the tiles that an image is turned by.
-_TILE: Final = 16
 
 
 @kernel_part
@@ -132,95 +128,6 @@ def gather_voxels(
 
 
 @kernel_part
-def _add_sheared(
-    image: NDArray[np.int32],
-    spans: NDArray[np.int32],
-    shear: float,
-    line: NDArray[np.int32],
-) -> tuple[int, int]:
-    """Add the rows of an image to a line, each shifted by its height over the middle times a shear.
-
-    A row's first column lands at half its number of rows, and one more, with no shift. The line is
-    zero before; gives the piece of it that no longer is.
-    """
-    n_rows = image.shape[0]
-    low, high = line.size, 0
-    for row in range(n_rows):
-        first, last = spans[row, 0], spans[row, 1]
-        if first >= last:
-            continue
-        shift = math.floor((row + 0.5 - 0.5 * n_rows) * shear + 0.5) + n_rows // 2 + 1
-        target = line[shift + first : shift + last]
-        source = image[row, first:last]
-        for i in range(source.size):
-            target[i] += source[i]
-        low, high = min(low, shift + first), max(high, shift + last)
-    return low, high
-
-
-@kernel_part
-def _share_out(
-    line: NDArray[np.int32],
-    piece: tuple[int, int],
-    shape: tuple[int, int],
-    scale: float,
-    votes: NDArray[np.int32],
-) -> None:
-    """Add a piece of a line to a row of votes whose bins are narrower, in quarters; clears it.
-
-    Args:
-        line: see `_add_sheared`.
-        piece: what of it is not zero.
-        shape: rows and columns of the image that was added up.
-        scale: width of a cell of the line, in bins; negative when it runs the other way.
-        votes: (bins,) added to.
-    """
-    middle = 0.5 * votes.size
-    for i in range(piece[0], piece[1]):
-        if line[i] == 0:
-            continue
-        left = scale * (i - (shape[0] // 2 + 1) - 0.5 * shape[1]) + middle
-        low = min(left, left + scale)
-        first = math.floor(low)
-        share = min(VOTE_SHARES, int(VOTE_SHARES * (first + 1 - low) / abs(scale) + 0.5))
-        if 0 <= first < votes.size:
-            votes[first] += share * line[i]
-        if 0 <= first + 1 < votes.size:
-            votes[first + 1] += (VOTE_SHARES - share) * line[i]
-        line[i] = 0
-
-
-@kernel_part
-def _span_rows(
-    image: NDArray[np.int32], window: tuple[int, int, int, int], spans: NDArray[np.int32]
-) -> None:
-    """Set (rows, 2) spans to the first column with votes and the one behind the last.
-
-    All votes lie in the window: first row, row behind the last, and the same for the columns.
-    """
-    spans[:] = 0
-    for row in range(window[0], window[1]):
-        first, last = window[2], window[3]
-        while first < last and image[row, first] == 0:
-            first += 1
-        while last > first and image[row, last - 1] == 0:
-            last -= 1
-        spans[row, 0], spans[row, 1] = first, last
-
-
-@kernel_part
-def _turn_image(
-    image: NDArray[np.int32], window: tuple[int, int, int, int], turned: NDArray[np.int32]
-) -> None:
-    """Set turned to the image with rows and columns exchanged, tile by tile for the cache."""
-    for top in range(window[0], window[1], _TILE):
-        for left in range(window[2], window[3], _TILE):
-            for column in range(left, min(left + _TILE, window[3])):
-                for row in range(top, min(top + _TILE, window[1])):
-                    turned[column, row] = image[row, column]
-
-
-@kernel_part
 def _count_upright(
     places: NDArray[np.float32],
     weights: NDArray[np.int32],
@@ -300,17 +207,17 @@ def vote_planes(
         if starts[turn] == starts[turn + 1]:
             continue
         window = _count_upright(places, weights, angles[starts[turn], 0], bin_m, cells, image)
-        _turn_image(image, window, turned)
-        _span_rows(image, window, spans)
-        _span_rows(turned, (window[2], window[3], window[0], window[1]), turned_spans)
+        turn_image(image, window, turned)
+        span_rows(image, window, spans)
+        span_rows(turned, (window[2], window[3], window[0], window[1]), turned_spans)
         for d in range(starts[turn], starts[turn + 1]):
             level, rise = math.cos(angles[d, 1]), math.sin(angles[d, 1])
             if level >= abs(rise):
-                piece = _add_sheared(image, spans, rise / level, line)
-                _share_out(line, piece, (n_rows, n_columns), level, votes[d])
+                piece = add_sheared(image, spans, rise / level, line)
+                share_out(line, piece, (n_rows, n_columns), level, votes[d])
             else:
-                piece = _add_sheared(turned, turned_spans, level / rise, line)
-                _share_out(line, piece, (n_columns, n_rows), rise, votes[d])
+                piece = add_sheared(turned, turned_spans, level / rise, line)
+                share_out(line, piece, (n_columns, n_rows), rise, votes[d])
         image[window[0] : window[1], window[2] : window[3]] = 0
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Final
 
 import numpy as np
@@ -19,10 +19,17 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Plane
 from orthoflow.geometry.plane_kernels import vote_lines, vote_points
 from orthoflow.geometry.point_kernels import in_threads
+from orthoflow.geometry.shear_kernels import VOTE_SHARES, vote_image
 from orthoflow_plugins.plane.candidates import Candidate
 from orthoflow_plugins.plane.leftovers import PlanLeftovers
 from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.voters import Accumulation, Voters, plan_centre_m, voters
+from orthoflow_plugins.plane.voters import (
+    Accumulation,
+    Voters,
+    plan_centre_m,
+    vote_counts,
+    voters,
+)
 
 # A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
 # several bins until it is refined.
@@ -91,7 +98,7 @@ class PlanProposer:
         if whole.plan is None:
             raise ValueError("the points of the cloud were not counted over its plan")
         self._whole = whole
-        self._leftovers = PlanLeftovers(whole.plan, grid, whole)
+        self._plan = whole.plan
         self._cells = np.zeros(grid.shape[:2], dtype=np.int64)
         self._heights = whole.plan.heights
         self._voters: Voters | None = None
@@ -155,9 +162,13 @@ class PlanProposer:
         if self._counted_for == remainder.n_unclaimed:
             return
         self._counted_for = remainder.n_unclaimed
-        claims = remainder.sample_claims
-        self._heights = self._leftovers.heights(claims)
-        before, self._cells = self._cells, self._leftovers.cells(claims)
+        before = self._cells
+        if remainder.n_unclaimed == len(remainder.claims):
+            self._cells, self._heights = self._plan.cells, self._plan.heights
+        else:
+            claims = remainder.sample_claims
+            self._heights = self._leftovers.heights(claims)
+            self._cells = self._leftovers.cells(claims)
         self._voters = None
         if not self._voting.walls:
             return
@@ -166,30 +177,29 @@ class PlanProposer:
             self._vote_raw()
         elif self._voting.accumulator == "counts":
             # Votes are sums: what was taken away takes its votes back.
-            self._add(voters(self._grid, self._cells - before, "counts"))
+            self._add(self._cells - before)
         else:
             self._votes = np.zeros(self._votes.shape, dtype=np.int64)
-            self._add(voters(self._grid, self._cells, self._voting.accumulator))
+            self._add(vote_counts(self._cells, self._voting.accumulator))
         if self.first is None:
             self.first = Accumulator(
                 angles_rad=self._angles_rad,
                 low_m=-self._reach_bins * self._grid.cell_m,
                 bin_m=self._grid.cell_m,
                 centre_m=plan_centre_m(self._grid),
-                votes=self._votes.copy(),
+                votes=np.rint(self._votes / VOTE_SHARES).astype(np.int64),
             )
-        self._scores = contrast(self._votes, self._smear_bins)
+        self._scores = contrast(self._votes, self._smear_bins) / VOTE_SHARES
 
-    def _add(self, cells: Voters) -> None:
-        """Let cells vote for all lines through them."""
-        bin_m = self._grid.cell_m
-        low_m = -self._reach_bins * bin_m
-        in_threads(
-            [
-                partial(vote_lines, cells.places_m, cells.votes, angles, low_m, bin_m, table)
-                for angles, table in self._shares()
-            ]
-        )
+    @cached_property
+    def _leftovers(self) -> PlanLeftovers:
+        """What planes leave over; who looks for one plane only never asks."""
+        return PlanLeftovers(self._plan, self._grid, self._whole)
+
+    def _add(self, votes: NDArray[np.int64]) -> None:
+        """Let the cells of the plan (e1, e2) vote for all lines through them."""
+        image = votes.astype(np.int32)
+        in_threads([partial(vote_image, image, angles, table) for angles, table in self._shares()])
 
     def _vote_raw(self) -> None:
         """Let every unclaimed point of the cloud vote for all lines through it."""
@@ -204,6 +214,7 @@ class PlanProposer:
                 for angles, table in self._shares()
             ]
         )
+        self._votes *= VOTE_SHARES
 
     def _shares(self) -> list[tuple[NDArray[np.float64], NDArray[np.int64]]]:
         """Angles and their rows of the votes, one share per thread."""
@@ -220,7 +231,7 @@ class PlanProposer:
         """Look around a maximum with finer angles and half-cell bins."""
         cells = self._voters
         if cells is None:
-            cells = voters(self._grid, self._cells, self._voting.accumulator)
+            cells = voters(self._grid, vote_counts(self._cells, self._voting.accumulator))
             self._voters = cells
         places_m = cells.places_m
         bin_m = self._grid.cell_m

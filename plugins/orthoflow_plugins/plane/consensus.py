@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.consensus_kernels import distance_histograms
+from orthoflow.geometry.consensus_kernels import consensus_sums, distance_histograms
 from orthoflow.geometry.point_kernels import in_threads
 from orthoflow_plugins.plane.candidates import Candidate, Family
 from orthoflow_plugins.plane.fitting import refine_plane
@@ -22,8 +21,15 @@ from orthoflow_plugins.plane.hypotheses import (
     curve_order,
     draw_hypotheses,
 )
+from orthoflow_plugins.plane.rejections import Rejections, alike
 from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.scores import MODEL_POINTS, Scores, Scoring, scores_of
+from orthoflow_plugins.plane.scores import (
+    MODEL_POINTS,
+    Scores,
+    Scoring,
+    scores_of,
+    scores_of_sums,
+)
 
 _BINS: Final = 100
 # Points of the sample that hypotheses are drawn from, and that they are scored on, at most.
@@ -34,9 +40,6 @@ _FIRST_POINTS: Final = 2_000
 _SECOND_POINTS: Final = 20_000
 _SECOND_SHARE: Final = 0.1
 _SECOND_LEAST: Final = 50
-# A hypothesis this near to one that turned out to be none is not proposed again.
-_BARRED_DEG: Final = 2.0
-_BARRED_TOLERANCES: Final = 1.0
 # Few points fix a plane badly: it may lean by this much more than what is looked for.
 _LEAN_CAUTION_DEG: Final = 5.0
 # Points within the tolerance may fall short of what a plane needs: the hypothesis is rough.
@@ -109,13 +112,13 @@ class ConsensusProposer:
         self._box_m = corners.max(axis=0) - corners.min(axis=0)
         self._drawn_for = -1
         self._pool: _Pool | None = None
-        self._barred: list[Hypotheses] = []
+        self._witnesses = self._shuffled[:_SECOND_POINTS]
+        self._rejections = Rejections(points_m[self._witnesses] - self._centre_m, search.find_m)
 
     def propose(self, remainder: Remainder) -> Candidate | None:
         """Name the best hypothesis about the points that remain."""
         if self._drawn_for != remainder.n_unclaimed:
-            # What was no plane among other points may be one among those that remain.
-            self._barred.clear()
+            self._rejections.take(remainder.sample_claims[self._witnesses] < 0)
             self._drawn_for = remainder.n_unclaimed
             self._draw(remainder)
         for _ in range(_REDRAWS):
@@ -129,23 +132,24 @@ class ConsensusProposer:
         pool = self._pool
         if pool is None:
             return None
-        is_barred = self._near_any(pool.hypotheses, self._barred)
+        is_barred = self._rejections.cover(pool.hypotheses)
         for place in range(len(pool.hypotheses)):
             if is_barred[place] or not self._is_worth_it(pool.scores, place, remainder):
                 continue
             hypothesis = pool.hypotheses.chosen(np.array([place]))
-            if self._is_crowded(hypothesis, pool.asked_m, remainder.up):
-                return self._candidate(hypothesis, pool.scores, place, remainder)
+            layer = self._crowded_layer(hypothesis, pool.asked_m, remainder.up)
+            if layer is not None:
+                return self._candidate(hypothesis, pool.scores, place, layer, remainder)
             # Not asked about again; the full examination would cost ten times as much.
-            self._barred.append(hypothesis)
-            is_barred |= self._near_any(pool.hypotheses, [hypothesis])
+            self._rejections.add(hypothesis)
+            is_barred |= self._alike(pool.hypotheses, hypothesis)[:, 0]
         return None
 
     def reject(self, candidate: Candidate) -> None:
         """Bar the surroundings of a hypothesis that turned out to be no plane."""
         plane = candidate.plane
         offset_m = plane.offset_m - float(plane.normal @ self._centre_m)
-        self._barred.append(Hypotheses(normals=plane.normal[None], offsets_m=np.array([offset_m])))
+        self._rejections.add(Hypotheses(normals=plane.normal[None], offsets_m=np.array([offset_m])))
 
     def _draw(self, remainder: Remainder) -> None:
         claims = remainder.sample_claims
@@ -159,9 +163,9 @@ class ConsensusProposer:
         drawn = draw_hypotheses(
             self._ordered_m.take(free, axis=0), count, self._search.model, remainder.up, self._rng
         )
-        hypotheses = _joined(drawn, None if earlier is None else earlier.hypotheses)
+        hypotheses = drawn if earlier is None else drawn.joined(earlier.hypotheses)
         hypotheses = hypotheses.chosen(self._leans_well(hypotheses, remainder.up))
-        hypotheses = hypotheses.chosen(~self._near_any(hypotheses, self._barred))
+        hypotheses = hypotheses.chosen(~self._rejections.cover(hypotheses))
         if len(hypotheses) == 0:
             return
         # Among the first of them there nearly always are enough.
@@ -190,18 +194,29 @@ class ConsensusProposer:
     def _score(self, hypotheses: Hypotheses, points_m: NDArray[np.float64], parts: int) -> Scores:
         columns = np.ascontiguousarray(points_m.T, dtype=np.float32)
         rows = hypotheses.rows()
+        find_m, scoring = self._search.find_m, self._search.scoring
+        if scoring != "a-contrario":
+            sums = np.zeros((len(rows), 2), dtype=np.int64)
+            pieces = zip(np.array_split(rows, parts), np.array_split(sums, parts), strict=True)
+            in_threads(
+                [
+                    partial(consensus_sums, columns, planes, find_m, _BINS, table)
+                    for planes, table in pieces
+                ]
+            )
+            return scores_of_sums(sums, scoring, n_bins=_BINS, reach_m=find_m)
         histograms = np.zeros((len(rows), _BINS), dtype=np.int32)
-        pieces = zip(np.array_split(rows, parts), np.array_split(histograms, parts), strict=True)
+        tables = zip(np.array_split(rows, parts), np.array_split(histograms, parts), strict=True)
         in_threads(
             [
-                partial(distance_histograms, columns, planes, self._search.find_m, table)
-                for planes, table in pieces
+                partial(distance_histograms, columns, planes, find_m, table)
+                for planes, table in tables
             ]
         )
         return scores_of(
             histograms,
-            self._search.scoring,
-            reach_m=self._search.find_m,
+            scoring,
+            reach_m=find_m,
             n_points=len(points_m),
             extents_m=np.abs(hypotheses.normals) @ self._box_m,
             model_points=MODEL_POINTS[self._search.model],
@@ -216,27 +231,9 @@ class ConsensusProposer:
         leans: NDArray[np.bool_] = tilts_deg <= limit_deg if wall else tilts_deg >= 90 - limit_deg
         return leans
 
-    def _near_any(self, hypotheses: Hypotheses, others: list[Hypotheses]) -> NDArray[np.bool_]:
-        """(h,) whether hypotheses are much the same as one of some."""
-        if not others:
-            return np.zeros(len(hypotheses), dtype=bool)
-        joined = Hypotheses(
-            normals=np.concatenate([one.normals for one in others]),
-            offsets_m=np.concatenate([one.offsets_m for one in others]),
-        )
-        any_near: NDArray[np.bool_] = np.logical_or.reduce(self._near(hypotheses, joined), axis=1)
-        return any_near
-
-    def _near(self, hypotheses: Hypotheses, others: Hypotheses) -> NDArray[np.bool_]:
+    def _alike(self, hypotheses: Hypotheses, others: Hypotheses) -> NDArray[np.bool_]:
         """(h, o) whether hypotheses are much the same as others."""
-        cosines = hypotheses.normals @ others.normals.T
-        apart_m = np.abs(
-            hypotheses.offsets_m[:, None] - np.copysign(1.0, cosines) * others.offsets_m
-        )
-        near: NDArray[np.bool_] = (np.abs(cosines) > math.cos(math.radians(_BARRED_DEG))) & (
-            apart_m < _BARRED_TOLERANCES * self._search.find_m
-        )
-        return near
+        return alike(hypotheses, others, self._search.find_m)
 
     def _distinct(
         self, hypotheses: Hypotheses, ranked: NDArray[np.intp], n_most: int
@@ -246,7 +243,7 @@ class ConsensusProposer:
         for n_asked in (min(len(ranked), _ALIKE_MOST * n_most), len(ranked)):
             asked = ranked[:n_asked]
             some = hypotheses.chosen(asked)
-            near = self._near(some, some)
+            near = self._alike(some, some)
             kept: list[int] = []
             alike = np.zeros(n_asked, dtype=np.int64)
             for place in range(n_asked):
@@ -265,10 +262,10 @@ class ConsensusProposer:
         n_points = share * remainder.n_unclaimed
         return bool(n_points >= _SUPPORT_CAUTION * self._search.least_share * len(remainder.claims))
 
-    def _is_crowded(
+    def _crowded_layer(
         self, hypothesis: Hypotheses, asked_m: NDArray[np.float64], up: NDArray[np.float64]
-    ) -> bool:
-        """Whether points crowd about a hypothesis once it is moved to the densest layer near it.
+    ) -> Plane | None:
+        """The densest layer near a hypothesis, about the centre, if points crowd about it.
 
         A plane through mouldings and clutter holds many points too, but spread over its slab.
         """
@@ -277,13 +274,19 @@ class ConsensusProposer:
         find_m = self._search.find_m
         moved = refine_plane(asked_m, start, find_m, freedom="free", up=up)
         if moved is None:
-            return False
+            return None
         sizes_m = np.abs(moved.distances_m(asked_m))
         inner = np.count_nonzero(sizes_m <= INNER_SHARE * find_m)
-        return bool(inner >= _CROWDED_SHARE * np.count_nonzero(sizes_m <= find_m))
+        crowds = inner >= _CROWDED_SHARE * np.count_nonzero(sizes_m <= find_m)
+        return moved if crowds else None
 
     def _candidate(
-        self, hypothesis: Hypotheses, scores: Scores, place: int, remainder: Remainder
+        self,
+        hypothesis: Hypotheses,
+        scores: Scores,
+        place: int,
+        layer: Plane,
+        remainder: Remainder,
     ) -> Candidate:
         own_m = None
         if self._search.scoring == "a-contrario":
@@ -295,6 +298,10 @@ class ConsensusProposer:
             family="wall" if self._search.model == "2d" else self._search.family,
             support=float(scores.value[place]),
             own_tolerance_m=own_m,
+            start=Plane(
+                normal=layer.normal,
+                offset_m=layer.offset_m + float(layer.normal @ self._centre_m),
+            ),
         )
 
     def _polished(
@@ -314,15 +321,6 @@ class ConsensusProposer:
                 break
             hypothesis, best = fitted, score
         return hypothesis, float(best.tolerance_m[0])
-
-
-def _joined(first: Hypotheses, second: Hypotheses | None) -> Hypotheses:
-    if second is None:
-        return first
-    return Hypotheses(
-        normals=np.concatenate([first.normals, second.normals]),
-        offsets_m=np.concatenate([first.offsets_m, second.offsets_m]),
-    )
 
 
 def _fitted(

@@ -24,9 +24,10 @@ from orthoflow_plugins.plane.preparing import prepare, sample_alone
 from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.reporting import report_planes, report_thickness, report_times
 from orthoflow_plugins.plane.sampling import thinned
+from orthoflow_plugins.plane.scan_rows import scan_row
 from orthoflow_plugins.plane.scene_figures import draw_planes
 from orthoflow_plugins.plane.settling import label, name_points, settle
-from orthoflow_plugins.plane.thickness import measure_thickness, scan_row
+from orthoflow_plugins.plane.thickness import measure_thickness
 from orthoflow_plugins.plane.thickness_figures import draw_thickness
 
 Report = Callable[[float, str], None]
@@ -37,6 +38,11 @@ _NO_PLANE: Final = (
     "no plane holds {share:.2%} of the {count} points within {tolerance} m: raise tolerance_m "
     "or fit_tolerance_m for rough or noisy walls, lower min_share for small ones, or raise "
     "max_tilt_deg ({method})"
+)
+
+_NO_INTENSITY: Final = (
+    "materials are told apart by the intensity of the points, which the cloud has not: leave "
+    "materials out, or read a scan with intensity ({method})"
 )
 
 
@@ -115,9 +121,12 @@ def detect(
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
-        MethodError: the points fix no plane, or none has enough of them.
+        MethodError: the points fix no plane, or none has enough of them; or materials are asked for
+            of a cloud without intensity.
     """
     rules = rules_of(params)
+    if params.materials and cloud.intensity is None:
+        raise MethodError(_NO_INTENSITY.format(method=method))
     started_s = perf_counter()
     ctx.progress(0.0, "preparing the points")
 
@@ -178,14 +187,20 @@ def detect(
     plane_of_sample = assembly.labels_from_claims[whole.sample_claims].astype(np.int64)
     draw_planes(ctx, assembly.planes, whole.sample.offsets_m, plane_of_sample, cloud)
     found_thickness = measure_thickness(
-        assembly.planes, plane_of_sample, whole, cloud, reach_m=rules.fit_m
+        assembly.planes,
+        plane_of_sample,
+        whole,
+        cloud,
+        reach_m=rules.fit_m,
+        materials=params.materials,
     )
     row = scan_row(assembly.planes, plane_of_sample, whole, cloud)
     report_thickness(ctx, found_thickness)
-    draw_thickness(ctx, assembly.planes, found_thickness, row)
+    draw_thickness(ctx, assembly.planes, found_thickness, row, params.materials)
     details: dict[str, JsonValue] = {
         **assembly.planes.details,
         "thickness": [None if item is None else item.to_json() for item in found_thickness],
+        "scan_row": None if row is None else row.to_json(params.materials),
     }
     return Detection(
         planes=replace(assembly.planes, details=details),

@@ -84,9 +84,10 @@ def _look(
     raster: SurfaceRaster, remainder: Remainder, rules: Rules, freedom: Freedom
 ) -> Look | None:
     """One pass over all points: the cells that belong, and the fit to them; None for no plane."""
+    points, claims = remainder.asked()
     sums = measure_cells(
-        remainder.points,
-        remainder.claims,
+        points,
+        claims,
         raster,
         find_m=rules.find_m,
         fit_m=rules.fit_m,

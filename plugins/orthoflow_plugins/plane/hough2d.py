@@ -37,7 +37,7 @@ class Hough2d(Method):
     """
 
     id = "plane.hough2d"
-    result_version = 1
+    result_version = 2
     determinism = "exact"
     citations = (
         (

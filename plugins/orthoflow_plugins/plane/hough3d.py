@@ -32,7 +32,7 @@ class Hough3d(Method):
     """
 
     id = "plane.hough3d"
-    result_version = 1
+    result_version = 2
     determinism = "exact"
     citations = (
         (

@@ -43,6 +43,13 @@ class Hypotheses:
         """Give some of them."""
         return Hypotheses(normals=self.normals[index], offsets_m=self.offsets_m[index])
 
+    def joined(self, others: Hypotheses) -> Hypotheses:
+        """Give them and some others."""
+        return Hypotheses(
+            normals=np.concatenate([self.normals, others.normals]),
+            offsets_m=np.concatenate([self.offsets_m, others.offsets_m]),
+        )
+
     def rows(self) -> NDArray[np.float32]:
         """(h, 4) normal and offset, as the compiled scoring takes them."""
         return np.column_stack([self.normals, self.offsets_m]).astype(np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from orthoflow.sdk import MethodParams
 
@@ -67,6 +67,11 @@ class DetectorParams(MethodParams):
         description="Parts of one plane that do not touch are one plane; else each is its own.",
     )
 
+    materials: dict[str, tuple[float, float]] = Field(
+        default_factory=dict,
+        description="Lowest and highest intensity (0..1) of each material, by its name, e.g. "
+        "{fabric: [0, 0.3], plaster: [0.3, 1]}: how thick the cloud is on each of them is told.",
+    )
     refit: bool = Field(
         default=True,
         description="Fit planes to all their points, the same for every detector; else they stay "
@@ -77,6 +82,25 @@ class DetectorParams(MethodParams):
     def family(self) -> Family:
         """The planes that `constraint` asks for."""
         return _FAMILIES[self.constraint]
+
+    @field_validator("materials")
+    @classmethod
+    def _materials_lie_apart(
+        cls, materials: dict[str, tuple[float, float]]
+    ) -> dict[str, tuple[float, float]]:
+        before_name, before = "", 0.0
+        for name, (low, high) in sorted(materials.items(), key=lambda item: item[1]):
+            if not 0.0 <= low < high <= 1.0:
+                raise ValueError(
+                    f"intensities of {name} must ascend between 0 and 1, got {low:g} and {high:g}"
+                )
+            if low < before:
+                raise ValueError(
+                    f"intensities of {name} begin at {low:g}, below {before:g} where those of "
+                    f"{before_name} end"
+                )
+            before_name, before = name, high
+        return materials
 
     @model_validator(mode="after")
     def _fit_lies_within_find(self) -> Self:

@@ -58,11 +58,10 @@ def prepare(
         MethodError: the points coincide or lie on one line.
     """
     sample = draw_sample(cloud)
-    spread = np.linalg.svd(
-        sample.offsets_m - sample.offsets_m.mean(axis=0), compute_uv=False, full_matrices=False
-    ) / np.sqrt(len(sample.index))
-    if spread[1] < _THINNEST_M:
-        where = "coincide" if spread[0] < _THINNEST_M else "lie on one line"
+    centred = sample.offsets_m - sample.offsets_m.mean(axis=0)
+    spread_m2 = np.linalg.eigvalsh(centred.T @ centred) / len(sample.index)
+    if spread_m2[1] < _THINNEST_M**2:
+        where = "coincide" if spread_m2[2] < _THINNEST_M**2 else "lie on one line"
         raise MethodError(f"the {len(cloud)} points of the cloud {where}, which fixes no plane")
     grid = plan_grid(sample, basis, cell_m=cell_m, outside_share=0.25 * least_share)
     parts = max(1, min(parts, _PARTS_MOST))

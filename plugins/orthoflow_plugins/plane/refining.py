@@ -28,10 +28,11 @@ _SAMPLE_CAUTION: Final = 0.7
 # Parts are of one plane when the common fit lies not much worse in the largest than its own.
 _ASKEW: Final = 1.5
 _SAME_M: Final = 2e-4
-# Points that are enough to move a candidate to the surface near it; the fit that follows has all.
-_FIRST_POINTS: Final = 60_000
+# Points that are enough to move a candidate to the surface near it; the fits that follow, to the
+# cells of the sample and then of all points, have all.
+_FIT_POINTS: Final = 20_000
 # Points that are enough to see how far a candidate's points spread.
-_SPREAD_POINTS: Final = 20_000
+_SPREAD_POINTS: Final = 5_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +53,10 @@ def refine_on_sample(
 ) -> Refined | None:
     """Move a candidate to the surface near it; None where too few of the sample crowd there."""
     sample = remainder.sample
-    free_points = remainder.free_sample_m()
+    free_points = remainder.free_sample().offsets_m
     first, *rest = shrinking_tolerances(rules.find_m, rules.fit_m)
     start = candidate.plane if candidate.start is None else candidate.start
-    some = free_points[:: max(1, len(free_points) // _FIRST_POINTS)]
+    some = _thinned(free_points, _FIT_POINTS)
     plane = refine_plane(some, start, first, freedom=freedom, up=remainder.up)
     if plane is None:
         return None
@@ -66,12 +67,19 @@ def refine_on_sample(
     least = _SAMPLE_CAUTION * rules.least_share * len(sample.index)
     if place is None or place.n_points < least:
         return None
-    plane = _fitted_to_parts(plane, near, raster, place, (first, *rest), freedom, remainder.up)
+    plane = _fitted_to_parts(
+        plane, _thinned(near, _FIT_POINTS), raster, place, (first, *rest), freedom, remainder.up
+    )
     if plane is None:
         return None
     n_represented = float(sums.n_find[place.cells].sum()) * sample.n_represented
     area_m2 = float(place.cells.sum()) * raster.cell_m**2
     return Refined(plane=plane, cell_m=cell_for(n_represented, area_m2))
+
+
+def _thinned(points: NDArray[np.float64], n_most: int) -> NDArray[np.float64]:
+    """Some of the points (m, 3), about so many if there are more."""
+    return points[:: max(1, len(points) // n_most)]
 
 
 def _fitted_to_parts(
@@ -123,9 +131,10 @@ def _sample_cells(
     low, high = _spread(placed) if len(near) else np.zeros((2, 2))
     cell_m = max(rules.find_m, cell_for(len(near), float(np.prod(high - low))))
     raster = surface_raster(plane, remainder.box_corners(), remainder.up, cell_m=cell_m)
+    free = remainder.free_sample()
     sums = measure_cells(
-        remainder.sample.points,
-        remainder.sample_claims,
+        free.points,
+        free.claims,
         raster,
         find_m=rules.find_m,
         fit_m=rules.fit_m,
@@ -136,7 +145,7 @@ def _sample_cells(
 
 def _spread(placed_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """(2, 2) where the middle 96 % of points (m, 2) begin and end along both axes."""
-    some = placed_m[:: max(1, len(placed_m) // _SPREAD_POINTS)]
+    some = _thinned(placed_m, _SPREAD_POINTS)
     spread: NDArray[np.float64] = np.quantile(some, (0.02, 0.98), axis=0)
     return spread
 

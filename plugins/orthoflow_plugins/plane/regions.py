@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from orthoflow.geometry import Plane
 from orthoflow.geometry.point_kernels import BlockedPoints
 from orthoflow.geometry.region_kernels import grow_regions, sum_regions
-from orthoflow_plugins.plane.surface_cells import SurfaceCells
+from orthoflow_plugins.plane.coarser_cells import coarser
+from orthoflow_plugins.plane.surface_cells import POINTS_LEAST, SurfaceCells
 
 _FREE: Final = -2
 _NONE: Final = -1
@@ -23,6 +24,10 @@ _NARROWEST: Final = 0.2
 # Seeds are taken flattest first, in steps of this share of a cell.
 _FLATNESS_STEP: Final = 1.0 / 2000.0
 _MEAN_SHIFTS: Final = 12
+# How often cells become twice as wide where neighbourhoods hold less than so many times the points
+# that a normal needs.
+_WIDENINGS: Final = 2
+_THIN: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +108,48 @@ def grow(cells: SurfaceCells, growth: Growth, viewer_m: NDArray[np.float64]) -> 
 
 
 def _grown(cells: SurfaceCells, growth: Growth, distance_m: float) -> tuple[NDArray[np.int32], int]:
+    """Grow regions; where the cloud is thin, those of wider cells among what they leave."""
+    regions, n_regions = _grown_once(cells, growth, distance_m)
+    crumbs = np.flatnonzero(_is_crumb(cells, regions, growth))
+    cells_left = cells
+    for _ in range(_WIDENINGS):
+        n_left = cells_left.counts[crumbs]
+        if n_left.sum() < growth.least_points or not _is_thin(cells_left, n_left):
+            break
+        step = coarser(cells_left, crumbs)
+        found, n_found = _grown_once(step.cells, growth, distance_m)
+        if cells_left is cells:
+            wide_of_cell = np.full(len(regions), -1)
+            wide_of_cell[crumbs] = step.of_member
+        else:
+            of_wide = np.full(len(cells_left.counts), -1)
+            of_wide[crumbs] = step.of_member
+            wide_of_cell = np.where(wide_of_cell >= 0, of_wide[wide_of_cell], -1)
+        is_crumb = _is_crumb(step.cells, found, growth)
+        joins = (wide_of_cell >= 0) & ~is_crumb[wide_of_cell]
+        regions[joins] = n_regions + found[wide_of_cell[joins]]
+        n_regions += n_found
+        cells_left, crumbs = step.cells, np.flatnonzero(is_crumb)
+    return regions, n_regions
+
+
+def _is_crumb(cells: SurfaceCells, regions: NDArray[np.int32], growth: Growth) -> NDArray[np.bool_]:
+    """(m,) whether cells are in no region, or in one with too few points to be looked at."""
+    n_points = np.bincount(regions + 1, cells.counts)
+    too_few = n_points < growth.least_points
+    too_few[0] = True
+    return np.asarray(too_few[regions + 1])
+
+
+def _is_thin(cells: SurfaceCells, counts: NDArray[np.int64]) -> bool:
+    """Whether neighbourhoods of cells with these counts hold few points for a normal."""
+    in_neighbourhood = float(counts.mean()) * cells.neighbourhood.width_cells() ** 2
+    return in_neighbourhood < _THIN * POINTS_LEAST
+
+
+def _grown_once(
+    cells: SurfaceCells, growth: Growth, distance_m: float
+) -> tuple[NDArray[np.int32], int]:
     reach = distance_m / cells.grid.cell_m
     deviation, width = cells.spreads[:, 0], cells.spreads[:, 1]
     may_join = (deviation <= reach) & (deviation <= _ROUNDEST * width) & (width > _NARROWEST)

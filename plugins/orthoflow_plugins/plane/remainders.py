@@ -16,7 +16,7 @@ from orthoflow.geometry.point_kernels import (
     each_part,
     piece_of,
 )
-from orthoflow_plugins.plane.sampling import Sample
+from orthoflow_plugins.plane.sampling import Sample, boxed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +30,23 @@ class Taking:
 
     slabs: NDArray[np.float64]
     bounds: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeSample:
+    """The points of a sample that no plane has.
+
+    Attributes:
+        offsets_m: (m, 3) offsets.
+        points: the same for the compiled passes.
+        claims: (m,) int8, -1 each.
+        n_takings: planes that had taken points.
+    """
+
+    offsets_m: NDArray[np.float64]
+    points: BlockedPoints
+    claims: NDArray[np.int8]
+    n_takings: int
 
 
 @dataclass(kw_only=True)
@@ -57,17 +74,33 @@ class Remainder:
     plan: PlanCounts | None = None
     takings: list[Taking] = field(default_factory=list)
     n_unclaimed: int = field(init=False)
-    _free: tuple[int, NDArray[np.float64]] | None = field(init=False, default=None)
+    _free: FreeSample | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         self.n_unclaimed = len(self.claims)
 
-    def free_sample_m(self) -> NDArray[np.float64]:
-        """(m, 3) offsets of the sample points that no plane has; kept until the next claim."""
-        if self._free is None or self._free[0] != len(self.takings):
-            free = np.flatnonzero(self.sample_claims < 0)
-            self._free = (len(self.takings), self.sample.offsets_m.take(free, axis=0))
-        return self._free[1]
+    def free_sample(self) -> FreeSample:
+        """The sample points that no plane has; kept until the next claim."""
+        if self._free is None or self._free.n_takings != len(self.takings):
+            index = np.flatnonzero(self.sample_claims < 0)
+            offsets_m = self.sample.offsets_m.take(index, axis=0)
+            self._free = FreeSample(
+                offsets_m=offsets_m,
+                points=boxed(offsets_m),
+                claims=np.full(len(index), -1, dtype=np.int8),
+                n_takings=len(self.takings),
+            )
+        return self._free
+
+    def asked(self) -> tuple[BlockedPoints, NDArray[np.int8]]:
+        """Points that a pass over what no plane has must ask, and the claims of each.
+
+        All of the cloud, or the free points alone where the sample is all of it.
+        """
+        if len(self.sample.index) != len(self.claims):
+            return self.points, self.claims
+        free = self.free_sample()
+        return free.points, free.claims
 
     @property
     def sample_claims(self) -> NDArray[np.int8]:

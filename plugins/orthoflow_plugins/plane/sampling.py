@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.point_kernels import (
-    BLOCK_POINTS,
     BlockedPoints,
-    Offsets,
     PlanGrid,
     blocked,
+    box_blocks,
     read_only,
 )
 from orthoflow.products import PointCloud
@@ -23,7 +22,7 @@ SAMPLE_POINTS: Final = 200_000
 # More cells than this cost more than they show; the cell grows instead.
 PLAN_CELLS_MOST: Final = 8_000_000
 # Points that are enough to see where a scene ends.
-_BOX_POINTS: Final = 40_000
+_BOX_POINTS: Final = 20_000
 _TAIL_SHARE: Final = 0.05
 _GOLDEN: Final = 0.6180339887498949
 
@@ -64,7 +63,7 @@ def draw_sample(cloud: PointCloud, *, n_most: int = SAMPLE_POINTS) -> Sample:
     return Sample(
         index=index,
         offsets_m=offsets_m,
-        points=blocked(offsets, _boxes(offsets)),
+        points=boxed(offsets_m),
         n_represented=len(cloud) / len(index),
     )
 
@@ -98,12 +97,10 @@ def _spread_index(n_points: int, count: int) -> NDArray[np.int64]:
     return np.minimum((ordinal + within) * stretch, n_points - 1).astype(np.int64)
 
 
-def _boxes(offsets: Offsets) -> NDArray[np.float32]:
-    starts = np.arange(0, len(offsets.x), BLOCK_POINTS)
-    columns = []
-    for values in offsets:
-        columns += [np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)]
-    return np.column_stack(columns)
+def boxed(offsets_m: NDArray[np.float64]) -> BlockedPoints:
+    """Give points (m, 3) of a sample in blocks."""
+    offsets = read_only(*np.ascontiguousarray(offsets_m.T, dtype=np.float32))
+    return blocked(offsets, box_blocks(offsets, parts=1).boxes)
 
 
 def plan_grid(

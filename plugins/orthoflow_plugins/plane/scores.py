@@ -69,6 +69,22 @@ def scores_of(
     )
 
 
+def scores_of_sums(
+    sums: NDArray[np.int64], scoring: Scoring, *, n_bins: int, reach_m: float
+) -> Scores:
+    """Score hypotheses as `scores_of` does, by count or msac, from what `consensus_sums` gives.
+
+    Args:
+        sums: (h, 2) see there.
+        scoring: count or msac.
+        n_bins: bins that the distances were put into.
+        reach_m: the tolerance.
+    """
+    n_points = sums[:, 0].copy()
+    value = sums[:, 1] / (4.0 * n_bins**2) if scoring == "msac" else n_points.astype(np.float64)
+    return Scores(value=value, tolerance_m=np.full(len(value), reach_m), n_points=n_points)
+
+
 def _fewest_false_alarms(
     within: NDArray[np.int64],
     reach_m: float,

@@ -38,7 +38,7 @@ from orthoflow_plugins.plane.voxels import coarsened, with_room
 Shape = Literal["cube", "radius", "knn"]
 
 # Points a neighbourhood should hold where the cloud is thin, so that its normal means something.
-_POINTS_LEAST: Final = 16.0
+POINTS_LEAST: Final = 16.0
 # A cell is no larger than this share of the scene.
 _CELL_SHARE_MOST: Final = 0.05
 # Rows and cells that tables begin with.
@@ -163,25 +163,7 @@ def surface_cells(remainder: Remainder, wanted: Neighbourhood) -> SurfaceCells:
     table = _in_order(_gathered(remainder, grid))
     bricks = table.bricks.reshape(-(-np.array(grid.shape) // BRICK_SIDE))
     places = _places(bricks, table.numbers)
-    normals = np.empty((len(places), 3), dtype=np.float32)
-    spreads = np.empty((len(places), 3), dtype=np.float32)
-    around = used.around()
-
-    def fit(_part: int, piece: slice) -> None:
-        fit_neighbourhoods(
-            places[piece],
-            piece.start,
-            bricks,
-            table.numbers,
-            table.sums,
-            around,
-            used.enough,
-            normals[piece],
-            spreads[piece],
-        )
-
-    each_part(len(places), remainder.parts, fit)
-    return SurfaceCells(
+    cells = SurfaceCells(
         neighbourhood=used,
         grid=grid,
         frame=plan_frame(grid),
@@ -189,9 +171,31 @@ def surface_cells(remainder: Remainder, wanted: Neighbourhood) -> SurfaceCells:
         numbers=table.numbers,
         places=places,
         sums=table.sums,
-        normals=normals,
-        spreads=spreads,
+        normals=np.empty((len(places), 3), dtype=np.float32),
+        spreads=np.empty((len(places), 3), dtype=np.float32),
     )
+    return with_normals(cells, parts=remainder.parts)
+
+
+def with_normals(cells: SurfaceCells, *, parts: int) -> SurfaceCells:
+    """Fit a plane to the neighbourhood of each cell, which sets normals and spreads."""
+    around = cells.neighbourhood.around()
+
+    def fit(_part: int, piece: slice) -> None:
+        fit_neighbourhoods(
+            cells.places[piece],
+            piece.start,
+            cells.bricks,
+            cells.numbers,
+            cells.sums,
+            around,
+            cells.neighbourhood.enough,
+            cells.normals[piece],
+            cells.spreads[piece],
+        )
+
+    each_part(len(cells.places), parts, fit)
+    return cells
 
 
 @dataclass(kw_only=True)
@@ -222,7 +226,7 @@ def _cell_grid(remainder: Remainder, wanted: Neighbourhood) -> PlanGrid:
     # How many others of the sample share a point's cell: chance alone shares no cell, however few.
     others = float((counts * (counts - 1)).sum()) / max(1, len(sample.index))
     in_neighbourhood = others * sample.n_represented * wanted.width_cells() ** 2
-    scale = math.sqrt(_POINTS_LEAST / max(in_neighbourhood, 1e-9))
+    scale = math.sqrt(POINTS_LEAST / max(in_neighbourhood, 1e-9))
     cell_m = wanted.cell_m * scale if scale > 1.0 else wanted.cell_m
     cell_m = min(cell_m, max(wanted.cell_m, _CELL_SHARE_MOST * float(extent_m.max())))
     cell_m = coarsened(cell_m, extent_m)

@@ -7,6 +7,7 @@ from the sample that every detector has; the scan row alone is read from the who
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -25,8 +26,10 @@ _INCIDENCE_DEG: Final = tuple(float(edge) for edge in range(0, 91, 10))
 _CLASSES: Final = 6
 # Half the share of a normal distribution that lies outside the width reported.
 _TAIL: Final = 0.025
-# Points a scan row needs on a plane to be worth drawing.
-_ROW_LEAST: Final = 20
+
+
+# Lowest and highest intensity of each material.
+Materials = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,12 +41,25 @@ class Spread:
         high: largest value of the class.
         n_points: points that were measured.
         sigma_m: robust standard deviation.
+        name: of the class, where it has one.
     """
 
     low: float
     high: float
     n_points: int
     sigma_m: float
+    name: str | None = None
+
+    def to_json(self) -> dict[str, JsonValue]:
+        """Numbers for the planes' details."""
+        named: dict[str, JsonValue] = {} if self.name is None else {"name": self.name}
+        return {
+            **named,
+            "low": self.low,
+            "high": self.high,
+            "n_points": self.n_points,
+            "sigma_m": self.sigma_m,
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +71,8 @@ class Thickness:
         width_m: width that holds 95 % of them.
         scan_step_m: distance between neighbouring points on the plane, median over tiles.
         over: spreads by class of `incidence_deg`, `range_m` (where stations are known) and
-            `intensity` (which tells materials apart, where the cloud has it).
+            `intensity` (which tells materials apart, where the cloud has it), and by `material`
+            where those were named.
     """
 
     sigma_m: float
@@ -69,36 +86,17 @@ class Thickness:
             "sigma_m": self.sigma_m,
             "width_95_m": self.width_m,
             "scan_step_m": self.scan_step_m,
-            **{
-                name: [
-                    {
-                        "low": item.low,
-                        "high": item.high,
-                        "n_points": item.n_points,
-                        "sigma_m": item.sigma_m,
-                    }
-                    for item in spreads
-                ]
-                for name, spreads in self.over.items()
-            },
+            **{name: [item.to_json() for item in spreads] for name, spreads in self.over.items()},
         }
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanRow:
-    """One row of one scan on the first plane, as in Figure 3 of markiewicz2015.
+class _Seen:
+    """What thickness is measured on."""
 
-    Attributes:
-        row: its number.
-        scan: the scan it is from.
-        along_m: (n,) place along the plane, to the viewer's right; ascending.
-        distance_m: (n,) distance from the plane, positive towards the viewer.
-    """
-
-    row: int
-    scan: int
-    along_m: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
+    whole: Remainder
+    cloud: PointCloud
+    materials: Materials
 
 
 def measure_thickness(
@@ -108,6 +106,7 @@ def measure_thickness(
     cloud: PointCloud,
     *,
     reach_m: float,
+    materials: Materials,
 ) -> tuple[Thickness | None, ...]:
     """Measure the thickness of each plane; None where too few points are on it.
 
@@ -117,14 +116,16 @@ def measure_thickness(
         whole: the cloud and its sample.
         cloud: the cloud.
         reach_m: points further than this from their plane are relief or belong to something else.
+        materials: lowest and highest intensity of each material.
     """
+    seen = _Seen(whole=whole, cloud=cloud, materials=materials)
     found: list[Thickness | None] = []
     for k in range(len(planes)):
         members = np.flatnonzero(plane_of_sample == k)
         offset_m = planes.offset[k] - float(planes.normal[k] @ cloud.origin)
         distance_m = whole.sample.offsets_m[members] @ planes.normal[k] - offset_m
         near = np.abs(distance_m) <= reach_m
-        found.append(_measured(planes, k, members[near], distance_m[near], whole, cloud))
+        found.append(_measured(planes, k, members[near], distance_m[near], seen))
     return tuple(found)
 
 
@@ -133,10 +134,10 @@ def _measured(
     index: int,
     members: NDArray[np.int64],
     distance_m: NDArray[np.float64],
-    whole: Remainder,
-    cloud: PointCloud,
+    seen: _Seen,
 ) -> Thickness | None:
-    points_m = whole.sample.offsets_m[members]
+    sample = seen.whole.sample
+    points_m = sample.offsets_m[members]
     normal = planes.normal[index]
     placed = np.floor(points_m @ wall_axes(normal, planes.up).T / _TILE_M).astype(np.int64)
     # One number per tile, since rows of two take many times as long to sort.
@@ -150,13 +151,13 @@ def _measured(
     tile = tile[crowded]
     deviation_m = (distance_m[crowded] - mean_m[tile]) / np.sqrt(1.0 - 1.0 / count[tile])
     low_m, high_m = np.quantile(deviation_m, (_TAIL, 1.0 - _TAIL))
-    density = float(np.median(count[count >= _TILE_LEAST])) * whole.sample.n_represented
+    density = float(np.median(count[count >= _TILE_LEAST])) * sample.n_represented
     kept = members[crowded]
     return Thickness(
-        sigma_m=_sigma(deviation_m),
+        sigma_m=robust_sigma(deviation_m),
         width_m=float(high_m - low_m),
         scan_step_m=_TILE_M / float(np.sqrt(density)),
-        over=_by_class(points_m[crowded], normal, deviation_m, kept, whole, cloud),
+        over=_by_class(points_m[crowded], normal, deviation_m, kept, seen),
     )
 
 
@@ -165,10 +166,10 @@ def _by_class(
     normal: NDArray[np.float64],
     deviation_m: NDArray[np.float64],
     members: NDArray[np.int64],
-    whole: Remainder,
-    cloud: PointCloud,
+    seen: _Seen,
 ) -> dict[str, tuple[Spread, ...]]:
-    in_cloud = whole.sample.index[members]
+    cloud = seen.cloud
+    in_cloud = seen.whole.sample.index[members]
     over = {}
     stations_m = _stations_of(in_cloud, cloud)
     if stations_m is not None:
@@ -181,7 +182,29 @@ def _by_class(
     if cloud.intensity is not None:
         intensity = cloud.intensity[in_cloud].astype(np.float64)
         over["intensity"] = _spreads(intensity, _even_edges(intensity), deviation_m)
+        if seen.materials:
+            over["material"] = spreads_by_material(intensity, seen.materials, deviation_m)
     return over
+
+
+def spreads_by_material(
+    intensity: NDArray[np.float64], materials: Materials, deviation_m: NDArray[np.float64]
+) -> tuple[Spread, ...]:
+    """Spread of the points of each material; those with too few points are left out."""
+    found = []
+    for name, (low, high) in materials.items():
+        inside = (intensity >= low) & (intensity <= high)
+        if inside.sum() >= _POINTS_LEAST:
+            found.append(
+                Spread(
+                    low=low,
+                    high=high,
+                    n_points=int(inside.sum()),
+                    sigma_m=robust_sigma(deviation_m[inside]),
+                    name=name,
+                )
+            )
+    return tuple(found)
 
 
 def _stations_of(index: NDArray[np.int64], cloud: PointCloud) -> NDArray[np.float64] | None:
@@ -218,40 +241,12 @@ def _spreads(
                     low=float(edges[k]),
                     high=float(edges[k + 1]),
                     n_points=int(inside.sum()),
-                    sigma_m=_sigma(deviation_m[inside]),
+                    sigma_m=robust_sigma(deviation_m[inside]),
                 )
             )
     return tuple(found)
 
 
-def _sigma(deviation_m: NDArray[np.float64]) -> float:
+def robust_sigma(deviation_m: NDArray[np.float64]) -> float:
+    """Standard deviation of a normal distribution with the same median deviation."""
     return 1.4826 * float(np.median(np.abs(deviation_m)))
-
-
-def scan_row(
-    planes: Planes, plane_of_sample: NDArray[np.int64], whole: Remainder, cloud: PointCloud
-) -> ScanRow | None:
-    """Give the scan row that most of the first plane's points are on, None without rows."""
-    if cloud.row is None:
-        return None
-    members = whole.sample.index[plane_of_sample == 0]
-    if not len(members):
-        return None
-    scans = np.zeros(len(members), dtype=np.int64) if cloud.scan is None else cloud.scan[members]
-    keys = scans.astype(np.int64) * 2**32 + cloud.row[members]
-    names, counts = np.unique(keys, return_counts=True)
-    scan, row = divmod(int(names[np.argmax(counts)]), 2**32)
-    chosen = np.flatnonzero(cloud.row == row)
-    if cloud.scan is not None:
-        chosen = chosen[cloud.scan[chosen] == scan]
-    on_plane = whole.claims[chosen]
-    claim = whole.sample_claims[plane_of_sample == 0]
-    chosen = chosen[on_plane == claim[0]]
-    if len(chosen) < _ROW_LEAST:
-        return None
-    points = np.column_stack([cloud.x[chosen], cloud.y[chosen], cloud.z[chosen]]).astype(np.float64)
-    normal = planes.normal[0]
-    along_m = points @ wall_axes(normal, planes.up)[0]
-    order = np.argsort(along_m, kind="stable")
-    distance_m = points @ normal - (planes.offset[0] - float(normal @ cloud.origin))
-    return ScanRow(row=row, scan=scan, along_m=along_m[order], distance_m=distance_m[order])

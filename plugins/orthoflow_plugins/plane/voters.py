@@ -38,29 +38,33 @@ def plan_centre_m(grid: PlanGrid) -> NDArray[np.float64]:
     return centre
 
 
-def voters(grid: PlanGrid, counts: NDArray[np.int64], accumulation: Accumulation) -> Voters:
-    """Choose the cells that vote.
+def vote_counts(counts: NDArray[np.int64], accumulation: Accumulation) -> NDArray[np.int64]:
+    """(e1, e2) votes of each cell of a plan.
 
     With one vote per cell, votes are multiplied by the points of a mean voter, so that they compare
     with the heights, which are counted in points.
 
     Args:
-        grid: where the cells lie.
         counts: (e1, e2) points per cell.
         accumulation: how loud a cell is.
     """
+    if accumulation == "counts":
+        return counts
     chosen = _edges(counts) if accumulation == "canny" else counts != 0
-    first, second = np.nonzero(chosen)
-    votes = counts[first, second]
-    if accumulation != "counts":
-        votes = np.full(len(first), max(1, round(float(votes.mean()) if len(votes) else 1.0)))
+    mean = float(counts[chosen].mean()) if chosen.any() else 1.0
+    return chosen * np.int64(max(1, round(mean)))
+
+
+def voters(grid: PlanGrid, votes: NDArray[np.int64]) -> Voters:
+    """List the cells (e1, e2) that have votes."""
+    first, second = np.nonzero(votes)
     places = np.column_stack(
         [
             (first + 0.5 - 0.5 * grid.shape[0]) * grid.cell_m,
             (second + 0.5 - 0.5 * grid.shape[1]) * grid.cell_m,
         ]
     ).astype(np.float32)
-    return Voters(places_m=places, votes=votes.astype(np.int64), centre_m=plan_centre_m(grid))
+    return Voters(places_m=places, votes=votes[first, second], centre_m=plan_centre_m(grid))
 
 
 def _edges(counts: NDArray[np.int64]) -> NDArray[np.bool_]:
