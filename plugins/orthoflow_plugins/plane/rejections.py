@@ -80,4 +80,5 @@ class Rejections:
         """(h,) free points near each hypothesis."""
         free_m = self._points_m[self._is_free]
         apart_m = np.abs(free_m @ hypotheses.normals.T - hypotheses.offsets_m)
-        return np.count_nonzero(apart_m <= self._tolerance_m, axis=0)
+        n_near: NDArray[np.int64] = np.sum(apart_m <= self._tolerance_m, axis=0, dtype=np.int64)
+        return n_near
