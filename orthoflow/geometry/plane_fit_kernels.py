@@ -72,7 +72,7 @@ def _nearby(
         near[count, 0], near[count, 1], near[count, 2] = x, y, z
         distance_m = plane[0] * x + plane[1] * y + plane[2] * z - plane[3]
         # Without a branch: which points are near cannot be foretold.
-        count += np.int64(abs(distance_m) < reach_m)
+        count += 1 if abs(distance_m) < reach_m else 0
     return near[:count]
 
 
