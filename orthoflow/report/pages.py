@@ -156,8 +156,8 @@ def cited(citation: str) -> Markup:
 
 
 def _breakable(name: str) -> Markup:
-    """Let a long name be broken behind its underscores."""
-    return Markup("_<wbr>").join(name.split("_"))
+    """Let a long name or address be broken behind its underscores, and before its variants."""
+    return Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(name))))
 
 
 def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
