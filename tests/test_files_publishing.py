@@ -404,3 +404,41 @@ def test_the_table_of_residuals_is_published_as_it_is(tmp_path: Path) -> None:
     assert [list(line) for line in found] == [list(row)] * 2
     assert [line["shift_p"] for line in found] == ["", "0.25"]
     assert found[0]["n"] == "3"
+
+
+def test_large_images_are_written_in_bands_and_read_back_the_same(
+    tmp_path: Path, frame: WallFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import rasterio
+
+    tall, profile = replace(frame, width=600, height=1100), bytes(range(256))
+    product = Orthoimages(images=(orthoimage(tall),), icc_profile=profile)
+    folders = [tmp_path / "whole", tmp_path / "bands"]
+    for folder in folders:
+        folder.mkdir()
+        publishing.publish_orthoimages(product, folder, DIGEST)
+        monkeypatch.setattr(geotiff, "_IN_MEMORY_CELLS", 1000)
+        monkeypatch.setattr(images, "_WHOLE_PX", 1000)
+    whole, bands = (geotiff.read_raster(folder / "wall_3_ortho.tif") for folder in folders)
+    np.testing.assert_array_equal(bands.values, whole.values)
+    np.testing.assert_array_equal(bands.shown, whole.shown)
+    assert bands.tags == whole.tags
+    assert (bands.layout, bands.overviews) == ("COG", whole.overviews)
+    for folder in folders:
+        with rasterio.open(folder / "wall_3_ortho.tif") as dataset:
+            told = dataset.tags(ns="COLOR_PROFILE")["SOURCE_ICC_PROFILE"]
+        assert base64.b64decode(told) == profile
+    names = [sorted(path.name for path in folder.iterdir()) for folder in folders]
+    assert names[0] == names[1]
+    with pytest.raises(StoreError, match=r"wall_3_ortho\.tif cannot be written: .*No such file"):
+        publishing.publish_orthoimages(product, tmp_path / "missing", DIGEST)
+
+
+def test_previews_of_large_images_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    rgb = np.repeat(np.repeat(rng.integers(0, 256, (24, 40, 3), np.uint8), 16, 0), 16, 1)
+    shown = np.repeat(np.repeat(rng.random((24, 40)) < 0.8, 16, 0), 16, 1)
+    whole = images.decode_image(images.preview_png(rgb, shown, longest_side_px=40), "whole")
+    monkeypatch.setattr(images, "_WHOLE_PX", 1000)
+    bands = images.decode_image(images.preview_png(rgb, shown, longest_side_px=40), "bands")
+    np.testing.assert_array_equal(bands, whole)

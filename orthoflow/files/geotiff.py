@@ -21,12 +21,27 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError, ProductError, StoreError
 
 if TYPE_CHECKING:
+    from rasterio.io import DatasetWriter
     from rasterio.transform import Affine
+    from rasterio.windows import Window
 
 LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["plane of the wall, metres",UNIT["metre",1.0],AXIS["X",EAST],AXIS["Y",NORTH]]'
 )
 TILE_PX: Final = 512
+# Larger images are not laid out in memory, but in a file beside the one to write.
+_IN_MEMORY_CELLS: Final = 1 << 26
+_CACHE_BYTES: Final = 1 << 27
+
+
+_COG_OPTIONS: Final[dict[str, object]] = {
+    "compress": "DEFLATE",
+    "predictor": "YES",
+    "blocksize": TILE_PX,
+    # The driver makes overviews itself; odd factors with a mask crashed older builds.
+    "overviews": "AUTO",
+    "resampling": "AVERAGE",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +117,9 @@ def write_orthoimage(
 ) -> None:
     """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
 
+    Images of more than 64 million cells are written band by band, so that arrays mapped from files
+    need not fit into memory; an uncompressed copy lies beside the file while it is made.
+
     Args:
         path: file to write; its folder exists.
         rgb: (rows, cols, 3).
@@ -118,20 +136,67 @@ def write_orthoimage(
             f"{path.name} takes uint8 RGB and a mask of one size, got {rgb.dtype} of shape "
             f"{rgb.shape} and a mask of {shown.shape}"
         )
-    profile: dict[str, object] = {
-        "driver": "COG",
-        "count": 3,
-        "dtype": "uint8",
-        "compress": "DEFLATE",
-        "predictor": "YES",
-        "blocksize": TILE_PX,
-        # The driver makes overviews itself; odd factors with a mask crashed older builds.
-        "overviews": "AUTO",
-        "resampling": "AVERAGE",
-    }
-    bands = np.moveaxis(rgb, 2, 0)
-    placed = profile | _placed(shown.shape, gsd_m)
-    _write(path, bands, shown, placed, tags, icc_profile=icc_profile)
+    image = _Image(rgb=rgb, shown=shown, tags=tags, icc_profile=icc_profile)
+    placed: dict[str, object] = {"count": 3, "dtype": "uint8"} | _placed(shown.shape, gsd_m)
+    if shown.size > _IN_MEMORY_CELLS:
+        _write_banded(path, image, placed)
+    else:
+        bands = np.moveaxis(rgb, 2, 0)
+        options = {"driver": "COG"} | _COG_OPTIONS
+        _write(path, bands, shown, placed | options, tags, icc_profile=icc_profile)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Image:
+    """What `write_orthoimage` writes."""
+
+    rgb: NDArray[np.uint8]
+    shown: NDArray[np.bool_]
+    tags: Mapping[str, str]
+    icc_profile: bytes | None
+
+
+def _write_banded(path: Path, image: _Image, placed: Mapping[str, object]) -> None:
+    """Write a large image by way of an uncompressed one, a band of tiles at a time."""
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.shutil import copy
+
+    plain = path.with_name(f"{path.name}.plain")
+    options = {"driver": "GTiff", "tiled": True, "blockxsize": TILE_PX, "blockysize": TILE_PX}
+    try:
+        with _quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+            with rasterio.open(plain, "w", BIGTIFF="IF_SAFER", **options, **placed) as dataset:
+                _describe(dataset, image.tags, image.icc_profile)
+                for window in _bands(image.shown.shape):
+                    rows = slice(window.row_off, window.row_off + window.height)
+                    dataset.write(np.moveaxis(image.rgb[rows], 2, 0), window=window)
+                    dataset.write_mask(image.shown[rows], window=window)
+            copy(plain, path, driver="COG", BIGTIFF="IF_SAFER", **_COG_OPTIONS)
+            _require_written(path, image)
+    except (RasterioError, OSError) as error:
+        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+    finally:
+        plain.unlink(missing_ok=True)
+
+
+def _bands(shape: tuple[int, ...]) -> Iterator[Window]:
+    from rasterio.windows import Window
+
+    for first in range(0, shape[0], TILE_PX):
+        yield Window(0, first, shape[1], min(TILE_PX, shape[0] - first))
+
+
+def _require_written(path: Path, image: _Image) -> None:
+    """Read the file again: of a disk that gets full at closing, GDAL only tells a log."""
+    import rasterio
+
+    with rasterio.open(path) as dataset:
+        for window in _bands(image.shown.shape):
+            rows = slice(window.row_off, window.row_off + window.height)
+            written = np.moveaxis(dataset.read(window=window), 0, 2)
+            if not np.array_equal(written, image.rgb[rows]):
+                raise OSError(f"rows {rows.start} to {rows.stop} do not read back")
 
 
 def world_file_text(gsd_m: float) -> str:
@@ -212,27 +277,32 @@ def _write(
     *,
     icc_profile: bytes | None = None,
 ) -> None:
-    from rasterio.enums import ColorInterp
     from rasterio.errors import RasterioError
     from rasterio.io import MemoryFile
 
     try:
         with _quiet(), MemoryFile(ext=".tif") as memory:
             with memory.open(**profile) as dataset:
-                if len(bands) == 3:
-                    dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+                _describe(dataset, tags, icc_profile)
                 dataset.write(bands)
                 if shown is not None:
                     dataset.write_mask(shown)
-                dataset.update_tags(AREA_OR_POINT="Area", **tags)
-                if icc_profile is not None:
-                    text = base64.b64encode(icc_profile).decode()
-                    dataset.update_tags(ns="COLOR_PROFILE", SOURCE_ICC_PROFILE=text)
             # Python writes the file: GDAL only logs a disk that gets full at closing.
             with path.open("wb") as target:
                 target.write(memory.getbuffer())
     except (RasterioError, OSError) as error:
         raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+
+
+def _describe(dataset: DatasetWriter, tags: Mapping[str, str], icc_profile: bytes | None) -> None:
+    from rasterio.enums import ColorInterp
+
+    if dataset.count == 3:
+        dataset.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+    dataset.update_tags(AREA_OR_POINT="Area", **tags)
+    if icc_profile is not None:
+        text = base64.b64encode(icc_profile).decode()
+        dataset.update_tags(ns="COLOR_PROFILE", SOURCE_ICC_PROFILE=text)
 
 
 @contextmanager

@@ -15,6 +15,9 @@ from orthoflow.errors import InputError, ProductError
 from orthoflow.files.exif import without_orientation
 
 PREVIEW_SIDE_PX: Final = 1600
+# Larger images are averaged before they are shrunk, so many rows of the result at a time.
+_WHOLE_PX: Final = 1 << 26
+_BAND_PX: Final = 64
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
 
 Shrunk = TypeVar("Shrunk", np.float32, np.uint8)
@@ -118,15 +121,46 @@ def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
 def _preview(
     image: NDArray[np.uint8], shown: NDArray[np.bool_], longest_side_px: int
 ) -> NDArray[np.uint8]:
-    colour = np.dstack([image] * 3) if image.ndim == 2 else image
-    weight = shown.astype(np.float32)
     if max(shown.shape) > longest_side_px:
         # Averaged under the mask: black void must not darken the rim of what is shown.
-        summed = _shrink(colour * weight[:, :, None], longest_side_px)
+        factor = max(shown.shape) // (2 * longest_side_px) if shown.size > _WHOLE_PX else 1
+        summed, weight = _weighted(image, shown, factor)
+        summed = _shrink(summed, longest_side_px)
         weight = _shrink(weight, longest_side_px)
         colour = np.rint(summed / np.maximum(weight, 1e-6)[:, :, None]).astype(np.uint8)
+    else:
+        colour = np.dstack([image] * 3) if image.ndim == 2 else image
+        weight = shown.astype(np.float32)
     alpha = np.rint(weight * 255.0).astype(np.uint8)
     return np.dstack([colour, alpha])
+
+
+def _weighted(
+    image: NDArray[np.uint8], shown: NDArray[np.bool_], factor: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Colours times their weight, and weights, averaged over squares of `factor` pixels.
+
+    A band of squares at a time, since float32 of a whole large image would not fit into memory.
+    What is left over at the right and below a whole number of squares is cut off.
+    """
+    import cv2
+
+    rows, columns = (side // factor for side in shown.shape)
+    summed = np.empty((rows, columns, 3), dtype=np.float32)
+    weight = np.empty((rows, columns), dtype=np.float32)
+    step = rows if factor == 1 else _BAND_PX
+    for first in range(0, rows, step):
+        last = min(rows, first + step)
+        part = (slice(first * factor, last * factor), slice(0, columns * factor))
+        seen = shown[part].astype(np.float32)
+        colours = image[part] if image.ndim == 3 else np.dstack([image[part]] * 3)
+        for values, into in ((colours * seen[:, :, None], summed), (seen, weight)):
+            into[first:last] = (
+                values
+                if factor == 1
+                else cv2.resize(values, (columns, last - first), interpolation=cv2.INTER_AREA)
+            )
+    return summed, weight
 
 
 def _shrink(values: NDArray[Shrunk], longest_side_px: int) -> NDArray[Shrunk]:
