@@ -76,7 +76,17 @@ def test_a_crate_may_hold_the_embedded_record(studio: Studio) -> None:
     assert done.exit_code == 0, done.output
     assert verify_record(studio.folder / "crate" / "run.h5") == ()
     assert all(entry.embedded for entry in open_run("crate").record.inputs)
-    assert studio("verify", "crate").exit_code == 0
+    verified = studio("verify", "crate")
+    assert (verified.exit_code, "note" in verified.stdout) == (0, False), verified.stdout
+
+
+def test_every_figure_is_written_on_demand(studio: Studio) -> None:
+    done = studio("export", "first", "--to", "figures")
+    assert done.exit_code == 0, done.output
+    assert "0 figures and the graph" in done.stdout
+    assert (studio.folder / "first" / "all-figures" / "graph.svg").is_file()
+    refused = studio("export", "first", "--to", "figures", "--cell", "nowhere", "-o", "other")
+    assert (refused.exit_code, "has no cell 'nowhere'" in refused.stderr) == (2, True)
 
 
 def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:

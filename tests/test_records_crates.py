@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -182,6 +183,14 @@ def test_the_questions_of_the_profile_are_answered(graph: Any, question: str, an
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         assert len(list(graph.query(PREFIXES + question))) == answers
+
+
+def test_published_files_have_their_digests(studio: Studio, crate: dict[str, Any]) -> None:
+    stated = {entity["@id"]: entity for entity in entities(crate, "File")}
+    for path in (studio.folder / "crate" / "products").rglob("*.*"):
+        entity = stated[path.relative_to(studio.folder / "crate").as_posix()]
+        assert entity["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        assert int(entity["contentSize"]) == path.stat().st_size
 
 
 def test_a_failed_cell_says_why(crate: dict[str, Any]) -> None:

@@ -61,7 +61,8 @@ _SAID: Final = {
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Where to write it, a new or empty folder; without it RUN's own folder of that name.",
+    help="Where to write it, a new or empty folder; without it one in RUN of the format's name "
+    "(all-figures, embedded).",
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
     """Write the results of RUN, a run folder or its run.h5, for other programs.
@@ -80,7 +81,8 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     chosen.check(target)
     opened = open_run(run)
     name = target or "embedded"
-    folder = output if output is not None else opened.folder / name
+    # figures/ has those of the baseline already.
+    folder = output or opened.folder / ("all-figures" if target == "figures" else name)
     if target == "colmap":
         said = _export_colmap(opened, folder, chosen.cell)
     elif target == "csv":

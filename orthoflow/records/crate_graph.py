@@ -210,6 +210,7 @@ class _Crate:
 
     def _plain_files(self) -> Iterator[Entity]:
         lists = set(self._environment_files())
+        published = {file.path: file for file in self.record.published}
         for name in self.files:
             if name == WORKFLOW_FILE:
                 continue
@@ -218,6 +219,9 @@ class _Crate:
             if name in lists:
                 entity["conformsTo"] = ref(_REQUIREMENTS)
                 entity["name"] = "Python packages that were installed"
+            if name in published:
+                entity["contentSize"] = str(published[name].size_bytes)
+                entity["sha256"] = published[name].sha256
             yield entity
         yield {"@id": _REQUIREMENTS, "@type": "WebPage", "name": "Requirements file format"}
 

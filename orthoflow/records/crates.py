@@ -10,7 +10,7 @@ from typing import Final
 from orthoflow.engine.durability import writing_to
 from orthoflow.records.crate_entities import RESOLVED_FILE, WORKFLOW_FILE, environment_file
 from orthoflow.records.crate_graph import METADATA_FILE, crate_metadata
-from orthoflow.records.published import PRODUCTS_FOLDER
+from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run
 
 NO_LICENSE: Final = "not stated: ask who made these results"
@@ -62,9 +62,10 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
     report = run.folder / REPORT_FILE
     if report.is_file():
         sources[REPORT_FILE] = report
-    for files in run.files.values():
-        for file in files:
-            sources[f"{PRODUCTS_FOLDER}/{file.relative_to(run.products_folder).as_posix()}"] = file
+    metrics = run.products_folder / METRICS_FILE
+    published = [file for files in run.files.values() for file in files]
+    for file in (*published, *([metrics] if metrics.is_file() else [])):
+        sources[f"{PRODUCTS_FOLDER}/{file.relative_to(run.products_folder).as_posix()}"] = file
     for name, source in sources.items():
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
