@@ -89,8 +89,9 @@ def _places(size: int) -> list[int]:
 def _is_apart(before: float | None, after: float | None, tolerance: Tolerance | None) -> bool:
     if before is None or after is None:
         return before is not after
-    limit = tolerance.limit if tolerance else 0.0
-    return abs(after - before) > max(limit, _STATED_SHARE * max(1.0, abs(before), abs(after)))
+    largest = max(abs(before), abs(after))
+    limit = tolerance.limit if tolerance else _STATED_SHARE * max(1.0, largest)
+    return abs(after - before) > limit + 10.0 ** (1 - _DIGITS) * largest
 
 
 def _is_bytes(payload: Payload, name: str) -> bool:
