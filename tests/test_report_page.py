@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -137,3 +139,17 @@ def test_all_that_can_be_used_has_a_name(page: Page) -> None:
         ".map(element => element.outerHTML.slice(0, 80))"
     )
     assert nameless == []
+
+
+def test_two_environments_on_a_page_fit_a_phone(page: Page, tmp_path: Path) -> None:
+    run = compared_run(tmp_path)
+    [here] = run.record.environments
+    there = replace(here, id="there", cpu="another processor", git_commit="5895f5a" * 6)
+    cells = tuple(replace(cell, environment="there") for cell in run.record.cells)
+    other = replace(run, record=replace(run.record, environments=(there,), cells=cells))
+    write_report([run, other], tmp_path / "both.html")
+    page.show_as(390)
+    page.open(tmp_path / "both.html")
+    assert len(page.evaluate("document.querySelector('.legend').innerText").splitlines()) == 2
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert page.complaints == []
