@@ -61,6 +61,9 @@ def test_a_run_is_embedded_afterwards(studio: Studio) -> None:
     done = studio("export", "first", "--embed", "-o", "whole")
     assert done.exit_code == 0, done.output
     assert "run.h5 with 2 products and 1 input file, " in done.stdout
+    assert "input number: n.txt, 3 B, sha256 " in studio("show", "first").stdout
+    assert ", in the record" not in studio("show", "first").stdout
+    assert ", in the record" in studio("show", "whole").stdout
     assert [path.name for path in (studio.folder / "whole").iterdir()] == ["run.h5"]
     # What is embedded once can be embedded again, with neither store nor files.
     shutil.rmtree(studio.folder / ".orthoflow")

@@ -50,7 +50,7 @@ def _print_head(run: Run) -> None:
         for file in entry.files:
             click.echo(
                 f"input {entry.name}: {file.name}, {size(file.size_bytes)}, "
-                f"sha256 {file.sha256[:12]}"
+                f"sha256 {file.sha256[:12]}{', in the record' if entry.embedded else ''}"
             )
 
 
