@@ -43,6 +43,7 @@ GSD_M = 0.003
 UP = np.array([0.0, 0.0, 1.0])
 # What is worked out in float64 at once.
 BAND_ROWS = 256
+MOST_POINTS = 10_000_000
 
 
 def wall(megacells: float) -> Walls:
@@ -77,12 +78,14 @@ def wall(megacells: float) -> Walls:
 
 
 def cloud(walls: Walls) -> PointCloud:
-    """The wall's cells as points, and a tenth as many on a board before it."""
+    """Cells of the wall as points, all or some, and a tenth as many on a board before it."""
     frame, depth = walls.walls[0].frame, walls.walls[0].depth_m
-    points = []
+    points, step = [], max(1, depth.size // MOST_POINTS)
     for first in range(0, frame.height, BAND_ROWS):
-        rows, columns = np.nonzero(np.isfinite(depth[first : first + BAND_ROWS]))
-        rows += first
+        rows, columns = (
+            part[::step] for part in np.nonzero(np.isfinite(depth[first : first + BAND_ROWS]))
+        )
+        rows = rows + first
         places = np.column_stack([columns, rows]) + 0.5
         heights = depth[rows, columns].astype(np.float64)
         points.append(frame.world_from_wall(places, heights).astype(np.float32))

@@ -54,7 +54,8 @@ def hand_over(
     seen = sight.mask.reshape(sight.mask.size)
     worth = sight.quality.view(np.uint32).reshape(sight.quality.size)
     near = is_near.reshape(is_near.size)
-    painted, occluded, zero = np.uint8(PAINTED), np.uint8(OCCLUDED), np.uint32(0)
+    painted, occluded = np.uint8(PAINTED), np.uint8(OCCLUDED)
+    zero, bits = np.uint32(0), _QUALITY_BITS
     for row in range(rows.start, rows.stop):
         first = np.uintp(row * width + columns.start)
         source = np.uintp((row - rows.start + inner[0]) * sight.mask.shape[1] + inner[1])
@@ -68,7 +69,7 @@ def hand_over(
                 masks[first + np.uintp(j)] = occluded if is_lost else seen[source + np.uintp(j)]
         for j in range(n_columns):
             is_bare = masks[first + np.uintp(j)] != painted
-            value = worth[source + np.uintp(j)] & _QUALITY_BITS
+            value = np.uint32(worth[source + np.uintp(j)] & bits)
             qualities[first + np.uintp(j)] = zero if is_bare else value
     _take_colours(canvas, tile)
 
@@ -83,10 +84,10 @@ def _take_colours(canvas: Canvas, tile: tuple[slice, slice]) -> None:
         for start in range(columns.start, columns.stop, _RUN):
             first = np.uintp(row * canvas.mask.shape[1] + start)
             n_cells = min(columns.stop - start, _RUN)
-            differs = np.uint8(0)
+            has_bare = False
             for j in range(n_cells):
-                differs |= masks[first + np.uintp(j)] ^ painted
-            if differs == 0:
+                has_bare |= masks[first + np.uintp(j)] != painted
+            if not has_bare:
                 continue
             for j in range(n_cells):
                 if masks[first + np.uintp(j)] != painted:

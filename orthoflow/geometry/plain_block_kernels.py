@@ -33,6 +33,8 @@ PARABOLA_PX: Final = 0.02
 HIDDEN: Final = -1
 UNSURE: Final = 0
 SEEN: Final = 1
+# Blocks that are looked at together where parabolas reach so far.
+WIDE_BLOCKS: Final = 4
 # What describes a row of a block: see `_fit_block`.
 N_TERMS: Final = 15
 
@@ -204,9 +206,11 @@ class BlockRoom(NamedTuple):
         u: (cells of the tile,) as in `Sight`; v, mask and quality likewise.
         bends: (3, N_TERMS) of `_fit_block`; along (3, 5) likewise.
         terms: (N_TERMS,) of one row.
-        rises: (BLOCK_CELLS,) metres above the lower of the two depths, 0 where void.
-        ramp: (BLOCK_CELLS,) 0, 1, 2, ...
+        rises: (WIDE_BLOCKS * BLOCK_CELLS,) metres above the lower of the two depths, 0 where void.
+        ramp: (WIDE_BLOCKS * BLOCK_CELLS,) 0, 1, 2, ...
         wall_columns: columns of the wall; tile_columns those of the tile.
+        nodes: (2, 3, 3, 4) of `span_block`.
+        box: (4,) of `judge_block`.
     """
 
     heights: NDArray[np.float32]
@@ -221,6 +225,8 @@ class BlockRoom(NamedTuple):
     ramp: NDArray[np.float32]
     wall_columns: int
     tile_columns: int
+    nodes: NDArray[np.float64]
+    box: NDArray[np.float64]
 
 
 @compiled
@@ -235,10 +241,12 @@ def room_for_blocks(relief: Relief, sight: Sight) -> BlockRoom:
         np.empty((3, N_TERMS)),
         np.empty((3, 5)),
         np.empty(N_TERMS, dtype=np.float32),
-        np.empty(BLOCK_CELLS, dtype=np.float32),
-        np.arange(BLOCK_CELLS).astype(np.float32),
+        np.empty(WIDE_BLOCKS * BLOCK_CELLS, dtype=np.float32),
+        np.arange(WIDE_BLOCKS * BLOCK_CELLS).astype(np.float32),
         relief.depth.shape[1],
         sight.mask.shape[1],
+        np.empty((2, 3, 3, 4)),
+        np.empty(4),
     )
 
 
@@ -249,8 +257,6 @@ def look_at_plain_block(
     place: tuple[int, int, int, int, int, int],
     block: tuple[tuple[int, int], tuple[int, int]],
     depths: tuple[float, float],
-    nodes: NDArray[np.float64],
-    box: NDArray[np.float64],
 ) -> int:
     """Fill in the cells of a block that a photo surely sees where they are known.
 
@@ -265,8 +271,6 @@ def look_at_plain_block(
             rows and columns, and first row and column in the tile.
         block: first and last row, and first and last column, of the whole block.
         depths: those of the nodes.
-        nodes: of `span_block`.
-        box: of `judge_block`.
 
     Returns:
         How many of the cells are known.
@@ -277,7 +281,8 @@ def look_at_plain_block(
     per_column = 1.0 / max(1, columns[1] - columns[0])
     heights, us, vs, mask, quality = room.heights, room.u, room.v, room.mask, room.quality
     bends, terms, rises, ramp = room.bends, room.terms, room.rises, room.ramp
-    _fit_block(nodes, per_column, 1.0 / (depths[1] - depths[0]), bends, room.along)
+    box = room.box
+    _fit_block(room.nodes, per_column, 1.0 / (depths[1] - depths[0]), bends, room.along)
     low, begin = np.float32(depths[0]), np.uintp(first_column - columns[0])
     nothing = np.float32(0.0)
     void, painted = np.uint8(NO_SURFACE), np.uint8(PAINTED)

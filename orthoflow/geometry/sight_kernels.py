@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.plain_block_kernels import (
     HIDDEN,
-    SEEN,
     UNSURE,
+    WIDE_BLOCKS,
+    BlockRoom,
     judge_block,
     look_at_hidden_block,
     look_at_plain_block,
@@ -118,71 +119,120 @@ def look_at_cells(
         first_column: column likewise.
     """
     end_row, end_column = first_row + sight.mask.shape[0], first_column + sight.mask.shape[1]
-    n_rows, n_columns = relief.depth.shape
-    lanes, box, nodes = np.empty((5, BLOCK_CELLS)), np.empty(4), np.empty((2, 3, 3, 4))
-    room = room_for_blocks(relief, sight)
+    tile = (first_row, first_column, end_row, end_column)
+    lanes, room = np.empty((5, BLOCK_CELLS)), room_for_blocks(relief, sight)
+    wide, n_blocks = WIDE_BLOCKS * BLOCK_CELLS, relief.bottoms.shape[1]
     summary = sight.summary
     summary[:] = 0.0
     summary[0], summary[1] = math.inf, -math.inf
     summary[2], summary[3] = math.inf, -math.inf
     for block_row in range(first_row // BLOCK_CELLS, (end_row - 1) // BLOCK_CELLS + 1):
-        begin = max(first_row, block_row * BLOCK_CELLS)
-        finish = min(end_row, (block_row + 1) * BLOCK_CELLS)
-        for block_column in range(first_column // BLOCK_CELLS, (end_column - 1) // BLOCK_CELLS + 1):
-            start = max(first_column, block_column * BLOCK_CELLS)
-            end = min(end_column, (block_column + 1) * BLOCK_CELLS)
-            bottom = np.float64(relief.bottoms[block_row, block_column])
-            top = highest_in_the_way(
-                view,
-                relief.tops,
-                bottom,
-                BLOCK_CELLS,
-                (block_row, block_column),
-                relief.highest_m,
-            )
-            crest = np.float64(relief.crests[block_row, block_column])
-            depths = (bottom, max(crest, bottom + _LEAST_SPAN_M))
-            # The whole block counts, whatever part of it is in the tile: tiles must not show.
-            rows = (block_row * BLOCK_CELLS, min(n_rows, (block_row + 1) * BLOCK_CELLS) - 1)
-            columns = (
-                block_column * BLOCK_CELLS,
-                min(n_columns, (block_column + 1) * BLOCK_CELLS) - 1,
-            )
-            verdict = UNSURE
-            if (
-                not view.is_exact
-                and bottom <= crest
-                and depths[1] < view.height_m
-                and span_block(view, depths, rows, columns, nodes)
-            ):
-                verdict = judge_block(view, buffer, depths[1], rows, columns, nodes, box)
-            place = (
-                begin,
-                start,
-                finish - begin,
-                end - start,
-                begin - first_row,
-                start - first_column,
-            )
-            if verdict == HIDDEN:
-                look_at_hidden_block(relief, sight, place)
+        for wide_column in range(first_column // wide, (end_column - 1) // wide + 1):
+            first = wide_column * WIDE_BLOCKS
+            end = min(n_blocks, first + WIDE_BLOCKS)
+            if look_at_blocks(view, relief, buffer, sight, room, tile, (block_row, first, end)):
                 continue
-            if verdict == SEEN:
-                n_seen = look_at_plain_block(view, room, place, (rows, columns), depths, nodes, box)
-                if bottom + view.tolerance_m < top:
-                    n_seen -= hide_low_cells(view, relief, sight, place, top)
-                if n_seen:
-                    summary[0], summary[1] = min(summary[0], box[0]), max(summary[1], box[1])
-                    summary[2], summary[3] = min(summary[2], box[2]), max(summary[3], box[3])
-                    summary[4] += n_seen
-                    summary[5] += n_seen * 0.5 * (start + end - 1)
-                    summary[6] += n_seen * 0.5 * (begin + finish - 1)
-                    summary[7] += n_seen * 0.5 * (bottom + crest)
-                continue
-            for row in range(begin, finish):
-                into = _part(sight, row - first_row, start - first_column, end - start)
-                project_row(view, relief, row, start, lanes[:, : end - start])
-                look_at_row(view, relief, buffer, (row, start, top), lanes, into, summary)
+            first = max(first, first_column // BLOCK_CELLS)
+            end = min(end, (end_column - 1) // BLOCK_CELLS + 1)
+            for column in range(first, end):
+                blocks = (block_row, column, column + 1)
+                if not look_at_blocks(view, relief, buffer, sight, room, tile, blocks):
+                    _ask_each_cell(view, relief, buffer, sight, tile, (block_row, column), lanes)
+
+
+@compiled
+def look_at_blocks(
+    view: WallView,
+    relief: Relief,
+    buffer: DepthBuffer,
+    sight: Sight,
+    room: BlockRoom,
+    tile: tuple[int, int, int, int],
+    blocks: tuple[int, int, int],
+) -> bool:
+    """Fill in blocks beside each other, if the photo surely sees all of them, or none.
+
+    Args:
+        view: the camera before the wall.
+        relief: the wall.
+        buffer: what else stands before the camera.
+        sight: of the tile, filled in part.
+        room: of `room_for_blocks`.
+        tile: its first row and column, and the row and column after its last ones.
+        blocks: row of the blocks, column of the first one, and the column after the last one.
+
+    Returns:
+        Whether they are filled in.
+    """
+    block_row, first, end = blocks
+    # Whole blocks count, whatever part of them is in the tile: tiles must not show.
+    rows = (block_row * BLOCK_CELLS, min(relief.depth.shape[0], (block_row + 1) * BLOCK_CELLS) - 1)
+    columns = (first * BLOCK_CELLS, min(relief.depth.shape[1], end * BLOCK_CELLS) - 1)
+    bottom, crest = math.inf, -math.inf
+    for column in range(first, end):
+        bottom = min(bottom, float(relief.bottoms[block_row, column]))
+        crest = max(crest, float(relief.crests[block_row, column]))
+    depths = (bottom, max(crest, bottom + _LEAST_SPAN_M))
+    if view.is_exact or bottom > crest or depths[1] >= view.height_m:
+        return False
+    if not span_block(view, depths, rows, columns, room.nodes):
+        return False
+    verdict = judge_block(view, buffer, depths[1], rows, columns, room.nodes, room.box)
+    if verdict == UNSURE:
+        return False
+    place = _place_in_tile(tile, rows, columns)
+    if verdict == HIDDEN:
+        look_at_hidden_block(relief, sight, place)
+        return True
+    n_seen = look_at_plain_block(view, room, place, (rows, columns), depths)
+    for column in range(first, end):
+        n_seen -= _hide_low_cells(view, relief, sight, tile, (block_row, column))
+    if n_seen:
+        summary, box = sight.summary, room.box
+        summary[0], summary[1] = min(summary[0], box[0]), max(summary[1], box[1])
+        summary[2], summary[3] = min(summary[2], box[2]), max(summary[3], box[3])
+        summary[4] += n_seen
+        summary[5] += n_seen * (place[1] + 0.5 * (place[3] - 1))
+        summary[6] += n_seen * (place[0] + 0.5 * (place[2] - 1))
+        summary[7] += n_seen * 0.5 * (bottom + crest)
+    return True
+
+
+@compiled
+def _place_in_tile(
+    tile: tuple[int, int, int, int], rows: tuple[int, int], columns: tuple[int, int]
+) -> tuple[int, int, int, int, int, int]:
+    """Give the `place` of `look_at_plain_block` for blocks with such first and last cells."""
+    begin, finish = max(tile[0], rows[0]), min(tile[2], rows[1] + 1)
+    start, end = max(tile[1], columns[0]), min(tile[3], columns[1] + 1)
+    return (begin, start, finish - begin, end - start, begin - tile[0], start - tile[1])
+
+
+@compiled
+def _highest(view: WallView, relief: Relief, block: tuple[int, int]) -> float:
+    """Bound the height up to which the rays from a block must be followed."""
+    bottom = float(relief.bottoms[block[0], block[1]])
+    return highest_in_the_way(view, relief.tops, bottom, BLOCK_CELLS, block, relief.highest_m)
+
+
+@compiled
+def _ask_each_cell(
+    view: WallView,
+    relief: Relief,
+    buffer: DepthBuffer,
+    sight: Sight,
+    tile: tuple[int, int, int, int],
+    block: tuple[int, int],
+    lanes: NDArray[np.float64],
+) -> None:
+    """Project the cells of a block one by one, and ask for each whether the photo sees it."""
+    top = _highest(view, relief, block)
+    begin, finish = max(tile[0], block[0] * BLOCK_CELLS), min(tile[2], (block[0] + 1) * BLOCK_CELLS)
+    start, end = max(tile[1], block[1] * BLOCK_CELLS), min(tile[3], (block[1] + 1) * BLOCK_CELLS)
+    for row in range(begin, finish):
+        into = _part(sight, row - tile[0], start - tile[1], end - start)
+        project_row(view, relief, row, start, lanes[:, : end - start])
+        look_at_row(view, relief, buffer, (row, start, top), lanes, into, sight.summary)
 
 
 @compiled
@@ -254,12 +304,12 @@ def look_at_row(
 
 
 @compiled
-def hide_low_cells(
+def _hide_low_cells(
     view: WallView,
     relief: Relief,
     sight: Sight,
-    place: tuple[int, int, int, int, int, int],
-    top: float,
+    tile: tuple[int, int, int, int],
+    block: tuple[int, int],
 ) -> int:
     """Follow the rays of those cells of a painted block that lie low enough to be hidden.
 
@@ -269,37 +319,51 @@ def hide_low_cells(
         view: the camera before the wall.
         relief: the wall.
         sight: of the tile, changed where cells are hidden.
-        place: as of `look_at_plain_block`.
-        top: height up to which rays have to be followed.
+        tile: as of `look_at_blocks`.
+        block: row and column of the block.
 
     Returns:
         How many cells are hidden.
     """
-    first_row, first_column, n_rows, n_columns, tile_row, tile_column = place
-    n_hidden = 0
-    for fine_row in range(first_row // FINE_CELLS, (first_row + n_rows - 1) // FINE_CELLS + 1):
-        begin = max(first_row, fine_row * FINE_CELLS)
-        finish = min(first_row + n_rows, (fine_row + 1) * FINE_CELLS)
-        for fine_column in range(
-            first_column // FINE_CELLS, (first_column + n_columns - 1) // FINE_CELLS + 1
-        ):
-            bottom = np.float64(relief.fine_bottoms[fine_row, fine_column])
+    top = _highest(view, relief, block)
+    if not float(relief.bottoms[block[0], block[1]]) + view.tolerance_m < top:
+        return 0
+    n_hidden, per_block = 0, BLOCK_CELLS // FINE_CELLS
+    n_rows, n_columns = relief.fine_bottoms.shape
+    for row in range(block[0] * per_block, min(n_rows, (block[0] + 1) * per_block)):
+        for column in range(block[1] * per_block, min(n_columns, (block[1] + 1) * per_block)):
+            bottom = float(relief.fine_bottoms[row, column])
             if not bottom + view.tolerance_m < top:
                 continue
             fine_top = highest_in_the_way(
-                view, relief.fine_tops, bottom, FINE_CELLS, (fine_row, fine_column), top
+                view, relief.fine_tops, bottom, FINE_CELLS, (row, column), top
             )
-            if not bottom + view.tolerance_m < fine_top:
+            if bottom + view.tolerance_m < fine_top:
+                n_hidden += _hide_cells(view, relief, sight, tile, (row, column, fine_top))
+    return n_hidden
+
+
+@compiled
+def _hide_cells(
+    view: WallView,
+    relief: Relief,
+    sight: Sight,
+    tile: tuple[int, int, int, int],
+    block: tuple[int, int, float],
+) -> int:
+    """Follow the rays of the low cells of a small block, given with the height up to which."""
+    fine_row, fine_column, top = block
+    n_hidden = 0
+    for row in range(
+        max(tile[0], fine_row * FINE_CELLS), min(tile[2], (fine_row + 1) * FINE_CELLS)
+    ):
+        for column in range(
+            max(tile[1], fine_column * FINE_CELLS), min(tile[3], (fine_column + 1) * FINE_CELLS)
+        ):
+            if not relief.depth[row, column] < top - view.tolerance_m:
                 continue
-            start = max(first_column, fine_column * FINE_CELLS)
-            end = min(first_column + n_columns, (fine_column + 1) * FINE_CELLS)
-            for row in range(begin, finish):
-                for column in range(start, end):
-                    if not relief.depth[row, column] < fine_top - view.tolerance_m:
-                        continue
-                    if is_hidden_by_relief(view, relief, row, column, fine_top):
-                        i, j = tile_row + row - first_row, tile_column + column - first_column
-                        sight.mask[i, j] = OCCLUDED
-                        sight.quality[i, j] = 0.0
-                        n_hidden += 1
+            if is_hidden_by_relief(view, relief, row, column, top):
+                sight.mask[row - tile[0], column - tile[1]] = OCCLUDED
+                sight.quality[row - tile[0], column - tile[1]] = 0.0
+                n_hidden += 1
     return n_hidden

@@ -265,32 +265,34 @@ def is_hidden_by_relief(view: WallView, relief: Relief, row: int, column: int, t
     along = max(abs(down), abs(across))
     if along < 1.0:
         return False
-    step_down, step_across = down / along, across / along
     rise = (view.height_m - depth) / along
     is_along_rows = abs(down) >= abs(across)
-    height = depth + view.tolerance_m
+    # Steps are whole rows or columns; beside them the ray moves by a part of a cell.
+    step = 1 if (down if is_along_rows else across) > 0.0 else -1
+    aside = (across if is_along_rows else down) / along
+    here, beside = (row, float(column)) if is_along_rows else (column, float(row))
+    n_here, n_beside = (rows, columns) if is_along_rows else (columns, rows)
+    height, per_step = depth + view.tolerance_m, 1.0 / relief.step_m
     for k in range(1, int(along) + 1):
         height += rise
+        here += step
         if height >= top:
             return False
-        at_row, at_column = row + k * step_down, column + k * step_across
-        # One of the two is whole; the surface is linear between the two cells beside the other.
-        if is_along_rows:
-            first_row, first_column = round(at_row), math.floor(at_column)
-            second_row, second_column = first_row, first_column + 1
-            share = at_column - first_column
-        else:
-            first_row, first_column = math.floor(at_row), round(at_column)
-            second_row, second_column = first_row + 1, first_column
-            share = at_row - first_row
-        if share == 0.0:
-            second_row, second_column = first_row, first_column
-        if first_row < 0 or first_column < 0 or second_row >= rows or second_column >= columns:
+        at = beside + k * aside
+        first = math.floor(at)
+        # The surface is linear between the two cells beside the ray.
+        share = at - first
+        second = first + 1 if share > 0.0 else first
+        if here < 0 or here >= n_here or first < 0 or second >= n_beside:
             return False
-        one = relief.occluding[first_row, first_column]
-        other = relief.occluding[second_row, second_column]
+        if is_along_rows:
+            one = relief.occluding[np.uintp(here), np.uintp(first)]
+            other = relief.occluding[np.uintp(here), np.uintp(second)]
+        else:
+            one = relief.occluding[np.uintp(first), np.uintp(here)]
+            other = relief.occluding[np.uintp(second), np.uintp(here)]
         if min(one, other) == NOTHING:
             continue
-        if ((1.0 - share) * one + share * other) * relief.step_m > height:
+        if (1.0 - share) * one + share * other > height * per_step:
             return True
     return False
