@@ -34,6 +34,14 @@ EXPECTED_FAILURES: dict[str, dict[str, str]] = {
     },
 }
 
+# Recorded results; taking a method out and running the tests records it anew.
+GOLDEN = Path(__file__).with_name("golden.json")
+# Method whose results on another processor are not within tolerances of those here -> why.
+NO_GOLDEN: dict[str, str] = {
+    "match.sift": "which key points OpenCV finds hangs on the instructions that a processor has",
+    "match.guided": "which places agree to the last tie hangs on them too",
+}
+
 # What a source reads where the suite's own example, a scan, does not fit.
 FILES: dict[str, str] = {
     "read.photos": "photo.jpg",
@@ -93,7 +101,7 @@ def cases() -> list[ConformanceCase]:
             inputs=partial(inputs, method_id),
             params=QUICK.get(method_id),
             expected_failures=EXPECTED_FAILURES.get(method_id),
-            golden=Path(__file__).with_name("golden.json"),
+            golden=None if method_id in NO_GOLDEN else GOLDEN,
         )
     ]
 

@@ -18,7 +18,7 @@ from orthoflow.sdk import Method, MethodParams, Ports
 from orthoflow.testing import golden
 from orthoflow.testing.examples import example_room
 from orthoflow.testing.golden import golden_problem
-from orthoflow.testing.samples import sample_of, sample_problem
+from orthoflow.testing.samples import Sample, sample_of, sample_problem
 from orthoflow.testing.trials import Trial
 
 
@@ -158,3 +158,13 @@ def test_a_sample_tells_a_picture_that_moved_from_noise(
     before, after = (sample_of(Picture(rgb=image)) for image in (rgb, change(rgb)))
     problem = sample_problem(before, after, Picture.tolerances)
     assert bool(problem) == is_noticed, problem
+
+
+@pytest.mark.parametrize(
+    ("after", "is_noticed"), [(0.0758759669, False), (0.0789, True), (-0.0759018587, True)]
+)
+def test_numbers_of_the_metadata_may_differ_by_a_hundredth(after: float, is_noticed: bool) -> None:
+    before, now = (
+        {"metadata": Sample(shape=[1], values=[value])} for value in (0.0759018587, after)
+    )
+    assert bool(sample_problem(before, now, {})) == is_noticed
