@@ -19,6 +19,7 @@ from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
 from orthoflow.workflow.schema import workflow_schema
 from tests.long_loops import IS_LONG
+from tests.road.conftest import metrics_of
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -82,26 +83,50 @@ def test_a_method_of_a_plugins_own_kind_keeps_the_rules(cracks: Path) -> None:
     assert [problem for problem in problems if problem] == []
 
 
+def environment(folder: Path) -> Path:
+    """The Python of a new environment with this checkout and what the tests' own has."""
+    venv.create(folder, with_pip=True)
+    (packages,) = (folder / "lib").glob("python*/site-packages")
+    paths = [str(ROOT / part) for part in ("", "plugins", "provenance")]
+    paths += [path for path in sys.path if path.endswith("-packages")]
+    (packages / "shared.pth").write_text("\n".join(paths))
+    return folder / "bin" / "python"
+
+
+def succeed(folder: Path, *command: str | Path) -> str:
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        command, cwd=folder, env=variables, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
+    return done.stdout
+
+
 @pytest.mark.long
 @pytest.mark.skipif(not IS_LONG, reason="installs the examples from an index: .ci/run --long")
 @pytest.mark.parametrize("name", ["orthoflow-pyransac3d", "orthoflow-poselib", "orthoflow-cracks"])
 def test_an_example_installs_and_passes_its_tests(name: str, tmp_path: Path) -> None:
-    venv.create(tmp_path / "venv", with_pip=True)
-    python = tmp_path / "venv" / "bin" / "python"
-    (packages,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
-    paths = [str(ROOT / part) for part in ("", "plugins", "provenance")]
-    paths += [path for path in sys.path if path.endswith("-packages")]
-    (packages / "shared.pth").write_text("\n".join(paths))
+    python = environment(tmp_path / "venv")
     folder = tmp_path / name
     shutil.copytree(EXAMPLES / name, folder)
-    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    for command in (["pip", "install", "-q", "."], ["pytest", "-q", "-p", "no:dash"]):
-        done = subprocess.run(
-            [python, "-m", *command],
-            cwd=folder,
-            env=variables,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
+    succeed(folder, python, "-m", "pip", "install", "-q", ".")
+    succeed(folder, python, "-m", "pytest", "-q", "-p", "no:dash")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not IS_LONG, reason="installs the examples from an index: .ci/run --long")
+def test_the_examples_stand_beside_our_own_methods(tmp_path: Path) -> None:
+    python = environment(tmp_path / "venv")
+    for name in ("orthoflow-pyransac3d", "orthoflow-poselib"):
+        shutil.copytree(EXAMPLES / name, tmp_path / name)
+        succeed(tmp_path, python, "-m", "pip", "install", "-q", f"./{name}")
+    shutil.copy(EXAMPLES / "beside-ours.yaml", tmp_path)
+    succeed(tmp_path, python, "-m", "orthoflow", "run", "beside-ours.yaml", "-o", "run")
+    shown = json.loads(succeed(tmp_path, python, "-m", "orthoflow", "show", "run", "--json"))
+    assert {cell["status"] for cell in shown["cells"]} == {"ok"}
+    metrics = metrics_of(tmp_path / "run")
+    for variant in ("plane=ransac,orient=pnp", "plane=ransac,orient=poselib"):
+        assert metrics[f"check@{variant}", "plane_angle_deg"] < 0.01
+        assert metrics[f"check@{variant}", "n_oriented"] == 6
+        assert metrics[f"check@{variant}", "pose_wall_rms_mm"] < 8.0  # a cell
+    assert metrics["check@plane=pyransac3d,orient=pnp", "plane_angle_deg"] < 0.05
