@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,18 @@ class PlaneRow:
     size: str
     n_points: int
     rms_mm: float
+    thickness_mm: float | None
+    scan_step_mm: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaterialRow:
+    """How thick the cloud is on a material of one plane, or of one row of the scan."""
+
+    place: str
+    material: str
+    n_points: int
+    thickness_mm: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +47,7 @@ class PlaneTable:
     cell: str
     viewpoint: str
     rows: tuple[PlaneRow, ...]
+    materials: tuple[MaterialRow, ...]
 
 
 def plane_tables(run: Run) -> Iterator[PlaneTable]:
@@ -46,6 +59,7 @@ def plane_tables(run: Run) -> Iterator[PlaneTable]:
             cell=address,
             viewpoint=planes.viewpoint,
             rows=tuple(_plane_row(planes, index) for index in range(len(planes))),
+            materials=tuple(_material_rows(planes)),
         )
 
 
@@ -54,6 +68,7 @@ def _plane_row(planes: Planes, index: int) -> PlaneRow:
     corners = planes.corners[index]
     width_m = float(np.linalg.norm(corners[3] - corners[0]))
     height_m = float(np.linalg.norm(corners[1] - corners[0]))
+    thickness = _thickness(planes, index)
     return PlaneRow(
         name=planes.names[index],
         omega_deg=omega,
@@ -63,7 +78,37 @@ def _plane_row(planes: Planes, index: int) -> PlaneRow:
         size=f"{width_m:.2f} x {height_m:.2f} m",
         n_points=int(planes.n_points[index]),
         rms_mm=1000 * float(planes.rms_m[index]),
+        thickness_mm=_in_mm(thickness.get("sigma_m")),
+        scan_step_mm=_in_mm(thickness.get("scan_step_m")),
     )
+
+
+def _thickness(planes: Planes, index: int) -> Mapping[str, object]:
+    """What a detector measured on a plane; nothing for planes that were given."""
+    told = planes.details.get("thickness")
+    item = told[index] if isinstance(told, Sequence) and index < len(told) else None
+    return item if isinstance(item, Mapping) else {}
+
+
+def _material_rows(planes: Planes) -> Iterator[MaterialRow]:
+    places = [(planes.names[k], _thickness(planes, k)) for k in range(len(planes))]
+    row = planes.details.get("scan_row")
+    if isinstance(row, Mapping):
+        places.append((f"row {row.get('row')} of scan {row.get('scan')}, {planes.names[0]}", row))
+    for place, told in places:
+        found = told.get("material", ())
+        for item in found if isinstance(found, Sequence) else ():
+            if isinstance(item, Mapping):
+                yield MaterialRow(
+                    place=place,
+                    material=str(item["name"]),
+                    n_points=int(str(item["n_points"])),
+                    thickness_mm=1000.0 * float(str(item["sigma_m"])),
+                )
+
+
+def _in_mm(value: object) -> float | None:
+    return 1000.0 * value if isinstance(value, float) else None
 
 
 def _offset_sigma_m(planes: Planes, index: int) -> float:

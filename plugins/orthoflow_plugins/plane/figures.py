@@ -127,7 +127,8 @@ def draw_accumulator(
     right.set_xlabel("direction of the normal [deg]")
     right.set_ylabel("distance from the middle of the plan [m]")
     if left.lines:
-        left.legend(fontsize=7, loc="upper right")
+        # Beside the plan: one of a single long wall is too narrow to hold it.
+        left.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1.0))
     ctx.figure(
         "accumulator",
         figure,
