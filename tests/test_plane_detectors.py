@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane import settling
 from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import Ransac
@@ -408,3 +409,26 @@ def test_an_unknown_scan_of_a_point_does_not_matter(detector: str, tmp_path: Pat
 def test_a_fit_tolerance_above_the_find_tolerance_is_refused(detector: str) -> None:
     with pytest.raises(ValidationError, match=r"must be at most tolerance_m = 0\.01"):
         DETECTORS[detector][0].Params(tolerance_m=0.01, fit_tolerance_m=0.02)
+
+
+def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    cloud = cloud_of(np.random.default_rng(0).permutation(sampled()), stations=STATION)
+
+    def found(cores: int) -> Planes:
+        ctx = StepContext(rng=np.random.default_rng(0), cores=cores, scratch=tmp_path)
+        planes: Planes = Ransac().run(Ransac.In(cloud=cloud), Ransac.Params(), ctx).planes
+        return planes
+
+    whole = found(1)
+    # 88 000 points in blocks of 256: one of three blocks is fitted.
+    monkeypatch.setattr(settling, "_FITTED_MOST", 25_000)
+    one, three = found(1), found(3)
+    np.testing.assert_array_equal(one.normal, three.normal)
+    np.testing.assert_array_equal(one.offset, three.offset)
+    assert not np.array_equal(one.offset, whole.offset)
+    for truth in ROOM[:6]:
+        angle_deg, miss_m = errors(one, truth, np.eye(3))
+        assert angle_deg < 0.02
+        assert miss_m < 3e-4  # a third of the points: 1.7 times the error of all of them

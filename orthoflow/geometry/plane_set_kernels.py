@@ -281,8 +281,20 @@ def _claim(owner: NDArray[np.int32], claims: NDArray[np.int8]) -> None:
         claims[i] = np.int8(owner[i])
 
 
+@kernel_part
+def _is_drawn(block: int, every: int) -> bool:
+    """Whether a block is among those that are summed: one of so many, drawn by its number.
+
+    At a fixed step, blocks would fall in step with the columns of a scan and leave stripes out.
+    """
+    mixed = np.uint64(block + 1) * np.uint64(0x9E3779B97F4A7C15)
+    mixed ^= mixed >> np.uint64(29)
+    mixed *= np.uint64(0xBF58476D1CE4E5B9)
+    return bool((mixed >> np.uint64(33)) % np.uint64(every) == np.uint64(0))
+
+
 @compiled
-def assign_points(
+def assign_points(  # noqa: PLR0913, PLR0917 - compiled code has no objects to bundle these in
     points: BlockedPoints,
     claims: NDArray[np.int8],
     slabs: NDArray[np.float64],
@@ -290,6 +302,7 @@ def assign_points(
     rasters: NDArray[np.float64],
     counts: NDArray[np.int32],
     sums: NDArray[np.int64],
+    drawn: tuple[int, int],
 ) -> None:
     """Give each point to the nearest slab that holds it, or sum distances in that slab's cells.
 
@@ -304,6 +317,7 @@ def assign_points(
         counts: (cells, 3) points within the find, inner and fit tolerance; added to.
         sums: (cells, 2) distances and squared distances of those within the fit tolerance, in
             steps and squared steps; added to.
+        drawn: one of so many blocks is summed; number of the first block in the cloud.
     """
     boxes = points.boxes
     scratch = _new_scratch()
@@ -323,7 +337,7 @@ def assign_points(
             # Most blocks of a scan are a short piece of one wall: no point has to be asked.
             claims[start:stop] = np.int8(holder)
             continue
-        if is_summing and n_wanted == 0:
+        if is_summing and (n_wanted == 0 or not _is_drawn(drawn[1] + block, drawn[0])):
             continue
         centre_block(points, block, scratch.middle, scratch.local)
         _own_block(scratch, slabs, bounds, active, holder)

@@ -1,4 +1,8 @@
-"""Planes found on part of a cloud, fitted to all of it: one pass for all planes, one for labels."""
+"""Planes found on part of a cloud, fitted to more of it: one pass for all planes, one for labels.
+
+All points take part in the fits, or of more than 24 million every so many'th block of neighbours,
+drawn over the whole cloud: neighbours share their errors, so that those left out say the same.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.plane_set_kernels import assign_points, name_labels
-from orthoflow.geometry.point_kernels import each_part, in_threads, piece_of
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, each_part, in_threads, piece_of
 from orthoflow_plugins.plane.candidates import FoundPlane, Rules
 from orthoflow_plugins.plane.examining import Look, carried, judged
 from orthoflow_plugins.plane.footprints import INNER_SHARE, CellSums, SurfaceRaster, cell_for
@@ -20,6 +24,8 @@ from orthoflow_plugins.plane.remainders import Remainder
 _PASSES_MOST: Final = 3
 # A fit that moved by more than this share of the fit tolerance saw its points askew.
 _SETTLED_SHARE: Final = 0.1
+# Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.
+_FITTED_MOST: Final = 12_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,11 +45,13 @@ def settle(found: list[FoundPlane], whole: Remainder, rules: Rules) -> list[Foun
         whole: the cloud; its claims serve as scratch.
         rules: when a plane counts.
     """
+    every = max(1, len(whole.claims) // _FITTED_MOST)
     unsettled = [True] * len(found)
     for _ in range(_PASSES_MOST):
-        rasters = [_raster(item, whole, rules.find_m) for item in found]
-        measured = _measured(found, rasters, unsettled, whole, rules)
-        looks = _judged(found, rasters, measured, unsettled, whole, rules)
+        rasters = [_raster(item, whole, rules.find_m, every) for item in found]
+        measured = _measured(found, rasters, unsettled, whole, rules, every)
+        n_least = rules.least_share * len(whole.claims) / every
+        looks = _judged(found, rasters, measured, unsettled, whole, rules, n_least)
         kept: list[FoundPlane] = []
         moves: list[bool] = []
         for item, raster, look, is_new in zip(found, rasters, looks, unsettled, strict=True):
@@ -66,10 +74,10 @@ def _judged(
     wanted: list[bool],
     whole: Remainder,
     rules: Rules,
+    n_least: float,
 ) -> list[Look | None]:
     """What the sums say of each plane that is wanted, several planes at a time."""
     looks: list[Look | None] = [None] * len(found)
-    n_least = rules.least_share * len(whole.claims)
 
     def judge(first: int) -> None:
         for index in range(first, len(found), whole.parts):
@@ -90,7 +98,7 @@ def label(found: list[FoundPlane], whole: Remainder, find_m: float) -> None:
         counts=np.zeros((0, 3), dtype=np.int32),
         sums=np.zeros((0, 2), dtype=np.int64),
     )
-    _assign(found, whole, find_m, [nothing] * whole.parts)
+    _assign(found, whole, find_m, [nothing] * whole.parts, 1)
 
 
 def name_points(whole: Remainder, names: NDArray[np.int16], labels: NDArray[np.int16]) -> None:
@@ -105,11 +113,11 @@ def name_points(whole: Remainder, names: NDArray[np.int16], labels: NDArray[np.i
     each_part(len(labels), whole.parts, write)
 
 
-def _raster(item: FoundPlane, whole: Remainder, find_m: float) -> SurfaceRaster:
-    """Cells over the plane's rectangle alone, as fine as all points allow."""
+def _raster(item: FoundPlane, whole: Remainder, find_m: float, every: int) -> SurfaceRaster:
+    """Cells over the plane's rectangle alone, as fine as the points that are summed allow."""
     cells = item.footprint.cells
     area_m2 = float(cells.sum()) * item.raster.cell_m**2
-    share = len(whole.claims) / max(1, len(whole.sample.index))
+    share = len(whole.claims) / max(1, len(whole.sample.index)) / every
     cell_m = min(item.raster.cell_m, cell_for(item.footprint.n_points * share, area_m2))
     left, right, top, bottom = item.label_bounds(find_m)[1:]
     return SurfaceRaster(
@@ -130,6 +138,7 @@ def _measured(
     wanted: list[bool],
     whole: Remainder,
     rules: Rules,
+    every: int,
 ) -> list[CellSums]:
     """The sums of the cells of each plane that is wanted; others give no cells."""
     shapes = [
@@ -151,7 +160,7 @@ def _measured(
         )
         for _ in range(whole.parts)
     ]
-    _assign(found, whole, rules.find_m, tables)
+    _assign(found, whole, rules.find_m, tables, every)
     counts = np.stack([table.counts for table in tables]).sum(axis=0, dtype=np.int64)
     sums = np.stack([table.sums for table in tables]).sum(axis=0)
     measured = []
@@ -171,7 +180,11 @@ def _measured(
 
 
 def _assign(
-    found: list[FoundPlane], whole: Remainder, find_m: float, tables: list[_Tables]
+    found: list[FoundPlane],
+    whole: Remainder,
+    find_m: float,
+    tables: list[_Tables],
+    every: int,
 ) -> None:
     slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)
     bounds = np.array([item.label_bounds(find_m) for item in found]).reshape(-1, 5)
@@ -186,6 +199,7 @@ def _assign(
             table.rasters,
             table.counts,
             table.sums,
+            (every, piece.start // BLOCK_POINTS),
         )
 
     each_part(len(whole.claims), whole.parts, give)
