@@ -22,7 +22,7 @@ class Ransac(Method):
     Planes through random points are scored on a sample of the cloud; the best is refined on the
     sample with a tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, and must hold
     crowded cells of enough points. When all planes are found on the sample, one pass over all
-    points fits them, and one labels the points.
+    points (of more than 24 million, over a part drawn evenly) fits them, and one labels the points.
 
     `model: 2d` draws upright planes through two points of the plan, as in markiewicz2015; it finds
     walls only. `scoring: a-contrario` finds its own tolerance, up to `tolerance_m`: the one at
