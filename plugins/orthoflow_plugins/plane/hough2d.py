@@ -24,8 +24,9 @@ class Hough2d(Method):
     has points, for all lines through it. The best line is refined on a sample of the points, with a
     tolerance that shrinks from `tolerance_m` to `fit_tolerance_m`, given a rectangle, and its
     points are taken away: the sample says which share of each cell those are. When all planes are
-    found, one pass over all points, of more than 24 million over a part drawn evenly, fits them (total
-    least squares of cell means), one labels all points.
+    found, one pass over all points, of more than 24 million over a part drawn evenly, fits them
+    (total least squares of cell means), one labels all points.
+
     Floors, ceilings and other level planes come from the histogram of heights in the same race and
     are refitted in 3D.
 
