@@ -43,7 +43,7 @@ class PhotoResiduals:
     def of_kind(self, kind: TieRole) -> NDArray[np.float64]:
         """Residuals (m, 2) of one role that are known."""
         values = self.residuals_px[self.role == kind]
-        return values[np.isfinite(values).all(axis=1)]
+        return np.asarray(values[np.isfinite(values).all(axis=1)])
 
 
 def draw_residuals(ctx: StepContext, photos: Sequence[PhotoResiduals]) -> None:
