@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from typing import ClassVar, Final, Literal
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,10 @@ from orthoflow.files.images import decode_image
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Cameras, Photo, Photos, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.colour.depth_images import SeenBlock, blocks, depth_image
+from orthoflow_plugins.colour.sightings import SeenBlock, blocks, box_of, is_seen
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.visibility_kernels import DepthBuffer
 
 _UNSEEN_GREY: Final = 128
 # Towards the border of a photo its lens is known less well: worth falls to 0 over this share.
@@ -26,14 +29,15 @@ _REMAPPED_AT_ONCE: Final = 30_000
 class ColourPhotos(Method):
     """Give each point the colour of the photo that shows it best.
 
-    A point is seen where no nearer point of the whole cloud lies before it. Of several photos that
+    A point is seen where no nearer point of the whole cloud lies before it, outliers left out
+    (the depth buffer of `ortho.dsm-backward`). Of several photos that
     see it, the one with the most pixels per metre wins, away from its border; its colour is
     interpolated between four pixels. So a cloud without colours can take the direct way to
     orthoimages (`ortho.pointcloud-direct`) with the same photos as the other methods.
     """
 
     id: ClassVar[str] = "colour.photos"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Skarlatos and Kiparissi 2012 (orthoimages from coloured clouds)",
@@ -44,6 +48,12 @@ class ColourPhotos(Method):
 
         tolerance_m: float = Field(
             0.05, gt=0.0, description="A point so little behind the nearest one is seen as well."
+        )
+        occluder_points_min: int = Field(
+            6,
+            ge=1,
+            description="Points with fewer about them, themselves included, are outliers and hide "
+            "nothing.",
         )
         unseen: Literal["drop", "grey"] = Field(
             "drop", description="Points that no photo sees are left out, or are mid-grey."
@@ -63,6 +73,8 @@ class ColourPhotos(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Colour photo by photo, keeping the best of each point."""
+        from orthoflow.geometry.occluders import depth_buffer, occluders_in
+
         inputs.cloud.require_points(2)
         oriented = {camera.photo: camera for camera in inputs.cameras.cameras}
         chosen = [
@@ -77,9 +89,21 @@ class ColourPhotos(Method):
         cloud = inputs.cloud
         rgb = np.full((len(cloud), 3), _UNSEEN_GREY, dtype=np.uint8)
         best = np.zeros(len(cloud), dtype=np.float32)
+        occluders = occluders_in(
+            cloud,
+            box_of(cloud, [camera for _, camera in chosen]),
+            cloud.stations,
+            n_least=params.occluder_points_min,
+            threads=ctx.cores,
+        )
         for place, (photo, camera) in enumerate(chosen):
             ctx.progress(place / len(chosen), photo.name)
-            _colour(cloud, photo, camera.shifted(cloud.origin), rgb, best, params.tolerance_m)
+            sight = _Sight(
+                camera=camera.shifted(cloud.origin),
+                buffer=depth_buffer(occluders, camera),
+                tolerance_m=params.tolerance_m,
+            )
+            _colour(cloud, photo, sight, rgb, best)
         seen = best > 0.0
         n_seen = int(np.count_nonzero(seen))
         ctx.metric("n_photos", len(chosen), "1")
@@ -93,22 +117,29 @@ class ColourPhotos(Method):
         return self.Out(cloud=_only(coloured, seen) if params.unseen == "drop" else coloured)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Sight:
+    """A photo's camera, shifted to the cloud's origin, and how far it sees."""
+
+    camera: ViewingCamera
+    buffer: DepthBuffer
+    tolerance_m: float
+
+
 def _colour(
     cloud: PointCloud,
     photo: Photo,
-    camera: ViewingCamera,
+    sight: _Sight,
     rgb: NDArray[np.uint8],
     best: NDArray[np.float32],
-    tolerance_m: float,
 ) -> None:
     """Colour what a photo sees better than those before it; `rgb` and `best` are changed."""
     import cv2
 
     image = decode_image(photo.encoded, photo.name)
-    depths = depth_image(cloud, camera)
-    for block in blocks(cloud, camera):
-        worth = _worth(block, camera)
-        wins = depths.sees(block, tolerance_m) & (worth > best[block.index])
+    for block in blocks(cloud, sight.camera):
+        worth = _worth(block, sight.camera)
+        wins = is_seen(block, sight.buffer, sight.tolerance_m) & (worth > best[block.index])
         index = block.index[wins]
         if len(index) == 0:
             continue

@@ -1,0 +1,172 @@
+"""A whole cloud as seen from photos: which of its points stand before others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.point_kernels import Offsets, in_threads, read_only
+from orthoflow.geometry.slabs import OffsetPoints
+from orthoflow.geometry.visibility_kernels import (
+    DepthBuffer,
+    VoxelGrid,
+    count_in_voxels,
+    splat_points,
+)
+
+_LONGEST_SIDE_PX: Final = 2048
+_VOXELS_MOST: Final = 1 << 24
+# Small enough to tell a chair's legs apart, large enough to hold a few points of each surface.
+_VOXEL_CELLS: Final = 6.0
+# No scanner measures nearer to itself; what it reports from there are errors, and many in little
+# space.
+_BLIND_M: Final = 0.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """Where points may stand in the way, and how far apart they lie there.
+
+    Attributes:
+        low: (3,) float64 metres from the cloud's origin.
+        high: (3,) float64 metres from the cloud's origin.
+        spacing_m: between neighbouring points of a surface, about.
+    """
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    spacing_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Occluders:
+    """A cloud ready to be looked at from any of the photos.
+
+    Attributes:
+        origin: (3,) float64 metres.
+        points: float32 offsets from the origin.
+        around: how many points lie about each.
+        n_least: points with fewer about them are outliers.
+        threads: how many threads look at once; it does not show in the result.
+    """
+
+    origin: NDArray[np.float64]
+    points: Offsets
+    around: VoxelGrid
+    n_least: int
+    threads: int
+
+
+def occluders_in(
+    cloud: OffsetPoints,
+    box: Box,
+    stations_world: NDArray[np.float64] | None,
+    *,
+    n_least: int,
+    threads: int,
+) -> Occluders:
+    """Count the points in a box, to know outliers and the gaps between points.
+
+    Args:
+        cloud: the whole cloud.
+        box: nothing outside of it hides anything.
+        stations_world: (s, 3) metres, where scanners stood, if that is known.
+        n_least: see `Occluders`.
+        threads: see `Occluders`.
+    """
+    points = read_only(cloud.x, cloud.y, cloud.z)
+    side = _VOXEL_CELLS * box.spacing_m
+    size = np.maximum(box.high - box.low, side)
+    while np.prod(np.ceil(size / side)) > _VOXELS_MOST:
+        side *= 1.1
+    shape = np.ceil(size / side).astype(np.int64)
+    counts = np.zeros((int(shape[0]), int(shape[1]), int(shape[2])), dtype=np.uint16)
+    grid = VoxelGrid(low=box.low, side_m=float(side), counts=counts)
+    count_in_voxels(points, grid)
+    _sum_neighbours(counts)
+    if stations_world is not None:
+        _forget_around(grid, stations_world - cloud.origin)
+    return Occluders(
+        origin=cloud.origin, points=points, around=grid, n_least=n_least, threads=threads
+    )
+
+
+def depth_buffer(occluders: Occluders, camera: ViewingCamera) -> DepthBuffer:
+    """Look at the cloud through a camera."""
+    reduction = max(1, -(-max(camera.width, camera.height) // _LONGEST_SIDE_PX))
+    shape = (-(-camera.height // reduction), -(-camera.width // reduction))
+    flat = camera.shifted(occluders.origin).flat
+    buffers = [
+        DepthBuffer(nearest=np.full(shape, np.inf, dtype=np.float32), reduction=float(reduction))
+        for _ in range(occluders.threads)
+    ]
+    edges = np.linspace(0, len(occluders.points.x), occluders.threads + 1).astype(np.int64)
+    in_threads(
+        [
+            partial(
+                splat_points,
+                _part(occluders.points, slice(int(edges[k]), int(edges[k + 1]))),
+                flat,
+                occluders.around,
+                occluders.n_least,
+                buffer,
+            )
+            for k, buffer in enumerate(buffers)
+        ]
+    )
+    nearest = np.minimum.reduce([buffer.nearest for buffer in buffers])
+    return DepthBuffer(nearest=_closed(nearest), reduction=float(reduction))
+
+
+def nothing_in_the_way(camera: ViewingCamera) -> DepthBuffer:
+    """Give the depth buffer of an empty world."""
+    return DepthBuffer(
+        nearest=np.full((1, 1), np.inf, dtype=np.float32),
+        reduction=float(max(camera.width, camera.height)),
+    )
+
+
+def _closed(nearest: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depths without holes of a pixel or two: nothing near lets a wall shine through.
+
+    The nearest, then the farthest of 3 x 3 pixels, one axis after the other.
+    """
+    for choose in (np.minimum, np.maximum):
+        for axis in range(2):
+            before = np.moveaxis(nearest, axis, 0)
+            nearest = nearest.copy()
+            after = np.moveaxis(nearest, axis, 0)
+            choose(after[1:], before[:-1], out=after[1:])
+            choose(after[:-1], before[1:], out=after[:-1])
+    return nearest
+
+
+def _part(points: Offsets, piece: slice) -> Offsets:
+    return Offsets(points.x[piece], points.y[piece], points.z[piece])
+
+
+def _forget_around(grid: VoxelGrid, stations: NDArray[np.float64]) -> None:
+    """Take no surface to be where a scanner is blind."""
+    for station in stations:
+        middle = (station - grid.low) / grid.side_m - 0.5
+        reach = _BLIND_M / grid.side_m
+        first = np.maximum(np.floor(middle - reach), 0).astype(np.int64)
+        end = np.maximum(np.ceil(middle + reach) + 1, 0).astype(np.int64)
+        part = tuple(slice(a, b) for a, b in zip(first, end, strict=True))
+        ranges = np.indices(grid.counts[part].shape) + first[:, None, None, None]
+        squares = ((ranges - middle[:, None, None, None]) ** 2).sum(axis=0)
+        grid.counts[part][squares < reach**2] = 0
+
+
+def _sum_neighbours(counts: NDArray[np.uint16]) -> None:
+    """Replace each count by the sum over 3 x 3 x 3 voxels, in place."""
+    for axis in range(3):
+        view = np.moveaxis(counts, axis, 0)
+        before = view.copy()
+        view[1:] += before[:-1]
+        view[:-1] += before[1:]
