@@ -65,6 +65,21 @@ def test_nearest_takes_the_nearest_point_wherever_it_lies(tmp_path: Path, cores:
     assert wall.count.sum() == len(places)
 
 
+def test_cells_of_single_outliers_are_recovered_and_thin_bars_stay(tmp_path: Path) -> None:
+    known = scenes.leaning_wall(shape=(60, 80))
+    columns, rows = scenes.cell_centres(known.shape)
+    true_m = np.zeros(known.shape)
+    true_m[30, 20:40] = 0.05  # a bar one cell wide
+    wrong = np.zeros(known.shape, dtype=bool)
+    wrong[[5, 12, 50], [7, 60, 33]] = True
+    depths_m = np.where(wrong, 0.12, true_m).ravel()
+    cloud = scenes.cloud_of(known.world(columns, rows, depths_m))
+    for surface in ("median", "denoised"):
+        wall = rastered(cloud, known, scenes.context(tmp_path), surface=surface).walls[0]
+        np.testing.assert_allclose(wall.depth_m, true_m, atol=1e-5)
+        np.testing.assert_array_equal(wall.mask == SurfaceMask.RECOVERED, wrong)
+
+
 def test_denoising_takes_the_noise_and_leaves_the_steps(tmp_path: Path) -> None:
     known = scenes.leaning_wall(shape=(120, 160))
     cloud, _, _ = scattered(known, per_cell=2.25, noise_m=NOISE_M)

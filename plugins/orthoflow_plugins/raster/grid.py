@@ -76,10 +76,11 @@ class RasterGrid(Method):
         )
         surface: Surface = Field(
             default="median",
-            description="Depth of a cell: median of its best supported layer; the same denoised, "
-            "with steps kept; of the nearest point, also of the next cells (markiewicz2015); of "
-            "its point nearest the centre; of the topmost point (skarlatos2012); mean of all; or "
-            "tin, a net of triangles, which closes windows (for comparison).",
+            description="Depth of a cell: median of its best supported layer, cells of outliers "
+            "left out; the same denoised, with steps kept; of the nearest point, also of the next "
+            "cells (markiewicz2015); of its point nearest the centre; of the topmost point "
+            "(skarlatos2012); mean of all; or tin, a net of triangles, which closes windows (for "
+            "comparison).",
         )
         denoise_cells: int = Field(
             default=4, ge=0, le=20, description="Reach of the filter of surface denoised."
