@@ -44,10 +44,15 @@ class DarkLines(Method):
         images = inputs.orthoimages.images
         for index, image in enumerate(images):
             ctx.progress(index / len(images), image.name)
-            for vertices, width_m in lines_of(image, params):
-                lines.append(vertices)
-                walls.append(image.wall)
-                widths_m.append(width_m)
+            found = list(lines_of(image, params))
+            lines += [vertices for vertices, _ in found]
+            widths_m += [width_m for _, width_m in found]
+            walls += len(found) * [image.wall]
+            ctx.figure(
+                f"cracks-{image.wall}",
+                drawn(image, [vertices for vertices, _ in found]),
+                f"The {len(found)} cracks of {image.name}; metres across and down.",
+            )
         cracks = Cracks(
             vertices_world=np.concatenate([np.zeros((0, 3)), *lines]),
             line=np.repeat(np.arange(len(lines)), [len(line) for line in lines]).astype(np.int32),
@@ -84,6 +89,21 @@ def lines_of(image, params):
         kept = np.unique(bins)
         middle = np.array([cells[bins == number].mean(axis=0) for number in kept])
         yield frame.world_from_wall(middle), len(cells) * frame.gsd_m**2 / length_m
+
+
+def drawn(image, lines):
+    """Give a drawing of lines, each of vertices (m, 3), over their orthoimage."""
+    from matplotlib.figure import Figure
+
+    frame = image.frame
+    sides_m = frame.width * frame.gsd_m, frame.height * frame.gsd_m
+    drawing = Figure(figsize=(6.0, 6.0 * sides_m[1] / sides_m[0] + 0.4), layout="constrained")
+    axes = drawing.add_subplot()
+    axes.imshow(image.rgb, extent=(0.0, sides_m[0], sides_m[1], 0.0))
+    for vertices in lines:
+        across_m, down_m = frame.wall_from_world(vertices)[:, :2].T * frame.gsd_m
+        axes.plot(across_m, down_m, color="crimson", linewidth=1.0)
+    return drawing
 
 
 def _along(cells):
