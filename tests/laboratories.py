@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import textwrap
 from collections.abc import Mapping
 from importlib import metadata
@@ -84,6 +85,8 @@ def write_distribution(
         path = folder / file
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(textwrap.dedent(text), encoding="utf-8")
+    # An earlier test may have loaded hooks of the same name in this process.
+    sys.modules.pop(f"{name}_hooks", None)
     return folder
 
 
