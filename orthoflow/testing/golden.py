@@ -7,6 +7,7 @@ sample of the numbers, which must come again anywhere within the tolerances of t
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import platform
@@ -88,7 +89,7 @@ def golden_problem(file: Path, trial: Trial, outputs: Mapping[str, Product]) -> 
     known, now = _read(file), _golden(trial, outputs)
     before = known.get(trial.method.id)
     if before is None or _is_of_something_else(before, now, trial):
-        file.write_text(_text({**known, trial.method.id: now}), encoding="utf-8")
+        _record(file, trial.method.id, now)
         return ""
     for port in sorted({*before.outputs, *now.outputs}):
         if moved := _moved(before, now, port, trial.method, outputs.get(port)):
@@ -172,8 +173,24 @@ def _environment() -> str:
 def _read(file: Path) -> dict[str, Golden]:
     if not file.is_file():
         return {}
+    with file.open(encoding="utf-8") as stream:
+        fcntl.flock(stream, fcntl.LOCK_SH)
+        return _parsed(stream.read(), file)
+
+
+def _record(file: Path, method_id: str, golden: Golden) -> None:
+    """Put a result into the file, which processes that try other methods change meanwhile."""
+    with file.open("a+", encoding="utf-8") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        stream.seek(0)
+        known = _parsed(stream.read(), file)
+        stream.truncate(0)
+        stream.write(_text({**known, method_id: golden}))
+
+
+def _parsed(text: str, file: Path) -> dict[str, Golden]:
     try:
-        return _FORMAT.validate_json(file.read_text(encoding="utf-8"))
+        return _FORMAT.validate_json(text) if text else {}
     except ValidationError as error:
         raise InputError(
             f"{file.name} is no file of golden results ({error.error_count()} mistakes): remove "
