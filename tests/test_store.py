@@ -367,7 +367,9 @@ def test_file_digests_are_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyP
     digests = FileDigests(memo)
     first = digests.digest(file)
     digests.save()
-    monkeypatch.setattr("orthoflow.engine.file_digests._sha256", lambda path: pytest.fail("read"))
+    monkeypatch.setattr(
+        "orthoflow.engine.file_digests.file_sha256", lambda path: pytest.fail("read")
+    )
     assert FileDigests(memo).digest_all([file, file]) == (first, first)
     assert (first.name, first.size_bytes) == ("scan.xyz", 6)
 

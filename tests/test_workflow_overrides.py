@@ -106,9 +106,9 @@ def test_all_options_that_do_not_fit_are_named_together(catalog: Catalog, write:
             write, catalog, sets=["wal.x=1", "wall.gsd=1"], inputs=["scam=a", "scan", "=b"]
         )
     assert [problem.file for problem in caught.value.problems] == [
-        "--input scam=a",
         "--input scan",
         "--input =b",
+        "--input scam=a",
         "--set wal.x=1",
         "--set wall.gsd=1",
     ]
