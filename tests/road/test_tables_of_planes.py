@@ -8,23 +8,17 @@ import pytest
 
 from orthoflow.workflow import shipped_workflow
 from tests.long_loops import IS_LONG
-from tests.road.conftest import Shell, metrics_of, without_variants
+from tests.road.conftest import Shell, metrics_of
 
-pytestmark = pytest.mark.long  # some of the variants in a normal run
-ONLY_LONG = (
-    "hough2d-unit",
-    "hough2d-canny",
-    "hough2d-raw",
-    "hough2d-1in20",
-    "hough3d-1in20",
-    "hough3d-full",
-    "ransac-2d",
-    "ransac-1in20",
-    "ransac-2d-1in20",
-)
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(not IS_LONG, reason="recipes that compare: .ci/run --long"),
+]
 DETECTORS = (
-    "hough2d", "hough3d", "ransac", "region", "region-normals", "region-1in20",
-    *(ONLY_LONG if IS_LONG else ()),
+    "hough2d", "hough2d-unit", "hough2d-canny", "hough2d-raw", "hough2d-1in20",
+    "hough3d", "hough3d-1in20", "hough3d-full",
+    "ransac", "ransac-2d", "ransac-1in20", "ransac-2d-1in20",
+    "region", "region-normals", "region-1in20",
 )  # fmt: skip
 
 
@@ -36,8 +30,7 @@ def table(
     shell = Shell(tmp_path_factory.mktemp("plane-methods"), store)
     text = shipped_workflow("plane-methods").read_text()
     quick = text.replace("repeat: 10", "repeat: 2").replace("repeat: 3", "repeat: 1")
-    left_out = () if IS_LONG else ONLY_LONG
-    (shell.folder / "quick.yaml").write_text(without_variants(quick, left_out))
+    (shell.folder / "quick.yaml").write_text(quick)
     coarse = ("--set", "room.scan_step_m=0.02", "--executor", "inline")
     ended = shell("run", "quick.yaml", *coarse, "-o", "run", timeout_s=900)
     assert ended.code == 0, ended.said
