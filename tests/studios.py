@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +51,23 @@ def open_studio(folder: Path, patch: pytest.MonkeyPatch) -> Studio:
     # The page takes half of such a small run, and has tests of its own.
     patch.setattr("orthoflow.report.write_report", _write_empty_report)
     return Studio(folder)
+
+
+def open_finished_studio(folder: Path, patch: pytest.MonkeyPatch, *settings: str) -> Studio:
+    """Open a studio and make a run `first` there, whose plane a file says."""
+    studio = open_studio(folder, patch)
+    (folder / "n.txt").write_text("1.5")
+    studio.run("first", "--input", "number=n.txt", *settings)
+    return studio
+
+
+def open_copy(finished: Studio, folder: Path, patch: pytest.MonkeyPatch) -> Studio:
+    """Open another studio with the run `first`, its input and its store."""
+    opened = open_studio(folder, patch)
+    for name in ("first", ".orthoflow"):
+        shutil.copytree(finished.folder / name, folder / name)
+    shutil.copyfile(finished.folder / "n.txt", folder / "n.txt")
+    return opened
 
 
 def _write_empty_report(_runs: Sequence[Run], path: Path) -> None:

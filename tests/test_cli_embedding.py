@@ -10,27 +10,20 @@ import pytest
 from orthoflow_provenance.verify import verify_record
 
 from orthoflow.records import open_run
-from tests.studios import Studio, open_studio
+from tests.studios import Studio, open_copy, open_finished_studio
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
     """A folder with a run `first` whose plane a file says."""
     with pytest.MonkeyPatch.context() as patch:
-        studio = open_studio(tmp_path_factory.mktemp("finished"), patch)
-        (studio.folder / "n.txt").write_text("1.5")
-        studio.run("first", "--input", "number=n.txt")
-        yield studio
+        yield open_finished_studio(tmp_path_factory.mktemp("finished"), patch)
 
 
 @pytest.fixture
 def studio(finished: Studio, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Studio:
     """A folder of its own with the run, its input and its store."""
-    opened = open_studio(tmp_path, monkeypatch)
-    for name in ("first", ".orthoflow"):
-        shutil.copytree(finished.folder / name, tmp_path / name)
-    shutil.copyfile(finished.folder / "n.txt", tmp_path / "n.txt")
-    return opened
+    return open_copy(finished, tmp_path, monkeypatch)
 
 
 def assert_record_alone_is_enough(studio: Studio, record: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,27 +16,21 @@ from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.writer import write_record
 
 from orthoflow.engine import Store
-from tests.studios import Studio, open_studio
+from tests.studios import Studio, open_copy, open_finished_studio, open_studio
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
     """A folder with a run `first` whose plane a file says, kept as it was."""
     with pytest.MonkeyPatch.context() as patch:
-        studio = open_studio(tmp_path_factory.mktemp("finished"), patch)
-        (studio.folder / "n.txt").write_text("1.5")
-        studio.run("first", "--input", "number=n.txt", "--set", "paint.grey=131")
-        yield studio
+        folder = tmp_path_factory.mktemp("finished")
+        yield open_finished_studio(folder, patch, "--set", "paint.grey=131")
 
 
 @pytest.fixture
 def studio(finished: Studio, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Studio:
     """A folder of its own with the run, its input and its store."""
-    opened = open_studio(tmp_path, monkeypatch)
-    for name in ("first", ".orthoflow"):
-        shutil.copytree(finished.folder / name, tmp_path / name)
-    shutil.copyfile(finished.folder / "n.txt", tmp_path / "n.txt")
-    return opened
+    return open_copy(finished, tmp_path, monkeypatch)
 
 
 def write_changed(studio: Studio, change: Callable[[RecordedCell], RecordedCell]) -> None:

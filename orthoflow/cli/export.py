@@ -160,11 +160,8 @@ def _export_crate(run: Run, folder: Path, chosen: _Choices) -> str:
 
     _make_empty(folder)
     license_text = chosen.license_text or NO_LICENSE
-    if chosen.embed:
-        record = _embedded(run, folder, chosen)
-        files = write_crate(run, folder, license_text=license_text, record=record)
-    else:
-        files = write_crate(run, folder, license_text=license_text)
+    record = _embedded(run, folder, chosen) if chosen.embed else None
+    files = write_crate(run, folder, license_text=license_text, record=record)
     return f"{counted(len(files), 'file')}, described in {files[0].name}"
 
 

@@ -38,6 +38,17 @@ class GreyImage:
     valid: NDArray[np.bool_]
     region: NDArray[np.bool_]
 
+    def fullest_part(self, side: int) -> GreyImage:
+        """The tile of at most so many rows and columns with most cells that count."""
+        rows, columns = self.grey.shape
+        tiles = [
+            (slice(row, row + side), slice(column, column + side))
+            for row in range(0, rows, side)
+            for column in range(0, columns, side)
+        ]
+        best = max(tiles, key=lambda tile: int(np.count_nonzero(self.valid[tile])))
+        return GreyImage(grey=self.grey[best], valid=self.valid[best], region=self.region[best])
+
 
 @dataclass(frozen=True, kw_only=True)
 class PatchShifts:

@@ -55,7 +55,8 @@ def _edge_profiles(image: GreyImage) -> NDArray[np.float64]:
     """Profiles (n, steps) across edges, 0 on the dark side and 1 on the bright one."""
     from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
-    image = _fullest_part(image)
+    # A few million cells have edges enough.
+    image = image.fullest_part(_TILE_CELLS)
     if not image.valid.any():
         return np.zeros((0, _ALONG.size))
     # Voids go on as what is nearest: neither do they make edges, nor do they ring into profiles.
@@ -83,18 +84,6 @@ def _edge_profiles(image: GreyImage) -> NDArray[np.float64]:
     kept = even & (contrast >= _CONTRAST_GREY)
     scaled = (values[kept] - low[kept, None]) / contrast[kept, None]
     return _centred(scaled, _ALONG)
-
-
-def _fullest_part(image: GreyImage) -> GreyImage:
-    """The tile with most valid cells: a few million cells have edges enough."""
-    rows, columns = image.grey.shape
-    tiles = [
-        (slice(row, row + _TILE_CELLS), slice(column, column + _TILE_CELLS))
-        for row in range(0, rows, _TILE_CELLS)
-        for column in range(0, columns, _TILE_CELLS)
-    ]
-    best = max(tiles, key=lambda tile: int(np.count_nonzero(image.valid[tile])))
-    return GreyImage(grey=image.grey[best], valid=image.valid[best], region=image.region[best])
 
 
 def _closed(image: GreyImage) -> NDArray[np.float64]:

@@ -193,7 +193,8 @@ def _floor(intensity: GreyImage, radius: float) -> KeyPairs:
     """Pairs of the intensity with itself laid aside, their errors as displacements."""
     import cv2
 
-    intensity = _fullest_part(intensity)
+    # Some hundred pairs say what a floor is.
+    intensity = intensity.fullest_part(_FLOOR_CELLS)
     right, down = FLOOR_SHIFT_CELLS
     rows, columns = intensity.grey.shape
     move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
@@ -212,18 +213,6 @@ def _floor(intensity: GreyImage, radius: float) -> KeyPairs:
         shift=pairs.shift - FLOOR_SHIFT_CELLS,
         found=pairs.found - FLOOR_SHIFT_CELLS,
     )
-
-
-def _fullest_part(image: GreyImage) -> GreyImage:
-    """The tile with most valid cells: some hundred pairs say what a floor is."""
-    rows, columns = image.grey.shape
-    tiles = [
-        (slice(row, row + _FLOOR_CELLS), slice(column, column + _FLOOR_CELLS))
-        for row in range(0, rows, _FLOOR_CELLS)
-        for column in range(0, columns, _FLOOR_CELLS)
-    ]
-    best = max(tiles, key=lambda tile: int(np.count_nonzero(image.valid[tile])))
-    return GreyImage(grey=image.grey[best], valid=image.valid[best], region=image.region[best])
 
 
 def _numbers(items: list[_Verdict], wall: int, gsd_m: float) -> list[Finding]:
