@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_plugins.inspect.tie_truth import most_shown
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.simulate.room import SimulateRoom
 
@@ -26,6 +27,7 @@ from orthoflow.products import (
     Wall,
 )
 from orthoflow.sdk import StepContext
+from tests import matching_scenes as ms
 from tests import scenes
 from tests.inspecting import BUFFER_M, inspect
 
@@ -301,8 +303,22 @@ def test_ties_are_wrong_beyond_one_and_a_half_cells(tmp_path: Path, truth: Truth
     metrics, _, _ = inspect_cameras(tmp_path, truth, replace(cameras, ties=ties))
     assert metrics["n_ties_kept"] == 3
     assert metrics["match_wrong_share"] == pytest.approx(2 / 4)
+    assert metrics["match_wrong_share_own_wall"] == pytest.approx(2 / 4)
     assert metrics["tie_wrong_share"] == pytest.approx(1 / 3)
     assert metrics["tie_error_median_cells"] == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_photo_is_of_the_wall_that_covers_most_of_it() -> None:
+    scene = ms.textured_wall(0)
+    behind = ms.textured_wall(0, origin_world=np.add(scene.frame.origin_world, [0.8, 1.0, 0.0]))
+    walls = [*ms.walls_of(behind).walls, *ms.walls_of(scene).walls]
+    camera = ms.camera_before(scene)
+    assert most_shown(camera, walls) == 1
+    # The rest of the wall behind shows to the right of the one before it.
+    to_the_right = ms.camera_before(scene, centre=(3.2, -1.0, 1.0), towards=(3.5, 0.0, 1.0))
+    assert most_shown(to_the_right, walls) == 0
+    away = ms.camera_before(scene, towards=(1.2, -5.0, 1.1))
+    assert most_shown(away, walls) == -1
 
 
 def test_cameras_of_other_photos_are_refused(tmp_path: Path, truth: Truth) -> None:

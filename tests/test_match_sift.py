@@ -148,6 +148,18 @@ def test_key_points_lie_where_they_are(*, upscales_precisely: bool) -> None:
     np.testing.assert_allclose(np.median(nearest - places, axis=0), 0.0, atol=0.03)
 
 
+def test_the_key_points_that_are_kept_are_described_as_if_all_were(walls: Walls) -> None:
+    rgb = walls.walls[0].rgb
+    assert rgb is not None
+    grey = np.tile(rgb[..., 0], (1, 5))
+    every, few = (find_features(grey, replace(RULE, n_most=n)) for n in (10**6, 100))
+    assert len(few) == 100 < len(every) / 10
+    # Some lie in the second tile.
+    assert (few.pixels[:, 0] > 2048).any()
+    for name in ("pixels", "sizes_px", "angles_deg", "descriptors"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(every, name)[:100])
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -17,6 +17,7 @@ from orthoflow_plugins.orient.wall_errors import known_walls, sigmas_on_wall, wa
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.lenses import LensFreedom, stepped
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties
 from orthoflow.sdk import StepContext
@@ -155,6 +156,34 @@ def test_the_predicted_error_is_mapped_and_grows_away_from_the_ties(tmp_path: Pa
     middle = wall.corners_world[0] + [3.0 * (column + 0.5) / 15, 0.0, -2.0 * (row + 0.5) / 15]
     far = np.linalg.norm(camera.project(middle[None])[0, :2] - [450.0, 320.0])
     assert far < 250.0
+
+
+def test_the_error_at_the_corners_of_the_image_is_what_poses_scatter_there() -> None:
+    # Its left corners look past the end of the wall.
+    camera = ms.camera_before(ms.textured_wall(0), centre=(0.5, -2.0, 1.0), towards=(0.6, 0.0, 1.0))
+    ties = known_ties(camera, 4)
+    seen = SeenPoints(
+        pixels_photo=ties.pixels_photo,
+        points_world=ties.points_world,
+        sigma_px=ties.sigma_px,
+        sigma_m=ties.sigma_m,
+    )
+    (wall,) = known_walls(ties, np.ones(len(ties.photo), np.bool_))
+    resection = adjust(seen, camera)
+    found = wall_error(resection, [wall])
+    assert found is not None
+    assert np.isnan(found.corners_m[[0, 2]]).all()
+    assert found.worst_m == pytest.approx(max(found.corners_m[[1, 3]].max(), found.sigmas_m.max()))
+
+    def on_wall(posed: ViewingCamera) -> np.ndarray:
+        rays = posed.rays_world(np.array([[899.5, 0.5], [899.5, 639.5]]))
+        return (posed.centre_world - rays * (posed.centre_world[1] / rays[:, 1])[:, None])[:, ::2]
+
+    steps = np.random.default_rng(1).multivariate_normal(np.zeros(6), resection.covariance, 2000)
+    moved = [on_wall(stepped(resection.camera, step, LensFreedom())) for step in steps]
+    scatter = np.sqrt(np.mean(np.var(moved, axis=0), axis=1))
+    # 2000 samples of two coordinates give a deviation within 2 %.
+    np.testing.assert_allclose(found.corners_m[[1, 3]], scatter, rtol=0.06)
 
 
 @pytest.mark.parametrize("wrong_share", [0.3, 0.6, 0.8])

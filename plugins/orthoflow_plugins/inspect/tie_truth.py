@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import pixels_by_point
 from orthoflow.products import Cameras, Finding, TieRole, Ties, Truth, Wall, Walls
 from orthoflow_plugins.inspect.poses import true_camera
 
 # A tie that is off by more than so many cells of the wall is wrong.
 _WRONG_CELLS: Final = 1.5
+# Rays along the longer side of a photo that say which wall it shows most.
+_RAYS: Final = 32
 
 
 def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float64]:
@@ -46,11 +50,15 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
     if ties is None or not len(ties.photo) or not _of_these(ties, walls.walls):
         return []
     errors = tie_errors_cells(ties, walls, truth)
+    own = _with_own_wall(ties, walls, truth)
     kept = ties.role != TieRole.REJECTED
     findings = [
         Finding(name="match_wrong_share", value=float((errors > _WRONG_CELLS).mean()), unit="1"),
         Finding(name="n_ties_kept", value=int(kept.sum()), unit="1"),
     ]
+    if own.any():
+        wrong = float((errors[own] > _WRONG_CELLS).mean())
+        findings.append(Finding(name="match_wrong_share_own_wall", value=wrong, unit="1"))
     if kept.any():
         wrong = float((errors[kept] > _WRONG_CELLS).mean())
         median = float(np.median(errors[kept]))
@@ -59,6 +67,40 @@ def tie_findings(cameras: Cameras, walls: Walls, truth: Truth) -> list[Finding]:
             Finding(name="tie_error_median_cells", value=median, unit="1"),
         ]
     return findings
+
+
+def _with_own_wall(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.bool_]:
+    """Ties (n,) of photos with the wall that each truly shows most."""
+    most = [
+        most_shown(true_camera(truth, name), walls.walls) if (ties.photo == index).any() else -1
+        for index, name in enumerate(ties.photo_names)
+    ]
+    return np.asarray(ties.wall == np.array(most)[ties.photo])
+
+
+def most_shown(camera: ViewingCamera, walls: Sequence[Wall]) -> int:
+    """Index of the wall whose rectangle covers most of a photo, -1 where none is in it."""
+    step = max(camera.width, camera.height) / _RAYS
+    grid = np.meshgrid(
+        np.arange(0.5 * step, camera.width, step), np.arange(0.5 * step, camera.height, step)
+    )
+    rays = camera.rays_world(np.column_stack([axis.ravel() for axis in grid]))
+    nearest, shown = np.full(len(rays), np.inf), np.full(len(rays), -1)
+    for index, wall in enumerate(walls):
+        frame, centre = wall.frame, camera.centre_world
+        if float((centre - frame.origin_world) @ frame.normal_world) <= 0.0:
+            continue
+        with np.errstate(divide="ignore"):
+            along = ((frame.origin_world - centre) @ frame.normal_world) / (
+                rays @ frame.normal_world
+            )
+        ahead = np.flatnonzero((along > 0.0) & (along < nearest))
+        cells = frame.wall_from_world(centre + along[ahead, None] * rays[ahead])[:, :2]
+        hit = ahead[((cells >= 0.0) & (cells < [frame.width, frame.height])).all(axis=1)]
+        nearest[hit], shown[hit] = along[hit], index
+    counts = np.bincount(shown + 1, minlength=1 + len(walls))
+    counts[0] = 0
+    return int(counts.argmax()) - 1
 
 
 def _of_these(ties: Ties, walls: tuple[Wall, ...]) -> bool:

@@ -51,13 +51,14 @@ class InspectTruth(Method):
     through the estimated camera, and the ray of that pixel through the true camera meets the true
     scene at the place that the colour is of. The displacements of patches are then named `patch_`.
     Ties that come with the cameras are compared, too: `tie_wrong_share` of those that photos kept,
-    `match_wrong_share` of all, are more than 1.5 cells of the wall from where their pixel looks.
+    `match_wrong_share` of all, are more than 1.5 cells of the wall from where their pixel looks;
+    `match_wrong_share_own_wall` is that of the matches with the wall that each photo shows most.
 
     Without orthoimages only planes and labels are compared, as for a comparison of detectors.
     """
 
     id: ClassVar[str] = "inspect.truth"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Gruen 1985, Adaptive least squares correlation (patch matching)",

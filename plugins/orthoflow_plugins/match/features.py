@@ -20,6 +20,8 @@ _SHIFT_BY_UPSCALING_PX: Final = 0.25
 _TILE_PX: Final = 2048
 _TILE_OVERLAP_PX: Final = 96
 _SPREAD_CELLS: Final = 12
+# Smaller pictures have no key points.
+_SIDE_LEAST_PX: Final = 16
 # Squared RootSIFT entries in units of 1/512: their sums stay below 2^24, so that float32 products
 # are exact, whatever the order a BLAS library adds in.
 _QUANTA: Final = 512.0
@@ -126,23 +128,20 @@ def find_features(
     shift_px = _SHIFT_FROM_OPENCV_PX
     if not rule.upscales_precisely:
         shift_px -= _SHIFT_BY_UPSCALING_PX
-    tiles = _tiles(picture.shape)
-    parts = [part for corner in tiles if (part := _in_tile(sift, picture, corner, shift_px))]
-    if not parts:
-        return _none()
-    points = np.vstack([part[0] for part in parts])
-    raw = np.vstack([part[1] for part in parts])
+    parts = [_in_tile(sift, picture, corner, shift_px) for corner in _tiles(picture.shape)]
+    points = np.vstack([part.points for part in parts])
     pixels = points[:, :2]
     # Threads find key points in any order; the image alone orders them.
     chosen = np.lexsort(points[:, :4].T)
     if usable is not None:
         chosen = chosen[usable[_cell_of(pixels[chosen], usable.shape)]]
     chosen = chosen[_spread(pixels[chosen], points[chosen, 4], picture.shape, rule.n_most)]
+    raw = _described(sift, picture, parts, chosen)
     return Features(
         pixels=pixels[chosen],
         sizes_px=points[chosen, 2],
         angles_deg=points[chosen, 3],
-        descriptors=_root(raw[chosen]) if rule.is_rooted else raw[chosen],
+        descriptors=_root(raw) if rule.is_rooted else raw,
     )
 
 
@@ -154,32 +153,65 @@ def _tiles(shape: tuple[int, ...]) -> list[tuple[int, int]]:
     ]
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Tile:
+    """Key points that a tile of an image owns.
+
+    Attributes:
+        part: rows and columns of the image that were looked at, a margin wider than the tile.
+        points: (n, 5) float64 u, v, size, angle, response.
+        found: of OpenCV, in the part's own frame.
+    """
+
+    part: tuple[slice, slice]
+    points: NDArray[np.float64]
+    found: list[Any]
+
+
 def _in_tile(
     sift: Any, picture: NDArray[np.uint8], corner: tuple[int, int], shift_px: float
-) -> tuple[NDArray[np.float64], NDArray[np.float32]] | None:
-    """Rows (u, v, size, angle, response) and descriptors of the key points that a tile owns."""
-    low = [max(0, start - _TILE_OVERLAP_PX) for start in corner]
+) -> _Tile:
     ends = [
         min(limit, start + _TILE_PX) for start, limit in zip(corner, picture.shape, strict=True)
     ]
-    high = [
-        min(limit, end + _TILE_OVERLAP_PX) for end, limit in zip(ends, picture.shape, strict=True)
-    ]
-    view = np.ascontiguousarray(picture[low[0] : high[0], low[1] : high[1]])
-    if min(view.shape) < 16:
-        return None
-    found, raw = sift.detectAndCompute(view, None)
-    if not found:
-        return None
-    points = np.array([(*p.pt, p.size, p.angle, p.response) for p in found], dtype=np.float64)
+    low = [max(0, start - _TILE_OVERLAP_PX) for start in corner]
+    part = (
+        slice(low[0], min(picture.shape[0], ends[0] + _TILE_OVERLAP_PX)),
+        slice(low[1], min(picture.shape[1], ends[1] + _TILE_OVERLAP_PX)),
+    )
+    view = np.ascontiguousarray(picture[part])
+    found = sift.detect(view, None) if min(view.shape) >= _SIDE_LEAST_PX else ()
+    points = np.array(
+        [(*p.pt, p.size, p.angle, p.response) for p in found], dtype=np.float64
+    ).reshape(-1, 5)
     points[:, :2] += np.array([low[1], low[0]]) + shift_px
-    own = (
+    own = np.flatnonzero(
         (points[:, 0] >= corner[1])
         & (points[:, 0] < ends[1])
         & (points[:, 1] >= corner[0])
         & (points[:, 1] < ends[0])
     )
-    return points[own], np.asarray(raw, dtype=np.float32)[own]
+    return _Tile(part=part, points=points[own], found=[found[at] for at in own.tolist()])
+
+
+def _described(
+    sift: Any, picture: NDArray[np.uint8], tiles: list[_Tile], chosen: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """SIFT descriptors (n, 128) of chosen key points, counted through all tiles.
+
+    Only what is kept is described: of a rich picture that is one key point in ten, and describing
+    takes longer than finding.
+    """
+    raw = np.empty((len(chosen), 128), dtype=np.float32)
+    first = 0
+    for tile in tiles:
+        wanted = np.flatnonzero((chosen >= first) & (chosen < first + len(tile.found)))
+        if wanted.size:
+            view = np.ascontiguousarray(picture[tile.part])
+            points = [tile.found[at - first] for at in chosen[wanted].tolist()]
+            raw[wanted] = sift.compute(view, points)[1]
+        first += len(tile.found)
+    return raw
 
 
 def _spread(
@@ -212,12 +244,3 @@ def _cell_of(
     columns = np.clip(pixels[:, 0].astype(np.intp), 0, shape[1] - 1)
     rows = np.clip(pixels[:, 1].astype(np.intp), 0, shape[0] - 1)
     return rows, columns
-
-
-def _none() -> Features:
-    return Features(
-        pixels=np.empty((0, 2)),
-        sizes_px=np.empty(0),
-        angles_deg=np.empty(0),
-        descriptors=np.empty((0, 128), dtype=np.float32),
-    )

@@ -9,9 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.cameras import ViewingCamera, undistorted
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.rotations import cross_matrix
 from orthoflow_plugins.orient.photo_features import PhotoFeatures
+from orthoflow_plugins.orient.photo_rays import camera_rays
 
 _RATIO_MOST: Final = 0.85
 _PARTNERS_MOST: Final = 8
@@ -20,7 +21,6 @@ _BLOCK_ROWS: Final = 1024
 _OFF_LINE_MOST_PX: Final = 6.0
 _OFF_POINT_MOST_PX: Final = 8.0
 _ANGLE_LEAST: Final = np.radians(2.0)
-_UNDONE: Final = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,9 @@ def tie_photos(
         n_most: points at most; those that most photos see are kept.
     """
     starts = np.concatenate([[0], np.cumsum([len(item.pixels) for item in features])])
-    rays = [_rays(camera, item.pixels) for camera, item in zip(cameras, features, strict=True)]
+    rays = [
+        camera_rays(camera, item.pixels) for camera, item in zip(cameras, features, strict=True)
+    ]
     links = [np.empty((0, 2), dtype=np.intp)]
     for first, second in pairs:
         matched = _mutual(features[first].descriptors, features[second].descriptors)
@@ -104,15 +106,6 @@ def tie_photos(
         links.append(matched[off <= _OFF_LINE_MOST_PX] + [starts[first], starts[second]])
     tracks = _tracks(np.vstack(links), starts)
     return _located(cameras, features, rays, tracks[:n_most], starts)
-
-
-def _rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions (n, 3) with z = 1 in camera axes; NaN where the distortion cannot be undone."""
-    a, b = (pixels - [camera.cx, camera.cy]).T / np.array([[camera.fx], [camera.fy]])
-    found = undistorted(a, b, camera.distortion)
-    rays = np.column_stack([found[0], found[1], np.ones(len(pixels))])
-    rays[~(found[2] < _UNDONE)] = np.nan
-    return rays
 
 
 def _mutual(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:

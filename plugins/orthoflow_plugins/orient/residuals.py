@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +78,10 @@ def numbers_json(case: Case, numbers: PhotoNumbers) -> dict[str, JsonValue]:
     if case.error is not None:
         entry["sigma_wall_mm"] = 1000.0 * case.error.rms_m
         entry["sigma_wall_worst_mm"] = 1000.0 * case.error.worst_m
+        entry["sigma_image_corners_mm"] = [
+            1000.0 * sigma if math.isfinite(sigma) else None
+            for sigma in case.error.corners_m.tolist()
+        ]
     if result.lens.focal_sigma > 0.0:
         entry["focal_sigma_px"] = result.camera.fx * float(np.sqrt(result.covariance[6, 6]))
     return entry

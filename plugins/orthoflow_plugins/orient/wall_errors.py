@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import Resection, pixels_by_point, predicted_covariances
 from orthoflow.products import Ties
+from orthoflow_plugins.orient.photo_rays import camera_rays
 
 _SIDE: Final = 15
 # A view flatter than this onto the wall paints nothing useful.
@@ -43,13 +44,16 @@ class WallError:
 
     Attributes:
         rms_m: standard deviation of a coordinate in the wall's plane, RMS over the footprint.
-        worst_m: the largest one in the footprint.
+        worst_m: the largest one in the footprint, and at the corners of the image.
+        corners_m: (4,) the same at the corners of the image, top-left, top-right, bottom-left,
+            bottom-right; NaN where a corner shows none of the walls.
         footprint_px: (n, 2) pixels of the grid points that lie in the footprint.
         sigmas_m: (n,) standard deviation of a coordinate in the wall's plane at these.
     """
 
     rms_m: float
     worst_m: float
+    corners_m: NDArray[np.float64]
     footprint_px: NDArray[np.float64]
     sigmas_m: NDArray[np.float64]
 
@@ -79,9 +83,11 @@ def wall_error(resection: Resection, walls: Sequence[KnownWall]) -> WallError | 
     variances = np.concatenate([np.empty(0), *(part[0] for part in parts)])
     if not variances.size:
         return None
+    corners = _at_corners(resection, walls)
     return WallError(
         rms_m=float(np.sqrt(variances.mean())),
-        worst_m=float(np.sqrt(variances.max())),
+        worst_m=float(np.sqrt(np.fmax.reduce(corners, initial=variances.max()))),
+        corners_m=np.sqrt(corners),
         footprint_px=np.vstack([part[1] for part in parts]),
         sigmas_m=np.sqrt(variances),
     )
@@ -106,6 +112,27 @@ def _on_one_wall(
     variances, pixels = _variances(resection, wall, _grid(wall, (_SIDE, _SIDE)))
     shown = np.isfinite(variances)
     return variances[shown], pixels[shown]
+
+
+def _at_corners(resection: Resection, walls: Sequence[KnownWall]) -> NDArray[np.float64]:
+    """Variances (4,) where the corners of the image show a wall, of several the largest."""
+    camera, worst = resection.camera, np.full(4, np.nan)
+    # The middles of the outermost pixels, which the image holds for certain.
+    corners_px = np.array(
+        [[u, v] for v in (0.5, camera.height - 0.5) for u in (0.5, camera.width - 0.5)]
+    )
+    rays = camera_rays(camera, corners_px) @ camera.rotation
+    for wall in walls:
+        top_left, bottom_left, _, top_right = wall.corners_world
+        sides = np.array([top_right - top_left, bottom_left - top_left])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = ((top_left - camera.centre_world) @ wall.normal) / (rays @ wall.normal)
+            points = camera.centre_world + along[:, None] * rays
+        shares = ((points - top_left) @ sides.T) / (sides**2).sum(axis=1)
+        hit = np.flatnonzero((along > 0.0) & ((shares >= 0.0) & (shares <= 1.0)).all(axis=1))
+        variances, _ = _variances(resection, wall, points[hit])
+        worst[hit] = np.fmax(worst[hit], variances)
+    return worst
 
 
 def _grid(wall: KnownWall, shape: tuple[int, int]) -> NDArray[np.float64]:
