@@ -13,8 +13,9 @@ from orthoflow_plugins.ortho.dsm_backward_painting import SightRule, Surface, vi
 from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
 
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.relief_kernels import make_occluding
 from orthoflow.geometry.sight_kernels import look_at_cells
-from orthoflow.geometry.visibility_kernels import OCCLUDED, PAINTED, Sight
+from orthoflow.geometry.visibility_kernels import FINE_CELLS, NOTHING_M, OCCLUDED, PAINTED, Sight
 from orthoflow.products import LayerMask
 from tests import ortho_scenes as scenes
 from tests.raster_scenes import context
@@ -92,6 +93,39 @@ def test_without_visibility_only_void_and_the_frame_of_the_photo_count() -> None
     differs = sight.mask != hidden.mask
     assert (hidden.mask[differs] == OCCLUDED).all()
     assert (sight.mask[differs] == PAINTED).all()
+
+
+def test_what_hides_is_the_surface_without_spikes_and_with_its_edges_in_full() -> None:
+    rng = np.random.default_rng(3)
+    depth = rng.normal(0.0, 0.002, (77, 61)).astype(np.float32)
+    depth[20:40, 10:30] += 0.1
+    depth[50:60, 5:9] = depth[:2, :2] = depth[30, 50] = np.nan
+    depth[70, 40] = 0.5
+    step_m, edge_m = 1e-4, 0.015
+    occluding, tops = np.zeros(depth.shape, dtype=np.int16), np.zeros((10, 8), dtype=np.float32)
+    for first, end in ((0, 3), (3, 4), (4, 10)):
+        make_occluding(depth, step_m, edge_m, occluding, tops, first, end)
+
+    def of_windows(
+        values: NDArray[np.float32], pick: np.ufunc, steps: range
+    ) -> NDArray[np.float32]:
+        padded = np.pad(values, 1, mode="edge")
+        rows, columns = values.shape
+        parts = [padded[1 + i :, 1 + j :][:rows, :columns] for i in steps for j in steps]
+        return np.asarray(pick.reduce(parts), dtype=np.float32)
+
+    known = np.where(np.isnan(depth), np.float32(NOTHING_M), depth)
+    closed = np.where(np.isnan(depth), of_windows(known, np.maximum, range(-1, 2)), known)
+    lowest = of_windows(closed, np.minimum, range(2))
+    opened = of_windows(lowest, np.maximum, range(-1, 1))
+    highest = of_windows(opened, np.maximum, range(-1, 2))
+    expected = np.where(highest - opened > edge_m, highest, opened)
+    np.testing.assert_allclose(occluding * step_m, np.maximum(expected, -3.2768), atol=step_m)
+    for row, column in np.ndindex(tops.shape):
+        block = expected[FINE_CELLS * row :, FINE_CELLS * column :][:FINE_CELLS, :FINE_CELLS]
+        assert tops[row, column] == block.max()
+    assert occluding[70, 40] * step_m < 0.02  # the spike
+    assert occluding[19, 15] * step_m > 0.08  # beside the edge
 
 
 def test_visibility_none_paints_the_board_and_says_so(tmp_path: Path) -> None:

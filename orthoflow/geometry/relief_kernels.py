@@ -47,21 +47,26 @@ def bound_blocks(
 
 
 @compiled
-def take_spikes_away(
+def make_occluding(
     depth: NDArray[np.float32],
     step_m: float,
+    edge_m: float,
     occluding: NDArray[np.int16],
     tops: NDArray[np.float32],
     first: int,
     end: int,
 ) -> None:
-    """Close voids of one cell, then take away what is higher than all 2 x 2 cells it is in.
+    """Make of a surface what of it hides other cells: without spikes, and with edges in full.
 
-    A single outlier in front of a wall would cast a long shadow, which nothing real casts.
+    Voids of one cell are closed, then what is higher than all 2 x 2 cells it is in is taken away:
+    a single outlier in front of a wall would cast a long shadow, which nothing real casts. Where
+    an edge lies in its cell is not known, and the cell's own points lie on either side of it or
+    between; so beside a step of more than `edge_m` the lower cell counts as high as the higher.
 
     Args:
         depth: (rows, cols) metres, NaN where void.
         step_m: unit of `occluding`.
+        edge_m: what makes an edge.
         occluding: (rows, cols) set in some rows, `NOTHING` where void.
         tops: (blocks, blocks) set in some rows of blocks of `FINE_CELLS` to the highest of them in
             metres, `NOTHING_M` where all is void.
@@ -73,40 +78,89 @@ def take_spikes_away(
     # Of the rows above, here and below, what the next row needs; with a cell more on both sides.
     closed = np.empty((2, columns + 2), dtype=np.float32)
     lowest = np.empty((2, columns + 2), dtype=np.float32)
-    known = np.empty((3, columns + 2), dtype=np.float32)
+    known = np.empty((2, columns + 2), dtype=np.float32)
+    opened = np.empty((3, columns + 2), dtype=np.float32)
     high = np.empty(columns, dtype=np.float32)
-    per_step, floor = np.float32(1.0 / step_m), np.float32(NOTHING * step_m)
     high[:] = NOTHING_M
-    # A row of `lowest` needs that row and the next of `closed`, whose rows need three of `known`.
-    for row in range(first_row - 1, end_row):
-        if row == first_row - 1:
-            _close(depth, max(row, 0), known, closed[0])
-        else:
-            closed[0, :] = closed[1]
+    begin = max(first_row - 2, -1)
+    _close(depth, max(begin, 0), known, closed[1])
+    # A row needs those above and below it of `opened`, and a row of that itself and the one above
+    # of `lowest`, a row of which needs itself and the next of `closed`.
+    for row in range(begin, end_row + 1):
+        closed[0, :] = closed[1]
+        lowest[0, :] = lowest[1]
+        if row < rows:
+            _close(depth, min(row + 1, rows - 1), known, closed[1])
+            _erode(closed[0], closed[1], lowest[1])
+        if row <= 0:
             lowest[0, :] = lowest[1]
-        _close(depth, min(row + 1, rows - 1), known, closed[1])
-        _erode(closed[0], closed[1], lowest[1])
-        if row < first_row:
+        if row < max(first_row - 1, 0):
             continue
+        here = opened[row % 3]
+        _dilate(lowest[0], lowest[1], here)
         if row == 0:
-            lowest[0, :] = lowest[1]
-        opened = known[0]
-        _dilate(lowest[0], lowest[1], opened)
-        into = occluding[row]
+            opened[2, :] = here
+        elif row == rows:
+            here[:] = opened[(row - 1) % 3]
+        done = row - 1
+        if done < first_row:
+            continue
+        above, at = opened[(done - 1) % 3], opened[done % 3]
+        _widen(above, at, here, edge_m, step_m, known, occluding[done])
         for j in range(columns):
-            height = opened[j + 1]
-            scaled = (max(height, floor)) * per_step
-            into[j] = np.int16(np.int32(np.rint(scaled)))
-        for j in range(columns):
-            high[j] = max(high[j], opened[j + 1])
-        if (row + 1) % FINE_CELLS == 0 or row + 1 == rows:
-            block = row // FINE_CELLS
-            for k in range(tops.shape[1]):
-                top = high[k * FINE_CELLS]
-                for j in range(k * FINE_CELLS, min(columns, (k + 1) * FINE_CELLS)):
-                    top = max(top, high[j])
-                tops[block, k] = top
+            high[j] = max(high[j], known[1, j + 1])
+        if (done + 1) % FINE_CELLS == 0 or done + 1 == rows:
+            _bound(high, tops[done // FINE_CELLS])
             high[:] = NOTHING_M
+
+
+@kernel_part
+def _bound(high: NDArray[np.float32], tops: NDArray[np.float32]) -> None:
+    """Set (blocks,) the highest of each block of cells (cols,)."""
+    for k in range(tops.size):
+        top = high[k * FINE_CELLS]
+        for j in range(k * FINE_CELLS, min(high.size, (k + 1) * FINE_CELLS)):
+            top = max(top, high[j])
+        tops[k] = top
+
+
+@kernel_part
+def _widen(
+    above: NDArray[np.float32],
+    here: NDArray[np.float32],
+    below: NDArray[np.float32],
+    edge_m: float,
+    step_m: float,
+    room: NDArray[np.float32],
+    occluding: NDArray[np.int16],
+) -> None:
+    """Set a row to the highest of 3 x 3 cells where these lie an edge higher.
+
+    Args:
+        above: (cols + 2,) of the row above; the ends are not used.
+        here: likewise.
+        below: likewise, of the row below.
+        edge_m: what makes a step.
+        step_m: unit of `occluding`.
+        room: (2, cols + 2), of which the second row is set.
+        occluding: set.
+    """
+    n = here.size
+    edge, per_step = np.float32(edge_m), np.float32(1.0 / step_m)
+    floor = np.float32(NOTHING * step_m)
+    above[0], here[0], below[0] = above[1], here[1], below[1]
+    above[n - 1], here[n - 1], below[n - 1] = above[n - 2], here[n - 2], below[n - 2]
+    highest, widened = room[0], room[1]
+    for j in range(n):
+        beside = max(above[j], below[j])
+        highest[j] = max(beside, here[j])
+    for j in range(1, n - 1):
+        top = max(highest[j - 1], highest[j + 1])
+        top = max(top, highest[j])
+        widened[j] = top if top - here[j] > edge else here[j]
+    for j in range(occluding.size):
+        scaled = max(widened[j + 1], floor) * per_step
+        occluding[j] = np.int16(np.int32(np.rint(scaled)))
 
 
 @kernel_part
@@ -118,7 +172,7 @@ def _close(
     Args:
         depth: (rows, cols).
         row: which.
-        known: (3, cols + 2) room.
+        known: (2, cols + 2) room.
         closed: set; its ends repeat the first and the last cell.
     """
     rows, columns = depth.shape

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.rastering import in_parts
-from orthoflow.geometry.relief_kernels import bound_blocks, take_spikes_away
+from orthoflow.geometry.relief_kernels import bound_blocks, make_occluding
 from orthoflow.geometry.visibility_kernels import (
     BLOCK_CELLS,
     FINE_CELLS,
@@ -21,6 +21,8 @@ from orthoflow.products import Wall
 
 # Heights fit into 16 bits with room for rounding.
 _STEPS: Final = 32_000
+# Cells so much lower than one beside them, in cells, lie at an edge: steeper than 79 degrees.
+_EDGE_CELLS: Final = 5.0
 
 
 def relief_of(wall: Wall, *, threads: int) -> Relief:
@@ -29,7 +31,8 @@ def relief_of(wall: Wall, *, threads: int) -> Relief:
     step_m = max(1e-6, _largest_m(relief) / _STEPS)
     occluding = np.empty(relief.depth.shape, dtype=np.int16)
     fine_tops = np.empty_like(relief.fine_bottoms)
-    task = partial(take_spikes_away, relief.depth, step_m, occluding, fine_tops)
+    edge_m = _EDGE_CELLS * wall.frame.gsd_m
+    task = partial(make_occluding, relief.depth, step_m, edge_m, occluding, fine_tops)
     in_parts(fine_tops.shape[0], threads, task)
     # Kernels are compiled once, for arrays that cannot be written to.
     occluding.flags.writeable = False

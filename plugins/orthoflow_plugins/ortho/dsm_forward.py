@@ -44,7 +44,7 @@ class DsmForward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-forward"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7",
