@@ -4,13 +4,18 @@ After markiewicz2015: 8.6 x 4.2 x 5 m, main wall at omega 102 degrees leaning by
 deep, a fireplace, pilasters, mouldings, windows, furniture, and a leaning mirror behind which
 the scanner sees the room again. A panorama and a detail scan of the main wall, points in the order
 of the scan. Built and scanned with the parts that `simulate.room` is made of.
+
+    python benchmarks/great_room.py FOLDER        # room.npy, labels.npy and truth.json for others
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import math
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +67,29 @@ class GreatRoom:
     z: NDArray[np.float32]
     plane_index: NDArray[np.int8]
     planes: tuple[TruePlane, ...]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--points", type=int, default=FULL_POINTS)
+    parser.add_argument("--cores", type=int, default=2)
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    room = great_room(options.points, cores=options.cores)
+    np.save(options.folder / "room.npy", np.column_stack([room.x, room.y, room.z]))
+    np.save(options.folder / "labels.npy", room.plane_index)
+    truth = {
+        str(number): {
+            "name": item.name,
+            "n": item.plane.normal.tolist(),
+            "R": item.plane.offset_m,
+        }
+        for number, item in enumerate(room.planes)
+    }
+    (options.folder / "truth.json").write_text(json.dumps({"planes": truth}, indent=1))
 
 
 def great_room(n_points: int, *, cores: int) -> GreatRoom:
@@ -238,3 +266,7 @@ def _furnish(draft: SceneDraft) -> None:
     ):
         base = place * along + towards * across + FLOOR_M * np.array([0.0, 0.0, 1.0])
         add_block(draft, base=base, yaw_deg=12.0 + yaw_deg, size_m=size, paint=_PLASTER)
+
+
+if __name__ == "__main__":
+    main()

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, OrthoflowError, PluginError
-from orthoflow.files.points import PointBlock, open_scan
+from orthoflow.files.points import PointBlock, las_decoding, open_scan
 from orthoflow.files.points import blocks as blocks_module
 from orthoflow.files.points.columns import Columns, columns_of_text
 from orthoflow.files.points.foreign import guarded, load_library, reading
@@ -65,6 +65,26 @@ def test_las_leaves_out_points_marked_as_deleted(
     (block,) = read_all(path)
     np.testing.assert_allclose(block.points, points[~withheld], atol=1e-9)
     assert (block.n_read, block.n_withheld) == (40, 10)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("cores", [1, 3])
+def test_las_blocks_keep_the_order_of_the_file_for_any_number_of_processes(
+    suffix: str, cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Four chunks of 50 000 points, the last one not full; one to a block.
+    many = np.random.default_rng(0).uniform(0, 5, (170_000, 3))
+    path = scan_files.write_las(tmp_path / f"a{suffix}", many, withheld=np.arange(170_000) == 9)
+    monkeypatch.setattr(las_decoding, "BLOCK_POINTS", 50_000)
+    monkeypatch.setattr(las_decoding, "_BLOCKS_LEAST", 1)
+    blocks = list(open_scan(path, cores=cores).read())
+    assert [block.n_read for block in blocks] == [50_000, 50_000, 50_000, 20_000]
+    found = np.concatenate([block.points for block in blocks])
+    np.testing.assert_allclose(found, np.delete(many, 9, axis=0), atol=6e-5)
+    for block in blocks:
+        assert block.bounds is not None
+        np.testing.assert_array_equal(block.bounds[0], block.points.min(axis=0))
+        np.testing.assert_array_equal(block.bounds[1], block.points.max(axis=0))
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])

@@ -21,6 +21,7 @@ from orthoflow.errors import MethodError, ProductError
 from orthoflow.geometry import angle_between_deg
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import Method, StepContext
+from tests.long_loops import IS_LONG
 from tests.plane_scenes import ROOM, Rectangle, cloud_of, sampled, turned
 
 DETECTORS: dict[str, tuple[type[Method], dict[str, Any]]] = {
@@ -157,6 +158,19 @@ def test_a_turned_room_gives_the_turned_planes(
     cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
     out, _ = detect(detector, cloud, tmp_path, **TO_THE_END)
     same_planes(out.planes, rooms[detector].planes, turn)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not IS_LONG, reason="eighty detections; set ORTHOFLOW_LONG_TESTS=1")
+@every_detector
+def test_ten_other_turns_give_the_turned_planes(
+    detector: str, rooms: dict[str, Any], tmp_path: Path
+) -> None:
+    for angle_deg in (7.0, 18.5, 41.0, 57.3, 77.0, 103.0, 131.7, 168.0, 212.4, 299.9):
+        turn = turned(angle_deg)
+        cloud = cloud_of(sampled() @ turn.T, stations=STATION @ turn.T)
+        out, _ = detect(detector, cloud, tmp_path / str(angle_deg), **TO_THE_END)
+        same_planes(out.planes, rooms[detector].planes, turn)
 
 
 @pytest.mark.parametrize("detector", ["hough3d", "ransac-msac", "region-cube"])

@@ -35,6 +35,8 @@ class PointBlock:
         row: (n,) int64 position in the scan's grid, or None; column alike.
         station: (3,) float64 where the scanner stood, in the file's unit, or None.
         station_is_posed: the file states a pose other than the identity.
+        bounds: (2, 3) smallest and largest coordinates, where the reader has them already and all
+            are finite; None where it has not.
     """
 
     points: NDArray[np.float64]
@@ -48,6 +50,7 @@ class PointBlock:
     column: NDArray[np.int64] | None = None
     station: NDArray[np.float64] | None = None
     station_is_posed: bool = True
+    bounds: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -71,12 +71,13 @@ def find_format(path: Path) -> Format:
     return named
 
 
-def open_scan(path: Path, columns: Columns | None = None) -> ScanFile:
+def open_scan(path: Path, columns: Columns | None = None, *, cores: int = 1) -> ScanFile:
     """Open a point file as far as its header.
 
     Args:
         path: the file.
         columns: what the columns of a text file are, if the user says so.
+        cores: processes that may decode points; only large LAZ files use more than one.
 
     Raises:
         InputError: the file cannot be read, says what and why in one sentence.
@@ -87,19 +88,21 @@ def open_scan(path: Path, columns: Columns | None = None) -> ScanFile:
         from orthoflow.files.points.text import open_text
 
         return open_text(path, columns)
+    if found is LAS:
+        from orthoflow.files.points.las import open_las
+
+        return open_las(path, cores=cores)
     return _openers()[found.name](path)
 
 
 def _openers() -> Mapping[str, Callable[[Path], ScanFile]]:
     from orthoflow.files.points.e57 import open_e57
-    from orthoflow.files.points.las import open_las
     from orthoflow.files.points.pcd import open_pcd
     from orthoflow.files.points.ply import open_ply
     from orthoflow.files.points.ptx import open_ptx
 
     return {
         E57.name: open_e57,
-        LAS.name: open_las,
         PLY.name: open_ply,
         PCD.name: open_pcd,
         PTX.name: open_ptx,

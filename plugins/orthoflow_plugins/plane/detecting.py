@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from threading import Thread
 from time import perf_counter
 from typing import Final
 
@@ -128,6 +131,7 @@ def detect(
     if params.materials and cloud.intensity is None:
         raise MethodError(_NO_INTENSITY.format(method=method))
     started_s = perf_counter()
+    Thread(target=_load_charts, daemon=True).start()
     ctx.progress(0.0, "preparing the points")
 
     def prepared(points: PointCloud) -> Remainder:
@@ -207,3 +211,9 @@ def detect(
         labels=PointLabels(plane_index=labels),
         own_tolerances_m=assembly.own_tolerances_m,
     )
+
+
+def _load_charts() -> None:
+    """Load what draws, which takes as long as some passes: they leave the interpreter free."""
+    with contextlib.suppress(ImportError):
+        importlib.import_module("matplotlib.figure")

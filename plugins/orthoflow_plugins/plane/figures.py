@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import omega_phi_deg
 from orthoflow.geometry.directions import basis_from_up
 from orthoflow.geometry.plane_kernels import HISTOGRAM_BINS
 from orthoflow.geometry.point_kernels import PlanGrid
@@ -17,6 +16,7 @@ from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.accumulators import Accumulator
 from orthoflow_plugins.plane.assembling import Assembly
+from orthoflow_plugins.plane.figure_margins import Margins, space_out
 from orthoflow_plugins.plane.normality import Normality
 
 if TYPE_CHECKING:
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 _PANELS_MOST: Final = 4
 _PIXELS_MOST: Final = 900
+_DEVIATIONS: Final = Margins(left=0.3, right=0.1, bottom=0.45, top=0.3, across=0.3, down=0.75)
+# Between the panels stands the legend of the first.
+_ACCUMULATOR: Final = Margins(left=0.6, right=0.1, bottom=0.5, top=0.1, across=1.5)
 
 
 def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
@@ -32,7 +35,8 @@ def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
 
     deviations, names = assembly.deviations, assembly.planes.names
     count = min(_PANELS_MOST, len(names))
-    figure = Figure(figsize=(3.2 * count, 5.4), layout="constrained")
+    figure = Figure(figsize=(3.2 * count, 5.4))
+    space_out(figure, _DEVIATIONS, n_rows=2, n_columns=count)
     edges_mm = 1000.0 * np.linspace(-deviations.find_m, deviations.find_m, HISTOGRAM_BINS + 1)
     middles_mm = 0.5 * (edges_mm[1:] + edges_mm[:-1])
     for index in range(count):
@@ -80,11 +84,13 @@ class VotePicture:
         grid: where the cells of the plan lie.
         plan: (e1, e2) points per cell.
         accumulator: votes of that plan.
+        voters: who voted, to finish a sentence.
     """
 
     grid: PlanGrid
     plan: NDArray[np.int64]
     accumulator: Accumulator
+    voters: str
 
 
 def draw_accumulator(
@@ -100,7 +106,8 @@ def draw_accumulator(
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    figure = Figure(figsize=(11.0, 4.6))
+    space_out(figure, _ACCUMULATOR, n_rows=1, n_columns=2)
     left, right = figure.subplots(1, 2)
     basis = basis_from_up(planes.up)
     grid, accumulator = picture.grid, picture.accumulator
@@ -132,8 +139,8 @@ def draw_accumulator(
     ctx.figure(
         "accumulator",
         figure,
-        "Left: points per plan cell with the walls found. Right: the parameter space, each cell "
-        "voting with its number of points; circles mark the walls.",
+        "Left: points per plan cell with the walls found. Right: the parameter space, in which "
+        f"{picture.voters}; circles mark the walls.",
     )
 
 
@@ -154,37 +161,3 @@ def _thinned_sum(values: NDArray[np.int64]) -> NDArray[np.float64]:
     blocks = padded.reshape(padded.shape[0] // rows, rows, padded.shape[1] // columns, columns)
     thinned: NDArray[np.float64] = blocks.sum(axis=(1, 3)).astype(np.float64)
     return thinned
-
-
-def draw_space(ctx: StepContext, best: NDArray[np.float64], planes: Planes) -> None:
-    """Draw the best votes of a 3D accumulator over direction and inclination, and the planes.
-
-    Args:
-        ctx: takes the figure.
-        best: (o, p) over omega 0..180 and phi -90..90 degrees; NaN where nothing was asked.
-        planes: the planes, world.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
-    axes = figure.subplots()
-    axes.imshow(
-        np.sqrt(np.maximum(best.T, 0.0)),
-        origin="lower",
-        aspect="auto",
-        cmap="gray",
-        extent=(0.0, 180.0, -90.0, 90.0),
-    )
-    for normal in planes.normal:
-        omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
-        if omega_deg >= 180.0:
-            omega_deg, phi_deg = omega_deg - 180.0, -phi_deg
-        axes.plot(omega_deg, phi_deg, "o", fillstyle="none", markersize=9)
-    axes.set_xlabel("omega [deg]")
-    axes.set_ylabel("phi [deg]")
-    ctx.figure(
-        "accumulator",
-        figure,
-        "The best votes of any distance over the direction of the normal; circles mark the planes. "
-        "Directions are even over the hemisphere, so there are fewer towards the poles.",
-    )

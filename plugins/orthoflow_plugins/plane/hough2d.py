@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -15,6 +15,13 @@ if TYPE_CHECKING:
     from orthoflow_plugins.plane.detecting import Report
     from orthoflow_plugins.plane.figures import VotePicture
     from orthoflow_plugins.plane.remainders import Remainder
+
+_VOTERS: Final = {
+    "counts": "each cell votes with its number of points",
+    "unit": "each cell with points has one vote",
+    "canny": "each cell on an edge of the density has one vote",
+    "raw": "each point votes with its own coordinates",
+}
 
 
 class Hough2d(Method):
@@ -39,7 +46,7 @@ class Hough2d(Method):
     """
 
     id = "plane.hough2d"
-    result_version = 2
+    result_version = 3
     determinism = "exact"
     citations = (
         (
@@ -105,9 +112,13 @@ class Hough2d(Method):
             found = search_sample(remainder, rules, report, lambda _: proposer)
             if proposer.first is not None and remainder.plan is not None:
                 plan = remainder.plan.cells
-                pictures.append(
-                    VotePicture(grid=remainder.grid, plan=plan, accumulator=proposer.first)
+                picture = VotePicture(
+                    grid=remainder.grid,
+                    plan=plan,
+                    accumulator=proposer.first,
+                    voters=_VOTERS["raw" if params.coordinates == "raw" else params.accumulator],
                 )
+                pictures.append(picture)
             return found
 
         detection = detect(

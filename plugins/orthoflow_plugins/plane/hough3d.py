@@ -11,9 +11,6 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from orthoflow_plugins.plane.candidates import FoundPlane, Rules
     from orthoflow_plugins.plane.detecting import Report
     from orthoflow_plugins.plane.remainders import Remainder
@@ -32,7 +29,7 @@ class Hough3d(Method):
     """
 
     id = "plane.hough3d"
-    result_version = 2
+    result_version = 3
     determinism = "exact"
     citations = (
         (
@@ -77,11 +74,11 @@ class Hough3d(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.detecting import detect, search_sample
-        from orthoflow_plugins.plane.figures import draw_space
         from orthoflow_plugins.plane.scene_figures import draw_sections
         from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
+        from orthoflow_plugins.plane.space_figures import SpacePicture, draw_space
 
-        pictures: list[NDArray[np.float64]] = []
+        pictures: list[SpacePicture] = []
         coarser = 1.0 if params.search == "full" else 2.0
 
         def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:

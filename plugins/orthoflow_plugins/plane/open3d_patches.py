@@ -27,7 +27,7 @@ class Open3dPatches(Method):
     """
 
     id = "plane.open3d-patches"
-    result_version = 2
+    result_version = 3
     determinism = "loose"
     citations = (
         "Zhou, Park, Koltun 2018: Open3D, a modern library for 3D data, arXiv:1801.09847",

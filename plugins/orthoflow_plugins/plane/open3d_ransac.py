@@ -38,7 +38,7 @@ class Open3dRansac(Method):
     """
 
     id = "plane.open3d-ransac"
-    result_version = 2
+    result_version = 3
     determinism = "loose"
     citations = (
         "Zhou, Park, Koltun 2018: Open3D, a modern library for 3D data, arXiv:1801.09847",

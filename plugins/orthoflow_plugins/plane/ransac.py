@@ -31,7 +31,7 @@ class Ransac(Method):
     """
 
     id = "plane.ransac"
-    result_version = 2
+    result_version = 3
     determinism = "seeded"
     citations = (
         "Fischler, Bolles 1981: Random sample consensus, doi:10.1145/358669.358692",

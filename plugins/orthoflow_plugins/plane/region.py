@@ -49,7 +49,7 @@ class Region(Method):
     """
 
     id = "plane.region"
-    result_version = 2
+    result_version = 3
     determinism = "exact"
     citations = (
         (

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.directions import basis_from_up
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.figure_margins import Margins, space_out
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,6 +24,7 @@ _NAMED_MOST: Final = 12
 _AZIMUTH_DEG: Final = -60.0
 _ELEVATION_DEG: Final = 35.0
 _GREY: Final = "#c8c8c8"
+_SCENE: Final = Margins(left=0.05, right=0.05, bottom=0.05, top=0.05, across=0.1)
 
 
 def draw_planes(
@@ -47,7 +49,8 @@ def draw_planes(
     shown = points_m[::every]
     view = _view(planes.up)
     flat, index = shown @ view.T, plane_of_point[::every]
-    figure = Figure(figsize=(11.0, 4.8), layout="constrained")
+    figure = Figure(figsize=(11.0, 4.8))
+    space_out(figure, _SCENE, n_rows=1, n_columns=2)
     left, right = figure.subplots(1, 2)
     on_none = index < 0
     left.plot(*flat[on_none].T, ".", markersize=0.8, color=_GREY)

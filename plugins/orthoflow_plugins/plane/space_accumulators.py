@@ -19,6 +19,7 @@ from orthoflow_plugins.plane.accumulators import contrast, parabola
 from orthoflow_plugins.plane.candidates import Candidate, Family
 from orthoflow_plugins.plane.remainders import Remainder
 from orthoflow_plugins.plane.space_directions import directions_over
+from orthoflow_plugins.plane.space_figures import SpacePicture, pictured
 from orthoflow_plugins.plane.voxels import Places, VoxelCounts
 
 # A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
@@ -59,8 +60,7 @@ class SpaceProposer:
     instead of all others voting again.
 
     Attributes:
-        first_picture: (o, p) best contrast over omega and phi of the untouched cloud, NaN where no
-            direction was asked about.
+        first_picture: the accumulator of the untouched cloud.
     """
 
     def __init__(self, remainder: Remainder, voting: SpaceVoting) -> None:
@@ -88,7 +88,7 @@ class SpaceProposer:
         self._voted_for = -1
         self._unscored = np.arange(n_rows)
         self._last = (0, 0)
-        self.first_picture: NDArray[np.float64] | None = None
+        self.first_picture: SpacePicture | None = None
 
     def propose(self, remainder: Remainder) -> Candidate | None:
         """Name the plane whose votes stand out most."""
@@ -188,17 +188,9 @@ class SpaceProposer:
         in_threads(tasks)
         self._unscored = rows[:0]
         if self.first_picture is None:
-            self.first_picture = self._picture()
-
-    def _picture(self) -> NDArray[np.float64]:
-        """Best contrast over omega and phi."""
-        directions = self._directions
-        n_turns = len(directions.starts) - 1
-        picture = np.full((n_turns, n_turns + 1), np.nan)
-        omega = np.rint(directions.angles_rad[:, 0] / directions.step_rad).astype(int)
-        phi = np.rint((directions.angles_rad[:, 1] + 0.5 * math.pi) / directions.step_rad)
-        picture[omega, phi.astype(int)] = self._scores / VOTE_SHARES
-        return picture
+            self.first_picture = pictured(
+                self._directions, self._votes, self._scores / VOTE_SHARES, bin_m=self._bin_m
+            )
 
     def _refined(self, direction: int, score: float) -> Candidate:
         """Look around a maximum with finer slopes and half bins, with the voxels near it."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from orthoflow.products import Planes
 from orthoflow.sdk import StepContext
+from orthoflow_plugins.plane.figure_margins import Margins, space_out
 from orthoflow_plugins.plane.scan_rows import ScanRow
 from orthoflow_plugins.plane.thickness import Materials, Thickness
 
@@ -13,6 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _PLANES_MOST: Final = 12
+_MARGINS: Final = Margins(left=0.7, right=0.1, bottom=0.45, top=0.1, across=0.45, down=0.5)
+# The names of materials stand between panels.
+_WITH_NAMES: Final = replace(_MARGINS, across=1.3)
 _LABELS: Final = {
     "incidence_deg": "angle of incidence [deg]",
     "range_m": "range [m]",
@@ -36,8 +41,10 @@ def draw_thickness(
     classes = [name for name in _LABELS if any(item.over.get(name) for _, item in known)]
     named = any(item.over.get("material") for _, item in known)
     n_rows, n_columns = 1 if row is None else 2, 1 + len(classes) + int(named)
-    figure = Figure(figsize=(3.4 * n_columns, 2.9 * n_rows), layout="constrained")
+    figure = Figure(figsize=(3.4 * n_columns, 2.9 * n_rows))
     grid = figure.add_gridspec(n_rows, n_columns)
+    across = _WITH_NAMES if named else _MARGINS
+    space_out(figure, across, n_rows=n_rows, n_columns=n_columns)
     _draw_planes(figure.add_subplot(grid[0, 0]), planes, known)
     for place, name in enumerate(classes):
         axes = figure.add_subplot(grid[0, 1 + place])

@@ -88,7 +88,7 @@ class ReadScan(Method):
         columns = None if params.columns is None else columns_of_text(params.columns)
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} names no files: expected a scan")
-        files = [open_scan(path, columns) for path in inputs.files.paths]
+        files = [open_scan(path, columns, cores=ctx.cores) for path in inputs.files.paths]
         if columns is not None and not any(file.format_name == "text" for file in files):
             ctx.warn("columns only speaks of text files, and none was read; it has no effect")
         assembly = CloudAssembly(ctx, files, UNITS_M[params.unit])
