@@ -183,8 +183,8 @@ def engine_command(method: str, path: Path, folder: Path) -> list[str]:
 def run_child(arguments: list[str]) -> None:
     """Do one of the things that are measured."""
     task, *rest = arguments
-    if task in {"decode", "read", "chunks", "coordinates"}:
-        read_with_laspy(Path(rest[0]), keeps=task in ("read", "coordinates"))
+    if task in {"decode", "read"}:
+        read_with_laspy(Path(rest[0]), keeps=task == "read")
     elif task == "process":
         detect_in_file(rest[0], Path(rest[1]), Path(rest[2]))
     else:

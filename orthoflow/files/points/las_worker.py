@@ -5,6 +5,7 @@ It imports nothing but the decompressor, so that it is up at once.
 
 from __future__ import annotations
 
+import importlib
 import mmap
 import os
 import sys
@@ -15,8 +16,7 @@ def main() -> None:
     path, shared, start, record, *numbers = sys.argv[1:]
     slot_bytes, step, point_bytes, first, stride, n_points = (int(text) for text in numbers)
     try:
-        import lazrs
-
+        lazrs = importlib.import_module("lazrs")
         memory = memoryview(mmap.mmap(int(shared), 0))
         fields = (
             lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL
