@@ -50,7 +50,7 @@ class DsmBackward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-backward"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7, 4.4",

@@ -31,8 +31,8 @@ from orthoflow_plugins.ortho.dsm_backward_sampling import (
 )
 
 TILE_CELLS: Final = 512
-# cv2.remap takes images of sides below 32767.
-_CROP_MOST_PX: Final = 16_000
+# What is packed of a photo for a tile stays below 80 MB; cv2.remap takes sides below 32767.
+_CROP_MOST_PX: Final = 3_000
 
 Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 

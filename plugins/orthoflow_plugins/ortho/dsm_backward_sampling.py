@@ -10,6 +10,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.bilinear_kernels import pack_pixels, sample_bilinear
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.visibility_kernels import Sight, WallView
 
@@ -109,6 +110,11 @@ def sample(
         crop = np.asarray(blurred, dtype=np.uint8)
     # OpenCV has (0, 0) at the centre of the first pixel.
     centre = (corner[0] + np.float32(0.5), corner[1] + np.float32(0.5))
+    if resampling == "bilinear":
+        packed = np.empty((crop.shape[0] + 1, crop.shape[1] + 1), dtype=np.uint64)
+        pack_pixels(crop, packed)
+        sample_bilinear(packed, sight.u, sight.v, centre, into)
+        return into
     return _remapped(crop, sight.u, sight.v, centre, resampling, into)
 
 
@@ -125,7 +131,6 @@ def _remapped(
 
     flags = {
         "nearest": cv2.INTER_NEAREST,
-        "bilinear": cv2.INTER_LINEAR,
         "cubic": cv2.INTER_CUBIC,
         "lanczos": cv2.INTER_LANCZOS4,
     }
