@@ -287,3 +287,15 @@ def test_the_map_of_sources_names_their_colours(tmp_path: Path) -> None:
     left, right = (picture[:, part].mean(axis=(0, 1)) for part in np.s_[:third, -third:])
     assert left[2] > 2 * left[0]  # blue
     assert right[0] > 2 * right[2]  # orange
+
+
+def test_a_wall_joined_in_bands_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layers = Layers(layers=tuple(random_layer(seed) for seed in (1, 2, 3)))
+    (whole,) = joined(layers, tmp_path, island_cells_min=4).images
+    monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", 1)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.seams._ROWS_AT_ONCE", 3)
+    (banded,) = joined(layers, tmp_path, island_cells_min=4).images
+    for name in ("rgb", "mask", "source"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name))

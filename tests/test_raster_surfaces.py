@@ -239,3 +239,44 @@ def test_one_scan_cannot_be_balanced_and_that_is_said(tmp_path: Path) -> None:
     ctx = scenes.context(tmp_path)
     rastered(alone, known, ctx, balance_intensity=True)
     assert any("no two scans overlap" in warning for warning in ctx.warnings)
+
+
+def test_strays_in_the_shadow_of_an_edge_are_left_void_and_sparse_surfaces_stay(
+    tmp_path: Path,
+) -> None:
+    known = scenes.leaning_wall(shape=(120, 160))
+    columns, rows = scenes.cell_centres(known.shape)
+    rng = np.random.default_rng(8)
+    true_m = np.where(columns < 40, 0.07, 0.0)
+    in_shadow = (columns > 40) & (columns < 60)
+    # What a scan has there: few distances, mixed of both sides of the edge, and outliers.
+    is_stray = in_shadow & (rng.random(len(columns)) < 0.06)
+    depths_m = np.where(is_stray, rng.uniform(0.0, 0.2, len(columns)), true_m)
+    # A dark surface that gives few points, all on one plane.
+    is_dark = (columns > 100) & (columns < 140)
+    kept = np.where(in_shadow, is_stray, ~is_dark | (rng.random(len(columns)) < 0.25))
+    cloud = scenes.cloud_of(known.world(columns[kept], rows[kept], depths_m[kept]))
+    ctx = scenes.context(tmp_path)
+    wall = rastered(cloud, known, ctx, buffer_m=0.3, recover_gap_cells=0).walls[0]
+    measured = (wall.mask == SurfaceMask.MEASURED).ravel()
+    assert np.count_nonzero(is_stray & kept) > 100
+    assert np.mean(measured[is_stray & kept]) < 0.05
+    np.testing.assert_array_equal(measured[~in_shadow], kept[~in_shadow])
+
+
+@pytest.mark.parametrize("surface", ["nearest", "median", "denoised", "topmost"])
+def test_a_wall_rastered_in_bands_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, surface: str
+) -> None:
+    known = scenes.leaning_wall(shape=(300, 60))
+    cloud, *_ = scattered(known, per_cell=1.2, noise_m=NOISE_M)
+    params = {"surface": surface, "percentiles": (10.0,)}
+    whole = rastered(cloud, known, scenes.context(tmp_path), **params).walls[0]
+    monkeypatch.setattr("orthoflow_plugins.raster.grid._BAND_CELLS", 60 * 180)
+    banded = rastered(cloud, known, scenes.context(tmp_path), **params).walls[0]
+    for name in ("count", "mask", "rgb", "percentiles_m", "intensity", "depth_m", "sigma_m"):
+        one, other = getattr(whole, name), getattr(banded, name)
+        # How strongly noise is taken out follows from the noise of a band.
+        tolerance = 0.2 * NOISE_M if surface == "denoised" and name == "depth_m" else 1e-6
+        np.testing.assert_allclose(one, other, atol=tolerance, err_msg=name)
+    assert (tmp_path / "allocated" / "walls.0.depth_m").is_file()

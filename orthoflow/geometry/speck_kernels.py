@@ -1,4 +1,4 @@
-"""A compiled pass that finds cells of a raster whose depth nothing around them shares."""
+"""Compiled passes that find cells of a raster whose depth nothing around them shares."""
 
 from __future__ import annotations
 
@@ -8,16 +8,21 @@ from numpy.typing import NDArray
 from orthoflow.geometry.point_kernels import compiled
 
 # Cells within so many rows and columns are around.
-_REACH = 2
+NEAR_CELLS = 2
 # Fewer of them known say nothing, fewer of the known ones in agreement make a speck.
 _KNOWN_LEAST = 6
 _AGREEING_LEAST = 2
+# Where cells are sparse more of them are asked, and more must agree: at least half of the known.
+_SPARSE_CELLS = 4
+_SPARSE_LEAST = 3
 
 
 @compiled
 def find_specks(
     depth_m: NDArray[np.float32],
+    is_sparse: NDArray[np.bool_],
     layer_m: float,
+    close_m: float,
     is_speck: NDArray[np.bool_],
     first_row: int,
     end_row: int,
@@ -26,27 +31,41 @@ def find_specks(
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
+        is_sparse: (rows, cols) cells in gaps of an otherwise well known surface.
         layer_m: depths that differ by no more agree.
+        close_m: the same for sparse cells.
         is_speck: (rows, cols), made true for known cells of which fewer than two of at least six
-            known ones in the 5 x 5 around agree.
+            known ones in the 5 x 5 around agree, and for sparse ones of which fewer than three, or
+            fewer than half of the known ones, in the 9 x 9 around agree.
         first_row: first row to visit.
         end_row: the row after the last one.
     """
-    rows, columns = depth_m.shape
+    columns = depth_m.shape[1]
     for row in range(first_row, end_row):
         for column in range(columns):
-            here = depth_m[row, column]
-            if np.isnan(here):
+            if np.isnan(depth_m[row, column]):
                 continue
-            n_known, n_agreeing = 0, 0
-            for r in range(max(0, row - _REACH), min(rows, row + _REACH + 1)):
-                for c in range(max(0, column - _REACH), min(columns, column + _REACH + 1)):
-                    other = depth_m[r, c]
-                    if np.isnan(other) or (r == row and c == column):
-                        continue
-                    n_known += 1
-                    if abs(other - here) <= layer_m:
-                        n_agreeing += 1
-                if n_agreeing >= _AGREEING_LEAST:
-                    break
+            if is_sparse[row, column]:
+                n_known, n_agreeing = _count_around(depth_m, row, column, _SPARSE_CELLS, close_m)
+                is_speck[row, column] = n_agreeing < max(_SPARSE_LEAST, 0.5 * n_known)
+                continue
+            n_known, n_agreeing = _count_around(depth_m, row, column, NEAR_CELLS, layer_m)
             is_speck[row, column] = n_agreeing < _AGREEING_LEAST and n_known >= _KNOWN_LEAST
+
+
+@compiled
+def _count_around(
+    depth_m: NDArray[np.float32], row: int, column: int, reach: int, agree_m: float
+) -> tuple[int, int]:
+    """Count the known cells around a cell, and those that agree with it."""
+    rows, columns = depth_m.shape
+    here = depth_m[row, column]
+    n_known, n_agreeing = -1, -1
+    for r in range(max(0, row - reach), min(rows, row + reach + 1)):
+        for c in range(max(0, column - reach), min(columns, column + reach + 1)):
+            other = depth_m[r, c]
+            if np.isnan(other):
+                continue
+            n_known += 1
+            n_agreeing += abs(other - here) <= agree_m
+    return n_known, n_agreeing

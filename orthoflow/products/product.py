@@ -21,6 +21,8 @@ Array: TypeAlias = NDArray[np.generic]
 Unit = Literal["m", "px", "grey", "deg", "1"]
 
 _ARRAY: Final = "$array"
+# Arrays of more than this are memory-mapped, whatever their product: nobody holds them in memory.
+_LARGE_BYTES: Final = 1 << 31
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +66,8 @@ class Product:
     Attributes:
         type_name: identity in workflows, store and record; never changes.
         encoding_version: raised when the fields change.
-        mapped: store contiguous and memory-map on reading (for products of scan size).
+        mapped: store contiguous and memory-map on reading (for products of scan size; any product
+            of more than 2 GiB is).
         embedded: put the arrays into the record, not only their digest.
         tolerances: field name -> how far replays may differ; fields not named must be equal.
     """
@@ -84,7 +87,7 @@ class Product:
             encoding_version=self.encoding_version,
             metadata=metadata,
             arrays=arrays,
-            mapped=self.mapped,
+            mapped=self.mapped or sum(array.nbytes for array in arrays.values()) > _LARGE_BYTES,
         )
 
     @classmethod

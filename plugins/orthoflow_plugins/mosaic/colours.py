@@ -19,6 +19,7 @@ _LEAST_SAMPLES: Final = 100
 _DARKEST, _BRIGHTEST = 10, 245
 # As much as a tenth of what an overlap says, so that a chain of photos does not drift.
 _PRIOR: Final = 0.1
+_ROWS_AT_ONCE: Final = 1024
 _LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 
 
@@ -45,10 +46,9 @@ def seam_steps(source: NDArray[np.int16], layers: Sequence[Layer]) -> SeamSteps:
     nothing = np.zeros((0, 3), dtype=np.uint8)
     firsts, seconds = [nothing], [nothing]
     for axis in (0, 1):
-        here = source[:-1] if axis == 0 else source[:, :-1]
-        there = source[1:] if axis == 0 else source[:, 1:]
-        rows, columns = np.nonzero((here != there) & (here >= 0) & (there >= 0))
-        mine, other = here[rows, columns], there[rows, columns]
+        rows, columns = _before_seams(source, axis)
+        mine = source[rows, columns]
+        other = source[rows + (axis == 0), columns + (axis == 1)]
         for index, layer in enumerate(layers):
             chosen = (other == index) & (layer.mask[rows, columns] == LayerMask.PAINTED)
             seconds.append(layer.rgb[rows[chosen], columns[chosen]])
@@ -62,6 +62,21 @@ def seam_steps(source: NDArray[np.int16], layers: Sequence[Layer]) -> SeamSteps:
     return SeamSteps(
         grey=grey, delta_e=np.linalg.norm(_lab(one) - _lab(another), axis=1).astype(np.float64)
     )
+
+
+def _before_seams(
+    source: NDArray[np.int16], axis: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the cells above seams (axis 0) or left of them, strip by strip."""
+    found: list[NDArray[np.int64]] = []
+    for first in range(0, source.shape[0], _ROWS_AT_ONCE):
+        strip = source[first : first + _ROWS_AT_ONCE + (axis == 0)]
+        here = strip[:-1] if axis == 0 else strip[:, :-1]
+        there = strip[1:] if axis == 0 else strip[:, 1:]
+        rows, columns = np.nonzero((here != there) & (here >= 0) & (there >= 0))
+        found.append(np.stack([rows + first, columns]))
+    rows, columns = np.concatenate(found, axis=1)
+    return rows, columns
 
 
 def balanced(layers: Sequence[Layer], gains: NDArray[np.float64]) -> list[Layer]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask
@@ -16,7 +16,12 @@ from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask
 # Preferences (rows, cols) of layers that paint a wall together, larger is better.
 Preferring = Callable[[Sequence[Layer]], Sequence[NDArray[np.float32]]]
 
+# Name, shape, type -> zeroed array.
+Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
+
 NOBODY: Final = -1
+# Walls with more cells are joined in bands of so many.
+_BAND_CELLS: Final = 1 << 25
 # A cell takes the highest of these that a layer gives it. Occluded: no source paints it, although
 # at least one looks at it. A filled cell counts less than a painted one.
 _RANKED: Final = (
@@ -47,9 +52,14 @@ class Choice:
 
 
 def joined(
-    layers: tuple[Layer, ...], name: str, *, island_cells_min: int, prefer: Preferring
+    layers: tuple[Layer, ...],
+    name: str,
+    *,
+    island_cells_min: int,
+    prefer: Preferring,
+    allocate: Allocate,
 ) -> Orthoimage:
-    """Join the layers of one wall.
+    """Join the layers of one wall, a large one band by band.
 
     Args:
         layers: all of one wall, at least one.
@@ -57,6 +67,7 @@ def joined(
         island_cells_min: smaller patches from one source are painted from the source around
             them, where that one sees them too.
         prefer: says which layer paints a cell that several show as well.
+        allocate: gives the arrays of the orthoimage, by name.
 
     Raises:
         MethodError: the layers do not share one frame.
@@ -71,22 +82,58 @@ def joined(
     # What paints nothing is no source; it still tells what is hidden.
     painters = [layer for layer in layers if (layer.mask == LayerMask.PAINTED).any()]
     others = [layer for layer in layers if all(layer is not painter for painter in painters)]
-    preferred = prefer(painters) if painters else []
-    choice = best_views([*painters, *others], [*preferred, *(layer.quality for layer in others)])
-    if island_cells_min > 1 and len(painters) > 1:
-        choice = without_islands(choice, painters, island_cells_min)
-    rgb = np.zeros((*first.frame.shape, 3), dtype=np.uint8)
-    for index, layer in enumerate(painters):
-        is_mine = choice.source == index
-        rgb[is_mine] = layer.rgb[is_mine]
+    preferred = [*(prefer(painters) if painters else []), *(layer.quality for layer in others)]
+    shape = first.frame.shape
+    rgb = np.asarray(allocate("rgb", (*shape, 3), np.uint8), np.uint8)
+    mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
+    source = np.asarray(allocate("source", shape, np.int16), np.int16)
+    for rows, around in _bands(shape, _island_reach(island_cells_min)):
+        choice = best_views(
+            [_part(layer, around) for layer in [*painters, *others]],
+            [preference[around] for preference in preferred],
+        )
+        if island_cells_min > 1 and len(painters) > 1:
+            parts = [_part(layer, around) for layer in painters]
+            choice = without_islands(choice, parts, island_cells_min)
+        inner = slice(rows.start - around.start, rows.stop - around.start)
+        mask[rows], source[rows] = _MASK_OF_RANK[choice.rank[inner]], choice.source[inner]
+        for index, layer in enumerate(painters):
+            is_mine = source[rows] == index
+            rgb[rows][is_mine] = layer.rgb[rows][is_mine]
     return Orthoimage(
         frame=first.frame,
         wall=first.wall,
         name=name,
         rgb=rgb,
-        mask=_MASK_OF_RANK[choice.rank],
-        source=choice.source,
+        mask=mask,
+        source=source,
         sources=tuple(layer.source for layer in painters),
+    )
+
+
+def _island_reach(cells_min: int) -> int:
+    """How many rows away a cell may lie that decides who paints another."""
+    return cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
+
+
+def _bands(shape: tuple[int, int], reach: int) -> Iterator[tuple[slice, slice]]:
+    """Cut a large wall into bands of rows; give each with a reach of rows about it."""
+    rows, columns = shape
+    height = max(1, _BAND_CELLS // max(1, columns) - 2 * reach)
+    for first in range(0, rows, height):
+        end = min(rows, first + height)
+        yield slice(first, end), slice(max(0, first - reach), min(rows, end + reach))
+
+
+def _part(layer: Layer, rows: slice) -> Layer:
+    """Some rows of a layer, without a copy."""
+    return replace(
+        layer,
+        frame=replace(layer.frame, height=rows.stop - rows.start),
+        rgb=layer.rgb[rows],
+        mask=layer.mask[rows],
+        quality=layer.quality[rows],
+        filled=None if layer.filled is None else layer.filled[rows],
     )
 
 

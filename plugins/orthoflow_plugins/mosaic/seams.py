@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import groupby
-from typing import ClassVar, Literal
+from typing import ClassVar, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
@@ -28,10 +29,14 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.mosaic.colours import SeamSteps, balanced, estimate_gains, seam_steps
 from orthoflow_plugins.mosaic.cutting import depth_edges
-from orthoflow_plugins.mosaic.joining import joined
+from orthoflow_plugins.mosaic.joining import Allocate, joined
 from orthoflow_plugins.mosaic.overlaps import displacements_cells
 from orthoflow_plugins.mosaic.preferring import SeamRule, preferences, require_sources
 from orthoflow_plugins.mosaic.source_maps import caption, is_seam, source_map
+
+_ROWS_AT_ONCE: Final = 1024
+# Arrays of more values than this lie in files.
+_IN_MEMORY_MOST: Final = 1 << 27
 
 
 class MosaicSeams(Method):
@@ -98,7 +103,8 @@ class MosaicSeams(Method):
             group: tuple[Layer, ...] = tuple(members)
             name = _name(inputs.layers, index)
             ctx.progress(index / (layers[-1].wall + 1), name)
-            verdicts.append(_join(group, name, params, _wall(inputs.walls, index)))
+            allocate = partial(_allocated, ctx, index)
+            verdicts.append(_join(group, name, params, _wall(inputs.walls, index), allocate))
             _show(ctx, verdicts[-1].image)
         _report(ctx, verdicts)
         gains: dict[str, JsonValue] = {
@@ -120,6 +126,7 @@ class _Joined:
         image: the orthoimage.
         shifts_cells: (n, 2) displacements between the photos of overlaps.
         steps: of colours along seams.
+        n_seam: cells of seams.
         n_edge_seam: cells of seams at depth edges, None when the surface is not known.
         gains: per source and channel, when colours were balanced.
     """
@@ -127,12 +134,26 @@ class _Joined:
     image: Orthoimage
     shifts_cells: NDArray[np.float64]
     steps: SeamSteps
+    n_seam: int
     n_edge_seam: int | None = None
     gains: dict[str, JsonValue] = field(default_factory=dict)
 
 
+def _allocated(
+    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
+) -> NDArray[np.generic]:
+    """Memory for an orthoimage, in a file for a large one."""
+    if math.prod(shape) <= _IN_MEMORY_MOST:
+        return np.zeros(shape, dtype=dtype)
+    return ctx.allocate("orthoimages", f"{wall}.{name}", shape, dtype).view(np.ndarray)
+
+
 def _join(
-    group: tuple[Layer, ...], name: str, params: MosaicSeams.Params, wall: Wall | None
+    group: tuple[Layer, ...],
+    name: str,
+    params: MosaicSeams.Params,
+    wall: Wall | None,
+    allocate: Allocate,
 ) -> _Joined:
     painters = [layer for layer in group if (layer.mask == LayerMask.PAINTED).any()]
     gains: dict[str, JsonValue] = {}
@@ -150,17 +171,30 @@ def _join(
         name,
         island_cells_min=params.island_cells_min,
         prefer=partial(preferences, rule=params.seams, priority=params.priority, wall=wall),
+        allocate=allocate,
     )
-    n_edge_seam = None
-    if wall is not None:
-        n_edge_seam = int(np.count_nonzero(is_seam(image.source) & depth_edges(wall.depth_m)))
+    n_seam, n_edge_seam = _count_seams(image.source, None if wall is None else wall.depth_m)
     return _Joined(
         image=image,
         shifts_cells=displacements_cells(group),
         steps=seam_steps(image.source, painters),
-        n_edge_seam=n_edge_seam,
+        n_seam=n_seam,
+        n_edge_seam=None if wall is None else n_edge_seam,
         gains=gains,
     )
+
+
+def _count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) -> tuple[int, int]:
+    """Cells at seams, and those of them at depth edges; some rows at a time."""
+    n_seam = n_edge_seam = 0
+    for first in range(0, source.shape[0], _ROWS_AT_ONCE):
+        # The row below tells of the last one.
+        rows = slice(first, first + _ROWS_AT_ONCE + 1)
+        seam = is_seam(source[rows])[:_ROWS_AT_ONCE]
+        n_seam += int(np.count_nonzero(seam))
+        if depth_m is not None:
+            n_edge_seam += int(np.count_nonzero(seam & depth_edges(depth_m[rows])[:_ROWS_AT_ONCE]))
+    return n_seam, n_edge_seam
 
 
 def _wall(walls: Walls | None, index: int) -> Wall | None:
@@ -187,7 +221,7 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
         ctx.metric(f"{state.name.lower()}_share", share, "1")
     ctx.metric("n_sources", len({name for image in images for name in image.sources}), "1")
     n_shown = sum(np.count_nonzero(image.source >= 0) for image in images)
-    n_seam = sum(np.count_nonzero(is_seam(image.source)) for image in images)
+    n_seam = sum(item.n_seam for item in verdicts)
     ctx.metric("seam_share", n_seam / max(1, n_shown), "1")
     edges = [item.n_edge_seam for item in verdicts if item.n_edge_seam is not None]
     if edges and n_seam:

@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
-from orthoflow_plugins.raster.previews import depth_preview
+from orthoflow_plugins.raster.reporting import WallRaster, report, warn
 from orthoflow_plugins.raster.rules import Surface, SurfaceRule
 from orthoflow_plugins.raster.scan_steps import scan_step_m
 from orthoflow_plugins.raster.selection import Constraint, WallChoice, chosen_planes, frame_of
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.raster.surfaces import CellSurface
+    from orthoflow_plugins.raster.banding import Allocate, Raster
+    from orthoflow_plugins.raster.gaps import GapRule
 
 # Rec. 601 luma on the sRGB values as they are: the grey of cv2.cvtColor.
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
@@ -32,14 +33,8 @@ _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 _BYTES_KEPT: Final = 25
 _BYTES_WORKING: Final = 90
 _MEMORY_SHARE: Final = 0.75
-# Neighbours in the scan may lie so many widths of a narrow gap's radius apart.
-_SPAN_GAPS: Final = 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Raster:
-    wall: Wall
-    scan_step_m: float
+# Larger walls are rastered in bands of so many cells: 3 GB of memory.
+_BAND_CELLS: Final = 1 << 25
 
 
 class RasterGrid(Method):
@@ -50,7 +45,7 @@ class RasterGrid(Method):
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.4, 4.2",
@@ -157,17 +152,26 @@ class RasterGrid(Method):
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
         slabs = _slabs(planes, params)
-        rasters: list[_Raster] = []
+        rasters: list[WallRaster] = []
         source = _intensity_source(cloud)
         if params.balance_intensity:
             cloud = balanced(cloud, list(slabs.values()), ctx)
         for k, (index, slab) in enumerate(slabs.items()):
             ctx.progress(k / len(slabs), planes.names[index])
-            rasters.append(_raster(cloud, slab, params, threads=ctx.cores, plane=(planes, index)))
+            rasters.append(
+                _wall(
+                    cloud,
+                    slab,
+                    params,
+                    plane=(planes, index),
+                    allocate=partial(_allocated, ctx, k),
+                    threads=ctx.cores,
+                )
+            )
         walls = tuple(raster.wall for raster in rasters)
         _require_points_near(walls, next(iter(slabs.values())))
-        _warn(ctx, params, rasters, source)
-        _report(ctx, params, rasters)
+        warn(ctx, rasters, source)
+        report(ctx, rasters)
         slab = next(iter(slabs.values()))
         return self.Out(
             walls=Walls(
@@ -211,34 +215,99 @@ def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
         )
         for index in chosen_planes(planes, choice)
     }
-    _require_memory([slab.frame for slab in slabs.values()])
+    _require_memory([slab.frame for slab in slabs.values()], params)
     return slabs
 
 
-def _require_memory(frames: list[WallFrame]) -> None:
-    n_cells = [frame.width * frame.height for frame in frames]
-    needed = _BYTES_KEPT * sum(n_cells) + _BYTES_WORKING * max(n_cells)
+def _require_memory(frames: list[WallFrame], params: RasterGrid.Params) -> None:
+    sizes = [frame.width * frame.height for frame in frames]
+    # What is rastered in bands lies in files, and takes the memory of a band.
+    kept = [
+        size for size, frame in zip(sizes, frames, strict=True) if not _is_banded(frame, params)
+    ]
+    working = max([*kept, _BAND_CELLS] if len(kept) < len(sizes) else kept)
+    needed = _BYTES_KEPT * sum(kept) + _BYTES_WORKING * working
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     # Cells are numbered with 32 bits.
-    if needed > _MEMORY_SHARE * memory or max(n_cells) > np.iinfo(np.int32).max:
-        largest = frames[int(np.argmax(n_cells))]
+    if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
+        largest = frames[int(np.argmax(sizes))]
         raise MethodError(
-            f"cells of gsd_m = {largest.gsd_m:g} m make {sum(n_cells):.3g} cells ({largest.width} "
+            f"cells of gsd_m = {largest.gsd_m:g} m make {sum(sizes):.3g} cells ({largest.width} "
             f"x {largest.height} on the largest wall), which need {needed / 2**30:.3g} GiB where "
             f"this machine has {memory / 2**30:.3g} GiB: raise gsd_m, or lower n_walls_max"
         )
 
 
-def _raster(
+def _allocated(
+    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
+) -> NDArray[np.generic]:
+    return ctx.allocate("walls", f"{wall}.{name}", shape, dtype).view(np.ndarray)
+
+
+def _wall(
     cloud: PointCloud,
     slab: Slab,
     params: RasterGrid.Params,
     *,
-    threads: int,
     plane: tuple[Planes, int],
-) -> _Raster:
-    from orthoflow.geometry.rastering import lenders_in_gaps
-    from orthoflow_plugins.raster.scan_neighbours import SpanRule, recover_between_neighbours
+    allocate: Allocate,
+    threads: int,
+) -> WallRaster:
+    from orthoflow_plugins.raster.banding import rastered_in_bands
+
+    raster_of = partial(_raster, cloud, params=params, threads=threads)
+    if _is_banded(slab.frame, params):
+        raster = rastered_in_bands(
+            slab,
+            raster_of,
+            cells_most=_BAND_CELLS,
+            # Outliers are told from 20 cells around, noise taken out twice.
+            reach_rows=32
+            + 2 * params.denoise_cells
+            + _gap_rule(params, threads=threads).reach_cells,
+            allocate=allocate,
+        )
+    else:
+        raster = raster_of(slab)
+    surface, shape = raster.surface, slab.frame.shape
+    planes, index = plane
+    wall = Wall(
+        frame=slab.frame,
+        plane_index=index,
+        name=planes.names[index],
+        depth_m=surface.depth_m.reshape(shape),
+        sigma_m=surface.sigma_m.reshape(shape),
+        count=surface.count.reshape(shape),
+        mask=raster.mask.reshape(shape),
+        intensity=None if surface.intensity is None else surface.intensity.reshape(shape),
+        rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
+        rgb_mask=None if surface.rgb is None else (raster.mask > 0).astype(np.uint8).reshape(shape),
+        percentiles_m=None
+        if surface.percentiles_m is None
+        else surface.percentiles_m.reshape(*shape, -1),
+    )
+    return WallRaster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=params.gsd_m))
+
+
+def _is_banded(frame: WallFrame, params: RasterGrid.Params) -> bool:
+    """Whether a wall is rastered band by band; the triangles of a net know no bands."""
+    return frame.width * frame.height > _BAND_CELLS and params.surface != "tin"
+
+
+def _gap_rule(params: RasterGrid.Params, *, threads: int) -> GapRule:
+    from orthoflow_plugins.raster.gaps import GapRule
+
+    return GapRule(
+        gap_cells=params.recover_gap_cells,
+        scan_steps=params.recover_scan_steps,
+        layer_m=params.layer_m,
+        threads=threads,
+    )
+
+
+def _raster(cloud: PointCloud, slab: Slab, *, params: RasterGrid.Params, threads: int) -> Raster:
+    from orthoflow_plugins.raster.banding import Raster
+    from orthoflow_plugins.raster.gaps import close_gaps
     from orthoflow_plugins.raster.surfaces import surface_of
 
     rule = SurfaceRule(
@@ -249,48 +318,10 @@ def _raster(
         threads=threads,
     )
     surface = surface_of(cloud, slab, rule)
-    is_known = np.isfinite(surface.depth_m)
-    mask = np.where(surface.count > 0, SurfaceMask.MEASURED, SurfaceMask.RECOVERED).astype(np.uint8)
-    mask[~is_known] = SurfaceMask.VOID
-    spans = SpanRule(
-        steps=params.recover_scan_steps,
-        side_cells=_SPAN_GAPS * params.recover_gap_cells,
-        layer_m=params.layer_m,
-        threads=threads,
-    )
-    mask[recover_between_neighbours(cloud, slab, surface, spans)] = SurfaceMask.RECOVERED
-    lent = lenders_in_gaps(
-        is_known.reshape(slab.frame.shape), params.recover_gap_cells, threads=threads
-    )
-    _recover(surface, mask, lent[mask[lent[:, 0]] == SurfaceMask.VOID])
-    planes, index = plane
-    shape = slab.frame.shape
-    intensity = _grey(surface.rgb, mask) if surface.intensity is None else surface.intensity
-    wall = Wall(
-        frame=slab.frame,
-        plane_index=index,
-        name=planes.names[index],
-        depth_m=surface.depth_m.reshape(shape),
-        sigma_m=surface.sigma_m.reshape(shape),
-        count=surface.count.reshape(shape),
-        mask=mask.reshape(shape),
-        intensity=None if intensity is None else intensity.reshape(shape),
-        rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
-        rgb_mask=None if surface.rgb is None else (mask > 0).astype(np.uint8).reshape(shape),
-        percentiles_m=None
-        if surface.percentiles_m is None
-        else surface.percentiles_m.reshape(*shape, -1),
-    )
-    return _Raster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=params.gsd_m))
-
-
-def _recover(surface: CellSurface, mask: NDArray[np.uint8], lent: NDArray[np.int64]) -> None:
-    """Copy values into the cells of narrow gaps; their spread stays unknown, their count 0."""
-    void, lender = lent[:, 0], lent[:, 1]
-    mask[void] = SurfaceMask.RECOVERED
-    for values in (surface.depth_m, surface.intensity, surface.rgb):
-        if values is not None:
-            values[void] = values[lender]
+    mask = close_gaps(cloud, slab, surface, _gap_rule(params, threads=threads))
+    if surface.intensity is None:
+        surface = replace(surface, intensity=_grey(surface.rgb, mask))
+    return Raster(surface=surface, mask=mask)
 
 
 def _grey(rgb: NDArray[np.uint8] | None, mask: NDArray[np.uint8]) -> NDArray[np.float32] | None:
@@ -314,44 +345,3 @@ def _intensity_source(cloud: PointCloud) -> str:
     if cloud.intensity is not None:
         return "laser"
     return "none" if cloud.rgb is None else "luminance"
-
-
-def _warn(ctx: StepContext, params: RasterGrid.Params, rasters: list[_Raster], source: str) -> None:
-    if source == "luminance":
-        ctx.warn("the cloud has no laser intensity; the grey of its colours (Rec. 601) stands in")
-    if source == "none":
-        ctx.warn("the cloud has neither intensity nor colour; only the depth of walls is rastered")
-    for raster in rasters:
-        if not raster.wall.count.any():
-            ctx.warn(f"{raster.wall.name}: no point lies within its buffer")
-        elif raster.scan_step_m > params.gsd_m:
-            measured = np.count_nonzero(raster.wall.count) / raster.wall.count.size
-            ctx.warn(
-                f"{raster.wall.name}: cells of gsd_m = {params.gsd_m:g} m are finer than the scan, "
-                f"whose points lie about {raster.scan_step_m:.2g} m apart; {measured:.0%} of the "
-                "cells have a point"
-            )
-
-
-def _report(ctx: StepContext, params: RasterGrid.Params, rasters: list[_Raster]) -> None:
-    walls = [raster.wall for raster in rasters]
-    n_cells = sum(wall.mask.size for wall in walls)
-    per_cell = np.concatenate([wall.count[wall.count > 0] for wall in walls])
-    spread_m = np.concatenate([wall.sigma_m[wall.count > 1] for wall in walls])
-    ctx.metric("n_walls", len(walls), "1")
-    ctx.metric("n_points_inside", int(per_cell.sum(dtype=np.int64)), "1")
-    ctx.metric("points_per_cell", float(np.median(per_cell)), "1")
-    ctx.metric("scan_step_mm", 1000.0 * rasters[0].scan_step_m, "mm")
-    ctx.metric("gsd_mm", 1000.0 * params.gsd_m, "mm")
-    noise_m = depth_noise_m(walls[0].depth_m)
-    ctx.metric("depth_noise_mm", 1000.0 * noise_m, "mm")
-    if spread_m.size:
-        ctx.metric("sigma_median_mm", 1000.0 * float(np.median(spread_m)), "mm")
-    for state in SurfaceMask:
-        share = sum(np.count_nonzero(wall.mask == state) for wall in walls) / n_cells
-        ctx.metric(f"{state.name.lower()}_share", share, "1")
-    ctx.figure(
-        "depth",
-        depth_preview(walls[0]),
-        f"Depth of {walls[0].name}: brighter is nearer to the viewer, grey is void.",
-    )

@@ -25,6 +25,7 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from orthoflow_plugins.raster.denoising import denoised
 from orthoflow_plugins.raster.rules import SurfaceRule
+from orthoflow_plugins.raster.specks import without_specks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,9 +140,15 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
     sigma_m = spread_m(count, moments)
     if rule.surface != "mean":
         layer_m = rule.layer_m
-        depth_m = _without_specks(_medians_m(cloud, slab, count, rule), slab, rule)
-    if rule.surface == "denoised":
-        depth_m = denoised(depth_m.reshape(slab.frame.shape), rule.denoise_cells).ravel()
+        raster_m = without_specks(
+            _medians_m(cloud, slab, count, rule).reshape(slab.frame.shape),
+            gsd_m=slab.frame.gsd_m,
+            layer_m=layer_m,
+            threads=rule.threads,
+        )
+        if rule.surface == "denoised":
+            raster_m = denoised(raster_m, rule.denoise_cells)
+        depth_m = raster_m.ravel()
     intensity, rgb = _averaged_values(cloud, slab, depth_m, layer_m=layer_m, threads=rule.threads)
     return CellSurface(
         depth_m=depth_m,
@@ -169,22 +176,6 @@ def _medians_m(
 ) -> NDArray[np.float32]:
     grouped_m = _grouped_m(cloud, slab, count, threads=rule.threads)
     return _sorted_medians_m(grouped_m, count, rule)
-
-
-def _without_specks(
-    depth_m: NDArray[np.float32], slab: Slab, rule: SurfaceRule
-) -> NDArray[np.float32]:
-    """Leave void what only an outlier measured: a cell that hardly any of those around agrees with.
-
-    A photo would paint it with a place far off.
-    """
-    from orthoflow.geometry.speck_kernels import find_specks
-
-    raster = depth_m.reshape(slab.frame.shape)
-    is_speck = np.zeros(raster.shape, dtype=np.bool_)
-    in_parts(raster.shape[0], rule.threads, partial(find_specks, raster, rule.layer_m, is_speck))
-    depth_m[is_speck.ravel()] = np.nan
-    return depth_m
 
 
 def _sorted_medians_m(

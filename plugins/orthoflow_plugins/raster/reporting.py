@@ -1,0 +1,80 @@
+"""What is told of rastered walls: numbers, a picture, and what limits them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.products import SurfaceMask, Wall
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.raster.previews import depth_preview
+
+# Medians of larger walls are told from some of their rows.
+_CELLS_ASKED: Final = 1 << 26
+
+_Number = TypeVar("_Number", np.float32, np.uint32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallRaster:
+    """A rastered wall, and how far apart the scan's points lie on it."""
+
+    wall: Wall
+    scan_step_m: float
+
+
+def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str) -> None:
+    """Tell what limits the walls: what the cloud lacks, and cells finer than its points."""
+    if intensity_source == "luminance":
+        ctx.warn("the cloud has no laser intensity; the grey of its colours (Rec. 601) stands in")
+    if intensity_source == "none":
+        ctx.warn("the cloud has neither intensity nor colour; only the depth of walls is rastered")
+    for raster in rasters:
+        wall, gsd_m = raster.wall, raster.wall.frame.gsd_m
+        if not wall.count.any():
+            ctx.warn(f"{wall.name}: no point lies within its buffer")
+        elif raster.scan_step_m > gsd_m:
+            measured = np.count_nonzero(wall.count) / wall.count.size
+            ctx.warn(
+                f"{wall.name}: cells of gsd_m = {gsd_m:g} m are finer than the scan, "
+                f"whose points lie about {raster.scan_step_m:.2g} m apart; {measured:.0%} of the "
+                "cells have a point"
+            )
+
+
+def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
+    """Tell in numbers what the walls hold, and draw the first."""
+    walls = [raster.wall for raster in rasters]
+    n_cells = sum(wall.mask.size for wall in walls)
+    counts = [_sampled(wall.count) for wall in walls]
+    per_cell = np.concatenate([count[count > 0] for count in counts])
+    spread_m = np.concatenate(
+        [_sampled(wall.sigma_m)[count > 1] for wall, count in zip(walls, counts, strict=True)]
+    )
+    ctx.metric("n_walls", len(walls), "1")
+    ctx.metric("n_points_inside", sum(int(wall.count.sum(dtype=np.int64)) for wall in walls), "1")
+    ctx.metric("points_per_cell", float(np.median(per_cell)), "1")
+    ctx.metric("scan_step_mm", 1000.0 * rasters[0].scan_step_m, "mm")
+    ctx.metric("gsd_mm", 1000.0 * walls[0].frame.gsd_m, "mm")
+    noise_m = depth_noise_m(walls[0].depth_m)
+    ctx.metric("depth_noise_mm", 1000.0 * noise_m, "mm")
+    if spread_m.size:
+        ctx.metric("sigma_median_mm", 1000.0 * float(np.median(spread_m)), "mm")
+    for state in SurfaceMask:
+        share = sum(np.count_nonzero(wall.mask == state) for wall in walls) / n_cells
+        ctx.metric(f"{state.name.lower()}_share", share, "1")
+    ctx.figure(
+        "depth",
+        depth_preview(walls[0]),
+        f"Depth of {walls[0].name}: brighter is nearer to the viewer, grey is void.",
+    )
+
+
+def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:
+    """Rows of a raster, all of them unless it is large."""
+    return values[:: max(1, values.size // _CELLS_ASKED)]
