@@ -2,6 +2,8 @@
 
     python benchmarks/method_comparisons.py runs/comparisons
     python benchmarks/method_comparisons.py runs/comparisons --recipe plane-methods
+    # the variants of markiewicz2015, as the header of orient-methods.yaml has them:
+    python benchmarks/method_comparisons.py runs/variants --recipe variant1 --recipe variant2
 
 Each recipe runs into `FOLDER/<recipe>` on its simulated room, as `orthoflow run <recipe>.yaml` does
 it, unless that folder holds a finished run; a single report of all of them goes to
@@ -25,6 +27,18 @@ from orthoflow.report.rankings import Mark, Value, rank
 from orthoflow.report.senses import sense_of
 
 RECIPES = ("plane-methods", "orient-methods", "ortho-methods")
+COARSE = {"room.scan_step_m": "0.004", "room.photo_gsd_m": "0.003", "wall.gsd_m": "0.006"}
+# Settings of orient-methods.yaml.
+VARIANTS = {
+    "variant1": {
+        **COARSE,
+        "room.photo_layout": "variant1",
+        "room.panorama_step_m": "0.0052",
+        "wall.n_walls_max": "4",
+        "wall.constraint": "vertical",
+    },
+    "variant2": {**COARSE, "room.photo_layout": "variant2", "room.calibrated": "false"},
+}
 # Metrics of each table and what stands over them; the record has many more.
 COLUMNS: dict[str, dict[str, str]] = {
     "plane-methods": {
@@ -67,17 +81,37 @@ COLUMNS: dict[str, dict[str, str]] = {
         "ortho.cpu_s": "processor / s",
     },
 }
+# Of several walls, each its own.
+COLUMNS["variant1"] = {
+    "orient.n_oriented": "photos oriented",
+    "check.match_wrong_share": "wrong matches",
+    "check.match_wrong_share_own_wall": "with the own wall",
+    "check.tie_wrong_share": "wrong ties kept",
+    "orient.check_rmse_px_median": "check RMSE / px",
+    "orient.check_rmse_mm_median": "check RMSE / mm",
+    "check.pose_wall_rms_mm": "true error of a pose / mm",
+    "check.pose_error_over_sigma": "true over stated error",
+    "check.rmse_u_mm": "wall 0, u / mm",
+    "check.wall_1_rmse_u_mm": "wall 1, u / mm",
+    "check.wall_2_rmse_u_mm": "wall 2, u / mm",
+    "check.wall_3_rmse_u_mm": "wall 3, u / mm",
+    "check.all_rmse_u_mm": "all, u / mm",
+    "check.all_rmse_v_mm": "all, v / mm",
+    "check.all_completeness_seen_by_both": "painted",
+}
+COLUMNS["variant2"] = COLUMNS["orient-methods"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--recipe", action="append", choices=RECIPES)
+    parser.add_argument("--recipe", action="append", choices=[*RECIPES, *VARIANTS])
     options = parser.parse_args()
-    runs = [finished_run(options.folder, recipe) for recipe in options.recipe or RECIPES]
-    for run in runs:
-        print(f"\n### {run.record.name}, run {run.record.run_id}\n")
-        print("\n".join(markdown(combinations_of(run), COLUMNS[run.record.name])))
+    recipes = options.recipe or list(RECIPES)
+    runs = [finished_run(options.folder, recipe) for recipe in recipes]
+    for recipe, run in zip(recipes, runs, strict=True):
+        print(f"\n### {recipe}, run {run.record.run_id}\n")
+        print("\n".join(markdown(combinations_of(run), COLUMNS[recipe])))
     write_report(runs, options.folder / "report.html")
 
 
@@ -85,7 +119,10 @@ def finished_run(folder: Path, recipe: str) -> Run:
     """Run a recipe, or take the run that is there."""
     target = folder / recipe
     if not (target / "run.h5").is_file():
-        command = [sys.executable, "-m", "orthoflow", "run", f"{recipe}.yaml", "-o", str(target)]
+        workflow = "orient-methods" if recipe in VARIANTS else recipe
+        command = [sys.executable, "-m", "orthoflow", "run", f"{workflow}.yaml", "-o", str(target)]
+        for name, value in VARIANTS.get(recipe, {}).items():
+            command += ["--set", f"{name}={value}"]
         # Failed cells are rows of the table, so the exit code is no reason to stop.
         subprocess.run([*command, "--store", str(folder / "store")], check=False)
     return open_run(target)
@@ -103,7 +140,8 @@ def markdown(combinations: Sequence[Combination], names: Mapping[str, str]) -> l
     for index, one in enumerate(combinations):
         variants = [one.assignment.get(step, "-") for step in steps]
         if one.failure is not None:
-            lines.append(line([*variants, f"failed: {one.failure.error_message}"]))
+            reason = one.failure.error_message.partition(":")[0]
+            lines.append(line([*variants, f"failed: {reason}"]))
         else:
             lines.append(line([*variants, *(printed(column[index]) for column in columns)]))
     return lines

@@ -110,6 +110,24 @@ def test_stated_errors_are_those_of_repeated_orientations(tmp_path: Path) -> Non
     assert 0.7 < rms(np.array(ratios)) < 1.5
 
 
+def with_errors_of_places(ties: Ties, seed: int) -> Ties:
+    """Ties whose points are off by what the scan is at their place, 2 mm, in whichever photo."""
+    cubes = np.floor(ties.points_world / 0.4).astype(int)
+    cubes -= cubes.min(axis=0)
+    off = 0.002 * np.random.default_rng(100 + seed).normal(size=(*(cubes.max(axis=0) + 1), 3))
+    return replace(ties, points_world=ties.points_world + off[tuple(cubes.T)])
+
+
+def test_errors_of_the_scan_that_photos_share_are_stated(tmp_path: Path) -> None:
+    ratios = []
+    for seed in range(6):
+        ties, ctx = with_errors_of_places(bs.scan_ties(seed), seed), context(tmp_path, seed=seed)
+        together = bundle(ties, bs.photos(calibrated=False), ctx, **ALONE)
+        ratios.append(errors_m(together) / sigmas_m(together))
+    # Measured: 0.95; with cells of single photos as groups alone 1.15.
+    assert 0.7 < rms(np.array(ratios)) < 1.1
+
+
 def test_lenses_of_their_own_have_a_mean_and_a_spread(tmp_path: Path) -> None:
     ties, photos = bs.scan_ties(3), bs.photos(calibrated=False)
     together = bundle(ties, photos, context(tmp_path), intrinsics="per-photo", **ALONE)

@@ -375,6 +375,19 @@ def test_a_quarter_past_the_end_of_the_wall_needs_no_ties(tmp_path: Path) -> Non
     assert found.cameras[0].status == "ok"
 
 
+def test_strictly_an_empty_quarter_is_refused_whatever_is_predicted(tmp_path: Path) -> None:
+    scene = ms.textured_wall(0)
+    behind = ms.camera_before(scene)
+    past = ms.camera_before(scene, centre=(3.05, -2.6, 1.1), towards=(3.05, 0.0, 1.0))
+    for nth, (camera, ties) in enumerate(
+        [(behind, with_an_empty_quarter(known_ties(behind, 1))), (past, known_ties(past, 1))]
+    ):
+        folder = tmp_path / str(nth)
+        folder.mkdir()
+        found = orient(ties, calibrated(camera), context(folder), quadrants="strict")
+        assert found.cameras[0].status == "a quarter of the photo has 0 ties, each needs 2"
+
+
 def test_an_empty_quarter_is_left_to_the_predicted_error_when_asked(tmp_path: Path) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
     emptied = with_an_empty_quarter(known_ties(camera, 1, n=400))

@@ -41,6 +41,22 @@ def seen_by(
     )
 
 
+def test_a_point_beside_the_projection_centre_agrees_with_nothing() -> None:
+    camera = true_camera()
+    ahead = camera.rotation[2]
+    # 2 mm and 2 m before the camera, known to 3 mm: the first may be anywhere in the image.
+    points = camera.centre_world + np.array([[0.002], [2.0]]) * ahead
+    seen = SeenPoints(
+        pixels_photo=camera.project(points)[:, :2] + [1.0, 0.0],
+        points_world=points,
+        sigma_px=np.full(2, 0.5),
+        sigma_m=np.full(2, 0.003),
+    )
+    near, far = misfit(seen, camera).normalised
+    assert np.isinf(near)
+    assert 0.5 < far < 1.5
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_exact_points_give_the_exact_camera(seed: int) -> None:
     camera = true_camera()

@@ -280,6 +280,7 @@ def test_equal_values_have_no_winner() -> None:
         ("check_rmse_px_median", Sense.LESS),
         ("wall_s", Sense.LESS),
         ("match_wrong_share", Sense.LESS),
+        ("match_wrong_share_own_wall", Sense.LESS),
         ("label_recall", Sense.MORE),
         ("completeness_seen_by_both", Sense.MORE),
         ("pose_error_over_sigma", Sense.ONE),

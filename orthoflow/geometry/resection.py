@@ -33,6 +33,8 @@ _ITERATIONS: Final = 40
 _CONVERGED: Final = 1e-7
 _DAMPING_START: Final = 1e-6
 _DAMPING_MOST: Final = 1e8
+# A point whose own uncertainty covers more of the image's longer side agrees with any pixel.
+_BLUR_MOST_SHARE: Final = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +96,8 @@ class Misfit:
     Attributes:
         residuals_px: (n, 2) float64 observed - computed; NaN where the camera cannot see the point.
         normalised: (n,) float64 length of the residual in units of its expected standard
-            deviation (chi with 2 degrees of freedom); inf where the camera cannot see the point.
+            deviation (chi with 2 degrees of freedom); inf where the camera cannot see the point,
+            and where the point lies so near to it that it could be anywhere in the image.
     """
 
     residuals_px: NDArray[np.float64]
@@ -212,9 +215,10 @@ def misfit(seen: SeenPoints, camera: ViewingCamera) -> Misfit:
     with np.errstate(invalid="ignore"):
         whitened = whiten(_pixel_covariances(linear, seen), residuals[:, :, None])[:, :, 0]
         normalised = np.linalg.norm(whitened, axis=1)
-    return Misfit(
-        residuals_px=residuals, normalised=np.where(np.isfinite(normalised), normalised, np.inf)
-    )
+        blur_px = seen.sigma_m * np.linalg.norm(linear.by_camera_point, axis=2).max(axis=1)
+        tells = blur_px <= _BLUR_MOST_SHARE * max(camera.width, camera.height)
+    known = tells & np.isfinite(normalised)
+    return Misfit(residuals_px=residuals, normalised=np.where(known, normalised, np.inf))
 
 
 def predicted_covariances(

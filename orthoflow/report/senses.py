@@ -25,7 +25,7 @@ _PATTERNS: Final[tuple[tuple[str, Sense], ...]] = (
     ("raw_omega_deg", Sense.NEITHER),
     ("raw_phi_deg", Sense.NEITHER),
     ("sigma0*", Sense.NEITHER),
-    ("*wrong_share", Sense.LESS),
+    ("*wrong_share*", Sense.LESS),
     ("*stretch_share", Sense.LESS),
     ("*smear_share", Sense.LESS),
     ("*ghost_share", Sense.LESS),

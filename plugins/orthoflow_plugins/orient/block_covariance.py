@@ -85,7 +85,7 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     for start, lens in zip(block.column_starts[1][:-1], block.lenses, strict=True):
         sigmas = lens.freedom.sigmas
         prior[start : start + sigmas.size] = 1.0 / sigmas**2
-    rows = list(_rows(block, soft_limit))
+    rows = list(_rows(block, soft_limit, _groups(block)))
     normal = np.diag(prior)
     squares, n_rows = 0.0, 0
     for part in rows:
@@ -103,8 +103,13 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
     if redundancy <= 0.0 or not (np.diag(cofactors) > 0.0).all():
         raise GeometryError("the ties do not determine the block of photos")
     sigma0 = math.sqrt(squares / redundancy)
+    matrix = _honest(rows, cofactors, sigma0**2 * cofactors)
+    if _is_linked(block):
+        # Photos of one place share the errors that the scan has there.
+        shared = list(_rows(block, soft_limit, _places(block)))
+        matrix = _honest(shared, cofactors, matrix)
     return BlockCovariance(
-        matrix=_honest(rows, cofactors, sigma0),
+        matrix=matrix,
         cofactors=cofactors,
         sigma0=sigma0,
         redundancy=redundancy,
@@ -112,14 +117,14 @@ def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
 
 
 def _honest(
-    rows: list[_Rows], cofactors: NDArray[np.float64], sigma0: float
+    rows: list[_Rows], cofactors: NDArray[np.float64], plain: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Widen by what leaving out each group changes, see `geometry.covariances`."""
-    plain = sigma0**2 * cofactors
     by_group: dict[int, list[_Rows]] = {}
     for part in rows:
         by_group.setdefault(part.group, []).append(part)
-    if len(by_group) <= len(cofactors):
+    # Fewer groups than unknowns of a photo say nothing of it.
+    if len(by_group) <= max(part.columns.size for part in rows):
         return plain
     spread = np.zeros_like(plain)
     for parts in by_group.values():
@@ -135,10 +140,16 @@ def _honest(
     return widened(plain, (len(by_group) - 1) / len(by_group) * spread)
 
 
-def _rows(block: Block, soft_limit: float) -> Iterator[_Rows]:
-    """Equations of the unknowns that remain when every point is eliminated."""
+def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> Iterator[_Rows]:
+    """Equations of the unknowns that remain when every point is eliminated.
+
+    Args:
+        block: as adjusted.
+        soft_limit: residuals beyond so many standard deviations count less.
+        groups: (m,) of the observations.
+    """
     seen = block.seen
-    groups, joint = _groups(block), block.is_joint[seen.point]
+    joint = block.is_joint[seen.point]
     covariances = pixel_covariances(block)
     stacked: dict[int, list[_Seen]] = {}
     for photo in range(len(block.cameras)):
@@ -229,3 +240,25 @@ def _groups(block: Block) -> NDArray[np.intp]:
         cells = image_cells(block.seen.pixels[mine], (camera.width, camera.height), GROUPS)
         groups[mine] = photo * GROUPS**2 + cells
     return groups
+
+
+def _is_linked(block: Block) -> bool:
+    """Whether photos have unknowns in common: points, or a lens that is free."""
+    shared = [
+        lens.freedom.sigmas.size > 0 and block.lens_of.count(index) > 1
+        for index, lens in enumerate(block.lenses)
+    ]
+    return any(shared) or bool(block.is_joint.any())
+
+
+def _places(block: Block) -> NDArray[np.intp]:
+    """Group (m,) of each observation: a place in the world, as wide as a cell of the photos."""
+    seen = block.seen
+    widths = []
+    for photo, camera in enumerate(block.cameras):
+        distances = camera.project(block.points.now[seen.point[seen.photo == photo]])[:, 2]
+        if distances.size:
+            side_px = max(camera.width, camera.height) / GROUPS
+            widths.append(side_px / camera.fx * float(np.median(distances)))
+    cubes = np.floor(block.points.now[seen.point] / float(np.median(widths))).astype(np.intp)
+    return np.asarray(np.unique(cubes, axis=0, return_inverse=True)[1].ravel(), dtype=np.intp)

@@ -60,7 +60,7 @@ class OrientColmapBundle(Method):
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "seeded"
     citations: ClassVar[tuple[str, ...]] = (
         "schoenberger2016: Structure-from-motion revisited (COLMAP), doi:10.1109/CVPR.2016.445",

@@ -62,7 +62,7 @@ class OrientDlt(Method):
     """
 
     id: ClassVar[str] = "orient.dlt"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "seeded"
     citations: ClassVar[tuple[str, ...]] = (
         "abdelaziz1971: Direct linear transformation, doi:10.14358/PERS.81.2.103",

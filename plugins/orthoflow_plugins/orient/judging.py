@@ -35,6 +35,7 @@ class GateRule:
     Attributes:
         n_control_least: control ties that agree.
         n_quadrant_least: ties that agree in each quarter of the photo.
+        quadrants_are_strict: whether a quarter with fewer is refused whatever is predicted there.
         inlier_share_least: share of all ties that agree.
         hull_ratio_least: hull of the control over the part of the photo that shows its walls.
         sigma_wall_most_gsd: predicted error on the wall, RMS over the footprint, in cells.
@@ -43,6 +44,7 @@ class GateRule:
 
     n_control_least: int
     n_quadrant_least: int
+    quadrants_are_strict: bool
     inlier_share_least: float
     hull_ratio_least: float
     sigma_wall_most_gsd: float
@@ -227,11 +229,17 @@ def _spread(case: Case) -> str:
     past the end of the wall, may fill a quarter in which no tie can be. A surveyor keeps such a
     photo when the rest of it fixes the pose: the error predicted for the walls in that quarter must
     be as small at its worst place as it has to be on the average of the photo. A quarter that shows
-    no wall is painted nowhere and needs nothing.
+    no wall is painted nowhere and needs nothing. Only strictly the paper's rule holds as it stands.
     """
     for quarter, count in enumerate(case.quadrant_counts):
+        if count >= case.rule.n_quadrant_least:
+            continue
+        if case.rule.quadrants_are_strict:
+            return (
+                f"a quarter of the photo has {count} ties, each needs {case.rule.n_quadrant_least}"
+            )
         worst_m = case.worst_in_quarter_m(quarter)
-        if count >= case.rule.n_quadrant_least or worst_m == 0.0:
+        if worst_m == 0.0:
             continue
         most_m = case.rule.sigma_wall_most_gsd * case.gsd_m if case.gsd_m else 0.0
         if worst_m > most_m:

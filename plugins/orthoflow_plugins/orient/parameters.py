@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from orthoflow.sdk import MethodParams
@@ -44,6 +46,11 @@ class OrientParams(MethodParams):
         "unless the predicted error on the walls in that quarter stays below "
         "sigma_wall_max_cells; 0 leaves it to the predicted error alone.",
     )
+    quadrants: Literal["predicted", "strict"] = Field(
+        default="predicted",
+        description="strict: a photo with fewer than n_quadrant_min ties in a quarter is refused "
+        "whatever is predicted there, also where the quarter shows no wall (markiewicz2015).",
+    )
     inlier_min_share: float = Field(
         default=0.04,
         ge=0,
@@ -83,6 +90,7 @@ class OrientParams(MethodParams):
         return GateRule(
             n_control_least=self.n_control_min,
             n_quadrant_least=self.n_quadrant_min,
+            quadrants_are_strict=self.quadrants == "strict",
             inlier_share_least=self.inlier_min_share,
             hull_ratio_least=self.hull_min_ratio,
             sigma_wall_most_gsd=self.sigma_wall_max_cells,

@@ -23,7 +23,7 @@ class OrientPnp(Method):
     """
 
     id: ClassVar[str] = "orient.pnp"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "seeded"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.6, 4.3",
