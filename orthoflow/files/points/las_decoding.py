@@ -69,7 +69,9 @@ def records(path: Path, laspy: Any, *, cores: int) -> Iterator[Any]:
     wanted = fields.base().decompress_z().decompress_flags()
     wanted = wanted.decompress_intensity().decompress_rgb()
     with laspy.open(path, decompression_selection=wanted) as reader:
-        layout = _layout(path, reader.header) if cores > 1 else None
+        # Where memory cannot be shared without a name, this process decodes all by itself.
+        is_shared_out = cores > 1 and hasattr(os, "memfd_create")
+        layout = _layout(path, reader.header) if is_shared_out else None
         if layout is None:
             yield from reader.chunk_iterator(BLOCK_POINTS)
         else:
