@@ -87,6 +87,25 @@ def test_las_blocks_keep_the_order_of_the_file_for_any_number_of_processes(
         np.testing.assert_array_equal(block.bounds[1], block.points.max(axis=0))
 
 
+@pytest.mark.parametrize(
+    ("worker", "reason"),
+    [
+        ("raise SystemExit(3)", "its decoder ended with 3"),
+        ("print('a chunk makes no sense')", "a chunk makes no sense"),
+    ],
+)
+def test_a_decoder_that_fails_ends_in_one_sentence(
+    worker: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many = np.random.default_rng(0).uniform(0, 5, (5000, 3))
+    path = scan_files.write_las(tmp_path / "a.laz", many)
+    monkeypatch.setattr(las_decoding, "_BLOCKS_LEAST", 0)
+    monkeypatch.setattr(las_decoding, "_WORKER", tmp_path / "worker.py")
+    (tmp_path / "worker.py").write_text(worker)
+    with pytest.raises(InputError, match=f"a.laz cannot be read as LAS/LAZ: {reason};"):
+        list(open_scan(path, cores=2).read())
+
+
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("share", [0.3, 0.7, 0.95])
 def test_a_las_file_that_is_cut_off_is_refused(tmp_path: Path, suffix: str, share: float) -> None:
