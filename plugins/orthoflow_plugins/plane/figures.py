@@ -26,7 +26,7 @@ _PANELS_MOST: Final = 4
 _PIXELS_MOST: Final = 900
 _DEVIATIONS: Final = Margins(left=0.3, right=0.1, bottom=0.45, top=0.3, across=0.3, down=0.75)
 # Between the panels stands the legend of the first.
-_ACCUMULATOR: Final = Margins(left=0.6, right=0.1, bottom=0.5, top=0.1, across=1.5)
+_ACCUMULATOR: Final = Margins(left=0.6, right=0.2, bottom=0.5, top=0.1, across=1.5)
 
 
 def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
