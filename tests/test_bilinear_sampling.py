@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.bilinear_kernels import pack_pixels, sample_bilinear
+from orthoflow.geometry.bilinear_kernels import Patch, pack_pixels, sample_bilinear
 
 HALF_PIXEL = (np.float32(0.5), np.float32(0.5))
 
@@ -16,7 +16,7 @@ def sampled(photo: NDArray[np.uint8], places: NDArray[np.float32]) -> NDArray[np
     pack_pixels(photo, packed)
     colours = np.empty((*places.shape[:2], 3), dtype=np.uint8)
     u, v = (np.ascontiguousarray(places[..., axis]) for axis in range(2))
-    sample_bilinear(packed, u, v, HALF_PIXEL, colours)
+    sample_bilinear(packed, (u, v), HALF_PIXEL, Patch(0, 0, *u.shape), colours)
     return colours
 
 

@@ -7,7 +7,7 @@ and three sums give three colours, the same ones on every machine. `cv2.remap` t
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,44 +40,59 @@ def pack_pixels(photo: NDArray[np.uint8], packed: NDArray[np.uint64]) -> None:
         packed[row, columns] = packed[row, columns - 1]
 
 
+class Patch(NamedTuple):
+    """Cells of a larger array, which stays whole: rows of a part of it would be slower to read.
+
+    Attributes:
+        row: the first one; column likewise.
+        n_rows: how many; n_columns likewise.
+    """
+
+    row: int
+    column: int
+    n_rows: int
+    n_columns: int
+
+
 @compiled
 def sample_bilinear(
     packed: NDArray[np.uint64],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
+    places: tuple[NDArray[np.float32], NDArray[np.float32]],
     corner: tuple[np.float32, np.float32],
+    patch: Patch,
     colours: NDArray[np.uint8],
 ) -> None:
     """Set the colours at places of a photo, which goes on beyond its border as it ends there.
 
     Args:
         packed: of `pack_pixels`.
-        u: (rows, cols) float32 places in pixels, numbers everywhere.
-        v: (rows, cols) float32 likewise.
+        places: u and v (rows, cols) in pixels, numbers everywhere.
         corner: u and v of the centre of the first pixel.
-        colours: (rows, cols, 3) overwritten.
+        patch: which of the places.
+        colours: (rows, cols, 3) of the patch, overwritten.
     """
-    rows, columns = u.shape
+    us, vs = places[0].reshape(places[0].size), places[1].reshape(places[1].size)
     width, pixels = packed.shape[1], packed.reshape(packed.size)
     first_u, first_v, zero = corner[0], corner[1], np.float32(0.0)
     last_u, last_v = np.float32(packed.shape[1] - 2), np.float32(packed.shape[0] - 2)
     steps, half, whole = np.float32(_STEPS), np.float32(0.5), np.uint64(_STEPS)
-    places, shares = np.empty(columns, dtype=np.int32), np.empty(columns, dtype=np.int32)
-    for row in range(rows):
-        us, vs, into = u[row], v[row], colours[row]
+    at, shares = np.empty(patch.n_columns, np.int32), np.empty(patch.n_columns, np.int32)
+    for row in range(patch.n_rows):
+        first = np.uintp((patch.row + row) * places[0].shape[1] + patch.column)
+        into = colours[row]
         # Each of these loops writes one array, and the processor takes eight cells at once.
-        for j in range(columns):
-            across = min(max(us[j] - first_u, zero), last_u)
-            down = min(max(vs[j] - first_v, zero), last_v)
-            places[j] = np.int32(down) * np.int32(width) + np.int32(across)
-        for j in range(columns):
-            across = min(max(us[j] - first_u, zero), last_u)
-            down = min(max(vs[j] - first_v, zero), last_v)
+        for j in range(patch.n_columns):
+            across = min(max(us[first + np.uintp(j)] - first_u, zero), last_u)
+            down = min(max(vs[first + np.uintp(j)] - first_v, zero), last_v)
+            at[j] = np.int32(down) * np.int32(width) + np.int32(across)
+        for j in range(patch.n_columns):
+            across = min(max(us[first + np.uintp(j)] - first_u, zero), last_u)
+            down = min(max(vs[first + np.uintp(j)] - first_v, zero), last_v)
             share_across = np.int32((across - np.float32(np.int32(across))) * steps + half)
             share_down = np.int32((down - np.float32(np.int32(down))) * steps + half)
             shares[j] = share_across | (share_down << np.int32(8))
-        for j in range(columns):
-            upper = np.uintp(places[j])
+        for j in range(patch.n_columns):
+            upper = np.uintp(at[j])
             lower = upper + np.uintp(width)
             right = np.uint64(np.uint32(shares[j]) & np.uint32(255))
             below = np.uint64(np.uint32(shares[j]) >> np.uint32(8))

@@ -183,7 +183,8 @@ class _Brush:
         is_near = self._near_hidden(sight)
         sample(
             self._photo,
-            sight._replace(u=sight.u[inner], v=sight.v[inner]),
+            sight,
+            inner,
             footprint,
             self._rule.resampling,
             is_filtered=self._rule.is_filtered,

@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.bilinear_kernels import pack_pixels, sample_bilinear
+from orthoflow.geometry.bilinear_kernels import Patch, pack_pixels, sample_bilinear
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.visibility_kernels import Sight, WallView
 
@@ -70,6 +70,7 @@ _project: Callable[..., tuple[float, float, float]] = project_point.py_func
 def sample(
     photo: NDArray[np.uint8],
     sight: Sight,
+    inner: tuple[slice, slice],
     footprint: Footprint,
     resampling: Resampling,
     *,
@@ -80,7 +81,9 @@ def sample(
 
     Args:
         photo: (height, width, 3).
-        sight: where the cells are in the photo; its places are used up.
+        sight: where the cells of the tile and those around it are in the photo; its places are
+            used up.
+        inner: rows and columns of `sight` that are the tile's.
         footprint: how many pixels a cell covers.
         resampling: `nearest` gives the pixel's own colour and filters nothing.
         is_filtered: average over what a cell covers where the photo is finer than the wall.
@@ -91,7 +94,7 @@ def sample(
     if resampling == "nearest":
         crop, corner = _crop(photo, sight, reach=0)
         # Whole positions: the pixel that a place lies in, and nothing for OpenCV to round.
-        u, v = (np.floor(places, out=places) for places in (sight.u, sight.v))
+        u, v = (np.floor(places, out=places) for places in (sight.u[inner], sight.v[inner]))
         return _remapped(crop, u, v, corner, resampling, into)
     sigmas = [
         0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if is_filtered else 0.0
@@ -113,9 +116,10 @@ def sample(
     if resampling == "bilinear":
         packed = np.empty((crop.shape[0] + 1, crop.shape[1] + 1), dtype=np.uint64)
         pack_pixels(crop, packed)
-        sample_bilinear(packed, sight.u, sight.v, centre, into)
+        patch = Patch(inner[0].start, inner[1].start, into.shape[0], into.shape[1])
+        sample_bilinear(packed, (sight.u, sight.v), centre, patch, into)
         return into
-    return _remapped(crop, sight.u, sight.v, centre, resampling, into)
+    return _remapped(crop, sight.u[inner], sight.v[inner], centre, resampling, into)
 
 
 def _remapped(
