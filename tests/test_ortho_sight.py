@@ -15,7 +15,14 @@ from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.relief_kernels import make_occluding
 from orthoflow.geometry.sight_kernels import look_at_cells
-from orthoflow.geometry.visibility_kernels import FINE_CELLS, NOTHING_M, OCCLUDED, PAINTED, Sight
+from orthoflow.geometry.visibility_kernels import (
+    FINE_CELLS,
+    NOTHING_M,
+    OCCLUDED,
+    PAINTED,
+    Sight,
+    is_hidden_by_relief,
+)
 from orthoflow.products import LayerMask
 from tests import ortho_scenes as scenes
 from tests.raster_scenes import context
@@ -36,15 +43,22 @@ def noisy_depths() -> NDArray[np.float32]:
     return depths
 
 
-def seen(camera: ViewingCamera, *, is_transparent: bool) -> Sight:
+def surface_of(depths: NDArray[np.float32], *, is_transparent: bool) -> Surface:
     where = scenes.frame()
-    wall = scenes.walls(where, noisy_depths()).walls[0]
-    surface = Surface(
+    wall = scenes.walls(where, depths).walls[0]
+    return Surface(
         frame=where,
         relief=(transparent_relief_of if is_transparent else relief_of)(wall, threads=2),
         front_m=scenes.BUFFER_M,
         tolerance_m=0.008,
     )
+
+
+def seen(camera: ViewingCamera, *, is_transparent: bool) -> Sight:
+    return seen_of(surface_of(noisy_depths(), is_transparent=is_transparent), camera)
+
+
+def seen_of(surface: Surface, camera: ViewingCamera) -> Sight:
     height, width = scenes.SHAPE
     sight = Sight(
         u=np.empty((height, width), dtype=np.float32),
@@ -82,6 +96,26 @@ def test_places_are_exact_to_a_twentieth_of_a_pixel(aside_m: float, is_transpare
     border = 0.05 * min(camera.width, camera.height)
     worth = cosine * area / exact[:, 2] ** 2 * np.clip(inside / border, 0.0, 1.0)
     np.testing.assert_allclose(sight.quality[painted], worth, rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("aside_m", [-1.4, -0.7, 0.0, 0.4, 1.4])
+def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None:
+    rng = np.random.default_rng(8)
+    depths = noisy_depths()
+    for row, column in rng.integers(0, scenes.SHAPE, (40, 2)):
+        rows, columns = rng.integers(1, 12, 2)
+        depths[row : row + rows, column : column + columns] += rng.uniform(0.01, 0.06)
+    surface = surface_of(depths, is_transparent=False)
+    camera = scenes.camera(scenes.frame(), aside_m=aside_m)
+    view, relief = view_of(camera, surface, RULE), surface.relief
+    sight = seen_of(surface, camera)
+    asked = (sight.mask == PAINTED) | (sight.mask == OCCLUDED)
+    # Each ray is followed to the camera, whatever bounds say.
+    followed = [
+        is_hidden_by_relief(view, relief, row, column, 1.0) for row, column in np.argwhere(asked)
+    ]
+    assert 200 < np.sum(followed) < 0.5 * len(followed)
+    np.testing.assert_array_equal(sight.mask[asked] == OCCLUDED, followed)
 
 
 def test_without_visibility_only_void_and_the_frame_of_the_photo_count() -> None:

@@ -80,11 +80,12 @@ class Relief(NamedTuple):
         occluding: (rows, cols) int16 the same without spikes, in steps of `step_m`, `NOTHING`
             where void; half the memory of float32, and far finer than what counts as hidden.
         step_m: of `occluding`.
-        tops: (blocks, blocks) float32, the highest `occluding` in 3 x 3 blocks, metres.
+        tops: (blocks + 1, blocks + 1) float32, the highest `occluding` in the window of 2 x 2
+            blocks that begins one row and one column before, metres.
         bottoms: (blocks, blocks) float32, the lowest depth in a block, infinite in a void one.
         crests: (blocks, blocks) float32, the highest depth in a block, minus infinity in a void
             one.
-        fine_tops: (fine blocks, fine blocks) as `tops`, for blocks of `FINE_CELLS`.
+        fine_tops: (fine blocks + 1, fine blocks + 1) as `tops`, for blocks of `FINE_CELLS`.
         fine_bottoms: (fine blocks, fine blocks) as `bottoms`, for blocks of `FINE_CELLS`.
         highest_m: the highest `occluding` of all; `NOTHING_M` and no ray is followed.
     """
@@ -216,13 +217,15 @@ def highest_in_the_way(
 ) -> float:
     """Bound the height up to which rays from the cells of a block must be followed.
 
-    At a fraction t of the way to the camera, no ray from the block is lower than the one from its
-    lowest cell, and none is farther than half a block from the one from its centre. The samples
-    are half a block apart, and each looks at 3 x 3 blocks: nothing in between is missed.
+    On its way to the camera the block takes the rays along, and shrinks. At any place it touches no
+    more than the window of 2 x 2 blocks that begins where its corner is; between two samples, half
+    a block apart, that window moves by one row or column of blocks at most, or by both, one after
+    the other. No ray is lower than the one from the lowest cell.
 
     Args:
         view: the camera before the wall.
-        tops: (blocks, blocks) metres, the highest in 3 x 3 blocks.
+        tops: (blocks + 1, blocks + 1) metres, the highest in the window of 2 x 2 blocks that begins
+            one row and one column before.
         bottom: the lowest depth of the block.
         side: of a block, in cells.
         block: its row and column among the blocks.
@@ -231,29 +234,48 @@ def highest_in_the_way(
     top = NOTHING_M
     if not bottom < view.height_m:
         return top
-    centre_row = (block[0] + 0.5) * side - 0.5
-    centre_column = (block[1] + 0.5) * side - 0.5
-    down, across = view.row - centre_row, view.column - centre_column
-    n_steps = max(1, math.ceil(max(abs(down), abs(across)) / (0.5 * side)))
+    down = (view.row + 0.5) / side - block[0] - 0.5
+    across = (view.column + 0.5) / side - block[1] - 0.5
+    n_steps = max(1, math.ceil(2.0 * max(abs(down), abs(across))))
     per_step = 1.0 / n_steps
-    down_blocks, across_blocks = down * per_step / side, across * per_step / side
     rise = (view.height_m - bottom) * per_step
-    at_row, at_column = centre_row / side, centre_column / side
-    n_block_rows, n_block_columns = tops.shape
+    row, column = _first_block(block[0], down), _first_block(block[1], across)
     for k in range(n_steps + 1):
-        height = bottom + max(0.0, k - 0.5) * rise + view.tolerance_m
+        height = bottom + max(0, k - 1) * rise + view.tolerance_m
         if height >= highest_m:
             break
-        row = math.floor(at_row + k * down_blocks)
-        column = math.floor(at_column + k * across_blocks)
-        if row < -1 or row > n_block_rows or column < -1 or column > n_block_columns:
+        next_row = _first_block(block[0] + k * per_step * down, down)
+        next_column = _first_block(block[1] + k * per_step * across, across)
+        here = _top_at(tops, next_row, next_column)
+        if next_row != row and next_column != column:
+            here = max(here, _top_at(tops, row, next_column), _top_at(tops, next_row, column))
+        elif here == NOTHING_M and not _is_inside(tops, next_row, next_column):
             break
-        row = min(max(row, 0), n_block_rows - 1)
-        column = min(max(column, 0), n_block_columns - 1)
-        here = float(tops[row, column])
         if here > height and here > top:
             top = here
+        row, column = next_row, next_column
     return top
+
+
+@compiled
+def _first_block(corner: float, direction: float) -> int:
+    """First row or column of the two that a block touches, from where its upper left corner is.
+
+    A block that touches a single one looks at the next one too, in the direction it moves.
+    """
+    return math.floor(corner) if direction > 0.0 else math.ceil(corner) - 1
+
+
+@compiled
+def _is_inside(tops: NDArray[np.float32], row: int, column: int) -> bool:
+    return -1 <= row < tops.shape[0] - 1 and -1 <= column < tops.shape[1] - 1
+
+
+@compiled
+def _top_at(tops: NDArray[np.float32], row: int, column: int) -> float:
+    if not _is_inside(tops, row, column):
+        return NOTHING_M
+    return float(tops[np.uintp(row + 1), np.uintp(column + 1)])
 
 
 @compiled

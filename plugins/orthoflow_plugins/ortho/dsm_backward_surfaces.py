@@ -40,8 +40,8 @@ def relief_of(wall: Wall, *, threads: int) -> Relief:
     return relief._replace(
         occluding=occluding,
         step_m=float(step_m),
-        tops=_highest_around(tops),
-        fine_tops=_highest_around(fine_tops),
+        tops=_highest_of_four(tops),
+        fine_tops=_highest_of_four(fine_tops),
         highest_m=float(tops.max(initial=NOTHING_M)),
     )
 
@@ -84,8 +84,8 @@ def _coarse(fine: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:
     return np.asarray(across, dtype=np.float32)
 
 
-def _highest_around(tops: NDArray[np.float32]) -> NDArray[np.float32]:
+def _highest_of_four(tops: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The highest in each window of 2 x 2 blocks, from those that begin before the first one on."""
     padded = np.pad(tops, 1, constant_values=NOTHING_M)
-    rows, columns = tops.shape
-    shifted = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)]
-    return np.asarray(np.maximum.reduce(shifted), dtype=np.float32)
+    pairs = np.maximum(padded[:-1], padded[1:])
+    return np.maximum(pairs[:, :-1], pairs[:, 1:])
