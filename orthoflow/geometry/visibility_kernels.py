@@ -268,7 +268,8 @@ def _first_block(corner: float, direction: float) -> int:
 
 @compiled
 def _is_inside(tops: NDArray[np.float32], row: int, column: int) -> bool:
-    return -1 <= row < tops.shape[0] - 1 and -1 <= column < tops.shape[1] - 1
+    rows, columns = tops.shape
+    return -1 <= row < rows - 1 and -1 <= column < columns - 1
 
 
 @compiled
