@@ -269,7 +269,7 @@ def _first_block(corner: float, direction: float) -> int:
 @compiled
 def _is_inside(tops: NDArray[np.float32], row: int, column: int) -> bool:
     rows, columns = tops.shape
-    return -1 <= row < rows - 1 and -1 <= column < columns - 1
+    return bool(-1 <= row < rows - 1 and -1 <= column < columns - 1)
 
 
 @compiled
