@@ -29,7 +29,7 @@ class SpacePicture:
 
     Attributes:
         best: (o, p) best contrast of any distance, over omega 0..180 and phi -90..90 degrees; NaN
-            where no direction was asked about.
+            where no direction of that phi was asked about.
         over_omega: (3, o, d) votes over omega and distance, for each phi of `SECTIONS_DEG`; NaN
             where no direction was asked about.
         over_phi: (3, p, d) votes over phi and distance, for each omega of `SECTIONS_DEG`.
@@ -62,6 +62,9 @@ def pictured(
     column = np.rint((directions.angles_rad[:, 1] + 0.5 * math.pi) / directions.step_rad)
     row = np.rint(directions.angles_rad[:, 0] / directions.step_rad)
     best[row.astype(int), column.astype(int)] = scores
+    # Each direction stands for those of the same phi up to the next one.
+    last_asked = np.where(np.isnan(best), 0, np.arange(n_turns)[:, None])
+    best = np.take_along_axis(best, np.maximum.accumulate(last_asked, axis=0), axis=0)
     omegas = directions.step_rad * np.arange(n_turns, dtype=np.float64)
     phis = directions.step_rad * np.arange(n_turns + 1, dtype=np.float64) - 0.5 * math.pi
     cuts = np.radians(SECTIONS_DEG)
@@ -132,7 +135,7 @@ def _draw_best(ctx: StepContext, picture: SpacePicture, planes: Planes) -> None:
         "accumulator",
         figure,
         "The best votes of any distance over the direction of the normal; circles mark the planes. "
-        "Directions are even over the hemisphere, so there are fewer towards the poles.",
+        "Directions are even over the hemisphere: towards the poles one stands for several.",
     )
 
 
