@@ -8,12 +8,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.block_verdict_kernels import HIDDEN, UNSURE, judge_block
 from orthoflow.geometry.plain_block_kernels import (
-    HIDDEN,
-    UNSURE,
     WIDE_BLOCKS,
     BlockRoom,
-    judge_block,
     look_at_hidden_block,
     look_at_plain_block,
     room_for_blocks,

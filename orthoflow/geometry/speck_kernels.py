@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,14 +17,29 @@ _AGREEING_LEAST = 2
 # Where cells are sparse more of them are asked, and more must agree: at least half of the known.
 _SPARSE_CELLS = 4
 _SPARSE_LEAST = 3
+# Steepest surface whose sparse cells agree: 27 degrees.
+_SLOPE = 0.5
+
+
+class SpeckRule(NamedTuple):
+    """Which depths agree.
+
+    Attributes:
+        layer_m: those that differ by no more.
+        noise_m: of sparse cells, those that differ by no more, but for the slope of a surface.
+        gsd_m: side of a cell.
+    """
+
+    layer_m: float
+    noise_m: float
+    gsd_m: float
 
 
 @compiled
 def find_specks(
     depth_m: NDArray[np.float32],
     is_sparse: NDArray[np.bool_],
-    layer_m: float,
-    close_m: float,
+    rule: SpeckRule,
     is_speck: NDArray[np.bool_],
     first_row: int,
     end_row: int,
@@ -32,8 +49,7 @@ def find_specks(
     Args:
         depth_m: (rows, cols) metres, NaN where void.
         is_sparse: (rows, cols) cells in gaps of an otherwise well known surface.
-        layer_m: depths that differ by no more agree.
-        close_m: the same for sparse cells.
+        rule: which depths agree.
         is_speck: (rows, cols), made true for known cells of which fewer than two of at least six
             known ones in the 5 x 5 around agree, and for sparse ones of which fewer than three, or
             fewer than half of the known ones, in the 9 x 9 around agree.
@@ -46,18 +62,28 @@ def find_specks(
             if np.isnan(depth_m[row, column]):
                 continue
             if is_sparse[row, column]:
-                n_known, n_agreeing = _count_around(depth_m, row, column, _SPARSE_CELLS, close_m)
+                n_known, n_agreeing = _count_around(
+                    depth_m, row, column, _SPARSE_CELLS, rule.noise_m, _SLOPE * rule.gsd_m
+                )
                 is_speck[row, column] = n_agreeing < max(_SPARSE_LEAST, 0.5 * n_known)
                 continue
-            n_known, n_agreeing = _count_around(depth_m, row, column, NEAR_CELLS, layer_m)
+            n_known, n_agreeing = _count_around(depth_m, row, column, NEAR_CELLS, rule.layer_m, 0.0)
             is_speck[row, column] = n_agreeing < _AGREEING_LEAST and n_known >= _KNOWN_LEAST
 
 
 @compiled
 def _count_around(
-    depth_m: NDArray[np.float32], row: int, column: int, reach: int, agree_m: float
+    depth_m: NDArray[np.float32],
+    row: int,
+    column: int,
+    reach: int,
+    agree_m: float,
+    slope_m: float,
 ) -> tuple[int, int]:
-    """Count the known cells around a cell, and those that agree with it."""
+    """Count the known cells around a cell, and those that agree with it.
+
+    Depths agree that differ by `agree_m`, and by `slope_m` more for each row or column between.
+    """
     rows, columns = depth_m.shape
     here = depth_m[row, column]
     n_known, n_agreeing = -1, -1
@@ -67,5 +93,6 @@ def _count_around(
             if np.isnan(other):
                 continue
             n_known += 1
-            n_agreeing += abs(other - here) <= agree_m
+            n_between = max(abs(r - row), abs(c - column))
+            n_agreeing += abs(other - here) <= agree_m + n_between * slope_m
     return n_known, n_agreeing

@@ -45,7 +45,7 @@ class RasterGrid(Method):
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.4, 4.2",

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.rastering import in_parts
-from orthoflow.geometry.speck_kernels import NEAR_CELLS, find_specks
+from orthoflow.geometry.speck_kernels import NEAR_CELLS, SpeckRule, find_specks
 
 # A cell is sparse where less than this share of the cells is known as somewhere around is.
 _SPARSE_SHARE: Final = 0.35
 # The shadow of an edge is narrower than twice this reach, in cells.
 _AROUND_CELLS: Final = 16
-# Cells on one surface differ by noise, in standard deviations, and by the slope over a cell.
+# Cells on one surface differ by noise, in standard deviations, and by its slope.
 _CLOSE_SIGMAS: Final = 4.0
 
 
@@ -27,7 +27,7 @@ def without_specks(
 
     A photo would paint it with a place far off. Where an edge casts its shadow on the scan, and
     cells are sparse that are dense beside it, what is there are outliers and distances mixed of
-    both sides of the edge: most of the few cells around must agree.
+    both sides of the edge: most of the few cells around must agree, but for a slope.
 
     Args:
         depth_m: (rows, cols) metres, NaN where void.
@@ -35,9 +35,10 @@ def without_specks(
         layer_m: depths that differ by more are of different layers.
         threads: how many threads work.
     """
-    close_m = min(layer_m, gsd_m + _CLOSE_SIGMAS * depth_noise_m(depth_m))
-    is_speck = np.zeros(depth_m.shape, dtype=np.bool_)
-    task = partial(find_specks, depth_m, _sparse(np.isfinite(depth_m)), layer_m, close_m, is_speck)
+    noise_m = min(layer_m, _CLOSE_SIGMAS * depth_noise_m(depth_m))
+    rule = SpeckRule(layer_m=layer_m, noise_m=noise_m, gsd_m=gsd_m)
+    is_sparse, is_speck = _sparse(np.isfinite(depth_m)), np.zeros(depth_m.shape, dtype=np.bool_)
+    task = partial(find_specks, depth_m, is_sparse, rule, is_speck)
     in_parts(depth_m.shape[0], threads, task)
     return np.where(is_speck, np.float32(np.nan), depth_m)
 
