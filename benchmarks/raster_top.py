@@ -3,8 +3,10 @@
     python benchmarks/raster_top.py [--millions 48] [--threads 2] [--repeat 5]
 
 Times are medians of interleaved runs. F is one streaming pass over the coordinates measured in the
-same run, the floor of anything that reads the cloud once. Goals: at most 25 F, and at least four
-times as fast as `np.maximum.at`. The whole of `raster.grid` is timed beside it.
+same run, the floor of anything that reads the cloud once. Goals: at most 20 F, at least four times
+as fast as `np.maximum.at`, depths identical to those of `np.lexsort`. numpy's way has less to do:
+it knows that the wall is upright along x, counts no points, and leaves open which of several
+topmost points gives its intensity. The whole of `raster.grid` is timed beside it.
 """
 
 from __future__ import annotations
@@ -82,20 +84,35 @@ def with_ours(cloud: PointCloud, slab: Slab, threads: int) -> tuple[NDArray, NDA
     return winners["depth_m"], intensity[:, 0]
 
 
-def with_maximum_at(cloud: PointCloud, slab: Slab) -> tuple[NDArray, NDArray]:
+def laid_out(cloud: PointCloud, slab: Slab) -> tuple[NDArray, NDArray, NDArray]:
+    """Cell, depth and intensity of the points inside, as numpy finds them."""
     frame = slab.frame
     depth = -cloud.y
     near = np.abs(depth) <= np.float32(BUFFER_M)
     column = (cloud.x[near].astype(np.float64) / GSD_M).astype(np.int32)
     row = ((SIZE_M[1] - cloud.z[near].astype(np.float64)) / GSD_M).astype(np.int32)
     inside = (column >= 0) & (column < frame.width) & (row >= 0) & (row < frame.height)
-    cell, depth = (row * frame.width + column)[inside], depth[near][inside]
+    cell = (row * frame.width + column)[inside]
+    return cell, depth[near][inside], cloud.intensity[near][inside]
+
+
+def with_maximum_at(cloud: PointCloud, slab: Slab) -> tuple[NDArray, NDArray]:
+    cell, depth, values = laid_out(cloud, slab)
     top = np.full(slab.n_cells, -np.inf, dtype=np.float32)
     np.maximum.at(top, cell, depth)
     is_top = depth == top[cell]
     intensity = np.full(slab.n_cells, np.nan, dtype=np.float32)
-    intensity[cell[is_top]] = cloud.intensity[near][inside][is_top]
+    intensity[cell[is_top]] = values[is_top]
     return top, intensity
+
+
+def depths_by_sorting(cloud: PointCloud, slab: Slab) -> NDArray:
+    cell, depth, _ = laid_out(cloud, slab)
+    order = np.lexsort((depth, cell))
+    is_last = np.append(np.diff(cell[order]) != 0, True)
+    top = np.full(slab.n_cells, -np.inf, dtype=np.float32)
+    top[cell[order[is_last]]] = depth[order[is_last]]
+    return top
 
 
 def whole_method(cloud: PointCloud, surface: str, threads: int) -> None:
@@ -143,7 +160,7 @@ def main() -> None:
         },
         options.repeat,
     )
-    ours, theirs = with_ours(cloud, slab, threads)[0], with_maximum_at(cloud, slab)[0]
+    ours, theirs = with_ours(cloud, slab, threads)[0], depths_by_sorting(cloud, slab)
     print(
         f"{len(cloud) / 1e6:.1f} M points, {frame.width} x {frame.height} cells, {threads} threads"
     )
@@ -159,7 +176,7 @@ def main() -> None:
             times["topmost, ours"]
         )
         print(f"np.maximum.at takes {ratio:.1f} x as long{kind}")
-    print(f"same depths: {np.array_equal(ours, theirs)}")
+    print(f"same depths as by np.lexsort: {np.array_equal(ours, theirs)}")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from orthoflow.geometry.rastering import (
     disc_offsets,
     lenders_in_gaps,
     topmost_points,
+    values_of_winners,
     wall_from_offset,
 )
 from orthoflow.geometry.slabs import Slab
@@ -82,6 +83,29 @@ def test_of_equal_points_the_first_wins() -> None:
     twins = wall.world(np.full(5, 3.5), np.full(5, 4.5), np.zeros(5))
     winners = topmost_points(scenes.cloud_of(twins), slab_of(wall), threads=1)
     assert winners["point"][4 * 40 + 3] == 0
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize(("dtype", "nothing"), [("u1", 0), ("f4", np.nan)])
+def test_cells_take_every_channel_of_their_winner(dtype: str, nothing: float, threads: int) -> None:
+    wall = scenes.upright_wall(shape=(60, 80))
+    cloud, slab = random_cloud(wall, n_points=6_000, seed=3), slab_of(wall)
+    values = np.random.default_rng(3).integers(1, 256, (len(cloud), 3)).astype(dtype)
+    winners = topmost_points(cloud, slab, threads=1)
+    has_point = winners["point"] != NO_POINT
+    assert 0 < has_point.sum() < has_point.size
+    taken = values_of_winners(winners, values, nothing, threads=threads)
+    np.testing.assert_array_equal(taken[has_point], values[winners["point"][has_point]])
+    np.testing.assert_array_equal(taken[~has_point], nothing)
+
+
+def test_depths_are_in_order_on_both_sides_of_the_plane() -> None:
+    wall = scenes.upright_wall()
+    depths_m = np.array([-1e-3, -1e-6, 0.0, 0.0, 1e-6, -1e-6])
+    points = scenes.cloud_of(wall.world(np.full(6, 3.5), np.full(6, 4.5), depths_m))
+    for n_points, winner in ((1, 0), (2, 1), (3, 2), (4, 2), (5, 4), (6, 4)):
+        some = replace(points, **{axis: getattr(points, axis)[:n_points] for axis in "xyz"})
+        assert topmost_points(some, slab_of(wall), threads=1)["point"][4 * 40 + 3] == winner
 
 
 def test_a_cell_owns_its_left_and_upper_border() -> None:

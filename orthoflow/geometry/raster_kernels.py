@@ -24,6 +24,12 @@ NO_POINT: Final = np.uint32(0xFFFFFFFF)
 # One cell in one record: a scan along columns touches another row of the raster with every point,
 # and one cache line for each is what the passes wait for.
 WINNER: Final = np.dtype([("depth_m", "f4"), ("square", "f4"), ("point", "u4"), ("n_points", "u4")])
+# The same record with the bits of its floats as whole numbers.
+_WINNER_BITS: Final = np.dtype(
+    [("depth_m", "i4"), ("square", "i4"), ("point", "u4"), ("n_points", "u4")]
+)
+# Cells whose channels are fetched one after the other: their winners stay in the nearest cache.
+_RUN_OF_VALUES: Final = 1024
 
 
 @numba.njit(cache=True, inline="always")
@@ -47,7 +53,7 @@ def empty_cells(winners: NDArray[np.void], first: int, end: int) -> None:
 def take_values(
     winners: NDArray[np.void],
     values: NDArray[np.generic],
-    nothing: float,
+    nothing: np.generic,
     taken: NDArray[np.generic],
     first: int,
     end: int,
@@ -62,13 +68,28 @@ def take_values(
         first: first cell.
         end: the cell after the last one.
     """
-    for cell in range(first, end):
-        winner = winners[cell]
-        if winner.n_points == 0:
-            taken[cell, :] = nothing
-            continue
+    for start in range(first, end, _RUN_OF_VALUES):
+        stop = min(start + _RUN_OF_VALUES, end)
+        of_cells = winners[start:stop]
+        # One channel at a time and without branches, so that several values are fetched at once.
         for channel in range(values.shape[1]):
-            taken[cell, channel] = values[winner.point, channel]
+            source, goal = values[:, channel], taken[start:stop, channel]
+            for k in range(of_cells.size):
+                winner = of_cells[k]
+                goal[k] = source[winner.point] if winner.n_points > 0 else nothing
+
+
+@numba.njit(cache=True, inline="always")
+def _rank(depth_bits, square_bits):  # type: ignore[no-untyped-def]  # numba infers the types
+    """Order of points as whole numbers: larger depths first, then smaller squares.
+
+    Bits of floats, those of negative ones turned over, are in the order of their values; there is
+    no depth of -0.0 (see `wall_from_offset`), and squares are never negative. Whole numbers are
+    compared and chosen without branches: which of a cell's points wins cannot be foreseen, and
+    wrong guesses took half of the pass.
+    """
+    ordered = np.int64(depth_bits ^ ((depth_bits >> np.int32(31)) & np.int32(0x7FFFFFFF)))
+    return (ordered << 32) - np.int64(square_bits)
 
 
 @compiled
@@ -81,20 +102,26 @@ def keep_topmost(entries: Entries, winners: NDArray[np.void], owners: int, owner
         owners: a power of two, how many threads share the cells.
         owner: whose cells to visit.
     """
+    winners_in_bits = winners.view(_WINNER_BITS)
     for block in range(entries.n_inside.size):
         first = block * BLOCK
-        for k in range(first, first + entries.n_inside[block]):
-            cell = entries.cells[k]
+        end = first + entries.n_inside[block]
+        # Unsigned, an index is not looked at for being negative.
+        cells = entries.cells[first:end].view(np.uint32)
+        depths, squares = entries.depths_m[first:end], entries.squares[first:end]
+        depth_bits, square_bits = depths.view(np.int32), squares.view(np.int32)
+        points = entries.points[first:end]
+        for k in range(cells.size):
+            cell = cells[k]
             if not is_own(cell, owners, owner):
                 continue
-            winner = winners[cell]
+            winner = winners_in_bits[cell]
+            depth, square = winner.depth_m, winner.square
+            wins = _rank(depth_bits[k], square_bits[k]) > _rank(depth, square)
+            winner.depth_m = depth_bits[k] if wins else depth
+            winner.square = square_bits[k] if wins else square
+            winner.point = points[k] if wins else winner.point
             winner.n_points += np.uint32(1)
-            depth = entries.depths_m[k]
-            is_tie = depth == winner.depth_m
-            if depth > winner.depth_m or (is_tie and entries.squares[k] < winner.square):
-                winner.depth_m = depth
-                winner.square = entries.squares[k]
-                winner.point = entries.points[k]
 
 
 @compiled

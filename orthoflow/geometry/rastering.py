@@ -35,7 +35,8 @@ def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[n
     nothing is lost.
     """
     axes = np.vstack([frame.u_world / frame.gsd_m, frame.v_world / frame.gsd_m, frame.normal_world])
-    return np.column_stack([axes, axes @ (origin - frame.origin_world)])
+    # Added to +0.0, no place or depth is ever -0.0, which is smaller than +0.0 only by its bits.
+    return np.column_stack([axes, axes @ (origin - frame.origin_world) + 0.0])
 
 
 def entries_inside(points: OffsetPoints, slab: Slab, *, threads: int) -> Iterator[Entries]:
@@ -120,7 +121,8 @@ def values_of_winners(
     taken = np.empty((winners.size, values.shape[1]), dtype=values.dtype)
     seen = np.asarray(values).view(np.ndarray)
     seen.flags.writeable = False
-    in_parts(winners.size, threads, partial(kernels.take_values, winners, seen, nothing, taken))
+    void = values.dtype.type(nothing)
+    in_parts(winners.size, threads, partial(kernels.take_values, winners, seen, void, taken))
     return taken
 
 
