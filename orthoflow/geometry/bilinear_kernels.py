@@ -96,10 +96,12 @@ def sample_bilinear(
             lower = upper + np.uintp(width)
             right = np.uint64(np.uint32(shares[j]) & np.uint32(255))
             below = np.uint64(np.uint32(shares[j]) >> np.uint32(8))
-            left = whole - right
-            above_sum = pixels[upper] * left + pixels[upper + np.uintp(1)] * right
-            below_sum = pixels[lower] * left + pixels[lower + np.uintp(1)] * right
-            colour = above_sum * (whole - below) + below_sum * below + _HALF
+            # One product each: that differences run under does no harm, for the sums do not.
+            above_sum = pixels[upper] * whole
+            above_sum += (pixels[upper + np.uintp(1)] - pixels[upper]) * right
+            below_sum = pixels[lower] * whole
+            below_sum += (pixels[lower + np.uintp(1)] - pixels[lower]) * right
+            colour = above_sum * whole + (below_sum - above_sum) * below + _HALF
             into[j, 0] = np.uint8((colour >> _WEIGHT_BITS) & np.uint64(255))
             into[j, 1] = np.uint8((colour >> (_WEIGHT_BITS + _GREEN)) & np.uint64(255))
             into[j, 2] = np.uint8((colour >> (_WEIGHT_BITS + _BLUE)) & np.uint64(255))

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from orthoflow.geometry.block_verdict_kernels import parabola
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import kernel_part
+from orthoflow.geometry.ray_kernels import N_LANES
 from orthoflow.geometry.visibility_kernels import (
     BLOCK_CELLS,
+    FINE_CELLS,
     NO_SURFACE,
     OCCLUDED,
     PAINTED,
@@ -138,6 +140,8 @@ class BlockRoom(NamedTuple):
         wall_columns: columns of the wall; tile_columns those of the tile.
         nodes: (2, 3, 3, 4) of `span_block`.
         box: (4,) of `judge_block`.
+        lanes: (5, BLOCK_CELLS) of `sight_kernels.project_row`.
+        rays: (FINE_CELLS * FINE_CELLS, N_LANES) of `ray_kernels.follow_rays`.
     """
 
     heights: NDArray[np.float32]
@@ -154,6 +158,8 @@ class BlockRoom(NamedTuple):
     tile_columns: int
     nodes: NDArray[np.float64]
     box: NDArray[np.float64]
+    lanes: NDArray[np.float64]
+    rays: NDArray[np.int64]
 
 
 @compiled
@@ -174,6 +180,8 @@ def room_for_blocks(relief: Relief, sight: Sight) -> BlockRoom:
         sight.mask.shape[1],
         np.empty((2, 3, 3, 4)),
         np.empty(4),
+        np.empty((5, BLOCK_CELLS)),
+        np.empty((FINE_CELLS * FINE_CELLS, N_LANES), dtype=np.int64),
     )
 
 

@@ -83,30 +83,22 @@ def make_occluding(
     high = np.empty(columns, dtype=np.float32)
     high[:] = NOTHING_M
     begin = max(first_row - 2, -1)
-    _close(depth, max(begin, 0), known, closed[1])
+    _close(depth, max(begin, 0), known, closed[begin % 2])
     # A row needs those above and below it of `opened`, and a row of that itself and the one above
-    # of `lowest`, a row of which needs itself and the next of `closed`.
+    # of `lowest`, a row of which needs itself and the next of `closed`. Above the first row and
+    # below the last one the surface goes on as it ends.
     for row in range(begin, end_row + 1):
-        closed[0, :] = closed[1]
-        lowest[0, :] = lowest[1]
+        now, other = row % 2, (row + 1) % 2
         if row < rows:
-            _close(depth, min(row + 1, rows - 1), known, closed[1])
-            _erode(closed[0], closed[1], lowest[1])
-        if row <= 0:
-            lowest[0, :] = lowest[1]
-        if row < max(first_row - 1, 0):
-            continue
-        here = opened[row % 3]
-        _dilate(lowest[0], lowest[1], here)
-        if row == 0:
-            opened[2, :] = here
-        elif row == rows:
-            here[:] = opened[(row - 1) % 3]
+            _close(depth, min(row + 1, rows - 1), known, closed[other])
+            _erode(closed[now], closed[other], lowest[now])
+            if row >= max(first_row - 1, 0):
+                _dilate(lowest[other if row > 0 else now], lowest[now], opened[row % 3])
         done = row - 1
         if done < first_row:
             continue
-        above, at = opened[(done - 1) % 3], opened[done % 3]
-        _widen(above, at, here, edge_m, step_m, known, occluding[done])
+        above, below = opened[max(done - 1, 0) % 3], opened[min(row, rows - 1) % 3]
+        _widen(above, opened[done % 3], below, edge_m, step_m, known, occluding[done])
         for j in range(columns):
             high[j] = max(high[j], known[1, j + 1])
         if (done + 1) % FINE_CELLS == 0 or done + 1 == rows:

@@ -17,9 +17,17 @@ from orthoflow.geometry.plain_block_kernels import (
     room_for_blocks,
     span_block,
 )
+from orthoflow.geometry.ray_kernels import (
+    COLUMN,
+    IS_HIDDEN,
+    ROW,
+    eye_of,
+    follow_rays,
+    hide_low_cells,
+    highest_in_the_way,
+)
 from orthoflow.geometry.visibility_kernels import (
     BLOCK_CELLS,
-    FINE_CELLS,
     NO_SURFACE,
     OCCLUDED,
     OUTSIDE,
@@ -29,8 +37,6 @@ from orthoflow.geometry.visibility_kernels import (
     Sight,
     WallView,
     compiled,
-    highest_in_the_way,
-    is_hidden_by_relief,
 )
 
 # Two depths that stand for a level block lie so far apart.
@@ -118,7 +124,7 @@ def look_at_cells(
     """
     end_row, end_column = first_row + sight.mask.shape[0], first_column + sight.mask.shape[1]
     tile = (first_row, first_column, end_row, end_column)
-    lanes, room = np.empty((5, BLOCK_CELLS)), room_for_blocks(relief, sight)
+    room = room_for_blocks(relief, sight)
     wide, n_blocks = WIDE_BLOCKS * BLOCK_CELLS, relief.bottoms.shape[1]
     summary = sight.summary
     summary[:] = 0.0
@@ -135,7 +141,7 @@ def look_at_cells(
             for column in range(first, end):
                 blocks = (block_row, column, column + 1)
                 if not look_at_blocks(view, relief, buffer, sight, room, tile, blocks):
-                    _ask_each_cell(view, relief, buffer, sight, tile, (block_row, column), lanes)
+                    _ask_each_cell(view, relief, buffer, sight, room, tile, (block_row, column))
 
 
 @compiled
@@ -184,7 +190,11 @@ def look_at_blocks(
         return True
     n_seen = look_at_plain_block(view, room, place, (rows, columns), depths)
     for column in range(first, end):
-        n_seen -= _hide_low_cells(view, relief, sight, tile, (block_row, column))
+        block = (block_row, column)
+        top = _highest(view, relief, block)
+        if float(relief.bottoms[block]) + view.tolerance_m < top:
+            corner, area = (tile[0], tile[1]), _cells_in_tile(tile, block)
+            n_seen -= hide_low_cells(view, relief, sight, corner, area, top, room.rays)
     if n_seen:
         summary, box = sight.summary, room.box
         summary[0], summary[1] = min(summary[0], box[0]), max(summary[1], box[1])
@@ -209,8 +219,22 @@ def _place_in_tile(
 @compiled
 def _highest(view: WallView, relief: Relief, block: tuple[int, int]) -> float:
     """Bound the height up to which the rays from a block must be followed."""
-    bottom = float(relief.bottoms[block[0], block[1]])
-    return highest_in_the_way(view, relief.tops, bottom, BLOCK_CELLS, block, relief.highest_m)
+    bottom, eye = float(relief.bottoms[block]), eye_of(view, relief)
+    return highest_in_the_way(eye, relief.tops, bottom, BLOCK_CELLS, block, relief.highest_m)
+
+
+@compiled
+def _cells_in_tile(
+    tile: tuple[int, int, int, int], block: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Give the first row and column of a block's cells in a tile, and those after the last ones."""
+    begin, start = block[0] * BLOCK_CELLS, block[1] * BLOCK_CELLS
+    return (
+        max(tile[0], begin),
+        max(tile[1], start),
+        min(tile[2], begin + BLOCK_CELLS),
+        min(tile[3], start + BLOCK_CELLS),
+    )
 
 
 @compiled
@@ -219,18 +243,17 @@ def _ask_each_cell(
     relief: Relief,
     buffer: DepthBuffer,
     sight: Sight,
+    room: BlockRoom,
     tile: tuple[int, int, int, int],
     block: tuple[int, int],
-    lanes: NDArray[np.float64],
 ) -> None:
     """Project the cells of a block one by one, and ask for each whether the photo sees it."""
     top = _highest(view, relief, block)
-    begin, finish = max(tile[0], block[0] * BLOCK_CELLS), min(tile[2], (block[0] + 1) * BLOCK_CELLS)
-    start, end = max(tile[1], block[1] * BLOCK_CELLS), min(tile[3], (block[1] + 1) * BLOCK_CELLS)
+    begin, start, finish, end = _cells_in_tile(tile, block)
     for row in range(begin, finish):
         into = _part(sight, row - tile[0], start - tile[1], end - start)
-        project_row(view, relief, row, start, lanes[:, : end - start])
-        look_at_row(view, relief, buffer, (row, start, top), lanes, into, sight.summary)
+        project_row(view, relief, row, start, room.lanes[:, : end - start])
+        look_at_row(view, relief, buffer, (row, start, top), room, into, sight.summary)
 
 
 @compiled
@@ -250,7 +273,7 @@ def look_at_row(
     relief: Relief,
     buffer: DepthBuffer,
     place: tuple[int, int, float],
-    lanes: NDArray[np.float64],
+    room: BlockRoom,
     into: SightRow,
     summary: NDArray[np.float64],
 ) -> None:
@@ -262,7 +285,7 @@ def look_at_row(
         buffer: what else stands before the camera.
         place: row of the cells, column of the first one, and the height up to which rays have to
             be followed.
-        lanes: of `project_row`.
+        room: its lanes are those of `project_row`.
         into: filled.
         summary: of the `Sight`, updated.
     """
@@ -270,26 +293,35 @@ def look_at_row(
     row, first_column, top = place
     width, image_height = view.camera[21], view.camera[22]
     per_pixel, per_border = 1.0 / buffer.reduction, 1.0 / view.border_px
+    # What stands in a tuple is taken out once: each time costs as much as a projection.
+    depths, nearest, lanes, rays = relief.depth[row], buffer.nearest, room.lanes, room.rays
+    cosine_least, tolerance_m = view.cosine_least, view.tolerance_m
+    n_low = 0
     for k in range(mask.size):
-        depth = float(relief.depth[row, first_column + k])
-        u, v = lanes[0, k], lanes[1, k]
-        us[k], vs[k], quality[k] = 0.0, 0.0, 0.0
+        depth, u, v = float(depths[first_column + k]), lanes[0, k], lanes[1, k]
         if math.isnan(depth):
             mask[k] = NO_SURFACE
-            continue
-        if not (0.0 <= u < width and 0.0 <= v < image_height):
+        elif not (0.0 <= u < width and 0.0 <= v < image_height):
             mask[k] = OUTSIDE
-            continue
-        mask[k] = OCCLUDED
-        if lanes[3, k] <= view.cosine_least:
-            continue
-        if buffer.nearest[int(v * per_pixel), int(u * per_pixel)] < lanes[2, k]:
-            continue
-        if depth + view.tolerance_m < top and is_hidden_by_relief(
-            view, relief, row, first_column + k, top
+        elif (
+            lanes[3, k] <= cosine_least
+            or nearest[int(v * per_pixel), int(u * per_pixel)] < lanes[2, k]
         ):
+            mask[k] = OCCLUDED
+        else:
+            mask[k] = PAINTED
+            if depth + tolerance_m < top:
+                rays[n_low, ROW], rays[n_low, COLUMN] = row, first_column + k
+                n_low += 1
+    follow_rays(eye_of(view, relief), relief.depth, relief.occluding, top, n_low, rays)
+    for i in range(n_low):
+        if rays[i, IS_HIDDEN]:
+            mask[rays[i, COLUMN] - first_column] = OCCLUDED
+    for k in range(mask.size):
+        u, v = lanes[0, k], lanes[1, k]
+        if mask[k] != PAINTED:
+            us[k], vs[k], quality[k] = 0.0, 0.0, 0.0
             continue
-        mask[k] = PAINTED
         inside = min(width - u, u, image_height - v, v) * per_border
         quality[k] = lanes[4, k] * min(1.0, inside)
         us[k], vs[k] = u, v
@@ -298,70 +330,4 @@ def look_at_row(
         summary[4] += 1
         summary[5] += first_column + k
         summary[6] += row
-        summary[7] += depth
-
-
-@compiled
-def _hide_low_cells(
-    view: WallView,
-    relief: Relief,
-    sight: Sight,
-    tile: tuple[int, int, int, int],
-    block: tuple[int, int],
-) -> int:
-    """Follow the rays of those cells of a painted block that lie low enough to be hidden.
-
-    Small blocks within it are asked first: most of them are free.
-
-    Args:
-        view: the camera before the wall.
-        relief: the wall.
-        sight: of the tile, changed where cells are hidden.
-        tile: as of `look_at_blocks`.
-        block: row and column of the block.
-
-    Returns:
-        How many cells are hidden.
-    """
-    top = _highest(view, relief, block)
-    if not float(relief.bottoms[block[0], block[1]]) + view.tolerance_m < top:
-        return 0
-    n_hidden, per_block = 0, BLOCK_CELLS // FINE_CELLS
-    n_rows, n_columns = relief.fine_bottoms.shape
-    for row in range(block[0] * per_block, min(n_rows, (block[0] + 1) * per_block)):
-        for column in range(block[1] * per_block, min(n_columns, (block[1] + 1) * per_block)):
-            bottom = float(relief.fine_bottoms[row, column])
-            if not bottom + view.tolerance_m < top:
-                continue
-            fine_top = highest_in_the_way(
-                view, relief.fine_tops, bottom, FINE_CELLS, (row, column), top
-            )
-            if bottom + view.tolerance_m < fine_top:
-                n_hidden += _hide_cells(view, relief, sight, tile, (row, column, fine_top))
-    return n_hidden
-
-
-@compiled
-def _hide_cells(
-    view: WallView,
-    relief: Relief,
-    sight: Sight,
-    tile: tuple[int, int, int, int],
-    block: tuple[int, int, float],
-) -> int:
-    """Follow the rays of the low cells of a small block, given with the height up to which."""
-    fine_row, fine_column, top = block
-    n_hidden = 0
-    for row in range(
-        max(tile[0], fine_row * FINE_CELLS), min(tile[2], (fine_row + 1) * FINE_CELLS)
-    ):
-        for column in range(
-            max(tile[1], fine_column * FINE_CELLS), min(tile[3], (fine_column + 1) * FINE_CELLS)
-        ):
-            if not relief.depth[row, column] < top - view.tolerance_m:
-                continue
-            if is_hidden_by_relief(view, relief, row, column, top):
-                sight.mask[row - tile[0], column - tile[1]] = OCCLUDED
-                sight.quality[row - tile[0], column - tile[1]] = 0.0
-                n_hidden += 1
-    return n_hidden
+        summary[7] += depths[first_column + k]

@@ -77,8 +77,9 @@ class Relief(NamedTuple):
 
     Attributes:
         depth: (rows, cols) float32 metres, NaN where void.
-        occluding: (rows, cols) int16 the same without spikes, in steps of `step_m`, `NOTHING`
+        occluding: (rows * cols,) int16 the same without spikes, in steps of `step_m`, `NOTHING`
             where void; half the memory of float32, and far finer than what counts as hidden.
+            Empty where the surface hides nothing.
         step_m: of `occluding`.
         tops: (blocks + 1, blocks + 1) float32, the highest `occluding` in the window of 2 x 2
             blocks that begins one row and one column before, metres.
@@ -204,118 +205,3 @@ def splat_points(
         for row in range(first_row, end_row):
             for column in range(first, end):
                 buffer.nearest[row, column] = min(buffer.nearest[row, column], nearest)
-
-
-@compiled
-def highest_in_the_way(
-    view: WallView,
-    tops: NDArray[np.float32],
-    bottom: float,
-    side: int,
-    block: tuple[int, int],
-    highest_m: float,
-) -> float:
-    """Bound the height up to which rays from the cells of a block must be followed.
-
-    On its way to the camera the block takes the rays along, and shrinks. At any place it touches no
-    more than the window of 2 x 2 blocks that begins where its corner is; between two samples, half
-    a block apart, that window moves by one row or column of blocks at most, or by both, one after
-    the other. No ray is lower than the one from the lowest cell.
-
-    Args:
-        view: the camera before the wall.
-        tops: (blocks + 1, blocks + 1) metres, the highest in the window of 2 x 2 blocks that begins
-            one row and one column before.
-        bottom: the lowest depth of the block.
-        side: of a block, in cells.
-        block: its row and column among the blocks.
-        highest_m: nothing that counts is higher.
-    """
-    top = NOTHING_M
-    if not bottom < view.height_m:
-        return top
-    down = (view.row + 0.5) / side - block[0] - 0.5
-    across = (view.column + 0.5) / side - block[1] - 0.5
-    n_steps = max(1, math.ceil(2.0 * max(abs(down), abs(across))))
-    per_step = 1.0 / n_steps
-    rise = (view.height_m - bottom) * per_step
-    row, column = _first_block(block[0], down), _first_block(block[1], across)
-    for k in range(n_steps + 1):
-        height = bottom + max(0, k - 1) * rise + view.tolerance_m
-        if height >= highest_m:
-            break
-        next_row = _first_block(block[0] + k * per_step * down, down)
-        next_column = _first_block(block[1] + k * per_step * across, across)
-        here = _top_at(tops, next_row, next_column)
-        if next_row != row and next_column != column:
-            here = max(here, _top_at(tops, row, next_column), _top_at(tops, next_row, column))
-        elif here == NOTHING_M and not _is_inside(tops, next_row, next_column):
-            break
-        if here > height and here > top:
-            top = here
-        row, column = next_row, next_column
-    return top
-
-
-@compiled
-def _first_block(corner: float, direction: float) -> int:
-    """First row or column of the two that a block touches, from where its upper left corner is.
-
-    A block that touches a single one looks at the next one too, in the direction it moves.
-    """
-    return math.floor(corner) if direction > 0.0 else math.ceil(corner) - 1
-
-
-@compiled
-def _is_inside(tops: NDArray[np.float32], row: int, column: int) -> bool:
-    rows, columns = tops.shape
-    return bool(-1 <= row < rows - 1 and -1 <= column < columns - 1)
-
-
-@compiled
-def _top_at(tops: NDArray[np.float32], row: int, column: int) -> float:
-    if not _is_inside(tops, row, column):
-        return NOTHING_M
-    return float(tops[np.uintp(row + 1), np.uintp(column + 1)])
-
-
-@compiled
-def is_hidden_by_relief(view: WallView, relief: Relief, row: int, column: int, top: float) -> bool:
-    """Follow the ray from a cell to the camera, one row or column at a time, up to a height."""
-    rows, columns = relief.occluding.shape
-    depth = float(relief.depth[row, column])
-    down, across = view.row - row, view.column - column
-    along = max(abs(down), abs(across))
-    if along < 1.0:
-        return False
-    rise = (view.height_m - depth) / along
-    is_along_rows = abs(down) >= abs(across)
-    # Steps are whole rows or columns; beside them the ray moves by a part of a cell.
-    step = 1 if (down if is_along_rows else across) > 0.0 else -1
-    aside = (across if is_along_rows else down) / along
-    here, beside = (row, float(column)) if is_along_rows else (column, float(row))
-    n_here, n_beside = (rows, columns) if is_along_rows else (columns, rows)
-    height, per_step = depth + view.tolerance_m, 1.0 / relief.step_m
-    for k in range(1, int(along) + 1):
-        height += rise
-        here += step
-        if height >= top:
-            return False
-        at = beside + k * aside
-        first = math.floor(at)
-        # The surface is linear between the two cells beside the ray.
-        share = at - first
-        second = first + 1 if share > 0.0 else first
-        if here < 0 or here >= n_here or first < 0 or second >= n_beside:
-            return False
-        if is_along_rows:
-            one = relief.occluding[np.uintp(here), np.uintp(first)]
-            other = relief.occluding[np.uintp(here), np.uintp(second)]
-        else:
-            one = relief.occluding[np.uintp(first), np.uintp(here)]
-            other = relief.occluding[np.uintp(second), np.uintp(here)]
-        if min(one, other) == NOTHING:
-            continue
-        if (1.0 - share) * one + share * other > height * per_step:
-            return True
-    return False

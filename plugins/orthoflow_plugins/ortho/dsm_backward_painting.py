@@ -212,8 +212,9 @@ class _Brush:
 
     def _near_hidden(self, sight: Sight) -> NDArray[np.uint8]:
         """Not 0 where a cell is too near to a hidden patch; empty where none is."""
-        if self._rule.erosion_cells and (sight.mask == OCCLUDED).any():
-            return _near_patches(sight.mask == OCCLUDED, self._rule.erosion_cells)
+        is_hidden = sight.mask == OCCLUDED
+        if self._rule.erosion_cells and is_hidden.any():
+            return _near_patches(is_hidden, self._rule.erosion_cells)
         return np.empty((0, 0), dtype=np.uint8)
 
     def _blank_sight(self, rows: int, columns: int) -> Sight:
@@ -248,10 +249,10 @@ def _near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.uint8]
     """
     import cv2
 
-    square, window = np.ones((2, 2), dtype=np.uint8), np.ones((2 * reach + 1,) * 2, dtype=np.uint8)
-    lowest = cv2.erode(is_hidden.view(np.uint8), square, anchor=(0, 0))
-    patches = cv2.dilate(lowest, square, anchor=(1, 1))
-    return np.asarray(cv2.dilate(patches, window), dtype=np.uint8)
+    lowest = cv2.erode(is_hidden.view(np.uint8), np.ones((2, 2), dtype=np.uint8), anchor=(0, 0))
+    # The patches again from their upper left cells, and what is around them, in one.
+    window = np.ones((2 * reach + 2,) * 2, dtype=np.uint8)
+    return np.asarray(cv2.dilate(lowest, window, anchor=(reach + 1,) * 2), dtype=np.uint8)
 
 
 def _crop_side(sight: Sight) -> float:

@@ -13,7 +13,6 @@ from orthoflow.geometry.relief_kernels import bound_blocks, make_occluding
 from orthoflow.geometry.visibility_kernels import (
     BLOCK_CELLS,
     FINE_CELLS,
-    NOTHING,
     NOTHING_M,
     Relief,
 )
@@ -38,7 +37,7 @@ def relief_of(wall: Wall, *, threads: int) -> Relief:
     occluding.flags.writeable = False
     tops = _coarse(fine_tops, np.maximum)
     return relief._replace(
-        occluding=occluding,
+        occluding=occluding.reshape(-1),
         step_m=float(step_m),
         tops=_highest_of_four(tops),
         fine_tops=_highest_of_four(fine_tops),
@@ -54,7 +53,7 @@ def transparent_relief_of(wall: Wall, *, threads: int) -> Relief:
     fine_bottoms = np.empty(shape, dtype=np.float32)
     fine_crests = np.empty_like(fine_bottoms)
     in_parts(shape[0], threads, partial(bound_blocks, depth, fine_bottoms, fine_crests))
-    nothing = np.full((1, 1), NOTHING, dtype=np.int16)
+    nothing = np.empty(0, dtype=np.int16)
     nothing.flags.writeable = False
     bottoms = _coarse(fine_bottoms, np.minimum)
     return Relief(
@@ -78,10 +77,19 @@ def _largest_m(relief: Relief) -> float:
 
 def _coarse(fine: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:
     """The extreme of each large block, from those of the small ones in it."""
+    for _ in range(2):
+        fine = _reduced_rows(fine, reduce).T
+    return np.ascontiguousarray(fine)
+
+
+def _reduced_rows(fine: NDArray[np.float32], reduce: np.ufunc) -> NDArray[np.float32]:
+    """The extreme of as many rows each as lie in a large block; the last may be fewer."""
     per_block = BLOCK_CELLS // FINE_CELLS
-    down = reduce.reduceat(fine, np.arange(0, fine.shape[0], per_block), axis=0)
-    across = reduce.reduceat(down, np.arange(0, fine.shape[1], per_block), axis=1)
-    return np.asarray(across, dtype=np.float32)
+    coarse = fine[::per_block].copy()
+    for k in range(1, per_block):
+        part = fine[k::per_block]
+        reduce(coarse[: len(part)], part, out=coarse[: len(part)])
+    return coarse
 
 
 def _highest_of_four(tops: NDArray[np.float32]) -> NDArray[np.float32]:
