@@ -139,6 +139,34 @@ def test_the_world_file_says_what_the_geotiff_says(tmp_path: Path, frame: WallFr
         assert placed.almost_equals(dataset.transform, 1e-12)
 
 
+@pytest.mark.parametrize("whole_px", [1 << 26, 1000], ids=["small", "averaged first"])
+def test_previews_open_where_their_rasters_lie(
+    tmp_path: Path, frame: WallFrame, monkeypatch: pytest.MonkeyPatch, whole_px: int
+) -> None:
+    import rasterio
+
+    monkeypatch.setattr(images, "_WHOLE_PX", whole_px)
+    wide = replace(frame, width=6407, height=1203)
+    half = np.zeros((*wide.shape, 3), dtype=np.uint8)
+    half[:, 3000:] = 200
+    half[400:, :, 0] = 250
+    shown = np.ones(wide.shape, dtype=np.uint8)
+    image = replace(orthoimage(wide), rgb=half, mask=shown)
+    publishing.publish_orthoimages(Orthoimages(images=(image,)), tmp_path, DIGEST)
+    with (
+        rasterio.open(tmp_path / "wall_3_ortho.tif") as raster,
+        rasterio.open(tmp_path / "wall_3_ortho.png") as preview,
+    ):
+        # Less than a square of averaged cells is cut off.
+        np.testing.assert_allclose(preview.bounds, raster.bounds, atol=0.03)
+        red, green, _, _ = preview.read()
+        to_right = preview.xy(0, int(np.argmax(green[5] > 100)), offset="ul")[0]
+        downwards = preview.xy(int(np.argmax(red[:, 5] > 125)), 0, offset="ul")[1]
+        side_m = preview.res[0]
+    assert to_right == pytest.approx(30.0, abs=side_m)
+    assert downwards == pytest.approx(-4.0, abs=side_m)
+
+
 def test_the_profile_of_the_photos_goes_into_the_file(tmp_path: Path, frame: WallFrame) -> None:
     import rasterio
 
@@ -199,10 +227,10 @@ def test_publishing_twice_gives_the_same_bytes(tmp_path: Path, frame: WallFrame)
         contents.append({path.name: path.read_bytes() for path in folder.iterdir()})
     assert contents[0] == contents[1]
     assert set(contents[0]) == {
-        *(f"wall_3_ortho{suffix}" for suffix in (".tif", ".tfw", ".json", ".png")),
+        *(f"wall_3_ortho{suffix}" for suffix in (".tif", ".tfw", ".json", ".png", ".pgw")),
         *(f"wall_3_ortho_mask{suffix}" for suffix in (".tif", ".json")),
-        *(f"wall_0_depth{suffix}" for suffix in (".tif", ".json", ".png")),
-        *(f"wall_0_intensity{suffix}" for suffix in (".tif", ".json", ".png")),
+        *(f"wall_0_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")),
+        *(f"wall_0_intensity{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")),
     }
 
 

@@ -76,6 +76,8 @@ def write_raster(
 ) -> None:
     """Write one band: float32 with NaN for nothing, or uint8 classes without a nodata value.
 
+    Rasters of more than 64 million cells are written band by band of rows.
+
     Args:
         path: file to write; its folder exists.
         values: (rows, cols) float32 or uint8.
@@ -103,7 +105,32 @@ def write_raster(
     }
     if is_float:
         profile["nodata"] = math.nan
-    _write(path, values[None], None, profile | _placed(values.shape, gsd_m), tags)
+    profile |= _placed(values.shape, gsd_m)
+    if values.size > _IN_MEMORY_CELLS:
+        _write_large_raster(path, values, profile, tags)
+    else:
+        _write(path, values[None], None, profile, tags)
+
+
+def _write_large_raster(
+    path: Path,
+    values: NDArray[np.generic],
+    profile: Mapping[str, object],
+    tags: Mapping[str, str],
+) -> None:
+    """Write one band to the disk, a row of tiles at a time."""
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    try:
+        with _quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+            with rasterio.open(path, "w", BIGTIFF="IF_SAFER", **profile) as dataset:
+                _describe(dataset, tags, None)
+                for window in _bands(values.shape):
+                    dataset.write(values[_rows(window)], 1, window=window)
+            _require_written(path, values[:, :, None])
+    except (RasterioError, OSError) as error:
+        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
 
 
 def write_orthoimage(
@@ -169,11 +196,11 @@ def _write_banded(path: Path, image: _Image, placed: Mapping[str, object]) -> No
             with rasterio.open(plain, "w", BIGTIFF="IF_SAFER", **options, **placed) as dataset:
                 _describe(dataset, image.tags, image.icc_profile)
                 for window in _bands(image.shown.shape):
-                    rows = slice(window.row_off, window.row_off + window.height)
+                    rows = _rows(window)
                     dataset.write(np.moveaxis(image.rgb[rows], 2, 0), window=window)
                     dataset.write_mask(image.shown[rows], window=window)
             copy(plain, path, driver="COG", BIGTIFF="IF_SAFER", **_COG_OPTIONS)
-            _require_written(path, image)
+            _require_written(path, image.rgb)
     except (RasterioError, OSError) as error:
         raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
     finally:
@@ -187,25 +214,35 @@ def _bands(shape: tuple[int, ...]) -> Iterator[Window]:
         yield Window(0, first, shape[1], min(TILE_PX, shape[0] - first))
 
 
-def _require_written(path: Path, image: _Image) -> None:
+def _rows(window: Window) -> slice:
+    return slice(window.row_off, window.row_off + window.height)
+
+
+def _require_written(path: Path, values: NDArray[np.generic]) -> None:
     """Read the file again: of a disk that gets full at closing, GDAL only tells a log."""
     import rasterio
 
     with rasterio.open(path) as dataset:
-        for window in _bands(image.shown.shape):
-            rows = slice(window.row_off, window.row_off + window.height)
+        for window in _bands(values.shape):
+            rows = _rows(window)
             written = np.moveaxis(dataset.read(window=window), 0, 2)
-            if not np.array_equal(written, image.rgb[rows]):
+            if not np.array_equal(written, values[rows], equal_nan=True):
                 raise OSError(f"rows {rows.start} to {rows.stop} do not read back")
 
 
-def world_file_text(gsd_m: float) -> str:
+def world_file_text(gsd_m: float, *, rows: float = 1.0, columns: float = 1.0) -> str:
     """Give the world file of a wall's raster, for programs that read no GeoTIFF tags.
 
     Six lines: step along a row, two rotations, step down a column, and the centre of the first
-    cell.
+    pixel.
+
+    Args:
+        gsd_m: side of a cell in metres.
+        rows: of cells that a pixel covers; more than one for a preview.
+        columns: of cells that a pixel covers.
     """
-    numbers = (gsd_m, 0.0, 0.0, -gsd_m, 0.5 * gsd_m, -0.5 * gsd_m)
+    across_m, down_m = columns * gsd_m, rows * gsd_m
+    numbers = (across_m, 0.0, 0.0, -down_m, 0.5 * across_m, -0.5 * down_m)
     return "".join(f"{number!r}\n" for number in numbers)
 
 

@@ -6,6 +6,8 @@ orientation: the pixel frame is the stored array.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Final, TypeVar
 
 import numpy as np
@@ -21,6 +23,10 @@ _BAND_PX: Final = 64
 STRETCH_PERCENTILES: Final = (1.0, 99.0)
 
 Shrunk = TypeVar("Shrunk", np.float32, np.uint8)
+Sampled = TypeVar("Sampled", bound=np.generic)
+Part = tuple[slice, slice]
+# Image (rows, cols[, 3]) of a part of a raster, and where it shows something.
+Cells = Callable[[Part], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 
 
 def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
@@ -71,14 +77,51 @@ def encode_webp(image: NDArray[np.uint8], *, quality: int = 85) -> bytes:
     return _encode(".webp", colour, [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
+def cells_per_preview_px(shape: tuple[int, ...]) -> tuple[float, float]:
+    """Rows and columns of a raster that a pixel of its preview covers."""
+    if max(shape) <= PREVIEW_SIDE_PX:
+        return 1.0, 1.0
+    factor = _averaged_px(shape, PREVIEW_SIDE_PX)
+    rows, columns = shape[0] // factor, shape[1] // factor
+    small = _shrunk_shape((rows, columns), PREVIEW_SIDE_PX)
+    return factor * rows / small[0], factor * columns / small[1]
+
+
 def stretch_to_grey(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Grey picture of a raster: the 1st percentile is black, the 99th white, NaN is black."""
-    known = np.isfinite(values)
-    if not known.any():
+    return _stretched(values, _stretch_of(values))
+
+
+def grey_cells(values: NDArray[np.floating]) -> Cells:
+    """Give the picture of `stretch_to_grey` part by part, with NaN for what is not shown.
+
+    Of a raster (rows, cols) of more than 64 million cells the percentiles are those of some rows.
+    """
+    stretch = _stretch_of(sampled_rows(values))
+    return lambda part: (_stretched(values[part], stretch), np.isfinite(values[part]))
+
+
+def sampled_rows(values: NDArray[Sampled]) -> NDArray[Sampled]:
+    """Rows of a raster with at most some 64 million cells, evenly from all of it."""
+    return values[:: max(1, -(-values.size // _WHOLE_PX))]
+
+
+def _stretch_of(values: NDArray[np.floating]) -> tuple[float, float] | None:
+    """Value that is black, and how much more is white; None of a raster that knows nothing."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return None
+    low, high = np.percentile(known, STRETCH_PERCENTILES)
+    return low, max(float(high - low), 1e-12)
+
+
+def _stretched(
+    values: NDArray[np.floating], stretch: tuple[float, float] | None
+) -> NDArray[np.uint8]:
+    if stretch is None:
         return np.zeros(values.shape, dtype=np.uint8)
-    low, high = np.percentile(values[known], STRETCH_PERCENTILES)
-    span = max(float(high - low), 1e-12)
-    scaled = (np.where(known, values, low) - low) / span
+    low, span = stretch
+    scaled = (np.where(np.isfinite(values), values, low) - low) / span
     grey: NDArray[np.uint8] = np.rint(np.clip(scaled, 0.0, 1.0) * 255.0).astype(np.uint8)
     return grey
 
@@ -93,7 +136,12 @@ def preview_png(
         shown: (rows, cols), True where the image holds something.
         longest_side_px: larger images are averaged down to this; smaller ones stay as they are.
     """
-    return encode_png(_preview(image, shown, longest_side_px))
+    return encode_png(_preview(shown.shape, _cells_of(image, shown), longest_side_px))
+
+
+def cells_png(shape: tuple[int, ...], cells: Cells) -> bytes:
+    """Give the PNG of `preview_png` of a raster that is made part by part, never as a whole."""
+    return encode_png(_preview(shape, cells, PREVIEW_SIDE_PX))
 
 
 def preview_webp(
@@ -103,7 +151,12 @@ def preview_webp(
     longest_side_px: int = PREVIEW_SIDE_PX,
 ) -> bytes:
     """Give the picture of `preview_png` as lossy WebP."""
-    return encode_webp(_preview(image, shown, longest_side_px))
+    return cells_webp(shown.shape, _cells_of(image, shown), longest_side_px=longest_side_px)
+
+
+def cells_webp(shape: tuple[int, ...], cells: Cells, *, longest_side_px: int) -> bytes:
+    """Give the WebP of `preview_webp` of a raster that is made part by part, never as a whole."""
+    return encode_webp(_preview(shape, cells, longest_side_px))
 
 
 def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
@@ -118,17 +171,19 @@ def shrunk_webp(encoded: bytes, name: str, *, longest_side_px: int) -> bytes:
     return encode_webp(image, quality=80)
 
 
-def _preview(
-    image: NDArray[np.uint8], shown: NDArray[np.bool_], longest_side_px: int
-) -> NDArray[np.uint8]:
-    if max(shown.shape) > longest_side_px:
+def _cells_of(image: NDArray[np.uint8], shown: NDArray[np.bool_]) -> Cells:
+    return lambda part: (image[part], shown[part])
+
+
+def _preview(shape: tuple[int, ...], cells: Cells, longest_side_px: int) -> NDArray[np.uint8]:
+    if max(shape) > longest_side_px:
         # Averaged under the mask: black void must not darken the rim of what is shown.
-        factor = max(shown.shape) // (2 * longest_side_px) if shown.size > _WHOLE_PX else 1
-        summed, weight = _weighted(image, shown, factor)
+        summed, weight = _weighted(shape, cells, _averaged_px(shape, longest_side_px))
         summed = _shrink(summed, longest_side_px)
         weight = _shrink(weight, longest_side_px)
         colour = np.rint(summed / np.maximum(weight, 1e-6)[:, :, None]).astype(np.uint8)
     else:
+        image, shown = cells((slice(None), slice(None)))
         colour = np.dstack([image] * 3) if image.ndim == 2 else image
         weight = shown.astype(np.float32)
     alpha = np.rint(weight * 255.0).astype(np.uint8)
@@ -136,7 +191,7 @@ def _preview(
 
 
 def _weighted(
-    image: NDArray[np.uint8], shown: NDArray[np.bool_], factor: int
+    shape: tuple[int, ...], cells: Cells, factor: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Colours times their weight, and weights, averaged over squares of `factor` pixels.
 
@@ -145,15 +200,16 @@ def _weighted(
     """
     import cv2
 
-    rows, columns = (side // factor for side in shown.shape)
+    rows, columns = (side // factor for side in shape)
     summed = np.empty((rows, columns, 3), dtype=np.float32)
     weight = np.empty((rows, columns), dtype=np.float32)
     step = rows if factor == 1 else _BAND_PX
     for first in range(0, rows, step):
         last = min(rows, first + step)
         part = (slice(first * factor, last * factor), slice(0, columns * factor))
-        seen = shown[part].astype(np.float32)
-        colours = image[part] if image.ndim == 3 else np.dstack([image[part]] * 3)
+        image, shown = cells(part)
+        seen = shown.astype(np.float32)
+        colours = image if image.ndim == 3 else np.dstack([image] * 3)
         for values, into in ((colours * seen[:, :, None], summed), (seen, weight)):
             into[first:last] = (
                 values
@@ -163,12 +219,21 @@ def _weighted(
     return summed, weight
 
 
+def _averaged_px(shape: tuple[int, ...], longest_side_px: int) -> int:
+    """Side of the squares that are averaged before a picture is shrunk."""
+    return max(shape) // (2 * longest_side_px) if math.prod(shape) > _WHOLE_PX else 1
+
+
+def _shrunk_shape(shape: tuple[int, ...], longest_side_px: int) -> tuple[int, int]:
+    scale = longest_side_px / max(shape[:2])
+    return max(1, round(shape[0] * scale)), max(1, round(shape[1] * scale))
+
+
 def _shrink(values: NDArray[Shrunk], longest_side_px: int) -> NDArray[Shrunk]:
     import cv2
 
-    rows, columns = values.shape[:2]
-    scale = longest_side_px / max(rows, columns)
-    size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
+    rows, columns = _shrunk_shape(values.shape, longest_side_px)
+    size = (columns, rows)
     small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
     return np.asarray(small, dtype=values.dtype)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.calibration import write_calibration
 from orthoflow.files.geotiff import world_file_text, write_orthoimage, write_raster
-from orthoflow.files.images import preview_png, stretch_to_grey
+from orthoflow.files.images import cells_per_preview_px, cells_png, grey_cells, preview_png
 from orthoflow.files.sidecars import (
     ORTHO_MASK_MEANINGS,
     SURFACE_MASK_MEANINGS,
@@ -30,7 +30,8 @@ from orthoflow.files.sidecars import (
     write_json,
     write_text,
 )
-from orthoflow.geometry import omega_phi_deg
+from orthoflow.geometry import WallFrame, omega_phi_deg
+from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import (
     Calibration,
     Camera,
@@ -94,7 +95,7 @@ def publish_planes(product: Planes, folder: Path, digest: str) -> None:
 
 
 def publish_walls(product: Walls, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_depth.tif`, `wall_<k>_intensity.tif` if any, sidecars and previews.
+    """Write `wall_<k>_depth.tif`, `wall_<k>_intensity.tif` if any, sidecars, previews in place.
 
     Percentiles of the depths follow as `wall_<k>_depth_p<percent>.tif` where they were wanted.
     """
@@ -127,9 +128,11 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
 
 
 def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_ortho.tif`, its world file, the raster of its mask, sidecars, a preview."""
+    """Write `wall_<k>_ortho.tif`, the raster of its mask, sidecars, preview, and world files."""
     for image in product.images:
-        shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
+        shown = image.mask == OrthoMask.PAINTED
+        for rows in row_bands(shown.shape):
+            shown[rows] |= image.mask[rows] == OrthoMask.FILLED
         stem = f"wall_{image.wall}_ortho"
         gsd_m = image.frame.gsd_m
         colours = "sRGB" if product.icc_profile is None else "ICC profile of the photos"
@@ -147,7 +150,7 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
         mask_tags = tags | {"content": "mask of the orthoimage"}
         write_raster(folder / f"{stem}_mask.tif", image.mask, gsd_m=gsd_m, tags=mask_tags)
         _write_ortho_sidecars(folder, stem, image, {"content": content}, digest)
-        write_bytes(folder / f"{stem}.png", preview_png(image.rgb, shown))
+        _write_preview(folder / f"{stem}.png", preview_png(image.rgb, shown), image.frame)
 
 
 def publish_ties(product: Ties, folder: Path, digest: str) -> None:
@@ -241,8 +244,15 @@ def _publish_band(
             "product_digest": digest,
         },
     )
-    picture = preview_png(stretch_to_grey(values), np.isfinite(values))
-    write_bytes(stem.with_suffix(".png"), picture)
+    picture = cells_png(values.shape, grey_cells(values))
+    _write_preview(stem.with_suffix(".png"), picture, wall.frame)
+
+
+def _write_preview(path: Path, picture: bytes, frame: WallFrame) -> None:
+    """Write the preview of a raster, and the world file that places it where the raster lies."""
+    rows, columns = cells_per_preview_px(frame.shape)
+    write_bytes(path, picture)
+    write_text(path.with_suffix(".pgw"), world_file_text(frame.gsd_m, rows=rows, columns=columns))
 
 
 def _write_ortho_sidecars(
@@ -263,8 +273,11 @@ def _write_ortho_sidecars(
 
 
 def _counts(mask: NDArray[np.uint8]) -> JsonValue:
-    values, counts = np.unique(mask, return_counts=True)
-    return {str(int(value)): int(count) for value, count in zip(values, counts, strict=True)}
+    counts = sum(
+        (np.bincount(mask[rows].ravel(), minlength=256) for rows in row_bands(mask.shape)),
+        start=np.zeros(256, dtype=np.int64),
+    )
+    return {str(value): int(counts[value]) for value in np.flatnonzero(counts)}
 
 
 def _camera_json(camera: Camera) -> JsonValue:

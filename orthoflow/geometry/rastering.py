@@ -187,9 +187,10 @@ def lenders_in_gaps(
     is_narrow = np.logical_not(is_open[inner] | is_measured)
     void = np.flatnonzero(is_narrow)
     lent = np.column_stack([void, void])
+    del void, framed, is_touched, is_open, is_narrow  # Of sparse rasters as large as what is given.
     measured = np.ascontiguousarray(is_measured)
     task = partial(gaps.nearest_within, measured, disc_offsets(radius_cells), lent)
-    in_parts(void.size, threads, task)
+    in_parts(len(lent), threads, task)
     return lent
 
 

@@ -13,8 +13,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import preview_webp, stretch_to_grey
+from orthoflow.files.images import Part, cells_webp, grey_cells, sampled_rows
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.row_bands import count_cells
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
 from orthoflow.records import Run
 
@@ -141,16 +142,21 @@ def _drawn(drawings: Sequence[_Drawing], *, n_products: float) -> Iterator[Pictu
 
 
 def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawing:
-    shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
-    filled = float(np.mean(image.mask == OrthoMask.FILLED))
+    n_filled = count_cells(image.mask, OrthoMask.FILLED)
+    shown = (n_filled + count_cells(image.mask, OrthoMask.PAINTED)) / image.mask.size
+    filled = n_filled / image.mask.size
+
+    def cells(part: Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        return image.rgb[part], np.isin(image.mask[part], (OrthoMask.PAINTED, OrthoMask.FILLED))
+
     return _Drawing(
-        draw=lambda side: preview_webp(image.rgb, shown, longest_side_px=side),
+        draw=lambda side: cells_webp(image.mask.shape, cells, longest_side_px=side),
         title=_title(image.name, address),
         caption=(
-            f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells show something, "
+            f"{frame_words(image.frame)}; {_percent(shown)} of the cells show something, "
             f"{_percent(filled)} of them filled from neighbours"
             if filled
-            else f"{frame_words(image.frame)}; {_percent(shown.mean())} of the cells painted"
+            else f"{frame_words(image.frame)}; {_percent(shown)} of the cells painted"
         ),
         file=_published(run, address, f"wall_{index}_ortho.tif"),
         cell=address,
@@ -160,16 +166,18 @@ def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawi
 
 
 def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
-    known = wall.mask != SurfaceMask.VOID
-    limit_m = _depth_limit_m(wall.depth_m)
+    known = 1.0 - count_cells(wall.mask, SurfaceMask.VOID) / wall.mask.size
+    limit_m = _depth_limit_m(sampled_rows(wall.depth_m))
+
+    def cells(part: Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        return depth_colours(wall.depth_m[part], limit_m), wall.mask[part] != SurfaceMask.VOID
+
     return _Drawing(
-        draw=lambda side: preview_webp(
-            depth_colours(wall.depth_m, limit_m), known, longest_side_px=side
-        ),
+        draw=lambda side: cells_webp(wall.mask.shape, cells, longest_side_px=side),
         title=_title(f"{wall.name}, depth", address),
         caption=(
             f"blue {1000 * limit_m:.0f} mm behind the plane, white on it, red "
-            f"{1000 * limit_m:.0f} mm in front; {_percent(known.mean())} of the cells known"
+            f"{1000 * limit_m:.0f} mm in front; {_percent(known)} of the cells known"
         ),
         file=_published(run, address, f"wall_{index}_depth.tif"),
         cell=address,
@@ -182,9 +190,7 @@ def _intensity(
     run: Run, address: str, index: int, wall: Wall, intensity: NDArray[np.float32], source: str
 ) -> _Drawing:
     return _Drawing(
-        draw=lambda side: preview_webp(
-            stretch_to_grey(intensity), np.isfinite(intensity), longest_side_px=side
-        ),
+        draw=lambda side: cells_webp(intensity.shape, grey_cells(intensity), longest_side_px=side),
         title=_title(f"{wall.name}, intensity", address),
         caption={
             "laser": "laser intensity",

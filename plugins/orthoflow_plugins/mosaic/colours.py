@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import Layer, LayerMask
 
 # Overlaps are compared on every so manieth cell: a few thousand colours say what a gain is.
@@ -113,8 +114,7 @@ def estimate_gains(layers: Sequence[Layer]) -> NDArray[np.float64]:
 
 def _median_log_ratio(first: Layer, second: Layer) -> NDArray[np.float64] | None:
     """Median of log(first / second) per channel in linear light, None without an overlap."""
-    both = np.flatnonzero((first.mask == LayerMask.PAINTED) & (second.mask == LayerMask.PAINTED))
-    both = both[:: max(1, len(both) // _SAMPLES_MOST)]
+    both = _sampled_overlap(first.mask, second.mask)
     one, other = (layer.rgb.reshape(-1, 3)[both] for layer in (first, second))
     usable = np.all(
         (np.minimum(one, other) >= _DARKEST) & (np.maximum(one, other) <= _BRIGHTEST), axis=1
@@ -126,6 +126,24 @@ def _median_log_ratio(first: Layer, second: Layer) -> NDArray[np.float64] | None
         np.log(light[one[usable]]) - np.log(light[other[usable]]), axis=0
     )
     return ratio
+
+
+def _sampled_overlap(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Every so manieth of the cells (flat) that two layers paint, in their order."""
+
+    def overlap(rows: slice) -> NDArray[np.bool_]:
+        is_painted = (first[rows] == LayerMask.PAINTED) & (second[rows] == LayerMask.PAINTED)
+        return np.asarray(is_painted, dtype=np.bool_)
+
+    bands = list(row_bands(first.shape))
+    counts = [int(np.count_nonzero(overlap(rows))) for rows in bands]
+    step = max(1, sum(counts) // _SAMPLES_MOST)
+    found, seen = [np.empty(0, dtype=np.int64)], 0
+    for rows, count in zip(bands, counts, strict=True):
+        cells = np.flatnonzero(overlap(rows))[-seen % step :: step]
+        found.append(cells + rows.start * first.shape[1])
+        seen += count
+    return np.concatenate(found)
 
 
 def _linear_light() -> NDArray[np.float64]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import Layer, LayerMask, Wall
 
 # Cuts are made on a smaller picture of about so many cells.
@@ -38,7 +40,28 @@ class _Scene:
     edges: NDArray[np.float64]
 
 
-def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> NDArray[np.int16]:
+@dataclass(frozen=True, kw_only=True)
+class CutLabels:
+    """Which layer a cut gives each cell.
+
+    Attributes:
+        small: (rows, cols) int16 at the reduced scale, -1 where no layer paints.
+        factor: side of its squares in cells.
+        shape: rows and columns of the wall.
+    """
+
+    small: NDArray[np.int16]
+    factor: int
+    shape: tuple[int, int]
+
+    def in_rows(self, rows: slice) -> NDArray[np.int16]:
+        """Layer (rows, cols) of the cells in some rows of the wall."""
+        squares = np.arange(*rows.indices(self.shape[0])) // self.factor
+        wide: NDArray[np.int16] = np.repeat(self.small[squares], self.factor, axis=1)
+        return wide[:, : self.shape[1]]
+
+
+def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> CutLabels:
     """Give each cell the layer that a graph cut chooses, -1 where none paints it.
 
     Boykov, Veksler and Zabih 2001: each layer in turn may take over cells of the others where that
@@ -60,26 +83,28 @@ def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> NDArray[np.int16]:
         if np.array_equal(labels, before):
             break
     labels = np.where(scene.views.min(axis=0) < _FORBIDDEN, labels, -1)
-    large = np.repeat(np.repeat(labels, factor, axis=0), factor, axis=1)
-    return large[: shape[0], : shape[1]].astype(np.int16)
+    return CutLabels(small=labels.astype(np.int16), factor=factor, shape=shape)
 
 
 def _reduced(layers: Sequence[Layer], wall: Wall | None, factor: int) -> _Scene:
-    painted = np.stack([_means(layer.mask == LayerMask.PAINTED, factor) for layer in layers])
+    shape = layers[0].frame.shape
+    painted = np.stack(
+        [_means(partial(_painted_in, layer.mask), shape, factor) for layer in layers]
+    )
     colours = np.stack(
         [
-            np.stack([_means(layer.rgb[..., band], factor) for band in range(3)], axis=-1)
+            np.stack([_raster_means(layer.rgb[..., band], factor) for band in range(3)], axis=-1)
             / np.maximum(share, 1e-3)[..., None]
             for layer, share in zip(layers, painted, strict=True)
         ]
     )
-    quality = np.stack([_means(layer.quality, factor) for layer in layers])
+    quality = np.stack([_raster_means(layer.quality, factor) for layer in layers])
     best = np.maximum(quality.max(axis=0), 1e-12)
     views = np.where(painted > 0.5, _VIEW_WEIGHT * (1.0 - quality / best), _FORBIDDEN)
     edges = np.zeros(views.shape[1:])
     if wall is not None:
-        steps = depth_edges(wall.depth_m)
-        edges = np.where(_means(steps, factor) > 0.0, _DEPTH_EDGE_COST, 0.0)
+        steps = _means(partial(_depth_edges_in, wall.depth_m), shape, factor)
+        edges = np.where(steps > 0.0, _DEPTH_EDGE_COST, 0.0)
     return _Scene(colours=(colours / 255.0).astype(np.float32), views=views, edges=edges)
 
 
@@ -91,19 +116,42 @@ def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     return edges
 
 
-def _means(
-    values: NDArray[np.bool_] | NDArray[np.uint8] | NDArray[np.float32], factor: int
+def _painted_in(mask: NDArray[np.uint8], rows: slice) -> NDArray[np.bool_]:
+    return np.asarray(mask[rows] == LayerMask.PAINTED, dtype=np.bool_)
+
+
+def _depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool_]:
+    """The depth edges of some rows; the row below tells of the last one."""
+    edges = depth_edges(depth_m[rows.start : rows.stop + 1])
+    return edges[: rows.stop - rows.start]
+
+
+def _raster_means(
+    raster: NDArray[np.uint8] | NDArray[np.float32], factor: int
 ) -> NDArray[np.float64]:
-    """Means of squares of cells; those at the rim are of what is there."""
-    rows, columns = (-(-side // factor) * factor for side in values.shape)
-    padded = np.pad(
-        values.astype(np.float64),
-        ((0, rows - values.shape[0]), (0, columns - values.shape[1])),
-        mode="edge",
-    )
-    blocks = padded.reshape(rows // factor, factor, columns // factor, factor)
-    means: NDArray[np.float64] = blocks.mean(axis=(1, 3))
-    return means
+    return _means(lambda rows: raster[rows], (raster.shape[0], raster.shape[1]), factor)
+
+
+def _means(
+    values: Callable[[slice], NDArray[np.generic]], shape: tuple[int, int], factor: int
+) -> NDArray[np.float64]:
+    """Means of squares of cells; those at the rim are of what is there.
+
+    Args:
+        values: gives those of some rows.
+        shape: rows and columns of the wall.
+        factor: side of a square.
+    """
+    parts: list[NDArray[np.float64]] = []
+    for part in row_bands(shape, multiple=factor):
+        known = values(part).astype(np.float64)
+        rows, columns = (-(-side // factor) * factor for side in known.shape)
+        padded = np.pad(
+            known, ((0, rows - known.shape[0]), (0, columns - known.shape[1])), mode="edge"
+        )
+        blocks = padded.reshape(rows // factor, factor, columns // factor, factor)
+        parts.append(blocks.mean(axis=(1, 3)))
+    return np.concatenate(parts)
 
 
 def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:

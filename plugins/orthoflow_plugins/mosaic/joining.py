@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.row_bands import holds_cells
 from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask
+from orthoflow_plugins.mosaic.preferring import Preference
 
-# Preferences (rows, cols) of layers that paint a wall together, larger is better.
-Preferring = Callable[[Sequence[Layer]], Sequence[NDArray[np.float32]]]
+# Preferences of layers that paint a wall together.
+Preferring = Callable[[Sequence[Layer]], Sequence[Preference]]
 
 # Name, shape, type -> zeroed array.
 Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
@@ -80,9 +82,9 @@ def joined(
                 "all layers of a wall must come from the same walls"
             )
     # What paints nothing is no source; it still tells what is hidden.
-    painters = [layer for layer in layers if (layer.mask == LayerMask.PAINTED).any()]
+    painters = [layer for layer in layers if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in layers if all(layer is not painter for painter in painters)]
-    preferred = [*(prefer(painters) if painters else []), *(layer.quality for layer in others)]
+    preferred = prefer(painters) if painters else []
     shape = first.frame.shape
     rgb = np.asarray(allocate("rgb", (*shape, 3), np.uint8), np.uint8)
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
@@ -90,7 +92,10 @@ def joined(
     for rows, around in _bands(shape, _island_reach(island_cells_min)):
         choice = best_views(
             [_part(layer, around) for layer in [*painters, *others]],
-            [preference[around] for preference in preferred],
+            [
+                *(preference(around) for preference in preferred),
+                *(layer.quality[around] for layer in others),
+            ],
         )
         if island_cells_min > 1 and len(painters) > 1:
             parts = [_part(layer, around) for layer in painters]

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import Layer, LayerMask
 
 PATCH_CELLS: Final = 64
@@ -61,12 +62,15 @@ def _best_pairs(layers: Sequence[Layer]) -> list[tuple[int, int, int, int]]:
 
 def _patch_qualities(layer: Layer, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Mean quality of each patch, 0 where the layer does not paint all of it."""
-    rows, columns = (side * PATCH_CELLS for side in shape)
-    blocks = (shape[0], PATCH_CELLS, shape[1], PATCH_CELLS)
-    is_painted = layer.mask[:rows, :columns] == LayerMask.PAINTED
-    whole = is_painted.reshape(blocks).all(axis=(1, 3))
-    means = layer.quality[:rows, :columns].reshape(blocks).mean(axis=(1, 3), dtype=np.float64)
-    return np.where(whole, means, 0.0)
+    worths: list[NDArray[np.float64]] = []
+    columns = shape[1] * PATCH_CELLS
+    for rows in row_bands((shape[0] * PATCH_CELLS, columns), multiple=PATCH_CELLS):
+        blocks = (-1, PATCH_CELLS, shape[1], PATCH_CELLS)
+        is_painted = layer.mask[rows, :columns] == LayerMask.PAINTED
+        whole = is_painted.reshape(blocks).all(axis=(1, 3))
+        quality = layer.quality[rows, :columns].reshape(blocks)
+        worths.append(np.where(whole, quality.mean(axis=(1, 3), dtype=np.float64), 0.0))
+    return np.concatenate(worths)
 
 
 def _grey(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

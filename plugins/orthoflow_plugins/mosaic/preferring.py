@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -10,9 +11,13 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Layer, LayerMask, Wall
-from orthoflow_plugins.mosaic.cutting import cut_labels
+from orthoflow_plugins.mosaic.cutting import CutLabels, cut_labels
 
 SeamRule = Literal["best-view", "voronoi", "graph-cut", "priority"]
+
+# Preference (rows, cols) of a layer in some rows of its wall, made when they are joined: those of a
+# large wall would not fit into memory.
+Preference = Callable[[slice], NDArray[np.float32]]
 
 
 def preferences(
@@ -21,8 +26,8 @@ def preferences(
     *,
     priority: Sequence[str] = (),
     wall: Wall | None = None,
-) -> list[NDArray[np.float32]]:
-    """Give the preference (rows, cols) of each layer, larger is better, by a rule.
+) -> list[Preference]:
+    """Say by a rule how much each layer is preferred in rows of the wall, larger is more.
 
     `best-view` is the layers' own quality: incidence, resolution, distance to the photo's border.
     `voronoi` prefers the layer whose painted area ends farthest off, so that seams lie in the
@@ -33,16 +38,16 @@ def preferences(
         MethodError: `priority` names what is no layer of any wall.
     """
     if rule == "voronoi":
-        return [_depth_inside(layer) for layer in layers]
+        return [partial(_rows_of, _depth_inside(layer)) for layer in layers]
     if rule == "priority":
         return _by_order(layers, priority)
     if rule == "graph-cut" and len(layers) > 1:
-        labels = cut_labels(layers, wall)
+        cut = cut_labels(layers, wall)
         return [
-            layer.quality + np.where(labels == index, np.float32(2.0) * _best(layers), 0.0)
+            partial(_cut_off, layer, index, cut, _best(layers))
             for index, layer in enumerate(layers)
         ]
-    return [layer.quality for layer in layers]
+    return [partial(_rows_of, layer.quality) for layer in layers]
 
 
 def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
@@ -73,7 +78,24 @@ def _depth_inside(layer: Layer) -> NDArray[np.float32]:
     return np.asarray(distance[1:-1, 1:-1], dtype=np.float32)
 
 
-def _by_order(layers: Sequence[Layer], priority: Sequence[str]) -> list[NDArray[np.float32]]:
+def _by_order(layers: Sequence[Layer], priority: Sequence[str]) -> list[Preference]:
     places = {name: len(priority) - place for place, name in enumerate(priority)}
     bonus = np.float32(2.0) * _best(layers)
-    return [layer.quality + np.float32(places.get(layer.source, 0)) * bonus for layer in layers]
+    return [
+        partial(_raised, layer, np.float32(places.get(layer.source, 0)) * bonus) for layer in layers
+    ]
+
+
+def _rows_of(values: NDArray[np.float32], rows: slice) -> NDArray[np.float32]:
+    return values[rows]
+
+
+def _raised(layer: Layer, bonus: np.float32, rows: slice) -> NDArray[np.float32]:
+    return layer.quality[rows] + bonus
+
+
+def _cut_off(
+    layer: Layer, index: int, cut: CutLabels, best: np.float32, rows: slice
+) -> NDArray[np.float32]:
+    is_mine = cut.in_rows(rows) == index
+    return layer.quality[rows] + np.where(is_mine, np.float32(2.0) * best, np.float32(0.0))

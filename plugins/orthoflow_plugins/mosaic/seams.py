@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.row_bands import count_cells, holds_cells
 from orthoflow.products import (
     JsonValue,
     Layer,
@@ -29,7 +30,7 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.mosaic.colours import SeamSteps, balanced, estimate_gains, seam_steps
 from orthoflow_plugins.mosaic.cutting import depth_edges
-from orthoflow_plugins.mosaic.joining import Allocate, joined
+from orthoflow_plugins.mosaic.joining import NOBODY, Allocate, joined
 from orthoflow_plugins.mosaic.overlaps import displacements_cells
 from orthoflow_plugins.mosaic.preferring import SeamRule, preferences, require_sources
 from orthoflow_plugins.mosaic.source_maps import caption, is_seam, source_map
@@ -155,7 +156,7 @@ def _join(
     wall: Wall | None,
     allocate: Allocate,
 ) -> _Joined:
-    painters = [layer for layer in group if (layer.mask == LayerMask.PAINTED).any()]
+    painters = [layer for layer in group if holds_cells(layer.mask, LayerMask.PAINTED)]
     gains: dict[str, JsonValue] = {}
     if params.gains == "global" and len(painters) > 1:
         numbers = estimate_gains(painters)
@@ -164,7 +165,7 @@ def _join(
             layer.source: [round(float(value), 4) for value in gain]
             for layer, gain in zip(painters, numbers, strict=True)
         }
-        others = [layer for layer in group if not (layer.mask == LayerMask.PAINTED).any()]
+        others = [layer for layer in group if not holds_cells(layer.mask, LayerMask.PAINTED)]
         group = (*painters, *others)
     image = joined(
         group,
@@ -217,10 +218,10 @@ def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:
     n_cells = sum(image.mask.size for image in images)
     ctx.metric("n_orthoimages", len(images), "1")
     for state in OrthoMask:
-        share = sum(np.count_nonzero(image.mask == state) for image in images) / n_cells
+        share = sum(count_cells(image.mask, state) for image in images) / n_cells
         ctx.metric(f"{state.name.lower()}_share", share, "1")
     ctx.metric("n_sources", len({name for image in images for name in image.sources}), "1")
-    n_shown = sum(np.count_nonzero(image.source >= 0) for image in images)
+    n_shown = n_cells - sum(count_cells(image.source, NOBODY) for image in images)
     n_seam = sum(item.n_seam for item in verdicts)
     ctx.metric("seam_share", n_seam / max(1, n_shown), "1")
     edges = [item.n_edge_seam for item in verdicts if item.n_edge_seam is not None]

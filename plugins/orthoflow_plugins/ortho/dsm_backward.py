@@ -12,6 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.row_bands import count_known, holds_cells, row_bands
 from orthoflow.products import Camera, Layer, LayerMask, Layers, Photo
 from orthoflow.sdk import Determinism, Method, Ports, StepContext
 from orthoflow_plugins.ortho.oriented_photos import (
@@ -121,7 +122,7 @@ class _Studio:
             border_share=params.border_share,
         )
         self._surfaces: list[Surface] = surfaces_of(
-            inputs.walls, params, threads=ctx.cores, hides=params.visibility == "full"
+            inputs.walls, params, ctx, hides=params.visibility == "full"
         )
         self._occluders: Occluders | None = None
         self._layers: list[Layer] = []
@@ -220,13 +221,10 @@ class _Studio:
         return self._keep(index, photo.name, painting)
 
     def _keep(self, index: int, source: str, painting: Painting) -> bool:
-        is_empty = not (painting.mask == LayerMask.PAINTED).any()
+        is_empty = not holds_cells(painting.mask, LayerMask.PAINTED)
         if is_empty or painting.rgb is None or painting.quality is None:
-            if index in self._reached:
-                is_hidden = painting.mask == LayerMask.OCCLUDED
-                self._reached[index][is_hidden] = LayerMask.OCCLUDED
-            elif all(layer.wall != index for layer in self._layers):
-                self._reached[index] = painting.mask
+            if all(layer.wall != index for layer in self._layers):
+                self._reach(index, painting.mask)
             return False
         self._reached.pop(index, None)
         self._layers.append(
@@ -241,6 +239,17 @@ class _Studio:
         )
         return True
 
+    def _reach(self, index: int, mask: NDArray[np.uint8]) -> None:
+        """Note what a photo reaches of a wall; the next one's mask will lie in the same file."""
+        if index not in self._reached:
+            kept = self._ctx.allocate("layers", f"{index}.reached", mask.shape, np.uint8)
+            self._reached[index] = np.asarray(kept, np.uint8)
+            self._reached[index][...] = mask
+            return
+        for rows in row_bands(mask.shape):
+            is_hidden = mask[rows] == LayerMask.OCCLUDED
+            self._reached[index][rows][is_hidden] = LayerMask.OCCLUDED
+
     def _bare_layer(self, index: int) -> Layer:
         surface = self._surfaces[index]
         return bare_layer(surface.frame, index, surface.relief.depth, self._reached.get(index))
@@ -250,11 +259,12 @@ class _Studio:
         n_surface = n_painted = n_hidden = 0
         for index, surface in enumerate(self._surfaces):
             masks = [layer.mask for layer in layers if layer.wall == index]
-            is_painted = np.logical_or.reduce([mask == LayerMask.PAINTED for mask in masks])
-            is_hidden = np.logical_or.reduce([mask == LayerMask.OCCLUDED for mask in masks])
-            n_surface += int(np.count_nonzero(~np.isnan(surface.relief.depth)))
-            n_painted += int(np.count_nonzero(is_painted))
-            n_hidden += int(np.count_nonzero(is_hidden & ~is_painted))
+            n_surface += count_known(surface.relief.depth)
+            for rows in row_bands(surface.frame.shape):
+                is_painted = np.logical_or.reduce([m[rows] == LayerMask.PAINTED for m in masks])
+                is_hidden = np.logical_or.reduce([m[rows] == LayerMask.OCCLUDED for m in masks])
+                n_painted += int(np.count_nonzero(is_painted))
+                n_hidden += int(np.count_nonzero(is_hidden & ~is_painted))
         ctx.metric("n_layers", len(self._layers), "1")
         ctx.metric("painted_share", n_painted / max(1, n_surface), "1")
         ctx.metric("occluded_share", n_hidden / max(1, n_surface), "1")

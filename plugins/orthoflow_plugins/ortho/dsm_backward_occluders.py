@@ -16,6 +16,7 @@ from orthoflow.geometry.occluders import (
     nothing_in_the_way,
     occluders_in,
 )
+from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import PointCloud, Walls
 
 __all__ = ["Occluders", "depth_buffer", "find_occluders", "nothing_in_the_way"]
@@ -46,8 +47,12 @@ def find_occluders(
 def _spacing_m(walls: Walls) -> float:
     """The coarser of the finest raster's cells and the points' spacing on it."""
     wall = min(walls.walls, key=lambda wall: wall.frame.gsd_m)
-    known = np.isfinite(wall.depth_m)
-    density = float(wall.count[known].mean()) if known.any() else 1.0
+    n_known = n_points = 0
+    for rows in row_bands(wall.depth_m.shape):
+        known = np.isfinite(wall.depth_m[rows])
+        n_known += int(np.count_nonzero(known))
+        n_points += int(wall.count[rows].sum(where=known, dtype=np.int64))
+    density = n_points / n_known if n_known else 1.0
     return wall.frame.gsd_m / math.sqrt(min(1.0, max(density, 0.1)))
 
 

@@ -131,7 +131,8 @@ def paint(
         surface: the wall.
         buffer: what else stands before the camera.
         rule: how.
-        allocate: gives the arrays of a layer, zeroed, once something is painted.
+        allocate: gives the arrays of a layer, zeroed: the mask, and the others once something is
+            painted.
         threads: how many tiles are painted at once; it does not show in the result.
     """
     brush = _Brush(photo, view, surface, buffer, rule, allocate)
@@ -159,7 +160,8 @@ class _Brush:
         rule: SightRule,
         allocate: Allocate,
     ) -> None:
-        self.painting = Painting(mask=np.empty(surface.frame.shape, dtype=np.uint8))
+        mask = allocate("mask", surface.frame.shape, np.uint8)
+        self.painting = Painting(mask=np.asarray(mask, np.uint8))
         self._photo = photo
         self._view = view
         self._surface = surface

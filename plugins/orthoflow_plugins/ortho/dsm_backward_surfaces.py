@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.geometry.rastering import in_parts
 from orthoflow.geometry.relief_kernels import bound_blocks, make_occluding
@@ -18,17 +19,27 @@ from orthoflow.geometry.visibility_kernels import (
 )
 from orthoflow.products import Wall
 
+# Name, shape, type -> array.
+Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
+
 # Heights fit into 16 bits with room for rounding.
 _STEPS: Final = 32_000
 # Cells so much lower than one beside them, in cells, lie at an edge: steeper than 79 degrees.
 _EDGE_CELLS: Final = 5.0
 
 
-def relief_of(wall: Wall, *, threads: int) -> Relief:
-    """Prepare a wall for looking at it from anywhere."""
+def relief_of(wall: Wall, *, threads: int, allocate: Allocate | None = None) -> Relief:
+    """Prepare a wall for looking at it from anywhere.
+
+    Args:
+        wall: its depths.
+        threads: how many threads work.
+        allocate: gives the array of the heights that hide, two bytes per cell; None for memory.
+    """
     relief = transparent_relief_of(wall, threads=threads)
     step_m = max(1e-6, _largest_m(relief) / _STEPS)
-    occluding = np.empty(relief.depth.shape, dtype=np.int16)
+    given = (allocate or _in_memory)("occluding", relief.depth.shape, np.int16)
+    occluding = np.asarray(given, np.int16)
     fine_tops = np.empty_like(relief.fine_bottoms)
     edge_m = _EDGE_CELLS * wall.frame.gsd_m
     task = partial(make_occluding, relief.depth, step_m, edge_m, occluding, fine_tops)
@@ -43,6 +54,11 @@ def relief_of(wall: Wall, *, threads: int) -> Relief:
         fine_tops=_highest_of_four(fine_tops),
         highest_m=float(tops.max(initial=NOTHING_M)),
     )
+
+
+def _in_memory(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+    del name
+    return np.empty(shape, dtype=dtype)
 
 
 def transparent_relief_of(wall: Wall, *, threads: int) -> Relief:

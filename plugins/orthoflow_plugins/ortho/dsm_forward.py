@@ -79,7 +79,7 @@ class DsmForward(Method):
         started = time.perf_counter()
         occluders = occluders_before(inputs, viewers, params, ctx, method=self.id)
         seconds["occluders_s"] = time.perf_counter() - started
-        surfaces = surfaces_of(inputs.walls, params, threads=ctx.cores)
+        surfaces = surfaces_of(inputs.walls, params, ctx)
         layers: list[Layer] = []
         for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
             ctx.progress(place / len(oriented), photo.name)

@@ -12,6 +12,7 @@ from orthoflow.errors import MethodError
 from orthoflow.files.containers import icc_profile
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import Camera, Cameras, Layer, LayerMask, Photo, Photos, Walls
 from orthoflow.sdk import StepContext
 
@@ -86,8 +87,9 @@ def bare_layer(
         reached: (rows, cols) `LayerMask`, what photos reach of it, if that is known.
     """
     if reached is None:
-        outside = np.where(np.isnan(depth), LayerMask.NO_SURFACE, LayerMask.OUTSIDE)
-        reached = outside.astype(np.uint8)
+        reached = np.full(depth.shape, LayerMask.OUTSIDE, dtype=np.uint8)
+        for rows in row_bands(depth.shape):
+            reached[rows][np.isnan(depth[rows])] = LayerMask.NO_SURFACE
     return Layer(
         frame=frame,
         wall=wall,

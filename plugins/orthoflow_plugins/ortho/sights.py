@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
-from orthoflow.products import Cameras, Photos, PointCloud, Walls
+from orthoflow.products import Cameras, Photos, PointCloud, Wall, Walls
 from orthoflow.sdk import MethodParams, Ports, StepContext
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
+    from orthoflow.geometry.visibility_kernels import Relief
     from orthoflow_plugins.ortho.dsm_backward_occluders import Occluders
     from orthoflow_plugins.ortho.dsm_backward_painting import Surface
+
+# Of walls with more cells lies in files what is looked up while photos are laid.
+_IN_MEMORY_MOST: Final = 1 << 26
 
 
 class PhotosOnWalls(Ports):
@@ -55,24 +63,37 @@ class SightParams(MethodParams):
 
 
 def surfaces_of(
-    walls: Walls, params: SightParams, *, threads: int, hides: bool = True
+    walls: Walls, params: SightParams, ctx: StepContext, *, hides: bool = True
 ) -> list[Surface]:
     """Give each wall as the surface that rays meet; with `hides` false its relief hides nothing."""
     from orthoflow.geometry.depth_noise import depth_noise_m
     from orthoflow_plugins.ortho.dsm_backward_painting import Surface
     from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
 
-    prepared = relief_of if hides else transparent_relief_of
+    def prepared(index: int, wall: Wall) -> Relief:
+        if not hides:
+            return transparent_relief_of(wall, threads=ctx.cores)
+        return relief_of(wall, threads=ctx.cores, allocate=partial(_allocated, ctx, index))
+
     return [
         Surface(
             frame=wall.frame,
-            relief=prepared(wall, threads=threads),
+            relief=prepared(index, wall),
             front_m=walls.buffer_front_m,
             tolerance_m=params.tolerance_sigma * depth_noise_m(wall.depth_m)
             + params.tolerance_cells * wall.frame.gsd_m,
         )
-        for wall in walls.walls
+        for index, wall in enumerate(walls.walls)
     ]
+
+
+def _allocated(
+    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
+) -> NDArray[np.generic]:
+    """What is prepared of a wall, in a file for a large one."""
+    if math.prod(shape) <= _IN_MEMORY_MOST:
+        return np.empty(shape, dtype=dtype)
+    return ctx.allocate("relief", f"{wall}.{name}", shape, dtype)
 
 
 def occluders_before(

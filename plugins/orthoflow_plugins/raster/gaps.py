@@ -16,6 +16,7 @@ from orthoflow_plugins.raster.surfaces import CellSurface
 
 # Neighbours in the scan may lie so many widths of a narrow gap's radius apart.
 _SPAN_GAPS: Final = 4
+_CELLS_AT_ONCE: Final = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +50,8 @@ def close_gaps(
         (cells,) `SurfaceMask`.
     """
     is_known = np.isfinite(surface.depth_m)
-    mask = np.where(surface.count > 0, SurfaceMask.MEASURED, SurfaceMask.RECOVERED).astype(np.uint8)
+    mask = np.full(is_known.shape, SurfaceMask.RECOVERED, dtype=np.uint8)
+    mask[surface.count > 0] = SurfaceMask.MEASURED
     mask[~is_known] = SurfaceMask.VOID
     spans = SpanRule(
         steps=rule.scan_steps,
@@ -59,9 +61,12 @@ def close_gaps(
     )
     mask[recover_between_neighbours(cloud, slab, surface, spans)] = SurfaceMask.RECOVERED
     lent = lenders_in_gaps(is_known.reshape(slab.frame.shape), rule.gap_cells, threads=rule.threads)
-    void, lender = lent[mask[lent[:, 0]] == SurfaceMask.VOID].T
-    mask[void] = SurfaceMask.RECOVERED
-    for values in (surface.depth_m, surface.intensity, surface.rgb):
-        if values is not None:
-            values[void] = values[lender]
+    for first in range(0, len(lent), _CELLS_AT_ONCE):
+        part = lent[first : first + _CELLS_AT_ONCE]
+        # Lenders are never void, so that it does not matter which part comes first.
+        void, lender = part[mask[part[:, 0]] == SurfaceMask.VOID].T
+        mask[void] = SurfaceMask.RECOVERED
+        for values in (surface.depth_m, surface.intensity, surface.rgb):
+            if values is not None:
+                values[void] = values[lender]
     return mask

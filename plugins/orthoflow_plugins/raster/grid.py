@@ -281,12 +281,23 @@ def _wall(
         mask=raster.mask.reshape(shape),
         intensity=None if surface.intensity is None else surface.intensity.reshape(shape),
         rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
-        rgb_mask=None if surface.rgb is None else (raster.mask > 0).astype(np.uint8).reshape(shape),
+        rgb_mask=None if surface.rgb is None else _where_known(raster.mask, shape, allocate),
         percentiles_m=None
         if surface.percentiles_m is None
         else surface.percentiles_m.reshape(*shape, -1),
     )
     return WallRaster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=params.gsd_m))
+
+
+def _where_known(
+    mask: NDArray[np.uint8], shape: tuple[int, int], allocate: Allocate
+) -> NDArray[np.uint8]:
+    """1 where a `SurfaceMask` (cells,) is not void, else 0; of a large wall in a file."""
+    if mask.size <= _BAND_CELLS:
+        return (mask > 0).astype(np.uint8).reshape(shape)
+    known = np.asarray(allocate("rgb_mask", shape, np.uint8), np.uint8)
+    np.minimum(mask.reshape(shape), 1, out=known)
+    return known
 
 
 def _is_banded(frame: WallFrame, params: RasterGrid.Params) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.geometry.row_bands import count_cells
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.raster.previews import depth_preview
@@ -66,7 +67,7 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
     if spread_m.size:
         ctx.metric("sigma_median_mm", 1000.0 * float(np.median(spread_m)), "mm")
     for state in SurfaceMask:
-        share = sum(np.count_nonzero(wall.mask == state) for wall in walls) / n_cells
+        share = sum(count_cells(wall.mask, state) for wall in walls) / n_cells
         ctx.metric(f"{state.name.lower()}_share", share, "1")
     ctx.figure(
         "depth",

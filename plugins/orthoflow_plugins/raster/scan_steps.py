@@ -26,10 +26,17 @@ def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
         per_block = blocks.sum(dtype=np.int64) / np.count_nonzero(blocks)
         if per_block >= 4.0 or blocks.size == 1:
             return float(side_m / np.sqrt(per_block))
-        rows, columns = blocks.shape
-        even = blocks
-        if rows % 2 or columns % 2:
-            even = np.pad(blocks, ((0, rows % 2), (0, columns % 2)))
-        blocks = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
+        blocks = _joined(blocks)
         side_m *= 2.0
     return 0.0
+
+
+def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Sums of 2 x 2 blocks; at the right and below what is left over counts as it is."""
+    rows, columns = blocks.shape
+    sums = np.zeros((-(-rows // 2), -(-columns // 2)), dtype=np.uint32)
+    for first_row in (0, 1):
+        for first_column in (0, 1):
+            quarter = blocks[first_row::2, first_column::2]
+            sums[: quarter.shape[0], : quarter.shape[1]] += quarter
+    return sums

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ from orthoflow.products import PointCloud
 from orthoflow_plugins.raster.denoising import denoised
 from orthoflow_plugins.raster.rules import SurfaceRule
 from orthoflow_plugins.raster.specks import without_specks
+
+_CELLS_AT_ONCE: Final = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +141,7 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
     with np.errstate(invalid="ignore"):
         depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
     sigma_m = spread_m(count, moments)
+    del moments  # A third of what is held here, and what follows takes more.
     if rule.surface != "mean":
         layer_m = rule.layer_m
         raster_m = without_specks(
@@ -231,12 +235,19 @@ def _averaged_values(
     intensity: NDArray[np.float32] | None = None
     rgb: NDArray[np.uint8] | None = None
     for sum_of_values in sums:
-        with np.errstate(invalid="ignore"):
-            means = sum_of_values[:, :-1] / sum_of_values[:, -1:]
-        if means.shape[1] == 1:
-            intensity = means[:, 0].astype(np.float32)
+        if sum_of_values.shape[1] == 2:
+            intensity = np.empty(slab.n_cells, dtype=np.float32)
         else:
-            rgb = np.rint(np.nan_to_num(means)).astype(np.uint8)
+            rgb = np.empty((slab.n_cells, 3), dtype=np.uint8)
+        # Means take several times the memory of what is kept of them.
+        for first in range(0, slab.n_cells, _CELLS_AT_ONCE):
+            part = slice(first, first + _CELLS_AT_ONCE)
+            with np.errstate(invalid="ignore"):
+                means = sum_of_values[part, :-1] / sum_of_values[part, -1:]
+            if intensity is not None and means.shape[1] == 1:
+                intensity[part] = means[:, 0]
+            elif rgb is not None:
+                rgb[part] = np.rint(np.nan_to_num(means))
     return intensity, rgb
 
 

@@ -1,0 +1,284 @@
+"""Walls too large for the memory: what is made of them lies in files, and bands are the whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.mosaic import colours
+from orthoflow_plugins.mosaic.seams import MosaicSeams
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.raster.grid import RasterGrid
+
+from orthoflow.files import geotiff, images, publishing
+from orthoflow.geometry import row_bands
+from orthoflow.geometry.row_bands import count_cells, count_known, holds_cells
+from orthoflow.products import Layer, LayerMask, Layers, Walls
+from tests import inspect_scenes, ortho_scenes, raster_scenes
+from tests.raster_scenes import context
+
+BAND_CELLS = 1 << 17
+SHAPE = (1500, 2000)
+N_CELLS = SHAPE[0] * SHAPE[1]
+
+
+@pytest.fixture
+def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let walls of a megacell count as large."""
+    monkeypatch.setattr(row_bands, "_BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.ortho.sights._IN_MEMORY_MOST", 0)
+    monkeypatch.setattr("orthoflow_plugins.ortho.dsm_backward_painting.TILE_CELLS", 128)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.seams._IN_MEMORY_MOST", 0)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.seams._ROWS_AT_ONCE", 64)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.colours._ROWS_AT_ONCE", 64)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.source_maps._LONGEST_PX", 100)
+    monkeypatch.setattr("orthoflow_plugins.raster.grid._BAND_CELLS", 2 * BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.raster.reporting._CELLS_ASKED", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.raster.previews._LONGEST_PX", 100)
+
+
+@contextmanager
+def peak_bytes() -> Iterator[Callable[[], int]]:
+    """The most memory that arrays took meanwhile; mapped files do not count."""
+    tracemalloc.start()
+    try:
+        yield lambda: tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def mapped(path: Path, values: NDArray[np.generic]) -> NDArray[np.generic]:
+    array = np.memmap(path, dtype=values.dtype, mode="w+", shape=values.shape)
+    array[...] = values
+    return array.view(np.ndarray)
+
+
+def large_inputs(folder: Path) -> DsmBackward.In:
+    """The wall of `ortho_scenes` in cells of a seventh, its rasters in files, and two photos."""
+    where = ortho_scenes.frame()
+    fine = dataclasses.replace(where, gsd_m=where.gsd_m / 7, width=7 * 320, height=7 * 240)
+    depths = np.repeat(np.repeat(ortho_scenes.depth_m(), 7, axis=0), 7, axis=1)
+    walls = ortho_scenes.walls(fine, depths)
+    wall = dataclasses.replace(
+        walls.walls[0],
+        **{
+            name: mapped(folder / f"given_{name}", getattr(walls.walls[0], name))
+            for name in ("depth_m", "sigma_m", "count", "mask")
+        },
+    )
+    asides_m = (-0.7, 0.3)
+    return DsmBackward.In(
+        walls=dataclasses.replace(walls, walls=(wall,)),
+        photos=ortho_scenes.photos(*(ortho_scenes.rendered(aside_m=aside) for aside in asides_m)),
+        cameras=ortho_scenes.cameras(
+            *(ortho_scenes.camera(where, aside_m=aside) for aside in asides_m)
+        ),
+    )
+
+
+@pytest.mark.usefixtures("small_bands")
+def test_layers_are_painted_and_reported_without_memory_per_cell(tmp_path: Path) -> None:
+    inputs = large_inputs(tmp_path)
+    n_cells = inputs.walls.walls[0].mask.size
+    DsmBackward().run(inputs, DsmBackward.Params(), context(tmp_path))  # compiled and loaded
+    with peak_bytes() as peak:
+        layers = DsmBackward().run(inputs, DsmBackward.Params(), context(tmp_path)).layers
+        # A layer holds eight bytes per cell, what hides cells two more.
+        assert peak() < 2.0 * n_cells, peak()
+    assert len(layers.layers) == 2
+    assert all(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers.layers)
+
+
+def test_what_photos_reach_of_a_wall_that_none_paints_adds_up(tmp_path: Path) -> None:
+    where = ortho_scenes.frame()
+    # A wall that looks the other way, and a camera before it, behind the first wall.
+    back = dataclasses.replace(
+        where,
+        origin_world=where.world_from_wall(np.array([[where.width, 0.0]]), -4.0)[0],
+        u_world=-where.u_world,
+        normal_world=-where.normal_world,
+    )
+    walls = dataclasses.replace(
+        ortho_scenes.walls(where),
+        walls=tuple(ortho_scenes.walls(frame).walls[0] for frame in (where, back)),
+    )
+    # A board before all of the first wall; one photo shows its left part, one its right part.
+    rows, columns = np.mgrid[: where.height, : where.width] + 0.5
+    board = where.world_from_wall(np.column_stack([columns.ravel(), rows.ravel()]), 0.4)
+    whole = ortho_scenes.camera(where, aside_m=0.1)
+    viewers = [
+        dataclasses.replace(whole, width=600),
+        dataclasses.replace(whole, width=600, cx=whole.cx - 400.0),
+        ortho_scenes.camera(back),
+    ]
+    pictures = [np.zeros((viewer.height, viewer.width, 3), np.uint8) for viewer in viewers]
+    reached = []
+    for chosen in ((0, 1, 2), (0, 2), (1, 2)):
+        inputs = DsmBackward.In(
+            walls=walls,
+            photos=ortho_scenes.photos(*(pictures[k] for k in chosen)),
+            cameras=ortho_scenes.cameras(*(viewers[k] for k in chosen)),
+            cloud=raster_scenes.cloud_of(board),
+        )
+        out = DsmBackward().run(inputs, DsmBackward.Params(), context(tmp_path))
+        bare, shown = out.layers.layers
+        assert (bare.source, bare.wall, shown.wall) == ("no photo", 0, 1)
+        reached.append(bare.mask == LayerMask.OCCLUDED)
+    both, first, second = reached
+    assert (first & ~second).any()
+    assert (second & ~first).any()
+    np.testing.assert_array_equal(both, first | second)
+
+
+def large_layers(folder: Path, shape: tuple[int, int]) -> tuple[Layer, ...]:
+    """Two photos whose quality falls from left to right, and the other way, in files."""
+    rng = np.random.default_rng(2)
+    ramp = np.broadcast_to(np.linspace(1.0, 2.0, shape[1], dtype=np.float32), shape)
+    layers = []
+    for k, quality in enumerate((ramp, ramp[:, ::-1])):
+        mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
+        mask[:, : shape[1] // 4] = LayerMask.OUTSIDE if k else LayerMask.PAINTED
+        is_painted = mask == LayerMask.PAINTED
+        rgb = rng.integers(1, 255, (*shape, 3), dtype=np.uint8) * is_painted[..., None]
+        layers.append(
+            Layer(
+                frame=inspect_scenes.frame(shape=shape),
+                wall=0,
+                source=f"photo {k}",
+                rgb=mapped(folder / f"{k}_rgb", rgb.astype(np.uint8)),
+                mask=mapped(folder / f"{k}_mask", mask),
+                quality=mapped(folder / f"{k}_quality", np.where(is_painted, quality, 0.0)),
+            )
+        )
+    return tuple(layers)
+
+
+def mosaic(layers: tuple[Layer, ...], folder: Path, **params: object) -> MosaicSeams.Out:
+    inputs = MosaicSeams.In(layers=Layers(layers=layers))
+    chosen = MosaicSeams.Params.model_validate({"island_cells_min": 4} | params)
+    return MosaicSeams().run(inputs, chosen, context(folder))
+
+
+@pytest.mark.parametrize("seams", ["best-view", "priority", "graph-cut"])
+@pytest.mark.usefixtures("small_bands")
+def test_mosaics_are_joined_and_reported_without_memory_per_cell(
+    tmp_path: Path, seams: str
+) -> None:
+    layers = large_layers(tmp_path, SHAPE)
+    params = {"seams": seams, "priority": ["photo 1"]}
+    mosaic(tuple(crop(layer, 100) for layer in layers), tmp_path, **params)  # libraries loaded
+    with peak_bytes() as peak:
+        mosaic(layers, tmp_path, **params)
+        # The layers hold sixteen bytes per cell, the orthoimage six; a cut is that of 30 000 cells.
+        assert peak() < 4.0 * N_CELLS + (30e6 if seams == "graph-cut" else 0.0), peak()
+
+
+def crop(layer: Layer, n_rows: int) -> Layer:
+    return dataclasses.replace(
+        layer,
+        frame=dataclasses.replace(layer.frame, height=n_rows),
+        rgb=layer.rgb[:n_rows],
+        mask=layer.mask[:n_rows],
+        quality=layer.quality[:n_rows],
+    )
+
+
+@pytest.mark.parametrize("seams", ["best-view", "priority", "graph-cut", "voronoi"])
+def test_bands_do_not_show_in_mosaics_nor_in_what_is_told_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seams: str
+) -> None:
+    layers = large_layers(tmp_path, (333, 270))
+    params = {"seams": seams, "priority": ["photo 1"], "gains": "global"}
+    told = []
+    for band_cells in (1 << 24, 270 * 70):
+        monkeypatch.setattr(row_bands, "_BAND_CELLS", band_cells)
+        monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", band_cells)
+        ctx = context(tmp_path)
+        inputs = MosaicSeams.In(layers=Layers(layers=layers))
+        chosen = MosaicSeams.Params.model_validate(params | {"island_cells_min": 4})
+        (image,) = MosaicSeams().run(inputs, chosen, ctx).orthoimages.images
+        told.append((image, ctx.metrics))
+    (whole, metrics), (banded, others) = told
+    assert metrics == others
+    for name in ("rgb", "mask", "source"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name))
+
+
+def test_an_overlap_is_sampled_as_if_it_lay_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    first, second = (rng.integers(0, 3, (97, 50), dtype=np.uint8) for _ in range(2))
+    both = np.flatnonzero((first == LayerMask.PAINTED) & (second == LayerMask.PAINTED))
+    monkeypatch.setattr(colours, "_SAMPLES_MOST", 70)
+    monkeypatch.setattr(row_bands, "_BAND_CELLS", 50 * 4)
+    sampled = colours._sampled_overlap(first, second)
+    np.testing.assert_array_equal(sampled, both[:: len(both) // 70])
+
+
+@pytest.mark.usefixtures("small_bands")
+def test_walls_are_rastered_and_reported_in_the_memory_of_a_band(tmp_path: Path) -> None:
+    known = raster_scenes.leaning_wall(shape=(4000, 1000))
+    places = np.random.default_rng(7).uniform([0, 0], [1000, 4000], (80_000, 2))
+    points = known.world(places[:, 0], places[:, 1], np.zeros(len(places)))
+    inputs = RasterGrid.In(cloud=raster_scenes.cloud_of(points), planes=known.planes())
+    params = RasterGrid.Params(gsd_m=known.gsd_m, buffer_m=0.3)
+    with peak_bytes() as peak:
+        walls = RasterGrid().run(inputs, params, context(tmp_path)).walls
+        # A wall keeps 13 bytes per cell without colours, and a band has a fifteenth of the cells.
+        assert peak() < 10.0 * walls.walls[0].mask.size, peak()
+
+
+def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    mask = rng.integers(0, 4, (103, 37), dtype=np.uint8)
+    depths = np.where(mask == 2, np.nan, 1.0)
+    monkeypatch.setattr(row_bands, "_BAND_CELLS", 37 * 10)
+    bands = list(row_bands.row_bands(mask.shape, multiple=4))
+    assert [band.stop - band.start for band in bands] == [8] * 12 + [7]
+    assert [band.start for band in bands[1:]] == [band.stop for band in bands[:-1]]
+    assert count_cells(mask, 3) == np.count_nonzero(mask == 3)
+    assert count_known(depths) == np.count_nonzero(mask != 2)
+    assert holds_cells(mask, 3)
+    assert not holds_cells(mask, 4)
+
+
+def test_rasters_of_large_walls_are_published_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = dataclasses.replace(ortho_scenes.frame(), width=600, height=1300)
+    rng = np.random.default_rng(4)
+    depths = rng.normal(0.0, 0.01, where.shape).astype(np.float32)
+    depths[rng.random(where.shape) < 0.2] = np.nan
+    (wall,) = ortho_scenes.walls(where, depths).walls
+    walls = Walls(
+        walls=(dataclasses.replace(wall, intensity=np.abs(depths)),),
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity_source="laser",
+        buffer_front_m=0.1,
+        buffer_behind_m=0.1,
+    )
+    folders = [tmp_path / "whole", tmp_path / "bands"]
+    for folder in folders:
+        folder.mkdir()
+        publishing.publish_walls(walls, folder, "sha256:" + "ab" * 32)
+        monkeypatch.setattr(geotiff, "_IN_MEMORY_CELLS", 1000)
+        monkeypatch.setattr(row_bands, "_BAND_CELLS", 1000)
+        monkeypatch.setattr(images, "_WHOLE_PX", 400 * 600)
+    for path in sorted(folders[0].iterdir()):
+        other = folders[1] / path.name
+        if path.suffix == ".tif":
+            whole, bands = geotiff.read_raster(path), geotiff.read_raster(other)
+            np.testing.assert_array_equal(whole.values, bands.values)
+            assert (whole.tags, whole.crs_wkt) == (bands.tags, bands.crs_wkt)
+        elif path.suffix == ".png":
+            # Black and white are those of every fourth row.
+            pictures = [images.decode_image(file.read_bytes()) for file in (path, other)]
+            assert np.abs(pictures[0].astype(int) - pictures[1]).max() <= 6
+        else:
+            assert path.read_text() == other.read_text()
