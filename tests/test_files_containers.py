@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
 
 import numpy as np
@@ -41,6 +42,21 @@ def test_a_profile_is_found_whole_in_any_order_of_its_segments() -> None:
     numbered = [(k + 1, 3, part) for k, part in enumerate(parts)]
     assert icc_profile(jpeg_with([numbered[2], numbered[0], numbered[1]])) == PROFILE
     assert icc_profile(png_with(zlib.compress(PROFILE))) == PROFILE
+
+
+def tiff_with(order: str, place: int | None = None) -> bytes:
+    """The head of a TIFF file whose only tag is a profile after its directory."""
+    mark, place = {"<": b"II*\x00", ">": b"MM\x00*"}[order], 26 if place is None else place
+    directory = struct.pack(order + "HHHIII", 1, 34675, 7, len(PROFILE), place, 0)
+    return mark + struct.pack(order + "I", 8) + directory + PROFILE
+
+
+@pytest.mark.parametrize("order", ["<", ">"], ids=["little-endian", "big-endian"])
+def test_the_profile_of_a_tiff_file_is_found(order: str) -> None:
+    assert icc_profile(tiff_with(order)) == PROFILE
+    assert icc_profile(tiff_with(order)[:-1]) is None
+    assert icc_profile(tiff_with(order)[:15]) is None
+    assert icc_profile(tiff_with(order, place=1 << 30)) is None
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ _SCAN: Final = 0xDA
 _APP1: Final = 0xE1
 _APP2: Final = 0xE2
 _ICC_MAGIC: Final = b"ICC_PROFILE\x00"
+_ICC_TAG: Final = 34675
 # Profiles of cameras take some kilobytes; a packed one that grows beyond this is none.
 _ICC_MOST: Final = 1 << 24
 _WITHOUT_LENGTH: Final = frozenset({0x01, *range(0xD0, 0xD9)})
@@ -85,11 +87,13 @@ def exif_block(encoded: bytes) -> bytes | None:
 
 
 def icc_profile(encoded: bytes) -> bytes | None:
-    """Give the ICC colour profile of a JPEG or PNG file; None without a whole one.
+    """Give the ICC colour profile of a JPEG, PNG or TIFF file; None without a whole one.
 
     Layout as in ICC.1:2022, annex B: a JPEG may hold it in several numbered segments.
     """
     match image_format(encoded):
+        case "TIFF":
+            return _tiff_profile(encoded)
         case "PNG":
             for segment in _png_chunks(encoded):
                 if segment.kind == b"iCCP":
@@ -106,6 +110,24 @@ def icc_profile(encoded: bytes) -> bytes | None:
                     parts[number] = content[14:]
             if parts and sorted(parts) == list(range(1, count + 1)):
                 return b"".join(parts[number] for number in sorted(parts))
+    return None
+
+
+def _tiff_profile(encoded: bytes) -> bytes | None:
+    """Profile that the first directory of a TIFF file points to."""
+    order = ">" if encoded.startswith(b"MM") else "<"
+    try:
+        (first,) = struct.unpack_from(order + "I", encoded, 4)
+        (count,) = struct.unpack_from(order + "H", encoded, first)
+        for index in range(count):
+            tag, _, size, place = struct.unpack_from(
+                order + "HHII", encoded, first + 2 + 12 * index
+            )
+            if tag == _ICC_TAG:
+                profile = encoded[place : place + size]
+                return profile if len(profile) == size > 0 else None
+    except struct.error:
+        return None
     return None
 
 
