@@ -150,7 +150,7 @@ def test_embed_makes_a_record_that_verifies(tmp_path: Path) -> None:
     checked = orthoflow(tmp_path, "verify", "r")
     assert (checked.returncode, checked.stdout) == (
         0,
-        "verified: 2 products, seal ok, 10 published files unchanged\n",
+        "verified: 2 products, seal ok, 11 published files unchanged\n",
     )
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
+
+# Name, shape, type -> zeroed array, in a file that is mapped into memory where it is large.
+Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
 # What is made of a band for a moment takes some 16 MB a byte.
 _BAND_CELLS: Final = 1 << 24

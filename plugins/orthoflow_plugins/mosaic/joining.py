@@ -8,18 +8,15 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.row_bands import holds_cells
+from orthoflow.geometry.row_bands import Allocate, holds_cells
 from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask
 from orthoflow_plugins.mosaic.preferring import Preference
 
 # Preferences of layers that paint a wall together.
 Preferring = Callable[[Sequence[Layer]], Sequence[Preference]]
-
-# Name, shape, type -> zeroed array.
-Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
 NOBODY: Final = -1
 # Walls with more cells are joined in bands of so many.

@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.row_bands import count_cells, holds_cells
+from orthoflow.geometry.row_bands import Allocate, count_cells, holds_cells
 from orthoflow.products import (
     JsonValue,
     Layer,
@@ -30,7 +30,7 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.mosaic.colours import SeamSteps, balanced, estimate_gains, seam_steps
 from orthoflow_plugins.mosaic.cutting import depth_edges
-from orthoflow_plugins.mosaic.joining import NOBODY, Allocate, joined
+from orthoflow_plugins.mosaic.joining import NOBODY, joined
 from orthoflow_plugins.mosaic.overlaps import displacements_cells
 from orthoflow_plugins.mosaic.preferring import SeamRule, preferences, require_sources
 from orthoflow_plugins.mosaic.source_maps import caption, is_seam, source_map

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from threading import Lock, local
 from typing import Final
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.layer_kernels import Canvas, hand_over
+from orthoflow.geometry.row_bands import Allocate
 from orthoflow.geometry.sight_kernels import look_at_cells
 from orthoflow.geometry.visibility_kernels import (
     OCCLUDED,
@@ -33,8 +33,6 @@ from orthoflow_plugins.ortho.dsm_backward_sampling import (
 TILE_CELLS: Final = 512
 # What is packed of a photo for a tile stays below 80 MB; cv2.remap takes sides below 32767.
 _CROP_MOST_PX: Final = 3_000
-
-Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Final
 
@@ -11,6 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.geometry.rastering import in_parts
 from orthoflow.geometry.relief_kernels import bound_blocks, make_occluding
+from orthoflow.geometry.row_bands import Allocate
 from orthoflow.geometry.visibility_kernels import (
     BLOCK_CELLS,
     FINE_CELLS,
@@ -18,9 +18,6 @@ from orthoflow.geometry.visibility_kernels import (
     Relief,
 )
 from orthoflow.products import Wall
-
-# Name, shape, type -> array.
-Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
 # Heights fit into 16 bits with room for rounding.
 _STEPS: Final = 32_000

@@ -7,13 +7,11 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
+from orthoflow.geometry.row_bands import Allocate
 from orthoflow.geometry.slabs import Slab
 from orthoflow_plugins.raster.surfaces import CellSurface
-
-# Name, shape, type -> zeroed array that is not held in memory.
-Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
 
 @dataclass(frozen=True, kw_only=True)

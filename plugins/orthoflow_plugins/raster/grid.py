@@ -24,7 +24,8 @@ from orthoflow_plugins.raster.scan_steps import scan_step_m
 from orthoflow_plugins.raster.selection import Constraint, WallChoice, chosen_planes, frame_of
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.raster.banding import Allocate, Raster
+    from orthoflow.geometry.row_bands import Allocate
+    from orthoflow_plugins.raster.banding import Raster
     from orthoflow_plugins.raster.gaps import GapRule
 
 # Rec. 601 luma on the sRGB values as they are: the grey of cv2.cvtColor.
