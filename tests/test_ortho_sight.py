@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -101,30 +100,30 @@ def test_places_are_exact_to_a_twentieth_of_a_pixel(aside_m: float, is_transpare
     np.testing.assert_allclose(sight.quality[painted], worth, rtol=2e-3, atol=2e-3)
 
 
-def is_hidden(view: WallView, relief: Relief, row: int, column: int) -> bool:
-    """Follow one ray to the camera: the surface between two cells is linear, void hides nothing."""
+def are_hidden(view: WallView, relief: Relief, cells: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Follow rays to the camera: the surface between two cells is linear, void hides nothing."""
     heights = relief.occluding.reshape(relief.depth.shape)
-    down, across = view.row - row, view.column - column
-    along = max(abs(down), abs(across))
-    depth = float(relief.depth[row, column])
-    for k in range(1, int(along) + 1):
-        at_row, at_column = row + k * down / along, column + k * across / along
-        if abs(down) >= abs(across):
-            at_row = round(at_row)
-            beside = [(at_row, math.floor(at_column)), (at_row, math.ceil(at_column))]
-            share = at_column % 1.0
-        else:
-            at_column = round(at_column)
-            beside = [(math.floor(at_row), at_column), (math.ceil(at_row), at_column)]
-            share = at_row % 1.0
-        if not all(0 <= i < heights.shape[0] and 0 <= j < heights.shape[1] for i, j in beside):
-            return False
-        one, other = (int(heights[place]) for place in beside)
+    depths = relief.depth[tuple(cells.T)].astype(np.float64)
+    ways = np.array([view.row, view.column]) - cells
+    along = np.abs(ways).max(axis=1)
+    is_main = np.arange(2) == np.where(np.abs(ways[:, 0]) >= np.abs(ways[:, 1]), 0, 1)[:, None]
+    hidden, inside = np.zeros(len(cells), dtype=np.bool_), np.ones(len(cells), dtype=np.bool_)
+    for k in range(1, int(along.max()) + 1):
+        way = k / along
+        at = cells + way[:, None] * ways
+        at = np.where(is_main, np.round(at), at)
+        first, second = np.floor(at).astype(int), np.ceil(at).astype(int)
+        inside &= (k <= along) & (first >= 0).all(axis=1) & (second < heights.shape).all(axis=1)
+        asked = np.flatnonzero(inside)
+        one, other = (
+            heights[tuple(places[asked].T)].astype(np.float64) for places in (first, second)
+        )
+        share = (at - first)[asked].sum(axis=1)
         surface = relief.step_m * ((1.0 - share) * one + share * other)
-        ray = depth + k / along * (view.height_m - depth)
-        if NOTHING not in (one, other) and surface > ray + view.tolerance_m:
-            return True
-    return False
+        ray = depths[asked] + way[asked] * (view.height_m - depths[asked])
+        is_known = (one != NOTHING) & (other != NOTHING)
+        hidden[asked] |= is_known & (surface > ray + view.tolerance_m)
+    return hidden
 
 
 @pytest.mark.parametrize("aside_m", [-1.4, -0.7, 0.0, 0.4, 1.4])
@@ -140,8 +139,8 @@ def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None
     sight = seen_of(surface, camera)
     asked = (sight.mask == PAINTED) | (sight.mask == OCCLUDED)
     # Each ray is followed to the camera, whatever bounds say.
-    followed = [is_hidden(view, relief, row, column) for row, column in np.argwhere(asked)]
-    assert 200 < np.sum(followed) < 0.5 * len(followed)
+    followed = are_hidden(view, relief, np.argwhere(asked))
+    assert 200 < followed.sum() < 0.5 * len(followed)
     np.testing.assert_array_equal(sight.mask[asked] == OCCLUDED, followed)
 
 
