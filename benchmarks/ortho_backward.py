@@ -1,10 +1,13 @@
 """Photos laid onto a wall: ours, with visibility, against bare cv2.remap with ready maps.
 
-    python benchmarks/ortho_backward.py [--megacells 4] [--megapixels 6] [--threads 2] [--repeat 5]
+    python benchmarks/ortho_backward.py [--megacells 4] [--megapixels 6] [--threads 2]
+                                        [--repeat 5] [--fresh]
 
 Times are medians of interleaved runs, decoding left out; the peer gets its maps for nothing and
-looks for nothing in the way. Each task runs twice in a row and the second run counts: memory that
-has lain idle a virtual machine gets anew from its host, which may take longer than the task.
+looks for nothing in the way. Both write into arrays that are there already; with `--fresh` both get
+new ones each time, of which the layer needs two and a half times as much (quality and mask): on a
+virtual machine that gives unused memory back to its host, new memory may take longer than painting.
+Each task runs twice in a row, and the second run counts.
 `layer` is one photo on one wall with everything: relief, cloud, erosion, anti-aliasing, quality.
 `cloud` is what looking at the cloud adds per photo. Goals for bilinear: at most 1.6 times the peer
 without visibility, 3 times with it, 200 MB besides the layer.
@@ -20,7 +23,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.dsm_backward_occluders import (
     depth_buffer,
@@ -150,6 +153,23 @@ def maps(walls: Walls, viewer: ViewingCamera) -> tuple[NDArray[np.float32], NDAr
     return u, v
 
 
+class KeptArrays:
+    """Gives the same array for a name every time, as it was left."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, NDArray[np.generic]] = {}
+
+    def __call__(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+        if name not in self._arrays:
+            self._arrays[name] = allocate_anew(name, shape, dtype)
+        return self._arrays[name].view()
+
+
+def allocate_anew(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+    del name
+    return np.zeros(shape, dtype)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--megacells", type=float, default=4.0)
@@ -157,6 +177,7 @@ def main() -> None:
     parser.add_argument("--oblique-deg", type=float, default=25.0)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--fresh", action="store_true")
     options = parser.parse_args()
     walls = wall(options.megacells)
     raster = walls.walls[0]
@@ -169,7 +190,11 @@ def main() -> None:
     ready = maps(walls, viewer)
     cv2.setNumThreads(options.threads)
 
-    def layer(resampling: str, *, is_seen_through: bool = False) -> Callable[[], object]:
+    kept = KeptArrays()
+
+    def layer(
+        resampling: str, *, is_seen_through: bool = False, is_fresh: bool = options.fresh
+    ) -> Callable[[], object]:
         params = DsmBackward.Params.model_validate({"resampling": resampling})
         rule = SightRule(
             resampling=params.resampling,
@@ -179,12 +204,14 @@ def main() -> None:
             border_share=params.border_share,
         )
 
+        allocate = allocate_anew if is_fresh else kept
+
         def task() -> object:
             surface = Surface(
                 frame=raster.frame,
-                relief=(transparent_relief_of if is_seen_through else relief_of)(
-                    raster, threads=options.threads
-                ),
+                relief=transparent_relief_of(raster, threads=options.threads)
+                if is_seen_through
+                else relief_of(raster, threads=options.threads, allocate=allocate),
                 front_m=walls.buffer_front_m,
                 tolerance_m=3.0 * depth_noise_m(raster.depth_m) + 0.5 * GSD_M,
             )
@@ -194,14 +221,15 @@ def main() -> None:
                 surface,
                 nothing_in_the_way(viewer) if is_seen_through else buffer,
                 rule,
-                allocate=lambda name, shape, dtype: np.zeros(shape, dtype),
+                allocate=allocate,
                 threads=options.threads,
             )
 
         return task
 
     def remap(flag: int) -> Callable[[], object]:
-        return lambda: cv2.remap(photo, *ready, flag, borderMode=cv2.BORDER_CONSTANT)
+        into = None if options.fresh else np.zeros((*raster.frame.shape, 3), dtype=np.uint8)
+        return lambda: cv2.remap(photo, *ready, flag, dst=into, borderMode=cv2.BORDER_CONSTANT)
 
     tasks = {
         "cv2.remap bilinear": remap(cv2.INTER_LINEAR),
@@ -235,10 +263,8 @@ def main() -> None:
         print(f"layer / cv2.remap, {kind}: {ratio[0]:.2f}, of processor time {ratio[1]:.2f}")
     # A layer is colours, quality and mask: eight bytes per cell.
     layer_bytes = 8 * raster.depth_m.size
-    for kind, task in (
-        ("none", tasks["layer bilinear, visibility none"]),
-        ("full", tasks["layer bilinear"]),
-    ):
+    for kind in ("none", "full"):
+        task = layer("bilinear", is_seen_through=kind == "none", is_fresh=True)
         extra = peak_bytes(task) - layer_bytes
         print(f"memory besides the layer, visibility {kind}: {extra / 2**20:.0f} MiB")
 

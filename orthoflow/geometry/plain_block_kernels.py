@@ -124,7 +124,6 @@ def look_at_hidden_block(
             sight.mask[at_row, at_column] = NO_SURFACE if math.isnan(depth) else OCCLUDED
             sight.u[at_row, at_column] = 0.0
             sight.v[at_row, at_column] = 0.0
-            sight.quality[at_row, at_column] = 0.0
 
 
 class BlockRoom(NamedTuple):
@@ -242,9 +241,8 @@ def look_at_plain_block(
             vs[in_tile + np.uintp(j)] = t0 + x * (t1 + x * t2) + rises[j] * (t3 + x * t4)
         t0, t1, t2, t3, t4 = terms[10], terms[11], terms[12], terms[13], terms[14]
         for j in range(n_columns):
-            x, depth = ramp[begin + np.uintp(j)], heights[on_wall + np.uintp(j)]
-            worth = t0 + x * (t1 + x * t2) + rises[j] * (t3 + x * t4)
-            quality[in_tile + np.uintp(j)] = nothing if math.isnan(depth) else worth
+            x = ramp[begin + np.uintp(j)]
+            quality[in_tile + np.uintp(j)] = t0 + x * (t1 + x * t2) + rises[j] * (t3 + x * t4)
         for j in range(n_columns):
             depth = heights[on_wall + np.uintp(j)]
             mask[in_tile + np.uintp(j)] = void if math.isnan(depth) else painted

@@ -19,7 +19,6 @@ from orthoflow.geometry.visibility_kernels import (
     NOTHING_M,
     OCCLUDED,
     Relief,
-    Sight,
     WallView,
 )
 
@@ -216,7 +215,7 @@ def _steps_inside(beside: int, n_beside: int, move: int) -> int:
 def hide_low_cells(
     view: WallView,
     relief: Relief,
-    sight: Sight,
+    mask: NDArray[np.uint8],
     corner: tuple[int, int],
     area: tuple[int, int, int, int],
     top: float,
@@ -229,7 +228,7 @@ def hide_low_cells(
     Args:
         view: the camera before the wall.
         relief: the wall.
-        sight: of a tile, changed where cells are hidden.
+        mask: of the tile's `Sight`, changed where cells are hidden.
         corner: row and column of the tile's first cell.
         area: first row and column of the block's cells in the tile, and the row and column after
             its last ones, on the wall.
@@ -242,7 +241,6 @@ def hide_low_cells(
     eye = eye_of(view, relief)
     depths, occluding = relief.depth, relief.occluding
     fine_bottoms, fine_tops = relief.fine_bottoms, relief.fine_tops
-    mask, quality = sight.mask, sight.quality
     begin, start, finish, end = area
     n_hidden = 0
     for block_row in range(begin // FINE_CELLS, (finish - 1) // FINE_CELLS + 1):
@@ -271,6 +269,5 @@ def hide_low_cells(
                 if rays[np.uintp(i), IS_HIDDEN]:
                     row, column = rays[np.uintp(i), ROW], rays[np.uintp(i), COLUMN]
                     mask[row - corner[0], column - corner[1]] = OCCLUDED
-                    quality[row - corner[0], column - corner[1]] = 0.0
                     n_hidden += 1
     return n_hidden

@@ -194,7 +194,7 @@ def look_at_blocks(
         top = _highest(view, relief, block)
         if float(relief.bottoms[block]) + view.tolerance_m < top:
             corner, area = (tile[0], tile[1]), _cells_in_tile(tile, block)
-            n_seen -= hide_low_cells(view, relief, sight, corner, area, top, room.rays)
+            n_seen -= hide_low_cells(view, relief, sight.mask, corner, area, top, room.rays)
     if n_seen:
         summary, box = sight.summary, room.box
         summary[0], summary[1] = min(summary[0], box[0]), max(summary[1], box[1])

@@ -121,7 +121,8 @@ class Sight(NamedTuple):
         u: (rows, cols) float32 photo pixels, first centre at 0.5, a number everywhere, but a place
             only where painted. v likewise.
         mask: (rows, cols) uint8 states.
-        quality: (rows, cols) float32 photo pixels per cell times the falling off at the border.
+        quality: (rows, cols) float32 photo pixels per cell times the falling off at the border;
+            it counts only where painted.
         summary: (8,) float64 over painted cells: bounds of u and of v (smallest, largest each),
             their number, sums of columns, rows and depths (where a whole block is seen, those of
             its middle).
