@@ -114,8 +114,14 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
     agrees = (apart <= _AGREE_CELLS) & (away > _WITNESS_CELLS)
     # A motif that repeats lets two or three pairs err alike, but not a quarter of a neighbourhood.
     needed = max(_AGREEING, _AGREEING_SHARE * n_near)
-    agreed: NDArray[np.bool_] = np.count_nonzero(agrees, axis=1) >= needed
-    return agreed
+    agreed = np.ones(len(places), dtype=np.bool_)
+    # Witnesses must be believed themselves.
+    while True:
+        kept: NDArray[np.bool_] = np.count_nonzero(agrees & agreed[near], axis=1) >= needed
+        kept &= agreed
+        if np.array_equal(kept, agreed):
+            return agreed
+        agreed = kept
 
 
 def _levelled(image: GreyImage) -> GreyImage:

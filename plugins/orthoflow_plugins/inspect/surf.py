@@ -50,7 +50,7 @@ class InspectSurf(Method):
     """
 
     id: ClassVar[str] = "inspect.surf"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4, Table 2, Figure 25)",
