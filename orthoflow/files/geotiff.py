@@ -120,17 +120,13 @@ def _write_large_raster(
 ) -> None:
     """Write one band to the disk, a row of tiles at a time."""
     import rasterio
-    from rasterio.errors import RasterioError
 
-    try:
-        with _quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
-            with rasterio.open(path, "w", BIGTIFF="IF_SAFER", **profile) as dataset:
-                _describe(dataset, tags, None)
-                for window in _bands(values.shape):
-                    dataset.write(values[_rows(window)], 1, window=window)
-            _require_written(path, values[:, :, None])
-    except (RasterioError, OSError) as error:
-        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+    with _writing(path), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+        with rasterio.open(path, "w", BIGTIFF="IF_SAFER", **profile) as dataset:
+            _describe(dataset, tags, None)
+            for window in _bands(values.shape):
+                dataset.write(values[_rows(window)], 1, window=window)
+        _require_written(path, values[:, :, None])
 
 
 def write_orthoimage(
@@ -186,13 +182,12 @@ class _Image:
 def _write_banded(path: Path, image: _Image, placed: Mapping[str, object]) -> None:
     """Write a large image by way of an uncompressed one, a band of tiles at a time."""
     import rasterio
-    from rasterio.errors import RasterioError
     from rasterio.shutil import copy
 
     plain = path.with_name(f"{path.name}.plain")
     options = {"driver": "GTiff", "tiled": True, "blockxsize": TILE_PX, "blockysize": TILE_PX}
     try:
-        with _quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+        with _writing(path), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
             with rasterio.open(plain, "w", BIGTIFF="IF_SAFER", **options, **placed) as dataset:
                 _describe(dataset, image.tags, image.icc_profile)
                 for window in _bands(image.shown.shape):
@@ -201,8 +196,6 @@ def _write_banded(path: Path, image: _Image, placed: Mapping[str, object]) -> No
                     dataset.write_mask(image.shown[rows], window=window)
             copy(plain, path, driver="COG", BIGTIFF="IF_SAFER", **_COG_OPTIONS)
             _require_written(path, image.rgb)
-    except (RasterioError, OSError) as error:
-        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
     finally:
         plain.unlink(missing_ok=True)
 
@@ -314,21 +307,17 @@ def _write(
     *,
     icc_profile: bytes | None = None,
 ) -> None:
-    from rasterio.errors import RasterioError
     from rasterio.io import MemoryFile
 
-    try:
-        with _quiet(), MemoryFile(ext=".tif") as memory:
-            with memory.open(**profile) as dataset:
-                _describe(dataset, tags, icc_profile)
-                dataset.write(bands)
-                if shown is not None:
-                    dataset.write_mask(shown)
-            # Python writes the file: GDAL only logs a disk that gets full at closing.
-            with path.open("wb") as target:
-                target.write(memory.getbuffer())
-    except (RasterioError, OSError) as error:
-        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
+    with _writing(path), MemoryFile(ext=".tif") as memory:
+        with memory.open(**profile) as dataset:
+            _describe(dataset, tags, icc_profile)
+            dataset.write(bands)
+            if shown is not None:
+                dataset.write_mask(shown)
+        # Python writes the file: GDAL only logs a disk that gets full at closing.
+        with path.open("wb") as target:
+            target.write(memory.getbuffer())
 
 
 def _describe(dataset: DatasetWriter, tags: Mapping[str, str], icc_profile: bytes | None) -> None:
@@ -340,6 +329,22 @@ def _describe(dataset: DatasetWriter, tags: Mapping[str, str], icc_profile: byte
     if icc_profile is not None:
         text = base64.b64encode(icc_profile).decode()
         dataset.update_tags(ns="COLOR_PROFILE", SOURCE_ICC_PROFILE=text)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn what GDAL or the disk says while a file is written into a sentence.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    from rasterio.errors import RasterioError
+
+    try:
+        with _quiet():
+            yield
+    except (RasterioError, OSError) as error:
+        raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
 
 
 @contextmanager

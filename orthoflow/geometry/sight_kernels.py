@@ -320,7 +320,7 @@ def look_at_row(
     for k in range(mask.size):
         u, v = lanes[0, k], lanes[1, k]
         if mask[k] != PAINTED:
-            us[k], vs[k], quality[k] = 0.0, 0.0, 0.0
+            us[k], vs[k] = 0.0, 0.0
             continue
         inside = min(width - u, u, image_height - v, v) * per_border
         quality[k] = lanes[4, k] * min(1.0, inside)

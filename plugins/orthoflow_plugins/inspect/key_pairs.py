@@ -118,7 +118,6 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
     # Witnesses must be believed themselves.
     while True:
         kept: NDArray[np.bool_] = np.count_nonzero(agrees & agreed[near], axis=1) >= needed
-        kept &= agreed
         if np.array_equal(kept, agreed):
             return agreed
         agreed = kept

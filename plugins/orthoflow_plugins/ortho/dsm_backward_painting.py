@@ -212,9 +212,10 @@ class _Brush:
 
     def _near_hidden(self, sight: Sight) -> NDArray[np.uint8]:
         """Not 0 where a cell is too near to a hidden patch; empty where none is."""
-        is_hidden = sight.mask == OCCLUDED
-        if self._rule.erosion_cells and is_hidden.any():
-            return _near_patches(is_hidden, self._rule.erosion_cells)
+        if self._rule.erosion_cells:
+            is_hidden = sight.mask == OCCLUDED
+            if is_hidden.any():
+                return _near_patches(is_hidden, self._rule.erosion_cells)
         return np.empty((0, 0), dtype=np.uint8)
 
     def _blank_sight(self, rows: int, columns: int) -> Sight:

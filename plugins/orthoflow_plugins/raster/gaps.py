@@ -12,11 +12,10 @@ from orthoflow.geometry.rastering import lenders_in_gaps
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud, SurfaceMask
 from orthoflow_plugins.raster.scan_neighbours import SpanRule, recover_between_neighbours
-from orthoflow_plugins.raster.surfaces import CellSurface
+from orthoflow_plugins.raster.surfaces import CELLS_AT_ONCE, CellSurface
 
 # Neighbours in the scan may lie so many widths of a narrow gap's radius apart.
 _SPAN_GAPS: Final = 4
-_CELLS_AT_ONCE: Final = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +60,8 @@ def close_gaps(
     )
     mask[recover_between_neighbours(cloud, slab, surface, spans)] = SurfaceMask.RECOVERED
     lent = lenders_in_gaps(is_known.reshape(slab.frame.shape), rule.gap_cells, threads=rule.threads)
-    for first in range(0, len(lent), _CELLS_AT_ONCE):
-        part = lent[first : first + _CELLS_AT_ONCE]
+    for first in range(0, len(lent), CELLS_AT_ONCE):
+        part = lent[first : first + CELLS_AT_ONCE]
         # Lenders are never void, so that it does not matter which part comes first.
         void, lender = part[mask[part[:, 0]] == SurfaceMask.VOID].T
         mask[void] = SurfaceMask.RECOVERED

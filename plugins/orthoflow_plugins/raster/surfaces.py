@@ -28,7 +28,8 @@ from orthoflow_plugins.raster.denoising import denoised
 from orthoflow_plugins.raster.rules import SurfaceRule
 from orthoflow_plugins.raster.specks import without_specks
 
-_CELLS_AT_ONCE: Final = 1 << 20
+# What is made of cells for a moment is made of so many.
+CELLS_AT_ONCE: Final = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,8 +241,8 @@ def _averaged_values(
         else:
             rgb = np.empty((slab.n_cells, 3), dtype=np.uint8)
         # Means take several times the memory of what is kept of them.
-        for first in range(0, slab.n_cells, _CELLS_AT_ONCE):
-            part = slice(first, first + _CELLS_AT_ONCE)
+        for first in range(0, slab.n_cells, CELLS_AT_ONCE):
+            part = slice(first, first + CELLS_AT_ONCE)
             with np.errstate(invalid="ignore"):
                 means = sum_of_values[part, :-1] / sum_of_values[part, -1:]
             if intensity is not None and means.shape[1] == 1:
