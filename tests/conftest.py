@@ -40,9 +40,19 @@ _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give a second process what needs no kernels while the first compiles them for tests/road."""
-    early = ["test_direct.py", "test_cli_running.py"]
-    items.sort(key=lambda item: early.index(item.path.name) if item.path.name in early else 2)
+    """Start with the longest modules, tests/road, and with what a second process can do meanwhile.
+
+    Two modules need no kernels: they run while the first process compiles those for tests/road.
+    """
+    first = [("road", "test_direct.py"), ("cli", "test_running.py")]
+
+    def turn(item: pytest.Item) -> int:
+        folder, name = item.path.parts[-2:]
+        if (folder, name) in first:
+            return first.index((folder, name))
+        return len(first) if folder == "road" else len(first) + 1
+
+    items.sort(key=turn)
 
 
 @pytest.fixture(scope="session")

@@ -87,7 +87,7 @@ def test_every_reference_leads_to_an_entity_or_the_web(crate: dict[str, Any]) ->
 def test_the_official_validator_finds_nothing(studio: Studio) -> None:
     pytest.importorskip("rocrate_validator")
     # In a process of its own: its libraries warn, patch each other and leave sessions open.
-    script = Path(__file__).with_name("crate_validation.py")
+    script = Path(__file__).resolve().parents[1] / "crate_validation.py"
     arguments = [sys.executable, "-W", "ignore", str(script), str(studio.folder / "crate"), PROFILE]
     done = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, "[]\n"), done.stderr

@@ -15,7 +15,7 @@ import pytest
 from orthoflow.records import open_run
 from tests.studios import Studio, open_studio
 
-REFERENCE = Path(__file__).resolve().parents[1] / "provenance" / "reference"
+REFERENCE = Path(__file__).resolve().parents[2] / "provenance" / "reference"
 WORKFLOWS = {"studio": "studio", "comparison": "comparison", "embedded": "studio"}
 
 

@@ -11,7 +11,7 @@ from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 
 from orthoflow.products import Layer, LayerMask
 from tests import raster_scenes as scenes
-from tests.test_ortho_direct import bare_walls
+from tests.plugins.ortho.test_direct import bare_walls
 
 N_TOP = 3
 

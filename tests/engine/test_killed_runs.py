@@ -18,7 +18,7 @@ from orthoflow.records import open_run, verify_run
 from tests.long_loops import IS_LONG
 from tests.workshop_runs import workshop_environment, write_studio
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 KILLS = 100 if IS_LONG else 10
 
 

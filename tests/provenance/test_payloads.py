@@ -214,7 +214,7 @@ def test_a_full_disk_is_an_ordinary_error_and_the_process_lives(
     tmp_path: Path, limit_bytes: int, layout: str
 ) -> None:
     command = [sys.executable, "-c", FULL_DISK, str(tmp_path / "a.h5"), str(limit_bytes), layout]
-    root = Path(__file__).parent.parent
+    root = Path(__file__).resolve().parents[2]
     path = [str(root), str(root / "provenance")]
     done = subprocess.run(
         command,

@@ -20,7 +20,7 @@ from orthoflow.testing import conformance_cases
 from orthoflow.workflow import load_workflow
 from tests.long_loops import IS_LONG
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 KINDS = sorted(discover_catalog().kinds)
 
 
