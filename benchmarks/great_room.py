@@ -33,8 +33,9 @@ from orthoflow_plugins.simulate.building import (
 from orthoflow_plugins.simulate.sweeping import SPOILT, Errors, Scanned, Scanner, Sweep
 
 from orthoflow.geometry.hashed_numbers import cell_states, uniforms
-from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, SceneRays, in_threads
+from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, SceneRays
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+from orthoflow.geometry.threads import in_runs
 
 SEED = 20150807
 # The paper's cloud; other sizes have other steps between rays.
@@ -113,7 +114,12 @@ def great_room(n_points: int, *, cores: int) -> GreatRoom:
     for sweep, size in zip(sweeps, sizes, strict=True):
         part = points.part(slice(start, start + size))
         columns = max(1, RAYS_AT_ONCE // sweep.n_rows)
-        in_threads(partial(_sweep, scanner, sweep, part), sweep.n_columns, columns, cores=cores)
+        in_runs(
+            partial(_sweep, scanner, sweep, part),
+            sweep.n_columns,
+            n_per_run=columns,
+            threads=cores,
+        )
         _mirrored(scene, mirror, sweep, part)
         start += size
     plane_index = np.append(scene.plane_index, -1).astype(np.int8)[np.maximum(points.rectangle, -1)]

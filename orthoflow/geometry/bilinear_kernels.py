@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.visibility_kernels import compiled
+from orthoflow.geometry.compiling import compiled
 
 _STEPS: Final = 64
 # Places of the channels in a packed pixel.

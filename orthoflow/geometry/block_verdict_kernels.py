@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.visibility_kernels import BLOCK_CELLS, DepthBuffer, WallView, compiled
+from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.visibility_kernels import BLOCK_CELLS, DepthBuffer, WallView
 
 # What `judge_block` finds.
 HIDDEN: Final = -1

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from orthoflow.geometry.compiling import inlined
 
 # Layout of a camera as a flat float64 array, so that kernels take one argument:
 # 0..8 rotation rows, 9..11 translation, 12 fx, 13 fy, 14 cx, 15 cy, 16..20 k1 k2 p1 p2 k3,
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 CAMERA_LENGTH = 24
 
 
-@njit(cache=True, inline="always")
+@inlined
 def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba infers the types
     """Project one world point: (u, v, depth); u and v are NaN behind the camera or beyond the lens.
 

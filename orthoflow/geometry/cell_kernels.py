@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints
 from orthoflow.geometry.voxel_kernels import VOXELS, place_keys
 
 # Steps along a side of a cell: 20 micrometres in cells of two centimetres.

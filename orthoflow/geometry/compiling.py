@@ -1,4 +1,4 @@
-"""Compiling the parts of kernels so that a first run waits as little as possible.
+"""The one way to compile: what numba is told is told here.
 
 Numba wraps every function for callers in Python and in C. Where a scene's tables are among the
 arguments, the wrappers take as long to compile as the function itself; what only kernels call
@@ -8,18 +8,39 @@ needs neither.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 import numba
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
+# Compiled code is kept between processes. Divisions do not stop at 0: lanes of a vector can fill.
+_KEPT: Final = {"cache": True, "error_model": "numpy"}
+_UNWRAPPED: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+def compiled(function: _Kernel) -> _Kernel:
+    """Compile a kernel that Python calls; it lets other threads run.
+
+    Threads come from `geometry.threads`, not from numba's own loops: those take seconds more to
+    compile.
+    """
+    return cast("_Kernel", numba.njit(**_KEPT, nogil=True)(function))  # type: ignore[call-overload]  # the stubs leave options out
+
+
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Put a function of a few instructions into each kernel that calls it."""
+    return cast("Callable[..., Any]", numba.njit(**_KEPT, inline="always")(function))  # type: ignore[call-overload]
+
+
+def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """Give an inlined function as Python runs it, for a few single calls."""
+    return cast("Callable[..., Any]", kernel.py_func)  # type: ignore[attr-defined]
+
 
 def kernel_part(function: _Kernel) -> _Kernel:
     """Compile a function that only kernels call, when one that does is compiled."""
-    options = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    compiler = numba.njit(**options)  # type: ignore[call-overload]  # the stubs leave these out
-    return cast("_Kernel", compiler(function))
+    return cast("_Kernel", numba.njit(**_KEPT, **_UNWRAPPED)(function))  # type: ignore[call-overload]
 
 
 def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
@@ -27,12 +48,9 @@ def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
 
     Without one, each constant that it is called with would compile a version of its own.
     """
-    options = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    compiler = numba.njit(  # type: ignore[call-overload]  # the stubs leave these out
-        signature, **options
-    )
 
-    def compiled(function: _Kernel) -> _Kernel:
+    def compile_part(function: _Kernel) -> _Kernel:
+        compiler = numba.njit(signature, **_KEPT, **_UNWRAPPED)  # type: ignore[call-overload]
         return cast("_Kernel", compiler(function))
 
-    return compiled
+    return compile_part

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.point_kernels import BLOCK_POINTS, compiled
+from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.point_kernels import BLOCK_POINTS
 
 
 @compiled

@@ -7,7 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-_MEDIAN_TO_SIGMA: Final = 1.4826
+from orthoflow.geometry.robust import NMAD_FACTOR
+
 _SAMPLES: Final = 300_000
 
 
@@ -20,4 +21,4 @@ def depth_noise_m(depth_m: NDArray[np.float32]) -> float:
     rows = depth_m[:: max(1, depth_m.size // _SAMPLES)]
     bends = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
     known = np.abs(bends[np.isfinite(bends)])
-    return float(np.median(known)) * _MEDIAN_TO_SIGMA / np.sqrt(6.0) if known.size else 0.0
+    return float(np.median(known)) * NMAD_FACTOR / np.sqrt(6.0) if known.size else 0.0

@@ -10,9 +10,9 @@ from orthoflow.geometry.box_kernels import (
     centre_block,
     place_along,
 )
-from orthoflow.geometry.compiling import kernel_part
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.plane_kernels import HISTOGRAM_BINS, STEPS_PER_TOLERANCE
-from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints
 
 
 @kernel_part

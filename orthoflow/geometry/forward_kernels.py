@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.visibility_kernels import DepthBuffer, Relief, WallView, compiled
+from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.visibility_kernels import DepthBuffer, Relief, WallView
 
 # Pixels between two exact rays; in between they are interpolated. With lenses of a metre's focal
 # length in pixels or more the error is below a hundredth of a pixel.

@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.visibility_kernels import OCCLUDED, PAINTED, Sight, compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.visibility_kernels import OCCLUDED, PAINTED, Sight
 
 # Twenty bits tell views apart well enough, and pack to half the size.
 _QUALITY_BITS: Final = np.uint32(0xFFFFF000)

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.point_kernels import Offsets, in_threads, read_only
+from orthoflow.geometry.point_kernels import Offsets, read_only
 from orthoflow.geometry.slabs import OffsetPoints
+from orthoflow.geometry.threads import in_threads
 from orthoflow.geometry.visibility_kernels import (
     DepthBuffer,
     VoxelGrid,

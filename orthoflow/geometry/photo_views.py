@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera, undistorted
 from orthoflow.geometry.hashed_numbers import cell_states, uniforms
-from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, in_threads, points_on
+from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_on
 from orthoflow.geometry.scenes import Scene
+from orthoflow.geometry.threads import in_runs
 
 # A point is seen when nothing is hit more than this share of its distance before it.
 _SEEN_WITHIN: Final = 2e-4
@@ -59,9 +60,8 @@ class SceneCameras:
         def expose_rows(first: int, last: int) -> None:
             image[first:last] = _exposed(self._rays, near, (first, last), supersample, seed)
 
-        in_threads(
-            expose_rows, camera.height, max(1, RAYS_AT_ONCE // camera.width), cores=self._cores
-        )
+        n_rows = max(1, RAYS_AT_ONCE // camera.width)
+        in_runs(expose_rows, camera.height, n_per_run=n_rows, threads=self._cores)
         return image
 
     def trace(self, camera: ViewingCamera, pixels_photo: NDArray[np.float64]) -> SeenPoints:
@@ -80,7 +80,7 @@ class SceneCameras:
             rectangle[chosen] = hits.rectangle
             points[chosen[hit]] = points_on(centre, ways, hits)[:, hit].T
 
-        in_threads(trace_part, len(pixels), RAYS_AT_ONCE, cores=self._cores)
+        in_runs(trace_part, len(pixels), n_per_run=RAYS_AT_ONCE, threads=self._cores)
         return SeenPoints(points=points, rectangle=rectangle)
 
     def sees(self, camera: ViewingCamera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -113,7 +113,7 @@ class SceneCameras:
             hits = self._rays.cast(starts[part].T, directions[part].T)
             t[part], rectangle[part] = hits.t, hits.rectangle
 
-        in_threads(cast_part, n_rays, RAYS_AT_ONCE, cores=self._cores)
+        in_runs(cast_part, n_rays, n_per_run=RAYS_AT_ONCE, threads=self._cores)
         return Hits(t=t, rectangle=rectangle)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.block_verdict_kernels import parabola
 from orthoflow.geometry.camera_kernels import project_point
-from orthoflow.geometry.compiling import kernel_part
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.ray_kernels import N_LANES
 from orthoflow.geometry.visibility_kernels import (
     BLOCK_CELLS,
@@ -26,7 +26,6 @@ from orthoflow.geometry.visibility_kernels import (
     Relief,
     Sight,
     WallView,
-    compiled,
 )
 
 # How far interpolated places may be off, in photo pixels; `cv2.remap` knows 32nds of them.

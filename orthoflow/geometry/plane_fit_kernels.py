@@ -7,8 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.point_kernels import compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.region_kernels import flattest
 
 # What a fit may change: everything, a normal kept across up, or one kept along up.

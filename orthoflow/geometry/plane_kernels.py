@@ -14,12 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.point_kernels import (
-    BLOCK_POINTS,
-    BlockedPoints,
-    compiled,
-)
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints
 
 # Distances are summed in steps of the fit tolerance over this: half a micrometre at 15 mm, and the
 # squares of 48 million points still fit into 64 bits.

@@ -22,9 +22,9 @@ from orthoflow.geometry.box_kernels import (
     meet_chunk,
     place_along,
 )
-from orthoflow.geometry.compiling import kernel_part
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.plane_kernels import STEPS_PER_TOLERANCE
-from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints
 
 # What a point adds to its cell, packed into one number so that a run of points is one sum: its
 # distance in steps from the lower limit of the fit tolerance, if it is within, itself, and whether

@@ -7,32 +7,20 @@ integer, so the result has the same bits for any number of threads.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple, TypeVar, cast
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.threads import even_parts, in_threads
 
 # Small enough that a block of a scan column is a short piece of one surface, so that its box tells
 # most planes apart; large enough that boxes of 48 million points fit into the processor's cache.
 BLOCK_POINTS: Final = 256
-
-_Kernel = TypeVar("_Kernel", bound=Callable[..., object])
-
-
-def compiled(function: _Kernel) -> _Kernel:
-    """Compile a kernel that lets other threads run; the code is kept between processes.
-
-    Threads come from `each_part`, not from numba's own loops: those take seconds more to compile.
-    """
-    return cast("_Kernel", numba.njit(cache=True, nogil=True)(function))
 
 
 def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> None:
@@ -43,20 +31,8 @@ def each_part(n_items: int, parts: int, task: Callable[[int, slice], None]) -> N
         parts: into how many parts; some may be empty.
         task: gets the number of the part and its piece of the range.
     """
-    n_blocks = -(-n_items // BLOCK_POINTS)
-    edges = [part * n_blocks // parts * BLOCK_POINTS for part in range(parts)] + [n_items]
-    pieces = [slice(first, last) for first, last in itertools.pairwise(edges)]
+    pieces = even_parts(n_items, parts, multiple=BLOCK_POINTS)
     in_threads([partial(task, part, piece) for part, piece in enumerate(pieces)])
-
-
-def in_threads(tasks: Sequence[Callable[[], None]]) -> None:
-    """Run tasks at the same time, each in a thread of its own."""
-    if len(tasks) == 1:
-        tasks[0]()
-        return
-    with ThreadPoolExecutor(len(tasks)) as pool:
-        for future in [pool.submit(task) for task in tasks]:
-            future.result()
 
 
 class Offsets(NamedTuple):

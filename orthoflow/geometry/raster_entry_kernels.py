@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.point_kernels import Offsets, compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.point_kernels import Offsets
 
 # Points handled by one task; an entry slot exists for each, so that tasks never wait for another.
 BLOCK: Final = 8192

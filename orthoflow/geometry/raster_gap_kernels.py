@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.point_kernels import compiled
+from orthoflow.geometry.compiling import compiled
 
 
 @compiled

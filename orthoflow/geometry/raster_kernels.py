@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from typing import Final
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.point_kernels import Offsets, compiled
+from orthoflow.geometry.compiling import compiled, inlined
+from orthoflow.geometry.point_kernels import Offsets
 from orthoflow.geometry.raster_entry_kernels import BLOCK, Entries
 
 # Cells are dealt out to threads in runs of 2^17, some dozens of rows: a scan runs along columns or
@@ -32,7 +32,7 @@ _WINNER_BITS: Final = np.dtype(
 _RUN_OF_VALUES: Final = 1024
 
 
-@numba.njit(cache=True, inline="always")
+@inlined
 def is_own(cell, owners, owner):  # type: ignore[no-untyped-def]  # numba infers the types
     """Tell whether a thread owns a cell; owners are a power of two."""
     return (cell >> _RUN_SHIFT) & (owners - 1) == owner
@@ -79,7 +79,7 @@ def take_values(
                 goal[k] = source[winner.point] if winner.n_points > 0 else nothing
 
 
-@numba.njit(cache=True, inline="always")
+@inlined
 def _rank(depth_bits, square_bits):  # type: ignore[no-untyped-def]  # numba infers the types
     """Order of points as whole numbers: larger depths first, then smaller squares.
 

@@ -5,7 +5,6 @@ Loads numba through `raster_kernels`: methods import it where they run.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Final, TypeVar
@@ -16,10 +15,11 @@ from numpy.typing import NDArray
 from orthoflow.geometry import raster_gap_kernels as gaps
 from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.frames import WallFrame
-from orthoflow.geometry.point_kernels import Offsets, in_threads, read_only
+from orthoflow.geometry.point_kernels import Offsets, read_only
 from orthoflow.geometry.raster_entry_kernels import BLOCK, Entries, Target, project_points
 from orthoflow.geometry.raster_kernels import WINNER
 from orthoflow.geometry.slabs import OffsetPoints, Slab
+from orthoflow.geometry.threads import even_parts, in_threads
 
 # 2^20 points: their entries (16 MB) stay in the processor's cache between the passes, and threads
 # wait for each other seldom.
@@ -82,8 +82,8 @@ def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:
 
 def in_parts(n_items: int, threads: int, task: Callable[[int, int], None]) -> None:
     """Run a task on parts of a range, given by first and end, one part per thread."""
-    edges = [part * n_items // threads for part in range(threads + 1)]
-    in_threads([partial(task, *edge) for edge in itertools.pairwise(edges)])
+    parts = even_parts(n_items, threads)
+    in_threads([partial(task, part.start, part.stop) for part in parts])
 
 
 def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> NDArray[np.void]:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cell_kernels import STEPS_PER_CELL
-from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.point_kernels import compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
 from orthoflow.geometry.voxel_kernels import BRICK_SIDE
 
 # A region's plane is fitted anew whenever it has grown by this share.

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.point_kernels import Offsets, compiled
+from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.point_kernels import Offsets
 
 # A hair outside of a triangle still counts: a centre on an edge belongs to one of two at least.
 _ON_EDGE = 1e-9

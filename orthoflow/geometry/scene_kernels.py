@@ -16,8 +16,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part, typed_kernel_part
-from orthoflow.geometry.point_kernels import compiled
+from orthoflow.geometry.compiling import compiled, kernel_part, typed_kernel_part
 
 Index: TypeAlias = int | np.int64
 

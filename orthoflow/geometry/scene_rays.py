@@ -5,8 +5,6 @@ Import this module where it is used: it loads compiled kernels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -108,13 +106,3 @@ def points_on(
     """Points (3, n) that rays meet; the start where they meet nothing."""
     points: NDArray[np.float64] = starts + np.where(hits.rectangle < 0, 0.0, hits.t) * ways
     return points
-
-
-def in_threads(
-    work: Callable[[int, int], None], n_items: int, n_per_task: int, *, cores: int
-) -> None:
-    """Call `work(first, last)` over runs of items, in several threads."""
-    starts = range(0, n_items, n_per_task)
-    with ThreadPoolExecutor(max(1, cores)) as pool:
-        for task in [pool.submit(work, s, min(n_items, s + n_per_task)) for s in starts]:
-            task.result()

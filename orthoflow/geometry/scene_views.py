@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import WallFrame
-from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, in_threads, points_on
+from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_on
 from orthoflow.geometry.scenes import Scene, Viewers
+from orthoflow.geometry.threads import in_runs
 
 # A point counts as seen when nothing is hit more than this before it, metres.
 _SEEN_WITHIN_M: Final = 0.0005
@@ -107,7 +108,7 @@ def cast(
         found = rays.cast(starts[:, part], ways[:, part])
         hits.t[part], hits.rectangle[part] = found.t, found.rectangle
 
-    in_threads(cast_part, n_rays, RAYS_AT_ONCE, cores=cores)
+    in_runs(cast_part, n_rays, n_per_run=RAYS_AT_ONCE, threads=cores)
     return hits
 
 
@@ -130,7 +131,7 @@ def colours_at(
         part = slice(first, last)
         painted[:, part] = rays.colours(rectangle[part], points[:, part])
 
-    in_threads(paint_part, len(rectangle), RAYS_AT_ONCE, cores=cores)
+    in_runs(paint_part, len(rectangle), n_per_run=RAYS_AT_ONCE, threads=cores)
     return Colours(rgb=painted[:3].T, reflectance=painted[3])
 
 
@@ -184,7 +185,8 @@ def render(scene: Scene, frame: WallFrame, rendering: Rendering) -> TrueOrthoima
         renderer.look_back(cells[chosen], points[:, chosen])
         renderer.colour(cells[renderer.shows_something(cells, rendering.coloured)])
 
-    in_threads(render_cells, frame.width * frame.height, RAYS_AT_ONCE, cores=rendering.cores)
+    n_cells = frame.width * frame.height
+    in_runs(render_cells, n_cells, n_per_run=RAYS_AT_ONCE, threads=rendering.cores)
     return truth
 
 

@@ -13,8 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.point_kernels import compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
 
 # A vote is counted in quarters, so that it can be shared between two bins without a rounding that
 # would not cancel when it is taken back.

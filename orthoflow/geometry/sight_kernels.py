@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.block_verdict_kernels import HIDDEN, UNSURE, judge_block
+from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.plain_block_kernels import (
     WIDE_BLOCKS,
     BlockRoom,
@@ -36,7 +37,6 @@ from orthoflow.geometry.visibility_kernels import (
     Relief,
     Sight,
     WallView,
-    compiled,
 )
 
 # Two depths that stand for a level block lie so far apart.

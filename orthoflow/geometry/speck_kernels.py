@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.point_kernels import compiled
+from orthoflow.geometry.compiling import compiled
 
 # Cells within so many rows and columns are around.
 NEAR_CELLS = 2

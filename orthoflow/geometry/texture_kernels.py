@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part, typed_kernel_part
-from orthoflow.geometry.point_kernels import compiled
+from orthoflow.geometry.compiling import compiled, kernel_part, typed_kernel_part
 
 # The small functions carry explicit types: otherwise each constant they are called with would
 # compile a version of its own, which costs seconds at the first run.

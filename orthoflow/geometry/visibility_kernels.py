@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Final, NamedTuple, TypeVar, cast
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.camera_kernels import project_point
+from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.point_kernels import Offsets
 
 # Side of the square blocks of cells that share one bound on how high rays have to be followed.
@@ -32,14 +31,6 @@ NO_SURFACE: Final = 3
 # Points nearer to the projection centre than this are the camera itself.
 _NEAREST_M: Final = 0.05
 _LARGEST_SPLAT_PX: Final = 24.0
-
-
-_Kernel = TypeVar("_Kernel", bound=Callable[..., object])
-
-
-def compiled(function: _Kernel) -> _Kernel:
-    """Compile a kernel that lets other threads run; divisions do not stop at 0, so lanes fill."""
-    return cast("_Kernel", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 class WallView(NamedTuple):

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints, compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints
 from orthoflow.geometry.shear_kernels import add_sheared, share_out, span_rows, turn_image
 
 BRICK_SIDE: Final = 8

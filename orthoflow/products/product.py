@@ -65,7 +65,7 @@ class Product:
 
     Attributes:
         type_name: identity in workflows, store and record; never changes.
-        encoding_version: raised when the fields change.
+        encoding_version: raised when the fields change; `upgraded` reads the older ones.
         mapped: store contiguous and memory-map on reading (for products of scan size; any product
             of more than 2 GiB is).
         embedded: put the arrays into the record, not only their digest.
@@ -99,12 +99,22 @@ class Product:
         """
         if payload.type_name != cls.type_name:
             raise ProductError(f"expected a {cls.type_name} product, got {payload.type_name}")
-        if payload.encoding_version != cls.encoding_version:
+        if payload.encoding_version > cls.encoding_version:
             raise ProductError(
                 f"{cls.type_name} has encoding version {payload.encoding_version}, this orthoflow "
-                f"reads version {cls.encoding_version}: use the orthoflow that wrote it"
+                f"reads version {cls.encoding_version} and older: use the orthoflow that wrote it"
             )
+        if payload.encoding_version < cls.encoding_version:
+            payload = cls.upgraded(payload)
         return typing.cast("Self", _decode_fields(cls, "", payload.metadata, payload.arrays))
+
+    @classmethod
+    def upgraded(cls, payload: Payload) -> Payload:
+        """Give a payload of an older encoding as the present one has it.
+
+        Fields that are new have defaults; a subclass moves what stood elsewhere before.
+        """
+        return dataclasses.replace(payload, encoding_version=cls.encoding_version)
 
 
 def _encode_fields(owner: object, prefix: str, arrays: dict[str, Array]) -> dict[str, JsonValue]:

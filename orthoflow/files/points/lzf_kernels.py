@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.compiling import compiled
 
-@numba.njit(cache=True)
+
+@compiled
 def decompress_lzf(packed: NDArray[np.uint8], plain: NDArray[np.uint8]) -> int:
     """Unpack LZF data.
 

@@ -6,7 +6,6 @@ the shift, with its standard deviation, that brings both patches together.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.point_kernels import in_threads
+from orthoflow.geometry.threads import even_parts, in_threads
 from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.patch_kernels import Picture, match_patches, search_shifts
 
@@ -82,16 +81,11 @@ def measure(
     in_threads(
         [
             partial(search_shifts, first.values, second.values, places[part], reach, found[part])
-            for part in _parts(len(places), rule.threads)
+            for part in even_parts(len(places), rule.threads)
         ]
     )
     kept = (found[:, 2] >= rule.score_least) & (found[:, 3] >= rule.distinct_least)
     return _refined(first, second, (places[kept], found[kept, :2]), rule)
-
-
-def _parts(count: int, threads: int) -> list[slice]:
-    edges = np.linspace(0, count, max(1, threads) + 1).astype(int).tolist()
-    return [slice(low, high) for low, high in itertools.pairwise(edges)]
 
 
 def _well_known(
@@ -163,7 +157,7 @@ def _matched(
     in_threads(
         [
             partial(match_patches, first, second, places[part], window, rooms, found[part])
-            for part in _parts(len(places), threads)
+            for part in even_parts(len(places), threads)
             for rooms in [tuple(np.empty(shape) for shape in shapes)]
         ]
     )

@@ -14,7 +14,7 @@ from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of
 from orthoflow_plugins.match.pictures import photo_grey, require_intensity
 from orthoflow_plugins.match.versions import opencv_version
-from orthoflow_plugins.match.workers import in_order
+from orthoflow_plugins.match.workers import one_by_one
 
 if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace, TracingRule
@@ -122,7 +122,7 @@ class MatchGuided(Method):
         pieces: list[TiePiece] = []
         traces: dict[str, Trace] = {}
         for nth, (index, found) in enumerate(
-            zip(indices, in_order(trace, indices, ctx.cores), strict=True)
+            zip(indices, one_by_one(trace, indices, ctx.cores), strict=True)
         ):
             name = photos.photos[index].name
             ctx.progress((nth + 1) / (len(indices) + 1), name)
@@ -158,7 +158,7 @@ def _masked(photos: Photos, walls: Walls, oriented: dict[str, Camera], ctx: Step
     """Match as markiewicz2015 did, within the footprint of each oriented photo."""
     from orthoflow_plugins.match.paper import footprints, paper_pieces, paper_wall_features
 
-    on_walls = list(in_order(paper_wall_features, walls.walls, ctx.cores))
+    on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
     pieces: list[TiePiece] = []
     for index, photo in enumerate(photos.photos):
         if photo.name not in oriented:

@@ -9,8 +9,9 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from orthoflow.geometry.compiling import compiled, kernel_part
 
 # Patches are smooth: every second cell suffices to find the whole-cell shift.
 _STRIDE: Final = 2
@@ -32,8 +33,14 @@ class Picture(NamedTuple):
     known: NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
-def search_shifts(first, second, places, reach, found):  # type: ignore[no-untyped-def]  # numba infers the types
+@compiled
+def search_shifts(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    places: NDArray[np.int64],
+    reach: tuple[int, int],
+    found: NDArray[np.float64],
+) -> None:
     """Find the whole-cell shift of each patch with the highest correlation.
 
     Args:
@@ -69,8 +76,14 @@ def search_shifts(first, second, places, reach, found):  # type: ignore[no-untyp
             found[i, 3] = scores[top] - elsewhere
 
 
-@njit(cache=True, nogil=True)
-def _correlation(first, second, at, to, half):  # type: ignore[no-untyped-def]
+@kernel_part
+def _correlation(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    at: tuple[int, int],
+    to: tuple[int, int],
+    half: int,
+) -> float:
     """Correlation of two patches, each channel without its mean."""
     cross, own, other = 0.0, 0.0, 0.0
     for c in range(first.shape[2]):
@@ -91,8 +104,15 @@ def _correlation(first, second, at, to, half):  # type: ignore[no-untyped-def]
     return cross / math.sqrt(max(own * other, 1e-20))
 
 
-@njit(cache=True, nogil=True)
-def match_patches(first, second, places, window, patch, found):  # type: ignore[no-untyped-def]
+@compiled
+def match_patches(
+    first: Picture,
+    second: Picture,
+    places: NDArray[np.int64],
+    window: NDArray[np.float64],
+    patch: tuple[NDArray[np.float64], ...],
+    found: NDArray[np.float64],
+) -> None:
     """Least-squares matching of each patch: shift, a gain, an offset per channel.
 
     Args:
@@ -131,8 +151,14 @@ def match_patches(first, second, places, window, patch, found):  # type: ignore[
                 break
 
 
-@njit(cache=True, nogil=True)
-def _sample(first, second, place, shift, patch):  # type: ignore[no-untyped-def]
+@kernel_part
+def _sample(
+    first: Picture,
+    second: Picture,
+    place: tuple[int, int],
+    shift: tuple[float, float],
+    patch: tuple[NDArray[np.float64], ...],
+) -> float:
     """Resample the second picture around a shifted place; give the sum of the weights."""
     window, weight, lines, moved = patch
     rows, columns, n_channels = second.values.shape
@@ -179,8 +205,8 @@ def _sample(first, second, place, shift, patch):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
-def _cubic(t):  # type: ignore[no-untyped-def]
+@kernel_part
+def _cubic(t: float) -> tuple[float, float, float, float]:
     """Cubic convolution (Keys 1981, a = -1/2): weights of four neighbours at fraction t."""
     return (
         ((-0.5 * t + 1.0) * t - 0.5) * t,
@@ -190,8 +216,14 @@ def _cubic(t):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
-def _improvement(values, place, weight, moved, total):  # type: ignore[no-untyped-def]
+@kernel_part
+def _improvement(
+    values: NDArray[np.float32],
+    place: tuple[int, int],
+    weight: NDArray[np.float64],
+    moved: NDArray[np.float64],
+    total: float,
+) -> tuple[float, float, float, float]:
     """One Gauss-Newton step (down, across), its standard deviation, and the correlation."""
     side, n_channels = weight.shape[0], values.shape[2]
     top, left = place[0] - side // 2, place[1] - side // 2

@@ -17,7 +17,7 @@ from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_
 from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features
 from orthoflow_plugins.match.pictures import photo_grey, require_intensity
 from orthoflow_plugins.match.versions import opencv_version
-from orthoflow_plugins.match.workers import in_order
+from orthoflow_plugins.match.workers import one_by_one
 
 
 class MatchSift(Method):
@@ -108,10 +108,10 @@ class MatchSift(Method):
             return self.Out(ties=_paper(photos, walls, ctx))
         rule = _rule(params)
         ctx.progress(0.0, "key points of the walls")
-        on_walls = list(in_order(lambda wall: wall_features(wall, rule), walls.walls, ctx.cores))
+        on_walls = list(one_by_one(lambda wall: wall_features(wall, rule), walls.walls, ctx.cores))
         pieces: list[TiePiece] = []
         notes: dict[str, JsonValue] = {}
-        paired = in_order(
+        paired = one_by_one(
             lambda photo: pair_photo(photo_grey(photo), on_walls, rule), photos.photos, ctx.cores
         )
         for index, (photo, pairs) in enumerate(zip(photos.photos, paired, strict=True)):
@@ -134,7 +134,7 @@ class MatchSift(Method):
 
 
 def _paper(photos: Photos, walls: Walls, ctx: StepContext) -> Ties:
-    on_walls = list(in_order(paper_wall_features, walls.walls, ctx.cores))
+    on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
     pieces: list[TiePiece] = []
     for index, photo in enumerate(photos.photos):
         ctx.progress(index / len(photos.photos), photo.name)

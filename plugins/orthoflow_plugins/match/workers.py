@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Final, TypeVar
+
+from orthoflow.geometry.threads import in_order
 
 # Each works on a picture of its own, which takes up to a gigabyte.
 _MOST: Final = 4
@@ -18,7 +19,7 @@ def n_workers(cores: int) -> int:
     return max(1, min(cores, _MOST))
 
 
-def in_order(
+def one_by_one(
     function: Callable[[_Item], _Result], items: Sequence[_Item], cores: int
 ) -> Iterator[_Result]:
     """Give a function's results item by item, several computed at once in threads.
@@ -30,5 +31,4 @@ def in_order(
 
     workers = n_workers(cores)
     cv2.setNumThreads(max(1, cores // workers))
-    with ThreadPoolExecutor(workers) as pool:
-        yield from pool.map(function, items)
+    yield from in_order(function, items, threads=workers)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from threading import Lock, local
 from typing import Final
 
@@ -16,6 +16,7 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.layer_kernels import Canvas, hand_over
 from orthoflow.geometry.row_bands import Allocate
 from orthoflow.geometry.sight_kernels import look_at_cells
+from orthoflow.geometry.threads import in_threads
 from orthoflow.geometry.visibility_kernels import (
     OCCLUDED,
     DepthBuffer,
@@ -140,9 +141,7 @@ def paint(
         for row in range(0, rows, TILE_CELLS)
         for column in range(0, columns, TILE_CELLS)
     ]
-    with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(brush.paint_tile, tiles):
-            pass
+    in_threads([partial(brush.paint_tile, tile) for tile in tiles], threads=threads)
     return brush.painting
 
 

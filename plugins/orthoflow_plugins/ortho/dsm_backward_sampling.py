@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.bilinear_kernels import Patch, pack_pixels, sample_bilinear
 from orthoflow.geometry.camera_kernels import project_point
+from orthoflow.geometry.compiling import interpreted
 from orthoflow.geometry.visibility_kernels import Sight, WallView
 
 Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
@@ -64,7 +65,7 @@ def footprint_of(view: WallView, sight: Sight) -> Footprint:
     )
 
 
-_project: Callable[..., tuple[float, float, float]] = project_point.py_func
+_project: Callable[..., tuple[float, float, float]] = interpreted(project_point)
 
 
 def sample(

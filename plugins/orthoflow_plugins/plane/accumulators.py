@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
 from orthoflow.geometry.plane_kernels import vote_lines, vote_points
-from orthoflow.geometry.point_kernels import in_threads
 from orthoflow.geometry.shear_kernels import VOTE_SHARES, vote_image
+from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.plane.candidates import Candidate
 from orthoflow_plugins.plane.leftovers import PlanLeftovers
 from orthoflow_plugins.plane.remainders import Remainder

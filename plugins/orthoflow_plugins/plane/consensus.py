@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
 from orthoflow.geometry.consensus_kernels import consensus_sums, distance_histograms
-from orthoflow.geometry.point_kernels import in_threads
+from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.plane.candidates import Candidate, Family
 from orthoflow_plugins.plane.fitting import refine_plane
 from orthoflow_plugins.plane.footprints import INNER_SHARE

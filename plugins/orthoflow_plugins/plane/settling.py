@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.plane_set_kernels import assign_points, name_labels
-from orthoflow.geometry.point_kernels import BLOCK_POINTS, each_part, in_threads, piece_of
+from orthoflow.geometry.point_kernels import BLOCK_POINTS, each_part, piece_of
+from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.plane.candidates import FoundPlane, Rules
 from orthoflow_plugins.plane.examining import Look, carried, judged
 from orthoflow_plugins.plane.footprints import INNER_SHARE, CellSums, SurfaceRaster, cell_for

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow.geometry.point_kernels import in_threads
 from orthoflow.geometry.shear_kernels import VOTE_SHARES
+from orthoflow.geometry.threads import in_threads
 from orthoflow.geometry.voxel_kernels import best_bins, vote_planes, vote_tilts
 from orthoflow_plugins.plane.accumulators import contrast, parabola
 from orthoflow_plugins.plane.candidates import Candidate, Family

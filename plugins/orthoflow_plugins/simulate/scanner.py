@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, in_threads
+from orthoflow.geometry.scene_rays import RAYS_AT_ONCE
 from orthoflow.geometry.scenes import Scene
+from orthoflow.geometry.threads import in_runs
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.palace import main_wall_axes
 from orthoflow_plugins.simulate.sweeping import MISSED, Errors, Scanned, Scanner, Sweep
@@ -106,11 +107,11 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
     for index, sweep in enumerate(sweeps):
         ctx.progress(0.5 * index / len(sweeps), f"scan {index + 1} of {len(sweeps)}")
         span = slice(int(starts[index]), int(starts[index + 1]))
-        in_threads(
+        in_runs(
             partial(_sweep, scanner, sweep, points.part(span)),
             sweep.n_columns,
-            max(1, RAYS_AT_ONCE // sweep.n_rows),
-            cores=ctx.cores,
+            n_per_run=max(1, RAYS_AT_ONCE // sweep.n_rows),
+            threads=ctx.cores,
         )
         scan[span] = index
         row[span] = np.tile(np.arange(sweep.n_rows, dtype=np.uint32), sweep.n_columns)
@@ -119,7 +120,7 @@ def scan_scene(scene: Scene, sweeps: list[Sweep], errors: Errors, ctx: StepConte
     return _only_hits(Scan(points=points, scan=scan, row=row, column=column, stations=stations))
 
 
-def _sweep(  # the range comes last, as `in_threads` gives it
+def _sweep(  # the range comes last, as `in_runs` gives it
     scanner: Scanner, sweep: Sweep, scanned: Scanned, first: int, last: int
 ) -> None:
     scanner.sweep(sweep, first, last, scanned)

@@ -1,0 +1,63 @@
+"""The one way to share work over threads: fixed parts, and results in the order of the parts.
+
+What a part works on does not hang on the number of threads, or does not show in the result; so
+results have the same bits for any number of them. Compiled kernels let other threads run.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import TypeVar
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = None) -> None:
+    """Run tasks at the same time.
+
+    Args:
+        tasks: what to run.
+        threads: so many at once; None for all of them.
+    """
+    if len(tasks) == 1:
+        tasks[0]()
+        return
+    with ThreadPoolExecutor(len(tasks) if threads is None else max(1, threads)) as pool:
+        for future in [pool.submit(task) for task in tasks]:
+            future.result()
+
+
+def in_order(
+    function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int
+) -> Iterator[_Result]:
+    """Give a function's results item by item, so many computed at once."""
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        yield from pool.map(function, items)
+
+
+def even_parts(n_items: int, n_parts: int, *, multiple: int = 1) -> list[slice]:
+    """Cut a range into parts of about equal length; some may be empty.
+
+    Args:
+        n_items: length of the range.
+        n_parts: how many.
+        multiple: parts begin at multiples of this.
+    """
+    n_units = -(-n_items // multiple)
+    edges = [part * n_units // n_parts * multiple for part in range(n_parts)] + [n_items]
+    return [slice(first, end) for first, end in itertools.pairwise(edges)]
+
+
+def in_runs(
+    work: Callable[[int, int], None], n_items: int, *, n_per_run: int, threads: int
+) -> None:
+    """Call `work(first, end)` over runs of a range, each of the same length."""
+    starts = range(0, n_items, n_per_run)
+    in_threads(
+        [partial(work, first, min(n_items, first + n_per_run)) for first in starts],
+        threads=threads,
+    )
