@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from orthoflow.version import __version__
+
 if TYPE_CHECKING:
     from orthoflow.records import open_run as open_run
 
 __all__ = ["__version__", "open_run"]
-
-__version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> object:

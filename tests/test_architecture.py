@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
+import networkx as nx
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("orthoflow", "plugins/orthoflow_plugins", "provenance/orthoflow_provenance")
+# What the packages lie in.
+FOLDERS = (Path("plugins"), Path("provenance"), Path())
 MODULES = sorted(
     path.relative_to(ROOT) for package in PACKAGES for path in (ROOT / package).rglob("*.py")
 )
@@ -33,13 +38,44 @@ def run_python(code: str) -> str:
 
 
 @pytest.mark.parametrize("module", MODULES, ids=str)
-def test_no_module_is_longer_than_four_hundred_lines(module: Path) -> None:
-    assert len((ROOT / module).read_text().splitlines()) <= 400
+def test_no_module_is_long_enough_for_two_nouns(module: Path) -> None:
+    assert len((ROOT / module).read_text().splitlines()) <= 600
 
 
 @pytest.mark.parametrize("module", MODULES, ids=str)
 def test_every_module_has_a_noun_for_a_name(module: Path) -> None:
     assert not FORBIDDEN_NAMES & {module.stem, *module.parts}
+
+
+def test_imports_run_in_no_circle() -> None:
+    names = {name_of(module): module for module in MODULES}
+    imports = {
+        name: imported_modules(ast.parse((ROOT / module).read_text()), names.keys()) - {name}
+        for name, module in names.items()
+    }
+    circles = [
+        circle
+        for circle in nx.strongly_connected_components(nx.DiGraph(imports))
+        if len(circle) > 1
+    ]
+    assert circles == []
+
+
+def name_of(module: Path) -> str:
+    parts = module.relative_to(next(p for p in FOLDERS if module.is_relative_to(p))).with_suffix("")
+    return ".".join(part for part in parts.parts if part != "__init__")
+
+
+def imported_modules(tree: ast.Module, known: Collection[str]) -> set[str]:
+    """Modules of ours that a module imports, anywhere in it."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            submodules = {f"{node.module}.{alias.name}" for alias in node.names} & set(known)
+            found |= submodules or {node.module}
+    return found & set(known)
 
 
 def test_loading_every_method_loads_no_heavy_or_slow_library() -> None:

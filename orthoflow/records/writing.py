@@ -23,12 +23,12 @@ from orthoflow_provenance.model import (
 from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.writer import write_record
 
-from orthoflow import __version__
 from orthoflow.engine.durability import sync_folder, writing_to
 from orthoflow.errors import InputError, StoreError
 from orthoflow.products.product import JsonValue
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import RECORD_FILE, Run
+from orthoflow.version import __version__
 from orthoflow.workflow import resolved_json
 
 if TYPE_CHECKING:
