@@ -6,7 +6,7 @@ Light on purpose: nothing here loads numpy, pydantic or networkx until a method 
 from __future__ import annotations
 
 from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.discovery import discover_catalog
+from orthoflow.catalog.discovery import NAME_PATTERN, discover_catalog
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.catalog.entries import (
     BrokenPlugin,
@@ -18,6 +18,7 @@ from orthoflow.catalog.entries import (
 from orthoflow.catalog.suggestions import did_you_mean, nearest
 
 __all__ = [
+    "NAME_PATTERN",
     "BrokenPlugin",
     "Catalog",
     "DistributionInfo",

@@ -31,9 +31,9 @@ from orthoflow.sdk.hooks import (
     ProductSpec,
 )
 
-_NAME: Final = r"[a-z][a-z0-9_-]{0,31}"
-_METHOD_ID: Final = re.compile(rf"{_NAME}\.{_NAME}")
-_KIND: Final = re.compile(_NAME)
+NAME_PATTERN: Final = r"[a-z][a-z0-9_-]{0,31}"
+_METHOD_ID: Final = re.compile(rf"{NAME_PATTERN}\.{NAME_PATTERN}")
+_KIND: Final = re.compile(NAME_PATTERN)
 _TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 _Spec = TypeVar("_Spec", MethodSpec, KindSpec, ProductSpec)
@@ -125,7 +125,7 @@ def _check_spelling(announcement: _Announcement) -> None:
         *(product.type_name for product in announcement.products),
     ]:
         if not _KIND.fullmatch(name):
-            raise PluginError(f"kind and product names must match {_NAME}, got {name!r}")
+            raise PluginError(f"kind and product names must match {NAME_PATTERN}, got {name!r}")
     for target in [
         *(method.target for method in announcement.methods),
         *(product.target for product in announcement.products),
