@@ -12,15 +12,16 @@ from typing import Final, Generic, TypeVar
 
 import pluggy
 
-from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.distributions import DistributionInfo, describe_distribution
-from orthoflow.catalog.entries import (
+from orthoflow.catalog.catalog import (
     BrokenPlugin,
+    Catalog,
     EntryState,
     KindEntry,
     MethodEntry,
     ProductEntry,
 )
+from orthoflow.catalog.distributions import DistributionInfo, describe_distribution
+from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import (
     ENTRY_POINT_GROUP,
@@ -138,12 +139,11 @@ def _check_spelling(announcement: _Announcement) -> None:
 def _describe_failure(
     entry: EntryPoint, distribution: DistributionInfo, error: BaseException
 ) -> BrokenPlugin:
-    text = " ".join(str(error).split())
     return BrokenPlugin(
         entry_point=entry.name,
         module=entry.value,
         distribution=distribution,
-        error=f"{type(error).__name__}: {text}" if text else type(error).__name__,
+        error=describe_error(error),
         traceback="".join(traceback.format_exception(error)),
     )
 
