@@ -21,7 +21,7 @@ from orthoflow.workflow.format import (
 )
 from orthoflow.workflow.positions import Position, Table, Value, join
 from orthoflow.workflow.problems import ProblemLog
-from orthoflow.workflow.shapes import AnyText
+from orthoflow.workflow.shapes import TEXT
 from orthoflow.workflow.steps import DraftStep
 
 Assignment: TypeAlias = dict[str, str]
@@ -128,7 +128,7 @@ def _read_assignment(
                 f"with variants: {', '.join(varied) or 'none'}",
             )
             continue
-        text = AnyText().read(entry.value, here, log)
+        text = TEXT.read(entry.value, here, log)
         names = [variant.call.name for variant in step.variants]
         if text in names:
             chosen[entry.key] = text

@@ -15,12 +15,14 @@ from typing import Final, Literal
 
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.shapes import (
+    ASSIGNMENT,
+    FLAG,
     INPUTS_NAME,
-    AnyText,
-    Assignment,
+    PARAMETERS,
+    TEXT,
+    TIME_SPAN,
     Assignments,
     Choice,
-    Flag,
     FormatVersion,
     InputSource,
     Key,
@@ -28,12 +30,10 @@ from orthoflow.workflow.shapes import (
     Name,
     Named,
     OneOrMore,
-    Parameters,
     Reference,
     Section,
-    TimeSpan,
-    WholeNumber,
     Wires,
+    whole_number,
 )
 
 FORMAT: Final = 1
@@ -44,14 +44,14 @@ Design = Literal["product", "one-at-a-time"]
 
 FILES: Final = Key(
     name="files",
-    shape=OneOrMore(AnyText()),
+    shape=OneOrMore(TEXT),
     meaning="A file, a folder, a pattern, or a list of them; relative paths start at the workflow.",
     example="data/photos/*.jpg",
     default="none, until `--input NAME=PATH` gives some",
 )
 OPTIONAL: Final = Key(
     name="optional",
-    shape=Flag(),
+    shape=FLAG,
     meaning="The workflow can do without it: steps that need it are skipped when it is absent.",
     example="true",
     default="`false`",
@@ -88,7 +88,7 @@ class WorkflowInputSpec:
 
 USE: Final = Key(
     name="use",
-    shape=AnyText(),
+    shape=TEXT,
     meaning="The method, as `kind.method`; `orthoflow plugins list` names all.",
     example="plane.hough2d",
     default="refused, unless the step has variants",
@@ -102,21 +102,21 @@ IN: Final = Key(
 )
 PARAMS: Final = Key(
     name="params",
-    shape=Parameters(),
+    shape=PARAMETERS,
     meaning="Parameters of the method; `orthoflow plugins show ID` lists them.",
     example="{gsd_m: 0.003}",
     default="the method's defaults",
 )
 REPEAT: Final = Key(
     name="repeat",
-    shape=WholeNumber(minimum=1),
+    shape=whole_number(minimum=1),
     meaning="How many runs with seeds of their own; what follows takes the first.",
     example="10",
     default="1",
 )
 CORES: Final = Key(
     name="cores",
-    shape=WholeNumber(minimum=1),
+    shape=whole_number(minimum=1),
     meaning="How many cores the method may use.",
     example="2",
     default="all, shared by the steps that run at the same time",
@@ -133,7 +133,7 @@ RESOURCES: Final = Key(
 )
 TIMEOUT: Final = Key(
     name="timeout",
-    shape=TimeSpan(),
+    shape=TIME_SPAN,
     meaning="The step is ended, and has failed, when it takes longer.",
     example="30min",
     default="no limit",
@@ -166,7 +166,7 @@ STEP: Final = Section(
     about="A step calls one method, or has variants that each call one; then what belongs to a "
     "call stands in the variants. A step that lacks a required product, because optional data are "
     "absent, is skipped with all that needs it. Steps may stand in any order.",
-    keys=(USE, IN, PARAMS, REPEAT, RESOURCES, TIMEOUT, UNLESS, VARIANTS),
+    keys=(USE, IN, *CALL.keys[1:], UNLESS, VARIANTS),
 )
 
 
@@ -237,7 +237,7 @@ DESIGN: Final[Key[Design]] = Key(
 )
 BASELINE: Final = Key(
     name="baseline",
-    shape=Assignment(),
+    shape=ASSIGNMENT,
     meaning="The variant of each step that others are compared with, and that a report shows.",
     example="{plane: hough2d, orient: bundle}",
     default="the first variant of each step",
@@ -299,7 +299,7 @@ NAME: Final = Key(
 )
 SEED: Final = Key(
     name="seed",
-    shape=WholeNumber(minimum=0),
+    shape=whole_number(minimum=0),
     meaning="Root of all seeds: one follows from it, the method and the repeat.",
     example="1729",
     default="0",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
@@ -18,6 +18,7 @@ from orthoflow.workflow.positions import (
     Entry,
     Listing,
     Position,
+    Scalar,
     Table,
     Text,
     Value,
@@ -90,6 +91,82 @@ class Key(Generic[Found]):
 # Single values ------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, kw_only=True)
+class Single(Generic[Found]):
+    """A single value: text, number, true or false.
+
+    Attributes:
+        words: what is expected.
+        says: the same as JSON Schema.
+        take: gives what a value stands for; None for what does not fit.
+        noun: one of it, e.g. `text`.
+    """
+
+    words: str
+    says: Schema
+    take: Callable[[Scalar], Found | None]
+    noun: str = "value"
+
+    def schema(self) -> Schema:
+        """Give what it says."""
+        return self.says
+
+    def read(self, value: Value, path: str, log: ProblemLog) -> Found | None:
+        """Take the value."""
+        found = self.take(value.value) if isinstance(value, Text) else None
+        if found is None:
+            _report_unexpected(self, value, path, log)
+        return found
+
+
+TEXT: Final[Single[str]] = Single(
+    words="a text",
+    says={"type": "string", "minLength": 1},
+    take=lambda raw: raw if isinstance(raw, str) and raw else None,
+    noun="text",
+)
+FLAG: Final[Single[bool]] = Single(
+    words="true or false",
+    says={"type": "boolean"},
+    take=lambda raw: raw if isinstance(raw, bool) else None,
+)
+
+
+def whole_number(*, minimum: int) -> Single[int]:
+    """A whole number from `minimum` on; `true` is none."""
+    return Single(
+        words=f"a whole number from {minimum} on",
+        says={"type": "integer", "minimum": minimum},
+        take=lambda raw: raw if type(raw) is int and raw >= minimum else None,
+    )
+
+
+def seconds_in(raw: Scalar) -> float | None:
+    """Give the seconds that a time stands for, e.g. 1800 for `30min`; None when it is no time.
+
+    >>> seconds_in("30min"), seconds_in(2), seconds_in("soon")
+    (1800.0, 2.0, None)
+    """
+    seconds = 0.0
+    if isinstance(raw, int | float) and not isinstance(raw, bool):
+        seconds = float(raw)
+    elif isinstance(raw, str) and (match := _TIME.fullmatch(raw)):
+        seconds = float(match[1]) * _SECONDS[match[2]]
+    return seconds if math.isfinite(seconds) and seconds > 0 else None
+
+
+TIME_SPAN: Final[Single[float]] = Single(
+    words="a time such as 90s, 30min, 2h or a number of seconds above 0",
+    says={
+        "oneOf": [
+            {"type": "number", "exclusiveMinimum": 0},
+            {"type": "string", "pattern": r"^\d+(\.\d+)? *(s|min|h)$"},
+        ]
+    },
+    take=seconds_in,
+)
+
+
 @dataclass(frozen=True)
 class FormatVersion:
     """The version of the format; newer ones than `current` are refused."""
@@ -107,7 +184,7 @@ class FormatVersion:
 
     def read(self, value: Value, path: str, log: ProblemLog) -> int | None:
         """Take a version, whether it can be read or not."""
-        version = WholeNumber(minimum=1).read(value, path, log)
+        version = whole_number(minimum=1).read(value, path, log)
         if version is not None and version > self.current:
             log.add(
                 value.position,
@@ -116,24 +193,6 @@ class FormatVersion:
                 f"upgrade orthoflow",
             )
         return version
-
-
-class AnyText:
-    """A text that is not empty."""
-
-    words = "a text"
-    noun = "text"
-
-    def schema(self) -> Schema:
-        """At least one character."""
-        return {"type": "string", "minLength": 1}
-
-    def read(self, value: Value, path: str, log: ProblemLog) -> str | None:
-        """Take a text."""
-        if isinstance(value, Text) and isinstance(value.value, str) and value.value:
-            return value.value
-        _report_unexpected(self, value, path, log)
-        return None
 
 
 class Name:
@@ -147,7 +206,7 @@ class Name:
 
     def read(self, value: Value, path: str, log: ProblemLog) -> str | None:
         """Take a name."""
-        name = AnyText().read(value, path, log)
+        name = TEXT.read(value, path, log)
         return name if name and check_name(name, value.position, path, log) else None
 
 
@@ -157,46 +216,6 @@ def check_name(name: str, position: Position, path: str, log: ProblemLog) -> boo
         return True
     log.add(position, path, f"{name!r} cannot be a name: {_NAME_RULE}")
     return False
-
-
-@dataclass(frozen=True, kw_only=True)
-class WholeNumber:
-    """A whole number from `minimum` on."""
-
-    minimum: int
-
-    @property
-    def words(self) -> str:
-        """The number with its limit."""
-        return f"a whole number from {self.minimum} on"
-
-    def schema(self) -> Schema:
-        """An integer with its limit."""
-        return {"type": "integer", "minimum": self.minimum}
-
-    def read(self, value: Value, path: str, log: ProblemLog) -> int | None:
-        """Take a whole number; `true` is none."""
-        if isinstance(value, Text) and type(value.value) is int and value.value >= self.minimum:
-            return value.value
-        _report_unexpected(self, value, path, log)
-        return None
-
-
-class Flag:
-    """True or false."""
-
-    words = "true or false"
-
-    def schema(self) -> Schema:
-        """A boolean."""
-        return {"type": "boolean"}
-
-    def read(self, value: Value, path: str, log: ProblemLog) -> bool | None:
-        """Take true or false; the texts "yes" and "no" are neither."""
-        if isinstance(value, Text) and isinstance(value.value, bool):
-            return value.value
-        _report_unexpected(self, value, path, log)
-        return None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +241,7 @@ class Choice(Generic[Word]):
 
     def read(self, value: Value, path: str, log: ProblemLog) -> Word | None:
         """Take one of the words."""
-        text = AnyText().read(value, path, log)
+        text = TEXT.read(value, path, log)
         if text is None:
             return None
         for word in self.choices:
@@ -234,34 +253,6 @@ class Choice(Generic[Word]):
             f"unknown {self.noun} {text}{did_you_mean(text, self.choices)}; known: "
             f"{', '.join(self.choices)}",
         )
-        return None
-
-
-class TimeSpan:
-    """A time, read as seconds."""
-
-    words = "a time such as 90s, 30min, 2h or a number of seconds above 0"
-
-    def schema(self) -> Schema:
-        """A number, or a text with a unit."""
-        return {
-            "oneOf": [
-                {"type": "number", "exclusiveMinimum": 0},
-                {"type": "string", "pattern": r"^\d+(\.\d+)? *(s|min|h)$"},
-            ]
-        }
-
-    def read(self, value: Value, path: str, log: ProblemLog) -> float | None:
-        """Take a time; seconds."""
-        raw = value.value if isinstance(value, Text) else None
-        seconds = 0.0
-        if isinstance(raw, int | float) and not isinstance(raw, bool):
-            seconds = float(raw)
-        elif isinstance(raw, str) and (match := _TIME.fullmatch(raw)):
-            seconds = float(match[1]) * _SECONDS[match[2]]
-        if math.isfinite(seconds) and seconds > 0:
-            return seconds
-        _report_unexpected(self, value, path, log)
         return None
 
 
@@ -429,7 +420,7 @@ class MetricPatterns:
 
     def read(self, value: Value, path: str, log: ProblemLog) -> tuple[str, ...]:
         """Take all patterns that name a step and a metric."""
-        patterns = OneOrMore(AnyText()).read(value, path, log)
+        patterns = OneOrMore(TEXT).read(value, path, log)
         fitting = tuple(text for text in patterns if re.fullmatch(r"[^.]+\..+", text, re.DOTALL))
         for text in patterns:
             if text not in fitting:
@@ -438,18 +429,29 @@ class MetricPatterns:
         return fitting
 
 
-class Assignment:
-    """A mapping from steps to one of their variants each; which there are is not asked here."""
+@dataclass(frozen=True, kw_only=True)
+class OpenTable:
+    """A mapping whose keys the workflow does not know; it is taken as it is written.
 
-    words = "a mapping step: variant"
+    Attributes:
+        words: what is expected.
+        values: what may stand behind each key, as JSON Schema.
+    """
+
+    words: str
+    values: Schema = field(default_factory=dict)
 
     def schema(self) -> Schema:
-        """Texts by any keys."""
-        return {"type": "object", "additionalProperties": AnyText().schema()}
+        """An object of any keys."""
+        return {"type": "object", "additionalProperties": self.values or True}
 
     def read(self, value: Value, path: str, log: ProblemLog) -> Table | None:
-        """Take the mapping as it is written."""
+        """Take the mapping."""
         return read_table(value, path, log)
+
+
+ASSIGNMENT: Final = OpenTable(words="a mapping step: variant", values=TEXT.schema())
+PARAMETERS: Final = OpenTable(words="a mapping of the method's own parameters")
 
 
 class Assignments:
@@ -459,7 +461,7 @@ class Assignments:
 
     def schema(self) -> Schema:
         """Assignments of at least one step."""
-        return {"type": "array", "items": {**Assignment().schema(), "minProperties": 1}}
+        return {"type": "array", "items": {**ASSIGNMENT.schema(), "minProperties": 1}}
 
     def read(self, value: Value, path: str, log: ProblemLog) -> tuple[tuple[str, Table], ...]:
         """Take the mappings as they are written, each behind its path."""
@@ -469,26 +471,12 @@ class Assignments:
         tables: list[tuple[str, Table]] = []
         for index, item in enumerate(value.items):
             here = f"{path}[{index}]"
-            table = Assignment().read(item, here, log)
+            table = ASSIGNMENT.read(item, here, log)
             if table is not None and not table.entries:
                 log.add(item.position, here, "expected step: variant, got an empty mapping")
             elif table is not None:
                 tables.append((here, table))
         return tuple(tables)
-
-
-class Parameters:
-    """Parameters of a method, which knows itself what they may be."""
-
-    words = "a mapping of the method's own parameters"
-
-    def schema(self) -> Schema:
-        """Any mapping."""
-        return {"type": "object"}
-
-    def read(self, value: Value, path: str, log: ProblemLog) -> Table | None:
-        """Take the mapping as it is written."""
-        return read_table(value, path, log)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -519,8 +507,10 @@ class Section:
     def read(self, value: Value, path: str, log: ProblemLog) -> Table | None:
         """Take the mapping; keys that are unknown or missing are reported."""
         table = read_table(value, path, log)
+        if table is None:
+            return None
         known = {key.name: key for key in self.keys}
-        for entry in table or ():
+        for entry in table:
             if entry.key not in known:
                 log.add(
                     entry.position,
@@ -528,8 +518,8 @@ class Section:
                     f"unknown key {entry.key}{did_you_mean(entry.key, known)}; "
                     f"known here: {', '.join(known)}",
                 )
-        for key in self.keys if table else ():
-            if key.missing and table and table.get(key.name) is None:
+        for key in self.keys:
+            if key.missing and table.get(key.name) is None:
                 log.add(table.position, join(path, key.name), key.missing)
         return table
 
