@@ -33,6 +33,7 @@ _NAME_RULE: Final = (
 )
 _REFERENCE: Final = re.compile(rf"({NAME_PATTERN})\.({NAME_PATTERN})")
 _TIME: Final = re.compile(r"(\d+(?:\.\d+)?) *(s|min|h)")
+_METRIC: Final = re.compile(r"[^.]+\..+", re.DOTALL)
 _SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 Schema: TypeAlias = dict[str, JsonValue]
@@ -160,7 +161,7 @@ TIME_SPAN: Final[Single[float]] = Single(
     says={
         "oneOf": [
             {"type": "number", "exclusiveMinimum": 0},
-            {"type": "string", "pattern": r"^\d+(\.\d+)? *(s|min|h)$"},
+            {"type": "string", "pattern": f"^{_TIME.pattern}$"},
         ]
     },
     take=seconds_in,
@@ -415,13 +416,13 @@ class MetricPatterns:
 
     def schema(self) -> Schema:
         """Texts with a dot inside."""
-        pattern: Schema = {"type": "string", "pattern": r"^[^.]+\..+$"}
+        pattern: Schema = {"type": "string", "pattern": f"^{_METRIC.pattern}$"}
         return {"oneOf": [pattern, {"type": "array", "minItems": 1, "items": pattern}]}
 
     def read(self, value: Value, path: str, log: ProblemLog) -> tuple[str, ...]:
         """Take all patterns that name a step and a metric."""
         patterns = OneOrMore(TEXT).read(value, path, log)
-        fitting = tuple(text for text in patterns if re.fullmatch(r"[^.]+\..+", text, re.DOTALL))
+        fitting = tuple(text for text in patterns if _METRIC.fullmatch(text))
         for text in patterns:
             if text not in fitting:
                 message = f"expected step.metric, * allowed, got {text}"
