@@ -5,19 +5,20 @@ Light on purpose: nothing here loads numpy, pydantic or networkx until a method 
 
 from __future__ import annotations
 
-from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.discovery import discover_catalog
-from orthoflow.catalog.distributions import DistributionInfo
-from orthoflow.catalog.entries import (
+from orthoflow.catalog.catalog import (
     BrokenPlugin,
+    Catalog,
     EntryState,
     KindEntry,
     MethodEntry,
     ProductEntry,
 )
-from orthoflow.catalog.suggestions import did_you_mean, nearest
+from orthoflow.catalog.discovery import NAME_PATTERN, discover_catalog
+from orthoflow.catalog.distributions import DistributionInfo
+from orthoflow.catalog.wording import did_you_mean, nearest
 
 __all__ = [
+    "NAME_PATTERN",
     "BrokenPlugin",
     "Catalog",
     "DistributionInfo",

@@ -12,15 +12,16 @@ from typing import Final, Generic, TypeVar
 
 import pluggy
 
-from orthoflow.catalog.catalog import Catalog
-from orthoflow.catalog.distributions import DistributionInfo, describe_distribution
-from orthoflow.catalog.entries import (
+from orthoflow.catalog.catalog import (
     BrokenPlugin,
+    Catalog,
     EntryState,
     KindEntry,
     MethodEntry,
     ProductEntry,
 )
+from orthoflow.catalog.distributions import DistributionInfo, describe_distribution
+from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import (
     ENTRY_POINT_GROUP,
@@ -31,9 +32,9 @@ from orthoflow.sdk.hooks import (
     ProductSpec,
 )
 
-_NAME: Final = r"[a-z][a-z0-9_-]{0,31}"
-_METHOD_ID: Final = re.compile(rf"{_NAME}\.{_NAME}")
-_KIND: Final = re.compile(_NAME)
+NAME_PATTERN: Final = r"[a-z][a-z0-9_-]{0,31}"
+_METHOD_ID: Final = re.compile(rf"{NAME_PATTERN}\.{NAME_PATTERN}")
+_KIND: Final = re.compile(NAME_PATTERN)
 _TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 _Spec = TypeVar("_Spec", MethodSpec, KindSpec, ProductSpec)
@@ -125,7 +126,7 @@ def _check_spelling(announcement: _Announcement) -> None:
         *(product.type_name for product in announcement.products),
     ]:
         if not _KIND.fullmatch(name):
-            raise PluginError(f"kind and product names must match {_NAME}, got {name!r}")
+            raise PluginError(f"kind and product names must match {NAME_PATTERN}, got {name!r}")
     for target in [
         *(method.target for method in announcement.methods),
         *(product.target for product in announcement.products),
@@ -138,12 +139,11 @@ def _check_spelling(announcement: _Announcement) -> None:
 def _describe_failure(
     entry: EntryPoint, distribution: DistributionInfo, error: BaseException
 ) -> BrokenPlugin:
-    text = " ".join(str(error).split())
     return BrokenPlugin(
         entry_point=entry.name,
         module=entry.value,
         distribution=distribution,
-        error=f"{type(error).__name__}: {text}" if text else type(error).__name__,
+        error=describe_error(error),
         traceback="".join(traceback.format_exception(error)),
     )
 

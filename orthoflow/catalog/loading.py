@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
+from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import KindSpec, MethodSpec
 from orthoflow.sdk.methods import (
@@ -43,12 +44,6 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
             f"{describe_error(error)}; install what is missing, or another version of "
             f"{distribution.name}"
         ) from error
-
-
-def describe_error(error: BaseException) -> str:
-    """Class and message of an error in one line."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def load_method(

@@ -7,8 +7,9 @@ from dataclasses import asdict
 
 import click
 
+from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Command, json_option, workflow_arguments
+from orthoflow.cli.options import json_option, workflow_arguments
 from orthoflow.cli.tables import counted, echo_json
 from orthoflow.errors import OrthoflowError
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
+from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Command, json_option, store_option
-from orthoflow.cli.product_tables import echo_distances
-from orthoflow.cli.tables import counted, echo_json, echo_table, number
+from orthoflow.cli.options import json_option, store_option
+from orthoflow.cli.tables import counted, echo_distances, echo_json, echo_table, number
 
 if TYPE_CHECKING:
     from orthoflow.records import (

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
+from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Command, input_option, store_option
+from orthoflow.cli.options import input_option, store_option
 from orthoflow.cli.tables import counted
 from orthoflow.errors import ArgumentError, StoreError
 

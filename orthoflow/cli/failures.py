@@ -9,7 +9,7 @@ from typing import Final
 
 import click
 
-from orthoflow.cli.sessions import Session
+from orthoflow.cli.commands import Session
 from orthoflow.cli.tables import counted
 from orthoflow.errors import OrthoflowError
 

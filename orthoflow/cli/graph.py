@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import click
 
+from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Command, workflow_arguments
+from orthoflow.cli.options import workflow_arguments
 
 
 @click.command(cls=Command)

@@ -8,21 +8,10 @@ from typing import Any, Final, TypeVar
 
 import click
 
-from orthoflow.cli.sessions import debug_parameter
-
 # Any: click decorates functions as well as commands.
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any] | click.Command)
 
 DEFAULT_STORE: Final = Path(".orthoflow")
-
-
-class Command(click.Command):
-    """A command that also takes `--debug` behind its name."""
-
-    # Any: click passes its own keyword arguments through.
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.params.append(debug_parameter())
 
 
 def workflow_arguments(command: _Decorated) -> _Decorated:

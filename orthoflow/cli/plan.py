@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import (
-    Command,
     json_option,
     selection_options,
     store_option,

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Final
+import inspect
+import json
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.cli.lazy_groups import LazyCommand, LazyGroup
+from orthoflow.catalog import Catalog, DistributionInfo, MethodEntry, discover_catalog
+from orthoflow.cli.commands import Command, LazyCommand, LazyGroup
+from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD, EXIT_PLUGIN_MISSING
+from orthoflow.cli.options import json_option
+from orthoflow.cli.tables import counted, echo_json, echo_table
+from orthoflow.errors import PluginError
+
+if TYPE_CHECKING:
+    from orthoflow.sdk import Method, MethodParams, Ports
 
 _SUMMARIES: Final = {
     "list": "List every method, and what is wrong with plugins that do not load.",
@@ -14,18 +27,408 @@ _SUMMARIES: Final = {
     "new": "Write a plugin of your own that works and passes its tests at once.",
     "check": "Run the conformance suite on a method.",
 }
-
-
-def _nothing_before_the_command() -> None:
-    """Satisfy click, which wants a callback on a group."""
+_UNITS: Final = {
+    "_m": "m",
+    "_mm": "mm",
+    "_px": "px",
+    "_deg": "deg",
+    "_rad": "rad",
+    "_s": "s",
+    "_mib": "MiB",
+    "_grey": "grey levels",
+    "_cells": "cells",
+    "_share": "1",
+}
 
 
 plugins: Final[click.Command] = LazyGroup(
     name="plugins",
-    callback=_nothing_before_the_command,
     help="List, show and check methods, and write a plugin of your own.",
     lazy={
-        name: LazyCommand(target=f"orthoflow.cli.plugins_{name}:plugins_{name}", summary=summary)
+        name: LazyCommand(target=f"orthoflow.cli.plugins:plugins_{name}", summary=summary)
         for name, summary in _SUMMARIES.items()
     },
 )
+
+
+@click.command("list", cls=Command)
+@json_option
+def plugins_list(*, as_json: bool) -> int:
+    """List methods, kinds and product types, and what is wrong with plugins that do not load.
+
+    `orthoflow plugins show PLUGIN` prints the traceback of one that is broken.
+    """
+    catalog = discover_catalog()
+    if as_json:
+        echo_json(_catalog_json(catalog))
+        return EXIT_GOOD
+    echo_table(
+        ("method", "state", "distribution", "summary"),
+        [
+            (
+                entry.spec.id,
+                entry.state,
+                f"{entry.distribution.name} {entry.distribution.version}",
+                entry.spec.summary,
+            )
+            for entry in catalog.methods.values()
+        ],
+    )
+    click.echo()
+    echo_table(
+        ("kind", "takes", "gives", "distribution", "summary"),
+        [
+            (
+                name,
+                "its methods' own" if kind.spec.is_source else ", ".join(kind.spec.inputs),
+                "its methods' own" if kind.spec.is_source else ", ".join(kind.spec.outputs),
+                str(kind.distribution),
+                kind.spec.summary,
+            )
+            for name, kind in catalog.kinds.items()
+        ],
+    )
+    click.echo()
+    echo_table(
+        ("product", "distribution", "summary"),
+        [
+            (name, str(product.distribution), product.spec.summary)
+            for name, product in catalog.products.items()
+        ],
+    )
+    problems = [
+        *(kind.problem for kind in catalog.kinds.values() if kind.problem),
+        *(product.problem for product in catalog.products.values() if product.problem),
+        *(entry.problem for entry in catalog.methods.values() if entry.problem),
+        *(str(broken) for broken in catalog.broken),
+    ]
+    if problems:
+        click.echo("\nwhat is wrong:")
+    for problem in problems:
+        click.echo(f"- {problem}")
+    for broken in catalog.broken:
+        click.echo(f"`orthoflow plugins show {broken.entry_point}` prints its traceback")
+    return EXIT_GOOD
+
+
+def _catalog_json(catalog: Catalog) -> dict[str, object]:
+    return {
+        "methods": [
+            {
+                "id": entry.spec.id,
+                "kind": entry.spec.kind,
+                "state": entry.state,
+                "problem": entry.problem,
+                "distribution": entry.distribution.name,
+                "version": entry.distribution.version,
+                "summary": entry.spec.summary,
+            }
+            for entry in catalog.methods.values()
+        ],
+        "kinds": [
+            {
+                "name": name,
+                "state": kind.state,
+                "problem": kind.problem,
+                "distribution": kind.distribution.name,
+                "version": kind.distribution.version,
+                "in": dict(kind.spec.inputs),
+                "out": dict(kind.spec.outputs),
+                "is_source": kind.spec.is_source,
+                "summary": kind.spec.summary,
+            }
+            for name, kind in catalog.kinds.items()
+        ],
+        "products": [
+            {
+                "name": name,
+                "state": product.state,
+                "problem": product.problem,
+                "distribution": product.distribution.name,
+                "version": product.distribution.version,
+                "summary": product.spec.summary,
+            }
+            for name, product in catalog.products.items()
+        ],
+        "broken": [
+            {
+                "plugin": broken.entry_point,
+                "module": broken.module,
+                "distribution": broken.distribution.name,
+                "version": broken.distribution.version,
+                "problem": str(broken),
+                "traceback": broken.traceback,
+            }
+            for broken in catalog.broken
+        ],
+    }
+
+
+@click.command("show", cls=Command)
+@click.argument("method_id", metavar="ID")
+@json_option
+def plugins_show(method_id: str, *, as_json: bool) -> int:
+    """Show the method ID, e.g. plane.hough2d: parameters, ports, origin and citations.
+
+    Of a plugin or a method that does not load, its traceback is shown; ID may then be the plugin's
+    name. Ends with 2 when there is no such method, with 4 when it cannot be used.
+    """
+    catalog = discover_catalog()
+    if failure := _failure(catalog, method_id):
+        _print_failure(failure, as_json=as_json)
+        return EXIT_PLUGIN_MISSING
+    entry = catalog.method(method_id)
+    if as_json:
+        echo_json(_method_json(entry))
+    else:
+        _print_method(entry, entry.load())
+    return EXIT_GOOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Failure:
+    """Why a plugin or a method cannot be loaded.
+
+    Attributes:
+        problem: one sentence.
+        distribution: who brought it.
+        target: the module or class that does not load.
+        traceback: of what it raised; empty when it loads and breaks a rule.
+    """
+
+    problem: str
+    distribution: DistributionInfo
+    target: str
+    traceback: str
+
+
+def _failure(catalog: Catalog, name: str) -> _Failure | None:
+    entry = catalog.methods.get(name)
+    if entry is None:
+        for broken in catalog.broken:
+            if name in (broken.entry_point, broken.distribution.name) or broken.mentions(name):
+                return _Failure(
+                    problem=str(broken),
+                    distribution=broken.distribution,
+                    target=broken.module,
+                    traceback=broken.traceback,
+                )
+    elif entry.state == "fine":
+        try:
+            entry.load()
+        except PluginError as error:
+            cause = error.__cause__
+            return _Failure(
+                problem=str(error),
+                distribution=entry.distribution,
+                target=entry.spec.target,
+                traceback="".join(traceback.format_exception(cause)) if cause else "",
+            )
+    return None
+
+
+def _method_json(entry: MethodEntry) -> dict[str, object]:
+    """Give everything that a method says of itself, as JSON.
+
+    Raises:
+        PluginError: the method's class cannot be loaded.
+    """
+    method = entry.load()
+    return {
+        "id": entry.spec.id,
+        "summary": entry.spec.summary,
+        "description": _docstring(method),
+        "state": entry.state,
+        "distribution": entry.distribution.name,
+        "version": entry.distribution.version,
+        "target": entry.spec.target,
+        "result_version": method.result_version,
+        "determinism": method.determinism,
+        "citations": list(method.citations),
+        "params": [
+            {"name": name, "type": type_, "default": default, "unit": unit, "description": text}
+            for name, type_, default, unit, text in _parameters(method.Params)
+        ],
+        "in": [
+            {"port": port, "product": type_name, "required": required}
+            for port, type_name, required in _ports(method.In)
+        ],
+        "out": [{"port": port, "product": type_name} for port, type_name, _ in _ports(method.Out)],
+    }
+
+
+def _print_failure(failure: _Failure, *, as_json: bool) -> None:
+    if as_json:
+        echo_json(
+            {
+                "state": "broken",
+                "problem": failure.problem,
+                "distribution": failure.distribution.name,
+                "version": failure.distribution.version,
+                "target": failure.target,
+                "traceback": failure.traceback,
+            }
+        )
+        return
+    click.echo(f"{failure.problem}\n")
+    click.echo(f"distribution  {failure.distribution}")
+    click.echo("state         broken")
+    click.echo(f"from          {failure.target}")
+    if failure.traceback:
+        click.echo(f"\n{failure.traceback.rstrip()}")
+
+
+def _print_method(entry: MethodEntry, method: type[Method]) -> None:
+    click.echo(f"{entry.spec.id}: {entry.spec.summary}\n")
+    if text := _docstring(method):
+        click.echo(f"{text}\n")
+    click.echo(f"distribution  {entry.distribution.name} {entry.distribution.version}")
+    click.echo(f"state         {entry.state}")
+    click.echo(f"class         {entry.spec.target}")
+    click.echo(f"determinism   {method.determinism}, result version {method.result_version}")
+    for citation in method.citations:
+        click.echo(f"citation      {citation}")
+    click.echo()
+    ports = [
+        *(
+            ("in", port, type_name, "" if required else "optional")
+            for port, type_name, required in _ports(method.In)
+        ),
+        *(("out", port, type_name, "") for port, type_name, _ in _ports(method.Out)),
+    ]
+    echo_table(("port", "name", "product", ""), ports)
+    parameters = _parameters(method.Params)
+    click.echo("" if parameters else "\nno parameters")
+    echo_table(
+        ("parameter", "type", "default", "unit", "description"),
+        [
+            (name, type_, json.dumps(default) if default is not None else "", unit, text)
+            for name, type_, default, unit, text in parameters
+        ],
+    )
+
+
+def _docstring(method: type[Method]) -> str:
+    return inspect.cleandoc(method.__doc__ or "")
+
+
+def _parameters(params: type[MethodParams]) -> list[tuple[str, str, object, str, str]]:
+    schema = params.model_json_schema()
+    definitions = schema.get("$defs", {})
+    return [
+        (
+            name,
+            _type_text(field, definitions),
+            field.get("default"),
+            _unit_of(name),
+            field.get("description", ""),
+        )
+        for name, field in schema.get("properties", {}).items()
+    ]
+
+
+def _type_text(field: dict[str, object], definitions: dict[str, dict[str, object]]) -> str:
+    """Say the type of a JSON Schema node in a few words, with its limits."""
+    reference = field.get("$ref")
+    if isinstance(reference, str):
+        return _type_text(definitions.get(reference.rpartition("/")[2], {}), definitions)
+    if isinstance(choices := field.get("enum"), list):
+        return " | ".join(str(choice) for choice in choices)
+    if "const" in field:
+        return str(field["const"])
+    if isinstance(alternatives := field.get("anyOf"), list):
+        return " | ".join(_type_text(option, definitions) for option in alternatives)
+    if field.get("type") == "array":
+        items = field.get("items")
+        inner = f" of {_type_text(items, definitions)}" if isinstance(items, dict) else ""
+        return f"array{inner}"
+    limits = "".join(
+        f" {sign} {field[key]}"
+        for key, sign in (
+            ("minimum", ">="),
+            ("exclusiveMinimum", ">"),
+            ("maximum", "<="),
+            ("exclusiveMaximum", "<"),
+        )
+        if key in field
+    )
+    return f"{field.get('type', 'any')}{limits}"
+
+
+def _unit_of(name: str) -> str:
+    suffix = "_" + name.rpartition("_")[2] if "_" in name else ""
+    return _UNITS.get(suffix, "")
+
+
+def _ports(ports: type[Ports]) -> list[tuple[str, str, bool]]:
+    from orthoflow.sdk import port_specs
+
+    return [(spec.name, spec.type_name, spec.required) for spec in port_specs(ports).values()]
+
+
+@click.command("new", cls=Command)
+@click.argument("name", metavar="NAME")
+@click.option("--kind", required=True, metavar="KIND", help="Kind of the method, e.g. plane.")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    default=Path(),
+    help="Where the folder NAME is made; the current one unless given.",
+)
+@click.option("--author", default="The authors", help="For pyproject, licence and citation.")
+@click.option("--licence", default="MIT", show_default=True, help="SPDX expression.")
+@click.option("--citation", default="", help="Where the method comes from: DOI, title or URL.")
+@json_option
+def plugins_new(name: str, *, as_json: bool, folder: Path, **said: str) -> int:
+    """Write a plugin NAME that installs, works and passes its tests at once, e.g. my-detector.
+
+    `orthoflow plugins list` names the kinds. The method does something simple; put your own in its
+    place.
+    """
+    from orthoflow.scaffold import Project, write_project
+
+    project = Project(name=name, **said)
+    written = write_project(project, folder, discover_catalog())
+    if as_json:
+        echo_json({"method": project.method_id, "files": [str(path) for path in written]})
+        return EXIT_GOOD
+    for path in written:
+        click.echo(f"wrote {path}")
+    click.echo(
+        f"\nnext: cd {name}, python -m pip install -e '.[test]', python -m pytest; "
+        f"then write {project.package}/method.py"
+    )
+    return EXIT_GOOD
+
+
+@click.command("check", cls=Command)
+@click.argument("method_id", metavar="ID")
+@click.option(
+    "--golden",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="File of golden digests; a method that it lacks is added.",
+)
+@json_option
+def plugins_check(method_id: str, *, as_json: bool, golden: Path | None) -> int:
+    """Run every conformance check that applies to the method ID, and say which rules it breaks.
+
+    Ends with 1 when a rule is broken, with 4 when the method cannot be loaded.
+    """
+    from orthoflow.testing import conformance_cases
+
+    results: list[dict[str, str]] = []
+    for case in conformance_cases(method_id, golden=golden):
+        problem = case.problem()
+        state = "broken" if problem else "kept"
+        results.append(
+            {"check": case.check.name, "state": state, "rule": case.check.rule, "problem": problem}
+        )
+        if not as_json:
+            click.echo(f"{state:7} {case.check.name}: {problem or case.check.rule}")
+    n_broken = sum(result["state"] == "broken" for result in results)
+    if as_json:
+        echo_json({"method": method_id, "checks": results})
+    else:
+        kept = f"{method_id} keeps {counted(len(results) - n_broken, 'rule')}"
+        click.echo(f"\n{kept}, breaks {n_broken}" if n_broken else f"\n{kept}")
+    return EXIT_CELL_FAILED if n_broken else EXIT_GOOD

@@ -9,9 +9,8 @@ from typing import Any, Final, NoReturn
 import click
 
 from orthoflow import __version__
+from orthoflow.cli.commands import LazyCommand, LazyGroup, Session, debug_parameter
 from orthoflow.cli.failures import explain, silence_stdout
-from orthoflow.cli.lazy_groups import LazyCommand, LazyGroup
-from orthoflow.cli.sessions import Session, debug_parameter
 
 _SUMMARIES: Final = {
     "check": "Say everything that is wrong with a workflow file.",
@@ -78,10 +77,6 @@ def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> 
         ctx.exit()
 
 
-def _nothing_before_the_command() -> None:
-    """Satisfy click, which wants a callback on the root."""
-
-
 program: Final = Program(
     name="orthoflow",
     lazy={
@@ -89,7 +84,6 @@ program: Final = Program(
         for name, summary in _SUMMARIES.items()
     },
     help=_HELP,
-    callback=_nothing_before_the_command,
     params=[
         click.Option(
             ["--version"],

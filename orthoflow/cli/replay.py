@@ -12,18 +12,16 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
+from orthoflow.cli.commands import Command, current_session
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import (
     DEFAULT_STORE,
-    Command,
     execution_options,
     input_option,
     json_option,
     output_option,
 )
-from orthoflow.cli.product_tables import echo_distances
-from orthoflow.cli.sessions import current_session
-from orthoflow.cli.tables import echo_json
+from orthoflow.cli.tables import echo_distances, echo_json
 from orthoflow.errors import CancelledStepError
 
 if TYPE_CHECKING:

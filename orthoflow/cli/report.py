@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
+from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Command
 from orthoflow.errors import ArgumentError
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import click
 
+from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Command, json_option
+from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import echo_json
 
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from orthoflow.cli.commands import Command
 from orthoflow.cli.diagnosis import LIBRARIES
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import Command, json_option
+from orthoflow.cli.options import json_option
 from orthoflow.cli.tables import counted, duration, echo_json, echo_table, number, size
 
 if TYPE_CHECKING:

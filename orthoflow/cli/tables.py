@@ -1,11 +1,19 @@
-"""Plain text on the terminal: aligned tables, times and sizes in words, JSON."""
+"""Plain text on the terminal: aligned tables, distances of products, quantities in words, JSON."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
 
 import click
+
+if TYPE_CHECKING:
+    from orthoflow.records import Distance, ProductDistance
+
+_VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")
+# How people say the units of tolerances; `1` stands for plain numbers.
+_UNITS: Final = {"grey": " grey levels", "1": ""}
 
 
 def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -31,6 +39,40 @@ def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[st
 def echo_json(value: object) -> None:
     """Print a value as JSON, readable and stable."""
     click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def echo_distances(distances: Sequence[ProductDistance]) -> None:
+    """Print a row per product, the reasons of what differs, and how many there are of each."""
+    echo_table(
+        ("product", "type", "verdict", "largest differences"),
+        [
+            (
+                f"{item.cell}.{item.port}",
+                item.type_name,
+                item.verdict,
+                ", ".join(_distance_text(distance) for distance in item.distances),
+            )
+            for item in distances
+        ],
+    )
+    for item in distances:
+        if item.reason:
+            click.echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
+    click.echo(verdict_counts(distances))
+
+
+def verdict_counts(distances: Sequence[ProductDistance]) -> str:
+    """Say how many products there are of each verdict.
+
+    >>> verdict_counts(())
+    '0 products'
+    """
+    counts = [
+        f"{count} {verdict}"
+        for verdict in _VERDICTS
+        if (count := sum(item.verdict == verdict for item in distances))
+    ]
+    return ": ".join([counted(len(distances), "product"), *([", ".join(counts)] if counts else [])])
 
 
 def duration(seconds: float) -> str:
@@ -80,3 +122,9 @@ def counted(count: int, noun: str) -> str:
     ('1 cell', '3 cells')
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def _distance_text(distance: Distance) -> str:
+    unit = _UNITS.get(distance.unit, f" {distance.unit}")
+    largest = "not comparable" if distance.largest is None else f"{number(distance.largest)}{unit}"
+    return f"{largest} ({distance.field})"

@@ -19,8 +19,7 @@ from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import InputError, PluginError, StoreError
 from orthoflow.products.input_files import InputFiles
 from orthoflow.workflow import Workflow, check_step_names, resolve_input_files
-from orthoflow.workflow.cells import Cell, CellOutput
-from orthoflow.workflow.selection import Selection, select_cells
+from orthoflow.workflow.cells import Cell, CellOutput, Selection, select_cells
 
 CellPlan = Literal["cached", "will run", "unknown yet", "skipped"]
 

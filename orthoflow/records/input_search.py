@@ -11,12 +11,10 @@ from typing import Final
 from orthoflow_provenance.model import RecordedFile, RecordedInput
 
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.workflow import Workflow, resolve_input_files
-from orthoflow.workflow.input_options import override_inputs, read_input_options
-from orthoflow.workflow.model import WorkflowInputSpec
+from orthoflow.workflow import Workflow, WorkflowInputSpec, resolve_input_files
+from orthoflow.workflow.inputs import override_inputs, read_input_options, read_inputs
 from orthoflow.workflow.positions import Table, read_yaml
 from orthoflow.workflow.problems import ProblemLog
-from orthoflow.workflow.sections import read_inputs
 
 # A run lies in runs/<name>/ below the folder of its workflow, when nobody says otherwise.
 _FOLDERS_ABOVE: Final = 3

@@ -19,8 +19,7 @@ from orthoflow.errors import PluginError, RecordError, WorkflowError
 from orthoflow.records.input_search import find_inputs
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
-from orthoflow.workflow import Cell, CellOutput, Workflow, WorkflowInput
-from orthoflow.workflow.model import StepVariant
+from orthoflow.workflow import Cell, CellOutput, StepVariant, Workflow, WorkflowInput
 from orthoflow.workflow.resolved import workflow_from_resolved
 
 if TYPE_CHECKING:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
-from orthoflow.workflow.document import load_workflow, resolved_json
-from orthoflow.workflow.expansion import derive_seed, expand_cells
-from orthoflow.workflow.inputs import present_inputs, resolve_input_files
-from orthoflow.workflow.model import (
+from orthoflow.workflow.cells import (
+    Cell,
+    CellOutput,
+    Selection,
+    WorkflowInput,
+    check_step_names,
+    derive_seed,
+    expand_cells,
+)
+from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.format import (
     Comparison,
-    Reference,
     StepVariant,
     Workflow,
     WorkflowInputSpec,
     WorkflowStep,
 )
+from orthoflow.workflow.inputs import present_inputs, resolve_input_files
 from orthoflow.workflow.problems import (
     InvalidArgumentsError,
     InvalidWorkflowError,
@@ -21,8 +27,9 @@ from orthoflow.workflow.problems import (
     UnusablePluginError,
 )
 from orthoflow.workflow.recipes import shipped_workflow, shipped_workflows
+from orthoflow.workflow.resolved import resolved_json
 from orthoflow.workflow.schema import workflow_schema
-from orthoflow.workflow.selection import Selection, check_step_names
+from orthoflow.workflow.shapes import Reference
 from orthoflow.workflow.wiring import topological_steps
 
 __all__ = [

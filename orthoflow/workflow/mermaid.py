@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from orthoflow.catalog import Catalog
+from orthoflow.workflow.format import StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.methods import describe_method
-from orthoflow.workflow.model import INPUTS, StepVariant, Workflow, WorkflowStep
+from orthoflow.workflow.shapes import INPUTS_NAME
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,7 @@ def mermaid(workflow: Workflow, catalog: Catalog) -> str:
             labels.setdefault(wire, []).append(label)
         for wire, ports in labels.items():
             source_name, _, port = wire.source.partition(".")
-            source = inputs[port] if source_name == INPUTS else steps[source_name]
+            source = inputs[port] if source_name == INPUTS_NAME else steps[source_name]
             arrow = "-->" if wire.is_certain else "-.->"
             text = ", ".join(dict.fromkeys(ports))
             lines.append(f'    {source} {arrow}|"{text}"| {steps[wire.target]}')
@@ -70,5 +71,5 @@ def _wires(step: WorkflowStep, catalog: Catalog) -> Iterator[tuple[_Wire, str]]:
             wire = _Wire(source=source, target=step.name, is_certain=len(references) == 1)
             yield wire, port
     if step.unless:
-        wire = _Wire(source=f"{INPUTS}.{step.unless}", target=step.name, is_certain=False)
+        wire = _Wire(source=f"{INPUTS_NAME}.{step.unless}", target=step.name, is_certain=False)
         yield wire, "unless"

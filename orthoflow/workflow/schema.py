@@ -1,25 +1,13 @@
-"""JSON Schema of the workflow file, with the parameters of every installed method folded in."""
+"""JSON Schema of the workflow file: the format, with the parameters of every installed method."""
 
 from __future__ import annotations
-
-from typing import Final, TypeAlias
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import PluginError
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.document import FORMAT
-from orthoflow.workflow.expectations import NAME
+from orthoflow.workflow.format import CALL, FILE, PARAMS, STEP, STEPS, USE, VARIANTS
 from orthoflow.workflow.methods import MethodInfo, describe_method
-
-Schema: TypeAlias = dict[str, JsonValue]
-
-_NAME: Final[Schema] = {"type": "string", "pattern": f"^{NAME}$"}
-_NAMED: Final[Schema] = {"pattern": f"^{NAME}$"}
-_REFERENCE: Final[Schema] = {
-    "type": "string",
-    "pattern": rf"^{NAME}\.{NAME}$",
-    "description": "step.port or inputs.name",
-}
+from orthoflow.workflow.shapes import Schema
 
 
 def workflow_schema(catalog: Catalog) -> Schema:
@@ -29,53 +17,18 @@ def workflow_schema(catalog: Catalog) -> Schema:
     cannot know whether references and ports fit together.
     """
     methods = _loadable(catalog)
-    calls: Schema = {f"call.{info.id}": _call(info) for info in methods}
-    definitions: Schema = {f"params.{info.id}": _params(info) for info in methods}
-    anywhere = [info.id for info in methods]
-    varied = [info.id for info in methods if not info.is_source]
+    steps: Schema = {
+        **STEPS.schema(),
+        "additionalProperties": {"$ref": "#/$defs/step"},
+    }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "orthoflow workflow",
-        "type": "object",
-        "required": ["orthoflow", "steps"],
-        "additionalProperties": False,
-        "properties": {
-            "orthoflow": {"const": FORMAT, "description": "version of this format"},
-            "name": _NAME,
-            "seed": {"type": "integer", "minimum": 0, "description": "root of all seeds"},
-            "inputs": {
-                "type": "object",
-                "propertyNames": _NAMED,
-                "additionalProperties": _input(),
-            },
-            "steps": {
-                "type": "object",
-                "minProperties": 1,
-                "propertyNames": {**_NAMED, "not": {"const": "inputs"}},
-                "additionalProperties": {"$ref": "#/$defs/step"},
-            },
-            "compare": _compare(),
-        },
+        **_with_properties(FILE.schema(), {STEPS.name: steps}),
         "$defs": {
-            **definitions,
-            **calls,
-            "step": {
-                "type": "object",
-                "oneOf": [{"required": ["use"]}, {"required": ["variants"]}],
-                "properties": {
-                    "in": _wires(),
-                    "unless": {**_REFERENCE, "description": "skipped when this input is given"},
-                    "variants": {
-                        "type": "object",
-                        "minProperties": 1,
-                        "propertyNames": _NAMED,
-                        "additionalProperties": _one_of(varied),
-                    },
-                    **_call_properties(anywhere),
-                },
-                "allOf": [_params_rule(name) for name in anywhere],
-                "additionalProperties": False,
-            },
+            **{f"params.{info.id}": _params(info) for info in methods},
+            **{f"call.{info.id}": _call(info) for info in methods},
+            "step": _step(methods),
         },
     }
 
@@ -99,87 +52,45 @@ def _params(info: MethodInfo) -> Schema:
 
 
 def _call(info: MethodInfo) -> Schema:
-    return {
-        "type": "object",
-        "required": ["use"],
-        "properties": {
-            **_call_properties([info.id]),
-            "params": {"$ref": f"#/$defs/params.{info.id}"},
-        },
-        "additionalProperties": False,
+    own: Schema = {
+        USE.name: _use([info]),
+        PARAMS.name: {"$ref": f"#/$defs/params.{info.id}"},
     }
+    return {**_with_properties(CALL.schema(), own), "required": [USE.name]}
 
 
-def _call_properties(methods: list[str]) -> Schema:
-    names: list[JsonValue] = [*methods]
+def _step(methods: list[MethodInfo]) -> Schema:
+    calls: list[JsonValue] = [
+        {"$ref": f"#/$defs/call.{info.id}"} for info in methods if not info.is_source
+    ]
+    variants: Schema = {**VARIANTS.schema(), "additionalProperties": {"oneOf": calls}}
+    own: Schema = {USE.name: _use(methods), VARIANTS.name: variants}
     return {
-        "use": {"enum": names, "description": "kind.method"},
-        "params": {"type": "object"},
-        "repeat": {"type": "integer", "minimum": 1, "description": "runs with seeds of their own"},
-        "resources": {
-            "type": "object",
-            "properties": {"cores": {"type": "integer", "minimum": 1}},
-            "additionalProperties": False,
-        },
-        "timeout": {
-            "description": "90s, 30min, 2h, or seconds",
-            "oneOf": [
-                {"type": "number", "exclusiveMinimum": 0},
-                {"type": "string", "pattern": r"^\d+(\.\d+)? *(s|min|h)$"},
-            ],
-        },
-    }
-
-
-def _params_rule(method_id: str) -> Schema:
-    return {
-        "if": {"required": ["use"], "properties": {"use": {"const": method_id}}},
-        "then": {"properties": {"params": {"$ref": f"#/$defs/params.{method_id}"}}},
-    }
-
-
-def _one_of(methods: list[str]) -> Schema:
-    return {"oneOf": [{"$ref": f"#/$defs/call.{name}"} for name in methods]}
-
-
-def _wires() -> Schema:
-    return {
-        "type": "object",
-        "description": "port: where its product comes from; of a list, the first that is present",
-        "additionalProperties": {
-            "oneOf": [_REFERENCE, {"type": "array", "minItems": 1, "items": _REFERENCE}]
-        },
-    }
-
-
-def _input() -> Schema:
-    text: Schema = {"type": "string", "minLength": 1}
-    return {
-        "type": "object",
-        "properties": {
-            "files": {
-                "description": "a file, a folder, a pattern, or a list of them",
-                "oneOf": [text, {"type": "array", "minItems": 1, "items": text}],
+        **_with_properties(STEP.schema(), own),
+        # With variants, what belongs to a call stands in each of them.
+        "oneOf": [
+            {"required": [USE.name], "properties": {VARIANTS.name: False}},
+            {
+                "required": [VARIANTS.name],
+                "properties": {key.name: False for key in CALL.keys},
             },
-            "optional": {"type": "boolean"},
-        },
-        "additionalProperties": False,
+        ],
+        "allOf": [_params_rule(info) for info in methods],
     }
 
 
-def _compare() -> Schema:
-    assignment: Schema = {
-        "type": "object",
-        "description": "step: variant",
-        "additionalProperties": {"type": "string"},
-    }
+def _with_properties(schema: Schema, properties: Schema) -> Schema:
+    """Put what is known of some properties in the place of what the format says."""
+    known = schema["properties"]
+    return {**schema, "properties": {**known, **properties} if isinstance(known, dict) else {}}
+
+
+def _use(methods: list[MethodInfo]) -> Schema:
+    return {"enum": [info.id for info in methods], "description": USE.meaning}
+
+
+def _params_rule(info: MethodInfo) -> Schema:
     return {
-        "type": "object",
-        "properties": {
-            "design": {"enum": ["product", "one-at-a-time"]},
-            "baseline": assignment,
-            "exclude": {"type": "array", "items": {**assignment, "minProperties": 1}},
-            "metrics": {"type": "array", "items": {"type": "string", "pattern": r"^[^.]+\..+$"}},
-        },
-        "additionalProperties": False,
+        "if": {"required": [USE.name], "properties": {USE.name: {"const": info.id}}},
+        "then": {"properties": {PARAMS.name: {"$ref": f"#/$defs/params.{info.id}"}}},
     }

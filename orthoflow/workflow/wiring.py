@@ -9,10 +9,11 @@ import networkx as nx
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.catalog.loading import FILES
-from orthoflow.workflow.model import INPUTS, WorkflowStep
+from orthoflow.workflow.format import WorkflowStep
 from orthoflow.workflow.positions import join
 from orthoflow.workflow.problems import ProblemLog
-from orthoflow.workflow.steps import DraftPort, DraftReference, DraftStep
+from orthoflow.workflow.shapes import INPUTS_NAME, PlacedPort, PlacedReference
+from orthoflow.workflow.steps import DraftStep
 
 
 def step_graph(steps: Mapping[str, WorkflowStep]) -> nx.DiGraph[str]:
@@ -74,49 +75,49 @@ class _Checker:
                 self._report_unknown_port(step, port, accepted)
                 self._check_references(port.references, None)
         if step.unless is not None:
-            self._check_unless(step.unless)
+            self._type_of(step.unless)
         self._check_required(step)
 
     def _report_unknown_port(
-        self, step: DraftStep, port: DraftPort, accepted: Collection[str]
+        self, step: DraftStep, port: PlacedPort, accepted: Collection[str]
     ) -> None:
         self.log.add(
             port.position,
             port.path,
-            f"{step.variants[0].method} has no input port {port.name}"
+            f"{step.variants[0].call.method} has no input port {port.name}"
             f"{did_you_mean(port.name, accepted)}; it has {', '.join(accepted) or 'none'}",
         )
 
-    def _check_references(self, drafts: Sequence[DraftReference], wanted: str | None) -> None:
-        for draft in drafts:
-            found = self._type_of(draft)
+    def _check_references(self, references: Sequence[PlacedReference], wanted: str | None) -> None:
+        for placed in references:
+            found = self._type_of(placed)
             if found is not None and wanted is not None and found != wanted:
                 self.log.add(
-                    draft.position,
-                    draft.path,
-                    f"expected {_article(wanted)}, but {draft.reference} gives {_article(found)}",
+                    placed.position,
+                    placed.path,
+                    f"expected {_article(wanted)}, but {placed.reference} gives {_article(found)}",
                 )
 
-    def _type_of(self, draft: DraftReference) -> str | None:
+    def _type_of(self, placed: PlacedReference) -> str | None:
         """Product type behind a reference; None when unknown, which is reported."""
-        reference = draft.reference
+        reference = placed.reference
         if reference.is_input:
             if reference.name in self.input_names:
                 return FILES
             known = ", ".join(self.input_names) or "none"
             self.log.add(
-                draft.position,
-                draft.path,
+                placed.position,
+                placed.path,
                 f"there is no input {reference.name}"
                 f"{did_you_mean(reference.name, self.input_names)}; inputs: {known}",
             )
             return None
         if reference.source not in self.step_names:
             self.log.add(
-                draft.position,
-                draft.path,
+                placed.position,
+                placed.path,
                 f"there is no step {reference.source}"
-                f"{did_you_mean(reference.source, [*self.step_names, INPUTS])}; steps: "
+                f"{did_you_mean(reference.source, [*self.step_names, INPUTS_NAME])}; steps: "
                 f"{', '.join(self.step_names)}",
             )
             return None
@@ -126,22 +127,12 @@ class _Checker:
             return None
         if reference.name not in given:
             self.log.add(
-                draft.position,
-                draft.path,
+                placed.position,
+                placed.path,
                 f"step {reference.source} has no output port {reference.name}"
                 f"{did_you_mean(reference.name, given)}; it has {', '.join(given)}",
             )
         return given.get(reference.name)
-
-    def _check_unless(self, draft: DraftReference) -> None:
-        if draft.reference.is_input:
-            self._type_of(draft)
-        else:
-            self.log.add(
-                draft.position,
-                draft.path,
-                f"expected an input such as inputs.scan, got {draft.reference}",
-            )
 
     def _check_required(self, step: DraftStep) -> None:
         wired = {port.name for port in step.ports}
@@ -153,8 +144,8 @@ class _Checker:
                     self.log.add(
                         variant.position,
                         join(step.path, "in"),
-                        f"{variant.method} needs port {port.name}, {_article(port.type_name)}, "
-                        f"which is not wired",
+                        f"{variant.call.method} needs port {port.name}, "
+                        f"{_article(port.type_name)}, which is not wired",
                     )
 
 
@@ -183,13 +174,13 @@ def _article(type_name: str) -> str:
 
 
 def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
-    wires: dict[tuple[str, str], DraftReference] = {}
+    wires: dict[tuple[str, str], PlacedReference] = {}
     names = {step.name for step in steps}
     for step in steps:
         for port in step.ports:
-            for draft in port.references:
-                if draft.reference.source in names:
-                    wires.setdefault((draft.reference.source, step.name), draft)
+            for placed in port.references:
+                if placed.reference.source in names:
+                    wires.setdefault((placed.reference.source, step.name), placed)
     graph: nx.DiGraph[str] = nx.DiGraph(list(wires))
     for members in nx.strongly_connected_components(graph):
         inside = graph.subgraph(members)
@@ -198,9 +189,9 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
         edges = [(str(edge[0]), str(edge[1])) for edge in nx.find_cycle(inside)]
         first = min(range(len(edges)), key=lambda index: wires[edges[index]].position)
         edges = edges[first:] + edges[:first]
-        drafts = [wires[edge] for edge in edges]
+        chain = [wires[edge] for edge in edges]
         listed = ", ".join(
-            f"{edge[1]} takes {draft.reference} (line {draft.position.line})"
-            for edge, draft in zip(edges, drafts, strict=True)
+            f"{edge[1]} takes {placed.reference} (line {placed.position.line})"
+            for edge, placed in zip(edges, chain, strict=True)
         )
-        log.add(drafts[0].position, drafts[0].path, f"the steps form a cycle: {listed}")
+        log.add(chain[0].position, chain[0].path, f"the steps form a cycle: {listed}")

@@ -14,9 +14,8 @@ from click.testing import CliRunner, Result
 
 from orthoflow import __version__
 from orthoflow.cli import program
-from orthoflow.cli.lazy_groups import LazyCommand
+from orthoflow.cli.commands import LazyCommand, current_session
 from orthoflow.cli.program import Program
-from orthoflow.cli.sessions import current_session
 from orthoflow.errors import (
     ArgumentError,
     CancelledStepError,

@@ -10,7 +10,7 @@ import pytest
 from orthoflow.engine import RunOptions, RunOutcome, Store, execute, plan_run
 from orthoflow.records import Run, write_run
 from orthoflow.records.replaying import plan_replay
-from orthoflow.workflow import expand_cells, expansion, load_workflow
+from orthoflow.workflow import cells, expand_cells, load_workflow
 from tests.engine_world import World, toy_world
 
 WORKFLOW = """
@@ -58,7 +58,7 @@ def test_seeds_of_repeats_are_those_of_the_record(
     run = recorded(world)
     assert len({cell.seed for cell in run.record.cells if cell.step == "draw"}) == 3
     # A later version that derives seeds in another way would draw other numbers.
-    monkeypatch.setattr(expansion, "derive_seed", lambda *_: 0)
+    monkeypatch.setattr(cells, "derive_seed", lambda *_: 0)
     store = Store(world.folder / "fresh")
     replay = plan_replay(run, world.catalog(), store, INLINE)
     outcome = execute(replay.plan, world.folder / "again", store)

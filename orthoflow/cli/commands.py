@@ -1,13 +1,51 @@
-"""Command groups that know their commands by name and load a command's module on first use."""
+"""What commands are made of: groups that load them on first use, `--debug`, one call's session."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, Final
 
 import click
+
+DEBUG_HELP: Final = "Show tracebacks of errors."
+
+
+@dataclass
+class Session:
+    """State of one call of the program.
+
+    Attributes:
+        debug: show tracebacks.
+        resume_hint: sentence that says how to go on after Ctrl-C, empty when there is no way.
+    """
+
+    debug: bool = False
+    resume_hint: str = ""
+
+
+def current_session() -> Session:
+    """Give the session of the running command; one of its own for a command called alone."""
+    context = click.get_current_context(silent=True)
+    session = context.find_object(Session) if context is not None else None
+    return session if session is not None else Session()
+
+
+def debug_parameter() -> click.Option:
+    """Give the `--debug` flag, which may stand before or behind the name of a command."""
+    return click.Option(
+        ["--debug"], is_flag=True, expose_value=False, callback=_keep_debug, help=DEBUG_HELP
+    )
+
+
+class Command(click.Command):
+    """A command that also takes `--debug` behind its name."""
+
+    # Any: click passes its own keyword arguments through.
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.params.append(debug_parameter())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +74,8 @@ class LazyGroup(click.Group):
 
     # Any: click passes its own keyword arguments through.
     def __init__(self, *args: Any, lazy: Mapping[str, LazyCommand], **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+        # Click wants a callback on a group, though nothing happens before its command.
+        super().__init__(*args, **{"callback": lambda: None, **kwargs})
         self._lazy = dict(lazy)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -55,15 +94,21 @@ class LazyGroup(click.Group):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            import difflib
+            from orthoflow.catalog import nearest
 
-            close = difflib.get_close_matches(args[0], self._lazy, n=1)
-            if not close or "did you mean" in error.message.lower():
+            near = nearest(args[0], self._lazy)
+            if not near or "did you mean" in error.message.lower():
                 raise
-            sentence = f"{error.message.rstrip('.')}; did you mean {close[0]!r}?"
+            sentence = f"{error.message.rstrip('.')}; did you mean {near!r}?"
             raise click.UsageError(sentence, ctx) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands from the table."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, entry.summary) for name, entry in self._lazy.items()])
+
+
+def _keep_debug(ctx: click.Context, _param: click.Parameter, value: bool) -> None:  # noqa: FBT001
+    session = ctx.find_object(Session)
+    if session is not None and value:
+        session.debug = True

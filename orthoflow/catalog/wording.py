@@ -1,4 +1,4 @@
-"""Did-you-mean: the known name that a misspelt one most likely stands for."""
+"""Pieces of messages: the name that a misspelt one most likely stands for, an error in one line."""
 
 from __future__ import annotations
 
@@ -26,3 +26,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """
     near = nearest(name, known)
     return f" (did you mean {near}?)" if near else ""
+
+
+def describe_error(error: BaseException) -> str:
+    r"""Give class and message of an error in one line.
+
+    >>> describe_error(ValueError("no such\n  plane"))
+    'ValueError: no such plane'
+    """
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

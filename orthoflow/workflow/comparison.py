@@ -1,0 +1,164 @@
+"""The comparison of a workflow: reading it, and which combinations of variants it consists of."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final, TypeAlias
+
+from orthoflow.catalog import did_you_mean
+from orthoflow.errors import WorkflowError
+from orthoflow.workflow.format import (
+    BASELINE,
+    COMPARE,
+    COMPARISON,
+    DESIGN,
+    EXCLUDE,
+    METRICS,
+    Comparison,
+    Workflow,
+)
+from orthoflow.workflow.positions import Position, Table, Value, join
+from orthoflow.workflow.problems import ProblemLog
+from orthoflow.workflow.shapes import TEXT
+from orthoflow.workflow.steps import DraftStep
+
+Assignment: TypeAlias = dict[str, str]
+MAX_COMBINATIONS: Final = 20_000
+
+
+def read_compare(
+    value: Value, steps: Sequence[DraftStep], step_names: Sequence[str], log: ProblemLog
+) -> Comparison | None:
+    """Read the section `compare` against the steps."""
+    path = COMPARE.name
+    table = COMPARISON.read(value, path, log)
+    if table is None:
+        return None
+    design = DESIGN.read(table, path, log) or "product"
+    baseline = BASELINE.read(table, path, log)
+    excluded = EXCLUDE.read(table, path, log) or ()
+    combinations = [_read_assignment(item, here, steps, log) for here, item in excluded]
+    return Comparison(
+        design=design,
+        baseline=_complete(
+            _read_assignment(baseline, join(path, BASELINE.name), steps, log) if baseline else {},
+            steps,
+        ),
+        exclude=tuple(combination for combination in combinations if combination),
+        metrics=_read_metrics(table, step_names, log),
+    )
+
+
+def check_baseline(comparison: Comparison, position: Position, log: ProblemLog) -> None:
+    """Report a baseline that the comparison itself leaves out."""
+    for combination in comparison.exclude:
+        if combination.items() <= comparison.baseline.items():
+            listed = ", ".join(f"{step}: {variant}" for step, variant in combination.items())
+            log.add(
+                position,
+                "compare.exclude",
+                f"the baseline contains the excluded combination {{{listed}}}; name another "
+                f"baseline",
+            )
+
+
+def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignment]:
+    """Give the combinations of variants that reach a step, each once, the last step fastest.
+
+    Args:
+        workflow: the workflow.
+        steps: the steps that matter, in graph order: the step itself and what lies before it.
+
+    Raises:
+        WorkflowError: there are more combinations than anybody can run.
+    """
+    varied = {
+        name: tuple(variant.name for variant in workflow.steps[name].variants)
+        for name in steps
+        if workflow.steps[name].is_varied
+    }
+    baseline = {name: workflow.baseline[name] for name in varied}
+    if workflow.compare is None:
+        yield baseline
+    elif workflow.compare.design == "product":
+        count = math.prod(len(names) for names in varied.values())
+        if count > MAX_COMBINATIONS:
+            raise WorkflowError(
+                f"the comparison of {workflow.name} has {count} combinations of variants, more "
+                f"than {MAX_COMBINATIONS}; use design: one-at-a-time, or fewer variants"
+            )
+        for names in itertools.product(*varied.values()):
+            yield dict(zip(varied, names, strict=True))
+    else:
+        yield from _one_at_a_time(varied, baseline)
+
+
+def _one_at_a_time(
+    varied: Mapping[str, tuple[str, ...]], baseline: Assignment
+) -> Iterator[Assignment]:
+    yield dict(baseline)
+    for step, names in varied.items():
+        for name in names:
+            if name != baseline[step]:
+                yield {**baseline, step: name}
+
+
+def is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
+    """Whether an assignment contains a combination that the comparison leaves out."""
+    excluded = workflow.compare.exclude if workflow.compare else ()
+    return any(combination.items() <= assignment.items() for combination in excluded)
+
+
+def _read_assignment(
+    table: Table, path: str, steps: Sequence[DraftStep], log: ProblemLog
+) -> Assignment:
+    """Read a mapping from varied steps to their variants."""
+    varied = {step.name: step for step in steps if step.is_varied}
+    chosen: Assignment = {}
+    for entry in table:
+        here = join(path, entry.key)
+        step = varied.get(entry.key)
+        if step is None:
+            log.add(
+                entry.position,
+                here,
+                f"there is no step {entry.key} with variants{did_you_mean(entry.key, varied)}; "
+                f"with variants: {', '.join(varied) or 'none'}",
+            )
+            continue
+        text = TEXT.read(entry.value, here, log)
+        names = [variant.call.name for variant in step.variants]
+        if text in names:
+            chosen[entry.key] = text
+        elif text is not None:
+            log.add(
+                entry.value.position,
+                here,
+                f"step {entry.key} has no variant {text}{did_you_mean(text, names)}; it has "
+                f"{', '.join(names)}",
+            )
+    return chosen
+
+
+def _complete(baseline: Mapping[str, str], steps: Sequence[DraftStep]) -> Assignment:
+    return {
+        step.name: baseline.get(step.name, step.variants[0].call.name)
+        for step in steps
+        if step.is_varied and step.variants
+    }
+
+
+def _read_metrics(table: Table, step_names: Sequence[str], log: ProblemLog) -> tuple[str, ...]:
+    patterns = METRICS.read(table, COMPARE.name, log) or ()
+    entry = table.get(METRICS.name)
+    for pattern in patterns if entry else ():
+        step = pattern.partition(".")[0]
+        if entry and not set(step) & set("*?[") and step not in step_names:
+            log.add(
+                entry.value.position,
+                join(COMPARE.name, METRICS.name),
+                f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}",
+            )
+    return patterns
