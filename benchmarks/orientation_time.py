@@ -25,7 +25,7 @@ from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
 
-from orthoflow.geometry.photo_views import SceneCameras
+from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import StepContext
 

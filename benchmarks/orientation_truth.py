@@ -35,7 +35,7 @@ from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.room import SimulateRoom
 
-from orthoflow.geometry.photo_views import SceneCameras
+from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.products import Cameras, Photos, Ties, Truth, Walls
 from orthoflow.sdk import StepContext
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.photo_views import SceneCameras, SeenPoints
+from orthoflow.geometry.scene_views import SceneCameras, SeenPoints
 from orthoflow.geometry.scenes import Scene
 from orthoflow.products import Camera, Cameras, Finding, JsonValue, Truth, Walls
 

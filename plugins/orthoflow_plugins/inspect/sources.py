@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.photo_views import SceneCameras
-from orthoflow.geometry.scene_views import TrueOrthoimage
+from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Truth, Wall
 from orthoflow_plugins.inspect.poses import true_camera

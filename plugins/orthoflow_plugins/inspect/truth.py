@@ -25,8 +25,7 @@ from orthoflow.products import (
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 
 if TYPE_CHECKING:
-    from orthoflow.geometry.photo_views import SceneCameras
-    from orthoflow.geometry.scene_views import TrueOrthoimage
+    from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
     from orthoflow_plugins.inspect.poses import PoseError
     from orthoflow_plugins.inspect.samples import WallErrors
     from orthoflow_plugins.inspect.sampling import Sampling, SamplingRule
@@ -190,7 +189,7 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
 def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
     if inputs.cameras is None:
         return None
-    from orthoflow.geometry.photo_views import SceneCameras
+    from orthoflow.geometry.scene_views import SceneCameras
 
     return SceneCameras(inputs.truth.scene, cores=cores)
 

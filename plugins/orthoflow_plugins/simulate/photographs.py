@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_jpeg
-from orthoflow.geometry.photo_views import SceneCameras
+from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.products import Calibration, Camera, Cameras, Intrinsics, JsonValue, Photo, Photos
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.viewpoints import Shot

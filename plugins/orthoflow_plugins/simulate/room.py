@@ -22,7 +22,7 @@ from orthoflow_plugins.simulate.palace import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow.geometry.photo_views import SceneCameras
+    from orthoflow.geometry.scene_views import SceneCameras
     from orthoflow_plugins.simulate.deliverables import Delivery
     from orthoflow_plugins.simulate.photographs import Film
     from orthoflow_plugins.simulate.scanner import Scan
@@ -166,7 +166,7 @@ class SimulateRoom(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Build the room, scan and photograph it, and write down the truth."""
         del inputs
-        from orthoflow.geometry.photo_views import SceneCameras
+        from orthoflow.geometry.scene_views import SceneCameras
         from orthoflow_plugins.simulate.deliverables import Delivery, cloud_of, truth_of
         from orthoflow_plugins.simulate.photographs import (
             calibrated,

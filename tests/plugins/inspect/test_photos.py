@@ -13,8 +13,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
-from orthoflow.geometry.photo_views import SceneCameras
-from orthoflow.geometry.scene_views import TrueOrthoimage, Viewers, render_frame
+from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, Viewers, render_frame
 from orthoflow.products import (
     Camera,
     Cameras,

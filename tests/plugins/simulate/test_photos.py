@@ -15,12 +15,12 @@ from orthoflow_plugins.simulate.viewpoints import PhotoLayout, ShotPlan, planned
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.photo_views import SceneCameras
-from orthoflow.geometry.scene_views import TrueOrthoimage, cast, colours_at, render_frame
+from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, render_frame
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Truth
 from orthoflow.sdk import StepContext
 from tests import scenes
+from tests.scene_rays import cast, colours_at
 
 COARSE = {"scan_step_m": 0.1, "photo_layout": "quick", "photo_gsd_m": 0.008}
 GREY = np.array([0.299, 0.587, 0.114])

@@ -9,10 +9,10 @@ import pytest
 from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.geometry import UpDirection, wall_axes
-from orthoflow.geometry.scene_views import cast, colours_at
 from orthoflow.products import PointCloud, Truth
 from orthoflow.sdk import StepContext
 from tests import scenes
+from tests.scene_rays import cast, colours_at
 
 COARSE = {"scan_step_m": 0.06, "panorama_step_m": 0.18}
 CLEAN = {**COARSE, "noise_m": 0.0, "outlier_share": 0.0, "beam_m": 0.0, "colour_noise_grey": 0.0}
