@@ -245,8 +245,8 @@ class _Truth:
         viewers = Viewers(
             positions_world=np.unique(truth.stations, axis=0),
             up=truth.planes.up,
-            lowest_elevation_deg=_detail_deg(truth, "lowest_elevation_deg", -90.0),
-            highest_elevation_deg=_detail_deg(truth, "highest_elevation_deg", 90.0),
+            lowest_elevation_deg=truth.lowest_elevation_deg,
+            highest_elevation_deg=truth.highest_elevation_deg,
         )
         rendering = Rendering(
             buffer_front_m=self.walls.buffer_front_m,
@@ -258,11 +258,6 @@ class _Truth:
             cores=self.cores,
         )
         return render(truth.scene, image.frame, rendering)
-
-
-def _detail_deg(truth: Truth, name: str, default: float) -> float:
-    value = truth.details.get(name, default)
-    return float(value) if isinstance(value, int | float) else default
 
 
 def _plane_findings(image: Orthoimage, truth: Truth) -> list[Finding]:
