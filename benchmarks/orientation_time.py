@@ -20,7 +20,7 @@ from typing import TypeVar
 
 import numpy as np
 from orientation_truth import ROUGHLY, room
-from orthoflow_plugins.inspect.poses import pose_errors
+from orthoflow_plugins.inspect.orientation_errors import pose_errors
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.bundle import OrientColmapBundle

@@ -25,8 +25,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from orthoflow_plugins.inspect.poses import pose_errors
-from orthoflow_plugins.inspect.tie_truth import tie_findings
+from orthoflow_plugins.inspect.orientation_errors import pose_errors, tie_findings
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.bundle import OrientColmapBundle

@@ -20,13 +20,12 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.inspect.displacements import displacement_findings
+from orthoflow_plugins.inspect.figures import enlargement, vector_map
+from orthoflow_plugins.inspect.findings import displacement_findings, report
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs
-from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
-from orthoflow_plugins.inspect.reporting import report
-from orthoflow_plugins.inspect.vectors import enlargement, vector_map
 
 # The intensity is laid so far aside to see how exactly the comparison tells that.
 FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)

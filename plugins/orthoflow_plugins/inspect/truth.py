@@ -26,10 +26,9 @@ from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
-    from orthoflow_plugins.inspect.poses import PoseError
-    from orthoflow_plugins.inspect.samples import WallErrors
-    from orthoflow_plugins.inspect.sampling import Sampling, SamplingRule
-    from orthoflow_plugins.inspect.sources import SourceErrors
+    from orthoflow_plugins.inspect.cell_errors import Sampling, SamplingRule, WallErrors
+    from orthoflow_plugins.inspect.orientation_errors import PoseError
+    from orthoflow_plugins.inspect.source_errors import SourceErrors
 
 _TRACED_POINTS: Final = 4000
 
@@ -99,13 +98,16 @@ class InspectTruth(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Compare the photos, then wall by wall, then all together."""
-        from orthoflow_plugins.inspect.poses import pose_findings
-        from orthoflow_plugins.inspect.reporting import report
-        from orthoflow_plugins.inspect.samples import pooled
-        from orthoflow_plugins.inspect.sampling import sampling_rule
-        from orthoflow_plugins.inspect.scores import found_planes, label_findings, sample_findings
-        from orthoflow_plugins.inspect.sources import source_findings
-        from orthoflow_plugins.inspect.tie_truth import tie_findings
+        from orthoflow_plugins.inspect.cell_errors import pooled, sample_findings, sampling_rule
+        from orthoflow_plugins.inspect.findings import report
+        from orthoflow_plugins.inspect.orientation_errors import pose_findings, tie_findings
+        from orthoflow_plugins.inspect.plane_errors import (
+            found_planes,
+            label_findings,
+            wall_plane_findings,
+            worst_plane_findings,
+        )
+        from orthoflow_plugins.inspect.source_errors import source_findings
 
         if inputs.orthoimages is None or inputs.walls is None:
             return self.Out(inspection=_inspect_planes(inputs, ctx))
@@ -132,13 +134,14 @@ class InspectTruth(Method):
             ctx.progress(place / len(inputs.orthoimages.images), f"wall {image.name}")
             verdict = truth.judge(image)
             verdicts.append(verdict)
-            findings += _plane_findings(image, inputs.truth) + verdict.findings(image.wall)
+            findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
+            findings += verdict.findings(image.wall)
             _draw(image, verdict, ctx)
         sources = [item.sources for item in verdicts if item.sources is not None]
         findings += sample_findings(
             pooled([item.errors.samples for item in verdicts]), -1, sources_are_traced=bool(sources)
         )
-        findings += source_findings(sources, -1) + _worst_planes(findings)
+        findings += source_findings(sources, -1) + worst_plane_findings(findings)
         if inputs.cameras is not None:
             findings += pose_findings(poses)
             findings += tie_findings(inputs.cameras, inputs.walls, inputs.truth)
@@ -167,8 +170,8 @@ class _Verdict:
 
     def findings(self, wall: int) -> list[Finding]:
         """The wall's numbers."""
-        from orthoflow_plugins.inspect.scores import sample_findings
-        from orthoflow_plugins.inspect.sources import source_findings
+        from orthoflow_plugins.inspect.cell_errors import sample_findings
+        from orthoflow_plugins.inspect.source_errors import source_findings
 
         is_traced = self.sources is not None
         numbers = sample_findings(self.errors.samples, wall, sources_are_traced=is_traced)
@@ -177,7 +180,7 @@ class _Verdict:
 
 
 def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
-    from orthoflow_plugins.inspect.plane_truth import inspect_planes
+    from orthoflow_plugins.inspect.plane_errors import inspect_planes
 
     if inputs.planes is None:
         raise MethodError(
@@ -197,7 +200,7 @@ def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
 def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[PoseError, ...]:
     if inputs.cameras is None or views is None or inputs.walls is None:
         return ()
-    from orthoflow_plugins.inspect.poses import pose_errors
+    from orthoflow_plugins.inspect.orientation_errors import pose_errors
 
     return pose_errors(inputs.cameras, inputs.walls, inputs.truth, views)
 
@@ -215,11 +218,10 @@ class _Truth:
 
     def judge(self, image: Orthoimage) -> _Verdict:
         """Compare one wall."""
+        from orthoflow_plugins.inspect.cell_errors import sampling, wall_errors
         from orthoflow_plugins.inspect.image_quality import grey_of, quality_findings
         from orthoflow_plugins.inspect.placing import wall_of
-        from orthoflow_plugins.inspect.samples import wall_errors
-        from orthoflow_plugins.inspect.sampling import sampling
-        from orthoflow_plugins.inspect.sources import trace_sources
+        from orthoflow_plugins.inspect.source_errors import trace_sources
 
         inputs = self.inputs
         wall = wall_of(image, self.walls)
@@ -260,32 +262,8 @@ class _Truth:
         return render(truth.scene, image.frame, rendering)
 
 
-def _plane_findings(image: Orthoimage, truth: Truth) -> list[Finding]:
-    from orthoflow_plugins.inspect.scores import (
-        nearest_true_plane,
-        plane_distance,
-        plane_findings,
-    )
-
-    index = nearest_true_plane(image.frame.plane, truth.planes)
-    if index is None:
-        return []
-    return plane_findings(plane_distance(image.frame.plane, truth.planes, index), image.wall)
-
-
-def _worst_planes(findings: list[Finding]) -> list[Finding]:
-    """The largest error of any wall's plane, as numbers on all walls."""
-    worst = []
-    for name in ("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"):
-        values = [finding for finding in findings if finding.name == name]
-        if values:
-            largest = max(abs(finding.value) for finding in values)
-            worst.append(Finding(name=name, value=largest, unit=values[0].unit))
-    return worst
-
-
 def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
-    from orthoflow_plugins.inspect.maps import (
+    from orthoflow_plugins.inspect.figures import (
         COLOUR_SPAN_GREY,
         DEPTH_SPAN_MM,
         DISPLACEMENT_SPAN_CELLS,
@@ -339,7 +317,7 @@ def _inspection(
         shifts.append(shift)
         kinds.append(kind)
     if poses:
-        from orthoflow_plugins.inspect.poses import pose_details
+        from orthoflow_plugins.inspect.orientation_errors import pose_details
 
         details["poses"] = pose_details(poses)
     return Inspection(

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect.check_table import (
+from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
+from orthoflow_plugins.inspect.findings import (
     check_findings,
     outliers_at_once,
     outliers_iterated,
 )
-from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
-from orthoflow_plugins.inspect.crossings import find_crossing
-from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.targets import find_crossing
 from orthoflow_plugins.plane.given import GivenPlane
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.read.scan import ReadScan

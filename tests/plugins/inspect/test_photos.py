@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.tie_truth import most_shown
+from orthoflow_plugins.inspect.orientation_errors import most_shown
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.simulate.room import SimulateRoom
 

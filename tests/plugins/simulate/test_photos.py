@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.matching import GreyImage, measure_shifts
+from orthoflow_plugins.inspect.patches import GreyImage, measure_shifts
 from orthoflow_plugins.simulate.photographs import PhotoLayout, ShotPlan, planned_shots
 from orthoflow_plugins.simulate.room import SimulateRoom
 from orthoflow_plugins.simulate.room_model import RoomPlan, build_room
