@@ -11,17 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
-from orthoflow.geometry.scene_views import TrueOrthoimage
 from orthoflow.products import Finding, Orthoimage, OrthoMask, SurfaceMask, Wall
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.image_quality import LUMINANCE, shown
 from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_shifts
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import TrueOrthoimage
 
 # Neighbouring cells whose true depths differ by more make a step, reported apart.
 STEP_M: Final = 0.004
@@ -40,7 +42,7 @@ _NAMES_BESIDE_TRACED: Final = {
     "ghost_share": "ghost_colour_share",
 }
 
-Number = tuple[str, float, str]
+_Number = tuple[str, float, str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +150,7 @@ class WallErrors:
         samples: the errors as numbers.
         patches: where displacements were measured.
         depth_m: (rows, cols) measured - true depth, NaN where either is missing.
-        grey: (rows, cols) root mean square colour error, NaN where none is told.
+        grey: (rows, cols) root mean square colour error, NaN where none is compared.
     """
 
     samples: WallSamples
@@ -251,7 +253,7 @@ def sample_findings(
 ) -> list[Finding]:
     """Numbers on the cells of one wall, or of all with wall -1; none for what has no samples.
 
-    Displacements and ghosts bear a longer name when they are also told from the photos' cameras,
+    Displacements and ghosts bear a longer name when they also follow from the photos' cameras,
     which says more.
     """
     renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
@@ -277,7 +279,7 @@ def _square_errors(
 
 
 def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -> PatchShifts:
-    """Displacements of patches, told from known cells away from steps."""
+    """Displacements of patches, by known cells away from steps."""
     painted = image.mask == OrthoMask.PAINTED
     filled = image.mask == OrthoMask.FILLED
     # Two centimetres is far beyond any fair error; further off is reported as gross colour.
@@ -320,7 +322,7 @@ def _count(mask: NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(mask))
 
 
-def _depth_numbers(samples: WallSamples) -> list[Number]:
+def _depth_numbers(samples: WallSamples) -> list[_Number]:
     errors = 1e3 * samples.depth_m
     if errors.size == 0:
         return []
@@ -339,7 +341,7 @@ def _depth_numbers(samples: WallSamples) -> list[Number]:
     return numbers
 
 
-def _colour_numbers(samples: WallSamples) -> list[Number]:
+def _colour_numbers(samples: WallSamples) -> list[_Number]:
     named = (
         ("colour_rmse_grey", samples.colour),
         ("filled_colour_rmse_grey", samples.filled_colour),
@@ -350,9 +352,9 @@ def _colour_numbers(samples: WallSamples) -> list[Number]:
     ]
 
 
-def _shift_numbers(samples: WallSamples) -> list[Number]:
+def _shift_numbers(samples: WallSamples) -> list[_Number]:
     kept = _kept_shifts(samples)
-    numbers: list[Number] = [("n_patches", float(len(kept)), "1")]
+    numbers: list[_Number] = [("n_patches", float(len(kept)), "1")]
     if not kept.any():
         return numbers
     shifts = 1e3 * samples.shift_m[kept]
@@ -376,8 +378,8 @@ def _kept_shifts(samples: WallSamples) -> NDArray[np.bool_]:
     return kept
 
 
-def _share_numbers(samples: WallSamples) -> list[Number]:
-    numbers: list[Number] = []
+def _share_numbers(samples: WallSamples) -> list[_Number]:
+    numbers: list[_Number] = []
     if samples.n_seen:
         numbers += [
             ("completeness", samples.n_seen_painted / samples.n_seen, "1"),

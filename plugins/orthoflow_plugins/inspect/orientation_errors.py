@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import pixels_by_point
-from orthoflow.geometry.scene_views import SceneCameras, SeenPoints
 from orthoflow.geometry.scenes import Scene
 from orthoflow.products import (
     Camera,
@@ -30,6 +29,9 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow_plugins.inspect.findings import rms
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import SceneCameras, SeenPoints
 
 _GRID: Final = (24, 18)
 # Surfaces that face another way than the wall, such as the sides of mouldings, are left out.

@@ -132,7 +132,7 @@ def refine_shifts(
         true: the image it should be.
         start: where patches of 32 x 32 cells lie, wholly inside the image, and how far they are
             displaced at first.
-        sigma_most_cells: patches told less exactly are left out.
+        sigma_most_cells: patches measured less exactly are left out.
         focus_cells: cells count by a Gaussian of this width about the patch's middle.
 
     Returns:

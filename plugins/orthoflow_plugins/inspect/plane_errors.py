@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,12 +14,12 @@ from orthoflow.geometry import Plane, angle_between_deg
 from orthoflow.products import Finding, Inspection, Planes, PointLabels, Truth
 from orthoflow.sdk import StepContext
 
-FOUND_ANGLE_DEG: Final = 1.0
-FOUND_OFFSET_M: Final = 0.015
+_FOUND_ANGLE_DEG: Final = 1.0
+_FOUND_OFFSET_M: Final = 0.015
 # A wall further off than this shows no true plane.
 _SAME_ANGLE_DEG: Final = 3.0
 _SAME_OFFSET_M: Final = 0.03
-_LABEL_SCORES = ("precision", "recall", "f1", "iou")
+_LABEL_SCORES: Final = ("precision", "recall", "f1", "iou")
 
 
 def inspect_planes(
@@ -30,7 +30,14 @@ def inspect_planes(
     Metrics without prefix are of the truth's first plane, its main wall; `worst_` are the largest
     of all true planes that were found; `label_..._mean` are means over all true planes.
     """
-    nearest = [_nearest_found(planes, truth.planes, index) for index in range(len(truth.planes))]
+    nearest = [
+        _nearest(
+            _distances(planes, truth.planes, index),
+            angle_deg=_FOUND_ANGLE_DEG,
+            offset_m=_FOUND_OFFSET_M,
+        )
+        for index in range(len(truth.planes))
+    ]
     findings = found_planes(planes, truth.planes)
     main = nearest[0]
     ctx.metric("main_found", float(main is not None), "1")
@@ -80,8 +87,9 @@ def inspect_planes(
 
 def wall_plane_findings(plane: Plane, wall: int, true: Planes) -> list[Finding]:
     """Numbers on the plane of one wall; none when it shows no true plane."""
-    index = _nearest_true(plane, true)
-    return [] if index is None else _plane_findings(_plane_distance(plane, true, index), wall)
+    distances = (_plane_distance(plane, true, index) for index in range(len(true)))
+    nearest = _nearest(distances, angle_deg=_SAME_ANGLE_DEG, offset_m=_SAME_OFFSET_M)
+    return [] if nearest is None else _plane_findings(nearest, wall)
 
 
 def worst_plane_findings(findings: Sequence[Finding]) -> list[Finding]:
@@ -97,12 +105,10 @@ def worst_plane_findings(findings: Sequence[Finding]) -> list[Finding]:
 
 def found_planes(planes: Planes, true: Planes) -> list[Finding]:
     """Count the true planes that were found within 1 deg and 15 mm."""
-    n_found = 0
-    for index in range(len(true)):
-        distances = [_plane_distance(planes.plane(k), true, index) for k in range(len(planes))]
-        n_found += any(
-            d.angle_deg <= FOUND_ANGLE_DEG and abs(d.offset_m) <= FOUND_OFFSET_M for d in distances
-        )
+    n_found = sum(
+        any(d.is_within(_FOUND_ANGLE_DEG, _FOUND_OFFSET_M) for d in _distances(planes, true, index))
+        for index in range(len(true))
+    )
     return [
         Finding(name="true_planes", value=len(true), unit="1"),
         Finding(name="true_planes_found", value=n_found, unit="1"),
@@ -139,7 +145,7 @@ def label_findings(labels: PointLabels, truth: Truth) -> list[Finding]:
             iou[index, column],
         )
     findings = []
-    for place, kind in enumerate(("precision", "recall", "f1", "iou")):
+    for place, kind in enumerate(_LABEL_SCORES):
         findings.append(
             Finding(name=f"label_{kind}_mean", value=float(scores[:, place].mean()), unit="1")
         )
@@ -164,6 +170,15 @@ class _PlaneDistance:
     offset_m: float
     corner_m: float
 
+    def is_within(self, angle_deg: float, offset_m: float) -> bool:
+        """Whether neither angle nor offset is larger."""
+        return self.angle_deg <= angle_deg and abs(self.offset_m) <= offset_m
+
+    @property
+    def score(self) -> float:
+        """What tells the nearest plane: angle and offset in units of those that count as found."""
+        return self.angle_deg / _FOUND_ANGLE_DEG + abs(self.offset_m) / _FOUND_OFFSET_M
+
 
 def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
     """Compare a plane with a true plane."""
@@ -176,31 +191,17 @@ def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
     )
 
 
-def _nearest_true(found: Plane, true: Planes) -> int | None:
-    """Index of the true plane a plane shows, or None when it is near none."""
-    best, best_score = None, np.inf
-    for index in range(len(true)):
-        distance = _plane_distance(found, true, index)
-        if distance.angle_deg > _SAME_ANGLE_DEG or abs(distance.offset_m) > _SAME_OFFSET_M:
-            continue
-        score = distance.angle_deg / FOUND_ANGLE_DEG + abs(distance.offset_m) / FOUND_OFFSET_M
-        if score < best_score:
-            best, best_score = index, score
-    return best
+def _distances(found: Planes, true: Planes, index: int) -> list[_PlaneDistance]:
+    """How far each of the found planes lies off a true one."""
+    return [_plane_distance(found.plane(k), true, index) for k in range(len(found))]
 
 
-def _nearest_found(planes: Planes, true: Planes, index: int) -> _PlaneDistance | None:
-    """How far the best plane lies off a true one, None when none counts as found."""
-    best: _PlaneDistance | None = None
-    best_score = np.inf
-    for k in range(len(planes)):
-        distance = _plane_distance(planes.plane(k), true, index)
-        if distance.angle_deg > FOUND_ANGLE_DEG or abs(distance.offset_m) > FOUND_OFFSET_M:
-            continue
-        score = distance.angle_deg / FOUND_ANGLE_DEG + abs(distance.offset_m) / FOUND_OFFSET_M
-        if score < best_score:
-            best, best_score = distance, score
-    return best
+def _nearest(
+    distances: Iterable[_PlaneDistance], *, angle_deg: float, offset_m: float
+) -> _PlaneDistance | None:
+    """The smallest of those distances that are within the limits."""
+    near = (distance for distance in distances if distance.is_within(angle_deg, offset_m))
+    return min(near, key=lambda distance: distance.score, default=None)
 
 
 def _plane_findings(distance: _PlaneDistance, wall: int) -> list[Finding]:

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.robust import median_deviation
-from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Truth, Wall
 from orthoflow_plugins.inspect.cell_errors import depth_step_band
 from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.orientation_errors import true_camera
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 # A cell coloured from farther away shows another place.
 FAR_CELLS: Final = 3.0

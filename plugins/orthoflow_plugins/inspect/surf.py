@@ -27,7 +27,7 @@ from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs
 from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
 
-# The intensity is laid so far aside to see how exactly the comparison tells that.
+# The intensity is laid so far aside to see how exactly the comparison measures that.
 FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10

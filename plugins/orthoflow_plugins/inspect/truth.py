@@ -23,12 +23,45 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.inspect.cell_errors import (
+    Sampling,
+    SamplingRule,
+    WallErrors,
+    pooled,
+    sample_findings,
+    sampling,
+    sampling_rule,
+    wall_errors,
+)
+from orthoflow_plugins.inspect.figures import (
+    COLOUR_SPAN_GREY,
+    DEPTH_SPAN_MM,
+    DISPLACEMENT_SPAN_CELLS,
+    colour_error_map,
+    depth_error_map,
+    displacement_map,
+)
+from orthoflow_plugins.inspect.findings import report
+from orthoflow_plugins.inspect.image_quality import grey_of, quality_findings
+from orthoflow_plugins.inspect.orientation_errors import (
+    PoseError,
+    pose_details,
+    pose_errors,
+    pose_findings,
+    tie_findings,
+)
+from orthoflow_plugins.inspect.placing import wall_of
+from orthoflow_plugins.inspect.plane_errors import (
+    found_planes,
+    inspect_planes,
+    label_findings,
+    wall_plane_findings,
+    worst_plane_findings,
+)
+from orthoflow_plugins.inspect.source_errors import SourceErrors, source_findings, trace_sources
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
-    from orthoflow_plugins.inspect.cell_errors import Sampling, SamplingRule, WallErrors
-    from orthoflow_plugins.inspect.orientation_errors import PoseError
-    from orthoflow_plugins.inspect.source_errors import SourceErrors
 
 _TRACED_POINTS: Final = 4000
 
@@ -98,17 +131,6 @@ class InspectTruth(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Compare the photos, then wall by wall, then all together."""
-        from orthoflow_plugins.inspect.cell_errors import pooled, sample_findings, sampling_rule
-        from orthoflow_plugins.inspect.findings import report
-        from orthoflow_plugins.inspect.orientation_errors import pose_findings, tie_findings
-        from orthoflow_plugins.inspect.plane_errors import (
-            found_planes,
-            label_findings,
-            wall_plane_findings,
-            worst_plane_findings,
-        )
-        from orthoflow_plugins.inspect.source_errors import source_findings
-
         if inputs.orthoimages is None or inputs.walls is None:
             return self.Out(inspection=_inspect_planes(inputs, ctx))
         if not inputs.orthoimages.images:
@@ -120,7 +142,7 @@ class InspectTruth(Method):
         )
         views = _views(inputs, ctx.cores)
         poses = _pose_errors(inputs, views)
-        truth = _Truth(
+        judge = _Judge(
             inputs=inputs,
             walls=inputs.walls,
             params=params,
@@ -132,7 +154,7 @@ class InspectTruth(Method):
         findings: list[Finding] = []
         for place, image in enumerate(inputs.orthoimages.images):
             ctx.progress(place / len(inputs.orthoimages.images), f"wall {image.name}")
-            verdict = truth.judge(image)
+            verdict = judge.verdict_on(image)
             verdicts.append(verdict)
             findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
             findings += verdict.findings(image.wall)
@@ -170,9 +192,6 @@ class _Verdict:
 
     def findings(self, wall: int) -> list[Finding]:
         """The wall's numbers."""
-        from orthoflow_plugins.inspect.cell_errors import sample_findings
-        from orthoflow_plugins.inspect.source_errors import source_findings
-
         is_traced = self.sources is not None
         numbers = sample_findings(self.errors.samples, wall, sources_are_traced=is_traced)
         numbers += self.quality
@@ -180,8 +199,6 @@ class _Verdict:
 
 
 def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
-    from orthoflow_plugins.inspect.plane_errors import inspect_planes
-
     if inputs.planes is None:
         raise MethodError(
             "there is nothing to inspect: wire orthoimages and walls, or planes (inspect.truth)"
@@ -200,13 +217,11 @@ def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
 def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[PoseError, ...]:
     if inputs.cameras is None or views is None or inputs.walls is None:
         return ()
-    from orthoflow_plugins.inspect.orientation_errors import pose_errors
-
     return pose_errors(inputs.cameras, inputs.walls, inputs.truth, views)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Truth:
+class _Judge:
     """What walls are judged by; `views` is None without cameras."""
 
     inputs: InspectTruth.In
@@ -216,13 +231,8 @@ class _Truth:
     views: SceneCameras | None
     cores: int
 
-    def judge(self, image: Orthoimage) -> _Verdict:
+    def verdict_on(self, image: Orthoimage) -> _Verdict:
         """Compare one wall."""
-        from orthoflow_plugins.inspect.cell_errors import sampling, wall_errors
-        from orthoflow_plugins.inspect.image_quality import grey_of, quality_findings
-        from orthoflow_plugins.inspect.placing import wall_of
-        from orthoflow_plugins.inspect.source_errors import trace_sources
-
         inputs = self.inputs
         wall = wall_of(image, self.walls)
         chosen = sampling(image, self.rule)
@@ -263,15 +273,6 @@ class _Truth:
 
 
 def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
-    from orthoflow_plugins.inspect.figures import (
-        COLOUR_SPAN_GREY,
-        DEPTH_SPAN_MM,
-        DISPLACEMENT_SPAN_CELLS,
-        colour_error_map,
-        depth_error_map,
-        displacement_map,
-    )
-
     errors = verdict.errors
     ctx.figure(
         f"wall_{image.wall}_depth_error",
@@ -317,8 +318,6 @@ def _inspection(
         shifts.append(shift)
         kinds.append(kind)
     if poses:
-        from orthoflow_plugins.inspect.orientation_errors import pose_details
-
         details["poses"] = pose_details(poses)
     return Inspection(
         wall=np.concatenate(walls),

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import CheckPoints
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import SceneCameras
 
 FLAT: Final = "flat"
 VERTICAL_EDGE: Final = "vertical edge"

@@ -8,14 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_jpeg
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.products import (
     Calibration,
     Camera,
@@ -28,6 +27,9 @@ from orthoflow.products import (
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.building import SceneDraft, Side
 from orthoflow_plugins.simulate.room_model import main_wall_axes, wall_sides
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import SceneCameras
 
 PhotoLayout = Literal["none", "quick", "variant1", "variant2"]
 

@@ -12,6 +12,16 @@ from pydantic import Field
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
 from orthoflow.products import Calibration, CheckPoints, Photos, PointCloud, Truth
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.simulate.check_points import check_points
+from orthoflow_plugins.simulate.photographs import (
+    Film,
+    PhotoLayout,
+    ShotPlan,
+    calibrated,
+    calibration_of,
+    planned_shots,
+    take_photos,
+)
 from orthoflow_plugins.simulate.room_model import (
     MOST_TEXTILE,
     TEXTILE_BY_DESIGN,
@@ -23,7 +33,6 @@ from orthoflow_plugins.simulate.room_model import (
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
     from orthoflow_plugins.simulate.deliverables import Delivery
-    from orthoflow_plugins.simulate.photographs import Film
     from orthoflow_plugins.simulate.scanning import Errors, Scan
 
 SpectralGap = Literal["none", "easy", "hard"]
@@ -108,7 +117,7 @@ class SimulateRoom(Method):
             le=MOST_TEXTILE,
             description="Share of the main wall covered by cloth with one repeated motif.",
         )
-        photo_layout: Literal["none", "quick", "variant1", "variant2"] = Field(
+        photo_layout: PhotoLayout = Field(
             "none",
             description="quick: 6 photos of the main wall; variant1: 8 photos of whole walls, 4 "
             "walls; variant2: a block of 18 over the main wall, 70 % and 50 % overlap.",
@@ -171,13 +180,6 @@ class SimulateRoom(Method):
             report_room,
             truth_of,
         )
-        from orthoflow_plugins.simulate.photographs import (
-            ShotPlan,
-            calibrated,
-            calibration_of,
-            planned_shots,
-            take_photos,
-        )
 
         scan_rng, photo_rng = ctx.rng.spawn(2)
         room = build_room(
@@ -235,8 +237,6 @@ def _scan(
 
 
 def _film(params: SimulateRoom.Params) -> Film:
-    from orthoflow_plugins.simulate.photographs import Film
-
     return Film(
         noise_grey=params.photo_noise_grey,
         vignetting=params.photo_vignetting_share,
@@ -245,8 +245,6 @@ def _film(params: SimulateRoom.Params) -> Film:
 
 
 def _check_points(delivery: Delivery, views: SceneCameras, n_most: int) -> CheckPoints:
-    from orthoflow_plugins.simulate.check_points import check_points
-
     return check_points(
         delivery.room.scene,
         views,
