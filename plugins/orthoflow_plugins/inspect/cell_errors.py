@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
 
 # Neighbouring cells whose true depths differ by more make a step, reported apart.
-STEP_M: Final = 0.004
-STEP_BAND_CELLS: Final = 2
+_STEP_M: Final = 0.004
+_STEP_BAND_CELLS: Final = 2
 # A colour so far outside of all true colours within one cell has no business there.
-GROSS_GREY: Final = 40.0
+_GROSS_GREY: Final = 40.0
 # Whole patches of 32 cells, and so many that little is lost at the rim.
 BLOCK_CELLS: Final = 96
 # Multiples of these, modulo 1, fill a square most evenly (Roberts 2018, the R2 sequence).
@@ -237,14 +237,14 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     # Far away instead of missing, so that the rim of the surface is a step too.
     depth = np.where(np.isfinite(depth_m), depth_m, np.float32(1e3))
     edge = np.zeros(depth.shape, dtype=np.uint8)
-    down = np.abs(np.diff(depth, axis=0)) > STEP_M
-    right = np.abs(np.diff(depth, axis=1)) > STEP_M
+    down = np.abs(np.diff(depth, axis=0)) > _STEP_M
+    right = np.abs(np.diff(depth, axis=1)) > _STEP_M
     # The cells beside the edge are its first cells on each side.
     edge[1:] |= down
     edge[:-1] |= down
     edge[:, 1:] |= right
     edge[:, :-1] |= right
-    window = np.ones((2 * STEP_BAND_CELLS - 1,) * 2, dtype=np.uint8)
+    window = np.ones((2 * _STEP_BAND_CELLS - 1,) * 2, dtype=np.uint8)
     return np.asarray(cv2.dilate(edge, window), dtype=np.bool_)
 
 
@@ -304,7 +304,7 @@ def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]
     low = cv2.erode(np.where(missing, np.float32(np.inf), true.rgb), window)
     high = cv2.dilate(np.where(missing, np.float32(-np.inf), true.rgb), window)
     outside: NDArray[np.bool_] = np.any(
-        (image.rgb < low - np.float32(GROSS_GREY)) | (image.rgb > high + np.float32(GROSS_GREY)),
+        (image.rgb < low - np.float32(_GROSS_GREY)) | (image.rgb > high + np.float32(_GROSS_GREY)),
         axis=2,
     )
     return outside

@@ -25,8 +25,8 @@ from orthoflow_plugins.inspect.patches import GreyImage
 # Rec. 601 luma on the values as they are.
 LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 # A pixel drawn over more cells than this, in the direction where it is widest.
-STRETCHED_CELLS: Final = 2.0
-SMEARED_CELLS: Final = 5.0
+_STRETCHED_CELLS: Final = 2.0
+_SMEARED_CELLS: Final = 5.0
 # Cells of a photo that are asked; more say nothing else.
 _ASKED_MOST: Final = 200_000
 _REACH_CELLS: Final = 8
@@ -131,7 +131,7 @@ def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> 
         return []
     return [
         Finding(name=name, value=float(np.mean(spread > most)), unit="1", wall=image.wall)
-        for name, most in (("stretch_share", STRETCHED_CELLS), ("smear_share", SMEARED_CELLS))
+        for name, most in (("stretch_share", _STRETCHED_CELLS), ("smear_share", _SMEARED_CELLS))
     ]
 
 

@@ -44,7 +44,6 @@ class KeyPairs:
         found: (n, 2) float64 the same as SURF alone gives it.
         n_points: key points of the two pictures.
         n_matched: pairs of like descriptors, right or wrong.
-        n_refined: those whose patches correlate.
     """
 
     places: NDArray[np.float64]
@@ -52,7 +51,6 @@ class KeyPairs:
     found: NDArray[np.float64]
     n_points: tuple[int, int]
     n_matched: int
-    n_refined: int
 
     def __len__(self) -> int:
         return len(self.places)
@@ -98,7 +96,6 @@ def find_key_pairs(shown: GreyImage, reference: GreyImage, *, radius_cells: floa
         found=refined.found[alike][kept],
         n_points=(len(points[0].places), len(points[1].places)),
         n_matched=len(matches),
-        n_refined=len(places),
     )
 
 

@@ -166,12 +166,12 @@ class PointFinder:
                 point_world=_NOWHERE,
             )
         radius_m = _DEPTH_SHARE * self.target_radius_m
-        point = point_on_surface(picture.surface, crossing.place, radius_m)
+        point = point_on_surface(picture.surface, crossing, radius_m)
         return ShownPoint(
             how="target",
             wall=picture.wall,
             expected=expected,
-            place=crossing.place,
+            place=crossing,
             point_world=_NOWHERE if point is None else point,
         )
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 # A cell coloured from farther away shows another place.
-FAR_CELLS: Final = 3.0
+_FAR_CELLS: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,5 +177,5 @@ def _of(errors: SourceErrors, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
 def _is_far(errors: SourceErrors) -> NDArray[np.bool_]:
     """Cells whose colour is of a place more than 3 cells away, or of nothing."""
     length = np.linalg.norm(errors.displacement_m, axis=2)
-    far: NDArray[np.bool_] = errors.traced & ~(length <= FAR_CELLS * errors.frame.gsd_m)
+    far: NDArray[np.bool_] = errors.traced & ~(length <= _FAR_CELLS * errors.frame.gsd_m)
     return far

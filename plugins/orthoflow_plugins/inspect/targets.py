@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -20,24 +19,9 @@ _SMOOTH_CELLS: Final = 1.2
 _LEAST_WEIGHT: Final = 0.2
 
 
-@dataclass(frozen=True, kw_only=True)
-class Crossing:
-    """Where the quadrants of a target meet.
-
-    Attributes:
-        place: (2,) float64 column, row.
-        alike: correlation of the target with itself after half a turn.
-        swapped: minus the correlation after a quarter turn.
-    """
-
-    place: NDArray[np.float64]
-    alike: float
-    swapped: float
-
-
 def find_crossing(
     picture: GreyImage, near: NDArray[np.float64], *, search_cells: float, radius_cells: float
-) -> Crossing | None:
+) -> NDArray[np.float64] | None:
     """Find the centre of a target near a place.
 
     The crossing is a saddle of the smoothed picture, found to a cell where the Hessian's
@@ -51,7 +35,7 @@ def find_crossing(
         radius_cells: of the target, or of as much of it as shall count.
 
     Returns:
-        The crossing, or None where nothing looks like one.
+        (2,) float64 column, row where the quadrants meet, or None where nothing looks like that.
     """
     margin = int(np.ceil(search_cells + radius_cells)) + 3
     corner = np.floor(near).astype(np.int64) - margin
@@ -64,9 +48,7 @@ def find_crossing(
         return None
     alike = _turned_correlation(window, place, radius_cells, half=True)
     swapped = -_turned_correlation(window, place, radius_cells, half=False)
-    if min(alike, swapped) < _LEAST_ALIKE:
-        return None
-    return Crossing(place=place + corner, alike=alike, swapped=swapped)
+    return None if min(alike, swapped) < _LEAST_ALIKE else place + corner
 
 
 def _window(picture: GreyImage, corner: NDArray[np.int64], side: int) -> GreyImage:

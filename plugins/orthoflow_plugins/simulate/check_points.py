@@ -15,8 +15,8 @@ from orthoflow.products import CheckPoints
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras
 
-FLAT: Final = "flat"
-VERTICAL_EDGE: Final = "vertical edge"
+_FLAT: Final = "flat"
+_VERTICAL_EDGE: Final = "vertical edge"
 # The lattice of painted lines of a fresco, in periods (see `texture_kernels`).
 _LATTICE: Final = 0.9
 _CLEAR_M: Final = 0.04
@@ -71,8 +71,8 @@ def check_points(
         n_most: so many of each class, or what there are.
     """
     chosen = {
-        FLAT: _spread(_crossings(scene, views, stations), n_most),
-        VERTICAL_EDGE: _spread(_corners(scene, views, stations), n_most),
+        _FLAT: _spread(_crossings(scene, views, stations), n_most),
+        _VERTICAL_EDGE: _spread(_corners(scene, views, stations), n_most),
     }
     points = np.concatenate(list(chosen.values())) @ world_from_room.T + shift_world_m
     names = [

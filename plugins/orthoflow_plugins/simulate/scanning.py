@@ -22,7 +22,7 @@ from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.room_model import main_wall_axes
 
 # `Scanned.rectangle` of a ray that met nothing, and of a gross outlier or a mixed distance.
-MISSED: Final = -1
+_MISSED: Final = -1
 SPOILT: Final = -2
 _TURN: Final = 2.0 * np.pi
 
@@ -89,7 +89,7 @@ class Scanned:
         z: see x.
         intensity: float32 0..1.
         rgb: (n, 3) uint8.
-        rectangle: int32 rectangle hit, `SPOILT` or `MISSED`.
+        rectangle: int32 rectangle hit, `SPOILT` or `_MISSED`.
     """
 
     x: NDArray[np.float32]
@@ -316,7 +316,7 @@ def _allocated(n_points: int, ctx: StepContext) -> Scanned:
 
 def _only_hits(scan: Scan) -> Scan:
     """Leave out rays that met nothing; a closed room has none, then nothing is copied."""
-    hit = scan.points.rectangle != MISSED
+    hit = scan.points.rectangle != _MISSED
     if bool(hit.all()):
         return scan
     return Scan(

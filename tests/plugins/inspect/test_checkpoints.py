@@ -134,7 +134,7 @@ def test_the_centre_of_a_target_is_found_in_noise_and_holes(turned_deg: float) -
     picture = GreyImage(grey=grey, valid=valid, region=valid)
     found = find_crossing(picture, np.array([47.0, 52.0]), search_cells=12.0, radius_cells=30.0)
     assert found is not None
-    np.testing.assert_allclose(found.place, centre, atol=0.06)  # cells
+    np.testing.assert_allclose(found, centre, atol=0.06)  # cells
     edge = np.where(np.mgrid[:100, :100][1] < 50, 40.0, 220.0)
     plain = GreyImage(grey=edge, valid=valid, region=valid)
     assert (
