@@ -30,7 +30,7 @@ from orthoflow_plugins.simulate.building import (
     flat_side,
     wall_side,
 )
-from orthoflow_plugins.simulate.sweeping import SPOILT, Errors, Scanned, Scanner, Sweep
+from orthoflow_plugins.simulate.scanning import SPOILT, Errors, Scanned, Scanner, Sweep
 
 from orthoflow.geometry.hashed_numbers import cell_states, uniforms
 from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, SceneRays

@@ -20,12 +20,12 @@ from typing import TypeVar
 
 import numpy as np
 from orientation_truth import ROUGHLY, room
-from orthoflow_plugins.inspect.poses import pose_errors
+from orthoflow_plugins.inspect.orientation_errors import pose_errors
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
 
-from orthoflow.geometry.photo_views import SceneCameras
+from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import StepContext
 

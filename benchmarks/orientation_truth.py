@@ -25,8 +25,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from orthoflow_plugins.inspect.poses import pose_errors
-from orthoflow_plugins.inspect.tie_truth import tie_findings
+from orthoflow_plugins.inspect.orientation_errors import pose_errors, tie_findings
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
@@ -35,7 +34,7 @@ from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.simulate.room import SimulateRoom
 
-from orthoflow.geometry.photo_views import SceneCameras
+from orthoflow.geometry.scene_views import SceneCameras
 from orthoflow.products import Cameras, Photos, Ties, Truth, Walls
 from orthoflow.sdk import StepContext
 

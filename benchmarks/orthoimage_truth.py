@@ -168,10 +168,7 @@ def _room(chosen: argparse.Namespace) -> SimulateRoom.Out:
     scratch = Path(tempfile.mkdtemp())
     context = StepContext(rng=np.random.default_rng(chosen.seed), cores=2, scratch=scratch)
     room = SimulateRoom().run(SimulateRoom.In(), params, context)
-    told = room.truth.details["photos"]
-    shots = [shot for shot in told if isinstance(shot, dict)] if isinstance(told, list) else []
-    angles = [shot["obliquity_deg"] for shot in shots]
-    oblique = ", ".join(f"{angle:.0f}" for angle in angles if isinstance(angle, float))
+    oblique = ", ".join(f"{taken.obliquity_deg:.0f}" for taken in room.truth.photos)
     print(f"{len(room.cloud) / 1e6:.1f} M points, photos {oblique} deg oblique", flush=True)
     return room
 

@@ -18,8 +18,7 @@ from orthoflow_plugins.simulate.building import (
     flat_side,
     wall_side,
 )
-from orthoflow_plugins.simulate.scanner import scan_scene
-from orthoflow_plugins.simulate.sweeping import Errors, Sweep
+from orthoflow_plugins.simulate.scanning import Errors, Sweep, scan_scene
 
 from orthoflow.geometry.scenes import SurfaceRole, TextureKind
 from orthoflow.products import PointCloud

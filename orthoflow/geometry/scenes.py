@@ -1,6 +1,6 @@
 """Simulated scenes of textured rectangles: what there is, wherever the world lies.
 
-What a ray hits and what it sees there is in `orthoflow.geometry.scene_views`, apart from here so
+What a ray hits and what it sees there is in `orthoflow.geometry.scene_rays`, apart from here so
 that products can hold a scene without loading compiled kernels.
 """
 

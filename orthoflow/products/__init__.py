@@ -2,7 +2,7 @@
 
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.input_files import InputFiles
-from orthoflow.products.inspections import CheckPoints, Finding, Inspection, Truth
+from orthoflow.products.inspections import CheckPoints, Finding, Inspection, TakenPhoto, Truth
 from orthoflow.products.photographs import (
     Calibration,
     Camera,
@@ -52,6 +52,7 @@ __all__ = [
     "PointLabels",
     "Product",
     "SurfaceMask",
+    "TakenPhoto",
     "TieRole",
     "Ties",
     "Tolerance",

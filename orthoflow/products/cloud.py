@@ -31,7 +31,8 @@ class PointCloud(Product):
         row: (n,) uint32 position in the scan's grid, or None; column alike.
         stations: (s, 3) float64 metres, where the scanner (or the viewer) stood, or None.
         stations_source: `file`, `view_from` (the user said it) or None without stations.
-        source: how the data were read: files, unit, ranges before normalising, counts dropped.
+        source: how the data were read: files, unit, ranges before normalising, counts dropped; for
+            people.
     """
 
     type_name: ClassVar[str] = "cloud"

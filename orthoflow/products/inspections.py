@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.scenes import Scene
 from orthoflow.products.photographs import Cameras
 from orthoflow.products.planes import Planes
-from orthoflow.products.product import JsonValue, Product, Tolerance
+from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +37,25 @@ class CheckPoints(Product):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TakenPhoto:
+    """How a simulated photo was taken.
+
+    Attributes:
+        photo: file name.
+        wall: name of the wall it was meant for.
+        gsd_m: side of a pixel on the wall where the optical axis meets it.
+        obliquity_deg: angle between the optical axis and the wall's normal.
+        roll_deg: turn about the optical axis.
+    """
+
+    photo: str
+    wall: str
+    gsd_m: float
+    obliquity_deg: float
+    roll_deg: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Truth(Product):
     """What a simulated scene really is.
 
@@ -45,19 +64,49 @@ class Truth(Product):
         planes: the planes a detector should find.
         labels: (n,) int16 per point of the simulated cloud: index into `planes`, -1 for none.
         stations: (s, 3) float64 metres, where the scanner stood.
+        lowest_elevation_deg: lowest direction that the scanner saw, above the horizon positive.
+        highest_elevation_deg: highest direction that it saw.
+        n_spoilt: points of the cloud that are gross outliers or mix the distances of two surfaces.
         cameras: true orientations of the photos, or None without photos.
-        details: parameters of the simulation (scan step, noise, relief ...), JSON.
+        photos: how the photos were taken, in the order of `cameras`.
+        details: parameters of the simulation (scan step, noise, relief ...), JSON, for people.
     """
 
     type_name: ClassVar[str] = "truth"
+    encoding_version: ClassVar[int] = 2
     embedded: ClassVar[bool] = False
 
     scene: Scene
     planes: Planes
     labels: NDArray[np.int16]
     stations: NDArray[np.float64]
+    lowest_elevation_deg: float = -90.0
+    highest_elevation_deg: float = 90.0
+    n_spoilt: int = 0
     cameras: Cameras | None = None
+    photos: tuple[TakenPhoto, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
+
+    @classmethod
+    def upgraded(cls, payload: Payload) -> Payload:
+        """Read encoding 1, in which elevations, spoilt points and photos stood in `details`."""
+        metadata = dict(payload.metadata)
+        details = cast("dict[str, JsonValue]", metadata.get("details", {}))
+        moved = ("lowest_elevation_deg", "highest_elevation_deg", "n_spoilt", "photos")
+        metadata |= {name: details[name] for name in moved if name in details}
+        metadata["details"] = {name: value for name, value in details.items() if name not in moved}
+        photos = cast("list[dict[str, JsonValue]]", metadata.get("photos", []))
+        metadata["photos"] = [
+            {
+                "photo": entry["name"],
+                "wall": entry["wall"],
+                "gsd_m": 1e-3 * cast("float", entry["gsd_mm"]),
+                "obliquity_deg": entry["obliquity_deg"],
+                "roll_deg": entry["roll_deg"],
+            }
+            for entry in photos
+        ]
+        return super().upgraded(replace(payload, metadata=metadata))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +137,7 @@ class Inspection(Product):
         kind: (n,) uint8 class of the point; `kinds` names them.
         kinds: names of the classes.
         findings: the numbers.
-        details: what else the method says, JSON.
+        details: what else the method says, JSON, for people.
     """
 
     type_name: ClassVar[str] = "inspection"

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry import WallFrame, frame_over
-from orthoflow.geometry.scene_views import Rendering, cast, colours_at, render, render_frame
+from orthoflow.geometry.scene_views import Rendering, render, render_frame
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind, Viewers
 from tests import scenes
+from tests.scene_rays import cast, colours_at
 
 
 def a_scene(rows: list[dict[str, object]], holes: list[tuple[int, tuple[float, ...]]]) -> Scene:

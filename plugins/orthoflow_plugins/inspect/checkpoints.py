@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry import WallFrame
 from orthoflow.products import (
     Cameras,
     CheckPoints,
@@ -26,19 +24,12 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.inspect.check_table import check_findings
-from orthoflow_plugins.inspect.crossings import find_crossing
-from orthoflow_plugins.inspect.displacements import rms
+from orthoflow_plugins.inspect.figures import enlargement, vector_map
+from orthoflow_plugins.inspect.findings import check_findings, report, rms
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
-from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
-from orthoflow_plugins.inspect.point_places import ShownPoint, find_by_truth, point_on_surface
-from orthoflow_plugins.inspect.reporting import report
-from orthoflow_plugins.inspect.vectors import enlargement, vector_map
-
-_NOWHERE: Final = np.full(3, np.nan)
-# Targets are not quite flat: only so much of their radius says how deep the centre lies.
-_DEPTH_SHARE: Final = 0.5
+from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
 
 class InspectCheckpoints(Method):
@@ -87,7 +78,14 @@ class InspectCheckpoints(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Find every point, then sum up."""
         pictures = _pictures(inputs)
-        finder = _Finder(pictures=pictures, inputs=inputs, params=params)
+        finder = PointFinder(
+            pictures=pictures,
+            checkpoints=inputs.checkpoints,
+            walls=inputs.walls,
+            truth=inputs.truth,
+            search_m=params.search_m,
+            target_radius_m=params.target_radius_m,
+        )
         points = []
         for index in range(len(inputs.checkpoints.names)):
             ctx.progress(index / len(inputs.checkpoints.names), inputs.checkpoints.names[index])
@@ -125,21 +123,10 @@ class InspectCheckpoints(Method):
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Picture:
-    """What points are looked for in; `image` is drawn beneath the residuals."""
-
-    wall: int
-    frame: WallFrame
-    grey: GreyImage
-    surface: Wall
-    image: Orthoimage
-
-
-def _pictures(inputs: InspectCheckpoints.In) -> list[_Picture]:
+def _pictures(inputs: InspectCheckpoints.In) -> list[Picture]:
     if inputs.orthoimages is not None:
         pictures = [
-            _Picture(
+            Picture(
                 wall=image.wall,
                 frame=image.frame,
                 grey=grey_of(image),
@@ -162,10 +149,10 @@ def _pictures(inputs: InspectCheckpoints.In) -> list[_Picture]:
     return pictures
 
 
-def _intensity_picture(index: int, wall: Wall, intensity: NDArray[np.float32]) -> _Picture:
+def _intensity_picture(index: int, wall: Wall, intensity: NDArray[np.float32]) -> Picture:
     known = np.isfinite(intensity)
     grey = 255.0 * np.where(known, intensity, 0.0).astype(np.float64)
-    return _Picture(
+    return Picture(
         wall=index,
         frame=wall.frame,
         grey=GreyImage(grey=grey, valid=known, region=known),
@@ -180,99 +167,6 @@ def _intensity_picture(index: int, wall: Wall, intensity: NDArray[np.float32]) -
             sources=("intensity",),
         ),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Finder:
-    """Finds one point after the other."""
-
-    pictures: Sequence[_Picture]
-    inputs: InspectCheckpoints.In
-    params: InspectCheckpoints.Params
-
-    def find(self, index: int) -> ShownPoint:
-        """Where a point is shown, and how that is known."""
-        points = self.inputs.checkpoints
-        world = points.points_world[index]
-        wall = int(points.wall[index])
-        picture = self._picture_of(world, wall if wall >= 0 else None)
-        if picture is None:
-            nowhere = _NOWHERE[:2]
-            return ShownPoint(
-                how="outside", wall=-1, expected=nowhere, place=nowhere, point_world=_NOWHERE
-            )
-        expected = picture.frame.wall_from_world(world[None])[0, :2]
-        if wall >= 0:
-            return ShownPoint(
-                how="measured",
-                wall=wall,
-                expected=expected,
-                place=points.pixels_wall[index],
-                point_world=_NOWHERE,
-            )
-        if self.inputs.truth is not None:
-            return self._by_truth(picture, expected, self.inputs.truth)
-        return self._target(picture, expected)
-
-    def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> _Picture | None:
-        """The picture that a point belongs to: the nearest wall whose rectangle it lies before."""
-        best, nearest = None, np.inf
-        walls = self.inputs.walls
-        for picture in self.pictures:
-            if wall is not None and picture.wall == wall:
-                return picture
-            column, row, depth = picture.frame.wall_from_world(world[None])[0]
-            inside = 0 <= column < picture.frame.width and 0 <= row < picture.frame.height
-            within = -walls.buffer_behind_m <= depth <= walls.buffer_front_m
-            if wall is None and inside and within and abs(depth) < nearest:
-                best, nearest = picture, abs(float(depth))
-        return best
-
-    def _by_truth(
-        self, picture: _Picture, expected: NDArray[np.float64], truth: Truth
-    ) -> ShownPoint:
-        walls = self.inputs.walls
-        place = find_by_truth(
-            picture.grey,
-            picture.frame,
-            expected,
-            truth,
-            buffers_m=(walls.buffer_front_m, walls.buffer_behind_m),
-            search_cells=int(np.clip(np.ceil(self.params.search_m / picture.frame.gsd_m), 2, 12)),
-        )
-        return ShownPoint(
-            how="not found" if place is None else "truth",
-            wall=picture.wall,
-            expected=expected,
-            place=_NOWHERE[:2] if place is None else place,
-            point_world=_NOWHERE,
-        )
-
-    def _target(self, picture: _Picture, expected: NDArray[np.float64]) -> ShownPoint:
-        gsd_m = picture.frame.gsd_m
-        crossing = find_crossing(
-            picture.grey,
-            expected,
-            search_cells=self.params.search_m / gsd_m,
-            radius_cells=self.params.target_radius_m / gsd_m,
-        )
-        if crossing is None:
-            return ShownPoint(
-                how="not found",
-                wall=picture.wall,
-                expected=expected,
-                place=_NOWHERE[:2],
-                point_world=_NOWHERE,
-            )
-        radius_m = _DEPTH_SHARE * self.params.target_radius_m
-        point = point_on_surface(picture.surface, crossing.place, radius_m)
-        return ShownPoint(
-            how="target",
-            wall=picture.wall,
-            expected=expected,
-            place=crossing.place,
-            point_world=_NOWHERE if point is None else point,
-        )
 
 
 def _findings(shift_m: NDArray[np.float64], classes: Sequence[str], gsd_m: float) -> list[Finding]:
@@ -305,7 +199,7 @@ def _findings_in_space(
     ]
 
 
-def _findings_of_images(pictures: Sequence[_Picture], cameras: Cameras | None) -> list[Finding]:
+def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) -> list[Finding]:
     return [
         finding
         for picture in pictures
@@ -316,7 +210,7 @@ def _findings_of_images(pictures: Sequence[_Picture], cameras: Cameras | None) -
     ]
 
 
-def _draw(pictures: Sequence[_Picture], points: Sequence[ShownPoint], ctx: StepContext) -> None:
+def _draw(pictures: Sequence[Picture], points: Sequence[ShownPoint], ctx: StepContext) -> None:
     for picture in pictures:
         mine = [point for point in points if point.wall == picture.wall]
         if not mine:

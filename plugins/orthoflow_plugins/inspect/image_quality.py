@@ -1,19 +1,48 @@
-"""What every inspection says of an orthoimage, whatever it is compared with."""
+"""What every inspection says of an orthoimage, whatever it is compared with.
+
+How complete it is, how much of it is filled, how sharp, and where it stretches its photos.
+
+Sharpness is told from the image's own edges: their width, and the MTF that they imply. A surface
+that a photo sees nearly edge on has few pixels there, however many cells it has: the stretches and
+smears that skarlatos2012 describes along vertical surfaces. Which pixel a cell takes follows from
+the wall's depths and the photo's camera, so how far apart the pixels of neighbouring cells lie is
+known exactly, whatever the picture shows.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Wall
-from orthoflow_plugins.inspect.matching import GreyImage
-from orthoflow_plugins.inspect.sampling import shown
-from orthoflow_plugins.inspect.sharpness import sharpness_findings
-from orthoflow_plugins.inspect.stretches import stretch_findings
+from orthoflow_plugins.inspect.patches import GreyImage
 
 # Rec. 601 luma on the values as they are.
 LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
+# A pixel drawn over more cells than this, in the direction where it is widest.
+_STRETCHED_CELLS: Final = 2.0
+_SMEARED_CELLS: Final = 5.0
+# Cells of a photo that are asked; more say nothing else.
+_ASKED_MOST: Final = 200_000
+_REACH_CELLS: Final = 8
+_STEP_CELLS: Final = 0.25
+_ALONG: Final = np.arange(-_REACH_CELLS, _REACH_CELLS + 0.5 * _STEP_CELLS, _STEP_CELLS)
+_PEAKS_MOST: Final = 4000
+_EDGES_MOST: Final = 400
+# Between valid cells only, but for rounding.
+_WHOLE: Final = 0.999
+_TILE_CELLS: Final = 2048
+_EDGES_LEAST: Final = 20
+_CONTRAST_GREY: Final = 30.0
+# Either side of an edge must be this even, as a share of its contrast.
+_EVEN_SHARE: Final = 0.15
+_END_CELLS: Final = 3.0
+_LOW, _HIGH = 0.1, 0.9
 
 
 def grey_of(image: Orthoimage) -> GreyImage:
@@ -21,6 +50,12 @@ def grey_of(image: Orthoimage) -> GreyImage:
     shows = shown(image)
     grey = np.where(shows, image.rgb @ LUMINANCE, 0.0)
     return GreyImage(grey=grey, valid=shows, region=shows)
+
+
+def shown(image: Orthoimage) -> NDArray[np.bool_]:
+    """Cells that are painted or filled."""
+    shows: NDArray[np.bool_] = np.isin(image.mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
+    return shows
 
 
 def completeness(image: Orthoimage, wall: Wall) -> Finding:
@@ -49,3 +84,213 @@ def quality_findings(
         *sharpness_findings(grey, image.wall),
         *stretch_findings(image, wall, cameras),
     ]
+
+
+def sharpness_findings(image: GreyImage, wall: int) -> list[Finding]:
+    """Width of edges from 10 to 90 %, and the frequency at which contrast is halved.
+
+    Profiles across the steepest places that have an even side each are brought to one contrast and
+    their middle; the median profile is the edge spread, its derivative's spectrum the MTF (ISO
+    12233). Nothing where there are fewer than 20 such edges.
+
+    Args:
+        image: grey levels, and cells that count.
+        wall: of the findings.
+    """
+    profiles = _edge_profiles(image)
+    if len(profiles) < _EDGES_LEAST:
+        return []
+    spread = np.median(profiles, axis=0)
+    if spread[0] > _LOW or spread[-1] < _HIGH:
+        return []
+    numbers = [
+        ("n_edges", float(len(profiles)), "1"),
+        ("edge_width_cells", _width_cells(spread), "cells"),
+        ("mtf50_per_cell", _mtf50(spread), "cycles/cell"),
+    ]
+    return [Finding(name=name, value=value, unit=unit, wall=wall) for name, value, unit in numbers]
+
+
+def stretch_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
+    """Shares of painted cells whose photo is stretched or smeared there; none without cameras.
+
+    `stretch_share` are cells of which one pixel covers more than two in some direction,
+    `smear_share` those where it covers more than five, or that show the surface from behind.
+
+    Args:
+        image: the orthoimage.
+        wall: the wall it is of, on the same cells.
+        cameras: of its photos.
+    """
+    if cameras is None:
+        return []
+    spread = np.concatenate(
+        [np.zeros(0), *(cells_per_pixel(image, wall, camera) for camera in _known(cameras))]
+    )
+    if not len(spread):
+        return []
+    return [
+        Finding(name=name, value=float(np.mean(spread > most)), unit="1", wall=image.wall)
+        for name, most in (("stretch_share", _STRETCHED_CELLS), ("smear_share", _SMEARED_CELLS))
+    ]
+
+
+def cells_per_pixel(
+    image: Orthoimage, wall: Wall, camera: tuple[str, ViewingCamera]
+) -> NDArray[np.float64]:
+    """How many cells one pixel of a photo covers where it is widest, at cells that it painted.
+
+    Args:
+        image: the orthoimage.
+        wall: the wall it is of, on the same cells.
+        camera: name of the photo, and its camera.
+
+    Returns:
+        (n,) cells per pixel, of at most some hundred thousand cells spread evenly; infinite where
+        the surface shows its back.
+    """
+    name, viewing = camera
+    if name not in image.sources:
+        return np.zeros(0)
+    painted = (image.mask == OrthoMask.PAINTED) & np.isfinite(wall.depth_m)
+    cells = np.flatnonzero(painted & (image.source == image.sources.index(name)))
+    cells = cells[:: max(1, len(cells) // _ASKED_MOST)]
+    rows, columns = np.divmod(cells, image.frame.width)
+    # Survey coordinates would cost digits.
+    near = replace(image.frame, origin_world=np.zeros(3))
+    moved = viewing.shifted(image.frame.origin_world)
+    depth = wall.depth_m[rows, columns].astype(np.float64)
+    places = np.column_stack([columns + 0.5, rows + 0.5])
+    at = moved.project(near.world_from_wall(places, depth))[:, :2]
+    along = [
+        moved.project(_neighbours(near, wall, places, depth, step))[:, :2] - at
+        for step in ((1, 0), (0, 1))
+    ]
+    jacobian = np.stack(along, axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = 1.0 / np.linalg.svd(np.nan_to_num(jacobian), compute_uv=False)[:, 1]
+        # The image of a surface seen from the front runs as the wall does: u right, v down.
+        spread[np.linalg.det(jacobian) <= 0.0] = np.inf
+    known: NDArray[np.float64] = spread[np.isfinite(jacobian).all(axis=(1, 2))]
+    return known
+
+
+def _edge_profiles(image: GreyImage) -> NDArray[np.float64]:
+    """Profiles (n, steps) across edges, 0 on the dark side and 1 on the bright one."""
+    from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
+
+    # A few million cells have edges enough.
+    image = image.fullest_part(_TILE_CELLS)
+    if not image.valid.any():
+        return np.zeros((0, _ALONG.size))
+    # Voids go on as what is nearest: neither do they make edges, nor do they ring into profiles.
+    grey = _closed(image)
+    smooth = gaussian_filter(grey, 1.0)
+    down, right = (np.asarray(part) for part in np.gradient(smooth))
+    steep = np.hypot(down, right)
+    peaks = image.valid & (steep == maximum_filter(steep, size=2 * _REACH_CELLS + 1))
+    rows, columns = np.nonzero(peaks & (steep > 0.0))
+    order = np.argsort(-steep[rows, columns], kind="stable")[:_PEAKS_MOST]
+    rows, columns = rows[order], columns[order]
+    length = steep[rows, columns][:, None]
+    at = [
+        rows[:, None] + _ALONG * down[rows, columns][:, None] / length,
+        columns[:, None] + _ALONG * right[rows, columns][:, None] / length,
+    ]
+    whole = map_coordinates(image.valid.astype(np.float64), at, order=1, cval=0.0) > _WHOLE
+    kept = np.flatnonzero(whole.all(axis=1))[:_EDGES_MOST]
+    values = map_coordinates(grey, [part[kept] for part in at], order=3, mode="nearest")
+    n_end = round(_END_CELLS / _STEP_CELLS)
+    dark, bright = values[:, :n_end], values[:, -n_end:]
+    low, high = dark.mean(axis=1), bright.mean(axis=1)
+    contrast = np.maximum(high - low, 1e-9)
+    even = np.maximum(np.ptp(dark, axis=1), np.ptp(bright, axis=1)) <= _EVEN_SHARE * contrast
+    kept = even & (contrast >= _CONTRAST_GREY)
+    scaled = (values[kept] - low[kept, None]) / contrast[kept, None]
+    return _centred(scaled, _ALONG)
+
+
+def _closed(image: GreyImage) -> NDArray[np.float64]:
+    """Grey levels where every void cell has that of the nearest valid one."""
+    from scipy.ndimage import distance_transform_edt
+
+    grey = np.asarray(image.grey, dtype=np.float64)
+    if image.valid.all():
+        return grey
+    nearest = np.asarray(
+        distance_transform_edt(~image.valid, return_distances=False, return_indices=True)
+    )
+    closed: NDArray[np.float64] = grey[nearest[0], nearest[1]]
+    return closed
+
+
+def _centred(profiles: NDArray[np.float64], along: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Profiles moved so that their middle lies in the middle."""
+    # The area above an edge tells its place with all samples, not with the two at the middle.
+    reach = along[-1]
+    offset = reach - np.sum(profiles[:, :-1] + profiles[:, 1:], axis=1) * 0.5 * _STEP_CELLS
+    moved = [
+        np.interp(along + shift, along, profile)
+        for profile, shift in zip(profiles, offset, strict=True)
+    ]
+    return np.array(moved).reshape(-1, len(along))
+
+
+def _width_cells(spread: NDArray[np.float64]) -> float:
+    """Distance between where the spread first passes 90 % and last was below 10 %."""
+    steps = np.arange(len(spread))
+    above = int(np.argmax(spread >= _HIGH))
+    below = int(np.flatnonzero(spread[: above + 1] <= _LOW)[-1])
+    high = np.interp(_HIGH, spread[above - 1 : above + 1], steps[above - 1 : above + 1])
+    low = np.interp(_LOW, spread[below : below + 2], steps[below : below + 2])
+    return float(high - low) * _STEP_CELLS
+
+
+def _mtf50(spread: NDArray[np.float64]) -> float:
+    """Frequency in cycles per cell at which the spectrum of the slope is half of its start."""
+    slope = np.diff(spread)
+    n_padded = 4096
+    spectrum = np.abs(np.fft.rfft(slope, n_padded))
+    contrast = spectrum / spectrum[0]
+    frequency = np.fft.rfftfreq(n_padded, _STEP_CELLS)
+    # A step within one sample never halves below the last frequency.
+    place = int(np.argmax(contrast < 0.5)) or len(contrast) - 1
+    return float(
+        np.interp(-0.5, -contrast[place - 1 : place + 1], frequency[place - 1 : place + 1])
+    )
+
+
+def _known(cameras: Cameras) -> list[tuple[str, ViewingCamera]]:
+    return [(item.photo, item.viewing()) for item in cameras.cameras if item.status == "ok"]
+
+
+def _neighbours(
+    frame: WallFrame,
+    wall: Wall,
+    places: NDArray[np.float64],
+    depth: NDArray[np.float64],
+    step: tuple[int, int],
+) -> NDArray[np.float64]:
+    """Points one cell further (column, row) on the surface, which goes on as it does at the cell.
+
+    Of the slopes on both sides the smaller one counts: at a depth step the other is the step's.
+    """
+    rows, columns = (places[:, 1] - 0.5).astype(np.int64), (places[:, 0] - 0.5).astype(np.int64)
+    after = _depth_at(wall, rows + step[1], columns + step[0]) - depth
+    before = depth - _depth_at(wall, rows - step[1], columns - step[0])
+    with np.errstate(invalid="ignore"):
+        is_after = np.isnan(before) | (np.abs(after) <= np.abs(before))
+    slope = np.nan_to_num(np.where(is_after & ~np.isnan(after), after, before))
+    points: NDArray[np.float64] = frame.world_from_wall(places + step, depth + slope)
+    return points
+
+
+def _depth_at(
+    wall: Wall, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Depths (n,) of cells; NaN outside the wall."""
+    height, width = wall.depth_m.shape
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    found = np.full(len(rows), np.nan)
+    found[inside] = wall.depth_m[rows[inside], columns[inside]]
+    return found

@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow_plugins.inspect.matching import (
+from orthoflow.geometry.opencv_border import from_opencv
+from orthoflow_plugins.inspect.patches import (
     PATCH_CELLS,
     GreyImage,
     refine_shifts,
@@ -43,7 +44,6 @@ class KeyPairs:
         found: (n, 2) float64 the same as SURF alone gives it.
         n_points: key points of the two pictures.
         n_matched: pairs of like descriptors, right or wrong.
-        n_refined: those whose patches correlate.
     """
 
     places: NDArray[np.float64]
@@ -51,7 +51,6 @@ class KeyPairs:
     found: NDArray[np.float64]
     n_points: tuple[int, int]
     n_matched: int
-    n_refined: int
 
     def __len__(self) -> int:
         return len(self.places)
@@ -97,7 +96,6 @@ def find_key_pairs(shown: GreyImage, reference: GreyImage, *, radius_cells: floa
         found=refined.found[alike][kept],
         n_points=(len(points[0].places), len(points[1].places)),
         n_matched=len(matches),
-        n_refined=len(places),
     )
 
 
@@ -155,15 +153,19 @@ def _key_points(image: GreyImage) -> _KeyPoints:
 
     n_most = int(np.clip(image.grey.size // _CELLS_PER_POINT, _POINTS_LEAST, _POINTS_MOST))
     found = surf.surf(image.grey, threshold=0.1, max_points=n_most)
-    # mahotas gives y, x, scale, score, sign of the Laplacian, angle and 64 numbers.
-    places = found[:, 1::-1] + 0.5
+    # mahotas gives y, x, scale, score, sign of the Laplacian, angle and 64 numbers; it counts cells
+    # from their centres, as OpenCV does.
+    places = from_opencv(found[:, 1::-1])
     rows, columns = image.grey.shape
     half = PATCH_CELLS // 2
     inside = np.all((places > half) & (places < (columns - half, rows - half)), axis=1)
     share = _patch_means(image.valid.astype(np.float32), places[inside])
-    found = found[inside][share >= _LEAST_VALID_SHARE]
+    kept = np.flatnonzero(inside)[share >= _LEAST_VALID_SHARE]
     return _KeyPoints(
-        places=found[:, 1::-1] + 0.5, scale=found[:, 2], sign=found[:, 4], descriptors=found[:, 6:]
+        places=places[kept],
+        scale=found[kept, 2],
+        sign=found[kept, 4],
+        descriptors=found[kept, 6:],
     )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import angle_between_deg
+from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Orthoimage, SurfaceMask, Wall, Walls
 
 _SAME_DIRECTION_DEG: Final = 2.0
@@ -57,7 +58,7 @@ def _laid_onto(image: Orthoimage, wall: Wall, walls: Walls) -> Wall:
         points = frame.world_from_wall(np.column_stack([columns, np.full(frame.width, row + 0.5)]))
         exact = wall.frame.wall_from_world(points)[:, :2]
         if wall.intensity is not None and intensity is not None:
-            at = (exact - 0.5).astype(np.float32).T[:, None]
+            at = to_opencv(exact).astype(np.float32).T[:, None]
             intensity[row] = cv2.remap(
                 wall.intensity, at[0], at[1], cv2.INTER_LINEAR, borderValue=(np.nan,)
             )[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -9,14 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.products import Truth, Wall
+from orthoflow.geometry.robust import median_deviation
+from orthoflow.products import CheckPoints, Orthoimage, Truth, Wall, Walls
 from orthoflow_plugins.inspect.image_quality import LUMINANCE
-from orthoflow_plugins.inspect.matching import (
+from orthoflow_plugins.inspect.patches import (
     PATCH_CELLS,
     GreyImage,
     refine_shifts,
     unrefined,
 )
+from orthoflow_plugins.inspect.targets import find_crossing
 
 How = Literal["measured", "target", "truth", "not found", "outside"]
 
@@ -25,6 +28,9 @@ _FOCUS_CELLS: Final = 5.0
 _LEAST_VALID: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
 _SIGMA_MOST_CELLS: Final = 1.0
+# Targets are not quite flat: only so much of their radius says how deep the centre lies.
+_DEPTH_SHARE: Final = 0.5
+_NOWHERE: Final = np.full(3, np.nan)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +50,130 @@ class ShownPoint:
     expected: NDArray[np.float64]
     place: NDArray[np.float64]
     point_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """What points are looked for in.
+
+    Attributes:
+        wall: index of the wall.
+        frame: the cells.
+        grey: what is shown on them.
+        surface: the wall on the same cells.
+        image: what is drawn beneath residuals.
+    """
+
+    wall: int
+    frame: WallFrame
+    grey: GreyImage
+    surface: Wall
+    image: Orthoimage
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointFinder:
+    """Finds one check point after the other.
+
+    Attributes:
+        pictures: where points may be shown.
+        checkpoints: the points.
+        walls: those of the pictures.
+        truth: of a simulated room, or None; targets are looked for then.
+        search_m: how far from its place a point is looked for.
+        target_radius_m: of the targets that counts.
+    """
+
+    pictures: Sequence[Picture]
+    checkpoints: CheckPoints
+    walls: Walls
+    truth: Truth | None
+    search_m: float
+    target_radius_m: float
+
+    def find(self, index: int) -> ShownPoint:
+        """Where a point is shown, and how that is known."""
+        points = self.checkpoints
+        world = points.points_world[index]
+        wall = int(points.wall[index])
+        picture = self._picture_of(world, wall if wall >= 0 else None)
+        if picture is None:
+            nowhere = _NOWHERE[:2]
+            return ShownPoint(
+                how="outside", wall=-1, expected=nowhere, place=nowhere, point_world=_NOWHERE
+            )
+        expected = picture.frame.wall_from_world(world[None])[0, :2]
+        if wall >= 0:
+            return ShownPoint(
+                how="measured",
+                wall=wall,
+                expected=expected,
+                place=points.pixels_wall[index],
+                point_world=_NOWHERE,
+            )
+        if self.truth is not None:
+            return self._by_truth(picture, expected, self.truth)
+        return self._target(picture, expected)
+
+    def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> Picture | None:
+        """The picture that a point belongs to: the nearest wall whose rectangle it lies before."""
+        best, nearest = None, np.inf
+        walls = self.walls
+        for picture in self.pictures:
+            if wall is not None and picture.wall == wall:
+                return picture
+            column, row, depth = picture.frame.wall_from_world(world[None])[0]
+            inside = 0 <= column < picture.frame.width and 0 <= row < picture.frame.height
+            within = -walls.buffer_behind_m <= depth <= walls.buffer_front_m
+            if wall is None and inside and within and abs(depth) < nearest:
+                best, nearest = picture, abs(float(depth))
+        return best
+
+    def _by_truth(
+        self, picture: Picture, expected: NDArray[np.float64], truth: Truth
+    ) -> ShownPoint:
+        walls = self.walls
+        place = find_by_truth(
+            picture.grey,
+            picture.frame,
+            expected,
+            truth,
+            buffers_m=(walls.buffer_front_m, walls.buffer_behind_m),
+            search_cells=int(np.clip(np.ceil(self.search_m / picture.frame.gsd_m), 2, 12)),
+        )
+        return ShownPoint(
+            how="not found" if place is None else "truth",
+            wall=picture.wall,
+            expected=expected,
+            place=_NOWHERE[:2] if place is None else place,
+            point_world=_NOWHERE,
+        )
+
+    def _target(self, picture: Picture, expected: NDArray[np.float64]) -> ShownPoint:
+        gsd_m = picture.frame.gsd_m
+        crossing = find_crossing(
+            picture.grey,
+            expected,
+            search_cells=self.search_m / gsd_m,
+            radius_cells=self.target_radius_m / gsd_m,
+        )
+        if crossing is None:
+            return ShownPoint(
+                how="not found",
+                wall=picture.wall,
+                expected=expected,
+                place=_NOWHERE[:2],
+                point_world=_NOWHERE,
+            )
+        radius_m = _DEPTH_SHARE * self.target_radius_m
+        point = point_on_surface(picture.surface, crossing, radius_m)
+        return ShownPoint(
+            how="target",
+            wall=picture.wall,
+            expected=expected,
+            place=crossing,
+            point_world=_NOWHERE if point is None else point,
+        )
 
 
 def find_by_truth(
@@ -86,7 +216,7 @@ def find_by_truth(
     reference = GreyImage(
         grey=np.where(known, np.nan_to_num(true.rgb) @ LUMINANCE, 0.0), valid=known, region=known
     )
-    shown = _part(picture, corner, side)
+    shown = picture.square(corner, side)
     whole = _whole_shift(shown, reference, rim, search_cells)
     if whole is None:
         return None
@@ -129,25 +259,9 @@ def point_on_surface(
             return None
         plane = np.linalg.lstsq(design[kept], values[kept], rcond=None)[0]
         off = values - design @ plane
-        spread = 1.4826 * float(np.median(np.abs(off[kept])))
+        spread = median_deviation(off[kept], 0.0)
         kept = np.abs(off) <= max(2.5 * spread, 1e-4)
     return np.asarray(wall.frame.world_from_wall(place[None], float(plane[0]))[0])
-
-
-def _part(picture: GreyImage, corner: NDArray[np.int64], side: int) -> GreyImage:
-    """A square part of a picture, not valid beyond its border."""
-    padded = np.zeros((side, side)), np.zeros((side, side), dtype=np.bool_)
-    rows = corner[1] + np.arange(side)
-    columns = corner[0] + np.arange(side)
-    inside = ((rows >= 0) & (rows < picture.grey.shape[0]))[:, None] & (
-        (columns >= 0) & (columns < picture.grey.shape[1])
-    )[None]
-    cells = np.ix_(
-        np.clip(rows, 0, picture.grey.shape[0] - 1), np.clip(columns, 0, picture.grey.shape[1] - 1)
-    )
-    padded[0][:] = np.where(inside, picture.grey[cells], 0.0)
-    padded[1][:] = inside & picture.valid[cells]
-    return GreyImage(grey=padded[0], valid=padded[1], region=padded[1])
 
 
 def _whole_shift(

@@ -20,16 +20,15 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.inspect.displacements import displacement_findings
+from orthoflow_plugins.inspect.figures import enlargement, vector_map
+from orthoflow_plugins.inspect.findings import displacement_findings, report
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs
-from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
-from orthoflow_plugins.inspect.reporting import report
-from orthoflow_plugins.inspect.vectors import enlargement, vector_map
 
-# The intensity is laid so far aside to see how exactly the comparison tells that.
-FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
+# The intensity is laid so far aside to see how exactly the comparison measures that.
+_FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
 
@@ -195,7 +194,7 @@ def _floor(intensity: GreyImage, radius: float) -> KeyPairs:
 
     # Some hundred pairs say what a floor is.
     intensity = intensity.fullest_part(_FLOOR_CELLS)
-    right, down = FLOOR_SHIFT_CELLS
+    right, down = _FLOOR_SHIFT_CELLS
     rows, columns = intensity.grey.shape
     move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
     # Averaging two of four cells would smooth one image only; cubic keeps most of the detail.
@@ -210,8 +209,8 @@ def _floor(intensity: GreyImage, radius: float) -> KeyPairs:
     pairs = find_key_pairs(aside, intensity, radius_cells=radius)
     return replace(
         pairs,
-        shift=pairs.shift - FLOOR_SHIFT_CELLS,
-        found=pairs.found - FLOOR_SHIFT_CELLS,
+        shift=pairs.shift - _FLOOR_SHIFT_CELLS,
+        found=pairs.found - _FLOOR_SHIFT_CELLS,
     )
 
 
@@ -255,7 +254,7 @@ def _inspection(items: list[_Verdict], findings: list[Finding], reason: str | No
         kinds=("SURF pair",),
         findings=tuple(findings),
         details={
-            "floor_shift_cells": list(FLOOR_SHIFT_CELLS),
+            "floor_shift_cells": list(_FLOOR_SHIFT_CELLS),
             "not_inspected_because": reason or "",
         },
     )

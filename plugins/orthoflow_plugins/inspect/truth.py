@@ -23,14 +23,45 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.inspect.cell_errors import (
+    Sampling,
+    SamplingRule,
+    WallErrors,
+    pooled,
+    sample_findings,
+    sampling,
+    sampling_rule,
+    wall_errors,
+)
+from orthoflow_plugins.inspect.figures import (
+    COLOUR_SPAN_GREY,
+    DEPTH_SPAN_MM,
+    DISPLACEMENT_SPAN_CELLS,
+    colour_error_map,
+    depth_error_map,
+    displacement_map,
+)
+from orthoflow_plugins.inspect.findings import report
+from orthoflow_plugins.inspect.image_quality import grey_of, quality_findings
+from orthoflow_plugins.inspect.orientation_errors import (
+    PoseError,
+    pose_details,
+    pose_errors,
+    pose_findings,
+    tie_findings,
+)
+from orthoflow_plugins.inspect.placing import wall_of
+from orthoflow_plugins.inspect.plane_errors import (
+    found_planes,
+    inspect_planes,
+    label_findings,
+    wall_plane_findings,
+    worst_plane_findings,
+)
+from orthoflow_plugins.inspect.source_errors import SourceErrors, source_findings, trace_sources
 
 if TYPE_CHECKING:
-    from orthoflow.geometry.photo_views import SceneCameras
-    from orthoflow.geometry.scene_views import TrueOrthoimage
-    from orthoflow_plugins.inspect.poses import PoseError
-    from orthoflow_plugins.inspect.samples import WallErrors
-    from orthoflow_plugins.inspect.sampling import Sampling, SamplingRule
-    from orthoflow_plugins.inspect.sources import SourceErrors
+    from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 _TRACED_POINTS: Final = 4000
 
@@ -100,14 +131,6 @@ class InspectTruth(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Compare the photos, then wall by wall, then all together."""
-        from orthoflow_plugins.inspect.poses import pose_findings
-        from orthoflow_plugins.inspect.reporting import report
-        from orthoflow_plugins.inspect.samples import pooled
-        from orthoflow_plugins.inspect.sampling import sampling_rule
-        from orthoflow_plugins.inspect.scores import found_planes, label_findings, sample_findings
-        from orthoflow_plugins.inspect.sources import source_findings
-        from orthoflow_plugins.inspect.tie_truth import tie_findings
-
         if inputs.orthoimages is None or inputs.walls is None:
             return self.Out(inspection=_inspect_planes(inputs, ctx))
         if not inputs.orthoimages.images:
@@ -119,7 +142,7 @@ class InspectTruth(Method):
         )
         views = _views(inputs, ctx.cores)
         poses = _pose_errors(inputs, views)
-        truth = _Truth(
+        judge = _Judge(
             inputs=inputs,
             walls=inputs.walls,
             params=params,
@@ -131,15 +154,16 @@ class InspectTruth(Method):
         findings: list[Finding] = []
         for place, image in enumerate(inputs.orthoimages.images):
             ctx.progress(place / len(inputs.orthoimages.images), f"wall {image.name}")
-            verdict = truth.judge(image)
+            verdict = judge.verdict_on(image)
             verdicts.append(verdict)
-            findings += _plane_findings(image, inputs.truth) + verdict.findings(image.wall)
+            findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
+            findings += verdict.findings(image.wall)
             _draw(image, verdict, ctx)
         sources = [item.sources for item in verdicts if item.sources is not None]
         findings += sample_findings(
             pooled([item.errors.samples for item in verdicts]), -1, sources_are_traced=bool(sources)
         )
-        findings += source_findings(sources, -1) + _worst_planes(findings)
+        findings += source_findings(sources, -1) + worst_plane_findings(findings)
         if inputs.cameras is not None:
             findings += pose_findings(poses)
             findings += tie_findings(inputs.cameras, inputs.walls, inputs.truth)
@@ -168,9 +192,6 @@ class _Verdict:
 
     def findings(self, wall: int) -> list[Finding]:
         """The wall's numbers."""
-        from orthoflow_plugins.inspect.scores import sample_findings
-        from orthoflow_plugins.inspect.sources import source_findings
-
         is_traced = self.sources is not None
         numbers = sample_findings(self.errors.samples, wall, sources_are_traced=is_traced)
         numbers += self.quality
@@ -178,8 +199,6 @@ class _Verdict:
 
 
 def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
-    from orthoflow_plugins.inspect.plane_truth import inspect_planes
-
     if inputs.planes is None:
         raise MethodError(
             "there is nothing to inspect: wire orthoimages and walls, or planes (inspect.truth)"
@@ -190,7 +209,7 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
 def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
     if inputs.cameras is None:
         return None
-    from orthoflow.geometry.photo_views import SceneCameras
+    from orthoflow.geometry.scene_views import SceneCameras
 
     return SceneCameras(inputs.truth.scene, cores=cores)
 
@@ -198,13 +217,11 @@ def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:
 def _pose_errors(inputs: InspectTruth.In, views: SceneCameras | None) -> tuple[PoseError, ...]:
     if inputs.cameras is None or views is None or inputs.walls is None:
         return ()
-    from orthoflow_plugins.inspect.poses import pose_errors
-
     return pose_errors(inputs.cameras, inputs.walls, inputs.truth, views)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Truth:
+class _Judge:
     """What walls are judged by; `views` is None without cameras."""
 
     inputs: InspectTruth.In
@@ -214,14 +231,8 @@ class _Truth:
     views: SceneCameras | None
     cores: int
 
-    def judge(self, image: Orthoimage) -> _Verdict:
+    def verdict_on(self, image: Orthoimage) -> _Verdict:
         """Compare one wall."""
-        from orthoflow_plugins.inspect.image_quality import grey_of, quality_findings
-        from orthoflow_plugins.inspect.placing import wall_of
-        from orthoflow_plugins.inspect.samples import wall_errors
-        from orthoflow_plugins.inspect.sampling import sampling
-        from orthoflow_plugins.inspect.sources import trace_sources
-
         inputs = self.inputs
         wall = wall_of(image, self.walls)
         chosen = sampling(image, self.rule)
@@ -246,8 +257,8 @@ class _Truth:
         viewers = Viewers(
             positions_world=np.unique(truth.stations, axis=0),
             up=truth.planes.up,
-            lowest_elevation_deg=_detail_deg(truth, "lowest_elevation_deg", -90.0),
-            highest_elevation_deg=_detail_deg(truth, "highest_elevation_deg", 90.0),
+            lowest_elevation_deg=truth.lowest_elevation_deg,
+            highest_elevation_deg=truth.highest_elevation_deg,
         )
         rendering = Rendering(
             buffer_front_m=self.walls.buffer_front_m,
@@ -261,45 +272,7 @@ class _Truth:
         return render(truth.scene, image.frame, rendering)
 
 
-def _detail_deg(truth: Truth, name: str, default: float) -> float:
-    value = truth.details.get(name, default)
-    return float(value) if isinstance(value, int | float) else default
-
-
-def _plane_findings(image: Orthoimage, truth: Truth) -> list[Finding]:
-    from orthoflow_plugins.inspect.scores import (
-        nearest_true_plane,
-        plane_distance,
-        plane_findings,
-    )
-
-    index = nearest_true_plane(image.frame.plane, truth.planes)
-    if index is None:
-        return []
-    return plane_findings(plane_distance(image.frame.plane, truth.planes, index), image.wall)
-
-
-def _worst_planes(findings: list[Finding]) -> list[Finding]:
-    """The largest error of any wall's plane, as numbers on all walls."""
-    worst = []
-    for name in ("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"):
-        values = [finding for finding in findings if finding.name == name]
-        if values:
-            largest = max(abs(finding.value) for finding in values)
-            worst.append(Finding(name=name, value=largest, unit=values[0].unit))
-    return worst
-
-
 def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
-    from orthoflow_plugins.inspect.maps import (
-        COLOUR_SPAN_GREY,
-        DEPTH_SPAN_MM,
-        DISPLACEMENT_SPAN_CELLS,
-        colour_error_map,
-        depth_error_map,
-        displacement_map,
-    )
-
     errors = verdict.errors
     ctx.figure(
         f"wall_{image.wall}_depth_error",
@@ -345,8 +318,6 @@ def _inspection(
         shifts.append(shift)
         kinds.append(kind)
     if poses:
-        from orthoflow_plugins.inspect.poses import pose_details
-
         details["poses"] = pose_details(poses)
     return Inspection(
         wall=np.concatenate(walls),

@@ -15,7 +15,7 @@ from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
 from orthoflow.files.images import decode_image
 from orthoflow.products import Calibration, InputFiles, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.read.contact_sheets import ContactSheet
+from orthoflow_plugins.read.figures import ContactSheet
 
 _SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"})
 _NAMED: Final = 3

@@ -15,8 +15,9 @@ from orthoflow.files.points.columns import columns_of_text
 from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.products import InputFiles, JsonValue, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.read.assembling import CloudAssembly
-from orthoflow_plugins.read.intensities import (
+from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, resolution_m
+from orthoflow_plugins.read.figures import plan_view_png, polar_view_png
+from orthoflow_plugins.read.scales import (
     LUMINANCE_CORRELATION,
     IntensityScale,
     choose_scale,
@@ -24,8 +25,6 @@ from orthoflow_plugins.read.intensities import (
     is_grey,
     normalise,
 )
-from orthoflow_plugins.read.precision import COARSE_M, FINE_M, resolution_m
-from orthoflow_plugins.read.previews import plan_view_png, polar_view_png
 from orthoflow_plugins.read.stations import Stations, choose_stations
 
 Unit = Literal["m", "mm", "ft", "us-ft"]
@@ -275,7 +274,7 @@ def _counts_json(assembly: CloudAssembly) -> dict[str, JsonValue]:
             "not_finite": count.n_not_finite,
             "rounding_m": count.rounding_m,
             "rgb_scale": count.rgb_scale,
-            "header": dict(count.details),
+            "header": dict(count.header),
         }
         for count in assembly.files
     ]

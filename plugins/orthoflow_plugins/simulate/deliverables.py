@@ -1,21 +1,32 @@
-"""What leaves the simulation: the cloud in the world, and the truth about it."""
+"""What leaves the simulation: the cloud in the world, the truth about it, and what is reported."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import Plane, wall_axes
-from orthoflow.products import JsonValue, Planes, PointCloud, Truth
+from orthoflow.geometry import Plane, frame_over, wall_axes
+from orthoflow.geometry.scene_views import render_frame
+from orthoflow.products import JsonValue, Photos, Planes, PointCloud, Truth
+from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.building import TruePlane
-from orthoflow_plugins.simulate.palace import Room
-from orthoflow_plugins.simulate.scanner import HIGHEST_ELEVATION_DEG, LOWEST_ELEVATION_DEG, Scan
-from orthoflow_plugins.simulate.sweeping import SPOILT
+from orthoflow_plugins.simulate.photographs import Shot, taken_photos, true_cameras
+from orthoflow_plugins.simulate.room_model import Room
+from orthoflow_plugins.simulate.scanning import (
+    HIGHEST_ELEVATION_DEG,
+    LOWEST_ELEVATION_DEG,
+    SPOILT,
+    Scan,
+)
 
 _CHUNK = 1 << 20
+_PICTURE_GSD_M = 0.01
+_TILE_M = 0.1
+_THUMB_PX = 300
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +81,20 @@ def cloud_of(delivery: Delivery) -> PointCloud:
     )
 
 
-def truth_of(delivery: Delivery, cloud: PointCloud, parameters: Mapping[str, JsonValue]) -> Truth:
-    """Give the truth; planes come in the order of their numbers of points."""
+def truth_of(
+    delivery: Delivery,
+    cloud: PointCloud,
+    shots: tuple[Shot, ...],
+    parameters: Mapping[str, JsonValue],
+) -> Truth:
+    """Give the truth; planes come in the order of their numbers of points.
+
+    Args:
+        delivery: the scanned room.
+        cloud: its points in the world.
+        shots: its photos, room frame.
+        parameters: of the simulation, for people.
+    """
     rectangle = delivery.scan.points.rectangle
     scene = delivery.room.scene
     # One more entry, for spoilt points: index -2 counts from the end.
@@ -91,14 +114,104 @@ def truth_of(delivery: Delivery, cloud: PointCloud, parameters: Mapping[str, Jso
         planes=replace(planes, rms_m=_rms_m(cloud, planes, labels)),
         labels=labels,
         stations=delivery.stations_world,
-        details={
-            "parameters": dict(parameters),
-            "lowest_elevation_deg": LOWEST_ELEVATION_DEG,
-            "highest_elevation_deg": HIGHEST_ELEVATION_DEG,
-            "n_points": len(cloud),
-            "n_spoilt": int(np.count_nonzero(rectangle == SPOILT)),
-        },
+        lowest_elevation_deg=LOWEST_ELEVATION_DEG,
+        highest_elevation_deg=HIGHEST_ELEVATION_DEG,
+        n_spoilt=int(np.count_nonzero(rectangle == SPOILT)),
+        cameras=true_cameras(shots, delivery.world_from_room, delivery.shift_world_m)
+        if shots
+        else None,
+        photos=taken_photos(shots),
+        details={"parameters": dict(parameters), "n_points": len(cloud)},
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanStep:
+    """Spacing of the points on a wall, as if they lay in a square grid.
+
+    Attributes:
+        median_m: half of the wall is scanned at least as finely.
+        p90_m: nine tenths are.
+    """
+
+    median_m: float
+    p90_m: float
+
+
+def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
+    """Report metrics and the true orthoimage of the wall with the most points."""
+    ctx.metric("n_points", len(cloud), "1")
+    ctx.metric("n_true_planes", len(truth.planes), "1")
+    ctx.metric("main_wall_points", int(truth.planes.n_points[0]), "1")
+    ctx.metric("outlier_share", truth.n_spoilt / len(cloud), "1")
+    step = measured_step(truth, cloud, 0)
+    if step is not None:
+        ctx.metric("scan_step_median_mm", 1000.0 * step.median_m, "mm")
+        ctx.metric("scan_step_p90_mm", 1000.0 * step.p90_m, "mm")
+    ctx.figure(
+        "main_wall",
+        _picture(truth, ctx.cores),
+        f"True orthoimage of the {truth.planes.names[0]} at {_PICTURE_GSD_M * 1000:.0f} mm.",
+    )
+
+
+def report_photos(photos: Photos, shots: tuple[Shot, ...], ctx: StepContext) -> None:
+    """Report how the photos were taken, and show them side by side; nothing without photos."""
+    if not photos.photos:
+        return
+    ctx.metric("n_photos", len(photos.photos), "1")
+    ctx.metric("photo_megapixels", sum(p.width * p.height for p in photos.photos) / 1e6, "1")
+    ctx.metric("photo_gsd_mm", float(np.mean([1000.0 * shot.gsd_m for shot in shots])), "mm")
+    ctx.metric("photo_obliquity_max_deg", max(shot.obliquity_deg for shot in shots), "deg")
+    ctx.figure("photos", _contact_sheet(photos), "The photos, in the order of their names.")
+
+
+def _contact_sheet(photos: Photos) -> bytes:
+    from orthoflow.files.images import decode_image, encode_webp
+
+    small = []
+    for photo in photos.photos:
+        step = max(1, photo.width // _THUMB_PX)
+        small.append(decode_image(photo.encoded, photo.name)[::step, ::step])
+    per_row = math.ceil(math.sqrt(len(small)))
+    blank = np.zeros_like(small[0])
+    small += [blank] * (-len(small) % per_row)
+    rows = [np.hstack(small[i : i + per_row]) for i in range(0, len(small), per_row)]
+    return encode_webp(np.vstack(rows))
+
+
+def measured_step(truth: Truth, cloud: PointCloud, plane: int) -> ScanStep | None:
+    """Measure the scan step on a plane from the points in tiles of 10 cm; None without tiles."""
+    frame = frame_over(truth.planes.corners[plane], truth.planes.normal[plane], gsd_m=_TILE_M)
+    counts = np.zeros(frame.shape, dtype=np.int64)
+    for start in range(0, len(cloud), _CHUNK):
+        chosen = np.flatnonzero(truth.labels[start : start + _CHUNK] == plane) + start
+        pixels = np.floor(frame.wall_from_world(cloud.points_world(chosen))[:, :2]).astype(int)
+        inside = np.all((pixels >= 0) & (pixels < [frame.width, frame.height]), axis=1)
+        np.add.at(counts, (pixels[inside, 1], pixels[inside, 0]), 1)
+    whole = counts[_inner(counts > 0)]
+    if whole.size == 0:
+        return None
+    steps = _TILE_M / np.sqrt(whole)
+    return ScanStep(median_m=float(np.median(steps)), p90_m=float(np.percentile(steps, 90)))
+
+
+def _inner(filled: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tiles whose neighbours all hold points: no rim of the wall cuts them."""
+    padded = np.pad(filled, 1)
+    inner = np.ones_like(filled)
+    for row in range(3):
+        for column in range(3):
+            inner &= padded[row : row + filled.shape[0], column : column + filled.shape[1]]
+    return inner
+
+
+def _picture(truth: Truth, cores: int) -> bytes:
+    from orthoflow.files.images import encode_webp
+
+    frame = frame_over(truth.planes.corners[0], truth.planes.normal[0], gsd_m=_PICTURE_GSD_M)
+    image = render_frame(truth.scene, frame, buffer_front_m=0.3, buffer_behind_m=0.3, supersample=2)
+    return encode_webp(np.nan_to_num(image.rgb).round().astype(np.uint8))
 
 
 def _turned_axis(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
@@ -13,7 +12,17 @@ from pydantic import Field
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
 from orthoflow.products import Calibration, CheckPoints, Photos, PointCloud, Truth
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
-from orthoflow_plugins.simulate.palace import (
+from orthoflow_plugins.simulate.check_points import check_points
+from orthoflow_plugins.simulate.photographs import (
+    Film,
+    PhotoLayout,
+    ShotPlan,
+    calibrated,
+    calibration_of,
+    planned_shots,
+    take_photos,
+)
+from orthoflow_plugins.simulate.room_model import (
     MOST_TEXTILE,
     TEXTILE_BY_DESIGN,
     Room,
@@ -22,12 +31,9 @@ from orthoflow_plugins.simulate.palace import (
 )
 
 if TYPE_CHECKING:
-    from orthoflow.geometry.photo_views import SceneCameras
+    from orthoflow.geometry.scene_views import SceneCameras
     from orthoflow_plugins.simulate.deliverables import Delivery
-    from orthoflow_plugins.simulate.photographs import Film
-    from orthoflow_plugins.simulate.scanner import Scan
-    from orthoflow_plugins.simulate.sweeping import Errors
-    from orthoflow_plugins.simulate.viewpoints import Shot
+    from orthoflow_plugins.simulate.scanning import Errors, Scan
 
 SpectralGap = Literal["none", "easy", "hard"]
 
@@ -111,7 +117,7 @@ class SimulateRoom(Method):
             le=MOST_TEXTILE,
             description="Share of the main wall covered by cloth with one repeated motif.",
         )
-        photo_layout: Literal["none", "quick", "variant1", "variant2"] = Field(
+        photo_layout: PhotoLayout = Field(
             "none",
             description="quick: 6 photos of the main wall; variant1: 8 photos of whole walls, 4 "
             "walls; variant2: a block of 18 over the main wall, 70 % and 50 % overlap.",
@@ -166,15 +172,14 @@ class SimulateRoom(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Build the room, scan and photograph it, and write down the truth."""
         del inputs
-        from orthoflow.geometry.photo_views import SceneCameras
-        from orthoflow_plugins.simulate.deliverables import Delivery, cloud_of, truth_of
-        from orthoflow_plugins.simulate.photographs import (
-            calibrated,
-            calibration_of,
-            take_photos,
+        from orthoflow.geometry.scene_views import SceneCameras
+        from orthoflow_plugins.simulate.deliverables import (
+            Delivery,
+            cloud_of,
+            report_photos,
+            report_room,
+            truth_of,
         )
-        from orthoflow_plugins.simulate.reporting import report_photos, report_room
-        from orthoflow_plugins.simulate.viewpoints import ShotPlan, planned_shots
 
         scan_rng, photo_rng = ctx.rng.spawn(2)
         room = build_room(
@@ -203,11 +208,9 @@ class SimulateRoom(Method):
         views = SceneCameras(room.scene, cores=ctx.cores)
         photos = take_photos(views, shots, _film(params), ctx, photo_rng)
         cloud = cloud_of(delivery)
-        truth = _with_cameras(
-            truth_of(delivery, cloud, params.model_dump(mode="json")), delivery, shots
-        )
+        truth = truth_of(delivery, cloud, shots, params.model_dump(mode="json"))
         report_room(truth, cloud, ctx)
-        report_photos(truth, photos, ctx)
+        report_photos(photos, shots, ctx)
         return self.Out(
             cloud=cloud,
             photos=calibrated(photos, calibration),
@@ -220,7 +223,7 @@ class SimulateRoom(Method):
 def _scan(
     room: Room, params: SimulateRoom.Params, rng: np.random.Generator, ctx: StepContext
 ) -> Scan:
-    from orthoflow_plugins.simulate.scanner import SweepPlan, planned_sweeps, scan_scene
+    from orthoflow_plugins.simulate.scanning import SweepPlan, planned_sweeps, scan_scene
 
     plan = SweepPlan(
         n_stations=params.n_stations,
@@ -234,8 +237,6 @@ def _scan(
 
 
 def _film(params: SimulateRoom.Params) -> Film:
-    from orthoflow_plugins.simulate.photographs import Film
-
     return Film(
         noise_grey=params.photo_noise_grey,
         vignetting=params.photo_vignetting_share,
@@ -243,21 +244,7 @@ def _film(params: SimulateRoom.Params) -> Film:
     )
 
 
-def _with_cameras(truth: Truth, delivery: Delivery, shots: tuple[Shot, ...]) -> Truth:
-    from orthoflow_plugins.simulate.photographs import shot_details, true_cameras
-
-    if not shots:
-        return truth
-    return replace(
-        truth,
-        cameras=true_cameras(shots, delivery.world_from_room, delivery.shift_world_m),
-        details={**truth.details, "photos": shot_details(shots)},
-    )
-
-
 def _check_points(delivery: Delivery, views: SceneCameras, n_most: int) -> CheckPoints:
-    from orthoflow_plugins.simulate.marks import check_points
-
     return check_points(
         delivery.room.scene,
         views,
@@ -269,7 +256,7 @@ def _check_points(delivery: Delivery, views: SceneCameras, n_most: int) -> Check
 
 
 def _errors(params: SimulateRoom.Params) -> Errors:
-    from orthoflow_plugins.simulate.sweeping import Errors
+    from orthoflow_plugins.simulate.scanning import Errors
 
     return Errors(
         noise_m=params.noise_m,

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect.check_table import (
+from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
+from orthoflow_plugins.inspect.findings import (
     check_findings,
     outliers_at_once,
     outliers_iterated,
 )
-from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
-from orthoflow_plugins.inspect.crossings import find_crossing
-from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.targets import find_crossing
 from orthoflow_plugins.plane.given import GivenPlane
 from orthoflow_plugins.raster.grid import RasterGrid
 from orthoflow_plugins.read.scan import ReadScan
@@ -134,7 +134,7 @@ def test_the_centre_of_a_target_is_found_in_noise_and_holes(turned_deg: float) -
     picture = GreyImage(grey=grey, valid=valid, region=valid)
     found = find_crossing(picture, np.array([47.0, 52.0]), search_cells=12.0, radius_cells=30.0)
     assert found is not None
-    np.testing.assert_allclose(found.place, centre, atol=0.06)  # cells
+    np.testing.assert_allclose(found, centre, atol=0.06)  # cells
     edge = np.where(np.mgrid[:100, :100][1] < 50, 40.0, 220.0)
     plain = GreyImage(grey=edge, valid=valid, region=valid)
     assert (

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.tie_truth import most_shown
+from orthoflow_plugins.inspect.orientation_errors import most_shown
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
-from orthoflow.geometry.photo_views import SceneCameras
-from orthoflow.geometry.scene_views import TrueOrthoimage, Viewers, render_frame
+from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, Viewers, render_frame
 from orthoflow.products import (
     Camera,
     Cameras,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.matching import GreyImage
-from orthoflow_plugins.inspect.sharpness import sharpness_findings
+from orthoflow_plugins.inspect.image_quality import sharpness_findings
+from orthoflow_plugins.inspect.patches import GreyImage
 from scipy.special import erf
 
 

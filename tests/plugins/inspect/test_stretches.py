@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.stretches import cells_per_pixel, stretch_findings
+from orthoflow_plugins.inspect.image_quality import cells_per_pixel, stretch_findings
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at

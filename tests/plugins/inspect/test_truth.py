@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from orthoflow_plugins.inspect.reporting import report
-from orthoflow_plugins.inspect.samples import depth_step_band
+from orthoflow_plugins.inspect.cell_errors import depth_step_band
+from orthoflow_plugins.inspect.findings import report
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.read.orthoimage import ReadOrthoimage
 from orthoflow_plugins.simulate.room import SimulateRoom

@@ -12,11 +12,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.read import assembling
-from orthoflow_plugins.read.colours import ColourScale
-from orthoflow_plugins.read.intensities import choose_scale, normalise
-from orthoflow_plugins.read.precision import rounding_m
-from orthoflow_plugins.read.previews import polar_view_png
+from orthoflow_plugins.read import assembly
+from orthoflow_plugins.read.assembly import rounding_m
+from orthoflow_plugins.read.figures import polar_view_png
+from orthoflow_plugins.read.scales import ColourScale, choose_scale, normalise
 from orthoflow_plugins.read.scan import ReadScan
 from orthoflow_plugins.read.stations import ScanSummary, choose_stations
 
@@ -549,7 +548,7 @@ def test_too_little_scratch_space_is_said_before_anything_is_written(
 def test_more_scans_than_can_be_numbered_are_refused(
     tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(assembling, "_MOST_SCANS", 2)
+    monkeypatch.setattr(assembly, "_MOST_SCANS", 2)
     paths = [write_text(tmp_path / f"{name}.xyz", points) for name in "abc"]
     with pytest.raises(InputError, match="there are more than 2 scans"):
         read(*paths)

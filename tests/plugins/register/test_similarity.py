@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.register.similarity import RegisterSimilarity
+from orthoflow_plugins.register.similarity import RegisterSimilarity, Similarity
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.similarity import Similarity
 from orthoflow.products import CheckPoints
 from tests import raster_scenes as scenes
 from tests.inspect_scenes import points_at

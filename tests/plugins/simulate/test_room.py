@@ -9,10 +9,10 @@ import pytest
 from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.geometry import UpDirection, wall_axes
-from orthoflow.geometry.scene_views import cast, colours_at
 from orthoflow.products import PointCloud, Truth
 from orthoflow.sdk import StepContext
 from tests import scenes
+from tests.scene_rays import cast, colours_at
 
 COARSE = {"scan_step_m": 0.06, "panorama_step_m": 0.18}
 CLEAN = {**COARSE, "noise_m": 0.0, "outlier_share": 0.0, "beam_m": 0.0, "colour_noise_grey": 0.0}
@@ -128,7 +128,7 @@ def test_noise_is_as_large_as_asked(tmp_path: Path) -> None:
 def test_outliers_are_as_many_as_asked_and_belong_to_no_plane(tmp_path: Path) -> None:
     clean = simulate(tmp_path / "clean", **{**COARSE, "outlier_share": 0.0, "beam_m": 0.0})
     dirty = simulate(tmp_path / "dirty", **{**COARSE, "outlier_share": 0.1, "beam_m": 0.0})
-    spoilt = dirty.truth.details["n_spoilt"]
+    spoilt = dirty.truth.n_spoilt
     assert isinstance(spoilt, int)
     # 4 standard deviations of a binomial share.
     limit = 4.0 * np.sqrt(0.1 * 0.9 / len(dirty.cloud))

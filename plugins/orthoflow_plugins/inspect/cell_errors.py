@@ -1,25 +1,104 @@
-"""What an orthoimage and its wall show against what they should, cell by cell."""
+"""What an orthoimage and its wall show against what they should, cell by cell.
+
+All cells of small walls are compared, a fair part of large ones. What is compared is exact; a part
+of it says as much about the whole as the whole does, as long as it is spread evenly. Colours are
+rendered in whole blocks, since patches need neighbours; who sees a cell is asked on a lattice, so
+that nothing wider than its step is passed over.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.scene_views import TrueOrthoimage
-from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask, Wall
-from orthoflow_plugins.inspect.image_quality import LUMINANCE
-from orthoflow_plugins.inspect.matching import GreyImage, PatchShifts, measure_shifts
-from orthoflow_plugins.inspect.sampling import Sampling
+from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
+from orthoflow.products import Finding, Orthoimage, OrthoMask, SurfaceMask, Wall
+from orthoflow_plugins.inspect.findings import rms
+from orthoflow_plugins.inspect.image_quality import LUMINANCE, shown
+from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_shifts
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import TrueOrthoimage
 
 # Neighbouring cells whose true depths differ by more make a step, reported apart.
-STEP_M: Final = 0.004
-STEP_BAND_CELLS: Final = 2
+_STEP_M: Final = 0.004
+_STEP_BAND_CELLS: Final = 2
 # A colour so far outside of all true colours within one cell has no business there.
-GROSS_GREY: Final = 40.0
+_GROSS_GREY: Final = 40.0
+# Whole patches of 32 cells, and so many that little is lost at the rim.
+BLOCK_CELLS: Final = 96
+# Multiples of these, modulo 1, fill a square most evenly (Roberts 2018, the R2 sequence).
+_SPREAD: Final = (0.7548776662466927, 0.5698402909980532)
+_NAMES_BESIDE_TRACED: Final = {
+    "rmse_u_mm": "patch_rmse_u_mm",
+    "rmse_v_mm": "patch_rmse_v_mm",
+    "mean_u_mm": "patch_mean_u_mm",
+    "mean_v_mm": "patch_mean_v_mm",
+    "ghost_share": "ghost_colour_share",
+}
+
+_Number = tuple[str, float, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """Which cells of an orthoimage are compared.
+
+    Attributes:
+        coloured: (rows, cols) bool, cells whose colour is.
+        lattice: (rows, cols) bool, cells of which is asked who sees them.
+    """
+
+    coloured: NDArray[np.bool_]
+    lattice: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingRule:
+    """How much of all walls is compared.
+
+    Attributes:
+        colour_share: share of blocks whose colours are compared.
+        lattice_step: every so manyth row and column is asked who sees it.
+    """
+
+    colour_share: float
+    lattice_step: int
+
+
+def sampling_rule(
+    images: Sequence[Orthoimage], *, colour_cells_most: int, seen_cells_most: int
+) -> SamplingRule:
+    """Find the share and the step that keep to about so many cells of all images together."""
+    n_shown = sum(int(np.count_nonzero(shown(image))) for image in images)
+    n_cells = sum(image.mask.size for image in images)
+    return SamplingRule(
+        colour_share=min(1.0, colour_cells_most / max(1, n_shown)),
+        lattice_step=max(1, math.ceil(math.sqrt(n_cells / seen_cells_most))),
+    )
+
+
+def sampling(image: Orthoimage, rule: SamplingRule) -> Sampling:
+    """Choose cells of an image; blocks that show nothing have no colours to compare."""
+    shows = shown(image)
+    coloured = np.zeros(shows.shape, dtype=np.bool_)
+    for i in range(-(-shows.shape[0] // BLOCK_CELLS)):
+        for j in range(-(-shows.shape[1] // BLOCK_CELLS)):
+            block = (
+                slice(i * BLOCK_CELLS, (i + 1) * BLOCK_CELLS),
+                slice(j * BLOCK_CELLS, (j + 1) * BLOCK_CELLS),
+            )
+            is_chosen = (i * _SPREAD[0] + j * _SPREAD[1]) % 1.0 < rule.colour_share
+            coloured[block] = is_chosen and shows[block].any()
+    lattice = np.zeros(shows.shape, dtype=np.bool_)
+    first = rule.lattice_step // 2
+    lattice[first :: rule.lattice_step, first :: rule.lattice_step] = True
+    return Sampling(coloured=coloured, lattice=lattice)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +150,7 @@ class WallErrors:
         samples: the errors as numbers.
         patches: where displacements were measured.
         depth_m: (rows, cols) measured - true depth, NaN where either is missing.
-        grey: (rows, cols) root mean square colour error, NaN where none is told.
+        grey: (rows, cols) root mean square colour error, NaN where none is compared.
     """
 
     samples: WallSamples
@@ -158,15 +237,35 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     # Far away instead of missing, so that the rim of the surface is a step too.
     depth = np.where(np.isfinite(depth_m), depth_m, np.float32(1e3))
     edge = np.zeros(depth.shape, dtype=np.uint8)
-    down = np.abs(np.diff(depth, axis=0)) > STEP_M
-    right = np.abs(np.diff(depth, axis=1)) > STEP_M
+    down = np.abs(np.diff(depth, axis=0)) > _STEP_M
+    right = np.abs(np.diff(depth, axis=1)) > _STEP_M
     # The cells beside the edge are its first cells on each side.
     edge[1:] |= down
     edge[:-1] |= down
     edge[:, 1:] |= right
     edge[:, :-1] |= right
-    window = np.ones((2 * STEP_BAND_CELLS - 1,) * 2, dtype=np.uint8)
+    window = np.ones((2 * _STEP_BAND_CELLS - 1,) * 2, dtype=np.uint8)
     return np.asarray(cv2.dilate(edge, window), dtype=np.bool_)
+
+
+def sample_findings(
+    samples: WallSamples, wall: int, *, sources_are_traced: bool = False
+) -> list[Finding]:
+    """Numbers on the cells of one wall, or of all with wall -1; none for what has no samples.
+
+    Displacements and ghosts bear a longer name when they also follow from the photos' cameras,
+    which says more.
+    """
+    renamed = _NAMES_BESIDE_TRACED if sources_are_traced else {}
+    return [
+        Finding(name=renamed.get(name, name), value=value, unit=unit, wall=wall)
+        for name, value, unit in (
+            *_depth_numbers(samples),
+            *_colour_numbers(samples),
+            *_shift_numbers(samples),
+            *_share_numbers(samples),
+        )
+    ]
 
 
 def _square_errors(
@@ -180,7 +279,7 @@ def _square_errors(
 
 
 def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -> PatchShifts:
-    """Displacements of patches, told from known cells away from steps."""
+    """Displacements of patches, by known cells away from steps."""
     painted = image.mask == OrthoMask.PAINTED
     filled = image.mask == OrthoMask.FILLED
     # Two centimetres is far beyond any fair error; further off is reported as gross colour.
@@ -205,7 +304,7 @@ def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]
     low = cv2.erode(np.where(missing, np.float32(np.inf), true.rgb), window)
     high = cv2.dilate(np.where(missing, np.float32(-np.inf), true.rgb), window)
     outside: NDArray[np.bool_] = np.any(
-        (image.rgb < low - np.float32(GROSS_GREY)) | (image.rgb > high + np.float32(GROSS_GREY)),
+        (image.rgb < low - np.float32(_GROSS_GREY)) | (image.rgb > high + np.float32(_GROSS_GREY)),
         axis=2,
     )
     return outside
@@ -221,3 +320,78 @@ def _inner(coloured: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.
 
 def _count(mask: NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(mask))
+
+
+def _depth_numbers(samples: WallSamples) -> list[_Number]:
+    errors = 1e3 * samples.depth_m
+    if errors.size == 0:
+        return []
+    middle = float(np.median(errors))
+    numbers = [
+        ("depth_median_mm", middle, "mm"),
+        ("depth_nmad_mm", median_deviation(errors, middle), "mm"),
+        ("depth_rmse_mm", rms(errors), "mm"),
+    ]
+    stated = samples.sigma_m > 0.0
+    if stated.any():
+        inside = np.abs(samples.depth_m[stated]) <= 3.0 * samples.sigma_m[stated]
+        numbers.append(("depth_within_3sigma", float(inside.mean()), "1"))
+    if samples.step_depth_m.size:
+        numbers.append(("depth_step_rmse_mm", 1e3 * rms(samples.step_depth_m), "mm"))
+    return numbers
+
+
+def _colour_numbers(samples: WallSamples) -> list[_Number]:
+    named = (
+        ("colour_rmse_grey", samples.colour),
+        ("filled_colour_rmse_grey", samples.filled_colour),
+        ("step_colour_rmse_grey", samples.step_colour),
+    )
+    return [
+        (name, float(np.sqrt(squares.mean())), "grey") for name, squares in named if squares.size
+    ]
+
+
+def _shift_numbers(samples: WallSamples) -> list[_Number]:
+    kept = _kept_shifts(samples)
+    numbers: list[_Number] = [("n_patches", float(len(kept)), "1")]
+    if not kept.any():
+        return numbers
+    shifts = 1e3 * samples.shift_m[kept]
+    for axis, name in enumerate(("u", "v")):
+        numbers += [
+            (f"rmse_{name}_mm", rms(shifts[:, axis]), "mm"),
+            (f"mean_{name}_mm", float(shifts[:, axis].mean()), "mm"),
+        ]
+    numbers.append(("displaced_share", 1.0 - float(kept.mean()), "1"))
+    return numbers
+
+
+def _kept_shifts(samples: WallSamples) -> NDArray[np.bool_]:
+    """Patches whose displacement belongs to the rest: 4 robust deviations, at least 1/4 cell."""
+    cells = samples.shift_cells
+    if len(cells) == 0:
+        return np.zeros(0, dtype=np.bool_)
+    middle = np.median(cells, axis=0)
+    nmad = NMAD_FACTOR * np.median(np.abs(cells - middle), axis=0)
+    kept: NDArray[np.bool_] = np.all(np.abs(cells - middle) <= np.maximum(4.0 * nmad, 0.25), axis=1)
+    return kept
+
+
+def _share_numbers(samples: WallSamples) -> list[_Number]:
+    numbers: list[_Number] = []
+    if samples.n_seen:
+        numbers += [
+            ("completeness", samples.n_seen_painted / samples.n_seen, "1"),
+            ("completeness_filled", samples.n_seen_shown / samples.n_seen, "1"),
+        ]
+    if samples.n_painted:
+        numbers += [
+            ("unseen_painted_share", samples.n_unseen_painted / samples.n_painted, "1"),
+        ]
+    if samples.n_coloured:
+        numbers += [
+            ("gross_colour_share", samples.n_gross / samples.n_coloured, "1"),
+            ("ghost_share", samples.n_ghost / samples.n_coloured, "1"),
+        ]
+    return numbers

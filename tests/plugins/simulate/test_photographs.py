@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.matching import GreyImage, measure_shifts
-from orthoflow_plugins.simulate.palace import RoomPlan, build_room
+from orthoflow_plugins.inspect.patches import GreyImage, measure_shifts
+from orthoflow_plugins.simulate.photographs import PhotoLayout, ShotPlan, planned_shots
 from orthoflow_plugins.simulate.room import SimulateRoom
-from orthoflow_plugins.simulate.viewpoints import PhotoLayout, ShotPlan, planned_shots
+from orthoflow_plugins.simulate.room_model import RoomPlan, build_room
 
 from orthoflow.files.images import decode_image
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.photo_views import SceneCameras
-from orthoflow.geometry.scene_views import TrueOrthoimage, cast, colours_at, render_frame
+from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, render_frame
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Truth
 from orthoflow.sdk import StepContext
 from tests import scenes
+from tests.scene_rays import cast, colours_at
 
 COARSE = {"scan_step_m": 0.1, "photo_layout": "quick", "photo_gsd_m": 0.008}
 GREY = np.array([0.299, 0.587, 0.114])
@@ -299,12 +299,13 @@ def test_the_textile_covers_its_share_of_the_main_wall(tmp_path: Path, share: fl
 
 
 def test_what_the_photos_were_taken_with_is_in_the_truth(room: SimulateRoom.Out) -> None:
-    details = room.truth.details
-    assert isinstance(details["photos"], list)
-    assert len(details["photos"]) == 6
-    for entry in details["photos"]:
-        assert isinstance(entry, dict)
-        assert entry["gsd_mm"] == pytest.approx(4.0, rel=0.1)
-        assert 0.0 < entry["obliquity_deg"] < 15.0
+    details, photos = room.truth.details, room.truth.photos
+    assert room.truth.cameras is not None
+    assert [taken.photo for taken in photos] == [c.photo for c in room.truth.cameras.cameras]
+    assert len(photos) == 6
+    for taken in photos:
+        assert taken.wall == "main wall"
+        assert 1e3 * taken.gsd_m == pytest.approx(4.0, rel=0.1)
+        assert 0.0 < taken.obliquity_deg < 15.0
     assert isinstance(details["parameters"], dict)
     assert details["parameters"]["scan_step_m"] == 0.1

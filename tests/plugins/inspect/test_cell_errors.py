@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.sampling import BLOCK_CELLS, sampling, sampling_rule
+from orthoflow_plugins.inspect.cell_errors import BLOCK_CELLS, sampling, sampling_rule
 
 from orthoflow.geometry import frame_over
 from orthoflow.products import Orthoimage, OrthoMask

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow_plugins.inspect.matching import GreyImage
+from orthoflow.geometry.opencv_border import to_opencv
+from orthoflow_plugins.inspect.patches import GreyImage
 
 _ROUNDS: Final = 20
 _CONVERGED_CELLS: Final = 1e-3
@@ -19,24 +19,9 @@ _SMOOTH_CELLS: Final = 1.2
 _LEAST_WEIGHT: Final = 0.2
 
 
-@dataclass(frozen=True, kw_only=True)
-class Crossing:
-    """Where the quadrants of a target meet.
-
-    Attributes:
-        place: (2,) float64 column, row.
-        alike: correlation of the target with itself after half a turn.
-        swapped: minus the correlation after a quarter turn.
-    """
-
-    place: NDArray[np.float64]
-    alike: float
-    swapped: float
-
-
 def find_crossing(
     picture: GreyImage, near: NDArray[np.float64], *, search_cells: float, radius_cells: float
-) -> Crossing | None:
+) -> NDArray[np.float64] | None:
     """Find the centre of a target near a place.
 
     The crossing is a saddle of the smoothed picture, found to a cell where the Hessian's
@@ -50,7 +35,7 @@ def find_crossing(
         radius_cells: of the target, or of as much of it as shall count.
 
     Returns:
-        The crossing, or None where nothing looks like one.
+        (2,) float64 column, row where the quadrants meet, or None where nothing looks like that.
     """
     margin = int(np.ceil(search_cells + radius_cells)) + 3
     corner = np.floor(near).astype(np.int64) - margin
@@ -63,26 +48,13 @@ def find_crossing(
         return None
     alike = _turned_correlation(window, place, radius_cells, half=True)
     swapped = -_turned_correlation(window, place, radius_cells, half=False)
-    if min(alike, swapped) < _LEAST_ALIKE:
-        return None
-    return Crossing(place=place + corner, alike=alike, swapped=swapped)
+    return None if min(alike, swapped) < _LEAST_ALIKE else place + corner
 
 
 def _window(picture: GreyImage, corner: NDArray[np.int64], side: int) -> GreyImage:
     """A square part, not valid beyond the border, its voids closed from around them."""
-    grey, valid = np.zeros((side, side)), np.zeros((side, side), dtype=np.bool_)
-    rows, columns = picture.grey.shape
-    top, left = max(0, int(corner[1])), max(0, int(corner[0]))
-    bottom, right = min(rows, int(corner[1]) + side), min(columns, int(corner[0]) + side)
-    if top < bottom and left < right:
-        inside = (
-            slice(top - int(corner[1]), bottom - int(corner[1])),
-            slice(left - int(corner[0]), right - int(corner[0])),
-        )
-        part = (slice(top, bottom), slice(left, right))
-        valid[inside] = picture.valid[part]
-        grey[inside] = np.where(picture.valid[part], picture.grey[part], 0.0)
-    return _closed(grey, valid)
+    part = picture.square(corner, side)
+    return _closed(np.where(part.valid, part.grey, 0.0), part.valid)
 
 
 def _closed(grey: NDArray[np.float64], valid: NDArray[np.bool_]) -> GreyImage:
@@ -148,7 +120,8 @@ def _symmetric(
     slopes = [np.gradient(window.grey, axis=axis) for axis in (1, 0)]
     place = start.copy()
     for _ in range(_ROUNDS):
-        ways = [(place + sign * aside - 0.5).T[::-1] for sign in (1.0, -1.0)]
+        # scipy counts cells from their centres, as OpenCV does.
+        ways = [to_opencv(place + sign * aside).T[::-1] for sign in (1.0, -1.0)]
         greys = [map_coordinates(window.grey, way, order=3, mode="nearest") for way in ways]
         valid = [
             map_coordinates(window.valid.astype(np.float64), way, order=1, cval=0.0) > 0.99
@@ -181,7 +154,7 @@ def _turned_correlation(
     aside = _disc(radius)
     turned = -aside if half else np.column_stack([-aside[:, 1], aside[:, 0]])
     one, other = (
-        map_coordinates(window.grey, (place + way - 0.5).T[::-1], order=1, mode="nearest")
+        map_coordinates(window.grey, to_opencv(place + way).T[::-1], order=1, mode="nearest")
         for way in (aside, turned)
     )
     spread = float(np.std(one) * np.std(other))

@@ -1,4 +1,4 @@
-"""Small pictures of a cloud: from above, and as the scanner saw it."""
+"""Pictures of what was read: a cloud from above and as its scanner saw it, photos side by side."""
 
 from __future__ import annotations
 
@@ -8,26 +8,35 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.images import encode_png
+from orthoflow.files.images import encode_png, encode_webp
 from orthoflow.geometry import basis_from_up
 from orthoflow.products import PointCloud
 
-_SIDE_PX: Final = 640
-_SAMPLE: Final = 250_000
+_PLAN_SIDE_PX: Final = 640
+_PLAN_SAMPLE: Final = 250_000
 _POLAR_SIDE_PX: Final = 1200
 _POLAR_SAMPLE: Final = 2_000_000
+
+_SHEET_SIDE_PX: Final = 1200
+_CELL_PX: Final = 300
+_LABEL_PX: Final = 18
+_LETTER_PX: Final = 7
+_GAP_PX: Final = 6
+_MOST: Final = 100
+_PAPER: Final = 245
+_INK: Final = (40, 40, 40)
 
 
 def plan_view_png(cloud: PointCloud) -> bytes:
     """Give a PNG of the cloud seen from above, brighter where it is denser (logarithmic)."""
-    step = max(1, len(cloud) // _SAMPLE)
+    step = max(1, len(cloud) // _PLAN_SAMPLE)
     offsets = np.column_stack([cloud.x[::step], cloud.y[::step], cloud.z[::step]])
     plan = offsets.astype(np.float64) @ basis_from_up(cloud.up)[:2].T
     # Percentiles, so that stray points do not shrink the building to a dot.
     low, high = np.percentile(plan, [0.1, 99.9], axis=0)
     span = max(float((high - low).max()), 1e-6)
-    size = np.maximum(np.ceil((high - low) / span * _SIDE_PX).astype(int), 1)
-    cells = np.floor((plan - low) / span * _SIDE_PX).astype(np.int64)
+    size = np.maximum(np.ceil((high - low) / span * _PLAN_SIDE_PX).astype(int), 1)
+    cells = np.floor((plan - low) / span * _PLAN_SIDE_PX).astype(np.int64)
     is_inside = np.all((cells >= 0) & (cells < size), axis=1)
     columns, rows = cells[is_inside].T
     counts = np.bincount(rows * size[0] + columns, minlength=int(size.prod())).astype(np.float64)
@@ -71,6 +80,56 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
     return encode_png(np.ascontiguousarray(image))
 
 
+class ContactSheet:
+    """Thumbnails with their names, in rows; photos show as they are stored, never turned."""
+
+    def __init__(self, n_photos: int) -> None:
+        self.n_photos = n_photos
+        self.n_shown = min(n_photos, _MOST)
+        self._columns = max(1, math.ceil(math.sqrt(self.n_shown)))
+        self._cell_px = min(_CELL_PX, _SHEET_SIDE_PX // self._columns)
+        self._cells: list[NDArray[np.uint8]] = []
+
+    @property
+    def caption(self) -> str:
+        """One sentence on what the sheet shows."""
+        if self.n_shown < self.n_photos:
+            return f"The first {self.n_shown} of {self.n_photos} photos, as they are stored."
+        return "The photos, as they are stored."
+
+    def add(self, name: str, image: NDArray[np.uint8]) -> None:
+        """Put the next photo (rows, cols, 3) RGB on the sheet, if there is room left."""
+        import cv2
+
+        if len(self._cells) == self.n_shown:
+            return
+        room_px = self._cell_px - 2 * _GAP_PX
+        scale = min(room_px / image.shape[1], (room_px - _LABEL_PX) / image.shape[0])
+        width, height = (max(1, int(side * scale)) for side in (image.shape[1], image.shape[0]))
+        shape = (height + _LABEL_PX + 2 * _GAP_PX, self._cell_px, 3)
+        cell = np.full(shape, _PAPER, dtype=np.uint8)
+        cell[_GAP_PX : _GAP_PX + height, _GAP_PX : _GAP_PX + width] = cv2.resize(
+            image, (width, height), interpolation=cv2.INTER_AREA
+        )
+        place = (_GAP_PX, _GAP_PX + height + _LABEL_PX - 5)
+        label = _shortened(name, room_px // _LETTER_PX)
+        cv2.putText(cell, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.38, _INK, 1, cv2.LINE_AA)
+        self._cells.append(cell)
+
+    def encoded(self) -> bytes:
+        """Encode the sheet as WebP; no side is longer than 1200 pixels."""
+        starts = range(0, len(self._cells), self._columns)
+        rows = [_in_a_row(self._cells[start : start + self._columns]) for start in starts]
+        width = max(row.shape[1] for row in rows)
+        height = sum(row.shape[0] for row in rows)
+        sheet = np.full((height, width, 3), _PAPER, dtype=np.uint8)
+        top = 0
+        for row in rows:
+            sheet[top : top + row.shape[0], : row.shape[1]] = row
+            top += row.shape[0]
+        return encode_webp(sheet)
+
+
 def _ways_of_grid(
     cloud: PointCloud,
     scan: int,
@@ -91,3 +150,22 @@ def _ways_of_grid(
     azimuth = np.arctan2(north, east)[np.bincount(column) > 0]
     steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi
     return upward, bool(len(steps)) and float(np.median(steps)) > 0.0
+
+
+def _in_a_row(cells: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    height = max(cell.shape[0] for cell in cells)
+    row = np.full((height, sum(cell.shape[1] for cell in cells), 3), _PAPER, dtype=np.uint8)
+    left = 0
+    for cell in cells:
+        row[: cell.shape[0], left : left + cell.shape[1]] = cell
+        left += cell.shape[1]
+    return row
+
+
+def _shortened(name: str, n_letters: int) -> str:
+    """Cut a name in the middle: photos differ at the end of theirs. OpenCV letters are ASCII."""
+    label = name.encode("ascii", "replace").decode()
+    if len(label) <= n_letters:
+        return label
+    n_end = n_letters // 2
+    return f"{label[: n_letters - n_end - 2]}..{label[-n_end:]}"

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.photo_views import SceneCameras
-from orthoflow.geometry.scene_views import TrueOrthoimage
+from orthoflow.geometry.robust import median_deviation
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Truth, Wall
-from orthoflow_plugins.inspect.poses import true_camera
-from orthoflow_plugins.inspect.samples import depth_step_band
+from orthoflow_plugins.inspect.cell_errors import depth_step_band
+from orthoflow_plugins.inspect.findings import rms
+from orthoflow_plugins.inspect.orientation_errors import true_camera
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 # A cell coloured from farther away shows another place.
-FAR_CELLS: Final = 3.0
+_FAR_CELLS: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,16 +123,14 @@ def source_findings(errors: Sequence[SourceErrors], wall: int) -> list[Finding]:
     numbers = [("n_traced", float(n_traced), "1")]
     for axis, name in enumerate(("u", "v")):
         if len(away):
-            middle = float(np.median(away[:, axis]))
-            spread = 1.4826 * float(np.median(np.abs(away[:, axis] - middle)))
             numbers += [
-                (f"rmse_{name}_mm", _rms(away[:, axis]), "mm"),
+                (f"rmse_{name}_mm", rms(away[:, axis]), "mm"),
                 (f"mean_{name}_mm", float(away[:, axis].mean()), "mm"),
-                (f"nmad_{name}_mm", spread, "mm"),
+                (f"nmad_{name}_mm", median_deviation(away[:, axis]), "mm"),
                 (f"p99_{name}_mm", float(np.percentile(np.abs(away[:, axis]), 99)), "mm"),
             ]
         if len(steps):
-            numbers.append((f"step_rmse_{name}_mm", _rms(steps[:, axis]), "mm"))
+            numbers.append((f"step_rmse_{name}_mm", rms(steps[:, axis]), "mm"))
     n_far = sum(int(np.count_nonzero(_is_far(item))) for item in errors)
     n_ghosts = sum(int(np.count_nonzero(item.ghosts)) for item in errors)
     numbers += [
@@ -146,15 +147,7 @@ def source_findings(errors: Sequence[SourceErrors], wall: int) -> list[Finding]:
 
 def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:
     """The frame seen from the scene's origin: survey coordinates would cost digits."""
-    return WallFrame(
-        origin_world=frame.origin_world - truth.scene.origin,
-        u_world=frame.u_world,
-        v_world=frame.v_world,
-        normal_world=frame.normal_world,
-        gsd_m=frame.gsd_m,
-        width=frame.width,
-        height=frame.height,
-    )
+    return replace(frame, origin_world=frame.origin_world - truth.scene.origin)
 
 
 def _seen_by_photos(
@@ -184,9 +177,5 @@ def _of(errors: SourceErrors, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
 def _is_far(errors: SourceErrors) -> NDArray[np.bool_]:
     """Cells whose colour is of a place more than 3 cells away, or of nothing."""
     length = np.linalg.norm(errors.displacement_m, axis=2)
-    far: NDArray[np.bool_] = errors.traced & ~(length <= FAR_CELLS * errors.frame.gsd_m)
+    far: NDArray[np.bool_] = errors.traced & ~(length <= _FAR_CELLS * errors.frame.gsd_m)
     return far
-
-
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -1,10 +1,11 @@
-"""Blocks of points from several files into the arrays of one cloud, without holding them twice."""
+"""A cloud in the making: blocks of several files into its arrays, held once; how fine they are."""
 
 from __future__ import annotations
 
 import contextlib
 import mmap
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -14,21 +15,45 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError, StoreError
 from orthoflow.files.points import PointBlock, ScanFile
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.read.colours import ColourScale
-from orthoflow_plugins.read.precision import rounding_m
+from orthoflow_plugins.read.scales import ColourScale
 from orthoflow_plugins.read.stations import ScanSummary
 
 # Beyond any survey frame on Earth; what lies farther comes from damaged numbers.
 FARTHEST_M: Final = 1e9
+# Coordinates rounded more coarsely than this limit what an orthoimage can show.
+COARSE_M: Final = 0.005
+# Offsets keep half a tenth of a millimetre; beyond, the user is told.
+FINE_M: Final = 5e-5
 _POINT_BYTES: Final = 40
 _MOST_SCANS: Final = 2**16
 # MADV_POPULATE_WRITE of Linux 5.14, which Python does not name.
 _POPULATE_WRITE: Final = 23
+_ROUNDING_SAMPLE: Final = 20_000
+_ROUNDING_VALUES: Final = 10
+# Decimal rounding, and the powers of two that float32 leaves of large coordinates.
+_ROUNDING_STEPS: Final = sorted(
+    {digit * 10.0**power for digit in (1, 2, 5) for power in range(-4, 3)}
+    | {2.0**power for power in range(-10, 4)},
+    reverse=True,
+)
 
 
 @dataclass(kw_only=True)
 class FileCount:
-    """What became of the points of one file."""
+    """What became of the points of one file.
+
+    Attributes:
+        name: of the file.
+        format_name: of the file.
+        n_read: points that the file holds.
+        n_kept: those of them that are in the cloud.
+        n_invalid: those marked as invalid.
+        n_withheld: those marked as deleted.
+        n_not_finite: those whose coordinates are not finite, or beyond any survey frame.
+        rounding_m: step to which coordinates are rounded, 0 where it is fine.
+        rgb_scale: what the file's colours range to, or None without colours.
+        header: what else the file says of itself, for people.
+    """
 
     name: str
     format_name: str
@@ -39,7 +64,7 @@ class FileCount:
     n_not_finite: int = 0
     rounding_m: float = 0.0
     rgb_scale: str | None = None
-    details: dict[str, str | int | float] = field(default_factory=dict)
+    header: Mapping[str, str | int | float] = field(default_factory=dict)
 
 
 class CloudAssembly:
@@ -79,7 +104,7 @@ class CloudAssembly:
         Raises:
             InputError: the file is damaged, or none of its points can be used.
         """
-        count = FileCount(name=file.name, format_name=file.format_name, details=file.details)
+        count = FileCount(name=file.name, format_name=file.format_name, header=file.details)
         self.files.append(count)
         first_scan = len(self._scans)
         colours = (
@@ -213,6 +238,32 @@ class CloudAssembly:
         return self._ctx.allocate("cloud", name, shape, dtype)
 
 
+def rounding_m(points: NDArray[np.float64], unit_m: float) -> float:
+    """Step to which a block's coordinates (n, 3) are rounded, in metres, if it is coarse.
+
+    Args:
+        points: in the file's unit.
+        unit_m: the file's unit in metres.
+
+    Returns:
+        The largest step on which all values of an axis lie, the finest of the axes; 0 when that
+        is finer than `COARSE_M` or cannot be told.
+    """
+    sample = points[:: max(1, len(points) // _ROUNDING_SAMPLE)]
+    found = []
+    for axis in range(3):
+        values = np.unique(sample[:, axis])
+        values = values[np.isfinite(values)]
+        if len(values) >= _ROUNDING_VALUES:
+            found.append(_common_step(values, unit_m))
+    return min(found, default=0.0) * unit_m
+
+
+def resolution_m(farthest_m: float) -> float:
+    """Distance between neighbouring float32 numbers at an offset."""
+    return float(np.spacing(np.float32(farthest_m)))
+
+
 def _make_ready(array: NDArray[Any], part: slice) -> None:
     """Ask for the pages of a mapped file that are about to be written, all at once.
 
@@ -253,3 +304,16 @@ def _require_space(ctx: StepContext, n_points: int) -> None:
             f"{n_points} points need {needed / 1e9:.2f} GB of scratch space, but only "
             f"{free / 1e9:.2f} GB are free: free some space or choose another --store"
         )
+
+
+def _common_step(values: NDArray[np.float64], unit_m: float) -> float:
+    finest = float(np.diff(values).min())
+    for step in _ROUNDING_STEPS:
+        if step * unit_m < COARSE_M:
+            break
+        if step > 1.1 * finest:
+            continue
+        multiples = (values - values[0]) / step
+        if np.abs(multiples - np.rint(multiples)).max() < 0.01:
+            return step
+    return 0.0

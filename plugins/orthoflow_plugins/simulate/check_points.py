@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.photo_views import SceneCameras
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import CheckPoints
 
-FLAT: Final = "flat"
-VERTICAL_EDGE: Final = "vertical edge"
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import SceneCameras
+
+_FLAT: Final = "flat"
+_VERTICAL_EDGE: Final = "vertical edge"
 # The lattice of painted lines of a fresco, in periods (see `texture_kernels`).
 _LATTICE: Final = 0.9
 _CLEAR_M: Final = 0.04
@@ -69,8 +71,8 @@ def check_points(
         n_most: so many of each class, or what there are.
     """
     chosen = {
-        FLAT: _spread(_crossings(scene, views, stations), n_most),
-        VERTICAL_EDGE: _spread(_corners(scene, views, stations), n_most),
+        _FLAT: _spread(_crossings(scene, views, stations), n_most),
+        _VERTICAL_EDGE: _spread(_corners(scene, views, stations), n_most),
     }
     points = np.concatenate(list(chosen.values())) @ world_from_room.T + shift_world_m
     names = [

@@ -49,6 +49,15 @@ class GreyImage:
         best = max(tiles, key=lambda tile: int(np.count_nonzero(self.valid[tile])))
         return GreyImage(grey=self.grey[best], valid=self.valid[best], region=self.region[best])
 
+    def square(self, corner: NDArray[np.int64], side: int) -> GreyImage:
+        """A square from a corner (2,) = column, row on; beyond the border 0 and not valid."""
+        rows, columns = self.grey.shape
+        down, right = corner[1] + np.arange(side), corner[0] + np.arange(side)
+        inside = ((down >= 0) & (down < rows))[:, None] & (right >= 0) & (right < columns)
+        cells = np.ix_(np.clip(down, 0, rows - 1), np.clip(right, 0, columns - 1))
+        valid = inside & self.valid[cells]
+        return GreyImage(grey=np.where(inside, self.grey[cells], 0.0), valid=valid, region=valid)
+
 
 @dataclass(frozen=True, kw_only=True)
 class PatchShifts:
@@ -123,7 +132,7 @@ def refine_shifts(
         true: the image it should be.
         start: where patches of 32 x 32 cells lie, wholly inside the image, and how far they are
             displaced at first.
-        sigma_most_cells: patches told less exactly are left out.
+        sigma_most_cells: patches measured less exactly are left out.
         focus_cells: cells count by a Gaussian of this width about the patch's middle.
 
     Returns:

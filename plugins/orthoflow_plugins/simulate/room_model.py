@@ -28,10 +28,10 @@ from orthoflow_plugins.simulate.building import (
 
 FLOOR_M: Final = -1.5
 CEILING_M: Final = 1.6
-MAIN_WALL_M: Final = 2.4
-MAIN_OMEGA_DEG: Final = 102.0
+_MAIN_WALL_M: Final = 2.4
+_MAIN_OMEGA_DEG: Final = 102.0
 # Area of the main wall that can be seen, and how much of it is textile at most and by design.
-MAIN_WALL_M2: Final = 16.7
+_MAIN_WALL_M2: Final = 16.7
 MOST_TEXTILE: Final = 0.35
 TEXTILE_BY_DESIGN: Final = 0.095
 
@@ -99,7 +99,7 @@ def build_room(plan: RoomPlan) -> Room:
 def wall_sides(draft: SceneDraft) -> tuple[Side, Side, Side, Side]:
     """Begin the main wall, the one opposite, the right and the left one."""
     return (
-        wall_side(draft, omega_deg=MAIN_OMEGA_DEG, phi_deg=0.8, distance_m=MAIN_WALL_M),
+        wall_side(draft, omega_deg=_MAIN_OMEGA_DEG, phi_deg=0.8, distance_m=_MAIN_WALL_M),
         wall_side(draft, omega_deg=282.4, phi_deg=-0.2, distance_m=2.0),
         wall_side(draft, omega_deg=12.2, phi_deg=0.3, distance_m=2.7),
         wall_side(draft, omega_deg=191.7, phi_deg=-0.3, distance_m=2.7),
@@ -108,7 +108,7 @@ def wall_sides(draft: SceneDraft) -> tuple[Side, Side, Side, Side]:
 
 def main_wall_axes() -> NDArray[np.float64]:
     """Horizontal directions (2, 3): along the main wall to the viewer's right, and towards it."""
-    omega = math.radians(MAIN_OMEGA_DEG)
+    omega = math.radians(_MAIN_OMEGA_DEG)
     return np.array(
         [[math.sin(omega), -math.cos(omega), 0.0], [math.cos(omega), math.sin(omega), 0.0]]
     )
@@ -160,7 +160,7 @@ def _cloths(share: float) -> list[Extent]:
         (-2.19, -1.95, -1.3, 0.75),  # left of the niche
         (-1.15, -0.95, -1.3, 0.75),  # right of it
     ]
-    left_m2 = share * MAIN_WALL_M2
+    left_m2 = share * _MAIN_WALL_M2
     if left_m2 <= 0.0:
         return []
     cloths = [_grown(by_design, middle, left_m2)]
@@ -266,7 +266,7 @@ def _build_floor_and_ceiling(draft: SceneDraft) -> None:
 
 def _furnish(draft: SceneDraft, plan: RoomPlan) -> None:
     along, towards = main_wall_axes()
-    yaw_deg = MAIN_OMEGA_DEG - 90.0
+    yaw_deg = _MAIN_OMEGA_DEG - 90.0
     floor = FLOOR_M * _UP
     if plan.obstacle:
         # A screen 0.6 m before the main wall, turned so that no face is parallel to it.

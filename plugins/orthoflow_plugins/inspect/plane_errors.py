@@ -1,0 +1,222 @@
+"""Planes and labels against the truth: of walls that were made, and how well detectors do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import Plane, angle_between_deg
+from orthoflow.products import Finding, Inspection, Planes, PointLabels, Truth
+from orthoflow.sdk import StepContext
+
+_FOUND_ANGLE_DEG: Final = 1.0
+_FOUND_OFFSET_M: Final = 0.015
+# A wall further off than this shows no true plane.
+_SAME_ANGLE_DEG: Final = 3.0
+_SAME_OFFSET_M: Final = 0.03
+_LABEL_SCORES: Final = ("precision", "recall", "f1", "iou")
+
+
+def inspect_planes(
+    planes: Planes, labels: PointLabels | None, truth: Truth, ctx: StepContext
+) -> Inspection:
+    """Compare planes, and labels if there are any, with the truth.
+
+    Metrics without prefix are of the truth's first plane, its main wall; `worst_` are the largest
+    of all true planes that were found; `label_..._mean` are means over all true planes.
+    """
+    nearest = [
+        _nearest(
+            _distances(planes, truth.planes, index),
+            angle_deg=_FOUND_ANGLE_DEG,
+            offset_m=_FOUND_OFFSET_M,
+        )
+        for index in range(len(truth.planes))
+    ]
+    findings = found_planes(planes, truth.planes)
+    main = nearest[0]
+    ctx.metric("main_found", float(main is not None), "1")
+    if main is not None:
+        findings += _plane_findings(main, 0)
+    seen = [distance for distance in nearest if distance is not None]
+    if seen:
+        worst = _PlaneDistance(
+            angle_deg=max(distance.angle_deg for distance in seen),
+            offset_m=max(abs(distance.offset_m) for distance in seen),
+            corner_m=max(distance.corner_m for distance in seen),
+        )
+        findings += [
+            Finding(name=f"worst_{item.name}", value=item.value, unit=item.unit)
+            for item in _plane_findings(worst, 0)
+        ]
+    for name, distance in zip(truth.planes.names, nearest, strict=True):
+        if distance is not None:
+            findings += [
+                Finding(name=f"{item.name}[{name}]", value=item.value, unit=item.unit)
+                for item in _plane_findings(distance, 0)
+            ]
+    if labels is not None:
+        scores = label_findings(labels, truth)
+        by_name = {item.name: item.value for item in scores}
+        findings += scores
+        findings += [
+            Finding(
+                name=f"label_{score}",
+                value=by_name[f"label_{score}[{truth.planes.names[0]}]"],
+                unit="1",
+            )
+            for score in _LABEL_SCORES
+        ]
+    for item in findings:
+        if "[" not in item.name:
+            ctx.metric(item.name, item.value, item.unit)
+    return Inspection(
+        wall=np.zeros(0, dtype=np.int32),
+        points_world=np.zeros((0, 3)),
+        displacement_m=np.zeros((0, 2)),
+        kind=np.zeros(0, dtype=np.uint8),
+        kinds=(),
+        findings=tuple(findings),
+    )
+
+
+def wall_plane_findings(plane: Plane, wall: int, true: Planes) -> list[Finding]:
+    """Numbers on the plane of one wall; none when it shows no true plane."""
+    distances = (_plane_distance(plane, true, index) for index in range(len(true)))
+    nearest = _nearest(distances, angle_deg=_SAME_ANGLE_DEG, offset_m=_SAME_OFFSET_M)
+    return [] if nearest is None else _plane_findings(nearest, wall)
+
+
+def worst_plane_findings(findings: Sequence[Finding]) -> list[Finding]:
+    """The largest error of any wall's plane, as numbers on all walls."""
+    worst = []
+    for name in ("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"):
+        values = [finding for finding in findings if finding.name == name]
+        if values:
+            largest = max(abs(finding.value) for finding in values)
+            worst.append(Finding(name=name, value=largest, unit=values[0].unit))
+    return worst
+
+
+def found_planes(planes: Planes, true: Planes) -> list[Finding]:
+    """Count the true planes that were found within 1 deg and 15 mm."""
+    n_found = sum(
+        any(d.is_within(_FOUND_ANGLE_DEG, _FOUND_OFFSET_M) for d in _distances(planes, true, index))
+        for index in range(len(true))
+    )
+    return [
+        Finding(name="true_planes", value=len(true), unit="1"),
+        Finding(name="true_planes_found", value=n_found, unit="1"),
+    ]
+
+
+def label_findings(labels: PointLabels, truth: Truth) -> list[Finding]:
+    """Precision, recall, F1 and IoU of the labels per true plane, matched one to one.
+
+    Raises:
+        MethodError: the labels are not of the simulated cloud.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    if len(labels.plane_index) != len(truth.labels):
+        raise MethodError(
+            f"the labels have {len(labels.plane_index)} points, but the truth has "
+            f"{len(truth.labels)}: wire the labels of the simulated cloud itself"
+        )
+    counts = _joint_counts(labels.plane_index, truth.labels, len(truth.planes))
+    both = counts[1:, 1:].astype(np.float64)
+    n_true, n_found = counts[1:].sum(axis=1), counts[:, 1:].sum(axis=0)
+    union = n_true[:, None] + n_found[None, :] - both
+    iou = both / np.maximum(union, 1.0)
+    rows, columns = linear_sum_assignment(-iou)
+    match = dict(zip(rows.tolist(), columns.tolist(), strict=True))
+    scores = np.zeros((len(truth.planes), 4))
+    for index, column in match.items():
+        hits = both[index, column]
+        scores[index] = (
+            hits / max(n_found[column], 1),
+            hits / max(n_true[index], 1),
+            2.0 * hits / max(n_found[column] + n_true[index], 1),
+            iou[index, column],
+        )
+    findings = []
+    for place, kind in enumerate(_LABEL_SCORES):
+        findings.append(
+            Finding(name=f"label_{kind}_mean", value=float(scores[:, place].mean()), unit="1")
+        )
+        findings += [
+            Finding(name=f"label_{kind}[{name}]", value=float(scores[k, place]), unit="1")
+            for k, name in enumerate(truth.planes.names)
+        ]
+    return findings
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PlaneDistance:
+    """How far a plane lies off a true one.
+
+    Attributes:
+        angle_deg: between the normals.
+        offset_m: signed distance at the centroid of the true rectangle, + towards the viewer.
+        corner_m: largest distance at its corners.
+    """
+
+    angle_deg: float
+    offset_m: float
+    corner_m: float
+
+    def is_within(self, angle_deg: float, offset_m: float) -> bool:
+        """Whether neither angle nor offset is larger."""
+        return self.angle_deg <= angle_deg and abs(self.offset_m) <= offset_m
+
+    @property
+    def score(self) -> float:
+        """What tells the nearest plane: angle and offset in units of those that count as found."""
+        return self.angle_deg / _FOUND_ANGLE_DEG + abs(self.offset_m) / _FOUND_OFFSET_M
+
+
+def _plane_distance(found: Plane, true: Planes, index: int) -> _PlaneDistance:
+    """Compare a plane with a true plane."""
+    corners = true.corners[index]
+    centroid = corners.mean(axis=0)
+    return _PlaneDistance(
+        angle_deg=angle_between_deg(found.normal, true.normal[index]),
+        offset_m=-float(found.distances_m(centroid[None])[0]),
+        corner_m=float(np.abs(found.distances_m(corners)).max()),
+    )
+
+
+def _distances(found: Planes, true: Planes, index: int) -> list[_PlaneDistance]:
+    """How far each of the found planes lies off a true one."""
+    return [_plane_distance(found.plane(k), true, index) for k in range(len(found))]
+
+
+def _nearest(
+    distances: Iterable[_PlaneDistance], *, angle_deg: float, offset_m: float
+) -> _PlaneDistance | None:
+    """The smallest of those distances that are within the limits."""
+    near = (distance for distance in distances if distance.is_within(angle_deg, offset_m))
+    return min(near, key=lambda distance: distance.score, default=None)
+
+
+def _plane_findings(distance: _PlaneDistance, wall: int) -> list[Finding]:
+    """Numbers on the plane of one wall."""
+    return [
+        Finding(name="plane_angle_deg", value=distance.angle_deg, unit="deg", wall=wall),
+        Finding(name="plane_offset_mm", value=1e3 * distance.offset_m, unit="mm", wall=wall),
+        Finding(name="plane_corner_max_mm", value=1e3 * distance.corner_m, unit="mm", wall=wall),
+    ]
+
+
+def _joint_counts(
+    found: NDArray[np.int16], true: NDArray[np.int16], n_true: int
+) -> NDArray[np.int64]:
+    """Points by (true + 1, found + 1)."""
+    n_found = int(found.max(initial=-1)) + 2
+    joint = (true.astype(np.int64) + 1) * n_found + (found.astype(np.int64) + 1)
+    return np.bincount(joint, minlength=(n_true + 1) * n_found).reshape(n_true + 1, n_found)
