@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-# OpenCV's (0, 0) is the centre of the first pixel, ours (0.5, 0.5).
-_SHIFT_FROM_OPENCV_PX: Final = 0.5
+from orthoflow.geometry.opencv_border import HALF_PIXEL
+
 _SHIFT_BY_UPSCALING_PX: Final = 0.25
 # SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. A tile bounds it.
 _TILE_PX: Final = 2048
@@ -125,7 +125,7 @@ def find_features(
         edgeThreshold=rule.edge_threshold,
         enable_precise_upscale=rule.upscales_precisely,
     )
-    shift_px = _SHIFT_FROM_OPENCV_PX
+    shift_px = HALF_PIXEL
     if not rule.upscales_precisely:
         shift_px -= _SHIFT_BY_UPSCALING_PX
     parts = [_in_tile(sift, picture, corner, shift_px) for corner in _tiles(picture.shape)]

@@ -10,14 +10,18 @@ from pydantic import Field
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of, without_twins
 from orthoflow_plugins.match.features import FeatureRule, Features
-from orthoflow_plugins.match.key_point_ties import key_point_ties
+from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features
 from orthoflow_plugins.match.pictures import photo_grey, require_intensity
-from orthoflow_plugins.match.versions import opencv_version
-from orthoflow_plugins.match.workers import one_by_one
+from orthoflow_plugins.match.tie_pieces import (
+    TiePiece,
+    key_point_ties,
+    require_photos,
+    ties_of,
+    without_twins,
+)
 
 
 class MatchSift(Method):

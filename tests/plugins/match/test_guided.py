@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.channels import gradient_channels, grey_channels
+from orthoflow_plugins.match.channels import (
+    gradient_channels,
+    grey_channels,
+    texture,
+    textured_places,
+)
 from orthoflow_plugins.match.displacements import SearchRule, measure
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.pictures import photo_grey
-from orthoflow_plugins.match.places import texture, textured_places
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.match.warping import project_walls, warp_photo
 from scipy.ndimage import gaussian_filter, shift
