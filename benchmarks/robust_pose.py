@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.estimating import EstimationRule, estimate_pose
+from orthoflow_plugins.orient.estimation import EstimationRule, estimate_pose
 
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.resection import SeenPoints

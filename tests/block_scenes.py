@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Photos, Ties
+from orthoflow.products import Photos, Ties, TieWall
 from tests import matching_scenes as ms
 
 _VIEWS = (
@@ -80,13 +80,11 @@ def scan_ties(
         sigma_m=np.full(n_all, noise_m),
         role=np.zeros(n_all, np.uint8),
         residual_px=np.full((n_all, 2), np.nan),
-        details={
-            "walls": [
-                {
-                    "gsd_m": ms.GSD_M,
-                    "normal": [0.0, -1.0, 0.0],
-                    "corners_world": (SCENE.frame.corners_world() + shift).tolist(),
-                }
-            ]
-        },
+        walls=(
+            TieWall(
+                gsd_m=ms.GSD_M,
+                normal_world=(0.0, -1.0, 0.0),
+                corners_world=tuple(map(tuple, (SCENE.frame.corners_world() + shift).tolist())),
+            ),
+        ),
     )

@@ -115,6 +115,7 @@ class MatchSift(Method):
         on_walls = list(one_by_one(lambda wall: wall_features(wall, rule), walls.walls, ctx.cores))
         pieces: list[TiePiece] = []
         notes: dict[str, JsonValue] = {}
+        radii_px: list[float] = []
         paired = one_by_one(
             lambda photo: pair_photo(photo_grey(photo), on_walls, rule), photos.photos, ctx.cores
         )
@@ -122,11 +123,13 @@ class MatchSift(Method):
             ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
             pieces += _pieces(index, pairs, on_walls, walls)
             notes[photo.name] = _note(ctx, photo.name, pairs, walls)
+            radii_px.append(pairs.radius_px)
         ties = ties_of(
             pieces,
             photos,
             walls,
             {"photos": notes, "intensity_source": walls.intensity_source},
+            search_radius_px=tuple(radii_px),
         )
         _report(ctx, ties, on_walls)
         return self.Out(ties=ties)
@@ -205,7 +208,6 @@ def _note(ctx: StepContext, name: str, pairs: PhotoPairs, walls: Walls) -> JsonV
         "walls": list(shown),
         "n_matches": sum(len(pair.matches) for pair in pairs.pairs),
         "n_agreeing": pairs.n_verified,
-        "search_radius_px": pairs.radius_px,
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.products import JsonValue, Photos, TieRole, Ties, Wall, Walls
+from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pictures import points_on_wall
 
@@ -103,12 +103,21 @@ def require_photos(photos: Photos) -> None:
 
 
 def ties_of(
-    pieces: Sequence[TiePiece], photos: Photos, walls: Walls, details: dict[str, JsonValue]
+    pieces: Sequence[TiePiece],
+    photos: Photos,
+    walls: Walls,
+    details: dict[str, JsonValue],
+    *,
+    search_radius_px: tuple[float | None, ...] = (),
 ) -> Ties:
     """Join pieces into one product, in their order.
 
-    `details["walls"]` says what the orientation needs to know of the walls: cell size, normal and
-    corners.
+    Args:
+        pieces: the ties.
+        photos: all photos.
+        walls: all walls.
+        details: what people may want to know.
+        search_radius_px: one per photo, as `Ties` has it.
     """
     counts = [len(piece) for piece in pieces]
     total = sum(counts)
@@ -130,7 +139,9 @@ def ties_of(
         sigma_m=joined("sigma_m", 1),
         role=np.repeat(np.array([piece.role for piece in pieces], dtype=np.uint8), counts),
         residual_px=np.full((total, 2), np.nan),
-        details={**details, "walls": [_wall_json(walls, k) for k in range(len(walls.walls))]},
+        walls=tuple(TieWall.of(wall) for wall in walls.walls),
+        search_radius_px=search_radius_px,
+        details=details,
     )
 
 
@@ -161,17 +172,6 @@ def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
     return [
         piece.take(kept[end - len(piece) : end]) for piece, end in zip(pieces, ends, strict=True)
     ]
-
-
-def _wall_json(walls: Walls, index: int) -> JsonValue:
-    frame = walls.walls[index].frame
-    corners: list[JsonValue] = [row.tolist() for row in frame.corners_world()]
-    return {
-        "name": walls.walls[index].name,
-        "gsd_m": frame.gsd_m,
-        "normal": frame.normal_world.tolist(),
-        "corners_world": corners,
-    }
 
 
 def _sigma_px(sizes_px: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,26 +14,22 @@ from orthoflow.errors import GeometryError
 from orthoflow.products import Cameras, JsonValue, Photo, Photos, Ties
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.block_estimating import Adjusted, Trusted, adjust_block
-from orthoflow_plugins.orient.estimating import estimate_pose
-from orthoflow_plugins.orient.judging import reason_to_leave_out, too_few
-from orthoflow_plugins.orient.lens_groups import (
-    Refined,
-    Sharing,
-    correlation_notes,
-    lens_groups,
-    lens_statistics,
-    lenses_json,
-)
+from orthoflow_plugins.orient.acceptance import reason_to_leave_out, too_few
+from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, lenses_json
+from orthoflow_plugins.orient.block_adjustment import Adjusted, Trusted, adjust_block
+from orthoflow_plugins.orient.estimation import estimate_pose
+from orthoflow_plugins.orient.lenses import Refined, Sharing, lens_groups
 from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.photo_features import no_features, photo_features
 from orthoflow_plugins.orient.photo_ties import (
     PhotoTies,
+    no_features,
     no_photo_ties,
     overlapping_pairs,
+    photo_features,
     tie_photos,
 )
-from orthoflow_plugins.orient.photowise import (
+from orthoflow_plugins.orient.reporting import told
+from orthoflow_plugins.orient.single_photo import (
     Oriented,
     Sighting,
     case_of,
@@ -42,7 +38,6 @@ from orthoflow_plugins.orient.photowise import (
     require,
     sighting,
 )
-from orthoflow_plugins.orient.reporting import told
 
 _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7

@@ -8,10 +8,10 @@ from typing import ClassVar
 from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.estimating import estimate_pose
+from orthoflow_plugins.orient.estimation import estimate_pose
 from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.photowise import each_by_itself
 from orthoflow_plugins.orient.reporting import told
+from orthoflow_plugins.orient.single_photo import each_by_itself
 
 
 class OrientPnp(Method):

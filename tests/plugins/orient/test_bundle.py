@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.block import Block, Lens, Observations, Points
-from orthoflow_plugins.orient.block_covariance import block_covariance
-from orthoflow_plugins.orient.block_solving import solve
+from orthoflow_plugins.orient.block import Block, Lens, Observations, Points, block_covariance
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
-from orthoflow_plugins.orient.photo_features import PhotoFeatures
-from orthoflow_plugins.orient.photo_ties import overlapping_pairs, tie_photos
+from orthoflow_plugins.orient.colmap import solve
+from orthoflow_plugins.orient.photo_ties import PhotoFeatures, overlapping_pairs, tie_photos
 from orthoflow_plugins.orient.pnp import OrientPnp
 
 from orthoflow.geometry.lenses import LensFreedom

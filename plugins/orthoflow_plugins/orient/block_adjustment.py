@@ -12,23 +12,27 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import Misfit, Resection, misfit, moved_origin
-from orthoflow_plugins.orient.block import Block, Observations, Points
-from orthoflow_plugins.orient.block_covariance import BlockCovariance, block_covariance
-from orthoflow_plugins.orient.block_solving import solve
-from orthoflow_plugins.orient.estimating import (
+from orthoflow.geometry.robust import MEDIAN_LENGTH
+from orthoflow_plugins.orient.block import (
+    Block,
+    BlockCovariance,
+    Observations,
+    Points,
+    block_covariance,
+)
+from orthoflow_plugins.orient.colmap import solve
+from orthoflow_plugins.orient.estimation import (
     SOFT_LIMIT,
     Estimate,
     posed,
     unit_deviation,
     without_chance,
 )
-from orthoflow_plugins.orient.lens_groups import LensGroups
-from orthoflow_plugins.orient.lenses import intrinsics_of
+from orthoflow_plugins.orient.lenses import LensGroups, intrinsics_of
 from orthoflow_plugins.orient.photo_ties import PhotoTies
-from orthoflow_plugins.orient.photowise import Sighting
+from orthoflow_plugins.orient.single_photo import Sighting
 
 _ROUNDS: Final = 5
-_MEDIAN_LENGTH: Final = 1.1774
 _TIE_SIGMA_START_PX: Final = 0.5
 _TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
 # Scan ties of several photos at one place of the wall are one point of the scan.
@@ -234,7 +238,7 @@ def _weighed(
         # Of 2 m coordinates, 3 go into the point.
         per_point = np.bincount(ties.point[active], minlength=len(state.tie_points))
         left = np.maximum(2 * per_point[per_point > 0] - 3, 1).sum() / (2 * active.sum())
-        sigma = float(np.median(lengths[active]) / _MEDIAN_LENGTH / math.sqrt(left))
+        sigma = float(np.median(lengths[active]) / MEDIAN_LENGTH / math.sqrt(left))
         sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
         rejection = photos[0].sight.rule.rejection_sigma
         active = _in_several(ties.point, lengths <= rejection * sigma)

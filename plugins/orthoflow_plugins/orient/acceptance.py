@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo
-from orthoflow_plugins.orient.estimating import Estimate
-from orthoflow_plugins.orient.splitting import hull_area, image_cells, quadrant_counts
+from orthoflow_plugins.orient.estimation import Estimate
+from orthoflow_plugins.orient.layout import hull_area, image_cells, quadrant_counts
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
 
 TIES_LEAST: Final = 8

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
+from orthoflow.products import Camera, JsonValue, Photo, Photos, ResidualRow, TieRole, Ties
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.estimating import Estimate, EstimationRule
-from orthoflow_plugins.orient.judging import Case, reason_against, too_few, warnings_for
+from orthoflow_plugins.orient.acceptance import Case, reason_against, too_few, warnings_for
+from orthoflow_plugins.orient.estimation import Estimate, EstimationRule
+from orthoflow_plugins.orient.layout import withheld
 from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.residuals import (
     PhotoNumbers,
@@ -22,7 +23,6 @@ from orthoflow_plugins.orient.residuals import (
     photo_numbers,
     residual_table,
 )
-from orthoflow_plugins.orient.splitting import withheld
 from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
 _SEED_LIMIT = 2**31 - 1
@@ -72,7 +72,7 @@ class Oriented:
     residuals_px: NDArray[np.float64]
     numbers: PhotoNumbers | None = None
     entry: JsonValue = None
-    table: tuple[JsonValue, ...] = ()
+    table: tuple[ResidualRow, ...] = ()
     notes: tuple[str, ...] = ()
     case: Case | None = None
 
@@ -228,7 +228,5 @@ def _usable(ties: Ties, name: str, n_most: int) -> NDArray[np.intp]:
 
 def _search_radius_px(ties: Ties, name: str) -> float:
     """What the matcher says of how far it looked for the ties of a photo."""
-    photos = ties.details.get("photos")
-    entry = photos.get(name) if isinstance(photos, Mapping) else None
-    radius = entry.get("search_radius_px") if isinstance(entry, Mapping) else None
-    return float(radius) if isinstance(radius, int | float) else math.inf
+    radius_px = dict(zip(ties.photo_names, ties.search_radius_px, strict=False)).get(name)
+    return math.inf if radius_px is None else radius_px

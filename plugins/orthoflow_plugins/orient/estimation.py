@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import (
     Misfit,
     Resection,
@@ -24,16 +25,16 @@ from orthoflow.geometry.resection import (
     pixels_by_point,
     stated,
 )
-from orthoflow.products import Intrinsics, JsonValue, Photo
+from orthoflow.geometry.robust import MEDIAN_LENGTH
+from orthoflow.products import Intrinsics, Photo
+from orthoflow_plugins.orient.layout import GROUPS, image_cells
 from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior
-from orthoflow_plugins.orient.robust import RobustPose, SamplingRule, robust_pose
-from orthoflow_plugins.orient.splitting import GROUPS, image_cells
 
+_LEAST_FOR_POSE: Final = 4
+_CONFIDENCE: Final = 0.99999
 _ROUNDS: Final = 8
 # A standard deviation of unit weight that changes by less changes no tie's weight to speak of.
 _SETTLED_SHARE: Final = 0.02
-# Median length of a two-dimensional standard normal deviation.
-_MEDIAN_LENGTH: Final = 1.1774
 _SIGMA0_RANGE: Final = (0.1, 3.0)
 _CHANCE_SHARE_MOST: Final = 0.1
 _TIGHTENING: Final = 0.8
@@ -81,7 +82,7 @@ class Estimate:
         agreeing: (n,) bool, ties within the limit.
         limit: in standard deviations, as `fit.normalised`.
         notes: what its method has to say of it.
-        details: its method's own numbers for the record.
+        numbers: what its method alone measures, by name, for the record.
     """
 
     resection: Resection
@@ -91,7 +92,7 @@ class Estimate:
     agreeing: NDArray[np.bool_]
     limit: float
     notes: tuple[str, ...] = ()
-    details: Mapping[str, JsonValue] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +114,34 @@ class Start:
     freedom: LensFreedom
     source: str
     n_least_for_lens: int = _LEAST_FOR_LENS
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustPose:
+    """A pose and the ties that agree with it.
+
+    Attributes:
+        camera: the camera at that pose.
+        agreeing: (n,) bool.
+    """
+
+    camera: ViewingCamera
+    agreeing: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplingRule:
+    """How samples are drawn.
+
+    Attributes:
+        threshold_px: ties agree with a pose up to this distance.
+        n_trials_most: samples drawn at most.
+        seed: of the samples.
+    """
+
+    threshold_px: float
+    n_trials_most: int
+    seed: int
 
 
 def estimate_pose(
@@ -196,6 +225,48 @@ def robust_start(
     )
 
 
+def robust_pose(
+    pixels_photo: NDArray[np.float64],
+    points_world: NDArray[np.float64],
+    lens: ViewingCamera,
+    rule: SamplingRule,
+) -> RobustPose | None:
+    """Find the pose that most ties agree with (MSAC on P3P: Torr & Zisserman 2000).
+
+    Args:
+        pixels_photo: (n, 2).
+        points_world: (n, 3) metres.
+        lens: the camera's interior orientation; its pose is ignored.
+        rule: how samples are drawn.
+
+    Returns:
+        None when no pose is found.
+    """
+    import cv2
+
+    usable = _undistorted(pixels_photo, lens)
+    inside: NDArray[np.bool_] = np.asarray(np.isfinite(usable).all(axis=1))
+    if inside.sum() < _LEAST_FOR_POSE:
+        return None
+    middle = points_world.mean(axis=0)
+    pixels = np.ascontiguousarray(to_opencv(usable[inside]))
+    points = np.ascontiguousarray(points_world[inside] - middle)
+    call: Any = cv2.solvePnPRansac
+    try:
+        found, _, turn, shift, agreed = call(
+            points, pixels, opencv_matrix(lens), None, params=_usac(rule)
+        )
+    except cv2.error:  # no sample has a solution
+        return None
+    if not found or agreed is None:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
+    agreeing = np.zeros(len(inside), dtype=np.bool_)
+    agreeing[np.flatnonzero(inside)[np.asarray(agreed).ravel()]] = True
+    return RobustPose(camera=local.shifted(-middle), agreeing=agreeing)
+
+
 def adjusted(
     photo: Photo,
     seen: SeenPoints,
@@ -276,6 +347,39 @@ def _expected_px(seen: SeenPoints) -> float:
     return float(sigma)
 
 
+def _usac(rule: SamplingRule) -> Any:
+    """OpenCV's universal sampling, one thread: several give another result each time."""
+    import cv2
+
+    params: Any = cv2.UsacParams()
+    params.threshold = rule.threshold_px
+    params.maxIterations = rule.n_trials_most
+    params.confidence = _CONFIDENCE
+    params.randomGeneratorState = rule.seed
+    params.isParallel = False
+    params.score = cv2.SCORE_METHOD_MSAC
+    # The adjustment that follows does what a local optimisation would do in thrice the time.
+    params.loMethod = cv2.LOCAL_OPTIM_NULL
+    return params
+
+
+def _undistorted(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDArray[np.float64]:
+    """Pixels of a camera without distortion; NaN where the lens model cannot be undone."""
+    if not lens.distortion.any():
+        return pixels
+    try:
+        rays = lens.rays_camera(pixels)
+    except GeometryError:
+        rays = np.full((len(pixels), 3), np.nan)
+        for index in range(len(pixels)):
+            try:
+                rays[index] = lens.rays_camera(pixels[index : index + 1])[0]
+            except GeometryError:
+                continue
+    straight: NDArray[np.float64] = rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
+    return straight
+
+
 def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
     """Tighten a limit until hardly any wrong tie lies within it by chance.
 
@@ -293,7 +397,7 @@ def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
 def unit_deviation(normalised: NDArray[np.float64]) -> float:
     """Robust standard deviation of unit weight, kept within reason."""
     median = float(np.median(normalised)) if normalised.size else 1.0
-    return float(np.clip(median / _MEDIAN_LENGTH, *_SIGMA0_RANGE))
+    return float(np.clip(median / MEDIAN_LENGTH, *_SIGMA0_RANGE))
 
 
 def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -> float:
