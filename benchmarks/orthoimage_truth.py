@@ -116,8 +116,8 @@ class Bench:
 
 def numbers(inspection: Inspection) -> dict[str, float]:
     """Findings of the first wall, and those of all that no wall has."""
-    told = {finding.name: finding.value for finding in inspection.findings if finding.wall < 0}
-    return told | {
+    values = {finding.name: finding.value for finding in inspection.findings if finding.wall < 0}
+    return values | {
         finding.name: finding.value for finding in inspection.findings if finding.wall == 0
     }
 
@@ -147,8 +147,8 @@ def main() -> None:
     for surface, wall in walls.items():
         for poses, cameras in (("true", true), ("estimated", found)):
             images = bench.orthoimages(wall, cameras)
-            told, surf = bench.truth(wall, cameras, images), bench.surf(wall, images)
-            values = [factor * told.get(key, np.nan) for _, key, factor in COLUMNS]
+            true, surf = bench.truth(wall, cameras, images), bench.surf(wall, images)
+            values = [factor * true.get(key, np.nan) for _, key, factor in COLUMNS]
             values += [surf.get(key, np.nan) for _, key in SURF_COLUMNS]
             row = " ".join(f"{value:8.3f}" for value in values)
             print(f"{surface:10s} {poses:10s} {raster_s[surface]:9.1f} {row}", flush=True)
@@ -168,8 +168,8 @@ def _room(chosen: argparse.Namespace) -> SimulateRoom.Out:
     scratch = Path(tempfile.mkdtemp())
     context = StepContext(rng=np.random.default_rng(chosen.seed), cores=2, scratch=scratch)
     room = SimulateRoom().run(SimulateRoom.In(), params, context)
-    told = room.truth.details["photos"]
-    shots = [shot for shot in told if isinstance(shot, dict)] if isinstance(told, list) else []
+    listed = room.truth.details["photos"]
+    shots = [shot for shot in listed if isinstance(shot, dict)] if isinstance(listed, list) else []
     angles = [shot["obliquity_deg"] for shot in shots]
     oblique = ", ".join(f"{angle:.0f}" for angle in angles if isinstance(angle, float))
     print(f"{len(room.cloud) / 1e6:.1f} M points, photos {oblique} deg oblique", flush=True)

@@ -13,7 +13,7 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.direct_linear import Distortion, estimate_dlt
 from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.reporting import told
+from orthoflow_plugins.orient.reporting import hand_over
 from orthoflow_plugins.orient.single_photo import each_by_itself
 
 
@@ -59,7 +59,7 @@ class OrientDlt(Method):
         """Orient the photos one after the other."""
         estimator = partial(estimate_dlt, distortion=params.distortion)
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
-        return self.Out(cameras=told(ctx, inputs.ties, inputs.photos.photos, found))
+        return self.Out(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 
     @classmethod
     def tools(cls) -> dict[str, str]:

@@ -14,7 +14,7 @@ from orthoflow.files.images import decode_image, encode_webp
 from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Photo, TieRole
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.acceptance import Case
+from orthoflow_plugins.orient.acceptance import Candidate
 from orthoflow_plugins.orient.wall_errors import sigmas_on_wall
 
 if TYPE_CHECKING:
@@ -104,14 +104,14 @@ def draw_ties(
     )
 
 
-def draw_wall_errors(ctx: StepContext, cases: Sequence[Case]) -> None:
+def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     """Draw the predicted error over each wall, at every place that of the photo that knows it best.
 
     Args:
         ctx: takes the pictures.
-        cases: of the photos that are ok.
+        candidates: of the photos that are ok.
     """
-    walls = {wall.index: wall for case in cases for wall in case.known}
+    walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
     for index in sorted(walls):
         wall = walls[index]
         if len(ctx.figures) >= _FIGURES_MOST:
@@ -120,8 +120,8 @@ def draw_wall_errors(ctx: StepContext, cases: Sequence[Case]) -> None:
         cell_m = max(across, down) / _MAP_CELLS
         shape = (max(1, round(down / cell_m)), max(1, round(across / cell_m)))
         best = np.full(shape, np.inf)
-        for case in cases:
-            sigmas = sigmas_on_wall(case.estimate.resection, wall, shape)
+        for candidate in candidates:
+            sigmas = sigmas_on_wall(candidate.estimate.resection, wall, shape)
             best = np.fmin(best, sigmas)
         shown = np.isfinite(best)
         if not shown.any():

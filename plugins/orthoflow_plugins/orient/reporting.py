@@ -19,7 +19,7 @@ from orthoflow_plugins.orient.residuals import COLUMNS_SAID
 from orthoflow_plugins.orient.single_photo import Oriented, of_photo
 
 
-def told(
+def hand_over(
     ctx: StepContext,
     ties: Ties,
     photos: Sequence[Photo],
@@ -44,7 +44,7 @@ def told(
         status = f"Status: {oriented.camera.status}"
         draw_ties(ctx, photo, ties.pixels_photo[mine], role[mine], status)
     _measure(ctx, found)
-    draw_wall_errors(ctx, [item.case for item in found if item.case is not None])
+    draw_wall_errors(ctx, [item.candidate for item in found if item.candidate is not None])
     draw_residuals(
         ctx,
         [

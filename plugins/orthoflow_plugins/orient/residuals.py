@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import JsonValue, ResidualRow
-from orthoflow_plugins.orient.acceptance import Case
+from orthoflow_plugins.orient.acceptance import Candidate
 from orthoflow_plugins.orient.estimation import metres_per_pixel
 
 # Of a normal distribution 4.55 % lie beyond; of any, at most a quarter can (Chebyshev).
@@ -57,63 +57,63 @@ class PhotoNumbers:
     hull_ratio: float
 
 
-def photo_numbers(case: Case) -> PhotoNumbers:
+def photo_numbers(candidate: Candidate) -> PhotoNumbers:
     """Summarise an orientation."""
-    residuals = case.estimate.fit.residuals_px
-    control, check = residuals[case.control], residuals[case.checked]
-    camera = case.estimate.resection.camera
-    pixel_mm = 1000.0 * metres_per_pixel(camera, case.seen.points_world[case.control])
+    residuals = candidate.estimate.fit.residuals_px
+    control, check = residuals[candidate.control], residuals[candidate.checked]
+    camera = candidate.estimate.resection.camera
+    pixel_mm = 1000.0 * metres_per_pixel(camera, candidate.seen.points_world[candidate.control])
     check_rmse_px = _rms(check)
     return PhotoNumbers(
         n_control=len(control),
         n_check=len(check),
-        n_rejected=int((~case.estimate.agreeing).sum()),
+        n_rejected=int((~candidate.estimate.agreeing).sum()),
         control_rmse_px=_rms(control),
         check_rmse_px=check_rmse_px,
         check_rmse_mm=check_rmse_px * pixel_mm,
         pixel_mm=pixel_mm,
-        hull_ratio=case.hull_ratio,
+        hull_ratio=candidate.hull_ratio,
     )
 
 
-def numbers_json(case: Case, numbers: PhotoNumbers) -> dict[str, JsonValue]:
+def numbers_json(candidate: Candidate, numbers: PhotoNumbers) -> dict[str, JsonValue]:
     """Give the numbers of an orientation as JSON."""
-    result = case.estimate.resection
+    result = candidate.estimate.resection
     entry: dict[str, JsonValue] = {
         "n_control": numbers.n_control,
         "n_check": numbers.n_check,
         "n_rejected": numbers.n_rejected,
         "pixel_mm": numbers.pixel_mm,
         "hull_ratio": numbers.hull_ratio,
-        "limit_sigma": case.estimate.limit,
+        "limit_sigma": candidate.estimate.limit,
         "sigma0": result.sigma0,
         "variance_factor": result.variance_factor,
-        "lens": case.estimate.source,
+        "lens": candidate.estimate.source,
         "focal_px": result.camera.fx,
         "k1": float(result.camera.distortion[0]),
     }
-    entry |= case.estimate.numbers
-    if case.error is not None:
-        entry["sigma_wall_mm"] = 1000.0 * case.error.rms_m
-        entry["sigma_wall_worst_mm"] = 1000.0 * case.error.worst_m
+    entry |= candidate.estimate.numbers
+    if candidate.error is not None:
+        entry["sigma_wall_mm"] = 1000.0 * candidate.error.rms_m
+        entry["sigma_wall_worst_mm"] = 1000.0 * candidate.error.worst_m
         entry["sigma_image_corners_mm"] = [
             1000.0 * sigma if math.isfinite(sigma) else None
-            for sigma in case.error.corners_m.tolist()
+            for sigma in candidate.error.corners_m.tolist()
         ]
     if result.lens.focal_sigma > 0.0:
         entry["focal_sigma_px"] = result.camera.fx * float(np.sqrt(result.covariance[6, 6]))
     return entry
 
 
-def residual_table(case: Case, numbers: PhotoNumbers) -> list[ResidualRow]:
+def residual_table(candidate: Candidate, numbers: PhotoNumbers) -> list[ResidualRow]:
     """Give the rows of the table of residuals, control and check apart."""
     units = {"px": 1.0, "mm": numbers.pixel_mm}
-    if case.gsd_m is not None:
-        units["cell"] = numbers.pixel_mm / (1000.0 * case.gsd_m)
+    if candidate.gsd_m is not None:
+        units["cell"] = numbers.pixel_mm / (1000.0 * candidate.gsd_m)
     rows: list[ResidualRow] = []
-    for role, chosen in (("control", case.control), ("check", case.checked)):
-        residuals_px = case.estimate.fit.residuals_px[chosen]
-        rows += residual_rows(case.photo.name, role, residuals_px, units)
+    for role, chosen in (("control", candidate.control), ("check", candidate.checked)):
+        residuals_px = candidate.estimate.fit.residuals_px[chosen]
+        rows += residual_rows(candidate.photo.name, role, residuals_px, units)
     return rows
 
 
