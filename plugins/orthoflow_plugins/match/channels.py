@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.key_points import in_turns
 from orthoflow.products import Wall
 from orthoflow_plugins.match.pictures import filled_smoothly
 
@@ -159,7 +160,7 @@ def textured_places(
     rows, columns = np.nonzero(peak)
     if not rows.size:
         return np.empty((0, 2), dtype=np.intp)
-    chosen = _in_turns(rows, columns, response[rows, columns], n_most)
+    chosen = _spread(rows, columns, response[rows, columns], n_most)
     return np.column_stack([columns[chosen], rows[chosen]])
 
 
@@ -202,7 +203,7 @@ def _broadly(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
 
 
-def _in_turns(
+def _spread(
     rows: NDArray[np.intp],
     columns: NDArray[np.intp],
     strength: NDArray[np.float32],
@@ -214,7 +215,4 @@ def _in_turns(
     cell = ((rows - low_row) / side_rows).astype(np.intp) * _GRID + (
         (columns - low_column) / side_columns
     ).astype(np.intp)
-    order = np.lexsort((columns, rows, -strength, cell))
-    turn = np.arange(len(order)) - np.searchsorted(cell[order], cell[order])
-    taken = order[np.lexsort((columns[order], rows[order], -strength[order], turn))]
-    return np.asarray(taken[:n_most], dtype=np.intp)
+    return in_turns(cell, (columns, rows, -strength), n_most)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import decode_image
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.key_points import in_turns, root_sift
 from orthoflow.geometry.opencv_border import from_opencv
 from orthoflow.geometry.rotations import cross_matrix
 from orthoflow.products import Photo
@@ -21,9 +22,6 @@ from orthoflow_plugins.orient.lenses import camera_rays
 _SIDE_MOST_PX: Final = 1600
 _CONTRAST_THRESHOLD: Final = 0.02
 _SPREAD_CELLS: Final = 16
-# Squared RootSIFT entries in units of 1/512: their sums stay below 2^24, so that float32 products
-# are exact, whatever the order a BLAS library adds in.
-_QUANTA: Final = 512.0
 _RATIO_MOST: Final = 0.85
 _PARTNERS_MOST: Final = 8
 _BLOCK_ROWS: Final = 1024
@@ -102,7 +100,7 @@ def photo_features(photo: Photo, n_most: int) -> PhotoFeatures:
     return PhotoFeatures(
         pixels=from_opencv(points[order, :2]) * ratios,
         scale=scale,
-        descriptors=_root(np.asarray(raw, dtype=np.float32)),
+        descriptors=root_sift(np.asarray(raw, dtype=np.float32)),
     )
 
 
@@ -177,17 +175,7 @@ def _spread(points: NDArray[np.float64], shape: tuple[int, ...], n_most: int) ->
     cells = (points[:, :2] * _SPREAD_CELLS / [shape[1], shape[0]]).astype(np.intp)
     cells = np.clip(cells, 0, _SPREAD_CELLS - 1)
     cell = cells[:, 1] * _SPREAD_CELLS + cells[:, 0]
-    order = np.lexsort((-points[:, 4], cell))
-    turn = np.arange(len(order)) - np.searchsorted(cell[order], cell[order])
-    taken = order[np.lexsort((-points[order, 4], turn))]
-    return np.asarray(taken[:n_most], dtype=np.intp)
-
-
-def _root(raw: NDArray[np.float32]) -> NDArray[np.float32]:
-    """RootSIFT (Arandjelovic & Zisserman 2012): Euclid's distance becomes Hellinger's."""
-    total = np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
-    rooted: NDArray[np.float32] = np.rint(np.sqrt(raw / total) * _QUANTA).astype(np.float32)
-    return rooted
+    return in_turns(cell, (-points[:, 4],), n_most)
 
 
 def _mutual(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:

@@ -17,8 +17,8 @@ from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import StepContext
+from orthoflow.testing import textured_walls as ms
 from tests import block_scenes as bs
-from tests import matching_scenes as ms
 from tests.scenes import SURVEY_SHIFT_M
 
 FEW = {"n_features_max": 1500, "n_photo_points_max": 300}
