@@ -19,7 +19,7 @@ from orthoflow.geometry.key_points import in_turns
 from orthoflow.products import Wall
 from orthoflow_plugins.match.pictures import filled_smoothly
 
-N_DIRECTIONS: Final = 6
+_N_DIRECTIONS: Final = 6
 _NOISE_SIGMA_CELLS: Final = 0.8
 _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
@@ -55,7 +55,7 @@ def gradient_channels(grey: NDArray[np.float32]) -> Channels:
     import cv2
 
     gradient, known = _gradient(grey)
-    angles = np.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
+    angles = np.pi * np.arange(_N_DIRECTIONS) / _N_DIRECTIONS
     layers = [
         cv2.GaussianBlur(
             np.abs(gradient[0] * np.float32(np.cos(a)) + gradient[1] * np.float32(np.sin(a))),

@@ -16,9 +16,9 @@ from orthoflow_plugins.orient.estimation import Estimate
 from orthoflow_plugins.orient.layout import hull_area, image_cells, quadrant_counts
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
 
-TIES_LEAST: Final = 8
+_TIES_LEAST: Final = 8
 _SIDE_CHECK_LEAST: Final = 4
-QUADRANT_RATIO: Final = 10
+_QUADRANT_RATIO: Final = 10
 # Probability that the check points of a wrong pose agree by chance. Right ties gather close to
 # where they should be, wrong ones do not: several shares of the limit are tried.
 _CHANCE_MOST: Final = 1e-5
@@ -123,9 +123,9 @@ class Candidate:
 
 def too_few(n_ties: int) -> str:
     """Say why ties are too few for an orientation; empty when they suffice."""
-    if n_ties < TIES_LEAST:
+    if n_ties < _TIES_LEAST:
         return (
-            f"{n_ties} ties with the walls, at least {TIES_LEAST} are needed: the photo "
+            f"{n_ties} ties with the walls, at least {_TIES_LEAST} are needed: the photo "
             "shows none of the walls, or too differently"
         )
     return ""
@@ -153,10 +153,10 @@ def warnings_for(candidate: Candidate) -> list[str]:
     """Say what limits an orientation that is `ok`."""
     notes = []
     counts = candidate.quadrant_counts
-    if max(counts) > QUADRANT_RATIO * min(counts):
+    if max(counts) > _QUADRANT_RATIO * min(counts):
         notes.append(
             f"a quarter of the photo has {max(counts)} ties, another {min(counts)}: more than "
-            f"{QUADRANT_RATIO} times as many"
+            f"{_QUADRANT_RATIO} times as many"
         )
     if candidate.hull_ratio < 1.5 * candidate.rule.hull_ratio_least:
         notes.append(

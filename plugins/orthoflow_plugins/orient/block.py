@@ -294,7 +294,7 @@ class _Rows:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Seen:
+class _Equations:
     """Equations of one observation, or of a photo's m, with the point still in them.
 
     Attributes:
@@ -347,7 +347,7 @@ def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> Iterator
     seen = block.seen
     joint = block.is_joint[seen.point]
     covariances = pixel_covariances(block)
-    stacked: dict[int, list[_Seen]] = {}
+    stacked: dict[int, list[_Equations]] = {}
     for photo in range(len(block.cameras)):
         mine = np.flatnonzero(seen.photo == photo)
         if not len(mine):
@@ -362,7 +362,7 @@ def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> Iterator
                 residuals=linear.residuals[alone].ravel(),
             )
         for nth in np.flatnonzero(joint[mine]):
-            one = _Seen(
+            one = _Equations(
                 columns=block.columns(photo),
                 group=int(groups[mine[nth]]),
                 by_camera=linear.by_camera[nth],
@@ -380,7 +380,7 @@ def _seen_by(
     mine: NDArray[np.intp],
     covariances: NDArray[np.float64],
     soft_limit: float,
-) -> _Seen:
+) -> _Equations:
     """Equations of a photo's observations, in standard deviations, robust weights applied."""
     camera, seen = block.cameras[photo], block.seen
     points = seen.point[mine]
@@ -394,7 +394,7 @@ def _seen_by(
     all_columns = whiten(covariances, all_columns)
     lengths = np.linalg.norm(all_columns[:, :, 0], axis=1)
     all_columns *= np.sqrt(np.minimum(1.0, soft_limit / np.maximum(lengths, 1e-12)))[:, None, None]
-    return _Seen(
+    return _Equations(
         columns=block.columns(photo),
         group=-1,
         by_camera=all_columns[:, :, 1:-3],
@@ -403,7 +403,7 @@ def _seen_by(
     )
 
 
-def _without_point(block: Block, point: int, parts: list[_Seen]) -> _Rows:
+def _without_point(block: Block, point: int, parts: list[_Equations]) -> _Rows:
     """Eliminate a point seen by several photos: what its position cannot explain remains."""
     columns = np.unique(np.concatenate([part.columns for part in parts]))
     sigma_m = float(block.points.sigma_m[point])

@@ -147,7 +147,7 @@ def estimate_dlt(
     if robust is None:
         return no_pose(seen)
     control = seen.take(robust.agreeing & ~is_check)
-    reason = _too_few(len(control), distortion) or too_flat(control)
+    reason = _too_few(len(control), distortion) or _too_flat(control)
     if reason:
         return reason
     size_px = (photo.width, photo.height)
@@ -170,64 +170,7 @@ def estimate_dlt(
     control = seen.take(estimate.agreeing & ~is_check)
     if distortion == _FULL or len(control) < _LEAST[_FULL]:
         return estimate
-    return with_what_is_missing(estimate, control, start, _freedom(_FULL, size_px))
-
-
-def too_flat(control: SeenPoints) -> str:
-    """Say that control lies too near a plane for eleven parameters; empty when it does not."""
-    depth = relief(control.points_world)
-    sigma_m = float(np.sqrt(np.mean(control.sigma_m**2)))
-    if depth.rms_m < _RELIEF_SIGMAS * sigma_m:
-        return _flat(
-            control,
-            f"its points are known to {1000 * sigma_m:.1f} mm, and a DLT needs "
-            f"{_RELIEF_SIGMAS:g} times as much relief",
-        )
-    if depth.rms_m < depth.extent_m / _CONDITION_MOST:
-        return _flat(control, "a DLT needs relief")
-    return ""
-
-
-def with_what_is_missing(
-    estimate: Estimate, control: SeenPoints, start: Start, freedom: LensFreedom
-) -> Estimate:
-    """Widen what is stated of a camera by how far a fuller lens model would move it, everywhere.
-
-    Residuals show hardly a tenth of what a lens model lacks: the other parameters take up the rest,
-    and bend the photo between and beyond the ties. So the error of the poorer camera is taken as
-    its distance from the fuller one, and the error of that one on top. With the distortion of a
-    usual lens unknown, eleven parameters stated a ninth of their error without this.
-
-    Args:
-        estimate: by the poorer model.
-        control: the ties that determined it.
-        start: what it started from.
-        freedom: what the fuller model may change of the lens.
-    """
-    model = estimate.resection
-    size_px = (model.camera.width, model.camera.height)
-    try:
-        full = adjust(
-            control,
-            model.camera,
-            prior=start.prior,
-            lens=freedom,
-            groups=image_cells(control.pixels_photo, size_px, GROUPS),
-            soft_limit=SOFT_LIMIT * max(model.sigma0, 1.0),
-        )
-    except GeometryError:
-        return estimate
-    points = control.points_world
-    missing = _mean_square(_moved_px(model.camera, full.camera, points)) - _variance_px2(
-        full, points
-    )
-    if missing <= 0.0:
-        return estimate
-    bias = _bias(model.camera, full, control)
-    wider = replace(model, covariance=full.covariance + np.outer(bias, bias), lens=full.lens)
-    factor = _variance_px2(wider, points) / _variance_px2(model, points)
-    wider = replace(wider, variance_factor=factor * model.variance_factor)
-    return replace(estimate, resection=wider, notes=_misfit_notes(estimate, missing, factor))
+    return _with_what_is_missing(estimate, control, start, _freedom(_FULL, size_px))
 
 
 def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[np.float64], float]:
@@ -282,6 +225,63 @@ def _too_few(n_control: int, distortion: Distortion) -> str:
         f"only {n_control} control ties agree with one pose, a DLT with distortion "
         f'"{distortion}" needs {_LEAST[distortion]}'
     )
+
+
+def _too_flat(control: SeenPoints) -> str:
+    """Say that control lies too near a plane for eleven parameters; empty when it does not."""
+    depth = relief(control.points_world)
+    sigma_m = float(np.sqrt(np.mean(control.sigma_m**2)))
+    if depth.rms_m < _RELIEF_SIGMAS * sigma_m:
+        return _flat(
+            control,
+            f"its points are known to {1000 * sigma_m:.1f} mm, and a DLT needs "
+            f"{_RELIEF_SIGMAS:g} times as much relief",
+        )
+    if depth.rms_m < depth.extent_m / _CONDITION_MOST:
+        return _flat(control, "a DLT needs relief")
+    return ""
+
+
+def _with_what_is_missing(
+    estimate: Estimate, control: SeenPoints, start: Start, freedom: LensFreedom
+) -> Estimate:
+    """Widen what is stated of a camera by how far a fuller lens model would move it, everywhere.
+
+    Residuals show hardly a tenth of what a lens model lacks: the other parameters take up the rest,
+    and bend the photo between and beyond the ties. So the error of the poorer camera is taken as
+    its distance from the fuller one, and the error of that one on top. With the distortion of a
+    usual lens unknown, eleven parameters stated a ninth of their error without this.
+
+    Args:
+        estimate: by the poorer model.
+        control: the ties that determined it.
+        start: what it started from.
+        freedom: what the fuller model may change of the lens.
+    """
+    model = estimate.resection
+    size_px = (model.camera.width, model.camera.height)
+    try:
+        full = adjust(
+            control,
+            model.camera,
+            prior=start.prior,
+            lens=freedom,
+            groups=image_cells(control.pixels_photo, size_px, GROUPS),
+            soft_limit=SOFT_LIMIT * max(model.sigma0, 1.0),
+        )
+    except GeometryError:
+        return estimate
+    points = control.points_world
+    missing = _mean_square(_moved_px(model.camera, full.camera, points)) - _variance_px2(
+        full, points
+    )
+    if missing <= 0.0:
+        return estimate
+    bias = _bias(model.camera, full, control)
+    wider = replace(model, covariance=full.covariance + np.outer(bias, bias), lens=full.lens)
+    factor = _variance_px2(wider, points) / _variance_px2(model, points)
+    wider = replace(wider, variance_factor=factor * model.variance_factor)
+    return replace(estimate, resection=wider, notes=_misfit_notes(estimate, missing, factor))
 
 
 def _flat(control: SeenPoints, why: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -28,7 +28,7 @@ from orthoflow.geometry.resection import (
 from orthoflow.geometry.robust import MEDIAN_LENGTH
 from orthoflow.products import Intrinsics, Photo
 from orthoflow_plugins.orient.layout import GROUPS, image_cells
-from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior
+from orthoflow_plugins.orient.lenses import intrinsics_of, lens_prior
 
 _LEAST_FOR_POSE: Final = 4
 _CONFIDENCE: Final = 0.99999
@@ -59,7 +59,8 @@ class EstimationRule:
 
     Attributes:
         rejection_sigma: ties beyond so many standard deviations are rejected.
-        threshold_px: of the samples; None derives it from the ties' sigmas.
+        threshold_px: ties agree with a sampled pose up to this distance; None derives it from
+            their sigmas.
         n_trials_most: samples drawn at most.
         seed: of the samples.
     """
@@ -116,34 +117,6 @@ class Start:
     n_least_for_lens: int = _LEAST_FOR_LENS
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobustPose:
-    """A pose and the ties that agree with it.
-
-    Attributes:
-        camera: the camera at that pose.
-        agreeing: (n,) bool.
-    """
-
-    camera: ViewingCamera
-    agreeing: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SamplingRule:
-    """How samples are drawn.
-
-    Attributes:
-        threshold_px: ties agree with a pose up to this distance.
-        n_trials_most: samples drawn at most.
-        seed: of the samples.
-    """
-
-    threshold_px: float
-    n_trials_most: int
-    seed: int
-
-
 def estimate_pose(
     photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
 ) -> Estimate | str:
@@ -162,34 +135,7 @@ def estimate_pose(
         found = adjusted(photo, seen, is_check, start, rule)
     except GeometryError:
         return no_pose(seen)
-    return calibration_doubt(found, seen.take(found.agreeing & ~is_check)) or found
-
-
-def calibration_doubt(found: Estimate, control: SeenPoints) -> str:
-    """Say that a calibrated photo was taken with another focal length; empty when it may be right.
-
-    The pose of such a photo takes up most of the mistake, and its residuals do not show the rest.
-    """
-    camera = found.resection.camera
-    if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
-        return ""
-    try:
-        step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
-        if abs(step[POSE_PARAMETERS]) < _FOCAL_STEP_LEAST:
-            return ""
-        cells = image_cells(control.pixels_photo, (camera.width, camera.height), GROUPS)
-        free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
-    except GeometryError:
-        return ""
-    off = abs(math.log(free.camera.fx / camera.fx))
-    sigma = math.sqrt(float(free.covariance[POSE_PARAMETERS, POSE_PARAMETERS]))
-    if off < max(_FOCAL_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma):
-        return ""
-    return (
-        f"its ties ask for a focal length of {free.camera.fx:.0f} px, give or take "
-        f"{sigma * free.camera.fx:.0f} px, but its calibration says {camera.fx:.0f} px: it is the "
-        "calibration of another lens, zoom or image size"
-    )
+    return _calibration_doubt(found, seen.take(found.agreeing & ~is_check)) or found
 
 
 def no_pose(seen: SeenPoints) -> str:
@@ -201,70 +147,30 @@ def robust_start(
     photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
 ) -> Start | None:
     """Find the pose that most control ties agree with; None when there is none."""
-    prior = lens_prior(photo)
-    control = np.flatnonzero(~is_check)
-    best: tuple[RobustPose, Intrinsics] | None = None
-    for pose, intrinsics in _starts(seen.take(control), prior, rule):
-        if best is None or pose.agreeing.sum() > best[0].agreeing.sum():
-            best = pose, intrinsics
+    prior, control = lens_prior(photo), seen.take(~is_check)
+    if rule.threshold_px is None:
+        # A lens known only roughly misplaces even right ties.
+        slack = 1.0 if prior.source not in ("exif", "none") else 2.0
+        rule = replace(rule, threshold_px=slack * rule.rejection_sigma * _expected_px(control))
+    best: _RobustPose | None = None
+    for intrinsics in prior.guesses:
+        pose = _robust_pose(control, intrinsics.posed(), rule)
+        if pose is not None and (best is None or pose.agreeing.sum() > best.agreeing.sum()):
+            best = pose
     if best is None:
         return None
     agreeing = np.zeros(len(seen), dtype=np.bool_)
-    agreeing[control] = best[0].agreeing
+    agreeing[~is_check] = best.agreeing
     # Points that appear twice say nothing new to a pose of six unknowns.
     if len(set(map(tuple, seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
-    pose, intrinsics = best
-    lens = intrinsics.posed()
     return Start(
-        camera=posed(lens, pose.camera),
-        prior=lens,
+        camera=best.camera,
+        prior=best.camera,
         agreeing=agreeing,
         freedom=prior.freedom,
         source=prior.source,
     )
-
-
-def robust_pose(
-    pixels_photo: NDArray[np.float64],
-    points_world: NDArray[np.float64],
-    lens: ViewingCamera,
-    rule: SamplingRule,
-) -> RobustPose | None:
-    """Find the pose that most ties agree with (MSAC on P3P: Torr & Zisserman 2000).
-
-    Args:
-        pixels_photo: (n, 2).
-        points_world: (n, 3) metres.
-        lens: the camera's interior orientation; its pose is ignored.
-        rule: how samples are drawn.
-
-    Returns:
-        None when no pose is found.
-    """
-    import cv2
-
-    usable = _undistorted(pixels_photo, lens)
-    inside: NDArray[np.bool_] = np.asarray(np.isfinite(usable).all(axis=1))
-    if inside.sum() < _LEAST_FOR_POSE:
-        return None
-    middle = points_world.mean(axis=0)
-    pixels = np.ascontiguousarray(to_opencv(usable[inside]))
-    points = np.ascontiguousarray(points_world[inside] - middle)
-    call: Any = cv2.solvePnPRansac
-    try:
-        found, _, turn, shift, agreed = call(
-            points, pixels, opencv_matrix(lens), None, params=_usac(rule)
-        )
-    except cv2.error:  # no sample has a solution
-        return None
-    if not found or agreed is None:
-        return None
-    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
-    local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
-    agreeing = np.zeros(len(inside), dtype=np.bool_)
-    agreeing[np.flatnonzero(inside)[np.asarray(agreed).ravel()]] = True
-    return RobustPose(camera=local.shifted(-middle), agreeing=agreeing)
 
 
 def adjusted(
@@ -313,29 +219,112 @@ def adjusted(
     )
 
 
+def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
+    """Tighten a limit until hardly any wrong tie lies within it by chance.
+
+    Wrong ties near a pose lie evenly around where they should be: the ring from one to three
+    times the limit has eight times the area within it and tells how many to expect.
+    """
+    lengths = np.sort(normalised[np.isfinite(normalised)])
+    for tightened in limit * _TIGHTENING ** np.arange(_TIGHTENED_MOST):
+        inside, around = np.searchsorted(lengths, [tightened, 3.0 * tightened], side="right")
+        if (around - inside) / 8.0 <= _CHANCE_SHARE_MOST * inside:
+            return float(tightened)
+    return float(tightened)
+
+
+def unit_deviation(normalised: NDArray[np.float64]) -> float:
+    """Robust standard deviation of unit weight, kept within reason."""
+    median = float(np.median(normalised)) if normalised.size else 1.0
+    return float(np.clip(median / MEDIAN_LENGTH, *_SIGMA0_RANGE))
+
+
+def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -> float:
+    """Size of a pixel of the photo at the points, median over them."""
+    derivatives = pixels_by_point(camera, points_world)
+    across = np.linalg.svd(derivatives, compute_uv=False)
+    return float(np.median(1.0 / np.sqrt(across[:, 0] * across[:, 1])))
+
+
 def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
     """Give the lens of one camera the pose of another."""
     return replace(lens, rotation=pose.rotation, translation=pose.translation)
 
 
-def _starts(
-    seen: SeenPoints, prior: LensPrior, rule: EstimationRule
-) -> Iterator[tuple[RobustPose, Intrinsics]]:
-    # A lens known only roughly misplaces even right ties.
-    slack = 1.0 if prior.source not in ("exif", "none") else 2.0
-    for intrinsics in prior.guesses:
-        lens = intrinsics.posed()
-        threshold = rule.threshold_px
-        if threshold is None:
-            threshold = slack * rule.rejection_sigma * _expected_px(seen)
-        pose = robust_pose(
-            seen.pixels_photo,
-            seen.points_world,
-            lens,
-            SamplingRule(threshold_px=threshold, n_trials_most=rule.n_trials_most, seed=rule.seed),
+@dataclass(frozen=True, kw_only=True)
+class _RobustPose:
+    """A pose and the ties that agree with it.
+
+    Attributes:
+        camera: the camera at that pose.
+        agreeing: (n,) bool.
+    """
+
+    camera: ViewingCamera
+    agreeing: NDArray[np.bool_]
+
+
+def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
+    """Say that a calibrated photo was taken with another focal length; empty when it may be right.
+
+    The pose of such a photo takes up most of the mistake, and its residuals do not show the rest.
+    """
+    camera = found.resection.camera
+    if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
+        return ""
+    try:
+        step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
+        if abs(step[POSE_PARAMETERS]) < _FOCAL_STEP_LEAST:
+            return ""
+        cells = image_cells(control.pixels_photo, (camera.width, camera.height), GROUPS)
+        free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
+    except GeometryError:
+        return ""
+    off = abs(math.log(free.camera.fx / camera.fx))
+    sigma = math.sqrt(float(free.covariance[POSE_PARAMETERS, POSE_PARAMETERS]))
+    if off < max(_FOCAL_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma):
+        return ""
+    return (
+        f"its ties ask for a focal length of {free.camera.fx:.0f} px, give or take "
+        f"{sigma * free.camera.fx:.0f} px, but its calibration says {camera.fx:.0f} px: it is the "
+        "calibration of another lens, zoom or image size"
+    )
+
+
+def _robust_pose(seen: SeenPoints, lens: ViewingCamera, rule: EstimationRule) -> _RobustPose | None:
+    """Find the pose that most ties agree with (MSAC on P3P: Torr & Zisserman 2000).
+
+    Args:
+        seen: the ties.
+        lens: the camera's interior orientation; its pose is ignored.
+        rule: how samples are drawn; its `threshold_px` is known.
+
+    Returns:
+        None when no pose is found.
+    """
+    import cv2
+
+    usable = _undistorted(seen.pixels_photo, lens)
+    inside: NDArray[np.bool_] = np.asarray(np.isfinite(usable).all(axis=1))
+    if inside.sum() < _LEAST_FOR_POSE:
+        return None
+    middle = seen.points_world.mean(axis=0)
+    pixels = np.ascontiguousarray(to_opencv(usable[inside]))
+    points = np.ascontiguousarray(seen.points_world[inside] - middle)
+    call: Any = cv2.solvePnPRansac
+    try:
+        found, _, turn, shift, agreed = call(
+            points, pixels, opencv_matrix(lens), None, params=_usac(rule)
         )
-        if pose is not None:
-            yield pose, intrinsics
+    except cv2.error:  # no sample has a solution
+        return None
+    if not found or agreed is None:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
+    agreeing = np.zeros(len(inside), dtype=np.bool_)
+    agreeing[np.flatnonzero(inside)[np.asarray(agreed).ravel()]] = True
+    return _RobustPose(camera=local.shifted(-middle), agreeing=agreeing)
 
 
 def _expected_px(seen: SeenPoints) -> float:
@@ -347,7 +336,7 @@ def _expected_px(seen: SeenPoints) -> float:
     return float(sigma)
 
 
-def _usac(rule: SamplingRule) -> Any:
+def _usac(rule: EstimationRule) -> Any:
     """OpenCV's universal sampling, one thread: several give another result each time."""
     import cv2
 
@@ -378,30 +367,3 @@ def _undistorted(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDArray[np
                 continue
     straight: NDArray[np.float64] = rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
     return straight
-
-
-def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
-    """Tighten a limit until hardly any wrong tie lies within it by chance.
-
-    Wrong ties near a pose lie evenly around where they should be: the ring from one to three
-    times the limit has eight times the area within it and tells how many to expect.
-    """
-    lengths = np.sort(normalised[np.isfinite(normalised)])
-    for tightened in limit * _TIGHTENING ** np.arange(_TIGHTENED_MOST):
-        inside, around = np.searchsorted(lengths, [tightened, 3.0 * tightened], side="right")
-        if (around - inside) / 8.0 <= _CHANCE_SHARE_MOST * inside:
-            return float(tightened)
-    return float(tightened)
-
-
-def unit_deviation(normalised: NDArray[np.float64]) -> float:
-    """Robust standard deviation of unit weight, kept within reason."""
-    median = float(np.median(normalised)) if normalised.size else 1.0
-    return float(np.clip(median / MEDIAN_LENGTH, *_SIGMA0_RANGE))
-
-
-def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -> float:
-    """Size of a pixel of the photo at the points, median over them."""
-    derivatives = pixels_by_point(camera, points_world)
-    across = np.linalg.svd(derivatives, compute_uv=False)
-    return float(np.median(1.0 / np.sqrt(across[:, 0] * across[:, 1])))

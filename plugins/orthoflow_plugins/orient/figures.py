@@ -65,12 +65,6 @@ class PhotoResiduals:
         return np.asarray(values[np.isfinite(values).all(axis=1)])
 
 
-def figure_name(prefix: str, photo_name: str) -> str:
-    """Name of a photo's figure: letters, digits, `-` and `_`."""
-    stem = photo_name.rpartition(".")[0] or photo_name
-    return f"{prefix}_{re.sub(r'[^A-Za-z0-9_-]', '-', stem)}"
-
-
 def draw_ties(
     ctx: StepContext,
     photo: Photo,
@@ -83,7 +77,7 @@ def draw_ties(
 
     if len(ctx.figures) >= _FIGURES_MOST:
         return
-    name = figure_name("ties", photo.name)
+    name = _figure_name("ties", photo.name)
     if any(figure.name == name for figure in ctx.figures):
         name = f"{name}-{len(ctx.figures)}"
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
@@ -147,6 +141,12 @@ def draw_residuals(ctx: StepContext, photos: Sequence[PhotoResiduals]) -> None:
     if drawn:
         _draw_pooled(ctx, drawn)
         _draw_each(ctx, photos, drawn)
+
+
+def _figure_name(prefix: str, photo_name: str) -> str:
+    """Name of a photo's figure: letters, digits, `-` and `_`."""
+    stem = photo_name.rpartition(".")[0] or photo_name
+    return f"{prefix}_{re.sub(r'[^A-Za-z0-9_-]', '-', stem)}"
 
 
 def _error_map(shares: NDArray[np.float64]) -> bytes:
