@@ -25,9 +25,10 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.estimating import EstimationRule, estimate_pose
+from orthoflow_plugins.orient.estimation import EstimationRule, estimate_pose
 
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Intrinsics, Photo
 
@@ -36,11 +37,13 @@ FOCAL_PX: Final = 2900.0
 NOISE_PX: Final = 1.5
 FOUND_M: Final = 0.05
 THRESHOLD_PX: Final = 3.5 * NOISE_PX
-K: Final = np.array([[FOCAL_PX, 0.0, 1500.0], [0.0, FOCAL_PX, 1000.0], [0.0, 0.0, 1.0]])
+LENS: Final = Intrinsics(
+    width=SIZE_PX[0], height=SIZE_PX[1], fx=FOCAL_PX, fy=FOCAL_PX, cx=1500.0, cy=1000.0
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class TiedPhoto:
     """A photo's ties and its true place."""
 
     pixels: NDArray[np.float64]
@@ -48,10 +51,10 @@ class Sight:
     centre: NDArray[np.float64]
 
 
-Solver = Callable[[Sight], "NDArray[np.float64] | None"]
+Solver = Callable[[TiedPhoto], "NDArray[np.float64] | None"]
 
 
-def sight(seed: int, n_ties: int, wrong_share: float) -> Sight:
+def tied_photo(seed: int, n_ties: int, wrong_share: float) -> TiedPhoto:
     rng = np.random.default_rng(seed)
     centre = np.array([rng.uniform(-0.6, 0.6), rng.uniform(-3.4, -2.4), rng.uniform(-0.5, 0.5)])
     rotation = looking_at(centre, rng.uniform(-0.2, 0.2, 3) * [1, 0, 1], np.array([0.0, 0, 1]))
@@ -64,7 +67,7 @@ def sight(seed: int, n_ties: int, wrong_share: float) -> Sight:
     observed = pixels[seen] + NOISE_PX * rng.normal(size=(len(seen), 2))
     n_wrong = round(wrong_share * len(seen))
     observed[:n_wrong] = rng.uniform([0.0, 0.0], SIZE_PX, (n_wrong, 2))
-    return Sight(pixels=observed, points=points[seen], centre=centre)
+    return TiedPhoto(pixels=observed, points=points[seen], centre=centre)
 
 
 def viewer(rotation: NDArray[np.float64], centre: NDArray[np.float64]) -> ViewingCamera:
@@ -86,13 +89,11 @@ PHOTO: Final = Photo(
     encoded=b"",
     width=SIZE_PX[0],
     height=SIZE_PX[1],
-    intrinsics=Intrinsics(
-        width=SIZE_PX[0], height=SIZE_PX[1], fx=FOCAL_PX, fy=FOCAL_PX, cx=1500.0, cy=1000.0
-    ),
+    intrinsics=LENS,
 )
 
 
-def ours(seen: Sight) -> NDArray[np.float64] | None:
+def ours(seen: TiedPhoto) -> NDArray[np.float64] | None:
     n = len(seen.pixels)
     ties = SeenPoints(
         pixels_photo=seen.pixels,
@@ -105,15 +106,14 @@ def ours(seen: Sight) -> NDArray[np.float64] | None:
     return None if isinstance(found, str) else found.resection.camera.centre_world
 
 
-def opencv(seen: Sight) -> NDArray[np.float64] | None:
+def opencv(seen: TiedPhoto) -> NDArray[np.float64] | None:
     params: Any = cv2.UsacParams()
     params.threshold = THRESHOLD_PX
     params.maxIterations = 20_000
     params.confidence = 0.99999
     params.score = cv2.SCORE_METHOD_MAGSAC
     params.loMethod = cv2.LOCAL_OPTIM_SIGMA
-    pixels = seen.pixels - 0.5
-    matrix = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    pixels, matrix = to_opencv(seen.pixels), opencv_matrix(LENS)
     call: Any = cv2.solvePnPRansac
     ok, _, turn, shift, inliers = call(seen.points, pixels, matrix.copy(), None, params=params)
     if not ok or inliers is None:
@@ -125,7 +125,7 @@ def opencv(seen: Sight) -> NDArray[np.float64] | None:
     return np.asarray(-rotation.T @ shift.ravel())
 
 
-def colmap(seen: Sight) -> NDArray[np.float64] | None:
+def colmap(seen: TiedPhoto) -> NDArray[np.float64] | None:
     camera = pycolmap.Camera(
         model="PINHOLE",
         width=SIZE_PX[0],
@@ -149,7 +149,7 @@ def colmap(seen: Sight) -> NDArray[np.float64] | None:
     return np.asarray(-matrix[:, :3].T @ matrix[:, 3])
 
 
-def poselib(seen: Sight) -> NDArray[np.float64] | None:
+def poselib(seen: TiedPhoto) -> NDArray[np.float64] | None:
     library: Any = importlib.import_module("poselib")
     camera = {
         "model": "PINHOLE",
@@ -179,7 +179,7 @@ def main() -> None:
         errors = {name: np.full(chosen.photos, np.inf) for name in named}
         seconds = {name: np.zeros(chosen.photos) for name in named}
         for seed in range(chosen.photos):
-            seen = sight(seed, chosen.ties, wrong_share)
+            seen = tied_photo(seed, chosen.ties, wrong_share)
             for name, solve in named.items():
                 # Loaded and warm: the first photo is solved twice.
                 for _ in range(2 if seed == 0 else 1):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Intrinsics, Photo, Ties
+from orthoflow.products import Intrinsics, Photo, Ties, TieWall
 from tests.scenes import SURVEY_SHIFT_M
 
 WALL_M: Final = (4.0, 3.0)
@@ -125,15 +125,13 @@ def _ties_of(draft: _Draft) -> Ties:
         sigma_m=np.full(n, NOISE_M),
         role=np.zeros(n, np.uint8),
         residual_px=np.full((n, 2), np.nan),
-        details={
-            "walls": [
-                {
-                    "gsd_m": GSD_M,
-                    "normal": [0.0, -1.0, 0.0],
-                    "corners_world": (_CORNERS + shift).tolist(),
-                }
-            ]
-        },
+        walls=(
+            TieWall(
+                gsd_m=GSD_M,
+                normal_world=(0.0, -1.0, 0.0),
+                corners_world=tuple(map(tuple, (_CORNERS + shift).tolist())),
+            ),
+        ),
     )
 
 

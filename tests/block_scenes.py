@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Photos, Ties
-from tests import matching_scenes as ms
+from orthoflow.products import Photos, Ties, TieWall
+from orthoflow.testing import textured_walls as ms
 
 _VIEWS = (
     ((0.8, -2.4, 1.1), (1.3, 0.0, 1.0), 0.0),
@@ -80,13 +80,11 @@ def scan_ties(
         sigma_m=np.full(n_all, noise_m),
         role=np.zeros(n_all, np.uint8),
         residual_px=np.full((n_all, 2), np.nan),
-        details={
-            "walls": [
-                {
-                    "gsd_m": ms.GSD_M,
-                    "normal": [0.0, -1.0, 0.0],
-                    "corners_world": (SCENE.frame.corners_world() + shift).tolist(),
-                }
-            ]
-        },
+        walls=(
+            TieWall(
+                gsd_m=ms.GSD_M,
+                normal_world=(0.0, -1.0, 0.0),
+                corners_world=tuple(map(tuple, (SCENE.frame.corners_world() + shift).tolist())),
+            ),
+        ),
     )

@@ -51,7 +51,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
                 f'{camera.photo}": rename the photo and run again'
             )
     lenses = list(dict.fromkeys(_lens(camera) for camera in oriented))
-    seen = _Seen(oriented, cameras.ties)
+    seen = _KeptTies(oriented, cameras.ties)
     write_text(folder / "cameras.txt", _cameras_text(lenses))
     write_text(folder / "images.txt", _images_text(oriented, lenses, seen))
     write_text(folder / "points3D.txt", _points_text(seen))
@@ -60,7 +60,7 @@ def write_colmap_model(folder: Path, cameras: Cameras) -> ColmapModel:
     )
 
 
-class _Seen:
+class _KeptTies:
     """The ties that count: places on the walls, and where the photos have them."""
 
     def __init__(self, oriented: list[Camera], ties: Ties | None) -> None:
@@ -102,7 +102,7 @@ def _cameras_text(lenses: list[Intrinsics]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _images_text(oriented: list[Camera], lenses: list[Intrinsics], seen: _Seen) -> str:
+def _images_text(oriented: list[Camera], lenses: list[Intrinsics], seen: _KeptTies) -> str:
     lines = [
         "# Image list: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
         "# and on a second line POINTS2D[] as X, Y, POINT3D_ID",
@@ -121,7 +121,7 @@ def _images_text(oriented: list[Camera], lenses: list[Intrinsics], seen: _Seen) 
     return "\n".join(lines) + "\n"
 
 
-def _points_text(seen: _Seen) -> str:
+def _points_text(seen: _KeptTies) -> str:
     lines = ["# Point list: POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as IMAGE_ID, POINT2D_IDX"]
     order = np.argsort(seen.point, kind="stable")
     ends = np.searchsorted(seen.point[order], np.arange(len(seen.points_world)), side="right")

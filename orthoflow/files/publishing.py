@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +32,7 @@ from orthoflow.files.sidecars import (
     write_text,
 )
 from orthoflow.geometry import WallFrame, omega_phi_deg
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import (
     Calibration,
@@ -41,14 +43,13 @@ from orthoflow.products import (
     Orthoimages,
     OrthoMask,
     Planes,
+    ResidualRow,
     TieRole,
     Ties,
     Wall,
     Walls,
 )
 
-# OpenCV puts (0, 0) at the centre of the first pixel, orthoflow (0.5, 0.5).
-OPENCV_SHIFT_PX: Final = -0.5
 PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
 TIE_COLUMNS: Final = (
     "photo",
@@ -159,7 +160,7 @@ def publish_ties(product: Ties, folder: Path, digest: str) -> None:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(TIE_COLUMNS)
-    pixels = product.pixels_photo + OPENCV_SHIFT_PX
+    pixels = to_opencv(product.pixels_photo)
     for index in range(len(product.photo)):
         table.writerow(
             [
@@ -180,8 +181,7 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
     """Write `cameras.json`, and what else the orientation found.
 
     That is `calibration.yaml` with the lenses that it estimated, to orient other photos of them,
-    `ties.csv` with the residuals if it kept its ties, and `residuals.csv` with the rows that its
-    details have of them as `residual_table`.
+    `ties.csv` with the residuals if it kept its ties, and `residuals.csv` with its table of them.
     """
     write_json(
         folder / "cameras.json",
@@ -202,18 +202,17 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
         write_calibration(folder / "calibration.yaml", calibration)
     if product.ties is not None:
         publish_ties(product.ties, folder, digest)
-    table = product.details.get("residual_table")
-    if isinstance(table, list) and table:
-        write_text(folder / "residuals.csv", _table_text(table))
+    if product.residual_table:
+        write_text(folder / "residuals.csv", _table_text(product.residual_table))
 
 
-def _table_text(rows: Sequence[JsonValue]) -> str:
-    """Rows of equal keys as CSV; what is absent stays empty."""
-    tables = [row for row in rows if isinstance(row, Mapping)]
+def _table_text(rows: Sequence[ResidualRow]) -> str:
+    """Rows as CSV; what is absent stays empty."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(tables[0]), lineterminator="\n")
+    columns = [column.name for column in fields(ResidualRow)]
+    writer = csv.DictWriter(text, fieldnames=columns, lineterminator="\n")
     writer.writeheader()
-    writer.writerows(tables)
+    writer.writerows(asdict(row) for row in rows)
     return text.getvalue()
 
 
@@ -284,11 +283,7 @@ def _camera_json(camera: Camera) -> JsonValue:
     entry: dict[str, JsonValue] = {"status": camera.status}
     inner = camera.intrinsics
     if inner is not None:
-        entry["K"] = [
-            [inner.fx, 0.0, inner.cx + OPENCV_SHIFT_PX],
-            [0.0, inner.fy, inner.cy + OPENCV_SHIFT_PX],
-            [0.0, 0.0, 1.0],
-        ]
+        entry["K"] = numbers(opencv_matrix(inner))
         entry["distortion"] = list(inner.distortion)
         entry["width"] = inner.width
         entry["height"] = inner.height

@@ -10,8 +10,10 @@ from orthoflow.products.photographs import (
     Intrinsics,
     Photo,
     Photos,
+    ResidualRow,
     TieRole,
     Ties,
+    TieWall,
 )
 from orthoflow.products.planes import Planes, PointLabels
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
@@ -51,9 +53,11 @@ __all__ = [
     "PointCloud",
     "PointLabels",
     "Product",
+    "ResidualRow",
     "SurfaceMask",
     "TakenPhoto",
     "TieRole",
+    "TieWall",
     "Ties",
     "Tolerance",
     "Truth",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields, replace
 from enum import IntEnum
 from typing import ClassVar, Self
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products.product import JsonValue, Product, Tolerance
+from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
+from orthoflow.products.walls import Wall
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,8 +138,42 @@ class TieRole(IntEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TieWall:
+    """What an orientation has to know of a wall that ties lie on.
+
+    Attributes:
+        name: label of the wall.
+        corners_world: four corners of its raster as (x, y, z) in metres: top-left, then
+            counter-clockwise for the viewer, as `WallFrame.corners_world` gives them.
+        normal_world: unit vector (x, y, z) to the viewer; no photo is taken from behind it.
+        gsd_m: side of a cell of its raster, metres; None where there is none, and then no error
+            can be too large in cells.
+    """
+
+    name: str = ""
+    corners_world: tuple[tuple[float, ...], ...]
+    normal_world: tuple[float, ...]
+    gsd_m: float | None = None
+
+    @classmethod
+    def of(cls, wall: Wall) -> Self:
+        """Give what ties say of a rastered wall."""
+        frame = wall.frame
+        return cls(
+            name=wall.name,
+            corners_world=tuple(tuple(corner) for corner in frame.corners_world().tolist()),
+            normal_world=tuple(frame.normal_world.tolist()),
+            gsd_m=frame.gsd_m,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Ties(Product):
     """Points seen in a photo and known on a wall.
+
+    A matcher need not fill in `walls` and `search_radius_px`, but orientations are judged better
+    with them: without `walls`, the points of the ties stand in for them, and neither the side of a
+    wall nor its cells are known.
 
     Attributes:
         photo_names: names the column `photo` refers to.
@@ -150,10 +185,15 @@ class Ties(Product):
         sigma_m: (n,) float64.
         role: (n,) uint8 `TieRole`.
         residual_px: (n, 2) float64 observed - computed, NaN before an orientation.
-        details: what else the method says, JSON.
+        walls: the walls that the column `wall` refers to; empty when the matcher does not say.
+        search_radius_px: one per photo name: the photo was searched no farther than this from
+            where a tie was expected, so that wrong ties lie within it, too; None where all of the
+            photo was searched, and empty when all of every photo was.
+        details: what else the method says, JSON, for people only.
     """
 
     type_name: ClassVar[str] = "ties"
+    encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "pixels_photo": Tolerance(limit=0.05, unit="px"),
         "points_world": Tolerance(limit=1e-4, unit="m"),
@@ -171,7 +211,15 @@ class Ties(Product):
     sigma_m: NDArray[np.float64]
     role: NDArray[np.uint8]
     residual_px: NDArray[np.float64]
+    walls: tuple[TieWall, ...] = ()
+    search_radius_px: tuple[float | None, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
+
+    @classmethod
+    def upgraded(cls, payload: Payload) -> Payload:
+        """Take walls and search radii, which version 1 had among the details, out of them."""
+        upgraded = replace(payload, metadata=_ties_of_version_2(payload.metadata))
+        return super().upgraded(upgraded)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,16 +259,63 @@ class Camera:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ResidualRow:
+    """Residuals (observed - computed) of one photo, role and coordinate, in one unit.
+
+    Attributes:
+        photo: name of the photo.
+        role: `control` or `check`.
+        axis: `u` or `v` of the photo.
+        unit: `px` of the photo, `cell` of the wall's raster, or `mm` on the wall: px times the
+            median size of a pixel there.
+        n: how many.
+        mean: their mean.
+        shift_p: probability of such a mean by chance (Student's t, two-sided); None for one tie.
+        sd: standard deviation.
+        median: their median.
+        nmad: 1.4826 times the median absolute deviation from the median.
+        skewness: third standardised moment; None where nothing varies.
+        rmse: root mean square.
+        p95: 95 % of them are no longer than this.
+        max: length of the longest.
+        beyond_own: share beyond twice the coordinate's own RMSE.
+        beyond_cells: share beyond two cells of the wall's raster; None where no cell is known.
+        beyond_any: share of ties of which u or v lies beyond twice its own RMSE.
+    """
+
+    photo: str
+    role: str
+    axis: str
+    unit: str
+    n: int
+    mean: float
+    shift_p: float | None = None
+    sd: float
+    median: float
+    nmad: float
+    skewness: float | None = None
+    rmse: float
+    p95: float
+    max: float
+    beyond_own: float
+    beyond_cells: float | None = None
+    beyond_any: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Cameras(Product):
     """Orientations of a set of photos.
 
     Attributes:
         cameras: one per photo, in the photos' order.
         ties: the ties with their roles and residuals after the orientation, or None.
-        details: what else the method says, JSON.
+        residual_table: the residuals of the oriented photos as surveyors ask for them; may be
+            empty.
+        details: what else the method says, JSON, for people only.
     """
 
     type_name: ClassVar[str] = "cameras"
+    encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "rotation_camera_from_world": Tolerance(limit=1e-5, unit="1"),
         "translation_camera_from_world": Tolerance(limit=1e-3, unit="m"),
@@ -230,4 +325,50 @@ class Cameras(Product):
 
     cameras: tuple[Camera, ...]
     ties: Ties | None = None
+    residual_table: tuple[ResidualRow, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
+
+    @classmethod
+    def upgraded(cls, payload: Payload) -> Payload:
+        """Take the table of residuals out of the details of version 1, and the like of its ties."""
+        metadata = dict(payload.metadata)
+        details = _mapping(metadata.get("details"))
+        rows = details.get("residual_table")
+        needed = {entry.name for entry in fields(ResidualRow) if entry.default is MISSING}
+        if isinstance(rows, list) and all(needed <= _mapping(row).keys() for row in rows):
+            metadata["residual_table"] = rows
+            metadata["details"] = _without(details, "residual_table")
+        if "ties" in metadata:
+            metadata["ties"] = _ties_of_version_2(_mapping(metadata["ties"]))
+        return super().upgraded(replace(payload, metadata=metadata))
+
+
+def _ties_of_version_2(metadata: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    """Metadata of ties whose details had `walls`, and `search_radius_px` of each photo."""
+    found, details = dict(metadata), _mapping(metadata.get("details"))
+    walls, needed = details.get("walls"), {"corners_world", "normal"}
+    if isinstance(walls, list) and all(needed <= _mapping(wall).keys() for wall in walls):
+        found["walls"] = [_wall_of_version_2(_mapping(wall)) for wall in walls]
+        details = _without(details, "walls")
+    photos, names = _mapping(details.get("photos")), metadata.get("photo_names")
+    if isinstance(names, list) and any("search_radius_px" in _mapping(p) for p in photos.values()):
+        found["search_radius_px"] = [
+            _mapping(photos.get(str(name))).get("search_radius_px") for name in names
+        ]
+        details["photos"] = {
+            name: _without(_mapping(entry), "search_radius_px") for name, entry in photos.items()
+        }
+    return found | {"details": details}
+
+
+def _wall_of_version_2(wall: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    return _without(wall, "normal") | {"normal_world": wall["normal"]}
+
+
+def _mapping(value: JsonValue) -> dict[str, JsonValue]:
+    """Give a JSON object; empty where there is none."""
+    return value if isinstance(value, dict) else {}
+
+
+def _without(entries: Mapping[str, JsonValue], name: str) -> dict[str, JsonValue]:
+    return {key: value for key, value in entries.items() if key != name}

@@ -12,8 +12,8 @@ from orthoflow.errors import ArgumentError
 from orthoflow.files.colmap import write_colmap_model
 from orthoflow.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from orthoflow.products import Camera, Cameras, TieRole
+from orthoflow.testing import textured_walls as ms
 from tests import block_scenes as bs
-from tests import matching_scenes as ms
 
 
 def oriented() -> Cameras:

@@ -24,6 +24,7 @@ from orthoflow.products import (
     Orthoimage,
     Orthoimages,
     Planes,
+    ResidualRow,
     TieRole,
     Ties,
     Wall,
@@ -424,12 +425,17 @@ def test_calibrated_lenses_are_not_published_again(tmp_path: Path) -> None:
 
 
 def test_the_table_of_residuals_is_published_as_it_is(tmp_path: Path) -> None:
-    row = {"photo": "a b.jpg", "role": "check", "axis": "u", "unit": "px", "n": 3, "shift_p": None}
-    cameras = Cameras(cameras=(), details={"residual_table": [row, row | {"shift_p": 0.25}]})
+    numbers = dict.fromkeys(
+        ("mean", "sd", "median", "nmad", "rmse", "p95", "max", "beyond_own", "beyond_any"), 0.5
+    )
+    row = ResidualRow(photo="a b.jpg", role="check", axis="u", unit="px", n=3, **numbers)
+    cameras = Cameras(cameras=(), residual_table=(row, replace(row, shift_p=0.25)))
     publishing.publish_cameras(cameras, tmp_path, DIGEST)
     with (tmp_path / "residuals.csv").open() as table:
         found = list(csv.DictReader(table))
-    assert [list(line) for line in found] == [list(row)] * 2
+    columns = ["photo", "role", "axis", "unit", "n", "mean", "shift_p", "sd", "median", "nmad"]
+    columns += ["skewness", "rmse", "p95", "max", "beyond_own", "beyond_cells", "beyond_any"]
+    assert [list(line) for line in found] == [columns] * 2
     assert [line["shift_p"] for line in found] == ["", "0.25"]
     assert found[0]["n"] == "3"
 

@@ -1,26 +1,33 @@
-"""What of a picture survives another spectral band: edges and their direction, not their sign.
+"""Channels: what of a picture survives another spectral band, and where it fixes a displacement.
 
 Dense channels of oriented gradients (after Ye et al. 2019, CFOG): the strength of the gradient
 across each of several directions, smoothed, and evened out locally. A light joint on dark stone and
-a dark joint on light stone look alike in them.
+a dark joint on light stone look alike in them. Where bands look alike, the grey itself is sharper.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from threading import Lock
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.key_points import in_turns
+from orthoflow.products import Wall
 from orthoflow_plugins.match.pictures import filled_smoothly
 
-N_DIRECTIONS: Final = 6
+_N_DIRECTIONS: Final = 6
 _NOISE_SIGMA_CELLS: Final = 0.8
 _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
 _BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
+# Places with texture lie so far apart, and are taken in turns from a grid of so many cells a side.
+_APART_CELLS: Final = 5
+_GRID: Final = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +55,7 @@ def gradient_channels(grey: NDArray[np.float32]) -> Channels:
     import cv2
 
     gradient, known = _gradient(grey)
-    angles = np.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
+    angles = np.pi * np.arange(_N_DIRECTIONS) / _N_DIRECTIONS
     layers = [
         cv2.GaussianBlur(
             np.abs(gradient[0] * np.float32(np.cos(a)) + gradient[1] * np.float32(np.sin(a))),
@@ -70,6 +77,91 @@ def grey_channels(grey: NDArray[np.float32]) -> Channels:
     known = _safe(np.isfinite(grey))
     flat = smooth - _broadly(smooth)
     return Channels(values=_evened(flat[:, :, None], known), known=known)
+
+
+CHANNELS: Final[Mapping[str, Callable[[NDArray[np.float32]], Channels]]] = {
+    "gradients": gradient_channels,
+    "grey": grey_channels,
+}
+"""By name, what may be compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallTarget:
+    """A wall ready to be matched.
+
+    Attributes:
+        wall: the wall.
+        grey: its intensity, NaN where it has no depth; None where it shows nothing.
+        channels: of its intensity, by content, as far as they were needed.
+        textures: of these channels, likewise.
+    """
+
+    wall: Wall
+    grey: NDArray[np.float32] | None
+    channels: dict[str, Channels] = field(default_factory=dict)
+    textures: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    lock: Lock = field(default_factory=Lock)
+
+    def prepare(self, content: str, half_patch_cells: int) -> None:
+        """Compute channels and texture unless that was done before, maybe by another thread."""
+        with self.lock:
+            if self.grey is None or content in self.channels:
+                return
+            channels = CHANNELS[content](self.grey)
+            self.textures[content] = texture(channels, half_patch_cells=half_patch_cells)
+            self.channels[content] = channels
+
+
+def target_of(wall: Wall) -> WallTarget:
+    """Prepare a wall for matching."""
+    if wall.intensity is None:
+        return WallTarget(wall=wall, grey=None)
+    grey = np.where(np.isfinite(wall.depth_m), wall.intensity, np.nan).astype(np.float32)
+    return WallTarget(wall=wall, grey=grey)
+
+
+def texture(channels: Channels, *, half_patch_cells: int) -> NDArray[np.float32]:
+    """How well the surroundings of each cell fix a displacement in both directions.
+
+    The smaller eigenvalue of the gradients' second moments over the patch (Shi & Tomasi 1994),
+    (rows, cols).
+    """
+    import cv2
+
+    second = np.zeros((*channels.known.shape, 3), dtype=np.float32)
+    for channel in range(channels.values.shape[2]):
+        layer = np.ascontiguousarray(channels.values[:, :, channel])
+        across = cv2.Scharr(layer, cv2.CV_32F, 1, 0)
+        down = cv2.Scharr(layer, cv2.CV_32F, 0, 1)
+        second += np.stack([across * across, across * down, down * down], axis=-1)
+    second = np.asarray(cv2.GaussianBlur(second, (0, 0), 0.4 * half_patch_cells), dtype=np.float32)
+    a, b, c = second[:, :, 0], second[:, :, 1], second[:, :, 2]
+    return np.asarray(0.5 * (a + c) - np.sqrt(0.25 * (a - c) ** 2 + b * b), dtype=np.float32)
+
+
+def textured_places(
+    strength: NDArray[np.float32], usable: NDArray[np.bool_], n_most: int
+) -> NDArray[np.intp]:
+    """Cells (n, 2) = (column, row) with the most texture around them.
+
+    The best are taken in turns from a grid, so that they cover the usable part evenly.
+
+    Args:
+        strength: (rows, cols) as `texture` gives it.
+        usable: (rows, cols), where cells may be taken.
+        n_most: at most so many.
+    """
+    import cv2
+
+    response = np.where(usable, strength, 0.0).astype(np.float32)
+    kernel = np.ones((_APART_CELLS, _APART_CELLS), dtype=np.uint8)
+    peak = (response >= cv2.dilate(response, kernel)) & (response > 0.0)
+    rows, columns = np.nonzero(peak)
+    if not rows.size:
+        return np.empty((0, 2), dtype=np.intp)
+    chosen = _spread(rows, columns, response[rows, columns], n_most)
+    return np.column_stack([columns[chosen], rows[chosen]])
 
 
 def _gradient(
@@ -109,3 +201,18 @@ def _broadly(values: NDArray[np.float32]) -> NDArray[np.float32]:
     small = cv2.resize(values, few, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (0, 0), _EVEN_SIGMA_CELLS / _BROAD_STEP)
     return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def _spread(
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    strength: NDArray[np.float32],
+    n_most: int,
+) -> NDArray[np.intp]:
+    low_row, low_column = rows.min(), columns.min()
+    side_rows = max(1.0, (rows.max() - low_row + 1) / _GRID)
+    side_columns = max(1.0, (columns.max() - low_column + 1) / _GRID)
+    cell = ((rows - low_row) / side_rows).astype(np.intp) * _GRID + (
+        (columns - low_column) / side_columns
+    ).astype(np.intp)
+    return in_turns(cell, (columns, rows, -strength), n_most)

@@ -13,8 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-# OpenCV's (0, 0) is the centre of the first pixel, ours (0.5, 0.5).
-_SHIFT_FROM_OPENCV_PX: Final = 0.5
+from orthoflow.geometry.key_points import in_turns, root_sift
+from orthoflow.geometry.opencv_border import HALF_PIXEL
+
 _SHIFT_BY_UPSCALING_PX: Final = 0.25
 # SIFT doubles the image and keeps all scales: 0.23 GB per million pixels. A tile bounds it.
 _TILE_PX: Final = 2048
@@ -22,9 +23,6 @@ _TILE_OVERLAP_PX: Final = 96
 _SPREAD_CELLS: Final = 12
 # Smaller pictures have no key points.
 _SIDE_LEAST_PX: Final = 16
-# Squared RootSIFT entries in units of 1/512: their sums stay below 2^24, so that float32 products
-# are exact, whatever the order a BLAS library adds in.
-_QUANTA: Final = 512.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +123,7 @@ def find_features(
         edgeThreshold=rule.edge_threshold,
         enable_precise_upscale=rule.upscales_precisely,
     )
-    shift_px = _SHIFT_FROM_OPENCV_PX
+    shift_px = HALF_PIXEL
     if not rule.upscales_precisely:
         shift_px -= _SHIFT_BY_UPSCALING_PX
     parts = [_in_tile(sift, picture, corner, shift_px) for corner in _tiles(picture.shape)]
@@ -141,7 +139,7 @@ def find_features(
         pixels=pixels[chosen],
         sizes_px=points[chosen, 2],
         angles_deg=points[chosen, 3],
-        descriptors=_root(raw) if rule.is_rooted else raw,
+        descriptors=root_sift(raw) if rule.is_rooted else raw,
     )
 
 
@@ -224,18 +222,7 @@ def _spread(
     scale = _SPREAD_CELLS / np.array([shape[1], shape[0]])
     cells = np.minimum((pixels * scale).astype(np.intp), _SPREAD_CELLS - 1)
     cell = cells[:, 1] * _SPREAD_CELLS + cells[:, 0]
-    order = np.lexsort((pixels[:, 1], pixels[:, 0], -strengths, cell))
-    starts = np.searchsorted(cell[order], cell[order])
-    turn = np.arange(len(order)) - starts
-    taken = order[np.lexsort((pixels[order, 1], pixels[order, 0], -strengths[order], turn))]
-    return np.asarray(taken[:n_most], dtype=np.intp)
-
-
-def _root(raw: NDArray[np.float32]) -> NDArray[np.float32]:
-    """RootSIFT (Arandjelovic & Zisserman 2012): Euclid's distance becomes Hellinger's."""
-    total = np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
-    rooted: NDArray[np.float32] = np.rint(np.sqrt(raw / total) * _QUANTA).astype(np.float32)
-    return rooted
+    return in_turns(cell, (pixels[:, 1], pixels[:, 0], -strengths), n_most)
 
 
 def _cell_of(

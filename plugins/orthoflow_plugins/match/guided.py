@@ -11,10 +11,9 @@ from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of
+from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pictures import photo_grey, require_intensity
-from orthoflow_plugins.match.versions import opencv_version
-from orthoflow_plugins.match.workers import one_by_one
+from orthoflow_plugins.match.tie_pieces import TiePiece, require_photos, ties_of
 
 if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace, TracingRule
@@ -99,8 +98,8 @@ class MatchGuided(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Trace every oriented photo on the walls."""
+        from orthoflow_plugins.match.channels import target_of
         from orthoflow_plugins.match.recovering import recovered_traces
-        from orthoflow_plugins.match.targets import target_of
         from orthoflow_plugins.match.tracing import trace_photo
 
         photos, walls = inputs.photos, inputs.walls

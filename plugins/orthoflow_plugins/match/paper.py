@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photo, Wall, Walls
-from orthoflow_plugins.match.assembling import TiePiece
+from orthoflow_plugins.match.descriptors import nearest
 from orthoflow_plugins.match.features import FeatureRule, Features, find_features
-from orthoflow_plugins.match.key_point_ties import key_point_ties
-from orthoflow_plugins.match.nearest import nearest
 from orthoflow_plugins.match.pictures import photo_grey, wall_picture
+from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties
 from orthoflow_plugins.match.warping import project_walls
 
 _VOID_MARGIN_CELLS: Final = 3

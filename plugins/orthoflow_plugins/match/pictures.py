@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image
+from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Photo, Wall, Walls
 
 _TILES: Final = 8
@@ -154,7 +155,8 @@ def shrunk(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
     # Gaussian of the width that keeps what the coarser grid can show.
     sigma = 0.5 * np.sqrt(max(0.0, factor**-2 - 1.0))
     soft = cv2.GaussianBlur(grey, (0, 0), sigma) if sigma > 0.1 else grey
-    shift = 0.5 / factor - 0.5
+    # Ours (0.5, 0.5) / factor, as OpenCV counts.
+    shift = HALF_PIXEL / factor - HALF_PIXEL
     matrix = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return np.asarray(

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.products import Camera, Photo, Photos, Wall
+from orthoflow_plugins.match.channels import WallTarget
 from orthoflow_plugins.match.features import FeatureRule, Features
-from orthoflow_plugins.match.key_point_ties import key_point_ties
 from orthoflow_plugins.match.pairing import PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.pictures import photo_grey
-from orthoflow_plugins.match.targets import WallTarget
+from orthoflow_plugins.match.tie_pieces import key_point_ties
 from orthoflow_plugins.match.tracing import Trace, TracingRule, trace_photo
 
 # Two photos of one wall share hundreds of key points; fewer than so many may be a repeated motif.
@@ -198,9 +199,9 @@ def _pose(
     params.score = cv2.SCORE_METHOD_MSAC
     params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
     middle = points.mean(axis=0)
-    # OpenCV's (0, 0) is the centre of the first pixel, ours (0.5, 0.5).
-    matrix = np.array([[lens.fx, 0.0, lens.cx - 0.5], [0.0, lens.fy, lens.cy - 0.5], [0, 0, 1]])
-    straight: Any = cv2.undistortPoints(pixels[:, None] - 0.5, matrix, lens.distortion, P=matrix)
+    matrix = opencv_matrix(lens)
+    observed = to_opencv(pixels)[:, None]
+    straight: Any = cv2.undistortPoints(observed, matrix, lens.distortion, P=matrix)
     call: Any = cv2.solvePnPRansac
     found, _, turn, shift, agreed = call(
         points - middle, straight[:, 0], matrix, None, params=params

@@ -10,14 +10,18 @@ from pydantic import Field
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.assembling import TiePiece, require_photos, ties_of, without_twins
 from orthoflow_plugins.match.features import FeatureRule, Features
-from orthoflow_plugins.match.key_point_ties import key_point_ties
+from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features
 from orthoflow_plugins.match.pictures import photo_grey, require_intensity
-from orthoflow_plugins.match.versions import opencv_version
-from orthoflow_plugins.match.workers import one_by_one
+from orthoflow_plugins.match.tie_pieces import (
+    TiePiece,
+    key_point_ties,
+    require_photos,
+    ties_of,
+    without_twins,
+)
 
 
 class MatchSift(Method):
@@ -111,6 +115,7 @@ class MatchSift(Method):
         on_walls = list(one_by_one(lambda wall: wall_features(wall, rule), walls.walls, ctx.cores))
         pieces: list[TiePiece] = []
         notes: dict[str, JsonValue] = {}
+        radii_px: list[float] = []
         paired = one_by_one(
             lambda photo: pair_photo(photo_grey(photo), on_walls, rule), photos.photos, ctx.cores
         )
@@ -118,11 +123,13 @@ class MatchSift(Method):
             ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
             pieces += _pieces(index, pairs, on_walls, walls)
             notes[photo.name] = _note(ctx, photo.name, pairs, walls)
+            radii_px.append(pairs.radius_px)
         ties = ties_of(
             pieces,
             photos,
             walls,
             {"photos": notes, "intensity_source": walls.intensity_source},
+            search_radius_px=tuple(radii_px),
         )
         _report(ctx, ties, on_walls)
         return self.Out(ties=ties)
@@ -201,7 +208,6 @@ def _note(ctx: StepContext, name: str, pairs: PhotoPairs, walls: Walls) -> JsonV
         "walls": list(shown),
         "n_matches": sum(len(pair.matches) for pair in pairs.pairs),
         "n_agreeing": pairs.n_verified,
-        "search_radius_px": pairs.radius_px,
     }
 
 

@@ -13,18 +13,17 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
+from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
 from orthoflow.products import Wall
-from orthoflow_plugins.match.assembling import TiePiece
+from orthoflow_plugins.match.channels import CHANNELS, WallTarget, textured_places
 from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
 from orthoflow_plugins.match.pictures import points_on_wall
-from orthoflow_plugins.match.places import textured_places
-from orthoflow_plugins.match.targets import CHANNELS, WallTarget
+from orthoflow_plugins.match.tie_pieces import TiePiece
 from orthoflow_plugins.match.warping import Projection, View, project_walls
 
 _NEIGHBOURS: Final = 12
 _MEDIAN_TOLERANCE_CELLS: Final = 0.6
 _REJECTION: Final = 3.5
-_MEDIAN_LENGTH: Final = 1.1774
 _HELD_OUT: Final = 4
 _LEAST: Final = 12
 _SIGMA_MOST_CELLS: Final = 2.0
@@ -293,7 +292,7 @@ def _without_misfits(pieces: list[TiePiece], camera: ViewingCamera) -> list[TieP
 
 
 def _limit(lengths: NDArray[np.float64]) -> float:
-    return _REJECTION * float(np.median(lengths)) / _MEDIAN_LENGTH
+    return _REJECTION * float(np.median(lengths)) / MEDIAN_LENGTH
 
 
 def _agrees_around(moved: Displacements) -> NDArray[np.bool_]:
@@ -308,7 +307,7 @@ def _agrees_around(moved: Displacements) -> NDArray[np.bool_]:
     around = np.asarray(cKDTree(places).query(places, k=neighbours + 1)[1])[:, 1:]
     shifts = moved.shift_cells[around]
     median = np.median(shifts, axis=1)
-    spread = 1.4826 * np.median(np.abs(shifts - median[:, None]), axis=1)
+    spread = NMAD_FACTOR * np.median(np.abs(shifts - median[:, None]), axis=1)
     tolerance = np.maximum(_MEDIAN_TOLERANCE_CELLS, 3.0 * spread)
     # Where the neighbours themselves do not agree, nothing can be told apart from chance.
     agrees = (np.abs(moved.shift_cells - median) <= tolerance) & (spread < 2.0)

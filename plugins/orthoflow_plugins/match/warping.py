@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Wall
 from orthoflow_plugins.match.pictures import shrunk
 
@@ -24,6 +25,8 @@ _ROWS_AT_ONCE: Final = 256
 # Which part of a wall a photo shows is found on every so many cells first.
 _COARSE: Final = 8
 _CELLS_LEAST: Final = 100
+# Where OpenCV samples what is not shown; the value is not used.
+_OUTSIDE_PX: Final = -10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,9 +128,10 @@ def warp_photo(grey: NDArray[np.uint8], projection: Projection) -> WarpedPhoto:
     factor = min(1.0, 1.0 / max(projection.pixels_per_cell, 1e-6))
     small = shrunk(grey, factor)
     known = np.isfinite(projection.u)
-    # OpenCV puts (0, 0) at the centre of the first pixel, ours is (0.5, 0.5).
-    map_u = np.where(known, projection.u * factor - 0.5, -10.0).astype(np.float32)
-    map_v = np.where(known, projection.v * factor - 0.5, -10.0).astype(np.float32)
+    map_u, map_v = (
+        np.where(known, to_opencv(pixels * factor), _OUTSIDE_PX).astype(np.float32)
+        for pixels in (projection.u, projection.v)
+    )
     warped = cv2.remap(
         small.astype(np.float32), map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )

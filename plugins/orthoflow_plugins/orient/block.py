@@ -1,33 +1,31 @@
-"""A block of photos: cameras that share lenses and points, as one adjustment takes them."""
+"""A block of photos: cameras that share lenses and points, how exact they are, and its lenses.
+
+The covariance of all unknowns is honest about what errs together.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.lenses import LensFreedom, linearised
+from orthoflow.geometry.covariances import widened
+from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom, lens_values, linearised
+from orthoflow.geometry.resection import whiten
+from orthoflow.products import JsonValue, Photo
+from orthoflow_plugins.orient.layout import GROUPS, image_cells
+from orthoflow_plugins.orient.lenses import Lens
 
 # A known point is never exact: an adjustment divides by its variance.
 SIGMA_LEAST_M: Final = 1e-6
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lens:
-    """A lens that one photo or several were taken with.
-
-    Attributes:
-        prior: what it is beforehand; its pose says nothing.
-        freedom: how far it may change.
-        source: what `prior` is known from.
-    """
-
-    prior: ViewingCamera
-    freedom: LensFreedom
-    source: str
+_CORRELATED: Final = 0.95
+_POSE_NAMES: Final = ("tilt", "pan", "roll", "x", "y", "distance")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,6 +119,23 @@ class Block:
         return replace(self, cameras=cameras, points=replace(self.points, now=now))
 
 
+@dataclass(frozen=True, kw_only=True)
+class BlockCovariance:
+    """The covariance of a block.
+
+    Attributes:
+        matrix: (p, p), the columns as `Block.columns` gives them.
+        cofactors: (p, p) the same for sigmas taken as they are.
+        sigma0: standard deviation of unit weight.
+        redundancy: observations beyond what determines the unknowns.
+    """
+
+    matrix: NDArray[np.float64]
+    cofactors: NDArray[np.float64]
+    sigma0: float
+    redundancy: float
+
+
 def pixel_covariances(block: Block) -> NDArray[np.float64]:
     """Covariances (m, 2, 2) of the pixels; of points seen once, with that of the point."""
     seen = block.seen
@@ -133,3 +148,313 @@ def pixel_covariances(block: Block) -> NDArray[np.float64]:
         variances = (block.points.sigma_m[points] ** 2)[:, None, None]
         covariances[mine] += variances * (by_point @ by_point.transpose(0, 2, 1))
     return covariances
+
+
+def block_covariance(block: Block, *, soft_limit: float) -> BlockCovariance:
+    """Give the covariance of a block after its adjustment.
+
+    Args:
+        block: as adjusted.
+        soft_limit: residuals beyond so many standard deviations count less (Huber).
+
+    Raises:
+        GeometryError: the observations do not determine the block.
+    """
+    n_free = int(block.column_starts[1][-1])
+    prior = np.zeros(n_free)
+    for start, lens in zip(block.column_starts[1][:-1], block.lenses, strict=True):
+        sigmas = lens.freedom.sigmas
+        prior[start : start + sigmas.size] = 1.0 / sigmas**2
+    rows = list(_rows(block, soft_limit, _groups(block)))
+    normal = np.diag(prior)
+    squares, n_rows = 0.0, 0
+    for part in rows:
+        # Not by BLAS: its sums depend on the number of threads.
+        normal[np.ix_(part.columns, part.columns)] += np.einsum(
+            "ij,ik->jk", part.jacobian, part.jacobian
+        )
+        squares += float((part.residuals**2).sum())
+        n_rows += len(part.residuals)
+    try:
+        cofactors = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise GeometryError("the ties do not determine the block of photos") from error
+    redundancy = n_rows - n_free + float((np.diag(cofactors) * prior).sum())
+    if redundancy <= 0.0 or not (np.diag(cofactors) > 0.0).all():
+        raise GeometryError("the ties do not determine the block of photos")
+    sigma0 = math.sqrt(squares / redundancy)
+    matrix = _honest(rows, cofactors, sigma0**2 * cofactors)
+    if _is_linked(block):
+        # Photos of one place share the errors that the scan has there.
+        shared = list(_rows(block, soft_limit, _places(block)))
+        matrix = _honest(shared, cofactors, matrix)
+    return BlockCovariance(
+        matrix=matrix,
+        cofactors=cofactors,
+        sigma0=sigma0,
+        redundancy=redundancy,
+    )
+
+
+def lenses_json(
+    block: Block, photos: Sequence[Photo], covariance: NDArray[np.float64]
+) -> JsonValue:
+    """Give each lens as it came out, with standard deviations where it was free."""
+    entries: list[JsonValue] = []
+    starts = block.column_starts[1]
+    for index, lens in enumerate(block.lenses):
+        members = [at for at, of in enumerate(block.lens_of) if of == index]
+        camera = block.cameras[members[0]]
+        columns = np.arange(starts[index], starts[index + 1])
+        sigmas = np.sqrt(np.diag(covariance)[columns])
+        names = lens.freedom.names
+        entry: dict[str, JsonValue] = {
+            "photos": [photos[at].name for at in members],
+            "known_from": lens.source,
+            "focal_px": camera.fx,
+            "centre_px": [camera.cx, camera.cy],
+            "distortion": [float(value) for value in camera.distortion],
+            "free": list(names),
+            "sigmas": {
+                name: float(sigma * (camera.fx if name == "focal" else 1.0))
+                for name, sigma in zip(names, sigmas, strict=True)
+            },
+        }
+        entries.append(entry)
+    return entries
+
+
+def lens_statistics(block: Block) -> JsonValue:
+    """Mean and SD of what is free, over lenses of one image size that are free alike."""
+    kinds: dict[tuple[int, int, tuple[str, ...]], list[NDArray[np.float64]]] = {}
+    for index, lens in enumerate(block.lenses):
+        camera = block.cameras[block.lens_of.index(index)]
+        values = lens_values(camera, lens.freedom)
+        values[: 1 if "focal" in lens.freedom.names else 0] = camera.fx
+        kind = (lens.prior.width, lens.prior.height, lens.freedom.names)
+        kinds.setdefault(kind, []).append(values)
+    table: list[JsonValue] = []
+    for (width, height, names), rows in kinds.items():
+        if not names:
+            continue
+        stacked = np.array(rows)
+        spread = stacked.std(axis=0, ddof=1) if len(rows) > 1 else np.zeros(len(names))
+        table.append(
+            {
+                "width": width,
+                "height": height,
+                "n_lenses": len(rows),
+                "mean": dict(zip(names, stacked.mean(axis=0).tolist(), strict=True)),
+                "sd": dict(zip(names, spread.tolist(), strict=True)),
+            }
+        )
+    return table
+
+
+def correlation_notes(
+    block: Block, photos: Sequence[Photo], cofactors: NDArray[np.float64]
+) -> list[str]:
+    """Say where the photos hardly tell a lens from where they were taken."""
+    notes = []
+    scale = np.sqrt(np.diag(cofactors))
+    correlations = np.abs(cofactors / np.outer(scale, scale))
+    for index, lens in enumerate(block.lenses):
+        members = [at for at, of in enumerate(block.lens_of) if of == index]
+        first = block.column_starts[1][index]
+        for nth, name in enumerate(lens.freedom.names):
+            rows = [correlations[6 * at : 6 * at + POSE_PARAMETERS, first + nth] for at in members]
+            # Only what all its photos confuse stays unknown.
+            confused = np.min(rows, axis=0)
+            worst = int(confused.argmax())
+            if confused[worst] > _CORRELATED:
+                notes.append(
+                    f"the {name} of the lens of {photos[members[0]].name} and the "
+                    f"{_POSE_NAMES[worst]} of its photos correlate by {confused[worst]:.3f}: "
+                    "photos from other sides, some turned by 90 degrees, or a calibration would "
+                    "tell them apart"
+                )
+    return notes
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rows:
+    """Equations in units of standard deviations, points eliminated.
+
+    Attributes:
+        columns: (c,) of the unknowns that take part.
+        group: of observations that may err together.
+        jacobian: (r, c).
+        residuals: (r,).
+    """
+
+    columns: NDArray[np.intp]
+    group: int
+    jacobian: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Equations:
+    """Equations of one observation, or of a photo's m, with the point still in them.
+
+    Attributes:
+        columns: (c,) of the unknowns that take part.
+        group: as in `_Rows`; -1 for several.
+        by_camera: ([m,] 2, c) by pose and lens.
+        by_point: ([m,] 2, 3).
+        residuals: ([m,] 2).
+    """
+
+    columns: NDArray[np.intp]
+    group: int
+    by_camera: NDArray[np.float64]
+    by_point: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+
+
+def _honest(
+    rows: list[_Rows], cofactors: NDArray[np.float64], plain: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Widen by what leaving out each group changes, see `geometry.covariances`."""
+    by_group: dict[int, list[_Rows]] = {}
+    for part in rows:
+        by_group.setdefault(part.group, []).append(part)
+    # Fewer groups than unknowns of a photo say nothing of it.
+    if len(by_group) <= max(part.columns.size for part in rows):
+        return plain
+    spread = np.zeros_like(plain)
+    for parts in by_group.values():
+        columns = np.unique(np.concatenate([part.columns for part in parts]))
+        normal, pull = np.zeros((columns.size, columns.size)), np.zeros(columns.size)
+        for part in parts:
+            at = np.searchsorted(columns, part.columns)
+            normal[np.ix_(at, at)] += np.einsum("ij,ik->jk", part.jacobian, part.jacobian)
+            pull[at] += np.einsum("ij,i->j", part.jacobian, part.residuals)
+        inner = np.eye(columns.size) - normal @ cofactors[np.ix_(columns, columns)]
+        move = cofactors[:, columns] @ (np.linalg.pinv(inner) @ pull)
+        spread += np.outer(move, move)
+    return widened(plain, (len(by_group) - 1) / len(by_group) * spread)
+
+
+def _rows(block: Block, soft_limit: float, groups: NDArray[np.intp]) -> Iterator[_Rows]:
+    """Equations of the unknowns that remain when every point is eliminated.
+
+    Args:
+        block: as adjusted.
+        soft_limit: residuals beyond so many standard deviations count less.
+        groups: (m,) of the observations.
+    """
+    seen = block.seen
+    joint = block.is_joint[seen.point]
+    covariances = pixel_covariances(block)
+    stacked: dict[int, list[_Equations]] = {}
+    for photo in range(len(block.cameras)):
+        mine = np.flatnonzero(seen.photo == photo)
+        if not len(mine):
+            continue
+        linear = _seen_by(block, photo, mine, covariances[mine], soft_limit)
+        for group in np.unique(groups[mine]):
+            alone = (groups[mine] == group) & ~joint[mine]
+            yield _Rows(
+                columns=block.columns(photo),
+                group=int(group),
+                jacobian=linear.by_camera[alone].reshape(-1, linear.by_camera.shape[2]),
+                residuals=linear.residuals[alone].ravel(),
+            )
+        for nth in np.flatnonzero(joint[mine]):
+            one = _Equations(
+                columns=block.columns(photo),
+                group=int(groups[mine[nth]]),
+                by_camera=linear.by_camera[nth],
+                by_point=linear.by_point[nth],
+                residuals=linear.residuals[nth],
+            )
+            stacked.setdefault(int(seen.point[mine[nth]]), []).append(one)
+    for point, parts in stacked.items():
+        yield _without_point(block, point, parts)
+
+
+def _seen_by(
+    block: Block,
+    photo: int,
+    mine: NDArray[np.intp],
+    covariances: NDArray[np.float64],
+    soft_limit: float,
+) -> _Equations:
+    """Equations of a photo's observations, in standard deviations, robust weights applied."""
+    camera, seen = block.cameras[photo], block.seen
+    points = seen.point[mine]
+    at = np.where(
+        block.is_joint[points, None], block.points.now[points], block.points.known[points]
+    )
+    linear = linearised(camera, at, block.lenses[block.lens_of[photo]].freedom)
+    by_point = linear.by_camera_point @ camera.rotation
+    residuals = seen.pixels[mine] - linear.pixels
+    all_columns = np.concatenate([residuals[:, :, None], linear.by_parameters, by_point], axis=2)
+    all_columns = whiten(covariances, all_columns)
+    lengths = np.linalg.norm(all_columns[:, :, 0], axis=1)
+    all_columns *= np.sqrt(np.minimum(1.0, soft_limit / np.maximum(lengths, 1e-12)))[:, None, None]
+    return _Equations(
+        columns=block.columns(photo),
+        group=-1,
+        by_camera=all_columns[:, :, 1:-3],
+        by_point=all_columns[:, :, -3:],
+        residuals=all_columns[:, :, 0],
+    )
+
+
+def _without_point(block: Block, point: int, parts: list[_Equations]) -> _Rows:
+    """Eliminate a point seen by several photos: what its position cannot explain remains."""
+    columns = np.unique(np.concatenate([part.columns for part in parts]))
+    sigma_m = float(block.points.sigma_m[point])
+    n_known = 3 if math.isfinite(sigma_m) else 0
+    jacobian = np.zeros((2 * len(parts) + n_known, columns.size))
+    by_point = np.zeros((len(jacobian), 3))
+    residuals = np.zeros(len(jacobian))
+    for nth, part in enumerate(parts):
+        own = slice(2 * nth, 2 * nth + 2)
+        jacobian[own, np.searchsorted(columns, part.columns)] = part.by_camera
+        by_point[own], residuals[own] = part.by_point, part.residuals
+    if n_known:
+        least = max(sigma_m, SIGMA_LEAST_M)
+        by_point[-3:] = np.eye(3) / least
+        residuals[-3:] = (block.points.known[point] - block.points.now[point]) / least
+    across = np.linalg.qr(by_point, mode="complete").Q[:, 3:]
+    return _Rows(
+        columns=columns,
+        group=parts[0].group,
+        jacobian=np.einsum("ij,ik->jk", across, jacobian),
+        residuals=np.einsum("ij,i->j", across, residuals),
+    )
+
+
+def _groups(block: Block) -> NDArray[np.intp]:
+    """Group (m,) of each observation: a cell of its photo."""
+    groups = np.zeros(len(block.seen), dtype=np.intp)
+    for photo, camera in enumerate(block.cameras):
+        mine = block.seen.photo == photo
+        cells = image_cells(block.seen.pixels[mine], (camera.width, camera.height), GROUPS)
+        groups[mine] = photo * GROUPS**2 + cells
+    return groups
+
+
+def _is_linked(block: Block) -> bool:
+    """Whether photos have unknowns in common: points, or a lens that is free."""
+    shared = [
+        lens.freedom.sigmas.size > 0 and block.lens_of.count(index) > 1
+        for index, lens in enumerate(block.lenses)
+    ]
+    return any(shared) or bool(block.is_joint.any())
+
+
+def _places(block: Block) -> NDArray[np.intp]:
+    """Group (m,) of each observation: a place in the world, as wide as a cell of the photos."""
+    seen = block.seen
+    widths = []
+    for photo, camera in enumerate(block.cameras):
+        distances = camera.project(block.points.now[seen.point[seen.photo == photo]])[:, 2]
+        if distances.size:
+            side_px = max(camera.width, camera.height) / GROUPS
+            widths.append(side_px / camera.fx * float(np.median(distances)))
+    cubes = np.floor(block.points.now[seen.point] / float(np.median(widths))).astype(np.intp)
+    return np.asarray(np.unique(cubes, axis=0, return_inverse=True)[1].ravel(), dtype=np.intp)

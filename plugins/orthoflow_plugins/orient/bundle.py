@@ -14,35 +14,30 @@ from orthoflow.errors import GeometryError
 from orthoflow.products import Cameras, JsonValue, Photo, Photos, Ties
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.block_estimating import Adjusted, Trusted, adjust_block
-from orthoflow_plugins.orient.estimating import estimate_pose
-from orthoflow_plugins.orient.judging import reason_to_leave_out, too_few
-from orthoflow_plugins.orient.lens_groups import (
-    Refined,
-    Sharing,
-    correlation_notes,
-    lens_groups,
-    lens_statistics,
-    lenses_json,
-)
+from orthoflow_plugins.orient.acceptance import reason_to_leave_out, too_few
+from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, lenses_json
+from orthoflow_plugins.orient.block_adjustment import Adjusted, Trusted, adjust_block
+from orthoflow_plugins.orient.estimation import estimate_pose
+from orthoflow_plugins.orient.lenses import Refined, Sharing, lens_groups
 from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.photo_features import no_features, photo_features
 from orthoflow_plugins.orient.photo_ties import (
     PhotoTies,
+    no_features,
     no_photo_ties,
     overlapping_pairs,
+    photo_features,
     tie_photos,
 )
-from orthoflow_plugins.orient.photowise import (
+from orthoflow_plugins.orient.reporting import hand_over
+from orthoflow_plugins.orient.single_photo import (
     Oriented,
-    Sighting,
-    case_of,
+    TiedPhoto,
+    candidate_of,
     judged,
     refused,
     require,
-    sighting,
+    tied_photo,
 )
-from orthoflow_plugins.orient.reporting import told
 
 _SHARE_BY_ITSELF: Final = 0.4
 _SHARE_FEATURES: Final = 0.7
@@ -116,8 +111,8 @@ class OrientColmapBundle(Method):
         trusted: dict[int, Trusted] = {}
         for nth, photo in enumerate(photos):
             ctx.progress(_SHARE_BY_ITSELF * nth / len(photos), photo.name)
-            sight = sighting(photo, ties, params, ctx.rng)
-            result = _by_itself(sight, ties, params)
+            tied = tied_photo(photo, ties, params, ctx.rng)
+            result = _by_itself(tied, ties, params)
             if isinstance(result, Trusted):
                 trusted[nth] = result
             else:
@@ -129,11 +124,11 @@ class OrientColmapBundle(Method):
             adjusted = _adjusted(block, params, ctx)
             if adjusted is not None:
                 estimates = list(adjusted.estimates)
-                details = _tell(ctx, adjusted, [item.sight.photo for item in block])
+                details = _report_block(ctx, adjusted, [item.tied.photo for item in block])
             for at, item, estimate in zip(trusted, block, estimates, strict=True):
-                found[at] = judged(item.sight, case_of(item.sight, ties, params, estimate))
+                found[at] = judged(item.tied, candidate_of(item.tied, ties, params, estimate))
         every = [found[nth] for nth in range(len(photos))]
-        return self.Out(cameras=told(ctx, ties, photos, every, details))
+        return self.Out(cameras=hand_over(ctx, ties, photos, every, details))
 
     @classmethod
     def tools(cls) -> dict[str, str]:
@@ -143,24 +138,24 @@ class OrientColmapBundle(Method):
 
 
 def _by_itself(
-    sight: Sighting, ties: Ties, params: OrientColmapBundle.Params
+    tied: TiedPhoto, ties: Ties, params: OrientColmapBundle.Params
 ) -> Trusted | Oriented:
     """Orient a photo by its own ties; refused where they agree by chance only."""
-    reason = too_few(len(sight.seen))
+    reason = too_few(len(tied.seen))
     if reason:
-        return refused(sight, reason)
-    estimate = estimate_pose(sight.photo, sight.seen, sight.is_check, sight.rule)
+        return refused(tied, reason)
+    estimate = estimate_pose(tied.photo, tied.seen, tied.is_check, tied.rule)
     if isinstance(estimate, str):
-        return refused(sight, estimate)
+        return refused(tied, estimate)
     # A wrong pose would pull at the photos that are tied to it.
-    reason = reason_to_leave_out(case_of(sight, ties, params, estimate))
-    return refused(sight, reason) if reason else Trusted(sight=sight, estimate=estimate)
+    reason = reason_to_leave_out(candidate_of(tied, ties, params, estimate))
+    return refused(tied, reason) if reason else Trusted(tied=tied, estimate=estimate)
 
 
 def _adjusted(
     block: Sequence[Trusted], params: OrientColmapBundle.Params, ctx: StepContext
 ) -> Adjusted | None:
-    photos = [item.sight.photo for item in block]
+    photos = [item.tied.photo for item in block]
     cameras = [item.estimate.resection.camera for item in block]
     groups = lens_groups(photos, cameras, params.intrinsics, params.refine)
     between = _photo_ties(block, params, ctx)
@@ -177,8 +172,7 @@ def _photo_ties(
 ) -> PhotoTies:
     cameras = [item.estimate.resection.camera for item in block]
     shown = [
-        item.sight.seen.points_world[item.estimate.agreeing & ~item.sight.is_check]
-        for item in block
+        item.tied.seen.points_world[item.estimate.agreeing & ~item.tied.is_check] for item in block
     ]
     pairs = overlapping_pairs(cameras, shown, params.overlap_min_share)
     if not (params.photo_ties and pairs):
@@ -187,13 +181,15 @@ def _photo_ties(
     features = []
     for at, item in enumerate(block):
         done = _SHARE_BY_ITSELF + (_SHARE_FEATURES - _SHARE_BY_ITSELF) * at / len(block)
-        ctx.progress(done, f"key points of {item.sight.photo.name}")
-        wanted = photo_features(item.sight.photo, params.n_features_max) if at in needed else None
+        ctx.progress(done, f"key points of {item.tied.photo.name}")
+        wanted = photo_features(item.tied.photo, params.n_features_max) if at in needed else None
         features.append(wanted or no_features())
     return tie_photos(cameras, features, pairs, params.n_photo_points_max)
 
 
-def _tell(ctx: StepContext, adjusted: Adjusted, photos: Sequence[Photo]) -> dict[str, JsonValue]:
+def _report_block(
+    ctx: StepContext, adjusted: Adjusted, photos: Sequence[Photo]
+) -> dict[str, JsonValue]:
     """Tell of the block as a whole; of its photos, each tells itself."""
     block, covariance = adjusted.block, adjusted.covariance
     for note in correlation_notes(block, photos, covariance.cofactors):

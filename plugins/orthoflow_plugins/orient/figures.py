@@ -1,19 +1,24 @@
-"""Pictures of an orientation: ties on the photos, and the predicted error on the walls."""
+"""Pictures of an orientation: ties on the photos, predicted error on the walls, and residuals."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import decode_image, encode_webp
+from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Photo, TieRole
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.judging import Case
+from orthoflow_plugins.orient.acceptance import Candidate
 from orthoflow_plugins.orient.wall_errors import sigmas_on_wall
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _SIDE_PX: Final = 900
 # markiewicz2015, Figure 17: control green, rejected red, check yellow.
@@ -28,12 +33,36 @@ _SUB_PIXEL_BITS: Final = 4
 _MAP_CELLS: Final = 90
 _MAP_ZOOM: Final = 8
 _UNSEEN_BGR: Final = (60, 40, 20)
+# Histograms, with normal distributions: markiewicz2015, Figures 18, 20, 21 and 23.
+_BARS: Final = 40
+_BARS_OF_A_PHOTO: Final = 25
+# Rows of the picture of single photos, and how much of a row its highest bar takes.
+_PHOTOS_MOST: Final = 30
+_ROW_SHARE: Final = 0.8
+_BAR_COLOUR: Final = "#9db8d2"
+_CURVE_COLOUR: Final = "#b03a2e"
+_PERCENTILE: Final = 99.5
+_KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
 
-def figure_name(prefix: str, photo_name: str) -> str:
-    """Name of a photo's figure: letters, digits, `-` and `_`."""
-    stem = photo_name.rpartition(".")[0] or photo_name
-    return f"{prefix}_{re.sub(r'[^A-Za-z0-9_-]', '-', stem)}"
+@dataclass(frozen=True, kw_only=True)
+class PhotoResiduals:
+    """Residuals of one oriented photo.
+
+    Attributes:
+        name: of the photo.
+        residuals_px: (n, 2) observed - computed.
+        role: (n,) `TieRole`.
+    """
+
+    name: str
+    residuals_px: NDArray[np.float64]
+    role: NDArray[np.uint8]
+
+    def of_kind(self, kind: TieRole) -> NDArray[np.float64]:
+        """Residuals (m, 2) of one role that are known."""
+        values = self.residuals_px[self.role == kind]
+        return np.asarray(values[np.isfinite(values).all(axis=1)])
 
 
 def draw_ties(
@@ -48,7 +77,7 @@ def draw_ties(
 
     if len(ctx.figures) >= _FIGURES_MOST:
         return
-    name = figure_name("ties", photo.name)
+    name = _figure_name("ties", photo.name)
     if any(figure.name == name for figure in ctx.figures):
         name = f"{name}-{len(ctx.figures)}"
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
@@ -59,7 +88,7 @@ def draw_ties(
     canvas = np.rint(0.7 * small).astype(np.uint8)
     unit = 1 << _SUB_PIXEL_BITS
     for kind, colour in _COLOURS.items():
-        at = np.rint((pixels_photo[role == kind] * scale - 0.5) * unit).astype(int)
+        at = np.rint(to_opencv(pixels_photo[role == kind] * scale) * unit).astype(int)
         for u, v in at.tolist():
             cv2.circle(canvas, (u, v), 2 * unit, colour, -1, cv2.LINE_AA, _SUB_PIXEL_BITS)
     ctx.figure(
@@ -69,14 +98,14 @@ def draw_ties(
     )
 
 
-def draw_wall_errors(ctx: StepContext, cases: Sequence[Case]) -> None:
+def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
     """Draw the predicted error over each wall, at every place that of the photo that knows it best.
 
     Args:
         ctx: takes the pictures.
-        cases: of the photos that are ok.
+        candidates: of the photos that are ok.
     """
-    walls = {wall.index: wall for case in cases for wall in case.known}
+    walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
     for index in sorted(walls):
         wall = walls[index]
         if len(ctx.figures) >= _FIGURES_MOST:
@@ -85,8 +114,8 @@ def draw_wall_errors(ctx: StepContext, cases: Sequence[Case]) -> None:
         cell_m = max(across, down) / _MAP_CELLS
         shape = (max(1, round(down / cell_m)), max(1, round(across / cell_m)))
         best = np.full(shape, np.inf)
-        for case in cases:
-            sigmas = sigmas_on_wall(case.estimate.resection, wall, shape)
+        for candidate in candidates:
+            sigmas = sigmas_on_wall(candidate.estimate.resection, wall, shape)
             best = np.fmin(best, sigmas)
         shown = np.isfinite(best)
         if not shown.any():
@@ -102,6 +131,24 @@ def draw_wall_errors(ctx: StepContext, cases: Sequence[Case]) -> None:
         )
 
 
+def draw_residuals(ctx: StepContext, photos: Sequence[PhotoResiduals]) -> None:
+    """Draw histograms of the residuals of oriented photos, all together and each by itself."""
+    pooled = {
+        kind: np.vstack([np.empty((0, 2)), *(photo.of_kind(kind) for photo in photos)])
+        for kind in _KINDS
+    }
+    drawn = {kind: values for kind, values in pooled.items() if len(values) > 2}
+    if drawn:
+        _draw_pooled(ctx, drawn)
+        _draw_each(ctx, photos, drawn)
+
+
+def _figure_name(prefix: str, photo_name: str) -> str:
+    """Name of a photo's figure: letters, digits, `-` and `_`."""
+    stem = photo_name.rpartition(".")[0] or photo_name
+    return f"{prefix}_{re.sub(r'[^A-Za-z0-9_-]', '-', stem)}"
+
+
 def _error_map(shares: NDArray[np.float64]) -> bytes:
     import cv2
 
@@ -112,3 +159,76 @@ def _error_map(shares: NDArray[np.float64]) -> bytes:
     size = (_MAP_ZOOM * shares.shape[1], _MAP_ZOOM * shares.shape[0])
     enlarged = cv2.resize(bgr, size, interpolation=cv2.INTER_NEAREST)
     return encode_webp(np.asarray(enlarged, dtype=np.uint8)[:, :, ::-1])
+
+
+def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 2.6 * len(pooled)), layout="constrained")
+    panels = figure.subplots(len(pooled), 2, squeeze=False)
+    for (kind, values), row in zip(pooled.items(), panels, strict=True):
+        for label, column, axes in zip("uv", values.T, row, strict=True):
+            # One outline instead of forty bars, each of which takes its time to draw.
+            counts, edges = np.histogram(column, bins=_BARS)
+            axes.stairs(counts, edges, fill=True, color=_BAR_COLOUR)
+            grid = np.linspace(edges[0], edges[-1], 200)
+            axes.plot(grid, _normal(column, edges, grid), color=_CURVE_COLOUR, linewidth=1.0)
+            axes.set_title(
+                f"{kind.name.lower()} {label}: {len(column)} ties, SD {column.std():.2f} px",
+                fontsize=9,
+            )
+            axes.set_xlabel("observed - computed [px]", fontsize=8)
+            axes.tick_params(labelsize=7)
+    ctx.figure("residuals", figure, "Residuals of all oriented photos, with normal distributions.")
+
+
+def _draw_each(
+    ctx: StepContext,
+    photos: Sequence[PhotoResiduals],
+    pooled: dict[TieRole, NDArray[np.float64]],
+) -> None:
+    """Draw a row per photo, a column per role and coordinate, all bars up to its height."""
+    from matplotlib.figure import Figure
+
+    shown = photos[:_PHOTOS_MOST]
+    columns = [(kind, axis) for kind in pooled for axis in (0, 1)]
+    figure = Figure(figsize=(2.6 * len(columns), 1.0 + 0.45 * len(shown)), layout="constrained")
+    panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
+    for (kind, axis), axes in zip(columns, panels, strict=True):
+        reach = max(float(np.percentile(np.abs(pooled[kind][:, axis]), _PERCENTILE)), 1e-6)
+        for row, photo in enumerate(shown):
+            _draw_row(axes, photo.of_kind(kind)[:, axis], -row, reach)
+        axes.axvline(0.0, color="#888888", linewidth=0.5)
+        axes.set_xlim(-reach, 1.6 * reach)
+        axes.set_ylim(0.9 - len(shown), 1.0)
+        axes.set_title(f"{kind.name.lower()} {'uv'[axis]}", fontsize=9)
+        axes.set_xlabel("observed - computed [px]", fontsize=8)
+        axes.tick_params(labelsize=7)
+    panels[0].set_yticks([-row for row in range(len(shown))], [photo.name for photo in shown])
+    ctx.figure(
+        "residuals_by_photo",
+        figure,
+        "Residuals of each oriented photo, with the normal distribution of the same mean and SD.",
+    )
+
+
+def _draw_row(axes: Axes, values: NDArray[np.float64], base: float, reach: float) -> None:
+    """Draw the residuals (n,) of a photo on the line `base`."""
+    if len(values) < 3:
+        return
+    counts, edges = np.histogram(values, bins=_BARS_OF_A_PHOTO, range=(-reach, reach))
+    grid = np.linspace(-reach, reach, 120)
+    curve = _normal(values, edges, grid)
+    scale = _ROW_SHARE / max(float(counts.max()), float(curve.max()), 1e-9)
+    axes.stairs(scale * counts + base, edges, baseline=base, fill=True, color=_BAR_COLOUR)
+    axes.plot(grid, scale * curve + base, color=_CURVE_COLOUR, linewidth=0.8)
+    axes.text(1.55 * reach, base, f"{len(values)}\nSD {values.std():.2f}", fontsize=5.5, ha="right")
+
+
+def _normal(
+    values: NDArray[np.float64], edges: NDArray[np.float64], grid: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Counts per bar of a normal distribution with the mean and SD of the values."""
+    mean, deviation = float(values.mean()), max(float(values.std()), 1e-9)
+    density = np.exp(-0.5 * ((grid - mean) / deviation) ** 2) / deviation / np.sqrt(2.0 * np.pi)
+    return np.asarray(len(values) * (edges[1] - edges[0]) * density)

@@ -7,8 +7,8 @@ from typing import Literal
 from pydantic import Field
 
 from orthoflow.sdk import MethodParams
-from orthoflow_plugins.orient.estimating import EstimationRule
-from orthoflow_plugins.orient.judging import GateRule
+from orthoflow_plugins.orient.acceptance import GateRule
+from orthoflow_plugins.orient.estimation import EstimationRule
 
 
 class OrientParams(MethodParams):

@@ -8,10 +8,10 @@ from typing import ClassVar
 from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.estimating import estimate_pose
+from orthoflow_plugins.orient.estimation import estimate_pose
 from orthoflow_plugins.orient.parameters import OrientParams
-from orthoflow_plugins.orient.photowise import each_by_itself
-from orthoflow_plugins.orient.reporting import told
+from orthoflow_plugins.orient.reporting import hand_over
+from orthoflow_plugins.orient.single_photo import each_by_itself
 
 
 class OrientPnp(Method):
@@ -49,7 +49,7 @@ class OrientPnp(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Orient the photos one after the other."""
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimate_pose)
-        return self.Out(cameras=told(ctx, inputs.ties, inputs.photos.photos, found))
+        return self.Out(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 
     @classmethod
     def tools(cls) -> dict[str, str]:

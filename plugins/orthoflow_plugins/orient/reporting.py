@@ -9,13 +9,17 @@ import numpy as np
 
 from orthoflow.products import Cameras, JsonValue, Photo, TieRole, Ties
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.figures import draw_ties, draw_wall_errors
-from orthoflow_plugins.orient.histograms import PhotoResiduals, draw_residuals
-from orthoflow_plugins.orient.photowise import Oriented, of_photo
-from orthoflow_plugins.orient.residual_tables import COLUMNS_SAID
+from orthoflow_plugins.orient.figures import (
+    PhotoResiduals,
+    draw_residuals,
+    draw_ties,
+    draw_wall_errors,
+)
+from orthoflow_plugins.orient.residuals import COLUMNS_SAID
+from orthoflow_plugins.orient.single_photo import Oriented, of_photo
 
 
-def told(
+def hand_over(
     ctx: StepContext,
     ties: Ties,
     photos: Sequence[Photo],
@@ -40,7 +44,7 @@ def told(
         status = f"Status: {oriented.camera.status}"
         draw_ties(ctx, photo, ties.pixels_photo[mine], role[mine], status)
     _measure(ctx, found)
-    draw_wall_errors(ctx, [item.case for item in found if item.case is not None])
+    draw_wall_errors(ctx, [item.candidate for item in found if item.candidate is not None])
     draw_residuals(
         ctx,
         [
@@ -51,7 +55,6 @@ def told(
     )
     said: dict[str, JsonValue] = {
         "photos": {item.camera.photo: item.entry for item in found},
-        "residual_table": [row for item in found for row in item.table],
         "residual_columns": dict(COLUMNS_SAID),
         "sigma_wall": "standard deviation of one coordinate in the wall's plane, from the "
         "covariance, RMS over what the photo shows of its walls",
@@ -59,6 +62,7 @@ def told(
     return Cameras(
         cameras=tuple(item.camera for item in found),
         ties=replace(ties, role=role, residual_px=residuals),
+        residual_table=tuple(row for item in found for row in item.table),
         details=said | (details or {}),
     )
 

@@ -1,17 +1,35 @@
-"""Numbers about the residuals of an orientation, control and check apart."""
+"""Residuals of an orientation, control and check apart: its numbers, and a table for surveyors."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.products import JsonValue
-from orthoflow_plugins.orient.estimating import metres_per_pixel
-from orthoflow_plugins.orient.judging import Case
-from orthoflow_plugins.orient.residual_tables import residual_rows
+from orthoflow.geometry.robust import median_deviation
+from orthoflow.products import JsonValue, ResidualRow
+from orthoflow_plugins.orient.acceptance import Candidate
+from orthoflow_plugins.orient.estimation import metres_per_pixel
+
+# Of a normal distribution 4.55 % lie beyond; of any, at most a quarter can (Chebyshev).
+_BEYOND: Final = 2.0
+_AXES: Final = ("u", "v")
+
+COLUMNS_SAID: Final[Mapping[str, JsonValue]] = {
+    "residual": "observed - computed; u and v of the photo",
+    "unit": "px of the photo, cell of the wall's raster, or mm on the wall: px times the median "
+    "size of a pixel there",
+    "shift_p": "probability of such a mean by chance, Student's t, two-sided",
+    "nmad": "1.4826 times the median absolute deviation from the median",
+    "p95": "95 % of the residuals are no longer than this",
+    "beyond_own": "share beyond twice the coordinate's own RMSE",
+    "beyond_cells": "share beyond two cells of the wall's raster, a reference that does not move",
+    "beyond_any": "share of ties of which u or v lies beyond twice its own RMSE",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,64 +57,145 @@ class PhotoNumbers:
     hull_ratio: float
 
 
-def photo_numbers(case: Case) -> PhotoNumbers:
+def photo_numbers(candidate: Candidate) -> PhotoNumbers:
     """Summarise an orientation."""
-    residuals = case.estimate.fit.residuals_px
-    control, check = residuals[case.control], residuals[case.checked]
-    camera = case.estimate.resection.camera
-    pixel_mm = 1000.0 * metres_per_pixel(camera, case.seen.points_world[case.control])
+    residuals = candidate.estimate.fit.residuals_px
+    control, check = residuals[candidate.control], residuals[candidate.checked]
+    camera = candidate.estimate.resection.camera
+    pixel_mm = 1000.0 * metres_per_pixel(camera, candidate.seen.points_world[candidate.control])
     check_rmse_px = _rms(check)
     return PhotoNumbers(
         n_control=len(control),
         n_check=len(check),
-        n_rejected=int((~case.estimate.agreeing).sum()),
+        n_rejected=int((~candidate.estimate.agreeing).sum()),
         control_rmse_px=_rms(control),
         check_rmse_px=check_rmse_px,
         check_rmse_mm=check_rmse_px * pixel_mm,
         pixel_mm=pixel_mm,
-        hull_ratio=case.hull_ratio,
+        hull_ratio=candidate.hull_ratio,
     )
 
 
-def numbers_json(case: Case, numbers: PhotoNumbers) -> dict[str, JsonValue]:
+def numbers_json(candidate: Candidate, numbers: PhotoNumbers) -> dict[str, JsonValue]:
     """Give the numbers of an orientation as JSON."""
-    result = case.estimate.resection
+    result = candidate.estimate.resection
     entry: dict[str, JsonValue] = {
         "n_control": numbers.n_control,
         "n_check": numbers.n_check,
         "n_rejected": numbers.n_rejected,
         "pixel_mm": numbers.pixel_mm,
         "hull_ratio": numbers.hull_ratio,
-        "limit_sigma": case.estimate.limit,
+        "limit_sigma": candidate.estimate.limit,
         "sigma0": result.sigma0,
         "variance_factor": result.variance_factor,
-        "lens": case.estimate.source,
+        "lens": candidate.estimate.source,
         "focal_px": result.camera.fx,
         "k1": float(result.camera.distortion[0]),
     }
-    entry |= case.estimate.details
-    if case.error is not None:
-        entry["sigma_wall_mm"] = 1000.0 * case.error.rms_m
-        entry["sigma_wall_worst_mm"] = 1000.0 * case.error.worst_m
+    entry |= candidate.estimate.numbers
+    if candidate.error is not None:
+        entry["sigma_wall_mm"] = 1000.0 * candidate.error.rms_m
+        entry["sigma_wall_worst_mm"] = 1000.0 * candidate.error.worst_m
         entry["sigma_image_corners_mm"] = [
             1000.0 * sigma if math.isfinite(sigma) else None
-            for sigma in case.error.corners_m.tolist()
+            for sigma in candidate.error.corners_m.tolist()
         ]
     if result.lens.focal_sigma > 0.0:
         entry["focal_sigma_px"] = result.camera.fx * float(np.sqrt(result.covariance[6, 6]))
     return entry
 
 
-def residual_table(case: Case, numbers: PhotoNumbers) -> list[JsonValue]:
+def residual_table(candidate: Candidate, numbers: PhotoNumbers) -> list[ResidualRow]:
     """Give the rows of the table of residuals, control and check apart."""
     units = {"px": 1.0, "mm": numbers.pixel_mm}
-    if case.gsd_m is not None:
-        units["cell"] = numbers.pixel_mm / (1000.0 * case.gsd_m)
-    rows: list[JsonValue] = []
-    for role, chosen in (("control", case.control), ("check", case.checked)):
-        place: dict[str, JsonValue] = {"photo": case.photo.name, "role": role}
-        rows += residual_rows(place, case.estimate.fit.residuals_px[chosen], units)
+    if candidate.gsd_m is not None:
+        units["cell"] = numbers.pixel_mm / (1000.0 * candidate.gsd_m)
+    rows: list[ResidualRow] = []
+    for role, chosen in (("control", candidate.control), ("check", candidate.checked)):
+        residuals_px = candidate.estimate.fit.residuals_px[chosen]
+        rows += residual_rows(candidate.photo.name, role, residuals_px, units)
     return rows
+
+
+def residual_rows(
+    photo: str,
+    role: str,
+    residuals_px: NDArray[np.float64],
+    units: Mapping[str, float],
+) -> list[ResidualRow]:
+    """Give the rows of one photo and role.
+
+    Args:
+        photo: name of the photo.
+        role: `control` or `check`.
+        residuals_px: (n, 2), observed - computed.
+        units: by name, how many of them a pixel is; `cell` among them if it is known.
+
+    Returns:
+        One row per coordinate and unit; none without residuals.
+    """
+    if not len(residuals_px):
+        return []
+    is_beyond = np.abs(residuals_px) > _BEYOND * _rmse(residuals_px)
+    any_axis = _share(is_beyond[:, 0] | is_beyond[:, 1])
+    rows: list[ResidualRow] = []
+    for axis, values in zip(_AXES, residuals_px.T, strict=True):
+        limit = _BEYOND / units["cell"] if "cell" in units else None
+        beyond_own = _share(np.abs(values) > _BEYOND * _rmse(values))
+        beyond_cells = None if limit is None else _share(np.abs(values) > limit)
+        for unit, factor in units.items():
+            scaled = values * factor
+            lengths, median = np.abs(scaled), float(np.median(scaled))
+            row = ResidualRow(
+                photo=photo,
+                role=role,
+                axis=axis,
+                unit=unit,
+                n=len(scaled),
+                mean=float(scaled.mean()),
+                shift_p=_chance_of_mean(scaled),
+                sd=float(scaled.std(ddof=1)) if len(scaled) > 1 else 0.0,
+                median=median,
+                nmad=median_deviation(scaled, median),
+                skewness=_skewness(scaled),
+                rmse=float(_rmse(scaled)),
+                p95=float(np.percentile(lengths, 95.0)),
+                max=float(lengths.max()),
+                beyond_own=beyond_own,
+                beyond_cells=beyond_cells,
+                beyond_any=any_axis,
+            )
+            rows.append(row)
+    return rows
+
+
+def _chance_of_mean(values: NDArray[np.float64]) -> float | None:
+    """Probability of a mean as far from 0 when there is no shift; None for fewer than two."""
+    from scipy.special import stdtr  # scipy.stats would take seconds to import
+
+    n = len(values)
+    if n < 2:
+        return None
+    deviation = float(values.std(ddof=1))
+    if deviation == 0.0:
+        return 1.0 if values[0] == 0.0 else 0.0
+    return 2.0 * float(stdtr(n - 1, -abs(float(values.mean())) * math.sqrt(n) / deviation))
+
+
+def _skewness(values: NDArray[np.float64]) -> float | None:
+    """Third standardised moment; None where nothing varies."""
+    centred = values - values.mean()
+    variance = float(np.mean(centred**2))
+    return float(np.mean(centred**3)) / variance**1.5 if variance > 0.0 else None
+
+
+def _rmse(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Root mean square along the first axis."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
+
+
+def _share(is_beyond: NDArray[np.bool_]) -> float:
+    return float(is_beyond.mean())
 
 
 def _rms(residuals: NDArray[np.float64]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import Resection, pixels_by_point, predicted_covariances
-from orthoflow.products import Ties
-from orthoflow_plugins.orient.photo_rays import camera_rays
+from orthoflow.products import Ties, TieWall
+from orthoflow_plugins.orient.lenses import camera_rays
 
 _SIDE: Final = 15
 # A view flatter than this onto the wall paints nothing useful.
@@ -60,16 +60,10 @@ class WallError:
 
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
     """Describe the walls of some ties: from what their matcher says, else from the points."""
-    described = ties.details.get("walls")
     walls = []
     for index in np.unique(ties.wall[chosen]):
-        entry = (
-            described[int(index)]
-            if isinstance(described, Sequence) and int(index) < len(described)
-            else None
-        )
-        if isinstance(entry, Mapping):
-            walls.append(_described(int(index), entry))
+        if int(index) < len(ties.walls):
+            walls.append(_described(int(index), ties.walls[int(index)]))
         else:
             points = ties.points_world[chosen & (ties.wall == index)]
             if len(points) >= 3:
@@ -184,13 +178,12 @@ def _seen(
     return pixels
 
 
-def _described(index: int, entry: Mapping[str, object]) -> KnownWall:
-    gsd_m = entry.get("gsd_m")
+def _described(index: int, wall: TieWall) -> KnownWall:
     return KnownWall(
         index=index,
-        corners_world=np.array(entry["corners_world"], dtype=np.float64),
-        normal=np.array(entry["normal"], dtype=np.float64),
-        gsd_m=float(gsd_m) if isinstance(gsd_m, int | float) else None,
+        corners_world=np.array(wall.corners_world, dtype=np.float64),
+        normal=np.array(wall.normal_world, dtype=np.float64),
+        gsd_m=wall.gsd_m,
         has_side=True,
     )
 

@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.channels import gradient_channels, grey_channels
+from orthoflow_plugins.match.channels import (
+    gradient_channels,
+    grey_channels,
+    texture,
+    textured_places,
+)
 from orthoflow_plugins.match.displacements import SearchRule, measure
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.pictures import photo_grey
-from orthoflow_plugins.match.places import texture, textured_places
 from orthoflow_plugins.match.sift import MatchSift
 from orthoflow_plugins.match.warping import project_walls, warp_photo
 from scipy.ndimage import gaussian_filter, shift
@@ -19,7 +23,7 @@ from scipy.ndimage import gaussian_filter, shift
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, Photos, Ties, Walls
 from orthoflow.sdk import StepContext
-from tests import matching_scenes as ms
+from orthoflow.testing import textured_walls as ms
 
 SEARCH = SearchRule(radius_cells=6, half_patch_cells=10, score_least=0.3, distinct_least=0.05)
 # Turned by 0.3 degrees and shifted by 2 cm: about five cells on the wall.

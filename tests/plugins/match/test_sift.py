@@ -7,24 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.match.assembling import TiePiece, without_twins
-from orthoflow_plugins.match.features import FeatureRule, find_features
-from orthoflow_plugins.match.neighbours import (
+from orthoflow_plugins.match.descriptors import (
     Matches,
     Window,
     mutual_matches,
     mutual_matches_within,
 )
+from orthoflow_plugins.match.features import FeatureRule, find_features
+from orthoflow_plugins.match.pairing import Expectation, rematched
 from orthoflow_plugins.match.pictures import filled_smoothly, photo_grey, points_on_wall, shrunk
-from orthoflow_plugins.match.rematching import Expectation, rematched
 from orthoflow_plugins.match.sift import MatchSift
+from orthoflow_plugins.match.tie_pieces import TiePiece, without_twins
 from scipy.spatial.distance import cdist
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Photo, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import StepContext
-from tests import matching_scenes as ms
+from orthoflow.testing import textured_walls as ms
 
 RULE = FeatureRule(n_most=3000, contrast_threshold=0.02, edge_threshold=10.0)
 

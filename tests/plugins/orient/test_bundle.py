@@ -7,20 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.block import Block, Lens, Observations, Points
-from orthoflow_plugins.orient.block_covariance import block_covariance
-from orthoflow_plugins.orient.block_solving import solve
+from orthoflow_plugins.orient.block import Block, Lens, Observations, Points, block_covariance
 from orthoflow_plugins.orient.bundle import OrientColmapBundle
-from orthoflow_plugins.orient.photo_features import PhotoFeatures
-from orthoflow_plugins.orient.photo_ties import overlapping_pairs, tie_photos
+from orthoflow_plugins.orient.colmap import solve
+from orthoflow_plugins.orient.photo_ties import PhotoFeatures, overlapping_pairs, tie_photos
 from orthoflow_plugins.orient.pnp import OrientPnp
 
 from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import StepContext
+from orthoflow.testing import textured_walls as ms
 from tests import block_scenes as bs
-from tests import matching_scenes as ms
 from tests.scenes import SURVEY_SHIFT_M
 
 FEW = {"n_features_max": 1500, "n_photo_points_max": 300}

@@ -9,18 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.orient.direct_linear import direct_linear, relief
-from orthoflow_plugins.orient.dlt import Distortion, OrientDlt, estimate_dlt
-from orthoflow_plugins.orient.estimating import Estimate, EstimationRule
+from orthoflow_plugins.orient.direct_linear import (
+    Distortion,
+    direct_linear,
+    estimate_dlt,
+    relief,
+)
+from orthoflow_plugins.orient.dlt import OrientDlt
+from orthoflow_plugins.orient.estimation import Estimate, EstimationRule
 from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
 from orthoflow.errors import GeometryError
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Cameras, Photo, Photos, Ties
+from orthoflow.products import Cameras, Photo, Photos, Ties, TieWall
 from orthoflow.sdk import StepContext
-from tests import matching_scenes as ms
+from orthoflow.testing import textured_walls as ms
 from tests.scenes import SURVEY_SHIFT_M
 
 SIZE_PX = (4000, 3000)
@@ -79,20 +84,18 @@ def ties_of(
         sigma_m=np.full(n, max(noise_m, 1e-5)),
         role=np.zeros(n, np.uint8),
         residual_px=np.full((n, 2), np.nan),
-        details={
-            "walls": [
-                {
-                    "gsd_m": 0.003,
-                    "normal": [0.0, -1.0, 0.0],
-                    "corners_world": [
-                        [-half[0], 0.0, half[1]],
-                        [-half[0], 0.0, -half[1]],
-                        [half[0], 0.0, -half[1]],
-                        [half[0], 0.0, half[1]],
-                    ],
-                }
-            ]
-        },
+        walls=(
+            TieWall(
+                gsd_m=0.003,
+                normal_world=(0.0, -1.0, 0.0),
+                corners_world=(
+                    (-half[0], 0.0, half[1]),
+                    (-half[0], 0.0, -half[1]),
+                    (half[0], 0.0, -half[1]),
+                    (half[0], 0.0, half[1]),
+                ),
+            ),
+        ),
     )
 
 

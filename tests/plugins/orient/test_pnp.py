@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from orthoflow_plugins.match.guided import MatchGuided
 from orthoflow_plugins.match.sift import MatchSift
+from orthoflow_plugins.orient.layout import hull_area, withheld
 from orthoflow_plugins.orient.pnp import OrientPnp
-from orthoflow_plugins.orient.splitting import hull_area, withheld
 from orthoflow_plugins.orient.wall_errors import known_walls, sigmas_on_wall, wall_error
 
 from orthoflow.errors import MethodError
@@ -19,9 +19,9 @@ from orthoflow.files.images import decode_image, encode_png
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import LensFreedom, stepped
 from orthoflow.geometry.resection import SeenPoints, adjust
-from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties
+from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties, TieWall
 from orthoflow.sdk import StepContext
-from tests import matching_scenes as ms
+from orthoflow.testing import textured_walls as ms
 from tests.scenes import SURVEY_SHIFT_M
 
 PIXEL = Photo(
@@ -67,15 +67,13 @@ def known_ties(
         sigma_m=np.full(len(chosen), 1e-4),
         role=np.zeros(len(chosen), np.uint8),
         residual_px=np.full((len(chosen), 2), np.nan),
-        details={
-            "walls": [
-                {
-                    "gsd_m": ms.GSD_M,
-                    "normal": [0.0, -1.0, 0.0],
-                    "corners_world": corners.tolist(),
-                }
-            ]
-        },
+        walls=(
+            TieWall(
+                gsd_m=ms.GSD_M,
+                normal_world=(0.0, -1.0, 0.0),
+                corners_world=tuple(map(tuple, corners.tolist())),
+            ),
+        ),
     )
 
 
@@ -212,23 +210,18 @@ def test_residuals_are_observed_less_computed(tmp_path: Path) -> None:
 def test_the_table_of_residuals_says_what_the_ties_do(tmp_path: Path) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
     cameras = orient(known_ties(camera, 4), calibrated(camera), context(tmp_path))
-    ties, table = cameras.ties, cameras.details["residual_table"]
+    ties, table = cameras.ties, cameras.residual_table
     assert ties is not None
-    assert isinstance(table, list)
-    rows = {(row["role"], row["axis"], row["unit"]): row for row in table}
+    rows = {(row.role, row.axis, row.unit): row for row in table}
     assert len(rows) == len(table) == 2 * 2 * 3
     for role in (TieRole.CONTROL, TieRole.CHECK):
         values = ties.residual_px[ties.role == role, 1]
         row = rows[role.name.lower(), "v", "px"]
-        assert row["n"] == len(values)
-        assert row["rmse"] == pytest.approx(np.sqrt(np.mean(values**2)))
+        assert row.n == len(values)
+        assert row.rmse == pytest.approx(np.sqrt(np.mean(values**2)))
         # 2.6 m before a lens of 840 px, a pixel is 3 mm on the wall, half a cell of 6 mm.
-        assert rows[role.name.lower(), "v", "mm"]["rmse"] == pytest.approx(
-            3.1 * row["rmse"], rel=0.1
-        )
-        assert rows[role.name.lower(), "v", "cell"]["sd"] == pytest.approx(
-            0.52 * row["sd"], rel=0.1
-        )
+        assert rows[role.name.lower(), "v", "mm"].rmse == pytest.approx(3.1 * row.rmse, rel=0.1)
+        assert rows[role.name.lower(), "v", "cell"].sd == pytest.approx(0.52 * row.sd, rel=0.1)
 
 
 def test_a_fifth_of_the_ties_is_withheld_from_everything(tmp_path: Path) -> None:
@@ -350,7 +343,7 @@ def test_an_empty_quarter_is_refused_when_the_others_hardly_fix_the_pose_there(
 
 def test_an_empty_quarter_is_refused_when_nothing_is_known_of_the_walls(tmp_path: Path) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
-    emptied = replace(with_an_empty_quarter(known_ties(camera, 1)), details={})
+    emptied = replace(with_an_empty_quarter(known_ties(camera, 1)), walls=())
     reason = status(emptied, calibrated(camera), tmp_path)
     assert reason.startswith("a quarter of the photo has 0 ties, each needs 2")
 
@@ -407,8 +400,8 @@ def test_ties_searched_within_a_small_radius_prove_less(tmp_path: Path) -> None:
     ties = known_ties(camera, 1, n=120)
     # Wrong everywhere, but within the 12 px that the matcher looked around a wrong place.
     jitter = rng.uniform(-12.0, 12.0, ties.pixels_photo.shape)
-    details = {**ties.details, "photos": {"a.png": {"search_radius_px": 12.0}}}
-    guessed = replace(ties, pixels_photo=ties.pixels_photo + jitter, details=details)
+    pixels = ties.pixels_photo + jitter
+    guessed = replace(ties, pixels_photo=pixels, search_radius_px=(12.0,))
     assert status(guessed, calibrated(camera), tmp_path) != "ok"
 
 
@@ -448,15 +441,14 @@ def test_a_large_predicted_error_is_refused(tmp_path: Path) -> None:
 def test_a_pose_behind_the_wall_is_refused(tmp_path: Path) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
     ties = known_ties(camera, 1)
-    wall = ties.details["walls"][0]  # type: ignore[index]
-    turned = replace(ties, details={"walls": [{**wall, "normal": [0.0, 1.0, 0.0]}]})  # type: ignore[dict-item]
+    turned = replace(ties, walls=(replace(ties.walls[0], normal_world=(0.0, 1.0, 0.0)),))
     reason = status(turned, calibrated(camera), tmp_path)
     assert reason == "the pose lies behind the wall it would show, so it must be wrong"
 
 
 def test_ties_without_a_word_on_the_walls_still_orient(tmp_path: Path) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
-    ties = replace(known_ties(camera, 1), details={})
+    ties = replace(known_ties(camera, 1), walls=())
     assert status(ties, calibrated(camera), tmp_path) == "ok"
 
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-STRATA: Final = 6
+_STRATA: Final = 6
 # Cells per side of a photo within which ties may err together. On simulated rooms ties agree in
 # their errors up to some 60 px of 1200: with 6 cells more of that crosses the borders, with 4 too
 # few are left to learn from (error over stated, pooled over 94 photos: 1.39 with 6, 1.34 with 5).
@@ -37,7 +37,7 @@ def withheld(
     is taken along that order: each cell gives its share, and the whole is at least `share`.
     """
     shuffled = rng.permutation(len(pixels_photo))
-    cells = image_cells(pixels_photo, size_px, STRATA)
+    cells = image_cells(pixels_photo, size_px, _STRATA)
     order = shuffled[np.argsort(cells[shuffled], kind="stable")]
     n_check = math.ceil(share * len(order))
     picked = np.floor((np.arange(n_check) + rng.random()) * len(order) / max(n_check, 1))

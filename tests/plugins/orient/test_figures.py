@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.histograms import PhotoResiduals, _normal, draw_residuals
+from orthoflow_plugins.orient.figures import PhotoResiduals, _normal, draw_residuals
 
 from orthoflow.products import TieRole
 from orthoflow.sdk import StepContext

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow_plugins.orient.block import SIGMA_LEAST_M, Block, Lens, pixel_covariances
+from orthoflow_plugins.orient.block import SIGMA_LEAST_M, Block, pixel_covariances
+from orthoflow_plugins.orient.lenses import Lens
 
 _ITERATIONS: Final = 60
 # Of the cost: the square of a hundredth of a standard deviation.

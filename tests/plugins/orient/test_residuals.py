@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.residual_tables import residual_rows
+from orthoflow_plugins.orient.residuals import residual_rows
 from scipy import stats
-
-from orthoflow.products import JsonValue
 
 UNITS = {"px": 1.0, "mm": 2.5, "cell": 0.5}
 
 
 def rows(residuals: np.ndarray, units: dict[str, float] = UNITS) -> dict[tuple[str, str], dict]:
-    found: list[JsonValue] = residual_rows({"photo": "a", "role": "check"}, residuals, units)
-    return {(row["axis"], row["unit"]): row for row in found if isinstance(row, dict)}
+    found = residual_rows("a", "check", residuals, units)
+    return {(row.axis, row.unit): asdict(row) for row in found}
 
 
 def test_numbers_are_those_of_their_definition() -> None:
@@ -71,4 +71,4 @@ def test_without_a_cell_there_is_no_share_beyond_cells() -> None:
 
 def test_one_residual_and_none() -> None:
     assert rows(np.array([[0.5, -0.5]]))["u", "px"]["shift_p"] is None
-    assert residual_rows({}, np.empty((0, 2)), UNITS) == []
+    assert residual_rows("a", "check", np.empty((0, 2)), UNITS) == []

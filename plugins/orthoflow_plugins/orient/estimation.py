@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.lenses import POSE_PARAMETERS, LensFreedom
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.resection import (
     Misfit,
     Resection,
@@ -24,16 +25,16 @@ from orthoflow.geometry.resection import (
     pixels_by_point,
     stated,
 )
-from orthoflow.products import Intrinsics, JsonValue, Photo
-from orthoflow_plugins.orient.lenses import LensPrior, intrinsics_of, lens_prior
-from orthoflow_plugins.orient.robust import RobustPose, SamplingRule, robust_pose
-from orthoflow_plugins.orient.splitting import GROUPS, image_cells
+from orthoflow.geometry.robust import MEDIAN_LENGTH
+from orthoflow.products import Intrinsics, Photo
+from orthoflow_plugins.orient.layout import GROUPS, image_cells
+from orthoflow_plugins.orient.lenses import intrinsics_of, lens_prior
 
+_LEAST_FOR_POSE: Final = 4
+_CONFIDENCE: Final = 0.99999
 _ROUNDS: Final = 8
 # A standard deviation of unit weight that changes by less changes no tie's weight to speak of.
 _SETTLED_SHARE: Final = 0.02
-# Median length of a two-dimensional standard normal deviation.
-_MEDIAN_LENGTH: Final = 1.1774
 _SIGMA0_RANGE: Final = (0.1, 3.0)
 _CHANCE_SHARE_MOST: Final = 0.1
 _TIGHTENING: Final = 0.8
@@ -58,7 +59,8 @@ class EstimationRule:
 
     Attributes:
         rejection_sigma: ties beyond so many standard deviations are rejected.
-        threshold_px: of the samples; None derives it from the ties' sigmas.
+        threshold_px: ties agree with a sampled pose up to this distance; None derives it from
+            their sigmas.
         n_trials_most: samples drawn at most.
         seed: of the samples.
     """
@@ -81,7 +83,7 @@ class Estimate:
         agreeing: (n,) bool, ties within the limit.
         limit: in standard deviations, as `fit.normalised`.
         notes: what its method has to say of it.
-        details: its method's own numbers for the record.
+        numbers: what its method alone measures, by name, for the record.
     """
 
     resection: Resection
@@ -91,7 +93,7 @@ class Estimate:
     agreeing: NDArray[np.bool_]
     limit: float
     notes: tuple[str, ...] = ()
-    details: Mapping[str, JsonValue] = field(default_factory=dict)
+    numbers: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,34 +135,7 @@ def estimate_pose(
         found = adjusted(photo, seen, is_check, start, rule)
     except GeometryError:
         return no_pose(seen)
-    return calibration_doubt(found, seen.take(found.agreeing & ~is_check)) or found
-
-
-def calibration_doubt(found: Estimate, control: SeenPoints) -> str:
-    """Say that a calibrated photo was taken with another focal length; empty when it may be right.
-
-    The pose of such a photo takes up most of the mistake, and its residuals do not show the rest.
-    """
-    camera = found.resection.camera
-    if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
-        return ""
-    try:
-        step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
-        if abs(step[POSE_PARAMETERS]) < _FOCAL_STEP_LEAST:
-            return ""
-        cells = image_cells(control.pixels_photo, (camera.width, camera.height), GROUPS)
-        free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
-    except GeometryError:
-        return ""
-    off = abs(math.log(free.camera.fx / camera.fx))
-    sigma = math.sqrt(float(free.covariance[POSE_PARAMETERS, POSE_PARAMETERS]))
-    if off < max(_FOCAL_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma):
-        return ""
-    return (
-        f"its ties ask for a focal length of {free.camera.fx:.0f} px, give or take "
-        f"{sigma * free.camera.fx:.0f} px, but its calibration says {camera.fx:.0f} px: it is the "
-        "calibration of another lens, zoom or image size"
-    )
+    return _calibration_doubt(found, seen.take(found.agreeing & ~is_check)) or found
 
 
 def no_pose(seen: SeenPoints) -> str:
@@ -172,24 +147,26 @@ def robust_start(
     photo: Photo, seen: SeenPoints, is_check: NDArray[np.bool_], rule: EstimationRule
 ) -> Start | None:
     """Find the pose that most control ties agree with; None when there is none."""
-    prior = lens_prior(photo)
-    control = np.flatnonzero(~is_check)
-    best: tuple[RobustPose, Intrinsics] | None = None
-    for pose, intrinsics in _starts(seen.take(control), prior, rule):
-        if best is None or pose.agreeing.sum() > best[0].agreeing.sum():
-            best = pose, intrinsics
+    prior, control = lens_prior(photo), seen.take(~is_check)
+    if rule.threshold_px is None:
+        # A lens known only roughly misplaces even right ties.
+        slack = 1.0 if prior.source not in ("exif", "none") else 2.0
+        rule = replace(rule, threshold_px=slack * rule.rejection_sigma * _expected_px(control))
+    best: _RobustPose | None = None
+    for intrinsics in prior.guesses:
+        pose = _robust_pose(control, intrinsics.posed(), rule)
+        if pose is not None and (best is None or pose.agreeing.sum() > best.agreeing.sum()):
+            best = pose
     if best is None:
         return None
     agreeing = np.zeros(len(seen), dtype=np.bool_)
-    agreeing[control] = best[0].agreeing
+    agreeing[~is_check] = best.agreeing
     # Points that appear twice say nothing new to a pose of six unknowns.
     if len(set(map(tuple, seen.points_world[agreeing].round(4).tolist()))) < 5:
         return None
-    pose, intrinsics = best
-    lens = intrinsics.posed()
     return Start(
-        camera=posed(lens, pose.camera),
-        prior=lens,
+        camera=best.camera,
+        prior=best.camera,
         agreeing=agreeing,
         freedom=prior.freedom,
         source=prior.source,
@@ -242,40 +219,6 @@ def adjusted(
     )
 
 
-def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
-    """Give the lens of one camera the pose of another."""
-    return replace(lens, rotation=pose.rotation, translation=pose.translation)
-
-
-def _starts(
-    seen: SeenPoints, prior: LensPrior, rule: EstimationRule
-) -> Iterator[tuple[RobustPose, Intrinsics]]:
-    # A lens known only roughly misplaces even right ties.
-    slack = 1.0 if prior.source not in ("exif", "none") else 2.0
-    for intrinsics in prior.guesses:
-        lens = intrinsics.posed()
-        threshold = rule.threshold_px
-        if threshold is None:
-            threshold = slack * rule.rejection_sigma * _expected_px(seen)
-        pose = robust_pose(
-            seen.pixels_photo,
-            seen.points_world,
-            lens,
-            SamplingRule(threshold_px=threshold, n_trials_most=rule.n_trials_most, seed=rule.seed),
-        )
-        if pose is not None:
-            yield pose, intrinsics
-
-
-def _expected_px(seen: SeenPoints) -> float:
-    """Usual deviation of a tie before any pose: the photo's scale from the spread of its ties."""
-    spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
-    lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
-    per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
-    sigma = np.hypot(np.median(seen.sigma_px), per_metre * np.median(seen.sigma_m))
-    return float(sigma)
-
-
 def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
     """Tighten a limit until hardly any wrong tie lies within it by chance.
 
@@ -293,7 +236,7 @@ def without_chance(normalised: NDArray[np.float64], limit: float) -> float:
 def unit_deviation(normalised: NDArray[np.float64]) -> float:
     """Robust standard deviation of unit weight, kept within reason."""
     median = float(np.median(normalised)) if normalised.size else 1.0
-    return float(np.clip(median / _MEDIAN_LENGTH, *_SIGMA0_RANGE))
+    return float(np.clip(median / MEDIAN_LENGTH, *_SIGMA0_RANGE))
 
 
 def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -> float:
@@ -301,3 +244,126 @@ def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -
     derivatives = pixels_by_point(camera, points_world)
     across = np.linalg.svd(derivatives, compute_uv=False)
     return float(np.median(1.0 / np.sqrt(across[:, 0] * across[:, 1])))
+
+
+def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
+    """Give the lens of one camera the pose of another."""
+    return replace(lens, rotation=pose.rotation, translation=pose.translation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RobustPose:
+    """A pose and the ties that agree with it.
+
+    Attributes:
+        camera: the camera at that pose.
+        agreeing: (n,) bool.
+    """
+
+    camera: ViewingCamera
+    agreeing: NDArray[np.bool_]
+
+
+def _calibration_doubt(found: Estimate, control: SeenPoints) -> str:
+    """Say that a calibrated photo was taken with another focal length; empty when it may be right.
+
+    The pose of such a photo takes up most of the mistake, and its residuals do not show the rest.
+    """
+    camera = found.resection.camera
+    if found.resection.lens.sigmas.size or len(control) < _LEAST_FOR_FOCAL:
+        return ""
+    try:
+        step = first_step(control, camera, _OTHER_LENS, soft_limit=SOFT_LIMIT)
+        if abs(step[POSE_PARAMETERS]) < _FOCAL_STEP_LEAST:
+            return ""
+        cells = image_cells(control.pixels_photo, (camera.width, camera.height), GROUPS)
+        free = adjust(control, camera, lens=_OTHER_LENS, groups=cells, soft_limit=SOFT_LIMIT)
+    except GeometryError:
+        return ""
+    off = abs(math.log(free.camera.fx / camera.fx))
+    sigma = math.sqrt(float(free.covariance[POSE_PARAMETERS, POSE_PARAMETERS]))
+    if off < max(_FOCAL_OFF_LEAST, _FOCAL_OFF_SIGMAS * sigma):
+        return ""
+    return (
+        f"its ties ask for a focal length of {free.camera.fx:.0f} px, give or take "
+        f"{sigma * free.camera.fx:.0f} px, but its calibration says {camera.fx:.0f} px: it is the "
+        "calibration of another lens, zoom or image size"
+    )
+
+
+def _robust_pose(seen: SeenPoints, lens: ViewingCamera, rule: EstimationRule) -> _RobustPose | None:
+    """Find the pose that most ties agree with (MSAC on P3P: Torr & Zisserman 2000).
+
+    Args:
+        seen: the ties.
+        lens: the camera's interior orientation; its pose is ignored.
+        rule: how samples are drawn; its `threshold_px` is known.
+
+    Returns:
+        None when no pose is found.
+    """
+    import cv2
+
+    usable = _undistorted(seen.pixels_photo, lens)
+    inside: NDArray[np.bool_] = np.asarray(np.isfinite(usable).all(axis=1))
+    if inside.sum() < _LEAST_FOR_POSE:
+        return None
+    middle = seen.points_world.mean(axis=0)
+    pixels = np.ascontiguousarray(to_opencv(usable[inside]))
+    points = np.ascontiguousarray(seen.points_world[inside] - middle)
+    call: Any = cv2.solvePnPRansac
+    try:
+        found, _, turn, shift, agreed = call(
+            points, pixels, opencv_matrix(lens), None, params=_usac(rule)
+        )
+    except cv2.error:  # no sample has a solution
+        return None
+    if not found or agreed is None:
+        return None
+    rotation = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
+    local = replace(lens, rotation=rotation, translation=np.asarray(shift).ravel())
+    agreeing = np.zeros(len(inside), dtype=np.bool_)
+    agreeing[np.flatnonzero(inside)[np.asarray(agreed).ravel()]] = True
+    return _RobustPose(camera=local.shifted(-middle), agreeing=agreeing)
+
+
+def _expected_px(seen: SeenPoints) -> float:
+    """Usual deviation of a tie before any pose: the photo's scale from the spread of its ties."""
+    spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
+    lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
+    per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
+    sigma = np.hypot(np.median(seen.sigma_px), per_metre * np.median(seen.sigma_m))
+    return float(sigma)
+
+
+def _usac(rule: EstimationRule) -> Any:
+    """OpenCV's universal sampling, one thread: several give another result each time."""
+    import cv2
+
+    params: Any = cv2.UsacParams()
+    params.threshold = rule.threshold_px
+    params.maxIterations = rule.n_trials_most
+    params.confidence = _CONFIDENCE
+    params.randomGeneratorState = rule.seed
+    params.isParallel = False
+    params.score = cv2.SCORE_METHOD_MSAC
+    # The adjustment that follows does what a local optimisation would do in thrice the time.
+    params.loMethod = cv2.LOCAL_OPTIM_NULL
+    return params
+
+
+def _undistorted(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDArray[np.float64]:
+    """Pixels of a camera without distortion; NaN where the lens model cannot be undone."""
+    if not lens.distortion.any():
+        return pixels
+    try:
+        rays = lens.rays_camera(pixels)
+    except GeometryError:
+        rays = np.full((len(pixels), 3), np.nan)
+        for index in range(len(pixels)):
+            try:
+                rays[index] = lens.rays_camera(pixels[index : index + 1])[0]
+            except GeometryError:
+                continue
+    straight: NDArray[np.float64] = rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
+    return straight

@@ -1,15 +1,25 @@
-"""Ties from the pieces that photos and walls give, each piece one photo on one wall."""
+"""Ties by pieces, each piece one photo on one wall: made from key points, joined, without twins."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
+from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
+from orthoflow_plugins.match.features import Features
+from orthoflow_plugins.match.pictures import points_on_wall
+
+# How well SIFT places a key point, in pixels of the image it was found in: for the smallest ones,
+# and growing with their size.
+_SIGMA_LEAST_PX: Final = 0.35
+_SIGMA_PER_SIZE: Final = 0.06
+# At an edge of the relief a key point belongs to neither side.
+_SIGMA_MOST_CELLS: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +60,38 @@ class TiePiece:
         )
 
 
+def key_point_ties(
+    at: tuple[int, int],
+    wall: Wall,
+    sets: tuple[Features, Features],
+    *,
+    scale: float = 1.0,
+    role: TieRole = TieRole.CONTROL,
+) -> TiePiece:
+    """Ties of one photo with one wall; pairs whose place on the wall is not known are left out.
+
+    Args:
+        at: index of the photo and of the wall.
+        wall: the wall.
+        sets: the pairs' key points in the photo (pixels of the full image) and on the wall.
+        scale: the photo's were found in the photo shrunk by this.
+        role: of the ties.
+    """
+    in_photo, on_wall = sets
+    points = points_on_wall(wall, on_wall.pixels)
+    wall_sigma_m = wall.frame.gsd_m * _sigma_px(on_wall.sizes_px)
+    piece = TiePiece(
+        photo=at[0],
+        wall=at[1],
+        pixels_photo=in_photo.pixels,
+        points_world=points.points_world,
+        sigma_px=_sigma_px(in_photo.sizes_px * scale) / scale,
+        sigma_m=np.hypot(points.sigma_m, wall_sigma_m),
+        role=role,
+    )
+    return piece.take(points.known & (piece.sigma_m < _SIGMA_MOST_CELLS * wall.frame.gsd_m))
+
+
 def require_photos(photos: Photos) -> None:
     """Refuse an empty set of photos.
 
@@ -61,12 +103,21 @@ def require_photos(photos: Photos) -> None:
 
 
 def ties_of(
-    pieces: Sequence[TiePiece], photos: Photos, walls: Walls, details: dict[str, JsonValue]
+    pieces: Sequence[TiePiece],
+    photos: Photos,
+    walls: Walls,
+    details: dict[str, JsonValue],
+    *,
+    search_radius_px: tuple[float | None, ...] = (),
 ) -> Ties:
     """Join pieces into one product, in their order.
 
-    `details["walls"]` says what the orientation needs to know of the walls: cell size, normal and
-    corners.
+    Args:
+        pieces: the ties.
+        photos: all photos.
+        walls: all walls.
+        details: what people may want to know.
+        search_radius_px: one per photo, as `Ties` has it.
     """
     counts = [len(piece) for piece in pieces]
     total = sum(counts)
@@ -88,7 +139,9 @@ def ties_of(
         sigma_m=joined("sigma_m", 1),
         role=np.repeat(np.array([piece.role for piece in pieces], dtype=np.uint8), counts),
         residual_px=np.full((total, 2), np.nan),
-        details={**details, "walls": [_wall_json(walls, k) for k in range(len(walls.walls))]},
+        walls=tuple(TieWall.of(wall) for wall in walls.walls),
+        search_radius_px=search_radius_px,
+        details=details,
     )
 
 
@@ -121,12 +174,6 @@ def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:
     ]
 
 
-def _wall_json(walls: Walls, index: int) -> JsonValue:
-    frame = walls.walls[index].frame
-    corners: list[JsonValue] = [row.tolist() for row in frame.corners_world()]
-    return {
-        "name": walls.walls[index].name,
-        "gsd_m": frame.gsd_m,
-        "normal": frame.normal_world.tolist(),
-        "corners_world": corners,
-    }
+def _sigma_px(sizes_px: NDArray[np.float64]) -> NDArray[np.float64]:
+    sigma: NDArray[np.float64] = np.maximum(_SIGMA_LEAST_PX, _SIGMA_PER_SIZE * sizes_px)
+    return sigma

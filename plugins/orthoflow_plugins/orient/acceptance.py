@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo
-from orthoflow_plugins.orient.estimating import Estimate
-from orthoflow_plugins.orient.splitting import hull_area, image_cells, quadrant_counts
+from orthoflow_plugins.orient.estimation import Estimate
+from orthoflow_plugins.orient.layout import hull_area, image_cells, quadrant_counts
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
 
-TIES_LEAST: Final = 8
+_TIES_LEAST: Final = 8
 _SIDE_CHECK_LEAST: Final = 4
-QUADRANT_RATIO: Final = 10
+_QUADRANT_RATIO: Final = 10
 # Probability that the check points of a wrong pose agree by chance. Right ties gather close to
 # where they should be, wrong ones do not: several shares of the limit are tried.
 _CHANCE_MOST: Final = 1e-5
@@ -52,7 +52,7 @@ class GateRule:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Case:
+class Candidate:
     """An orientation to judge.
 
     Attributes:
@@ -123,77 +123,79 @@ class Case:
 
 def too_few(n_ties: int) -> str:
     """Say why ties are too few for an orientation; empty when they suffice."""
-    if n_ties < TIES_LEAST:
+    if n_ties < _TIES_LEAST:
         return (
-            f"{n_ties} ties with the walls, at least {TIES_LEAST} are needed: the photo "
+            f"{n_ties} ties with the walls, at least {_TIES_LEAST} are needed: the photo "
             "shows none of the walls, or too differently"
         )
     return ""
 
 
-def reason_against(case: Case) -> str:
+def reason_against(candidate: Candidate) -> str:
     """Say why an orientation is not `ok`; empty when it is."""
     for gate in _GATES:
-        reason = gate(case)
+        reason = gate(candidate)
         if reason:
             return reason
     return ""
 
 
-def reason_to_leave_out(case: Case) -> str:
+def reason_to_leave_out(candidate: Candidate) -> str:
     """Say why an orientation would harm those of other photos; empty when it would not.
 
     What it lacks in exactness, the other photos may bring.
     """
     gates = (_enough_control, _enough_share, _not_by_chance, _check_agrees, _in_front)
-    return next((reason for gate in gates if (reason := gate(case))), "")
+    return next((reason for gate in gates if (reason := gate(candidate))), "")
 
 
-def warnings_for(case: Case) -> list[str]:
+def warnings_for(candidate: Candidate) -> list[str]:
     """Say what limits an orientation that is `ok`."""
     notes = []
-    counts = case.quadrant_counts
-    if max(counts) > QUADRANT_RATIO * min(counts):
+    counts = candidate.quadrant_counts
+    if max(counts) > _QUADRANT_RATIO * min(counts):
         notes.append(
             f"a quarter of the photo has {max(counts)} ties, another {min(counts)}: more than "
-            f"{QUADRANT_RATIO} times as many"
+            f"{_QUADRANT_RATIO} times as many"
         )
-    if case.hull_ratio < 1.5 * case.rule.hull_ratio_least:
-        notes.append(f"the control covers {case.hull_ratio:.0%} of the part that shows the walls")
-    if case.estimate.source == "none":
+    if candidate.hull_ratio < 1.5 * candidate.rule.hull_ratio_least:
+        notes.append(
+            f"the control covers {candidate.hull_ratio:.0%} of the part that shows the walls"
+        )
+    if candidate.estimate.source == "none":
         notes.append("neither calibration nor EXIF says its focal length, which was estimated")
     return notes
 
 
-def _enough_control(case: Case) -> str:
-    n_control = int(case.control.sum())
-    if n_control < case.rule.n_control_least:
+def _enough_control(candidate: Candidate) -> str:
+    n_control = int(candidate.control.sum())
+    if n_control < candidate.rule.n_control_least:
         return (
-            f"only {n_control} of {int((~case.is_check).sum())} control ties agree with one pose, "
-            f"at least {case.rule.n_control_least} must"
+            f"only {n_control} of {int((~candidate.is_check).sum())} control ties agree with one "
+            f"pose, at least {candidate.rule.n_control_least} must"
         )
     return ""
 
 
-def _enough_share(case: Case) -> str:
-    share = float(case.estimate.agreeing.mean())
-    if share < case.rule.inlier_share_least:
+def _enough_share(candidate: Candidate) -> str:
+    share = float(candidate.estimate.agreeing.mean())
+    if share < candidate.rule.inlier_share_least:
         return (
-            f"only {share:.1%} of {len(case.seen)} ties agree with one pose, at least "
-            f"{case.rule.inlier_share_least:.1%} must"
+            f"only {share:.1%} of {len(candidate.seen)} ties agree with one pose, at least "
+            f"{candidate.rule.inlier_share_least:.1%} must"
         )
     return ""
 
 
-def _not_by_chance(case: Case) -> str:
+def _not_by_chance(candidate: Candidate) -> str:
     """A pose fitted to wrong ties fits withheld ties by chance only."""
-    n_check, n_agree = int(case.is_check.sum()), int(case.checked.sum())
-    lengths = case.estimate.fit.normalised / case.estimate.limit
+    n_check, n_agree = int(candidate.is_check.sum()), int(candidate.checked.sum())
+    lengths = candidate.estimate.fit.normalised / candidate.estimate.limit
     probabilities = []
     for share in _CHANCE_RADII:
-        near = case.checked & (lengths <= share)
-        by_chance = _chance_probability(case, share * case.estimate.limit)
-        n_places = _n_places(case.seen.pixels_photo[near])
+        near = candidate.checked & (lengths <= share)
+        by_chance = _chance_probability(candidate, share * candidate.estimate.limit)
+        n_places = _n_places(candidate.seen.pixels_photo[near])
         probabilities.append(_tail(n_places, n_check, by_chance))
     if len(_CHANCE_RADII) * min(probabilities) > _CHANCE_MOST:
         return (
@@ -203,17 +205,17 @@ def _not_by_chance(case: Case) -> str:
     return ""
 
 
-def _check_agrees(case: Case) -> str:
-    share_control = float(case.control.sum() / (~case.is_check).sum())
-    n_check, n_agree = int(case.is_check.sum()), int(case.checked.sum())
+def _check_agrees(candidate: Candidate) -> str:
+    share_control = float(candidate.control.sum() / (~candidate.is_check).sum())
+    n_check, n_agree = int(candidate.is_check.sum()), int(candidate.checked.sum())
     if n_agree / n_check < _CHECK_AGREEMENT_LEAST * share_control and n_check >= 5:
         return (
             f"{n_agree} of {n_check} withheld ties agree with the pose, but {share_control:.0%} of "
             "the control does: the pose was fitted to chance"
         )
-    lengths = case.estimate.fit.normalised
-    rms_control = float(np.sqrt(np.mean(lengths[case.control] ** 2)))
-    rms_check = float(np.sqrt(np.mean(lengths[case.checked] ** 2))) if n_agree else math.inf
+    lengths = candidate.estimate.fit.normalised
+    rms_control = float(np.sqrt(np.mean(lengths[candidate.control] ** 2)))
+    rms_check = float(np.sqrt(np.mean(lengths[candidate.checked] ** 2))) if n_agree else math.inf
     if n_agree >= 5 and rms_check > _CHECK_RMSE_RATIO * rms_control:
         return (
             f"the check ties deviate {rms_check / rms_control:.1f} times as much as the control, "
@@ -222,7 +224,7 @@ def _check_agrees(case: Case) -> str:
     return ""
 
 
-def _spread(case: Case) -> str:
+def _spread(candidate: Candidate) -> str:
     """Hold each quarter of the photo to its ties, or else to what the others say about it.
 
     After markiewicz2015 each quarter needs two ties. But an obstacle before the wall, or a view
@@ -231,31 +233,30 @@ def _spread(case: Case) -> str:
     be as small at its worst place as it has to be on the average of the photo. A quarter that shows
     no wall is painted nowhere and needs nothing. Only strictly the paper's rule holds as it stands.
     """
-    for quarter, count in enumerate(case.quadrant_counts):
-        if count >= case.rule.n_quadrant_least:
+    n_least = candidate.rule.n_quadrant_least
+    for quarter, count in enumerate(candidate.quadrant_counts):
+        if count >= n_least:
             continue
-        if case.rule.quadrants_are_strict:
-            return (
-                f"a quarter of the photo has {count} ties, each needs {case.rule.n_quadrant_least}"
-            )
-        worst_m = case.worst_in_quarter_m(quarter)
+        if candidate.rule.quadrants_are_strict:
+            return f"a quarter of the photo has {count} ties, each needs {n_least}"
+        worst_m = candidate.worst_in_quarter_m(quarter)
         if worst_m == 0.0:
             continue
-        most_m = case.rule.sigma_wall_most_gsd * case.gsd_m if case.gsd_m else 0.0
+        most_m = candidate.rule.sigma_wall_most_gsd * candidate.gsd_m if candidate.gsd_m else 0.0
         if worst_m > most_m:
             return (
                 f"a quarter of the photo has {count} ties, each needs "
-                f"{case.rule.n_quadrant_least}: the pose would be extrapolated there, with a "
+                f"{n_least}: the pose would be extrapolated there, with a "
                 f"predicted error of {1000 * worst_m:.1f} mm"
-                + (f", at most {1000 * most_m:.1f} mm is allowed" if case.gsd_m else "")
+                + (f", at most {1000 * most_m:.1f} mm is allowed" if candidate.gsd_m else "")
             )
     return ""
 
 
-def _in_front(case: Case) -> str:
-    centre = case.estimate.resection.camera.centre_world
-    for wall in case.known:
-        used = case.walls[case.control] == wall.index
+def _in_front(candidate: Candidate) -> str:
+    centre = candidate.estimate.resection.camera.centre_world
+    for wall in candidate.known:
+        used = candidate.walls[candidate.control] == wall.index
         if not (wall.has_side and used.sum() >= _SIDE_CHECK_LEAST):
             continue
         if float((centre - wall.corners_world.mean(axis=0)) @ wall.normal) <= 0.0:
@@ -263,33 +264,37 @@ def _in_front(case: Case) -> str:
     return ""
 
 
-def _covered(case: Case) -> str:
-    if case.error is None:
+def _covered(candidate: Candidate) -> str:
+    if candidate.error is None:
         return "with this pose the photo would show no wall that its ties lie on"
-    if case.hull_ratio < case.rule.hull_ratio_least:
+    if candidate.hull_ratio < candidate.rule.hull_ratio_least:
         return (
-            f"the control covers {case.hull_ratio:.1%} of the part of the photo that shows the "
-            f"walls, at least {case.rule.hull_ratio_least:.1%} is needed"
+            f"the control covers {candidate.hull_ratio:.1%} of the part of the photo that shows "
+            f"the walls, at least {candidate.rule.hull_ratio_least:.1%} is needed"
         )
     return ""
 
 
-def _accurate(case: Case) -> str:
-    if case.error is None or case.gsd_m is None:
+def _accurate(candidate: Candidate) -> str:
+    if candidate.error is None or candidate.gsd_m is None:
         return ""
     for value, most, where in (
-        (case.error.rms_m, case.rule.sigma_wall_most_gsd, "on the wall"),
-        (case.error.worst_m, case.rule.sigma_corner_most_gsd, "at the worst place of the wall"),
+        (candidate.error.rms_m, candidate.rule.sigma_wall_most_gsd, "on the wall"),
+        (
+            candidate.error.worst_m,
+            candidate.rule.sigma_corner_most_gsd,
+            "at the worst place of the wall",
+        ),
     ):
-        if value > most * case.gsd_m:
+        if value > most * candidate.gsd_m:
             return (
                 f"its predicted error {where} is {1000 * value:.1f} mm, at most {most:g} cells of "
-                f"{1000 * case.gsd_m:g} mm are allowed"
+                f"{1000 * candidate.gsd_m:g} mm are allowed"
             )
     return ""
 
 
-_GATES: Final[tuple[Callable[[Case], str], ...]] = (
+_GATES: Final[tuple[Callable[[Candidate], str], ...]] = (
     _enough_control,
     _enough_share,
     _not_by_chance,
@@ -301,14 +306,14 @@ _GATES: Final[tuple[Callable[[Case], str], ...]] = (
 )
 
 
-def _chance_probability(case: Case, limit: float) -> float:
+def _chance_probability(candidate: Candidate, limit: float) -> float:
     """Probability that a wrong tie falls within a limit of a pose it has nothing to do with."""
-    residuals, lengths = case.estimate.fit.residuals_px, case.estimate.fit.normalised
-    inside = case.estimate.agreeing & (lengths > 0.0)
+    residuals, lengths = candidate.estimate.fit.residuals_px, candidate.estimate.fit.normalised
+    inside = candidate.estimate.agreeing & (lengths > 0.0)
     radius = limit * float(np.median(np.linalg.norm(residuals[inside], axis=1) / lengths[inside]))
     # Wrong ties gather where the texture is, not all over the photo.
-    textured = max(hull_area(case.seen.pixels_photo), 1.0) / 4.0
-    searched = (2.0 * case.search_radius_px) ** 2
+    textured = max(hull_area(candidate.seen.pixels_photo), 1.0) / 4.0
+    searched = (2.0 * candidate.search_radius_px) ** 2
     return min(0.5, math.pi * radius**2 / min(textured, searched))
 
 

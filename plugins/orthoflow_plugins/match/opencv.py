@@ -1,22 +1,19 @@
-"""Several photos or walls at once, their results in order."""
+"""OpenCV as the matchers use it: several pictures at once, results in order, and its version."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
 from typing import Final, TypeVar
 
 from orthoflow.geometry.threads import in_order
 
+_OPENCV: Final = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless")
 # Each works on a picture of its own, which takes up to a gigabyte.
 _MOST: Final = 4
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-
-
-def n_workers(cores: int) -> int:
-    """How many pictures are worked on at once."""
-    return max(1, min(cores, _MOST))
 
 
 def one_by_one(
@@ -29,6 +26,16 @@ def one_by_one(
     """
     import cv2
 
-    workers = n_workers(cores)
+    workers = max(1, min(cores, _MOST))
     cv2.setNumThreads(max(1, cores // workers))
     yield from in_order(function, items, threads=workers)
+
+
+def opencv_version() -> dict[str, str]:
+    """OpenCV's distribution and version, whichever of its distributions is installed."""
+    for name in _OPENCV:
+        try:
+            return {name: version(name)}
+        except PackageNotFoundError:
+            continue
+    return {}

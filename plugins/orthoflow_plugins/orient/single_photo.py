@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.resection import SeenPoints
-from orthoflow.products import Camera, JsonValue, Photo, Photos, TieRole, Ties
+from orthoflow.products import Camera, JsonValue, Photo, Photos, ResidualRow, TieRole, Ties
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.estimating import Estimate, EstimationRule
-from orthoflow_plugins.orient.judging import Case, reason_against, too_few, warnings_for
+from orthoflow_plugins.orient.acceptance import Candidate, reason_against, too_few, warnings_for
+from orthoflow_plugins.orient.estimation import Estimate, EstimationRule
+from orthoflow_plugins.orient.layout import withheld
 from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.residuals import (
     PhotoNumbers,
@@ -22,7 +23,6 @@ from orthoflow_plugins.orient.residuals import (
     photo_numbers,
     residual_table,
 )
-from orthoflow_plugins.orient.splitting import withheld
 from orthoflow_plugins.orient.wall_errors import known_walls, wall_error
 
 _SEED_LIMIT = 2**31 - 1
@@ -32,7 +32,7 @@ Estimator = Callable[[Photo, SeenPoints, NDArray[np.bool_], EstimationRule], Est
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sighting:
+class TiedPhoto:
     """A photo with the ties it is oriented by.
 
     Attributes:
@@ -63,7 +63,7 @@ class Oriented:
         entry: for the record.
         table: rows of the table of residuals.
         notes: what limits it.
-        case: what it was judged by, of a photo that is ok.
+        candidate: what it was judged by, of a photo that is ok.
     """
 
     camera: Camera
@@ -72,9 +72,9 @@ class Oriented:
     residuals_px: NDArray[np.float64]
     numbers: PhotoNumbers | None = None
     entry: JsonValue = None
-    table: tuple[JsonValue, ...] = ()
+    table: tuple[ResidualRow, ...] = ()
     notes: tuple[str, ...] = ()
-    case: Case | None = None
+    candidate: Candidate | None = None
 
 
 def require(ties: Ties, photos: Photos) -> None:
@@ -107,7 +107,9 @@ def of_photo(ties: Ties, name: str) -> NDArray[np.intp]:
     return mine
 
 
-def sighting(photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator) -> Sighting:
+def tied_photo(
+    photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Generator
+) -> TiedPhoto:
     """Choose the ties of a photo and split them into control and check."""
     # Drawn for every photo, so that one photo's ties do not change the luck of the next.
     own = np.random.default_rng(int(rng.integers(_SEED_LIMIT)))
@@ -119,7 +121,7 @@ def sighting(photo: Photo, ties: Ties, params: OrientParams, rng: np.random.Gene
         sigma_m=ties.sigma_m[chosen],
     )
     size_px = (photo.width, photo.height)
-    return Sighting(
+    return TiedPhoto(
         photo=photo,
         chosen=chosen,
         seen=seen,
@@ -140,77 +142,79 @@ def each_by_itself(
     found = []
     for nth, photo in enumerate(photos.photos):
         ctx.progress(nth / len(photos.photos), photo.name)
-        sight = sighting(photo, ties, params, ctx.rng)
-        found.append(_by_itself(sight, ties, params, estimator))
+        tied = tied_photo(photo, ties, params, ctx.rng)
+        found.append(_by_itself(tied, ties, params, estimator))
     return found
 
 
-def _by_itself(sight: Sighting, ties: Ties, params: OrientParams, estimator: Estimator) -> Oriented:
-    reason = too_few(len(sight.seen))
+def _by_itself(tied: TiedPhoto, ties: Ties, params: OrientParams, estimator: Estimator) -> Oriented:
+    reason = too_few(len(tied.seen))
     if reason:
-        return refused(sight, reason)
-    estimate = estimator(sight.photo, sight.seen, sight.is_check, sight.rule)
+        return refused(tied, reason)
+    estimate = estimator(tied.photo, tied.seen, tied.is_check, tied.rule)
     if isinstance(estimate, str):
-        return refused(sight, estimate)
-    return judged(sight, case_of(sight, ties, params, estimate))
+        return refused(tied, estimate)
+    return judged(tied, candidate_of(tied, ties, params, estimate))
 
 
-def case_of(sight: Sighting, ties: Ties, params: OrientParams, estimate: Estimate) -> Case:
+def candidate_of(
+    tied: TiedPhoto, ties: Ties, params: OrientParams, estimate: Estimate
+) -> Candidate:
     """Bring together what an orientation is judged by."""
     used = np.zeros(len(ties.photo), dtype=np.bool_)
-    used[sight.chosen[estimate.agreeing]] = True
+    used[tied.chosen[estimate.agreeing]] = True
     known = known_walls(ties, used)
-    return Case(
-        photo=sight.photo,
-        seen=sight.seen,
-        is_check=sight.is_check,
-        walls=ties.wall[sight.chosen],
+    return Candidate(
+        photo=tied.photo,
+        seen=tied.seen,
+        is_check=tied.is_check,
+        walls=ties.wall[tied.chosen],
         estimate=estimate,
         known=known,
         error=wall_error(estimate.resection, known),
         rule=params.gates(),
-        search_radius_px=_search_radius_px(ties, sight.photo.name),
+        search_radius_px=_search_radius_px(ties, tied.photo.name),
     )
 
 
-def judged(sight: Sighting, case: Case) -> Oriented:
+def judged(tied: TiedPhoto, candidate: Candidate) -> Oriented:
     """Call an orientation ok, or say why not."""
-    reason = reason_against(case)
-    numbers = photo_numbers(case) if case.control.any() else None
-    entry: JsonValue = None if numbers is None else numbers_json(case, numbers)
+    reason = reason_against(candidate)
+    numbers = photo_numbers(candidate) if candidate.control.any() else None
+    entry: JsonValue = None if numbers is None else numbers_json(candidate, numbers)
     if reason:
-        return replace(refused(sight, reason), entry=entry)
-    result, estimate = case.estimate.resection, case.estimate
-    role = np.where(case.is_check, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
+        return replace(refused(tied, reason), entry=entry)
+    result, estimate = candidate.estimate.resection, candidate.estimate
+    role = np.where(candidate.is_check, TieRole.CHECK, TieRole.CONTROL).astype(np.uint8)
     role[~estimate.agreeing] = TieRole.REJECTED
     return Oriented(
         camera=Camera(
-            photo=case.photo.name,
+            photo=candidate.photo.name,
             status="ok",
             intrinsics=estimate.intrinsics,
             rotation_camera_from_world=result.camera.rotation,
             translation_camera_from_world=result.camera.translation,
             covariance=result.covariance[:6, :6],
-            sigma0_px=result.sigma0 * float(np.median(case.seen.sigma_px[case.control])),
-            sigma_wall_m=None if case.error is None else case.error.rms_m,
+            sigma0_px=result.sigma0 * float(np.median(candidate.seen.sigma_px[candidate.control])),
+            sigma_wall_m=None if candidate.error is None else candidate.error.rms_m,
         ),
-        chosen=sight.chosen,
+        chosen=tied.chosen,
         role=role,
         residuals_px=estimate.fit.residuals_px,
         numbers=numbers,
         entry=entry,
-        table=() if numbers is None else tuple(residual_table(case, numbers)),
-        notes=(*estimate.notes, *warnings_for(case)),
-        case=case,
+        table=() if numbers is None else tuple(residual_table(candidate, numbers)),
+        notes=(*estimate.notes, *warnings_for(candidate)),
+        candidate=candidate,
     )
 
 
-def refused(sight: Sighting, reason: str) -> Oriented:
+def refused(tied: TiedPhoto, reason: str) -> Oriented:
     """Give a photo without an orientation."""
-    n_ties = len(sight.chosen)
+    n_ties = len(tied.chosen)
     return Oriented(
-        camera=Camera(photo=sight.photo.name, status=reason),
-        chosen=sight.chosen,
+        camera=Camera(photo=tied.photo.name, status=reason),
+        chosen=tied.chosen,
         role=np.full(n_ties, TieRole.REJECTED, dtype=np.uint8),
         residuals_px=np.full((n_ties, 2), np.nan),
     )
@@ -228,7 +232,5 @@ def _usable(ties: Ties, name: str, n_most: int) -> NDArray[np.intp]:
 
 def _search_radius_px(ties: Ties, name: str) -> float:
     """What the matcher says of how far it looked for the ties of a photo."""
-    photos = ties.details.get("photos")
-    entry = photos.get(name) if isinstance(photos, Mapping) else None
-    radius = entry.get("search_radius_px") if isinstance(entry, Mapping) else None
-    return float(radius) if isinstance(radius, int | float) else math.inf
+    radius_px = dict(zip(ties.photo_names, ties.search_radius_px, strict=False)).get(name)
+    return math.inf if radius_px is None else radius_px

@@ -12,23 +12,27 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import Misfit, Resection, misfit, moved_origin
-from orthoflow_plugins.orient.block import Block, Observations, Points
-from orthoflow_plugins.orient.block_covariance import BlockCovariance, block_covariance
-from orthoflow_plugins.orient.block_solving import solve
-from orthoflow_plugins.orient.estimating import (
+from orthoflow.geometry.robust import MEDIAN_LENGTH
+from orthoflow_plugins.orient.block import (
+    Block,
+    BlockCovariance,
+    Observations,
+    Points,
+    block_covariance,
+)
+from orthoflow_plugins.orient.colmap import solve
+from orthoflow_plugins.orient.estimation import (
     SOFT_LIMIT,
     Estimate,
     posed,
     unit_deviation,
     without_chance,
 )
-from orthoflow_plugins.orient.lens_groups import LensGroups
-from orthoflow_plugins.orient.lenses import intrinsics_of
+from orthoflow_plugins.orient.lenses import LensGroups, intrinsics_of
 from orthoflow_plugins.orient.photo_ties import PhotoTies
-from orthoflow_plugins.orient.photowise import Sighting
+from orthoflow_plugins.orient.single_photo import TiedPhoto
 
 _ROUNDS: Final = 5
-_MEDIAN_LENGTH: Final = 1.1774
 _TIE_SIGMA_START_PX: Final = 0.5
 _TIE_SIGMA_RANGE_PX: Final = (0.1, 2.0)
 # Scan ties of several photos at one place of the wall are one point of the scan.
@@ -40,11 +44,11 @@ class Trusted:
     """A photo whose own ties orient it beyond chance.
 
     Attributes:
-        sight: its ties.
+        tied: its ties.
         estimate: its orientation by itself.
     """
 
-    sight: Sighting
+    tied: TiedPhoto
     estimate: Estimate
 
 
@@ -106,14 +110,14 @@ def adjust_block(photos: Sequence[Trusted], ties: PhotoTies, groups: LensGroups)
     Raises:
         GeometryError: the ties do not determine the block.
     """
-    middle = np.mean([item.sight.seen.points_world.mean(axis=0) for item in photos], axis=0)
+    middle = np.mean([item.tied.seen.points_world.mean(axis=0) for item in photos], axis=0)
     state = _start(photos, ties, groups, middle)
     fits: list[Misfit] = []
     limits: list[float] = []
     for nth in range(_ROUNDS):
         block = solve(_block(photos, ties, groups, state, middle), soft_limit=SOFT_LIMIT)
         fits = [
-            misfit(item.sight.seen, camera.shifted(-middle))
+            misfit(item.tied.seen, camera.shifted(-middle))
             for item, camera in zip(photos, block.cameras, strict=True)
         ]
         before = state
@@ -157,7 +161,7 @@ def _start(
     return _State(
         cameras=tuple(cameras),
         tie_points=ties.points_world - middle,
-        agreeing=tuple(item.estimate.agreeing & ~item.sight.is_check for item in photos),
+        agreeing=tuple(item.estimate.agreeing & ~item.tied.is_check for item in photos),
         units=tuple(max(item.estimate.resection.sigma0, 0.1) for item in photos),
         tie_active=np.ones(len(ties.photo), dtype=np.bool_),
         tie_sigma=_TIE_SIGMA_START_PX,
@@ -173,7 +177,7 @@ def _block(
 ) -> Block:
     """Join scan ties and ties between photos."""
     used = state.agreeing
-    seen = [item.sight.seen.take(chosen) for item, chosen in zip(photos, used, strict=True)]
+    seen = [item.tied.seen.take(chosen) for item, chosen in zip(photos, used, strict=True)]
     counts = [len(part) for part in seen]
     world = np.vstack([part.points_world for part in seen])
     sigmas = np.concatenate(
@@ -222,9 +226,9 @@ def _weighed(
     """Reject what disagrees with the block, and estimate how exact the rest is."""
     agreeing, units, limits = [], [], []
     for item, fit, used in zip(photos, fits, state.agreeing, strict=True):
-        is_check = item.sight.is_check
+        is_check = item.tied.is_check
         unit = unit_deviation(fit.normalised[used])
-        limit = without_chance(fit.normalised[~is_check], item.sight.rule.rejection_sigma * unit)
+        limit = without_chance(fit.normalised[~is_check], item.tied.rule.rejection_sigma * unit)
         agreeing.append((fit.normalised <= limit) & ~is_check)
         units.append(unit)
         limits.append(limit)
@@ -234,9 +238,9 @@ def _weighed(
         # Of 2 m coordinates, 3 go into the point.
         per_point = np.bincount(ties.point[active], minlength=len(state.tie_points))
         left = np.maximum(2 * per_point[per_point > 0] - 3, 1).sum() / (2 * active.sum())
-        sigma = float(np.median(lengths[active]) / _MEDIAN_LENGTH / math.sqrt(left))
+        sigma = float(np.median(lengths[active]) / MEDIAN_LENGTH / math.sqrt(left))
         sigma = float(np.clip(sigma, *_TIE_SIGMA_RANGE_PX))
-        rejection = photos[0].sight.rule.rejection_sigma
+        rejection = photos[0].tied.rule.rejection_sigma
         active = _in_several(ties.point, lengths <= rejection * sigma)
     return (
         _State(

@@ -1,0 +1,41 @@
+"""What key points need, whoever finds them: to cover a picture, and descriptors that compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Squared RootSIFT entries in units of 1/512: their sums stay below 2^24, so that float32 products
+# are exact, whatever the order a BLAS library adds in.
+_QUANTA: Final = 512.0
+
+
+def in_turns(
+    cell: NDArray[np.intp], keys: Sequence[NDArray[np.floating] | NDArray[np.intp]], n_most: int
+) -> NDArray[np.intp]:
+    """Positions (k,) of at most so many of n things, taken in turns from the cells of a grid.
+
+    So they cover what the cells cover; within a cell, the first come first.
+
+    Args:
+        cell: (n,) cell of each.
+        keys: (n,) each, what orders them; the last one first, as in `numpy.lexsort`.
+        n_most: at most so many.
+    """
+    order = np.lexsort((*keys, cell))
+    turn = np.arange(len(order)) - np.searchsorted(cell[order], cell[order])
+    taken = order[np.lexsort((*(key[order] for key in keys), turn))]
+    return np.asarray(taken[:n_most], dtype=np.intp)
+
+
+def root_sift(raw: NDArray[np.float32]) -> NDArray[np.float32]:
+    """RootSIFT of SIFT descriptors (n, 128) as whole numbers (Arandjelovic & Zisserman 2012).
+
+    Euclid's distance becomes Hellinger's.
+    """
+    total = np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
+    rooted: NDArray[np.float32] = np.rint(np.sqrt(raw / total) * _QUANTA).astype(np.float32)
+    return rooted

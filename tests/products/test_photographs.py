@@ -1,0 +1,187 @@
+"""Ties and orientations: what older encodings had among their details, and what they have now."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from orthoflow.geometry import WallFrame
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    JsonValue,
+    Payload,
+    ResidualRow,
+    TieRole,
+    Ties,
+    TieWall,
+    Wall,
+)
+
+CORNERS = [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 0.0, 2.0]]
+WALL = TieWall(
+    name="wall 0",
+    corners_world=tuple(map(tuple, CORNERS)),
+    normal_world=(0.0, -1.0, 0.0),
+    gsd_m=0.01,
+)
+NUMBERS: dict[str, JsonValue] = dict.fromkeys(
+    ("mean", "sd", "median", "nmad", "rmse", "p95", "max", "beyond_own", "beyond_any"), 0.25
+)
+ROW: dict[str, JsonValue] = {"photo": "a.jpg", "role": "check", "axis": "u", "unit": "px", "n": 3}
+
+
+def ties(**more: object) -> Ties:
+    return Ties(
+        photo_names=("a.jpg", "b.jpg"),
+        photo=np.array([0, 1], np.int32),
+        wall=np.zeros(2, np.int32),
+        pixels_photo=np.array([[1.5, 2.5], [3.5, 4.5]]),
+        points_world=np.array([[0.5, 0.0, 0.5], [1.5, 0.0, 1.0]]),
+        sigma_px=np.full(2, 0.5),
+        sigma_m=np.full(2, 0.001),
+        role=np.full(2, TieRole.CONTROL, np.uint8),
+        residual_px=np.full((2, 2), np.nan),
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def old_tie_metadata(details: dict[str, JsonValue]) -> dict[str, JsonValue]:
+    """Metadata of ties as version 1 had them."""
+    arrays: dict[str, JsonValue] = {
+        name: {"$array": "numeric"} for name in ties().to_payload().arrays
+    }
+    return {"photo_names": ["a.jpg", "b.jpg"], **arrays, "details": details}
+
+
+OLD_DETAILS: dict[str, JsonValue] = {
+    "photos": {
+        "a.jpg": {"n_key_points": 812, "search_radius_px": 22.0},
+        "b.jpg": {"n_key_points": 40},
+    },
+    "intensity_source": "laser",
+    "walls": [
+        {
+            "name": "wall 0",
+            "gsd_m": 0.01,
+            "normal": [0.0, -1.0, 0.0],
+            "corners_world": [list(corner) for corner in CORNERS],
+        }
+    ],
+}
+NEW_DETAILS = {
+    "photos": {"a.jpg": {"n_key_points": 812}, "b.jpg": {"n_key_points": 40}},
+    "intensity_source": "laser",
+}
+
+
+def test_ties_come_back_with_what_they_say_of_walls_and_of_the_search() -> None:
+    given = ties(walls=(WALL,), search_radius_px=(22.0, None))
+    found = Ties.from_payload(given.to_payload())
+    assert (found.walls, found.search_radius_px) == ((WALL,), (22.0, None))
+
+
+def test_ties_of_version_1_hand_over_what_their_details_had() -> None:
+    payload = Payload(
+        type_name="ties",
+        encoding_version=1,
+        metadata=old_tie_metadata(OLD_DETAILS),
+        arrays=ties().to_payload().arrays,
+    )
+    found = Ties.from_payload(payload)
+    assert found.walls == (WALL,)
+    assert found.search_radius_px == (22.0, None)
+    assert found.details == NEW_DETAILS
+    np.testing.assert_array_equal(found.pixels_photo, ties().pixels_photo)
+
+
+@pytest.mark.parametrize(
+    "details",
+    [{}, {"photos": ["a.jpg"], "walls": "two"}, {"walls": [{"gsd_m": 0.01}]}],
+    ids=["nothing", "other-words", "half-a-wall"],
+)
+def test_ties_of_version_1_keep_details_that_mean_something_else(
+    details: dict[str, JsonValue],
+) -> None:
+    payload = Payload(
+        type_name="ties",
+        encoding_version=1,
+        metadata=old_tie_metadata(details),
+        arrays=ties().to_payload().arrays,
+    )
+    found = Ties.from_payload(payload)
+    assert (found.walls, found.search_radius_px, found.details) == ((), (), details)
+
+
+def test_cameras_of_version_1_hand_over_their_table_and_the_facts_of_their_ties() -> None:
+    refused = Camera(photo="b.jpg", status="only 3 ties, 8 are needed")
+    rows: list[JsonValue] = [ROW | NUMBERS | {"shift_p": None}, ROW | NUMBERS | {"shift_p": 0.5}]
+    payload = Payload(
+        type_name="cameras",
+        encoding_version=1,
+        metadata={
+            "cameras": [{"photo": refused.photo, "status": refused.status}],
+            "ties": old_tie_metadata(OLD_DETAILS),
+            "details": {"residual_table": rows, "sigma0": 1.25},
+        },
+        arrays={f"ties/{name}": array for name, array in ties().to_payload().arrays.items()},
+    )
+    found = Cameras.from_payload(payload)
+    assert found.cameras == (refused,)
+    assert [row.shift_p for row in found.residual_table] == [None, 0.5]
+    assert dataclasses.asdict(found.residual_table[1]) == {
+        **ROW,
+        **NUMBERS,
+        "shift_p": 0.5,
+        "skewness": None,
+        "beyond_cells": None,
+    }
+    assert found.details == {"sigma0": 1.25}
+    assert found.ties is not None
+    assert (found.ties.walls, found.ties.search_radius_px) == ((WALL,), (22.0, None))
+    assert found.ties.details == NEW_DETAILS
+
+
+def test_a_table_of_other_rows_stays_where_it_was() -> None:
+    details: dict[str, JsonValue] = {"residual_table": [{"photo": "a.jpg", "u": 0.5}]}
+    payload = Payload(
+        type_name="cameras",
+        encoding_version=1,
+        metadata={"cameras": [], "details": details},
+        arrays={},
+    )
+    found = Cameras.from_payload(payload)
+    assert (found.residual_table, found.details, found.ties) == ((), details, None)
+
+
+def test_the_table_of_residuals_comes_back() -> None:
+    row = ResidualRow(**(ROW | NUMBERS))  # type: ignore[arg-type]
+    given = Cameras(cameras=(), residual_table=(row, dataclasses.replace(row, shift_p=0.5)))
+    assert Cameras.from_payload(given.to_payload()).residual_table == given.residual_table
+
+
+def test_what_ties_say_of_a_wall_is_what_its_raster_says() -> None:
+    frame = WallFrame(
+        origin_world=np.array([1.0, 2.0, 3.0]),
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=np.array([0.0, 0.0, -1.0]),
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=0.01,
+        width=4,
+        height=3,
+    )
+    raster = np.zeros(frame.shape, np.float32)
+    wall = Wall(
+        frame=frame,
+        plane_index=0,
+        name="north",
+        depth_m=raster,
+        sigma_m=raster,
+        count=np.ones(frame.shape, np.uint32),
+        mask=np.zeros(frame.shape, np.uint8),
+    )
+    found = TieWall.of(wall)
+    assert (found.name, found.gsd_m, found.normal_world) == ("north", 0.01, (0.0, -1.0, 0.0))
+    np.testing.assert_array_equal(found.corners_world, frame.corners_world())
