@@ -8,7 +8,7 @@ from orthoflow_provenance.model import (
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
+    Metric,
     RecordedProduct,
     RunRecord,
 )
@@ -48,7 +48,7 @@ __all__ = [
     "RecordedFigure",
     "RecordedFile",
     "RecordedInput",
-    "RecordedMetric",
+    "Metric",
     "RecordedProduct",
     "Run",
     "RunComparison",

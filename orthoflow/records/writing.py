@@ -16,7 +16,7 @@ from orthoflow_provenance.model import (
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
+    Metric,
     RecordedProduct,
     RunRecord,
 )
@@ -193,7 +193,7 @@ class _CellRecorder:
             environment=str(result.environment.get("id", "")),
             cached_from=self.outcome.cached.get(cell.address, ""),
             metrics=tuple(
-                RecordedMetric(name=metric.name, value=metric.value, unit=metric.unit)
+                Metric(name=metric.name, value=metric.value, unit=metric.unit)
                 for metric in result.metrics
             ),
             figures=tuple(_recorded_figure(figure, self.store) for figure in result.figures),

@@ -18,13 +18,13 @@ from hypothesis import strategies as st
 from orthoflow_provenance.digests import payload_digest, sha256_text
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.model import (
+    Metric,
     PublishedFile,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
     RecordedProduct,
     RunRecord,
 )
@@ -77,7 +77,7 @@ CELL = st.builds(
     peak_rss_mib=NUMBER,
     environment=TEXT,
     cached_from=TEXT,
-    metrics=st.lists(st.builds(RecordedMetric, name=TEXT, value=NUMBER, unit=TEXT), max_size=3).map(
+    metrics=st.lists(st.builds(Metric, name=TEXT, value=NUMBER, unit=TEXT), max_size=3).map(
         tuple
     ),
     figures=st.lists(

@@ -17,12 +17,12 @@ import orthoflow
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import Planes
 from orthoflow.records import (
+    Metric,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
     RecordedProduct,
     Run,
     cell_metrics,
@@ -80,7 +80,7 @@ def planes_cell(digest: str) -> RecordedCell:
         wall_s=1.5,
         cpu_s=1.25,
         peak_rss_mib=128.0,
-        metrics=(RecordedMetric(name="rms_mm", value=2.0, unit="mm"),),
+        metrics=(Metric(name="rms_mm", value=2.0, unit="mm"),),
         figures=(RecordedFigure(name="plan", caption="seen", media_type="image/png", data=PNG),),
         warnings=("the side of the viewer is a guess",),
         inputs={
@@ -222,7 +222,7 @@ def test_published_files_and_metrics_lie_below_products(run: Run) -> None:
 def test_numbers_in_metrics_csv_keep_every_digit(tmp_path: Path) -> None:
     value = 0.1 + 0.2
     cell = dataclasses.replace(
-        cloud_cell(), metrics=(RecordedMetric(name="x", value=value, unit="1"),)
+        cloud_cell(), metrics=(Metric(name="x", value=value, unit="1"),)
     )
     write_metrics_csv(tmp_path / "metrics.csv", cell_metrics(cell))
     with (tmp_path / "metrics.csv").open(encoding="utf-8", newline="") as file:
