@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from orthoflow_provenance.model import (
+    COSTS,
+    Metric,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    Metric,
     RecordedProduct,
     RunRecord,
 )
 
+from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.records.comparison import (
     CellFacts,
-    MetricValue,
+    ComparedMetric,
     Pair,
     ParameterValue,
     RunComparison,
@@ -29,17 +31,19 @@ from orthoflow.records.product_distances import (
     Verdict,
     product_distances,
 )
-from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run, open_run
+from orthoflow.records.runs import REPORT_FILE, Run, open_run
 from orthoflow.records.verification import Verification, verify_run
 from orthoflow.records.writing import write_run
 
 __all__ = [
+    "COSTS",
     "RECORD_FILE",
     "REPORT_FILE",
     "CellFacts",
+    "ComparedMetric",
     "Distance",
+    "Metric",
     "MetricRow",
-    "MetricValue",
     "Pair",
     "ParameterValue",
     "ProductDistance",
@@ -48,7 +52,6 @@ __all__ = [
     "RecordedFigure",
     "RecordedFile",
     "RecordedInput",
-    "Metric",
     "RecordedProduct",
     "Run",
     "RunComparison",

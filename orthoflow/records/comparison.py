@@ -6,9 +6,9 @@ import difflib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
-from orthoflow_provenance.model import RecordedCell, RecordedFile, RunRecord
+from orthoflow_provenance.model import COSTS, RecordedCell, RecordedFile, RunRecord
 
 from orthoflow.products.product import JsonValue
 from orthoflow.records.metrics import cell_metrics
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from orthoflow.engine import Store
 
 Side = TypeVar("Side")
-_COSTS: Final = ("wall_s", "cpu_s", "peak_rss_mib")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +84,7 @@ class CellFacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricValue:
+class ComparedMetric:
     """One number of one cell; equal when value and unit are.
 
     Attributes:
@@ -128,7 +127,7 @@ class RunComparison:
     cells: tuple[Pair[CellFacts], ...]
     parameters: tuple[Pair[ParameterValue], ...]
     environment: tuple[Pair[str], ...]
-    metrics: tuple[Pair[MetricValue], ...]
+    metrics: tuple[Pair[ComparedMetric], ...]
     products: tuple[ProductDistance, ...]
 
 
@@ -214,12 +213,12 @@ def _parameters(cell: RecordedCell) -> dict[str, ParameterValue]:
     }
 
 
-def _metrics(cell: RecordedCell) -> dict[str, MetricValue]:
+def _metrics(cell: RecordedCell) -> dict[str, ComparedMetric]:
     return {
-        row.metric: MetricValue(
+        row.metric: ComparedMetric(
             value=row.value,
             unit=row.unit,
-            is_cost=row.metric in _COSTS,
+            is_cost=row.metric in COSTS,
             is_cached=bool(cell.cached_from),
             environment=cell.environment,
         )

@@ -10,11 +10,11 @@ from typing import Final
 
 from orthoflow_provenance.model import RecordedCell, RunRecord
 
+from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.products.product import JsonValue
 from orthoflow.records import crate_entities as entities
 from orthoflow.records.crate_entities import RESOLVED_FILE, WORKFLOW_FILE, Entity, ref, refs
 from orthoflow.records.published import PRODUCTS_FOLDER
-from orthoflow.records.runs import RECORD_FILE
 
 METADATA_FILE: Final = "ro-crate-metadata.json"
 _CRATE: Final = "https://w3id.org/ro/crate/1.1"

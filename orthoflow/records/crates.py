@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.durability import writing_to
+from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.records.crate_entities import RESOLVED_FILE, WORKFLOW_FILE, environment_file
 from orthoflow.records.crate_graph import METADATA_FILE, crate_metadata
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
-from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run
+from orthoflow.records.runs import REPORT_FILE, Run
 
 NO_LICENSE: Final = "not stated: ask who made these results"
 

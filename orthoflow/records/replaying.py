@@ -273,8 +273,8 @@ def _environment_notes(run: Run) -> Iterator[str]:
     here = environment(1)
     for recorded in run.record.environments:
         for name in _ENVIRONMENT:
-            if getattr(recorded, name) != here[name]:
-                yield f"{name}: {here[name]} here, {getattr(recorded, name)} in the record"
+            if getattr(recorded, name) != getattr(here, name):
+                yield f"{name}: {getattr(here, name)} here, {getattr(recorded, name)} in the record"
 
 
 def _method_notes(run: Run, plan: RunPlan) -> Iterator[str]:

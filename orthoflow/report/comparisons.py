@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Final
 
-from orthoflow.records import Run, cell_metrics
+from orthoflow.records import COSTS, Run, cell_metrics
 from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics
 from orthoflow.report.numbers import metric_label, number, number_with_spread
 from orthoflow.report.origins import Origins
 from orthoflow.report.rankings import Value, rank
 from orthoflow.report.senses import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
-
-_COSTS: Final = ("wall_s", "cpu_s", "peak_rss_mib")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +126,7 @@ def _matching(patterns: Iterable[str], known: Iterable[tuple[str, str]]) -> list
     for pattern in patterns:
         for step, metric in known:
             # `*.wall_s` asks for every step's time; the table sums it up in a column of its own.
-            is_summed = pattern.startswith("*.") and metric in _COSTS
+            is_summed = pattern.startswith("*.") and metric in COSTS
             if not is_summed and fnmatchcase(f"{step}.{metric}", pattern):
                 found[step, metric] = None
     return list(found)

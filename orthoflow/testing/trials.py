@@ -11,7 +11,7 @@ import numpy as np
 from orthoflow.engine.store import digest_of
 from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method, Metric, StepContext, StepEvent
-from orthoflow.sdk.context import Drawing, Figure
+from orthoflow.sdk.context import Drawing, DrawnFigure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class TrialRun:
     outputs: Mapping[str, Product]
     digests: Mapping[str, str]
     metrics: tuple[Metric, ...]
-    figures: tuple[Figure, ...]
+    figures: tuple[DrawnFigure, ...]
     events: tuple[StepEvent, ...]
     fractions: tuple[float, ...] = ()
 

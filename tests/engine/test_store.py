@@ -19,8 +19,13 @@ from numpy.typing import NDArray
 
 from orthoflow.engine import CellResult, ProductRef, Store, collect_garbage, list_results
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.result_files import result_from_json, result_to_json
-from orthoflow.engine.results import FigureRef, MetricValue
+from orthoflow.engine.results import (
+    FigureRef,
+    Metric,
+    RecordedEnvironment,
+    result_from_json,
+    result_to_json,
+)
 from orthoflow.engine.store import digest_of
 from orthoflow.errors import ArgumentError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
@@ -172,14 +177,23 @@ def test_a_result_comes_back_equal(store: Store) -> None:
     result = dataclasses.replace(
         ok_result(store, heights()),
         citations=("doi:1",),
-        metrics=(MetricValue(name="rms_mm", value=0.1, unit="mm"),),
+        metrics=(Metric(name="rms_mm", value=0.1, unit="mm"),),
         figures=(
             FigureRef(
                 name="f", caption="c", media_type="image/png", sha256=store.put_blob(b"\x89PNG")
             ),
         ),
         warnings=("half of it is missing",),
-        environment={"id": "sha256:0", "packages": {"numpy": "2"}},
+        environment=RecordedEnvironment(
+            id="sha256:0",
+            python="3",
+            os="Linux",
+            cpu="any",
+            cores=2,
+            threads=1,
+            git_commit="",
+            packages={"numpy": "2"},
+        ),
         log="λ\nline",
         seed=2**53 - 1,
     )

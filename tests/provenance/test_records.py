@@ -77,9 +77,7 @@ CELL = st.builds(
     peak_rss_mib=NUMBER,
     environment=TEXT,
     cached_from=TEXT,
-    metrics=st.lists(st.builds(Metric, name=TEXT, value=NUMBER, unit=TEXT), max_size=3).map(
-        tuple
-    ),
+    metrics=st.lists(st.builds(Metric, name=TEXT, value=NUMBER, unit=TEXT), max_size=3).map(tuple),
     figures=st.lists(
         st.builds(
             RecordedFigure, name=TEXT, caption=TEXT, media_type=TEXT, data=st.binary(max_size=20)
