@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 
 from orthoflow import __version__
 from orthoflow.errors import StoreError
-from orthoflow.records import Run, compare_runs
+from orthoflow.records import COSTS, Run, compare_runs
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table
 from orthoflow.report.diagrams import run_diagram
@@ -134,6 +134,7 @@ def _template() -> jinja2.Template:
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote
     # Ours, and no template: braces in them mean nothing.
+    environment.globals["costs"] = COSTS
     environment.globals["css"] = Markup(_packaged("page.css"))
     environment.globals["script"] = Markup(_packaged("page.js"))
     return environment.get_template("page.html.j2")

@@ -11,7 +11,6 @@ import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import Enum
-from functools import cache
 from typing import Annotated, Any, Final, Literal, Protocol, TypeAlias
 
 import numpy as np
@@ -34,8 +33,19 @@ class Stored(Enum):
 
 
 LongText: TypeAlias = Annotated[str, Stored.DATASET]
-Seconds: TypeAlias = Annotated[float, "s"]
-Mebibytes: TypeAlias = Annotated[float, "MiB"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """What the annotation of a measured number says of it.
+
+    Attributes:
+        label: what tables call it, beside its unit.
+        unit: as in metrics.
+    """
+
+    label: str
+    unit: str
 
 
 class PayloadLike(Protocol):
@@ -220,8 +230,7 @@ class MethodIdentity:
 class Costs:
     """What one execution of a method took; in a record that of the run that computed it.
 
-    A field's type says its unit. One that came with a later version of the format is None where an
-    older record does not state it.
+    One that came with a later version of the format is None where an older record lacks it.
 
     Attributes:
         wall_s: seconds on the clock.
@@ -229,12 +238,15 @@ class Costs:
         peak_rss_mib: largest memory of the step's process.
     """
 
-    wall_s: Seconds = 0.0
-    cpu_s: Seconds = 0.0
-    peak_rss_mib: Mebibytes = 0.0
+    wall_s: Annotated[float, Quantity(label="time", unit="s")] = 0.0
+    cpu_s: Annotated[float, Quantity(label="processor", unit="s")] = 0.0
+    peak_rss_mib: Annotated[float, Quantity(label="memory", unit="MiB")] = 0.0
 
 
-COSTS: Final = tuple(item.name for item in fields(Costs))
+COSTS: Final[Mapping[str, Quantity]] = {
+    name: hint.__metadata__[0]
+    for name, hint in typing.get_type_hints(Costs, include_extras=True).items()
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,10 +352,10 @@ class RunRecord:
 
 def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
     """What was measured as metrics, in the order of the fields; what is not stated is left out."""
-    measured = ((name, getattr(costs, name), unit) for name, unit in _cost_units().items())
+    measured = {name: getattr(costs, name) for name in COSTS}
     return tuple(
-        Metric(name=name, value=float(value), unit=unit)
-        for name, value, unit in measured
+        Metric(name=name, value=float(value), unit=COSTS[name].unit)
+        for name, value in measured.items()
         if value is not None
     )
 
@@ -352,16 +364,3 @@ def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
 def shared_fields(source: object, part: type) -> dict[str, Any]:
     """Give what an object says in the fields of a part that it has, to hand on as keywords."""
     return {item.name: getattr(source, item.name) for item in fields(part)}
-
-
-@cache
-def _cost_units() -> dict[str, str]:
-    hints = typing.get_type_hints(Costs, include_extras=True)
-    return {name: _unit(hints[name]) for name in COSTS}
-
-
-def _unit(hint: object) -> str:
-    annotated = [hint, *typing.get_args(hint)]
-    return next(
-        str(one.__metadata__[0]) for one in annotated if typing.get_origin(one) is Annotated
-    )
