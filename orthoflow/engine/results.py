@@ -78,6 +78,12 @@ class CellResult(CellOutcome):
     traceback: str = ""
     exit_code: int = 0
 
+    @property
+    def objects(self) -> frozenset[str]:
+        """Names of the store's objects that it refers to: products and figures."""
+        products = {ref.digest.removeprefix("sha256:") for ref in self.outputs.values()}
+        return frozenset(products | {figure.sha256 for figure in self.figures})
+
 
 def result_to_json(result: CellResult) -> str:
     """Give a result as JSON text."""

@@ -158,10 +158,9 @@ class _Call:
             self._wall_s = round(time.perf_counter() - wall, 4)
             self._cpu_s = round(_cpu_s() - cpu, 4)
         self._check_inputs(inputs)
-        refs = self._keep(self._products(cls, outputs))
         return dataclasses.replace(
             blank_result(self.task),
-            outputs=refs,
+            outputs=self._keep(self._products(cls, outputs)),
             metrics=tuple(self._context.metrics),
             figures=self._keep_figures(),
         )

@@ -274,6 +274,10 @@ class Store:
         )
         return result if is_complete else None
 
+    def size_bytes(self, result: CellResult) -> int:
+        """What a result's products, their published files and its figures take here."""
+        return sum(folder_size(self.objects / name) for name in result.objects)
+
     def touch(self, key: str) -> None:
         """Note that a result was used now; garbage collection keeps what is used."""
         with contextlib.suppress(OSError):
@@ -360,8 +364,6 @@ def list_results(store: Store) -> tuple[StoredResult, ...]:
             used = time_of_file(path.stat().st_mtime)
         except (StoreError, OSError, UnicodeDecodeError):
             continue
-        digests = {ref.digest.removeprefix("sha256:") for ref in result.outputs.values()}
-        digests |= {figure.sha256 for figure in result.figures}
         found.append(
             StoredResult(
                 key=path.stem,
@@ -369,7 +371,7 @@ def list_results(store: Store) -> tuple[StoredResult, ...]:
                 run_id=result.run_id,
                 ended=result.ended,
                 last_used=used,
-                size_bytes=sum(folder_size(store.objects / digest) for digest in digests),
+                size_bytes=store.size_bytes(result),
                 is_complete=store.result(path.stem) is not None,
             )
         )
