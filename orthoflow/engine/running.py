@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import store_error, writing_to
-from orthoflow.engine.memory import MemorySampler
+from orthoflow.engine.memory import MIB, MemorySampler
 from orthoflow.engine.results import (
     CellResult,
     Costs,
@@ -128,6 +128,7 @@ class _Call:
         self.task = task
         self._wall_s = 0.0
         self._cpu_s = 0.0
+        self._stored_mib: float | None = None
         self._store = Store(Path(task.store), workspace=Path(task.folder))
         with writing_to(self._store.folder):
             task.scratch.mkdir(parents=True, exist_ok=True)
@@ -145,7 +146,12 @@ class _Call:
 
     def costs(self, sampler: MemorySampler) -> Costs:
         """What the call took so far."""
-        return Costs(wall_s=self._wall_s, cpu_s=self._cpu_s, peak_rss_mib=sampler.peak_mib)
+        return Costs(
+            wall_s=self._wall_s,
+            cpu_s=self._cpu_s,
+            peak_rss_mib=sampler.peak_mib,
+            stored_mib=self._stored_mib,
+        )
 
     def run(self) -> CellResult:
         cls = cast("type[Method]", load_target(self.task.target))
@@ -158,12 +164,14 @@ class _Call:
             self._wall_s = round(time.perf_counter() - wall, 4)
             self._cpu_s = round(_cpu_s() - cpu, 4)
         self._check_inputs(inputs)
-        return dataclasses.replace(
+        result = dataclasses.replace(
             blank_result(self.task),
             outputs=self._keep(self._products(cls, outputs)),
             metrics=tuple(self._context.metrics),
             figures=self._keep_figures(),
         )
+        self._stored_mib = round(self._store.size_bytes(result) / MIB, 3)
+        return result
 
     def _read(self, given: TaskInput) -> Product | InputFiles:
         if given.input_name:

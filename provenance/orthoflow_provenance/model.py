@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 RUN_FORMAT: Final = "orthoflow-run"
 # Of the record; the minor number rises with every field that is added below (SPEC, 1.2).
-RUN_FORMAT_VERSION: Final = "1.1"
+RUN_FORMAT_VERSION: Final = "1.2"
 
 JsonValue: TypeAlias = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
 CellStatus = Literal["ok", "failed", "skipped"]
@@ -236,11 +236,14 @@ class Costs:
         wall_s: seconds on the clock.
         cpu_s: processor seconds of the step's process.
         peak_rss_mib: largest memory of the step's process.
+        stored_mib: what its products, their published files and its figures take in the store;
+            equal ones of several cells lie there once. None for cells without a result too.
     """
 
     wall_s: Annotated[float, Quantity(label="time", unit="s")] = 0.0
     cpu_s: Annotated[float, Quantity(label="processor", unit="s")] = 0.0
     peak_rss_mib: Annotated[float, Quantity(label="memory", unit="MiB")] = 0.0
+    stored_mib: Annotated[float | None, Quantity(label="stored", unit="MiB")] = None
 
 
 COSTS: Final[Mapping[str, Quantity]] = {

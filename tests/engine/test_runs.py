@@ -85,6 +85,7 @@ def test_a_result_says_where_it_comes_from(world: World) -> None:
     assert result.environment == environment(1)
     assert result.started <= result.ended <= outcome.ended
     assert result.peak_rss_mib > 10
+    assert result.stored_mib == round(world.store.size_bytes(result) / 2**20, 3) > 0.0
 
 
 def test_the_environment_holds_versions_but_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
