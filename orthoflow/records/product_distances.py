@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 from orthoflow_provenance.compare import ArrayDifference, measure_payloads
+from orthoflow_provenance.digests import payload_digest
 
 from orthoflow.errors import OrthoflowError
-from orthoflow.products.product import Payload, Product
+from orthoflow.products.product import JsonValue, Payload, Product
 from orthoflow.records.runs import Run
 
 if TYPE_CHECKING:
@@ -84,11 +85,24 @@ class RunProducts:
         output = None if cell is None else cell.outputs.get(port)
         return "" if output is None else output.digest
 
+    def encoding_version(self, address: str, port: str) -> int:
+        """Version of the encoding in which an output was written."""
+        return self.run.cells[address].outputs[port].encoding_version
+
     def payload(self, address: str, port: str, cls: type[Product]) -> Payload | None:
-        """Arrays and metadata of an output, None when they are nowhere to be found."""
+        """Arrays and metadata of an output as the present encoding has them.
+
+        None when they are nowhere to be found.
+
+        Raises:
+            ProductError: the output is of a newer encoding than the installed type.
+        """
         output = self.run.cells[address].outputs[port]
         if output.embedded:
-            return self.run.payload(address, port)
+            payload = self.run.payload(address, port)
+            if payload.encoding_version == cls.encoding_version:
+                return payload
+            return cls.from_payload(payload).to_payload()
         for store in self.stores:
             if store.product_file(output.digest) is not None:
                 return store.get_product(output.digest, cls).to_payload()
@@ -151,14 +165,43 @@ def _distance(
             "the digests differ, and its arrays are in no record and no store at hand; run with "
             "--embed to keep them",
         )
+    encodings = {side.encoding_version(address, port) for side in (left, right)}
+    if len(encodings) > 1:
+        ours, theirs = _common(ours, theirs)
     limits = {name: (limit.limit, limit.unit) for name, limit in cls.tolerances.items()}
     differences = measure_payloads(ours, theirs, limits)
     beyond = [difference for difference in differences if difference.n_values]
     if not beyond:
-        return verdict("within tolerance", "", _by_unit(differences))
+        is_same = payload_digest(ours) == payload_digest(theirs)
+        return verdict("identical" if is_same else "within tolerance", "", _by_unit(differences))
     others = f"; {len(beyond) - 1} more fields differ" if len(beyond) > 1 else ""
     reason = f"{beyond[0].name}: {beyond[0].problem}{others}"
     return verdict("different", reason, _by_unit(differences))
+
+
+def _common(left: Payload, right: Payload) -> tuple[Payload, Payload]:
+    """Leave out what only one of two encodings states: nothing can be said of a distance there."""
+    return _without_strangers(left, right), _without_strangers(right, left)
+
+
+def _without_strangers(payload: Payload, other: Payload) -> Payload:
+    return replace(
+        payload,
+        metadata={
+            name: _shared(value, other.metadata[name])
+            for name, value in payload.metadata.items()
+            if name in other.metadata
+        },
+        arrays={name: array for name, array in payload.arrays.items() if name in other.arrays},
+    )
+
+
+def _shared(value: JsonValue, other: JsonValue) -> JsonValue:
+    if isinstance(value, dict) and isinstance(other, dict):
+        return {key: _shared(value[key], other[key]) for key in value if key in other}
+    if isinstance(value, list) and isinstance(other, list) and len(value) == len(other):
+        return [_shared(a, b) for a, b in zip(value, other, strict=True)]
+    return value
 
 
 def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:

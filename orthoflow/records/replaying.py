@@ -208,7 +208,8 @@ class _MethodCheck:
             cls = self.catalog.method(cell.method).load()
             for product in cell.outputs.values():
                 found = self.catalog.product_class(product.type_name).encoding_version
-                if found != product.encoding_version:
+                # Older encodings are read; a newer one is of a later version of the type.
+                if found < product.encoding_version:
                     _add(
                         self.others,
                         f"product type {product.type_name}: the installed one has encoding "
