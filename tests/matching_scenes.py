@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orthoflow.testing.textured_walls import (
+from orthoflow.testing.photographed import (
     DISTORTION,
     GSD_M,
     RELIEF_M,

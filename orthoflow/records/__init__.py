@@ -18,19 +18,17 @@ from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.records.comparison import (
     CellFacts,
     ComparedMetric,
+    Distance,
     Pair,
     ParameterValue,
-    RunComparison,
-    compare_runs,
-)
-from orthoflow.records.metrics import MetricRow, cell_metrics
-from orthoflow.records.product_distances import (
-    Distance,
     ProductDistance,
+    RunComparison,
     RunProducts,
     Verdict,
+    compare_runs,
     product_distances,
 )
+from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.runs import REPORT_FILE, Run, open_run
 from orthoflow.records.verification import Verification, verify_run
 from orthoflow.records.writing import write_run

@@ -16,7 +16,7 @@ from orthoflow.engine.environment import environment
 from orthoflow.engine.keys import input_digest
 from orthoflow.engine.plan import RunPlan, plan_run
 from orthoflow.errors import PluginError, RecordError, WorkflowError
-from orthoflow.records.input_search import find_inputs
+from orthoflow.records.input_files import find_inputs
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
 from orthoflow.workflow import Cell, CellOutput, Workflow, WorkflowInput

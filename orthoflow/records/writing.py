@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
@@ -28,11 +28,14 @@ from orthoflow_provenance.writer import write_record
 
 from orthoflow import __version__
 from orthoflow.engine.durability import sync_folder, writing_to
+from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.errors import InputError, StoreError
+from orthoflow.records.input_files import embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
 from orthoflow.workflow import resolved_json
+from orthoflow.workflow.resolved import workflow_from_resolved
 
 if TYPE_CHECKING:
     from orthoflow.engine import CellResult, RunOutcome, RunPlan, Store
@@ -148,6 +151,53 @@ def build_record(
     )
 
 
+def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = ()) -> Run:
+    """Write the record of a run again with every product and every input file in it.
+
+    Args:
+        run: the run.
+        path: the new record; its folder exists.
+        store: holds the products that the run's record names by digest only.
+        inputs: `NAME=PATH`, each as behind `--input`; other files are looked for by content.
+
+    Returns:
+        The run, with the new record.
+
+    Raises:
+        InputError: an input file is missing or was changed.
+        StoreError: a product is in neither record nor store, or the disk refuses.
+        InvalidArgumentsError: `inputs` names no input of the workflow.
+    """
+    _check_products(run, store)
+    with embedded_inputs(run, path.parent) as extracted:
+        files = _input_files(run, store.file_digests(), inputs, extracted)
+        record = dataclasses.replace(
+            run.record,
+            inputs=tuple(
+                dataclasses.replace(entry, embedded=bool(entry.files))
+                for entry in run.record.inputs
+            ),
+            cells=tuple(
+                dataclasses.replace(
+                    cell,
+                    outputs={
+                        port: dataclasses.replace(output, embedded=True)
+                        for port, output in cell.outputs.items()
+                    },
+                )
+                for cell in run.record.cells
+            ),
+        )
+        try:
+            with writing_to(path.parent):
+                write_record(
+                    path, record, store.product_file, input_file=files.get, earlier=run.path
+                )
+        except RecordFormatError as error:
+            raise StoreError(f"{path} cannot be written: {error}") from error
+    return Run(path=path, record=record)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _CellRecorder:
     """Turns cells with their results into recorded cells."""
@@ -222,4 +272,38 @@ def _published(outcome: RunOutcome, store: Store) -> dict[str, dict[str, tuple[P
     return {
         address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
         for address, result in outcome.results.items()
+    }
+
+
+def _check_products(run: Run, store: Store) -> None:
+    missing = [
+        f"{address}.{port} ({output.digest})"
+        for address, cell in run.cells.items()
+        for port, output in cell.outputs.items()
+        if not output.embedded and store.product_file(output.digest) is None
+    ]
+    if missing:
+        raise StoreError(
+            f"neither the record {run.path} nor the store {store.folder} has "
+            f"{', '.join(missing)}: name the store of the run with --store, or replay the run"
+        )
+
+
+def _input_files(
+    run: Run,
+    digests: FileDigests,
+    given: Sequence[str],
+    extracted: Mapping[str, tuple[Path, ...]],
+) -> dict[str, Path]:
+    record = run.record
+    workflow = workflow_from_resolved(record.workflow_resolved, record.workflow_source)
+    search = find_inputs(
+        workflow, record.inputs, run.folder, digests, given=given, extracted=extracted
+    )
+    if search.problems:
+        raise InputError("; ".join(search.problems))
+    return {
+        file.sha256: place
+        for entry in record.inputs
+        for file, place in zip(entry.files, search.paths[entry.name], strict=True)
     }

@@ -43,7 +43,7 @@ class TrialRun:
         metrics: what the method reported.
         figures: pictures, still in the scratch folder.
         events: progress, log lines and warnings, in order.
-        fractions: progress as the method told it, before the context kept it from going back.
+        fractions: progress as the method stated it, before the context kept it from going back.
     """
 
     outputs: Mapping[str, Product]
@@ -56,7 +56,7 @@ class TrialRun:
 
 @dataclass(kw_only=True)
 class _WatchedContext(StepContext):
-    """Remembers every fraction that it was told."""
+    """Remembers every fraction that it was given."""
 
     fractions: list[float] = field(default_factory=list)
     draws: bool = True
