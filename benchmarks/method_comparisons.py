@@ -23,8 +23,7 @@ from orthoflow.records import Run, open_run
 from orthoflow.report import write_report
 from orthoflow.report.combinations import Combination, combinations_of
 from orthoflow.report.numbers import number, number_with_spread
-from orthoflow.report.rankings import Mark, Value, rank
-from orthoflow.report.senses import sense_of
+from orthoflow.report.rankings import Mark, Value, rank, sense_of
 
 RECIPES = ("plane-methods", "orient-methods", "ortho-methods")
 COARSE = {"room.scan_step_m": "0.004", "room.photo_gsd_m": "0.003", "wall.gsd_m": "0.006"}

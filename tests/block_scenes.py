@@ -9,7 +9,7 @@ import numpy as np
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photos, Ties, TieWall
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 
 _VIEWS = (
     ((0.8, -2.4, 1.1), (1.3, 0.0, 1.0), 0.0),

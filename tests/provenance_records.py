@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from orthoflow_provenance.digests import canonical_json, sha256_text
 from orthoflow_provenance.model import (
     JsonValue,
+    Metric,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
     RecordedProduct,
     RunRecord,
 )
@@ -109,8 +109,8 @@ def sample_record(cloud_digest: str, walls_digest: str) -> RunRecord:
                 )
             },
             metrics=(
-                RecordedMetric(name="rms_mm", value=1.25, unit="mm"),
-                RecordedMetric(name="cells", value=5400.0, unit="1"),
+                Metric(name="rms_mm", value=1.25, unit="mm"),
+                Metric(name="cells", value=5400.0, unit="1"),
             ),
             figures=(
                 RecordedFigure(

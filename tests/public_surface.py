@@ -60,7 +60,9 @@ def differences(before: list[str], now: list[str]) -> list[str]:
 
 
 def _path(module: str) -> Path:
-    path = ROOT.joinpath(*module.split("."))
+    # The words of a record, which the sdk hands on, lie in the lowest package.
+    root = ROOT / "provenance" if module.startswith("orthoflow_provenance") else ROOT
+    path = root.joinpath(*module.split("."))
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 from orthoflow_provenance.model import (
+    Metric,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
-    RecordedMetric,
     RecordedProduct,
     RunRecord,
 )
@@ -82,11 +82,11 @@ def cell(address: str, **more: object) -> RecordedCell:
     return RecordedCell(**{**wanted, **more})  # type: ignore[arg-type]
 
 
-def metrics(**values: float) -> tuple[RecordedMetric, ...]:
+def metrics(**values: float) -> tuple[Metric, ...]:
     """Metrics whose unit is what their name ends with."""
     units = {"mm": "mm", "deg": "deg", "s": "s"}
     return tuple(
-        RecordedMetric(name=name, value=value, unit=units.get(name.rpartition("_")[2], "1"))
+        Metric(name=name, value=value, unit=units.get(name.rpartition("_")[2], "1"))
         for name, value in values.items()
     )
 

@@ -19,7 +19,7 @@ from orthoflow.cli.tables import counted, echo_distances, echo_json, echo_table,
 if TYPE_CHECKING:
     from orthoflow.records import (
         CellFacts,
-        MetricValue,
+        ComparedMetric,
         Pair,
         ParameterValue,
         RecordedFile,
@@ -152,7 +152,7 @@ def _parameter_text(parameter: ParameterValue) -> str:
     return f"{text}*" if parameter.is_set else text
 
 
-def _print_metrics(rows: Sequence[Pair[MetricValue]]) -> None:
+def _print_metrics(rows: Sequence[Pair[ComparedMetric]]) -> None:
     """Print every metric that differs; time and memory always do, so they are not counted."""
     is_measured = [not _side(row).is_cost for row in rows]
     is_different = [_value(row.left) != _value(row.right) for row in rows]
@@ -177,12 +177,12 @@ def _print_metrics(rows: Sequence[Pair[MetricValue]]) -> None:
     )
 
 
-def _side(row: Pair[MetricValue]) -> MetricValue:
+def _side(row: Pair[ComparedMetric]) -> ComparedMetric:
     side = row.left or row.right
     if side is None:
         raise AssertionError("a row stands for something that a run has")
     return side
 
 
-def _value(side: MetricValue | None) -> float | None:
+def _value(side: ComparedMetric | None) -> float | None:
     return None if side is None else side.value

@@ -180,7 +180,7 @@ def _export_embedded(run: Run, folder: Path, chosen: _Choices) -> str:
 def _embedded(run: Run, folder: Path, chosen: _Choices) -> Run:
     from orthoflow.engine import Store
     from orthoflow.records import RECORD_FILE
-    from orthoflow.records.embedding import write_embedded
+    from orthoflow.records.writing import write_embedded
 
     return write_embedded(run, folder / RECORD_FILE, Store(chosen.store), chosen.inputs)
 

@@ -62,9 +62,9 @@ def replay(
     """
     from orthoflow.catalog import discover_catalog
     from orthoflow.engine import RunOptions, Store
-    from orthoflow.engine.journal import new_run_id
+    from orthoflow.engine.run_folder import new_run_id
     from orthoflow.records import open_run
-    from orthoflow.records.embedding import embedded_inputs
+    from orthoflow.records.input_files import embedded_inputs
     from orthoflow.records.replaying import plan_replay
 
     options = RunOptions(jobs=jobs, executor=executor)

@@ -81,7 +81,7 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report and say what came out."""
-        from orthoflow.engine.journal import new_run_id
+        from orthoflow.engine.run_folder import new_run_id
         from orthoflow.records import REPORT_FILE, write_run
         from orthoflow.report import write_page
 

@@ -17,13 +17,10 @@ if TYPE_CHECKING:
         RunStarted,
     )
     from orthoflow.engine.garbage import GarbageReport, collect_garbage
-    from orthoflow.engine.listing import StoredResult, list_results
-    from orthoflow.engine.options import RunOptions
-    from orthoflow.engine.outcome import RunOutcome
-    from orthoflow.engine.plan import PlannedCell, PlannedInput, RunPlan, plan_run
+    from orthoflow.engine.plan import PlannedCell, PlannedInput, RunOptions, RunPlan, plan_run
     from orthoflow.engine.results import CellResult, ProductRef
-    from orthoflow.engine.scheduling import execute
-    from orthoflow.engine.store import Store
+    from orthoflow.engine.scheduling import RunOutcome, execute
+    from orthoflow.engine.store import Store, StoredResult, list_results
 
 __all__ = [
     "CellFinished",
@@ -65,15 +62,15 @@ _HOMES = {
     "ProductRef": "results",
     "RunEvent": "events",
     "RunListener": "events",
-    "RunOptions": "options",
-    "RunOutcome": "outcome",
+    "RunOptions": "plan",
+    "RunOutcome": "scheduling",
     "RunPlan": "plan",
     "RunStarted": "events",
     "Store": "store",
-    "StoredResult": "listing",
+    "StoredResult": "store",
     "collect_garbage": "garbage",
     "execute": "scheduling",
-    "list_results": "listing",
+    "list_results": "store",
     "plan_run": "plan",
 }
 

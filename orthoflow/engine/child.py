@@ -109,14 +109,14 @@ def main(arguments: list[str]) -> None:
 
 def _leave(task: Task, result: CellResult, pipe: ProgressPipe) -> None:
     from orthoflow.engine.durability import write_whole  # noqa: PLC0415
-    from orthoflow.engine.result_files import result_to_json  # noqa: PLC0415
+    from orthoflow.engine.results import result_to_json  # noqa: PLC0415
     from orthoflow.errors import StoreError  # noqa: PLC0415
 
     try:
         write_whole(task.result_file, result_to_json(result).encode())
     except StoreError as error:
         reason = result.error_message or str(error)
-        pipe.send({"kind": "failed", "text": reason, "fraction": 0.0})
+        pipe.send({"kind": "failed", "text": reason})
 
 
 if __name__ == "__main__":

@@ -6,34 +6,37 @@ import hashlib
 import os
 import platform
 import subprocess
+from dataclasses import asdict, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Final
 
+from orthoflow.engine.results import RecordedEnvironment
 from orthoflow.engine.store import canonical_json
-from orthoflow.products.product import JsonValue
 
 _GIT_TIMEOUT_S: Final = 10.0
 
 
-def environment(threads: int) -> dict[str, JsonValue]:
+def environment(threads: int) -> RecordedEnvironment:
     """Describe this machine and installation, as a record's environment has it.
 
     Args:
         threads: threads given to the cell.
     """
-    content: dict[str, JsonValue] = {
-        "python": platform.python_version(),
-        "os": f"{platform.system()} {platform.release()}",
-        "cpu": cpu_name(),
-        "cores": os.cpu_count() or 1,
-        "threads": threads,
-        "git_commit": git_commit(),
-        "packages": dict(packages()),
-    }
+    unnamed = RecordedEnvironment(
+        id="",
+        python=platform.python_version(),
+        os=f"{platform.system()} {platform.release()}",
+        cpu=cpu_name(),
+        cores=os.cpu_count() or 1,
+        threads=threads,
+        git_commit=git_commit(),
+        packages=packages(),
+    )
+    content = {name: value for name, value in asdict(unnamed).items() if name != "id"}
     digest = hashlib.sha256(canonical_json(content).encode()).hexdigest()
-    return {"id": f"sha256:{digest}", **content}
+    return replace(unnamed, id=f"sha256:{digest}")
 
 
 @cache

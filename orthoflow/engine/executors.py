@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from orthoflow.engine.durability import write_whole
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.running import failed_result, run_task
 from orthoflow.engine.tasks import Task
-from orthoflow.engine.threads import compiled_code_in
 from orthoflow.errors import CancelledStepError
 from orthoflow.sdk.context import StepEvent
 
 Tell = Callable[[str, StepEvent], None]
+# Names the folder for what numba compiles.
+COMPILED_CODE: Final = "NUMBA_CACHE_DIR"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,3 +111,27 @@ class InlineExecutor:
     def close(self) -> None:
         """Forget the tasks in line."""
         self._waiting.clear()
+
+
+@contextmanager
+def compiled_code_in(folder: str) -> Iterator[None]:
+    """Let numba keep what it compiles in a folder, in this process, for as long as a step runs."""
+    before = os.environ.get(COMPILED_CODE)
+    os.environ[COMPILED_CODE] = folder
+    _tell_numba()
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[COMPILED_CODE]
+        else:
+            os.environ[COMPILED_CODE] = before
+        _tell_numba()
+
+
+def _tell_numba() -> None:
+    # It reads the environment once, when it is imported.
+    if "numba" in sys.modules:
+        from numba.core import config  # noqa: PLC0415 - only where it is loaded anyway
+
+        config.reload_config()  # type: ignore[no-untyped-call]

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.durability import write_whole
+from orthoflow.engine.results import RecordedFile
 from orthoflow.errors import InputError
 
 # A file changed this shortly before hashing may change again within the same time stamp.
@@ -20,19 +21,13 @@ _SETTLED_NS: Final = 2_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class FileRef:
-    """An input file by name and content.
+class FileRef(RecordedFile):
+    """An input file by name and content, where it lies.
 
     Attributes:
-        name: name without its folder.
-        size_bytes: its size.
-        sha256: hexadecimal digest of its bytes.
         mtime_ns: when it was last changed; only to notice a change while a step reads it.
     """
 
-    name: str
-    size_bytes: int
-    sha256: str
     mtime_ns: int
 
 

@@ -90,8 +90,7 @@ def _kept_objects(store: Store, gone: set[str]) -> set[str]:
     for path in store.results.glob("*.json"):
         result = None if path.stem in gone else store.result(path.stem)
         if result is not None:
-            kept |= {ref.digest.removeprefix("sha256:") for ref in result.outputs.values()}
-            kept |= {figure.sha256 for figure in result.figures}
+            kept |= result.objects
     return kept
 
 

@@ -1,20 +1,23 @@
 """Cache keys: which ingredients decide a cell's result, and nothing else.
 
-Paths, step names, cores, timeouts, package versions and time stamps stay out on purpose.
+Paths, step names, cores, timeouts, package versions and time stamps stay out on purpose. Digests
+of source code stand for a version wherever code is not a released install.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from importlib import metadata
 from pathlib import Path
-from typing import Final, Protocol, cast
+from typing import Final, cast
 
-from orthoflow.catalog import Catalog
-from orthoflow.engine.results import ProductRef
-from orthoflow.engine.sources import compiled_digest, files_digest, unreleased_code
+from orthoflow.catalog import Catalog, MethodEntry
+from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile
 from orthoflow.engine.store import canonical_json
 from orthoflow.errors import PluginError
 from orthoflow.products.product import JsonValue
@@ -23,20 +26,19 @@ from orthoflow.workflow.cells import Cell
 
 _WHAT: Final = "orthoflow/cell"
 _KEY_VERSION: Final = 1
+_ROOT: Final = Path(__file__).resolve().parents[1]
+_DISTRIBUTION: Final = "orthoflow-tls"
+# What a method's result can depend on in the framework; engine and command line cannot change it.
+_FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
+_BUILT_IN_PACKAGE: Final = "orthoflow_plugins"
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodFacts:
+class MethodFacts(MethodIdentity):
     """What the engine needs to know of a method, without its class.
 
     Attributes:
-        id: `kind.method`.
         target: import string of the class.
-        result_version: raised by the author when results change.
-        determinism: exact, seeded or loose.
-        citations: where the method comes from.
-        distribution: name of the distribution that brings it.
-        distribution_version: its version.
         tools: external libraries whose version changes results.
         code: digests of source code that is not a released install; empty when all is released.
         compiled_digest: names the folder for compiled kernels.
@@ -45,13 +47,7 @@ class MethodFacts:
         sources: the files behind `code`.
     """
 
-    id: str
     target: str
-    result_version: int
-    determinism: str
-    citations: tuple[str, ...]
-    distribution: str
-    distribution_version: str
     tools: Mapping[str, str]
     code: Mapping[str, str]
     compiled_digest: str
@@ -86,7 +82,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
     distribution = entry.distribution
     sources = unreleased_code(entry)
     return MethodFacts(
-        id=method_id,
+        method=method_id,
         target=entry.spec.target,
         result_version=cls.result_version,
         determinism=cls.determinism,
@@ -102,26 +98,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
     )
 
 
-class NamedContent(Protocol):
-    """A file by name and content; `FileRef` is one, and so is a file in a record."""
-
-    @property
-    def name(self) -> str:
-        """Name without its folder."""
-        raise AssertionError("a protocol is never called")
-
-    @property
-    def size_bytes(self) -> int:
-        """Its size."""
-        raise AssertionError("a protocol is never called")
-
-    @property
-    def sha256(self) -> str:
-        """Hexadecimal digest of its bytes."""
-        raise AssertionError("a protocol is never called")
-
-
-def input_digest(files: Sequence[NamedContent]) -> str:
+def input_digest(files: Sequence[RecordedFile]) -> str:
     """Digest of a workflow input: names without folders, sizes and contents, in order."""
     listing: JsonValue = [
         {"name": file.name, "size_bytes": file.size_bytes, "sha256": file.sha256} for file in files
@@ -141,7 +118,7 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
     preimage: dict[str, JsonValue] = {
         "what": _WHAT,
         "v": _KEY_VERSION,
-        "method": facts.id,
+        "method": facts.method,
         "result_version": facts.result_version,
         "code": dict(facts.code) or None,
         "params": dict(cell.params),
@@ -172,3 +149,78 @@ def _tools(cls: type[Method]) -> dict[str, str]:
         raise PluginError(
             f"method {cls.id} cannot tell the versions of its libraries: {error}"
         ) from error
+
+
+@cache
+def is_framework_released() -> bool:
+    """Whether the framework came from an index, so that its version stands for its code."""
+    try:
+        distribution = metadata.distribution(_DISTRIBUTION)
+    except metadata.PackageNotFoundError:
+        return False
+    if distribution.read_text("direct_url.json") is not None:
+        return False
+    return _ROOT.is_relative_to(Path(str(distribution.locate_file(""))).resolve())
+
+
+def framework_tag() -> str:
+    """What stands for the framework's code: the version of a release, else the digest."""
+    if is_framework_released():
+        return metadata.version(_DISTRIBUTION)
+    return files_digest(framework_files())
+
+
+@cache
+def framework_files() -> tuple[Path, ...]:
+    """The framework's code that methods use."""
+    parts = [_ROOT / part for part in _FRAMEWORK_PARTS]
+    return tuple(
+        file for part in parts for file in ([part] if part.is_file() else part.rglob("*.py"))
+    )
+
+
+def plugin_files(entry: MethodEntry) -> tuple[Path, ...]:
+    """The code that a method belongs to.
+
+    For the built-in methods that is the package of their kind, since one kind never imports
+    another; for all others everything their distribution's packages hold.
+    """
+    files = entry.source_files()
+    module = entry.spec.target.partition(":")[0]
+    if not module.startswith(f"{_BUILT_IN_PACKAGE}."):
+        return files
+    place = f"/{_BUILT_IN_PACKAGE}/{module.split('.')[1]}"
+    return tuple(file for file in files if file.as_posix().partition(place)[2][:1] in ("/", "."))
+
+
+def unreleased_code(entry: MethodEntry) -> dict[str, tuple[Path, ...]]:
+    """Files whose content decides a method's results, where no version stands for them."""
+    code: dict[str, tuple[Path, ...]] = {}
+    if not entry.distribution.is_released:
+        code["plugin"] = plugin_files(entry)
+    if not is_framework_released():
+        code["framework"] = framework_files()
+    return code
+
+
+def compiled_digest(entry: MethodEntry) -> str:
+    """Digest of all code whose compiled kernels a method may use, one per plugin."""
+    both = files_digest(framework_files()) + files_digest(entry.source_files())
+    return hashlib.sha256(both.encode()).hexdigest()
+
+
+def files_digest(files: Iterable[Path]) -> str:
+    """Digest of files with their names; computed once for as long as they stay as they are."""
+    stats = ((path, path.stat()) for path in sorted(files))
+    return _digest(tuple((path, stat.st_size, stat.st_mtime_ns) for path, stat in stats))
+
+
+@lru_cache(maxsize=256)
+def _digest(files: tuple[tuple[Path, int, int], ...]) -> str:
+    digest = hashlib.sha256()
+    root = os.path.commonpath([path.parent for path, _, _ in files]) if files else ""
+    for path, _, _ in files:
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(root).as_posix()}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()

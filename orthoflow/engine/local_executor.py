@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import os
 import selectors
 import signal
@@ -12,26 +11,54 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
+from pydantic import TypeAdapter
+
+from orthoflow.engine.clock import now
 from orthoflow.engine.durability import writing_to
-from orthoflow.engine.endings import describe_exit, describe_memory, describe_timeout
-from orthoflow.engine.executors import TaskEnd, Tell
+from orthoflow.engine.executors import COMPILED_CODE, TaskEnd, Tell
 from orthoflow.engine.group_guard import GroupGuard
-from orthoflow.engine.memory import process_memory
-from orthoflow.engine.memory_guard import MemoryGuard, oom_kills
-from orthoflow.engine.result_files import result_from_json
-from orthoflow.engine.results import CellResult
-from orthoflow.engine.running import failed_result, now
+from orthoflow.engine.memory import GIB, MemoryGuard, oom_kills, process_memory
+from orthoflow.engine.results import CellResult, result_from_json
+from orthoflow.engine.running import failed_result
 from orthoflow.engine.tasks import Task, write_task
-from orthoflow.engine.threads import child_environment
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
 from orthoflow.sdk.context import StepEvent
 
+_THREAD_VARIABLES: Final = (
+    "BLIS_NUM_THREADS",
+    "GDAL_NUM_THREADS",
+    "GOTO_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+    "RAYON_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+)
 _GRACE_S: Final = 5.0
 _LOG_BYTES: Final = 256 << 10
 _READ_BYTES: Final = 1 << 16
+_CRASHES: Final = {
+    signal.SIGSEGV: "segmentation fault",
+    signal.SIGBUS: "bus error, as when the disk is full under a memory-mapped file",
+    signal.SIGABRT: "abort",
+    signal.SIGFPE: "arithmetic error",
+    signal.SIGILL: "illegal instruction",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LastWords:
+    """The failure of a process that could not write its result."""
+
+    kind: Literal["failed"]
+    text: str
 
 
 @dataclass(kw_only=True)
@@ -173,12 +200,12 @@ class LocalExecutor:
 
     def _pass_on(self, run: _Running, line: bytes) -> None:
         # A method may write into the pipe by mistake: what is not an event is not passed on.
-        with contextlib.suppress(ValueError, KeyError, TypeError):
-            content = json.loads(line)
-            if content["kind"] == "failed":
-                run.last_words = content["text"]
+        with contextlib.suppress(ValueError):
+            message = _messages().validate_json(line, strict=True)
+            if isinstance(message, _LastWords):
+                run.last_words = message.text
             else:
-                self.tell(run.task.address, StepEvent(**content))
+                self.tell(run.task.address, message)
 
     def _watch(self) -> None:
         time_now = time.monotonic()
@@ -250,6 +277,12 @@ class LocalExecutor:
         )
 
 
+@cache
+def _messages() -> TypeAdapter[StepEvent | _LastWords]:
+    """What the process of a step says on its pipe, a line of JSON each."""
+    return TypeAdapter(StepEvent | _LastWords)
+
+
 def _reason_of_silence(run: _Running) -> OrthoflowError:
     if run.last_words:
         return StoreError(run.last_words)
@@ -280,3 +313,70 @@ def _read_log(path: Path) -> str:
     except OSError:
         return ""
     return text if size <= _LOG_BYTES else f"... ({size - _LOG_BYTES} bytes before)\n{text}"
+
+
+def child_environment(task: Task) -> dict[str, str]:
+    """Environment variables for the process of a task."""
+    variables = dict(os.environ)
+    variables |= dict.fromkeys(_THREAD_VARIABLES, str(task.cores))
+    # The child imports what this process would, wherever that came from.
+    paths = [str(Path(path).absolute()) for path in sys.path]
+    return variables | {
+        "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)),
+        "PYTHONHASHSEED": "0",
+        "PYTHONUNBUFFERED": "1",
+        COMPILED_CODE: task.numba_folder,
+        "MPLBACKEND": "Agg",
+        "MPLCONFIGDIR": str(Path(task.store) / "matplotlib"),
+        "TMPDIR": str(task.scratch),
+    }
+
+
+def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
+    """Say how a process ended that left no result.
+
+    Args:
+        who: method and distribution, as `Task.who` has them.
+        code: as `subprocess` has it, negative for signals.
+        n_bytes: largest memory seen.
+        tail: last line of its log.
+    """
+    if code >= 0:
+        last = f"; its log ends with: {tail}" if tail else ""
+        return f"{who} ended its process without a result (exit status {code}){last}"
+    name = _signal_name(-code)
+    if -code in _CRASHES:
+        return f"{who} crashed ({_CRASHES[signal.Signals(-code)]}, {name})"
+    return f"{who} was killed from outside ({name}) while it held {n_bytes / GIB:.1f} GiB of memory"
+
+
+def describe_memory(who: str, n_bytes: int) -> StepFailedError:
+    """Say that a step was stopped for want of memory."""
+    return StepFailedError(
+        f"{who} needed more memory than the machine has ({n_bytes / GIB:.1f} GiB when "
+        f"stopped); give it less data or coarser parameters"
+    )
+
+
+def describe_timeout(who: str, limit_s: float) -> StepFailedError:
+    """Say that a step took longer than its workflow allows."""
+    return StepFailedError(f"{who} ran past its timeout of {duration(limit_s)} and was stopped")
+
+
+def duration(seconds: float) -> str:
+    """Write a duration as people say it.
+
+    >>> [duration(s) for s in (0.5, 90, 1800, 7200)]
+    ['0.5 s', '90 s', '30 min', '2 h']
+    """
+    for unit, length in (("h", 3600), ("min", 60)):
+        if seconds >= length and seconds % length == 0:
+            return f"{seconds / length:g} {unit}"
+    return f"{seconds:g} s"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -3,25 +3,73 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from orthoflow.catalog import Catalog
-from orthoflow.engine.changes import explain
 from orthoflow.engine.file_digests import FileRef
-from orthoflow.engine.keys import CellKey, MethodFacts, cell_key, input_digest, method_facts
-from orthoflow.engine.options import RunOptions
+from orthoflow.engine.keys import (
+    CellKey,
+    MethodFacts,
+    cell_key,
+    framework_tag,
+    input_digest,
+    method_facts,
+    read_preimage,
+)
 from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.sources import framework_tag
 from orthoflow.engine.store import Preimage, Store
-from orthoflow.errors import InputError, PluginError, StoreError
+from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.products.input_files import InputFiles
 from orthoflow.workflow import Workflow, check_step_names, resolve_input_files
 from orthoflow.workflow.cells import Cell, CellOutput, Selection, select_cells
 
+ExecutorName = Literal["local", "inline"]
 CellPlan = Literal["cached", "will run", "unknown yet", "skipped"]
+_MOST_NAMED: Final = 4
+_LONGEST_VALUE: Final = 40
+_ABSENT: Final = "absent"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Options of plan and run.
+
+    Attributes:
+        jobs: cells that run at the same time; they share the cores.
+        executor: `local` (a child process per cell) or `inline` (this process, for debugging).
+        only: run these steps and what they need, from the store where it is there.
+        from_: run these steps, what follows from them, and what all these need.
+        until: run these steps and what they need.
+        force: run these steps although their results are in the store.
+        cores: processors to use in all; None for all this process may use.
+    """
+
+    jobs: int = 1
+    executor: ExecutorName = "local"
+    only: tuple[str, ...] = ()
+    from_: tuple[str, ...] = ()
+    until: tuple[str, ...] = ()
+    force: tuple[str, ...] = ()
+    cores: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs < 1:
+            raise ArgumentError(f"--jobs must be 1 or more, got {self.jobs}")
+        if self.cores is not None and self.cores < 1:
+            raise ArgumentError(f"cores must be 1 or more, got {self.cores}")
+        if self.executor not in ("local", "inline"):
+            raise ArgumentError(f"--executor must be local or inline, got {self.executor}")
+
+    @property
+    def all_cores(self) -> int:
+        """Processors the run may use in all."""
+        return self.cores or len(os.sched_getaffinity(0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,3 +290,64 @@ def _product_targets(
             )
         targets[type_name] = ProductTarget(target=entry.spec.target, publisher=entry.spec.publisher)
     return targets
+
+
+def explain(key: CellKey, step: str, earlier: Sequence[Preimage]) -> str:
+    """Say what changed since the most similar earlier result of the same method.
+
+    Args:
+        key: of the cell.
+        step: name of its step; earlier results of that step are preferred.
+        earlier: preimages of the method's earlier results, newest first.
+    """
+    if not earlier:
+        return "never ran before"
+    if any(preimage.key == key.key for preimage in earlier):
+        return "its result is no longer in the store"
+    now = _ingredients(key.preimage)
+    candidates = [preimage for preimage in earlier if preimage.step == step] or list(earlier)
+    before = min(
+        (_ingredients(item.text) for item in candidates),
+        key=lambda ingredients: len(_changed(ingredients, now)),
+    )
+    changes = _changed(before, now)
+    if not changes:
+        return "its key is made in another way than before"
+    named = list(dict.fromkeys(_sentence(name, before, now) for name in changes))
+    more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+    return ", ".join(named[:_MOST_NAMED]) + more
+
+
+@lru_cache(maxsize=1024)
+def _ingredients(text: str) -> Mapping[str, str]:
+    """Flatten a preimage by one level: `params.cell_m`, `inputs.cloud`, ...; values as JSON."""
+    flat: dict[str, str] = {}
+    for name, value in read_preimage(text).items():
+        prefix, items = (f"{name}.", value) if isinstance(value, dict) else ("", {name: value})
+        for key, item in items.items():
+            flat[prefix + key] = json.dumps(item, ensure_ascii=False, sort_keys=True)
+    return flat
+
+
+def _changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    names = dict.fromkeys([*now, *before])
+    return [name for name in names if before.get(name) != now.get(name)]
+
+
+def _sentence(name: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:
+    group, _, inner = name.partition(".")
+    if group == "inputs":
+        if name not in before:
+            return f"input {inner} added"
+        return f"input {inner} changed" if name in now else f"input {inner} removed"
+    if group == "code":
+        return "code changed"
+    change = f"{_shown(before, name)} -> {_shown(now, name)}"
+    if group == "params":
+        return f"{name}: {change}"
+    return f"{inner if group == 'tools' else name} {change}"
+
+
+def _shown(ingredients: Mapping[str, str], name: str) -> str:
+    text = ingredients.get(name, _ABSENT)
+    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 3] + "..."

@@ -1,113 +1,121 @@
-"""What a finished cell leaves behind, as JSON: the link between store, journal and record."""
+"""What a finished cell leaves behind, and its form in the store: the link to journal and record."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from functools import cache
+from typing import Final
 
-from orthoflow.products.product import JsonValue
+from orthoflow_provenance.model import (
+    CellOutcome,
+    CellStatus,
+    Costs,
+    Figure,
+    MethodIdentity,
+    Metric,
+    ProductRef,
+    RecordedEnvironment,
+    RecordedFile,
+    shared_fields,
+)
+from pydantic import TypeAdapter, ValidationError
+
+from orthoflow.errors import StoreError
+
+# The words of a record, for the rest of the engine.
+__all__ = [
+    "CellOutcome",
+    "CellResult",
+    "CellStatus",
+    "Costs",
+    "Figure",
+    "FigureRef",
+    "MethodIdentity",
+    "Metric",
+    "ProductRef",
+    "RecordedEnvironment",
+    "RecordedFile",
+    "result_from_json",
+    "result_to_json",
+    "shared_fields",
+]
+
+FORMAT: Final = "orthoflow/result/1"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProductRef:
-    """A product by its content.
-
-    Attributes:
-        type_name: product type, `files` for a workflow input.
-        encoding_version: version of the type's layout, 0 for files.
-        digest: `sha256:` + 64 hexadecimal digits.
-    """
-
-    type_name: str
-    encoding_version: int
-    digest: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class FigureRef:
+class FigureRef(Figure):
     """A picture in the store.
 
     Attributes:
-        name: name the method gave.
-        caption: one sentence.
-        media_type: `image/png`, `image/webp` or `image/svg+xml`.
         sha256: digest of the bytes, hexadecimal; the store's object of that name holds them.
     """
 
-    name: str
-    caption: str
-    media_type: str
     sha256: str
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricValue:
-    """One number with its unit."""
-
-    name: str
-    value: float
-    unit: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class CellResult:
+class CellResult(CellOutcome):
     """The outcome of one cell.
 
     Attributes:
-        status: ok, failed or skipped.
-        key: cache key, empty when it was never known.
-        key_preimage: canonical JSON the key is the SHA-256 of.
         run_id: the run that computed it.
-        method: method id.
-        distribution: name of the distribution that brought the method.
-        distribution_version: its version.
-        result_version: the method's own counter.
-        determinism: exact, seeded or loose.
-        citations: where the method comes from.
-        seed: seed the generator was made from, None when not part of the key.
-        started: ISO 8601 UTC.
-        ended: ISO 8601 UTC.
-        wall_s: seconds on the clock.
-        cpu_s: processor seconds of the step's process.
-        peak_rss_mib: largest memory of the step's process.
-        environment: the environment, as `RecordedEnvironment` has it, JSON.
+        environment: where it was computed, None when it never was.
         inputs: port -> product.
         outputs: port -> product.
-        metrics: what the method reported.
         figures: pictures.
-        warnings: what limits the result.
-        log: text.
-        error_type: class name of the error, empty when ok.
-        error_message: one sentence, or the reason why the cell was skipped.
         traceback: for `--debug` and bug reports, empty when ok.
         exit_code: of the error class, 0 when ok.
     """
 
-    status: Literal["ok", "failed", "skipped"]
-    key: str = ""
-    key_preimage: str = ""
     run_id: str = ""
-    method: str = ""
-    distribution: str = ""
-    distribution_version: str = ""
-    result_version: int = 0
-    determinism: str = ""
-    citations: tuple[str, ...] = ()
-    seed: int | None = None
-    started: str = ""
-    ended: str = ""
-    wall_s: float = 0.0
-    cpu_s: float = 0.0
-    peak_rss_mib: float = 0.0
-    environment: Mapping[str, JsonValue] = field(default_factory=dict)
+    environment: RecordedEnvironment | None = None
     inputs: Mapping[str, ProductRef] = field(default_factory=dict)
     outputs: Mapping[str, ProductRef] = field(default_factory=dict)
-    metrics: tuple[MetricValue, ...] = ()
     figures: tuple[FigureRef, ...] = ()
-    warnings: tuple[str, ...] = ()
-    log: str = ""
-    error_type: str = ""
-    error_message: str = ""
     traceback: str = ""
     exit_code: int = 0
+
+    @property
+    def objects(self) -> frozenset[str]:
+        """Names of the store's objects that it refers to: products and figures."""
+        products = {ref.digest.removeprefix("sha256:") for ref in self.outputs.values()}
+        return frozenset(products | {figure.sha256 for figure in self.figures})
+
+
+def result_to_json(result: CellResult) -> str:
+    """Give a result as JSON text."""
+    content = _codec().dump_python(result, mode="json")
+    return json.dumps({"format": FORMAT, **content}, allow_nan=False, ensure_ascii=False)
+
+
+def result_from_json(text: str, where: str) -> CellResult:
+    """Read a result from JSON text.
+
+    Args:
+        text: what `result_to_json` gave.
+        where: name of the file, for the error message.
+
+    Raises:
+        StoreError: the text is damaged or of another format.
+    """
+    try:
+        content = json.loads(text)
+        if not isinstance(content, dict) or content.get("format") != FORMAT:
+            raise StoreError(f"{where} has a result format that this orthoflow cannot read")
+        return _codec().validate_json(text, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise StoreError(f"{where} is damaged: {place}: {first['msg']}") from error
+    except ValueError as error:
+        if isinstance(error, StoreError):
+            raise
+        raise StoreError(f"{where} is damaged: {error}") from error
+
+
+@cache
+def _codec() -> TypeAdapter[CellResult]:
+    return TypeAdapter(CellResult)

@@ -10,7 +10,6 @@ import resource
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
 from typing import Final, cast
@@ -18,9 +17,18 @@ from typing import Final, cast
 import numpy as np
 from pydantic import ValidationError
 
+from orthoflow.engine.clock import now
 from orthoflow.engine.durability import store_error, writing_to
-from orthoflow.engine.memory import MemorySampler
-from orthoflow.engine.results import CellResult, FigureRef, MetricValue, ProductRef
+from orthoflow.engine.memory import MIB, MemorySampler
+from orthoflow.engine.results import (
+    CellResult,
+    Costs,
+    Figure,
+    FigureRef,
+    MethodIdentity,
+    ProductRef,
+    shared_fields,
+)
 from orthoflow.engine.store import Publisher, Store, digest_of
 from orthoflow.engine.tasks import Task, TaskInput
 from orthoflow.errors import InputError, MethodError, OrthoflowError, PluginError, StepFailedError
@@ -31,7 +39,6 @@ from orthoflow.sdk.methods import Method
 
 # Inputs up to this size are digested again after the run: they must not have changed.
 _CHECKED_BYTES: Final = 16 << 20
-_MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp", ".svg": "image/svg+xml"}
 
 Listener = Callable[[StepEvent], None]
 
@@ -59,10 +66,8 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         result,
         started=started,
         ended=now(),
-        wall_s=call.wall_s,
-        cpu_s=call.cpu_s,
-        peak_rss_mib=sampler.peak_mib,
         warnings=tuple(call.warnings),
+        **shared_fields(call.costs(sampler), Costs),
     )
 
 
@@ -85,12 +90,7 @@ def blank_result(task: Task) -> CellResult:
         key=task.key,
         key_preimage=task.key_preimage,
         run_id=task.run_id,
-        method=task.method,
-        distribution=task.distribution,
-        distribution_version=task.distribution_version,
-        result_version=task.result_version,
-        determinism=task.determinism,
-        citations=task.citations,
+        **shared_fields(task, MethodIdentity),
         seed=None if task.determinism == "exact" else task.seed,
         environment=task.environment,
         inputs={port: given.ref for port, given in task.inputs.items()},
@@ -121,18 +121,14 @@ def explain_failure(task: Task, error: Exception) -> OrthoflowError:
     return MethodError(f"{task.who} failed unexpectedly: {type(error).__name__}: {error}")
 
 
-def now() -> str:
-    """The time as ISO 8601 in UTC, to milliseconds."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
 class _Call:
     """One call of a method, with what it measured so far also when it fails."""
 
     def __init__(self, task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> None:
         self.task = task
-        self.wall_s = 0.0
-        self.cpu_s = 0.0
+        self._wall_s = 0.0
+        self._cpu_s = 0.0
+        self._stored_mib: float | None = None
         self._store = Store(Path(task.store), workspace=Path(task.folder))
         with writing_to(self._store.folder):
             task.scratch.mkdir(parents=True, exist_ok=True)
@@ -148,6 +144,15 @@ class _Call:
     def warnings(self) -> list[str]:
         return self._context.warnings
 
+    def costs(self, sampler: MemorySampler) -> Costs:
+        """What the call took so far."""
+        return Costs(
+            wall_s=self._wall_s,
+            cpu_s=self._cpu_s,
+            peak_rss_mib=sampler.peak_mib,
+            stored_mib=self._stored_mib,
+        )
+
     def run(self) -> CellResult:
         cls = cast("type[Method]", load_target(self.task.target))
         inputs = {port: self._read(given) for port, given in self.task.inputs.items()}
@@ -156,19 +161,17 @@ class _Call:
         try:
             outputs = cls().run(cls.In(**inputs), params, self._context)
         finally:
-            self.wall_s = round(time.perf_counter() - wall, 4)
-            self.cpu_s = round(_cpu_s() - cpu, 4)
+            self._wall_s = round(time.perf_counter() - wall, 4)
+            self._cpu_s = round(_cpu_s() - cpu, 4)
         self._check_inputs(inputs)
-        refs = self._keep(self._products(cls, outputs))
-        return dataclasses.replace(
+        result = dataclasses.replace(
             blank_result(self.task),
-            outputs=refs,
-            metrics=tuple(
-                MetricValue(name=metric.name, value=metric.value, unit=metric.unit)
-                for metric in self._context.metrics
-            ),
+            outputs=self._keep(self._products(cls, outputs)),
+            metrics=tuple(self._context.metrics),
             figures=self._keep_figures(),
         )
+        self._stored_mib = round(self._store.size_bytes(result) / MIB, 3)
+        return result
 
     def _read(self, given: TaskInput) -> Product | InputFiles:
         if given.input_name:
@@ -222,10 +225,8 @@ class _Call:
     def _keep_figures(self) -> tuple[FigureRef, ...]:
         return tuple(
             FigureRef(
-                name=figure.name,
-                caption=figure.caption,
-                media_type=_MEDIA_TYPES[figure.path.suffix],
                 sha256=self._store.put_blob(figure.path.read_bytes()),
+                **shared_fields(figure, Figure),
             )
             for figure in self._context.figures
         )

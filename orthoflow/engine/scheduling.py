@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
+import threading
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from types import FrameType
+from typing import Final, Literal
 
+from orthoflow.engine.clock import now
 from orthoflow.engine.durability import remove_tree, writing_to
+from orthoflow.engine.environment import environment
 from orthoflow.engine.events import (
     CellFinished,
     CellLogged,
@@ -22,31 +27,78 @@ from orthoflow.engine.events import (
     ignore,
 )
 from orthoflow.engine.executors import Executor, InlineExecutor, TaskEnd, Tell
-from orthoflow.engine.interruption import Interruption, watching_interruptions
-from orthoflow.engine.journal import Journal
-from orthoflow.engine.keys import CellKey, cell_key
+from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.local_executor import LocalExecutor
 from orthoflow.engine.locks import exclusive_lock, is_locked
-from orthoflow.engine.options import ExecutorName
-from orthoflow.engine.outcome import RunOutcome
 from orthoflow.engine.plan import (
+    ExecutorName,
+    PlannedInput,
     RunPlan,
     known_inputs,
     needed_addresses,
 )
-from orthoflow.engine.results import CellResult, ProductRef
-from orthoflow.engine.running import now
+from orthoflow.engine.results import CellResult, MethodIdentity, ProductRef, shared_fields
+from orthoflow.engine.run_folder import (
+    LOGS,
+    CellBegan,
+    CellEnded,
+    Journal,
+    RunWent,
+    cell_file_name,
+)
 from orthoflow.engine.store import Store
-from orthoflow.engine.task_making import TaskMaker
-from orthoflow.engine.tasks import Task
+from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput
 from orthoflow.errors import CancelledStepError
 from orthoflow.sdk.context import StepEvent
-from orthoflow.workflow.cells import Cell
+from orthoflow.workflow.cells import Cell, WorkflowInput
 
 _POLL_S: Final = 0.25
 _CODE_CHANGED: Final = (
     "the code of the method changed during the run: the result is not kept for other runs"
 )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOutcome:
+    """A finished run.
+
+    Attributes:
+        run_id: id of the run.
+        started: ISO 8601 UTC; of the first attempt when it was resumed.
+        ended: ISO 8601 UTC.
+        results: address -> result, in the order of the plan.
+        cached: address -> id of the run that computed it, for results of other runs.
+        resumed: addresses that this run had computed before it was interrupted.
+        inputs: workflow input -> files; None when it is optional and absent.
+    """
+
+    run_id: str
+    started: str
+    ended: str
+    results: Mapping[str, CellResult]
+    cached: Mapping[str, str] = field(default_factory=dict)
+    resumed: frozenset[str] = frozenset()
+    inputs: Mapping[str, PlannedInput | None] = field(default_factory=dict)
+
+    @property
+    def failed(self) -> Mapping[str, CellResult]:
+        """The failed cells; those behind them are skipped and not among them."""
+        return {
+            address: result for address, result in self.results.items() if result.status == "failed"
+        }
+
+    @property
+    def status(self) -> Literal["ok", "failed"]:
+        """`failed` when some cell failed."""
+        return "failed" if self.failed else "ok"
+
+    @property
+    def exit_code(self) -> int:
+        """0 good; the code that all failures share (2 inputs, 4 plugins or libraries); else 1."""
+        codes = {result.exit_code for result in self.failed.values()}
+        if not codes:
+            return 0
+        return codes.pop() if len(codes) == 1 else 1
 
 
 def execute(
@@ -77,7 +129,7 @@ def execute(
     folder = Path(run_folder).absolute()
     with store.in_use(), Journal(folder, plan.name, run_id=run_id) as journal:
         with writing_to(folder):
-            (folder / "logs").mkdir(exist_ok=True)
+            (folder / LOGS).mkdir(exist_ok=True)
         listen(
             RunStarted(
                 run_id=journal.run_id, n_cells=len(plan.cells), is_resumed=journal.is_resumed
@@ -88,7 +140,7 @@ def execute(
                 plan=plan,
                 store=store,
                 scratch=scratch,
-                logs=folder / "logs",
+                logs=folder / LOGS,
                 run_id=journal.run_id,
             )
             executor = _executor(plan.options.executor, _passing_on(listen), interruption)
@@ -140,7 +192,7 @@ class _Run:
 
     def outcome(self) -> RunOutcome:
         """Give what the run left, in the order of the plan."""
-        self._journal.write("ended")
+        self._journal.write(RunWent(event="ended", time=now()))
         order = [item.cell.address for item in self._plan.cells]
         return RunOutcome(
             run_id=self._journal.run_id,
@@ -157,7 +209,7 @@ class _Run:
         while self._running:
             for end in executor.poll(_POLL_S):
                 self._take(end)
-        self._journal.write("interrupted")
+        self._journal.write(RunWent(event="interrupted", time=now()))
         raise CancelledStepError(
             f"the run was interrupted; the same command goes on where it stopped, given "
             f"-o {self._tasks.logs.parent.name}"
@@ -203,16 +255,12 @@ class _Run:
         return ""
 
     def _skipped(self, cell: Cell, reason: str) -> CellResult:
-        facts = self._plan.methods.get(cell.method)
+        facts = self._plan.methods.get(cell.method) or MethodIdentity(method=cell.method)
         return CellResult(
             status="skipped",
             run_id=self._journal.run_id,
-            method=cell.method,
-            distribution=facts.distribution if facts else "",
-            distribution_version=facts.distribution_version if facts else "",
-            result_version=facts.result_version if facts else 0,
-            determinism=facts.determinism if facts else "",
             error_message=reason,
+            **shared_fields(facts, MethodIdentity),
         )
 
     def _known(self, cell: Cell, key: CellKey) -> CellResult | None:
@@ -245,7 +293,7 @@ class _Run:
         task = self._tasks.make(cell, ready.key, ready.refs, self._cores(cell))
         del self._waiting[cell.address]
         self._running[cell.address] = task
-        self._journal.write("started", address=cell.address, key=task.key)
+        self._journal.write(CellBegan(time=now(), address=cell.address, key=task.key))
         self._listen(CellStarted(address=cell.address))
         executor.start(task)
 
@@ -271,12 +319,14 @@ class _Run:
         elif is_cached:
             self._cached[cell.address] = result.run_id
         self._journal.write(
-            "finished",
-            address=cell.address,
-            key=result.key,
-            status=result.status,
-            cached=is_cached,
-            error=result.error_message,
+            CellEnded(
+                time=now(),
+                address=cell.address,
+                key=result.key,
+                status=result.status,
+                cached=is_cached,
+                error=result.error_message,
+            )
         )
         self._listen(CellFinished(address=cell.address, result=result, cached=is_cached))
 
@@ -321,3 +371,114 @@ def _scratch(store: Store, run_id: str) -> Iterator[Path]:
 
 def _lock_of(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.lock")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskMaker:
+    """Makes the tasks of one run.
+
+    Attributes:
+        plan: of the run.
+        store: where products and results go.
+        scratch: folder of the run for work in progress, on the store's file system.
+        logs: folder for the logs of steps.
+        run_id: of the run.
+    """
+
+    plan: RunPlan
+    store: Store
+    scratch: Path
+    logs: Path
+    run_id: str
+
+    def make(self, cell: Cell, key: CellKey, refs: Mapping[str, ProductRef], cores: int) -> Task:
+        """Give the task of a cell.
+
+        Args:
+            cell: the cell.
+            key: its key.
+            refs: port -> product.
+            cores: threads it may use.
+        """
+        facts = self.plan.methods[cell.method]
+        return Task(
+            address=cell.address,
+            run_id=self.run_id,
+            target=facts.target,
+            key=key.key,
+            key_preimage=key.preimage,
+            params=cell.params,
+            seed=cell.seed,
+            inputs={port: self._input(cell, port, ref) for port, ref in refs.items()},
+            outputs=self._outputs(facts),
+            cores=cores,
+            timeout_s=cell.timeout_s,
+            store=str(self.store.folder),
+            folder=str(self.scratch / uuid.uuid4().hex[:12]),
+            log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
+            numba_folder=str(self.store.numba_folder(facts.compiled_digest)),
+            publisher_tag=self.plan.publisher_tag,
+            environment=environment(cores),
+            **shared_fields(facts, MethodIdentity),
+        )
+
+    def _input(self, cell: Cell, port: str, ref: ProductRef) -> TaskInput:
+        source = cell.inputs[port]
+        if not isinstance(source, WorkflowInput):
+            return TaskInput(ref=ref, target=self.plan.products[ref.type_name].target)
+        given = self.plan.inputs[source.name]
+        return TaskInput(ref=ref, input_name=source.name, files=_task_files(given) if given else ())
+
+    def _outputs(self, facts: MethodFacts) -> dict[str, TaskOutput]:
+        return {
+            port: TaskOutput(
+                type_name=type_name,
+                target=self.plan.products[type_name].target,
+                publisher=self.plan.products[type_name].publisher,
+            )
+            for port, type_name in facts.outputs.items()
+        }
+
+
+def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
+    return tuple(
+        TaskFile(path=str(path.absolute()), size_bytes=file.size_bytes, mtime_ns=file.mtime_ns)
+        for path, file in zip(given.paths, given.files, strict=True)
+    )
+
+
+class Interruption:
+    """Whether the run was asked to stop.
+
+    Attributes:
+        is_asked: a signal came.
+    """
+
+    def __init__(self) -> None:
+        self.is_asked = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle the signal; a second one does not wait for anybody.
+
+        Raises:
+            KeyboardInterrupt: asked a second time.
+        """
+        if self.is_asked:
+            raise KeyboardInterrupt
+        self.is_asked = True
+
+
+@contextmanager
+def watching_interruptions() -> Iterator[Interruption]:
+    """Catch SIGINT and SIGTERM inside the block; only the main thread can, others never see any."""
+    interruption = Interruption()
+    if threading.current_thread() is not threading.main_thread():
+        yield interruption
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, interruption) for number in numbers}
+    try:
+        yield interruption
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -29,7 +29,9 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 from orthoflow_provenance.digests import canonical_json, payload_digest
 from orthoflow_provenance.errors import RecordFormatError
 
+from orthoflow.engine.clock import time_of_file
 from orthoflow.engine.durability import (
+    folder_size,
     place_folder,
     remove_tree,
     sync_file,
@@ -39,15 +41,27 @@ from orthoflow.engine.durability import (
 )
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.locks import shared_lock
-from orthoflow.engine.result_files import result_from_json, result_to_json
-from orthoflow.engine.results import CellResult, ProductRef
+from orthoflow.engine.results import (
+    CellResult,
+    ProductRef,
+    result_from_json,
+    result_to_json,
+)
 from orthoflow.errors import ProductError, StoreError
 from orthoflow.products.product import Payload, Product
 
 if TYPE_CHECKING:
     from orthoflow_provenance.payloads import StoredPayload
 
-__all__ = ["Preimage", "Publisher", "Store", "canonical_json", "digest_of"]
+__all__ = [
+    "Preimage",
+    "Publisher",
+    "Store",
+    "StoredResult",
+    "canonical_json",
+    "digest_of",
+    "list_results",
+]
 
 _HDF5_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _READ_RETRY_S: Final = 0.05
@@ -61,6 +75,30 @@ class Publisher(Protocol):
     def __call__(self, product: Product, folder: Path, digest: str, /) -> object:
         """Write the files into an existing empty folder."""
         raise AssertionError("a protocol is never called")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredResult:
+    """A result in the store.
+
+    Attributes:
+        key: cache key.
+        method: method id.
+        run_id: the run that computed it.
+        ended: ISO 8601 UTC.
+        last_used: ISO 8601 UTC, when a run last took or made it.
+        size_bytes: of its products with their published files; equal products of several results
+            count for each.
+        is_complete: all its products and figures are there.
+    """
+
+    key: str
+    method: str
+    run_id: str
+    ended: str
+    last_used: str
+    size_bytes: int
+    is_complete: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,6 +274,10 @@ class Store:
         )
         return result if is_complete else None
 
+    def size_bytes(self, result: CellResult) -> int:
+        """What a result's products, their published files and its figures take here."""
+        return sum(folder_size(self.objects / name) for name in result.objects)
+
     def touch(self, key: str) -> None:
         """Note that a result was used now; garbage collection keeps what is used."""
         with contextlib.suppress(OSError):
@@ -311,6 +353,29 @@ class Store:
             aside.parent.mkdir(parents=True, exist_ok=True)
             self._object(digest).rename(aside)
             remove_tree(aside)
+
+
+def list_results(store: Store) -> tuple[StoredResult, ...]:
+    """List the results of a store, last used first; unreadable ones are left out."""
+    found: list[StoredResult] = []
+    for path in store.results.glob("*.json"):
+        try:
+            result = result_from_json(path.read_text(encoding="utf-8"), path.name)
+            used = time_of_file(path.stat().st_mtime)
+        except (StoreError, OSError, UnicodeDecodeError):
+            continue
+        found.append(
+            StoredResult(
+                key=path.stem,
+                method=result.method,
+                run_id=result.run_id,
+                ended=result.ended,
+                last_used=used,
+                size_bytes=store.size_bytes(result),
+                is_complete=store.result(path.stem) is not None,
+            )
+        )
+    return tuple(sorted(found, key=lambda item: (item.last_used, item.key), reverse=True))
 
 
 def digest_of(product: Product) -> str:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
+from pydantic import JsonValue, TypeAdapter
+
 from orthoflow.engine.durability import write_whole
-from orthoflow.engine.results import ProductRef
-from orthoflow.products.product import JsonValue
+from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedEnvironment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +50,12 @@ class TaskOutput:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Task:
+class Task(MethodIdentity):
     """One method call.
 
     Attributes:
         address: of the cell.
         run_id: of the run.
-        method: method id.
         target: import string of the class.
         key: cache key.
         key_preimage: text it is the digest of.
@@ -70,17 +70,11 @@ class Task:
         log: file that takes stdout and stderr.
         numba_folder: where compiled kernels are kept.
         publisher_tag: version of what writes published files.
-        environment: as `engine.environment` gives it.
-        distribution: name of the distribution that brought the method.
-        distribution_version: its version.
-        result_version: the method's own counter.
-        determinism: exact, seeded or loose.
-        citations: where the method comes from.
+        environment: where it will run.
     """
 
     address: str
     run_id: str
-    method: str
     target: str
     key: str
     key_preimage: str
@@ -95,12 +89,7 @@ class Task:
     log: str
     numba_folder: str
     publisher_tag: str = ""
-    environment: Mapping[str, JsonValue] = field(default_factory=dict)
-    distribution: str = ""
-    distribution_version: str = ""
-    result_version: int = 0
-    determinism: str = "exact"
-    citations: tuple[str, ...] = ()
+    environment: RecordedEnvironment | None = None
 
     @property
     def who(self) -> str:
@@ -132,23 +121,15 @@ def write_task(task: Task) -> None:
     Raises:
         StoreError: the disk refuses.
     """
-    write_whole(task.task_file, json.dumps(dataclasses.asdict(task), allow_nan=False).encode())
+    content = _codec().dump_python(task, mode="json")
+    write_whole(task.task_file, json.dumps(content, allow_nan=False).encode())
 
 
 def read_task(path: Path) -> Task:
     """Read a task back."""
-    content = json.loads(path.read_text(encoding="utf-8"))
-    content["inputs"] = {
-        port: TaskInput(
-            ref=ProductRef(**given["ref"]),
-            target=given["target"],
-            input_name=given["input_name"],
-            files=tuple(TaskFile(**file) for file in given["files"]),
-        )
-        for port, given in content["inputs"].items()
-    }
-    content["outputs"] = {
-        port: TaskOutput(**expected) for port, expected in content["outputs"].items()
-    }
-    content["citations"] = tuple(content["citations"])
-    return Task(**content)
+    return _codec().validate_json(path.read_bytes(), strict=True)
+
+
+@cache
+def _codec() -> TypeAdapter[Task]:
+    return TypeAdapter(Task)

@@ -3,43 +3,45 @@
 from __future__ import annotations
 
 from orthoflow_provenance.model import (
+    COSTS,
+    Metric,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
     RecordedProduct,
     RunRecord,
 )
 
+from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.records.comparison import (
     CellFacts,
-    MetricValue,
+    ComparedMetric,
+    Distance,
     Pair,
     ParameterValue,
-    RunComparison,
-    compare_runs,
-)
-from orthoflow.records.metrics import MetricRow, cell_metrics
-from orthoflow.records.product_distances import (
-    Distance,
     ProductDistance,
+    RunComparison,
     RunProducts,
     Verdict,
+    compare_runs,
     product_distances,
 )
-from orthoflow.records.runs import RECORD_FILE, REPORT_FILE, Run, open_run
+from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.runs import REPORT_FILE, Run, open_run
 from orthoflow.records.verification import Verification, verify_run
 from orthoflow.records.writing import write_run
 
 __all__ = [
+    "COSTS",
     "RECORD_FILE",
     "REPORT_FILE",
     "CellFacts",
+    "ComparedMetric",
     "Distance",
+    "Metric",
     "MetricRow",
-    "MetricValue",
     "Pair",
     "ParameterValue",
     "ProductDistance",
@@ -48,7 +50,6 @@ __all__ = [
     "RecordedFigure",
     "RecordedFile",
     "RecordedInput",
-    "RecordedMetric",
     "RecordedProduct",
     "Run",
     "RunComparison",

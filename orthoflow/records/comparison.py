@@ -1,25 +1,31 @@
-"""Two runs side by side: inputs, workflow, parameters, versions, environment, metrics, products."""
+"""Two runs side by side: what differs is named, and how far their products lie apart."""
 
 from __future__ import annotations
 
 import difflib
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
-from orthoflow_provenance.model import RecordedCell, RecordedFile, RunRecord
+from orthoflow_provenance.compare import ArrayDifference, measure_payloads
+from orthoflow_provenance.digests import payload_digest
+from orthoflow_provenance.model import COSTS, RecordedCell, RecordedFile, RunRecord
 
-from orthoflow.products.product import JsonValue
+from orthoflow.errors import OrthoflowError
+from orthoflow.products.product import JsonValue, Payload, Product
 from orthoflow.records.metrics import cell_metrics
-from orthoflow.records.product_distances import ProductDistance, RunProducts, product_distances
 from orthoflow.records.runs import Run
 
 if TYPE_CHECKING:
     from orthoflow.engine import Store
+if TYPE_CHECKING:
+    from orthoflow.catalog import Catalog
+    from orthoflow.engine import Store
 
 Side = TypeVar("Side")
-_COSTS: Final = ("wall_s", "cpu_s", "peak_rss_mib")
+Verdict = Literal["identical", "within tolerance", "different", "not measured"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +91,7 @@ class CellFacts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricValue:
+class ComparedMetric:
     """One number of one cell; equal when value and unit are.
 
     Attributes:
@@ -128,7 +134,7 @@ class RunComparison:
     cells: tuple[Pair[CellFacts], ...]
     parameters: tuple[Pair[ParameterValue], ...]
     environment: tuple[Pair[str], ...]
-    metrics: tuple[Pair[MetricValue], ...]
+    metrics: tuple[Pair[ComparedMetric], ...]
     products: tuple[ProductDistance, ...]
 
 
@@ -214,12 +220,12 @@ def _parameters(cell: RecordedCell) -> dict[str, ParameterValue]:
     }
 
 
-def _metrics(cell: RecordedCell) -> dict[str, MetricValue]:
+def _metrics(cell: RecordedCell) -> dict[str, ComparedMetric]:
     return {
-        row.metric: MetricValue(
+        row.metric: ComparedMetric(
             value=row.value,
             unit=row.unit,
-            is_cost=row.metric in _COSTS,
+            is_cost=row.metric in COSTS,
             is_cached=bool(cell.cached_from),
             environment=cell.environment,
         )
@@ -246,3 +252,205 @@ def _environment(record: RunRecord) -> dict[str, str]:
 
 def _joined(values: Iterable[str]) -> str:
     return ", ".join(sorted(values))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distance:
+    """The largest difference among all fields of one unit.
+
+    Attributes:
+        unit: `m`, `px`, `grey`, `deg`, or `1` for plain numbers.
+        largest: largest absolute difference in that unit; None where values cannot be subtracted
+            (another shape or type, missing, NaN against a number).
+        limit: what the type allows in the field that lies farthest apart.
+        field: that field, e.g. `walls/0/depth_m`.
+        n_values: how many values of the unit lie beyond their limit.
+    """
+
+    unit: str
+    largest: float | None
+    limit: float
+    field: str
+    n_values: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProductDistance:
+    """Two products that ought to be one.
+
+    Attributes:
+        cell: address of the cell that gave them.
+        port: its output port.
+        type_name: product type.
+        verdict: `identical` (same bits), `within tolerance`, `different`, or `not measured` where
+            the digests differ and the arrays of one of them are nowhere to be found.
+        left: digest of the first, empty when it has none.
+        right: digest of the second, empty when it has none.
+        distances: one per unit in which they differ.
+        reason: one sentence for `different` and `not measured`, else empty.
+    """
+
+    cell: str
+    port: str
+    type_name: str
+    verdict: Verdict
+    left: str
+    right: str
+    distances: tuple[Distance, ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunProducts:
+    """The products of a run, from its record or a store.
+
+    Attributes:
+        run: the run.
+        stores: where arrays may lie that the record names by digest only.
+    """
+
+    run: Run
+    stores: tuple[Store, ...] = ()
+
+    def digest(self, address: str, port: str) -> str:
+        """Digest of an output, empty when the run has no such output."""
+        cell = self.run.cells.get(address)
+        output = None if cell is None else cell.outputs.get(port)
+        return "" if output is None else output.digest
+
+    def encoding_version(self, address: str, port: str) -> int:
+        """Version of the encoding in which an output was written."""
+        return self.run.cells[address].outputs[port].encoding_version
+
+    def payload(self, address: str, port: str, cls: type[Product]) -> Payload | None:
+        """Arrays and metadata of an output as the present encoding has them.
+
+        None when they are nowhere to be found.
+
+        Raises:
+            ProductError: the output is of a newer encoding than the installed type.
+        """
+        output = self.run.cells[address].outputs[port]
+        if output.embedded:
+            payload = self.run.payload(address, port)
+            if payload.encoding_version == cls.encoding_version:
+                return payload
+            return cls.from_payload(payload).to_payload()
+        for store in self.stores:
+            if store.product_file(output.digest) is not None:
+                return store.get_product(output.digest, cls).to_payload()
+        return None
+
+
+def product_distances(
+    left: RunProducts, right: RunProducts, addresses: Sequence[str], catalog: Catalog
+) -> tuple[ProductDistance, ...]:
+    """Compare the outputs of cells that both runs have.
+
+    Args:
+        left: one run.
+        right: the other.
+        addresses: the cells, each in both runs.
+        catalog: knows the product types and with them the tolerances.
+    """
+    found = []
+    for address in addresses:
+        ours, theirs = left.run.cells[address].outputs, right.run.cells[address].outputs
+        for port in dict.fromkeys((*ours, *theirs)):
+            type_name = (ours.get(port) or theirs[port]).type_name
+            found.append(_distance(left, right, (address, port, type_name), catalog))
+    return tuple(found)
+
+
+def _distance(
+    left: RunProducts, right: RunProducts, what: tuple[str, str, str], catalog: Catalog
+) -> ProductDistance:
+    address, port, type_name = what
+    digests = left.digest(address, port), right.digest(address, port)
+
+    def verdict(
+        said: Verdict, reason: str = "", distances: tuple[Distance, ...] = ()
+    ) -> ProductDistance:
+        return ProductDistance(
+            cell=address,
+            port=port,
+            type_name=type_name,
+            verdict=said,
+            left=digests[0],
+            right=digests[1],
+            distances=distances,
+            reason=reason,
+        )
+
+    if not all(digests):
+        return verdict("different", "only one of the runs has it")
+    if digests[0] == digests[1]:
+        return verdict("identical")
+    try:
+        cls = catalog.product_class(type_name)
+        payloads = [side.payload(address, port, cls) for side in (left, right)]
+    except OrthoflowError as error:
+        return verdict("not measured", f"the digests differ, and {error}")
+    ours, theirs = payloads
+    if ours is None or theirs is None:
+        return verdict(
+            "not measured",
+            "the digests differ, and its arrays are in no record and no store at hand; run with "
+            "--embed to keep them",
+        )
+    encodings = {side.encoding_version(address, port) for side in (left, right)}
+    if len(encodings) > 1:
+        ours, theirs = _common(ours, theirs)
+    limits = {name: (limit.limit, limit.unit) for name, limit in cls.tolerances.items()}
+    differences = measure_payloads(ours, theirs, limits)
+    beyond = [difference for difference in differences if difference.n_values]
+    if not beyond:
+        is_same = payload_digest(ours) == payload_digest(theirs)
+        return verdict("identical" if is_same else "within tolerance", "", _by_unit(differences))
+    others = f"; {len(beyond) - 1} more fields differ" if len(beyond) > 1 else ""
+    reason = f"{beyond[0].name}: {beyond[0].problem}{others}"
+    return verdict("different", reason, _by_unit(differences))
+
+
+def _common(left: Payload, right: Payload) -> tuple[Payload, Payload]:
+    """Leave out what only one of two encodings states: nothing can be said of a distance there."""
+    return _without_strangers(left, right), _without_strangers(right, left)
+
+
+def _without_strangers(payload: Payload, other: Payload) -> Payload:
+    return replace(
+        payload,
+        metadata={
+            name: _shared(value, other.metadata[name])
+            for name, value in payload.metadata.items()
+            if name in other.metadata
+        },
+        arrays={name: array for name, array in payload.arrays.items() if name in other.arrays},
+    )
+
+
+def _shared(value: JsonValue, other: JsonValue) -> JsonValue:
+    if isinstance(value, dict) and isinstance(other, dict):
+        return {key: _shared(value[key], other[key]) for key in value if key in other}
+    if isinstance(value, list) and isinstance(other, list) and len(value) == len(other):
+        return [_shared(a, b) for a, b in zip(value, other, strict=True)]
+    return value
+
+
+def _by_unit(differences: Sequence[ArrayDifference]) -> tuple[Distance, ...]:
+    units = dict.fromkeys(difference.unit for difference in differences)
+    return tuple(
+        _farthest([difference for difference in differences if difference.unit == unit])
+        for unit in units
+    )
+
+
+def _farthest(differences: Sequence[ArrayDifference]) -> Distance:
+    worst = max(differences, key=lambda difference: difference.largest)
+    return Distance(
+        unit=worst.unit,
+        largest=worst.largest if math.isfinite(worst.largest) else None,
+        limit=worst.limit,
+        field=worst.name,
+        n_values=sum(difference.n_values for difference in differences),
+    )

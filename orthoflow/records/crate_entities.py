@@ -19,6 +19,7 @@ from orthoflow_provenance.model import (
     RecordedFile,
     RecordedProduct,
     RunRecord,
+    cost_metrics,
 )
 
 from orthoflow.products.product import JsonValue
@@ -29,11 +30,11 @@ WORKFLOW_FILE: Final = "workflow.yaml"
 RESOLVED_FILE: Final = "workflow-resolved.json"
 _DONE: Final = "http://schema.org/CompletedActionStatus"
 _FAILED: Final = "http://schema.org/FailedActionStatus"
-_COSTS: Final = (
-    ("wall_s", "https://qudt.org/vocab/unit/SEC"),
-    ("cpu_s", "https://qudt.org/vocab/unit/SEC"),
-    ("peak_rss_mib", "https://qudt.org/vocab/unit/MebiBYTE"),
-)
+_UNIT_CODES: Final = {
+    "s": "https://qudt.org/vocab/unit/SEC",
+    "MiB": "https://qudt.org/vocab/unit/MebiBYTE",
+    "1": "https://qudt.org/vocab/unit/UNITLESS",
+}
 
 
 def ref(identifier: str) -> dict[str, JsonValue]:
@@ -240,14 +241,14 @@ def _settings(cell: RecordedCell) -> Iterator[Entity]:
 
 
 def _costs(cell: RecordedCell) -> Iterator[Entity]:
-    for name, unit in _COSTS:
+    for cost in cost_metrics(cell):
         yield {
-            "@id": f"#cost-{cell.address}/{name}",
+            "@id": f"#cost-{cell.address}/{cost.name}",
             "@type": "PropertyValue",
-            "name": name,
-            "propertyID": name,
-            "unitCode": unit,
-            "value": str(getattr(cell, name)),
+            "name": cost.name,
+            "propertyID": cost.name,
+            "unitCode": _UNIT_CODES[cost.unit],
+            "value": str(cost.value),
         }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
-from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.model import RecordedCell, cost_metrics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,22 +38,16 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
     """
     if cell.status != "ok":
         return ()
-    reported = [(metric.name, metric.value, metric.unit) for metric in cell.metrics]
-    measured = [
-        ("wall_s", cell.wall_s, "s"),
-        ("cpu_s", cell.cpu_s, "s"),
-        ("peak_rss_mib", cell.peak_rss_mib, "MiB"),
-    ]
     return tuple(
         MetricRow(
             cell=cell.address,
             step=cell.step,
             method=cell.method,
-            metric=name,
-            value=value,
-            unit=unit,
+            metric=metric.name,
+            value=metric.value,
+            unit=metric.unit,
         )
-        for name, value, unit in [*reported, *measured]
+        for metric in (*cell.metrics, *cost_metrics(cell))
     )
 
 

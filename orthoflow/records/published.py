@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shutil
@@ -15,23 +14,11 @@ from orthoflow_provenance.model import PublishedFile, RecordedCell
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import file_sha256
+from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.records.metrics import cell_metrics, write_metrics_csv
 
 PRODUCTS_FOLDER: Final = "products"
 METRICS_FILE: Final = "metrics.csv"
-_LONGEST_FOLDER_NAME: Final = 200  # bytes; file systems stop at 255
-
-
-def folder_name(address: str) -> str:
-    """Give the folder of a cell below `products/`: its address, shortened when it is too long.
-
-    >>> folder_name("ortho@plane=ransac,orient=pnp")
-    'ortho@plane=ransac,orient=pnp'
-    """
-    if len(address.encode()) <= _LONGEST_FOLDER_NAME:
-        return address
-    digest = hashlib.sha256(address.encode()).hexdigest()[:12]
-    return f"{address.encode()[: _LONGEST_FOLDER_NAME - 13].decode(errors='ignore')}-{digest}"
 
 
 def publish_products(
@@ -59,7 +46,7 @@ def publish_products(
         target.mkdir(parents=True, exist_ok=True)
         for cell in cells:
             if cell.status == "ok":
-                _publish_cell(target / folder_name(cell.address), cell, files_of)
+                _publish_cell(target / cell_file_name(cell.address), cell, files_of)
         rows = [row for cell in cells for row in cell_metrics(cell)]
         write_metrics_csv(target / METRICS_FILE, rows)
         return _digested(run_folder, target)
@@ -94,7 +81,7 @@ def _publish_cell(
 
 def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
     """Files of one cell below `products/`, wall 2 before wall 10; empty when there are none."""
-    folder = run_folder / PRODUCTS_FOLDER / folder_name(address)
+    folder = run_folder / PRODUCTS_FOLDER / cell_file_name(address)
     if not folder.is_dir():
         return ()
     files = (path for path in folder.iterdir() if path.is_file())

@@ -16,7 +16,7 @@ from orthoflow.engine.environment import environment
 from orthoflow.engine.keys import input_digest
 from orthoflow.engine.plan import RunPlan, plan_run
 from orthoflow.errors import PluginError, RecordError, WorkflowError
-from orthoflow.records.input_search import find_inputs
+from orthoflow.records.input_files import find_inputs
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
 from orthoflow.workflow import Cell, CellOutput, StepVariant, Workflow, WorkflowInput
@@ -207,7 +207,8 @@ class _MethodCheck:
             cls = self.catalog.method(cell.method).load()
             for product in cell.outputs.values():
                 found = self.catalog.product_class(product.type_name).encoding_version
-                if found != product.encoding_version:
+                # Older encodings are read; a newer one is of a later version of the type.
+                if found < product.encoding_version:
                     _add(
                         self.others,
                         f"product type {product.type_name}: the installed one has encoding "
@@ -272,8 +273,8 @@ def _environment_notes(run: Run) -> Iterator[str]:
     here = environment(1)
     for recorded in run.record.environments:
         for name in _ENVIRONMENT:
-            if getattr(recorded, name) != here[name]:
-                yield f"{name}: {here[name]} here, {getattr(recorded, name)} in the record"
+            if getattr(recorded, name) != getattr(here, name):
+                yield f"{name}: {getattr(here, name)} here, {getattr(recorded, name)} in the record"
 
 
 def _method_notes(run: Run, plan: RunPlan) -> Iterator[str]:

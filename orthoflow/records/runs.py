@@ -14,12 +14,12 @@ from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord
 from orthoflow_provenance.reader import read_outputs, read_record
 
+from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
 from orthoflow.products.product import Payload, Product
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.published import PRODUCTS_FOLDER, published_files
 
-RECORD_FILE: Final = "run.h5"
 REPORT_FILE: Final = "report.html"
 
 

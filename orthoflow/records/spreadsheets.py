@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
-from orthoflow_provenance.model import RunRecord
+from orthoflow_provenance.model import COSTS, RunRecord
 
 from orthoflow.records.metrics import write_metrics_csv
 from orthoflow.records.published import METRICS_FILE
@@ -48,7 +48,7 @@ def _write(path: Path, rows: Iterable[Row]) -> None:
 def _cells(record: RunRecord) -> Iterator[Row]:
     plain = (
         *("status", "method", "distribution", "distribution_version", "result_version"),
-        *("determinism", "seed", "started", "ended", "wall_s", "cpu_s", "peak_rss_mib"),
+        *("determinism", "seed", "started", "ended", *COSTS),
         *("environment", "cached_from", "key", "error_type", "error_message"),
     )
     yield ("cell", "step", "variants", "repeat", *plain, "warnings")

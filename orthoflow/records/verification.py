@@ -83,14 +83,14 @@ class _PublishedCheck:
 def _check_published(folder: Path, record: RunRecord) -> _PublishedCheck:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         states = list(pool.map(lambda file: _state(folder, file), record.published))
-    told = list(zip(record.published, states, strict=True))
-    missing = [file.path for file, state in told if state == "missing"]
+    checked = list(zip(record.published, states, strict=True))
+    missing = [file.path for file, state in checked if state == "missing"]
     changed = tuple(
         f"{file.path}: {state} since it was published"
-        for file, state in told
+        for file, state in checked
         if state in {"changed", "unreadable"}
     )
-    notes = (_missing_note(missing, len(told)),) if missing else ()
+    notes = (_missing_note(missing, len(checked)),) if missing else ()
     return _PublishedCheck(changed=changed, notes=notes, n_same=states.count("same"))
 
 

@@ -3,36 +3,42 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final
 
 from orthoflow_provenance.errors import InputFileError, RecordFormatError
 from orthoflow_provenance.model import (
+    CellOutcome,
+    Figure,
+    ProductRef,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
     RecordedProduct,
     RunRecord,
+    shared_fields,
 )
 from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.writer import write_record
 
 from orthoflow.engine.durability import sync_folder, writing_to
+from orthoflow.engine.file_digests import FileDigests
+from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.errors import InputError, StoreError
-from orthoflow.products.product import JsonValue
+from orthoflow.records.input_files import embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
-from orthoflow.records.runs import RECORD_FILE, Run
+from orthoflow.records.runs import Run
 from orthoflow.version import __version__
 from orthoflow.workflow import resolved_json
+from orthoflow.workflow.resolved import workflow_from_resolved
 
 if TYPE_CHECKING:
-    from orthoflow.engine import CellResult, ProductRef, RunOutcome, RunPlan, Store
+    from orthoflow.engine import CellResult, RunOutcome, RunPlan, Store
     from orthoflow.engine.results import FigureRef
     from orthoflow.workflow import Workflow
     from orthoflow.workflow.cells import Cell
@@ -145,6 +151,53 @@ def build_record(
     )
 
 
+def write_embedded(run: Run, path: Path, store: Store, inputs: Sequence[str] = ()) -> Run:
+    """Write the record of a run again with every product and every input file in it.
+
+    Args:
+        run: the run.
+        path: the new record; its folder exists.
+        store: holds the products that the run's record names by digest only.
+        inputs: `NAME=PATH`, each as behind `--input`; other files are looked for by content.
+
+    Returns:
+        The run, with the new record.
+
+    Raises:
+        InputError: an input file is missing or was changed.
+        StoreError: a product is in neither record nor store, or the disk refuses.
+        InvalidArgumentsError: `inputs` names no input of the workflow.
+    """
+    _check_products(run, store)
+    with embedded_inputs(run, path.parent) as extracted:
+        files = _input_files(run, store.file_digests(), inputs, extracted)
+        record = dataclasses.replace(
+            run.record,
+            inputs=tuple(
+                dataclasses.replace(entry, embedded=bool(entry.files))
+                for entry in run.record.inputs
+            ),
+            cells=tuple(
+                dataclasses.replace(
+                    cell,
+                    outputs={
+                        port: dataclasses.replace(output, embedded=True)
+                        for port, output in cell.outputs.items()
+                    },
+                )
+                for cell in run.record.cells
+            ),
+        )
+        try:
+            with writing_to(path.parent):
+                write_record(
+                    path, record, store.product_file, input_file=files.get, earlier=run.path
+                )
+        except RecordFormatError as error:
+            raise StoreError(f"{path} cannot be written: {error}") from error
+    return Run(path=path, record=record)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _CellRecorder:
     """Turns cells with their results into recorded cells."""
@@ -156,56 +209,27 @@ class _CellRecorder:
 
     def record(self, cell: Cell, result: CellResult) -> RecordedCell:
         """Give what the record says of one cell."""
-        facts = self.plan.methods.get(cell.method)
-        if facts is not None and not result.distribution:
-            # A cell that never started knows nothing of its method.
-            result = dataclasses.replace(
-                result,
-                distribution=facts.distribution,
-                distribution_version=facts.distribution_version,
-                result_version=facts.result_version,
-                determinism=facts.determinism,
-                citations=facts.citations,
-            )
         return RecordedCell(
+            **shared_fields(result, CellOutcome),
             address=cell.address,
             step=cell.step,
-            method=cell.method,
-            status=result.status,
             assignment=dict(cell.assignment),
             repeat=cell.repeat,
-            distribution=result.distribution,
-            distribution_version=result.distribution_version,
-            result_version=result.result_version,
-            determinism=result.determinism,
-            error_type=result.error_type,
-            error_message=result.error_message,
             params=dict(cell.params),
             params_set=dict(cell.params_set),
-            key=result.key,
-            key_preimage=result.key_preimage,
-            seed=result.seed,
-            started=result.started,
-            ended=result.ended,
-            wall_s=result.wall_s,
-            cpu_s=result.cpu_s,
-            peak_rss_mib=result.peak_rss_mib,
-            environment=str(result.environment.get("id", "")),
+            environment=result.environment.id if result.environment else "",
             cached_from=self.outcome.cached.get(cell.address, ""),
-            metrics=tuple(
-                RecordedMetric(name=metric.name, value=metric.value, unit=metric.unit)
-                for metric in result.metrics
-            ),
             figures=tuple(_recorded_figure(figure, self.store) for figure in result.figures),
-            warnings=result.warnings,
-            citations=result.citations,
-            log=result.log,
             inputs={
-                port: _recorded_product(ref, source=str(cell.inputs.get(port, "")))
+                port: RecordedProduct(
+                    source=str(cell.inputs.get(port, "")), **shared_fields(ref, ProductRef)
+                )
                 for port, ref in result.inputs.items()
             },
             outputs={
-                port: _recorded_product(ref, embedded=self._is_embedded(ref))
+                port: RecordedProduct(
+                    embedded=self._is_embedded(ref), **shared_fields(ref, ProductRef)
+                )
                 for port, ref in result.outputs.items()
             },
         )
@@ -215,18 +239,6 @@ class _CellRecorder:
         return self.embed or bool(resolve_name(target).embedded)
 
 
-def _recorded_product(
-    ref: ProductRef, *, source: str = "", embedded: bool = False
-) -> RecordedProduct:
-    return RecordedProduct(
-        type_name=ref.type_name,
-        encoding_version=ref.encoding_version,
-        digest=ref.digest,
-        source=source,
-        embedded=embedded,
-    )
-
-
 def _recorded_figure(figure: FigureRef, store: Store) -> RecordedFigure:
     path = store.blob_path(figure.sha256)
     if path is None:
@@ -234,12 +246,7 @@ def _recorded_figure(figure: FigureRef, store: Store) -> RecordedFigure:
             f"the store {store.folder} lost the figure {figure.name}; run again and it is drawn "
             "anew"
         )
-    return RecordedFigure(
-        name=figure.name,
-        caption=figure.caption,
-        media_type=figure.media_type,
-        data=path.read_bytes(),
-    )
+    return RecordedFigure(data=path.read_bytes(), **shared_fields(figure, Figure))
 
 
 def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]:
@@ -247,7 +254,7 @@ def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]
         RecordedInput(
             name=name,
             files=tuple(
-                RecordedFile(name=file.name, size_bytes=file.size_bytes, sha256=file.sha256)
+                RecordedFile(**shared_fields(file, RecordedFile))
                 for file in (given.files if given is not None else ())
             ),
             embedded=embed and given is not None,
@@ -257,30 +264,46 @@ def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]
 
 
 def _recorded_environments(results: Mapping[str, CellResult]) -> tuple[RecordedEnvironment, ...]:
-    found: dict[str, RecordedEnvironment] = {}
-    for result in results.values():
-        given = result.environment
-        if given and str(given["id"]) not in found:
-            found[str(given["id"])] = _recorded_environment(given)
-    return tuple(found.values())
-
-
-def _recorded_environment(given: Mapping[str, JsonValue]) -> RecordedEnvironment:
-    packages = cast("dict[str, str]", given["packages"])
-    return RecordedEnvironment(
-        id=str(given["id"]),
-        python=str(given["python"]),
-        os=str(given["os"]),
-        cpu=str(given["cpu"]),
-        cores=cast("int", given["cores"]),
-        threads=cast("int", given["threads"]),
-        git_commit=str(given["git_commit"]),
-        packages=dict(packages),
-    )
+    given = (result.environment for result in results.values())
+    return tuple({found.id: found for found in given if found is not None}.values())
 
 
 def _published(outcome: RunOutcome, store: Store) -> dict[str, dict[str, tuple[Path, ...]]]:
     return {
         address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
         for address, result in outcome.results.items()
+    }
+
+
+def _check_products(run: Run, store: Store) -> None:
+    missing = [
+        f"{address}.{port} ({output.digest})"
+        for address, cell in run.cells.items()
+        for port, output in cell.outputs.items()
+        if not output.embedded and store.product_file(output.digest) is None
+    ]
+    if missing:
+        raise StoreError(
+            f"neither the record {run.path} nor the store {store.folder} has "
+            f"{', '.join(missing)}: name the store of the run with --store, or replay the run"
+        )
+
+
+def _input_files(
+    run: Run,
+    digests: FileDigests,
+    given: Sequence[str],
+    extracted: Mapping[str, tuple[Path, ...]],
+) -> dict[str, Path]:
+    record = run.record
+    workflow = workflow_from_resolved(record.workflow_resolved, record.workflow_source)
+    search = find_inputs(
+        workflow, record.inputs, run.folder, digests, given=given, extracted=extracted
+    )
+    if search.problems:
+        raise InputError("; ".join(search.problems))
+    return {
+        file.sha256: place
+        for entry in record.inputs
+        for file, place in zip(entry.files, search.paths[entry.name], strict=True)
     }

@@ -77,7 +77,7 @@ def _boxes(run: Run) -> dict[str, _Box]:
     return {
         name: _Box(
             title=name,
-            below=_told(cells),
+            below=_state_words(cells),
             state=_state(cells),
             before=tuple(
                 dict.fromkeys(
@@ -97,7 +97,7 @@ def _cells_before(run: Run, cell: RecordedCell) -> list[str]:
     return [source for source in sources if source in run.cells]
 
 
-def _told(cells: Sequence[RecordedCell]) -> str:
+def _state_words(cells: Sequence[RecordedCell]) -> str:
     done = [cell for cell in cells if cell.status == "ok"]
     seconds = seconds_in_words(sum(cell.wall_s for cell in done))
     if len(cells) == 1:

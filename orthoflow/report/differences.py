@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 
 from orthoflow.records import (
     CellFacts,
-    MetricValue,
+    ComparedMetric,
     Pair,
     ParameterValue,
     ProductDistance,
@@ -118,7 +118,7 @@ def _table(title: str, pairs: Sequence[Pair[Side]], text: Callable[[Side], str])
     )
 
 
-def _metric_table(pairs: Sequence[Pair[MetricValue]]) -> DifferenceTable:
+def _metric_table(pairs: Sequence[Pair[ComparedMetric]]) -> DifferenceTable:
     """Metrics that differ; time and memory always do, and stand in the comparison table."""
     measured = [pair for pair in pairs if not _either(pair).is_cost]
     rows = []
@@ -140,7 +140,7 @@ def _metric_table(pairs: Sequence[Pair[MetricValue]]) -> DifferenceTable:
     )
 
 
-def _either(pair: Pair[MetricValue]) -> MetricValue:
+def _either(pair: Pair[ComparedMetric]) -> ComparedMetric:
     side = pair.left or pair.right
     if side is None:
         raise AssertionError("a pair stands for something that a run has")

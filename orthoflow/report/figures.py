@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.files.images import decode_image, encode_png, shrunk_webp
 from orthoflow.records import RecordedFigure, Run
-from orthoflow.records.published import folder_name
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.pictures import Picture, data_uri
@@ -94,7 +94,7 @@ def write_figures(run: Run, folder: Path, addresses: Iterable[str]) -> int:
     (folder / "graph.svg").write_text(run_diagram(run, stands_alone=True), encoding="utf-8")
     waiting: list[tuple[Path, RecordedFigure]] = []
     for address in addresses:
-        inside = folder / folder_name(address)
+        inside = folder / cell_file_name(address)
         figures = run.cells[address].figures
         if figures:
             inside.mkdir(exist_ok=True)

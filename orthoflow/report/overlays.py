@@ -39,7 +39,7 @@ class Overlay:
         svg: an `<svg>` element with transparent ground.
         title: what it shows.
         caption: magnification and counts, in words.
-        cell: address of the cell that told the vectors.
+        cell: address of the cell that gave the vectors.
         walls_cell: address of the cell that made the wall's raster.
         wall: index of the wall.
     """

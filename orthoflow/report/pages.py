@@ -17,9 +17,9 @@ from markupsafe import Markup, escape
 
 from orthoflow import __version__
 from orthoflow.errors import StoreError
-from orthoflow.records import Run, compare_runs
+from orthoflow.records import COSTS, Run, compare_runs
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.comparisons import ComparisonTable, comparison_table
+from orthoflow.report.comparisons import ComparisonTable, comparison_table, environment_words
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import differences
 from orthoflow.report.figures import (
@@ -30,11 +30,9 @@ from orthoflow.report.figures import (
     write_figures,
 )
 from orthoflow.report.numbers import number_with_unit
-from orthoflow.report.origins import environment_words
 from orthoflow.report.overlays import overlays
-from orthoflow.report.pictures import Picture, orthoimage_pictures, wall_pictures
+from orthoflow.report.pictures import Picture, orthoimage_pictures, sliders, wall_pictures
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
-from orthoflow.report.sliders import sliders
 from orthoflow.report.summaries import Answer, Limit, answers, citations, limits
 
 # Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
@@ -134,6 +132,7 @@ def _template() -> jinja2.Template:
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote
     # Ours, and no template: braces in them mean nothing.
+    environment.globals["costs"] = COSTS
     environment.globals["css"] = Markup(_packaged("page.css"))
     environment.globals["script"] = Markup(_packaged("page.js"))
     return environment.get_template("page.html.j2")

@@ -53,12 +53,12 @@ def answers(run: Run) -> tuple[Answer, ...]:
     values = {(row.cell, row.metric): row.value for row in rows}
     found: list[Answer] = []
     for wanted, what in QUALITY.items():
-        told = [row for row in rows if row.metric == wanted]
+        stated = [row for row in rows if row.metric == wanted]
         # A later step of the chain improves on an earlier one: first and final orientation.
-        told = [row for row in told if row.step == told[-1].step]
+        stated = [row for row in stated if row.step == stated[-1].step]
         if wanted == "completeness":
-            told = [row for row in told if (row.cell, _SHARPER_COMPLETENESS) not in values]
-        for row in told:
+            stated = [row for row in stated if (row.cell, _SHARPER_COMPLETENESS) not in values]
+        for row in stated:
             value = _in_words(wanted, row.value, row.unit)
             if wanted == "n_oriented" and (row.cell, "n_photos") in values:
                 value = f"{value} of {number(values[row.cell, 'n_photos'])}"
@@ -68,15 +68,15 @@ def answers(run: Run) -> tuple[Answer, ...]:
 
 def limits(run: Run) -> tuple[Limit, ...]:
     """What limits the results: failures, then warnings, the baseline's first, each said once."""
-    told: dict[str, list[str]] = {}
+    addresses: dict[str, list[str]] = {}
     for cell in run.record.cells:
         if cell.status == "failed":
-            told.setdefault(f"failed: {cell.error_message}", []).append(cell.address)
+            addresses.setdefault(f"failed: {cell.error_message}", []).append(cell.address)
     first = {cell.address for cell in baseline_cells(run)}
     for cell in sorted(run.record.cells, key=lambda cell: cell.address not in first):
         for text in cell.warnings:
-            told.setdefault(text, []).append(cell.address)
-    return tuple(Limit(text=text, cells=tuple(cells)) for text, cells in told.items())
+            addresses.setdefault(text, []).append(cell.address)
+    return tuple(Limit(text=text, cells=tuple(cells)) for text, cells in addresses.items())
 
 
 def _in_words(metric: str, value: float, unit: str) -> str:

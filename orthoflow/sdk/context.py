@@ -11,10 +11,13 @@ from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+from orthoflow_provenance.model import Figure, Metric
 
 from orthoflow.errors import CancelledStepError, ProductError
 
-FIGURE_SUFFIXES: Final = (".png", ".svg")
+__all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
+
+_MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp", ".svg": "image/svg+xml"}
 
 
 class Drawing(Protocol):
@@ -26,20 +29,9 @@ class Drawing(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Metric:
-    """One number a method reports about its result."""
+class DrawnFigure(Figure):
+    """One picture a method made, a PNG, WebP or SVG file in the scratch folder."""
 
-    name: str
-    value: float
-    unit: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class Figure:
-    """One picture a method made, a PNG or SVG file in the scratch folder."""
-
-    name: str
-    caption: str
     path: Path
 
 
@@ -87,7 +79,7 @@ class StepContext:
     listen: Callable[[StepEvent], None] = _ignore
     is_cancelled: Callable[[], bool] = _never
     metrics: list[Metric] = field(default_factory=list)
-    figures: list[Figure] = field(default_factory=list)
+    figures: list[DrawnFigure] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     _fraction: float = 0.0
 
@@ -126,7 +118,10 @@ class StepContext:
         else:
             path = folder / f"{name}.png"
             content.savefig(path)
-        self.figures.append(Figure(name=name, caption=caption, path=path))
+        media_type = _MEDIA_TYPES[path.suffix]
+        self.figures.append(
+            DrawnFigure(name=name, caption=caption, media_type=media_type, path=path)
+        )
 
     def progress(self, fraction: float, text: str = "") -> None:
         """Say how far the step is, 0..1; never goes back. Stops a cancelled step.

@@ -14,9 +14,8 @@ from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method
 from orthoflow.testing.checks import CHECKS, Check
 from orthoflow.testing.examples import example_inputs
-from orthoflow.testing.subjects import Subject
 from orthoflow.testing.trials import Trial
-from orthoflow.testing.witnesses import Witness
+from orthoflow.testing.witnesses import Subject, Witness
 
 Inputs = Mapping[str, Product | InputFiles]
 

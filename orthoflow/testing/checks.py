@@ -30,7 +30,7 @@ from orthoflow.testing.physics import (
     planes_follow_a_rigid_motion,
     poses_are_recovered,
 )
-from orthoflow.testing.subjects import Subject, require
+from orthoflow.testing.witnesses import Subject, require
 
 # What a float parameter's name ends with: its unit, or a word that says it has none.
 UNIT_SUFFIXES: Final = (

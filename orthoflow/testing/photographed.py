@@ -1,44 +1,286 @@
-"""Small inputs for methods that take photographs: a textured wall, seen by two known cameras."""
+"""A textured wall with relief, exactly known: as a raster, a cloud, and through a distorted camera.
+
+What methods for photographs are tried on. Everything is a function of the position on the wall, so
+the truth of a cell, of a pixel and of a pose is known to the last digit.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
-from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.files.images import encode_png
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.rotations import rotation_from_vector
 from orthoflow.products import (
     Calibration,
+    Camera,
     Cameras,
     CheckPoints,
     Intrinsics,
+    Photo,
     Photos,
     PointCloud,
     Product,
     TieRole,
     Ties,
+    Wall,
     Walls,
 )
-from orthoflow.testing.textured_walls import (
-    SIZE_M,
-    TexturedWall,
-    camera_before,
-    cloud_of,
-    oriented,
-    photo_of,
-    textured_wall,
-    walls_of,
-)
 
+SIZE_M: Final = (3.0, 2.0)
+GSD_M: Final = 0.006
+DISTORTION: Final = (-0.09, 0.03, 6e-4, -4e-4, 0.0)
+RELIEF_M: Final = 0.06
+# Finest octave of the texture: four cells, so that neither raster nor photo aliases.
+_OCTAVES_M: Final = (0.024, 0.06, 0.2)
 # Ties lie on the wall and on a board before it: a method that solves for the lens with the pose
 # cannot do so from control near one plane.
 _BOARD_M: Final = 0.6
 _TIE_SIGMA_PX: Final = 0.3
 _TIE_SIGMA_M: Final = 0.001
 _WRONG_SHARE: Final = 0.04
+
+
+@dataclass(frozen=True, kw_only=True)
+class TexturedWall:
+    """A wall whose depth and grey are smooth functions of the position on it.
+
+    Attributes:
+        frame: the raster's frame; the wall looks to -y, so a viewer stands at negative y.
+        noises: one grid of random numbers per octave of the texture.
+    """
+
+    frame: WallFrame
+    noises: tuple[NDArray[np.float64], ...]
+
+    def depth_m(
+        self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Give the relief towards the viewer at metres from the top-left corner."""
+        wave = np.sin(2.1 * across_m) * np.cos(2.9 * down_m + 0.4) + 0.4 * np.sin(
+            5.0 * across_m + 1
+        )
+        return RELIEF_M * wave
+
+    def grey(
+        self, across_m: NDArray[np.float64], down_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Give the grey, 0..1."""
+        total = np.zeros(np.broadcast(across_m, down_m).shape)
+        for step, noise in zip(_OCTAVES_M, self.noises, strict=True):
+            at = [down_m / step + 8.0, across_m / step + 8.0]
+            total += map_coordinates(noise, at, order=3, mode="mirror")
+        return 1.0 / (1.0 + np.exp(-1.3 * total))
+
+
+def textured_wall(
+    seed: int, *, origin_world: NDArray[np.float64] | None = None, gsd_m: float = GSD_M
+) -> TexturedWall:
+    """Give a wall of 3 m x 2 m with 6 cm of relief; its plane goes through `origin_world`."""
+    rng = np.random.default_rng(seed)
+    frame = WallFrame(
+        origin_world=np.array([0.0, 0.0, SIZE_M[1]]) if origin_world is None else origin_world,
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=np.array([0.0, 0.0, -1.0]),
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=gsd_m,
+        width=round(SIZE_M[0] / gsd_m),
+        height=round(SIZE_M[1] / gsd_m),
+    )
+    noises = tuple(
+        rng.normal(size=(int(SIZE_M[1] / step) + 18, int(SIZE_M[0] / step) + 18))
+        for step in _OCTAVES_M
+    )
+    return TexturedWall(frame=frame, noises=noises)
+
+
+def walls_of(scene: TexturedWall, *, noise: float = 0.02, seed: int = 5) -> Walls:
+    """Give the wall as the scan shows it: its contrast curve is not the photos', one window."""
+    frame = scene.frame
+    across, down = places_of_cells(frame)
+    rng = np.random.default_rng(seed)
+    grey = scene.grey(across, down)
+    intensity = 0.2 + 0.5 * grey**1.4
+    intensity += noise * rng.normal(size=intensity.shape)
+    depth = scene.depth_m(across, down) + 0.001 * rng.normal(size=across.shape)
+    _cut_window(intensity, frame.gsd_m)
+    known = np.isfinite(intensity)
+    wall = Wall(
+        frame=frame,
+        plane_index=0,
+        name="wall 0",
+        depth_m=np.where(known, depth, np.nan).astype(np.float32),
+        sigma_m=np.full(frame.shape, 0.001, dtype=np.float32),
+        count=np.where(known, 3, 0).astype(np.uint32),
+        mask=known.astype(np.uint8),
+        intensity=intensity.astype(np.float32),
+        rgb=np.repeat(np.rint(255 * grey)[..., np.newaxis], 3, axis=2).astype(np.uint8),
+        rgb_mask=known.astype(np.uint8),
+    )
+    return Walls(
+        walls=(wall,),
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity_source="laser",
+        buffer_front_m=0.2,
+        buffer_behind_m=0.2,
+    )
+
+
+def places_of_cells(frame: WallFrame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Give metres across and down, (rows, cols) each, of the centres of a raster's cells."""
+    across, down = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
+    return across * frame.gsd_m, down * frame.gsd_m
+
+
+def _cut_window(values: NDArray[np.float64], gsd_m: float) -> None:
+    left, right, top, bottom = (round(metres / gsd_m) for metres in (1.2, 1.44, 0.72, 0.9))
+    values[top:bottom, left:right] = np.nan
+
+
+def cloud_of(scene: TexturedWall, *, spacing_m: float = 0.005) -> PointCloud:
+    """Give the wall as coloured points in a regular grid, a station before its middle."""
+    across, down = (
+        places.ravel()
+        for places in np.meshgrid(
+            np.arange(spacing_m / 2, SIZE_M[0], spacing_m),
+            np.arange(spacing_m / 2, SIZE_M[1], spacing_m),
+        )
+    )
+    gsd_m, origin = scene.frame.gsd_m, scene.frame.origin_world
+    points = scene.frame.world_from_wall(
+        np.column_stack([across, down]) / gsd_m, scene.depth_m(across, down)
+    )
+    x, y, z = np.ascontiguousarray((points - origin).T, dtype=np.float32)
+    grey = np.rint(255 * scene.grey(across, down)).astype(np.uint8)
+    return PointCloud(
+        origin=origin.copy(),
+        x=x,
+        y=y,
+        z=z,
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity=(grey / 255.0).astype(np.float32),
+        rgb=np.repeat(grey[:, np.newaxis], 3, axis=1),
+        stations=origin[np.newaxis] + [[SIZE_M[0] / 2, -2.6, -1.0]],
+        stations_source="file",
+    )
+
+
+def camera_before(
+    scene: TexturedWall,
+    *,
+    centre: tuple[float, float, float] = (1.2, -2.6, 1.1),
+    towards: tuple[float, float, float] = (1.5, 0.0, 1.0),
+    roll: float = 0.0,
+) -> ViewingCamera:
+    """Give a distorted camera; its places are metres from the wall's bottom-left corner."""
+    corner = scene.frame.origin_world - [0.0, 0.0, SIZE_M[1]]
+    rotation = looking_at(
+        corner + np.array(centre), corner + np.array(towards), np.array([0.0, 0.0, 1.0])
+    )
+    turn = np.array(
+        [[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]]
+    )
+    rotation = turn @ rotation
+    return ViewingCamera(
+        width=900,
+        height=640,
+        fx=840.0,
+        fy=843.0,
+        cx=455.2,
+        cy=316.4,
+        distortion=np.array(DISTORTION),
+        rotation=rotation,
+        translation=-rotation @ (corner + np.array(centre)),
+    )
+
+
+def photo_of(
+    scene: TexturedWall, camera: ViewingCamera, *, name: str = "a.png", calibrated: bool = True
+) -> Photo:
+    """Give what the camera sees, each pixel's centre traced; black beside the wall."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = camera.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
+    gsd_m = scene.frame.gsd_m
+    start = scene.frame.wall_from_world(camera.centre_world[None])[0] * [gsd_m, gsd_m, 1.0]
+    axes = np.vstack([scene.frame.u_world, scene.frame.v_world, scene.frame.normal_world])
+    local = rays @ axes.T
+    depth = np.zeros(len(rays))
+    for _ in range(30):
+        across, down = (start[i] + local[:, i] * (depth - start[2]) / local[:, 2] for i in range(2))
+        before, depth = depth, scene.depth_m(across, down)
+        if np.abs(depth - before).max() < 1e-7:
+            break
+    grey = np.where(
+        (across > 0) & (across < SIZE_M[0]) & (down > 0) & (down < SIZE_M[1]),
+        scene.grey(across, down),
+        0.0,
+    )
+    image = np.rint(255 * grey).astype(np.uint8).reshape(camera.height, camera.width)
+    return Photo(
+        name=name,
+        encoded=encode_png(image),
+        width=camera.width,
+        height=camera.height,
+        exif_focal_px=None if calibrated else 1.02 * camera.fx,
+        intrinsics=Intrinsics.of(camera) if calibrated else None,
+    )
+
+
+def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:
+    """Give a photo's orientation as the product has it."""
+    return Camera(
+        photo=name,
+        status="ok",
+        intrinsics=Intrinsics.of(camera),
+        rotation_camera_from_world=camera.rotation,
+        translation_camera_from_world=camera.translation,
+    )
+
+
+def photos(*items: Photo) -> Photos:
+    """Give some photos as a product."""
+    return Photos(photos=items)
+
+
+def cameras(*items: Camera) -> Cameras:
+    """Give some orientations as a product."""
+    return Cameras(cameras=items)
+
+
+def nudged(camera: ViewingCamera, vector: tuple[float, ...]) -> ViewingCamera:
+    """Give the camera turned by a small rotation vector (rad) and shifted (m)."""
+    rotation = rotation_from_vector(np.array(vector[:3])) @ camera.rotation
+    centre = camera.centre_world + np.array(vector[3:])
+    return replace(camera, rotation=rotation, translation=-rotation @ centre)
+
+
+def wall_error_m(scene: TexturedWall, found: ViewingCamera, true: ViewingCamera) -> float:
+    """Give the RMS per coordinate of where pixels land on the wall's plane, found minus true."""
+    steps = np.linspace(20.0, 620.0, 9)
+    pixels = np.array([(u, v) for u in np.linspace(20.0, 880.0, 9) for v in steps])
+    landed = []
+    for camera in (found, true):
+        rays = camera.rays_world(pixels)
+        normal, offset = scene.frame.normal_world, scene.frame.plane.offset_m
+        reach = (offset - camera.centre_world @ normal) / (rays @ normal)
+        landed.append(camera.centre_world + reach[:, None] * rays)
+    cells = scene.frame.wall_from_world(landed[1])
+    inside = (
+        (cells[:, 0] > 0)
+        & (cells[:, 0] < scene.frame.width)
+        & (cells[:, 1] > 0)
+        & (cells[:, 1] < scene.frame.height)
+    )
+    difference = (landed[0] - landed[1])[inside]
+    return float(np.sqrt((difference**2).sum(axis=1).mean() / 2.0))
 
 
 @cache

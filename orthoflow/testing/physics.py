@@ -22,17 +22,15 @@ from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.examples import example_room
 from orthoflow.testing.photographed import (
     PHOTOGRAPHED,
-    photographed_scene,
-    photographing_cameras,
-)
-from orthoflow.testing.subjects import Subject, require
-from orthoflow.testing.textured_walls import (
     TexturedWall,
     cloud_of,
+    photographed_scene,
+    photographing_cameras,
     places_of_cells,
     wall_error_m,
     walls_of,
 )
+from orthoflow.testing.witnesses import Subject, require
 
 # Ties of 0.3 px and 1 mm at 2.5 m: single ones are off by 1.3 mm on the wall, a hundred together by
 # a tenth of that. A half pixel of the wrong convention is 1.5 mm.

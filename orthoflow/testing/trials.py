@@ -11,7 +11,7 @@ import numpy as np
 from orthoflow.engine.store import digest_of
 from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method, Metric, StepContext, StepEvent
-from orthoflow.sdk.context import Drawing, Figure
+from orthoflow.sdk.context import Drawing, DrawnFigure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,20 +43,20 @@ class TrialRun:
         metrics: what the method reported.
         figures: pictures, still in the scratch folder.
         events: progress, log lines and warnings, in order.
-        fractions: progress as the method told it, before the context kept it from going back.
+        fractions: progress as the method stated it, before the context kept it from going back.
     """
 
     outputs: Mapping[str, Product]
     digests: Mapping[str, str]
     metrics: tuple[Metric, ...]
-    figures: tuple[Figure, ...]
+    figures: tuple[DrawnFigure, ...]
     events: tuple[StepEvent, ...]
     fractions: tuple[float, ...] = ()
 
 
 @dataclass(kw_only=True)
 class _WatchedContext(StepContext):
-    """Remembers every fraction that it was told."""
+    """Remembers every fraction that it was given."""
 
     fractions: list[float] = field(default_factory=list)
     draws: bool = True

@@ -44,23 +44,6 @@ class ArrayDifference:
     problem: str
 
 
-def compare_payloads(
-    left: PayloadLike, right: PayloadLike, tolerances: Tolerances
-) -> tuple[ArrayDifference, ...]:
-    """Compare two products and give what differs by more than allowed.
-
-    Args:
-        left: one product.
-        right: the other.
-        tolerances: as in `measure_payloads`.
-
-    Returns:
-        Differences beyond the limits, by name; empty when the products agree.
-    """
-    measured = measure_payloads(left, right, tolerances)
-    return tuple(difference for difference in measured if difference.n_values)
-
-
 def measure_payloads(
     left: PayloadLike, right: PayloadLike, tolerances: Tolerances
 ) -> tuple[ArrayDifference, ...]:

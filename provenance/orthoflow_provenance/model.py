@@ -1,16 +1,51 @@
-"""What a record says, as plain dataclasses: the writer takes them, the reader gives them back."""
+"""What a run says, as plain dataclasses: the one declaration of metric, figure, cell and record.
+
+Methods, store and record use these types, or add to them what only they know. The writer and the
+reader go through the fields: a field that is added to `Costs` or `CellOutcome` is recorded, and
+those of `Costs` are shown wherever the others are.
+"""
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal, Protocol, TypeAlias
+from dataclasses import dataclass, field, fields
+from enum import Enum
+from typing import Annotated, Any, Final, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+RUN_FORMAT: Final = "orthoflow-run"
+# Of the record; the minor number rises with every field that is added below (SPEC, 1.2).
+RUN_FORMAT_VERSION: Final = "1.2"
+
 JsonValue: TypeAlias = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
 CellStatus = Literal["ok", "failed", "skipped"]
+
+
+class Stored(Enum):
+    """How a field lies in HDF5 where its type alone does not say it."""
+
+    DATASET = "a text of any length in a dataset of its own"
+    DIGITS = "a whole number of any size as decimal text; empty for None"
+    ELSEWHERE = "a group, or the name of one: writer and reader place it by hand"
+
+
+LongText: TypeAlias = Annotated[str, Stored.DATASET]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """What the annotation of a measured number says of it.
+
+    Attributes:
+        label: what tables call it, beside its unit.
+        unit: as in metrics.
+    """
+
+    label: str
+    unit: str
 
 
 class PayloadLike(Protocol):
@@ -43,7 +78,7 @@ class PayloadLike(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedMetric:
+class Metric:
     """One number with its unit."""
 
     name: str
@@ -52,30 +87,55 @@ class RecordedMetric:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedFigure:
-    """One picture, the bytes of a PNG or SVG file."""
+class Figure:
+    """What is said of a picture, wherever it is.
+
+    Attributes:
+        name: name the method gave.
+        caption: one sentence.
+        media_type: `image/png`, `image/webp` or `image/svg+xml`.
+    """
 
     name: str
     caption: str
     media_type: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedFigure(Figure):
+    """A picture in a record.
+
+    Attributes:
+        data: the bytes of the file.
+    """
+
     data: bytes
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedProduct:
-    """One output or input of a cell.
+class ProductRef:
+    """A product by its content.
 
     Attributes:
         type_name: product type, `files` for a workflow input.
         encoding_version: version of the type's layout, 0 for files.
         digest: `sha256:` + 64 hexadecimal digits of the logical content.
-        source: for inputs `address.port` or `inputs.name`; empty for outputs.
-        embedded: the arrays are in the record (outputs only).
     """
 
     type_name: str
     encoding_version: int
     digest: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedProduct(ProductRef):
+    """One output or input of a cell.
+
+    Attributes:
+        source: for inputs `address.port` or `inputs.name`; empty for outputs.
+        embedded: the arrays are in the record (outputs only).
+    """
+
     source: str = ""
     embedded: bool = False
 
@@ -99,9 +159,9 @@ class RecordedInput:
         embedded: the bytes of the files are in the record.
     """
 
-    name: str
+    name: Annotated[str, Stored.ELSEWHERE]
     files: tuple[RecordedFile, ...]
-    embedded: bool = False
+    embedded: Annotated[bool, Stored.ELSEWHERE] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,18 +195,96 @@ class RecordedEnvironment:
         packages: distribution name -> version.
     """
 
-    id: str
+    id: Annotated[str, Stored.ELSEWHERE]
     python: str
     os: str
     cpu: str
     cores: int
     threads: int
     git_commit: str
-    packages: Mapping[str, str]
+    packages: Annotated[Mapping[str, str], ("name", "version")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedCell:
+class MethodIdentity:
+    """Which code gave a result.
+
+    Attributes:
+        method: method id.
+        distribution: name of the distribution that brought the method.
+        distribution_version: its version.
+        result_version: the method's own counter.
+        determinism: exact, seeded or loose.
+        citations: where the method comes from.
+    """
+
+    method: str = ""
+    distribution: str = ""
+    distribution_version: str = ""
+    result_version: int = 0
+    determinism: str = ""
+    citations: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Costs:
+    """What one execution of a method took; in a record that of the run that computed it.
+
+    One that came with a later version of the format is None where an older record lacks it.
+
+    Attributes:
+        wall_s: seconds on the clock.
+        cpu_s: processor seconds of the step's process.
+        peak_rss_mib: largest memory of the step's process.
+        stored_mib: what its products, their published files and its figures take in the store;
+            equal ones of several cells lie there once. None for cells without a result too.
+    """
+
+    wall_s: Annotated[float, Quantity(label="time", unit="s")] = 0.0
+    cpu_s: Annotated[float, Quantity(label="processor", unit="s")] = 0.0
+    peak_rss_mib: Annotated[float, Quantity(label="memory", unit="MiB")] = 0.0
+    stored_mib: Annotated[float | None, Quantity(label="stored", unit="MiB")] = None
+
+
+COSTS: Final[Mapping[str, Quantity]] = {
+    name: hint.__metadata__[0]
+    for name, hint in typing.get_type_hints(Costs, include_extras=True).items()
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellOutcome(MethodIdentity, Costs):
+    """What a cell came to: the store keeps it, and the record of a run repeats it.
+
+    Attributes:
+        status: ok, failed or skipped.
+        error_type: class of the error, empty when ok; for skipped cells empty too.
+        error_message: one sentence; for skipped cells the reason.
+        key: cache key, SHA-256 in hexadecimal digits; empty when never known.
+        key_preimage: canonical JSON the key is the digest of.
+        seed: seed the generator was made from, None when the method uses none.
+        started: ISO 8601 UTC; of the original run for cached cells.
+        ended: likewise.
+        metrics: what the method reported.
+        warnings: what limits the result.
+        log: text.
+    """
+
+    status: CellStatus
+    error_type: str = ""
+    error_message: LongText = ""
+    key: str = ""
+    key_preimage: LongText = ""
+    seed: Annotated[int | None, Stored.DIGITS] = None
+    started: str = ""
+    ended: str = ""
+    metrics: tuple[Metric, ...] = ()
+    warnings: tuple[str, ...] = ()
+    log: LongText = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedCell(CellOutcome):
     """One cell of a run: a method applied once.
 
     Attributes:
@@ -154,66 +292,28 @@ class RecordedCell:
         step: name of the step.
         assignment: step -> variant, in graph order.
         repeat: 0 for the first.
-        method: method id.
-        distribution: name of the distribution that brought the method.
-        distribution_version: its version.
-        result_version: the method's own counter.
-        determinism: exact, seeded or loose.
-        status: ok, failed or skipped.
-        error_type: class of the error, empty when ok; for skipped cells empty too.
-        error_message: one sentence; for skipped cells the reason.
         params: all parameters, resolved.
         params_set: parameters as written, and from the command line.
-        key: cache key, SHA-256 in hexadecimal digits; empty when never known.
-        key_preimage: canonical JSON the key is the digest of.
-        seed: seed the generator was made from, None when the method uses none.
-        started: ISO 8601 UTC; of the original run for cached cells.
-        ended: likewise.
-        wall_s: seconds on the clock, of the original run for cached cells.
-        cpu_s: processor seconds.
-        peak_rss_mib: largest memory of the step's process.
         environment: id of the environment.
         cached_from: run id of the run that computed it; empty when computed in this run.
-        metrics: what the method reported.
         figures: pictures.
-        warnings: what limits the result.
-        citations: where the method comes from.
-        log: text.
         inputs: port -> product.
         outputs: port -> product.
     """
 
-    address: str
+    address: Annotated[str, Stored.ELSEWHERE]
     step: str
-    method: str
-    status: CellStatus
-    assignment: Mapping[str, str] = field(default_factory=dict)
+    assignment: Annotated[Mapping[str, str], ("step", "variant")] = field(default_factory=dict)
     repeat: int = 0
-    distribution: str = ""
-    distribution_version: str = ""
-    result_version: int = 0
-    determinism: str = ""
-    error_type: str = ""
-    error_message: str = ""
     params: Mapping[str, JsonValue] = field(default_factory=dict)
     params_set: Mapping[str, JsonValue] = field(default_factory=dict)
-    key: str = ""
-    key_preimage: str = ""
-    seed: int | None = None
-    started: str = ""
-    ended: str = ""
-    wall_s: float = 0.0
-    cpu_s: float = 0.0
-    peak_rss_mib: float = 0.0
     environment: str = ""
     cached_from: str = ""
-    metrics: tuple[RecordedMetric, ...] = ()
-    figures: tuple[RecordedFigure, ...] = ()
-    warnings: tuple[str, ...] = ()
-    citations: tuple[str, ...] = ()
-    log: str = ""
-    inputs: Mapping[str, RecordedProduct] = field(default_factory=dict)
-    outputs: Mapping[str, RecordedProduct] = field(default_factory=dict)
+    figures: Annotated[tuple[RecordedFigure, ...], Stored.ELSEWHERE] = ()
+    inputs: Annotated[Mapping[str, RecordedProduct], Stored.ELSEWHERE] = field(default_factory=dict)
+    outputs: Annotated[Mapping[str, RecordedProduct], Stored.ELSEWHERE] = field(
+        default_factory=dict
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,11 +343,27 @@ class RunRecord:
     status: Literal["ok", "failed"]
     started: str
     ended: str
-    seed: int
-    workflow_source: str
-    workflow_resolved: str
-    overrides: tuple[str, ...] = ()
-    inputs: tuple[RecordedInput, ...] = ()
-    environments: tuple[RecordedEnvironment, ...] = ()
-    cells: tuple[RecordedCell, ...] = ()
-    published: tuple[PublishedFile, ...] = ()
+    seed: Annotated[int, Stored.DIGITS]
+    workflow_source: Annotated[str, Stored.ELSEWHERE]
+    workflow_resolved: Annotated[str, Stored.ELSEWHERE]
+    overrides: Annotated[tuple[str, ...], Stored.ELSEWHERE] = ()
+    inputs: Annotated[tuple[RecordedInput, ...], Stored.ELSEWHERE] = ()
+    environments: Annotated[tuple[RecordedEnvironment, ...], Stored.ELSEWHERE] = ()
+    cells: Annotated[tuple[RecordedCell, ...], Stored.ELSEWHERE] = ()
+    published: Annotated[tuple[PublishedFile, ...], Stored.ELSEWHERE] = ()
+
+
+def cost_metrics(costs: Costs) -> tuple[Metric, ...]:
+    """What was measured as metrics, in the order of the fields; what is not stated is left out."""
+    measured = {name: getattr(costs, name) for name in COSTS}
+    return tuple(
+        Metric(name=name, value=float(value), unit=COSTS[name].unit)
+        for name, value in measured.items()
+        if value is not None
+    )
+
+
+# Any: keywords for a constructor, whose own annotations say what they are.
+def shared_fields(source: object, part: type) -> dict[str, Any]:
+    """Give what an object says in the fields of a part that it has, to hand on as keywords."""
+    return {item.name: getattr(source, item.name) for item in fields(part)}

@@ -101,22 +101,6 @@ def read_product_file(path: Path, *, map_arrays: bool = True) -> StoredPayload:
         return read_payload(open_group(file, PRODUCT_GROUP), map_arrays=map_arrays)
 
 
-def write_payload(group: h5py.Group, payload: PayloadLike, digest: str) -> None:
-    """Write a product into an empty group.
-
-    Args:
-        group: empty group.
-        payload: the product.
-        digest: `payload_digest` of it.
-
-    Raises:
-        RecordFormatError: the payload has names or types that the format does not know.
-    """
-    _check_payload(payload)
-    _write_content(group, payload)
-    set_attributes(group, {"digest": digest})
-
-
 def read_payload(group: h5py.Group, *, map_arrays: bool) -> StoredPayload:
     """Read a product from its group in a file that `safe_open` opened.
 

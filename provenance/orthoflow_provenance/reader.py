@@ -6,38 +6,36 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import h5py
 
 from orthoflow_provenance import layout
 from orthoflow_provenance.encoding import (
     dataset_of,
-    float_attribute,
     int_attribute,
-    read_json,
     read_text,
+    read_texts,
     reading,
     text_attribute,
 )
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.input_files import has_contents
 from orthoflow_provenance.model import (
-    CellStatus,
+    RUN_FORMAT,
+    RUN_FORMAT_VERSION,
+    Figure,
     PublishedFile,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
-    RecordedFile,
     RecordedInput,
-    RecordedMetric,
     RecordedProduct,
     RunRecord,
 )
 from orthoflow_provenance.payloads import StoredPayload, check_format, open_group, read_payload
 from orthoflow_provenance.safe import safe_open
 from orthoflow_provenance.seal import SEAL_ATTRIBUTE
-from orthoflow_provenance.tables import read_table, read_texts
 
 Entry = TypeVar("Entry")
 
@@ -84,7 +82,7 @@ def read_outputs(path: Path, wanted: Iterable[tuple[str, str]]) -> Iterator[Stor
         OSError: the file cannot be opened.
     """
     with safe_open(path) as file:
-        check_format(file, layout.RUN_FORMAT, layout.RUN_FORMAT_VERSION)
+        check_format(file, RUN_FORMAT, RUN_FORMAT_VERSION)
         for address, port in wanted:
             yield _payload(file, address, port)
 
@@ -109,7 +107,7 @@ def open_record(path: Path) -> Iterator[OpenRecord]:
         OSError: the file cannot be opened.
     """
     with safe_open(path) as file:
-        check_format(file, layout.RUN_FORMAT, layout.RUN_FORMAT_VERSION)
+        check_format(file, RUN_FORMAT, RUN_FORMAT_VERSION)
         yield OpenRecord(
             record=record_of(file), content_sha256=text_attribute(file, SEAL_ATTRIBUTE), file=file
         )
@@ -128,13 +126,7 @@ def record_of(file: h5py.File) -> RunRecord:
     """
     workflow = open_group(file, layout.WORKFLOW)
     return RunRecord(
-        run_id=text_attribute(file, "run_id"),
-        name=text_attribute(file, "name"),
-        created_by=text_attribute(file, "created_by"),
-        status=_run_status(file),
-        started=text_attribute(file, "started"),
-        ended=text_attribute(file, "ended"),
-        seed=_whole_number(text_attribute(file, "seed"), "/@seed"),
+        **layout.read_fields(file, RunRecord),
         workflow_source=read_text(workflow, "source"),
         workflow_resolved=read_text(workflow, "resolved"),
         overrides=read_texts(workflow, "overrides"),
@@ -157,84 +149,29 @@ def _entries(
 
 
 def _input(name: str, group: h5py.Group) -> RecordedInput:
-    files = tuple(
-        RecordedFile(name=str(file), size_bytes=int(size), sha256=str(sha256))
-        for file, size, sha256 in read_table(group, "files", layout.FILE_COLUMNS)
+    return RecordedInput(
+        name=name, embedded=has_contents(group), **layout.read_fields(group, RecordedInput)
     )
-    return RecordedInput(name=name, files=files, embedded=has_contents(group))
 
 
 def _published(file: h5py.File) -> tuple[PublishedFile, ...]:
     with reading(f"/{layout.PUBLISHED}"):
         is_there = layout.PUBLISHED in file
     # Records of version 1.0 do not name them.
-    rows = read_table(file, layout.PUBLISHED, layout.PUBLISHED_COLUMNS) if is_there else ()
-    return tuple(
-        PublishedFile(path=str(path), size_bytes=int(size), sha256=str(sha256))
-        for path, size, sha256 in rows
-    )
+    return layout.read_rows(file, layout.PUBLISHED, PublishedFile) if is_there else ()
 
 
 def _environment(name: str, group: h5py.Group) -> RecordedEnvironment:
-    return RecordedEnvironment(
-        id=name,
-        python=text_attribute(group, "python"),
-        os=text_attribute(group, "os"),
-        cpu=text_attribute(group, "cpu"),
-        cores=int_attribute(group, "cores"),
-        threads=int_attribute(group, "threads"),
-        git_commit=text_attribute(group, "git_commit"),
-        packages={
-            str(package): str(version)
-            for package, version in read_table(group, "packages", layout.PACKAGE_COLUMNS)
-        },
-    )
+    return RecordedEnvironment(id=name, **layout.read_fields(group, RecordedEnvironment))
 
 
 def _cell(address: str, group: h5py.Group) -> RecordedCell:
-    seed = text_attribute(group, "seed")
     return RecordedCell(
         address=address,
-        step=text_attribute(group, "step"),
-        method=text_attribute(group, "method"),
-        status=_cell_status(group),
-        assignment={
-            str(step): str(variant)
-            for step, variant in read_table(group, "assignment", layout.ASSIGNMENT_COLUMNS)
-        },
-        repeat=int_attribute(group, "repeat"),
-        distribution=text_attribute(group, "distribution"),
-        distribution_version=text_attribute(group, "distribution_version"),
-        result_version=int_attribute(group, "result_version"),
-        determinism=text_attribute(group, "determinism"),
-        error_type=text_attribute(group, "error_type"),
-        error_message=read_text(group, "error_message"),
-        params=read_json(group, "params"),
-        params_set=read_json(group, "params_set"),
-        key=text_attribute(group, "key"),
-        key_preimage=read_text(group, "key_preimage"),
-        seed=_whole_number(seed, f"{group.name}@seed") if seed else None,
-        started=text_attribute(group, "started"),
-        ended=text_attribute(group, "ended"),
-        wall_s=float_attribute(group, "wall_s"),
-        cpu_s=float_attribute(group, "cpu_s"),
-        peak_rss_mib=float_attribute(group, "peak_rss_mib"),
-        environment=text_attribute(group, "environment"),
-        cached_from=text_attribute(group, "cached_from"),
-        metrics=_metrics(group),
         figures=_figures(group),
-        warnings=read_texts(group, "warnings"),
-        citations=read_texts(group, "citations"),
-        log=read_text(group, "log"),
         inputs=_products(group, layout.CELL_INPUTS),
         outputs=_products(group, layout.CELL_OUTPUTS),
-    )
-
-
-def _metrics(group: h5py.Group) -> tuple[RecordedMetric, ...]:
-    return tuple(
-        RecordedMetric(name=str(name), value=float(value), unit=str(unit))
-        for name, value, unit in read_table(group, "metrics", layout.METRIC_COLUMNS)
+        **layout.read_fields(group, RecordedCell),
     )
 
 
@@ -248,12 +185,7 @@ def _figures(group: h5py.Group) -> tuple[RecordedFigure, ...]:
 def _figure(dataset: h5py.Dataset) -> RecordedFigure:
     with reading(dataset.name):
         data = dataset[()].tobytes()
-    return RecordedFigure(
-        name=text_attribute(dataset, "name"),
-        caption=text_attribute(dataset, "caption"),
-        media_type=text_attribute(dataset, "media_type"),
-        data=data,
-    )
+    return RecordedFigure(data=data, **layout.read_fields(dataset, Figure))
 
 
 def _products(group: h5py.Group, name: str) -> dict[str, RecordedProduct]:
@@ -271,30 +203,3 @@ def _product(group: h5py.Group) -> RecordedProduct:
         source=text_attribute(group, "source"),
         embedded=bool(int_attribute(group, "embedded")),
     )
-
-
-def _run_status(file: h5py.File) -> Literal["ok", "failed"]:
-    status = text_attribute(file, "status")
-    if status == "ok":
-        return "ok"
-    if status == "failed":
-        return "failed"
-    raise RecordFormatError(f"/@status must be ok or failed, got {status!r}")
-
-
-def _cell_status(group: h5py.Group) -> CellStatus:
-    status = text_attribute(group, "status")
-    if status == "ok":
-        return "ok"
-    if status == "failed":
-        return "failed"
-    if status == "skipped":
-        return "skipped"
-    raise RecordFormatError(f"{group.name}@status must be ok, failed or skipped, got {status!r}")
-
-
-def _whole_number(text: str, place: str) -> int:
-    digits = text.removeprefix("-")
-    if not (digits.isascii() and digits.isdigit() and len(digits) < 100):
-        raise RecordFormatError(f"{place} must be a whole number in decimal digits, got {text!r}")
-    return int(text)

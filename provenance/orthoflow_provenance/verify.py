@@ -22,7 +22,15 @@ from orthoflow_provenance.encoding import (
 )
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.input_files import content_name, is_file_name
-from orthoflow_provenance.model import RecordedCell, RecordedInput, RecordedProduct, RunRecord
+from orthoflow_provenance.model import (
+    RUN_FORMAT,
+    RUN_FORMAT_VERSION,
+    RecordedCell,
+    RecordedInput,
+    RecordedProduct,
+    RunRecord,
+    cost_metrics,
+)
 from orthoflow_provenance.payloads import array_datasets, check_format, open_group
 from orthoflow_provenance.reader import record_of
 from orthoflow_provenance.safe import safe_open
@@ -67,7 +75,7 @@ def verify_record(path: Path) -> tuple[Finding, ...]:
 
 
 def _findings(file: h5py.File) -> Iterator[Finding]:
-    check_format(file, layout.RUN_FORMAT, layout.RUN_FORMAT_VERSION)
+    check_format(file, RUN_FORMAT, RUN_FORMAT_VERSION)
     contents = digest_contents(file)
     for place, problem in contents.unreadable.items():
         yield Finding(place=place, problem=problem)
@@ -195,10 +203,10 @@ def _cell_findings(cell: RecordedCell, environments: Set[str]) -> Iterator[Findi
                 problem=f"the metric {metric.name!r} must be a finite number with a unit, got "
                 f"{metric.value} {metric.unit!r}",
             )
-    for name in ("wall_s", "cpu_s", "peak_rss_mib"):
-        value = float(getattr(cell, name))
-        if not math.isfinite(value) or value < 0:
-            yield Finding(place=f"{place}@{name}", problem=f"must not be negative, got {value}")
+    for cost in cost_metrics(cell):
+        if not math.isfinite(cost.value) or cost.value < 0:
+            problem = f"must not be negative, got {cost.value}"
+            yield Finding(place=f"{place}@{cost.name}", problem=problem)
 
 
 def _reference_findings(cell: RecordedCell, outputs: Mapping[str, str]) -> Iterator[Finding]:

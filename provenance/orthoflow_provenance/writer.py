@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import h5py
 import numpy as np
 
 from orthoflow_provenance import layout
-from orthoflow_provenance.digests import canonical_json, sha256_text
+from orthoflow_provenance.digests import sha256_text
 from orthoflow_provenance.encoding import (
     check_name,
     int_attribute,
@@ -22,25 +23,33 @@ from orthoflow_provenance.encoding import (
     storable_text,
     text_attribute,
     write_text,
+    write_texts,
 )
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.input_files import InputFile, embed_files
 from orthoflow_provenance.model import (
+    RUN_FORMAT,
+    RUN_FORMAT_VERSION,
+    Figure,
+    PublishedFile,
     RecordedCell,
-    RecordedEnvironment,
     RecordedFigure,
     RecordedInput,
     RecordedProduct,
     RunRecord,
 )
 from orthoflow_provenance.payloads import PRODUCT_GROUP, open_group
-from orthoflow_provenance.privacy import without_folders
 from orthoflow_provenance.safe import safe_open
 from orthoflow_provenance.seal import seal_file
 from orthoflow_provenance.sinks import create_file, create_group
-from orthoflow_provenance.tables import write_table, write_texts
 
 ProductFile: TypeAlias = Callable[[str], Path | None]
+
+_LETTER: Final = r"""[^\s/'"<>|,;:()\[\]{}\\]"""
+# An absolute path of at least two parts that does not continue a word, a relative path or a URL.
+_PATH: Final = re.compile(
+    rf"(?<![\w.:/~*?\\-]) (?:file://)? / (?:{_LETTER}+/)+ (?P<last>{_LETTER}*)", re.VERBOSE
+)
 
 
 def write_record(
@@ -93,6 +102,33 @@ def write_record(
     return content_sha256
 
 
+def without_folders(text: str, folders: Sequence[Path] = ()) -> str:
+    """Reduce absolute paths in a text to their last part.
+
+    Args:
+        text: a log, a message, an option as it was typed.
+        folders: folders to take out literally first, for names with spaces, which no pattern
+            finds the end of; the home and the working directory are always among them.
+
+    >>> without_folders("cannot read /home/jane/scans/hall.e57: 1/2 of it is missing")
+    'cannot read hall.e57: 1/2 of it is missing'
+    """
+    for folder in sorted({*map(str, folders), *_own_folders()}, key=len, reverse=True):
+        if len(folder) > 1:
+            text = text.replace(f"{folder}/", "")
+    return _PATH.sub(lambda match: match["last"], text)
+
+
+def _own_folders() -> set[str]:
+    folders = {str(Path.cwd())}
+    try:
+        folders.add(str(Path.home()))
+    except RuntimeError:
+        # No home directory is known, so no text can name it.
+        return folders
+    return folders
+
+
 def _without_folders(record: RunRecord) -> RunRecord:
     def clean(texts: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(without_folders(text) for text in texts)
@@ -123,18 +159,12 @@ def _write_run(file: h5py.File, record: RunRecord, input_file: InputFile) -> Non
     set_attributes(
         file,
         {
-            "format": layout.RUN_FORMAT,
-            "format_version": layout.RUN_FORMAT_VERSION,
-            "created_by": record.created_by,
-            "run_id": record.run_id,
-            "name": record.name,
-            "status": record.status,
-            "started": record.started,
-            "ended": record.ended,
-            "seed": str(record.seed),
+            "format": RUN_FORMAT,
+            "format_version": RUN_FORMAT_VERSION,
             "workflow_sha256": sha256_text(source),
         },
     )
+    layout.write_fields(file, record)
     workflow = create_group(file, layout.WORKFLOW)
     write_text(workflow, "source", source)
     write_text(workflow, "resolved", record.workflow_resolved)
@@ -145,13 +175,11 @@ def _write_run(file: h5py.File, record: RunRecord, input_file: InputFile) -> Non
         _write_input(group, entry)
         if entry.embedded:
             embed_files(group, entry, input_file)
-    published = [(file.path, file.size_bytes, file.sha256) for file in record.published]
-    write_table(file, layout.PUBLISHED, layout.PUBLISHED_COLUMNS, published)
+    layout.write_rows(file, layout.PUBLISHED, record.published, PublishedFile)
     environments = create_group(file, layout.ENVIRONMENTS)
     for index, environment in enumerate(record.environments):
-        _write_environment(
-            _create_entry(environments, environment.id, "the environment", index), environment
-        )
+        group = _create_entry(environments, environment.id, "the environment", index)
+        layout.write_fields(group, environment)
 
 
 def _create_entry(parent: h5py.Group, name: str, what: str, index: int) -> h5py.Group:
@@ -169,59 +197,11 @@ def _write_input(group: h5py.Group, entry: RecordedInput) -> None:
             raise RecordFormatError(
                 f"the file {file.name!r} of the input {entry.name} must be named without its folder"
             )
-    rows = [(file.name, file.size_bytes, file.sha256) for file in entry.files]
-    write_table(group, "files", layout.FILE_COLUMNS, rows)
-
-
-def _write_environment(group: h5py.Group, environment: RecordedEnvironment) -> None:
-    set_attributes(
-        group,
-        {
-            "python": environment.python,
-            "os": environment.os,
-            "cpu": environment.cpu,
-            "cores": environment.cores,
-            "threads": environment.threads,
-            "git_commit": environment.git_commit,
-        },
-    )
-    write_table(group, "packages", layout.PACKAGE_COLUMNS, list(environment.packages.items()))
+    layout.write_fields(group, entry)
 
 
 def _write_cell(group: h5py.Group, cell: RecordedCell) -> None:
-    set_attributes(
-        group,
-        {
-            "step": cell.step,
-            "method": cell.method,
-            "status": cell.status,
-            "repeat": cell.repeat,
-            "distribution": cell.distribution,
-            "distribution_version": cell.distribution_version,
-            "result_version": cell.result_version,
-            "determinism": cell.determinism,
-            "error_type": cell.error_type,
-            "key": cell.key,
-            "seed": "" if cell.seed is None else str(cell.seed),
-            "started": cell.started,
-            "ended": cell.ended,
-            "wall_s": float(cell.wall_s),
-            "cpu_s": float(cell.cpu_s),
-            "peak_rss_mib": float(cell.peak_rss_mib),
-            "environment": cell.environment,
-            "cached_from": cell.cached_from,
-        },
-    )
-    write_text(group, "error_message", cell.error_message)
-    write_text(group, "params", canonical_json(cell.params))
-    write_text(group, "params_set", canonical_json(cell.params_set))
-    write_text(group, "key_preimage", cell.key_preimage)
-    write_text(group, "log", cell.log)
-    write_texts(group, "warnings", cell.warnings)
-    write_texts(group, "citations", cell.citations)
-    write_table(group, "assignment", layout.ASSIGNMENT_COLUMNS, list(cell.assignment.items()))
-    rows = [(metric.name, metric.value, metric.unit) for metric in cell.metrics]
-    write_table(group, "metrics", layout.METRIC_COLUMNS, rows)
+    layout.write_fields(group, cell)
     figures = create_group(group, layout.FIGURES)
     for index, figure in enumerate(cell.figures):
         _write_figure(figures, figure, index)
@@ -229,10 +209,7 @@ def _write_cell(group: h5py.Group, cell: RecordedCell) -> None:
 
 def _write_figure(group: h5py.Group, figure: RecordedFigure, index: int) -> None:
     dataset = group.create_dataset(f"{index:04}", data=np.frombuffer(figure.data, dtype=np.uint8))
-    set_attributes(
-        dataset,
-        {"name": figure.name, "caption": figure.caption, "media_type": figure.media_type},
-    )
+    layout.write_fields(dataset, figure, Figure)
 
 
 @dataclass(frozen=True, kw_only=True)

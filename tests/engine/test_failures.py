@@ -13,15 +13,16 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import memory_guard
-from orthoflow.engine.endings import describe_exit
+from orthoflow.engine import memory as machine_memory
+from orthoflow.engine.local_executor import describe_exit
 from orthoflow.engine.memory import (
     AvailableMemory,
+    MemoryGuard,
+    Victim,
     available_memory,
     group_memory,
     process_memory,
 )
-from orthoflow.engine.memory_guard import MemoryGuard, Victim
 from orthoflow.engine.results import CellResult
 from orthoflow.errors import StoreError
 from tests.engine_world import World, toy_world
@@ -211,7 +212,7 @@ def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
         )
         return AvailableMemory(available=1536 * MIB - taken, total=8192 * MIB)
 
-    monkeypatch.setattr(memory_guard, "available_memory", little_memory)
+    monkeypatch.setattr(machine_memory, "available_memory", little_memory)
     result = bad_result(world, "eat")
     assert result.error_type == "StepFailedError"
     assert result.error_message == (
@@ -251,8 +252,8 @@ def test_the_guard_stops_the_largest_step_when_memory_is_short(
     groups = {address: index for index, address in enumerate(held)}
     sizes = {index: held[address] * MIB for address, index in groups.items()}
     memory = AvailableMemory(available=available * MIB, total=8192 * MIB)
-    monkeypatch.setattr(memory_guard, "available_memory", lambda: memory)
-    monkeypatch.setattr(memory_guard, "group_memory", lambda group: sizes[group])
+    monkeypatch.setattr(machine_memory, "available_memory", lambda: memory)
+    monkeypatch.setattr(machine_memory, "group_memory", lambda group: sizes[group])
     guard = MemoryGuard()
     assert guard.check(groups) == expected
     assert (guard.interval_s == 0.25) == (available > 2500)

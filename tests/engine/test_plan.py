@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.changes import explain
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
+from orthoflow.engine.plan import explain
 from orthoflow.engine.results import ProductRef
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError
@@ -56,7 +56,7 @@ def write_data(world: World, text: str, name: str = "data.txt") -> Path:
 # Keys ---------------------------------------------------------------------------------------------
 
 FACTS = MethodFacts(
-    id="work.noise",
+    method="work.noise",
     target="x:Y",
     result_version=1,
     determinism="seeded",
@@ -83,7 +83,7 @@ def key_of(
 
 DIFFERENT = {
     "as it is": key_of(),
-    "another method": key_of(facts=dataclasses.replace(FACTS, id="work.add")),
+    "another method": key_of(facts=dataclasses.replace(FACTS, method="work.add")),
     "another result_version": key_of(facts=dataclasses.replace(FACTS, result_version=2)),
     "another tool version": key_of(facts=dataclasses.replace(FACTS, tools={"tool": "2"})),
     "another tool": key_of(facts=dataclasses.replace(FACTS, tools={"loot": "1"})),

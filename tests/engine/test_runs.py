@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from collections.abc import Iterator
@@ -12,9 +13,9 @@ import pytest
 from orthoflow.engine import RunOutcome, execute
 from orthoflow.engine.environment import environment
 from orthoflow.engine.events import CellFinished, CellLogged, CellProgress, CellStarted, CellWarned
+from orthoflow.engine.executors import compiled_code_in
 from orthoflow.engine.results import CellResult
-from orthoflow.engine.task_making import log_name
-from orthoflow.engine.threads import compiled_code_in
+from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import ArgumentError, InputError, StoreError
 from tests.engine_world import World, toy_world
 
@@ -84,16 +85,17 @@ def test_a_result_says_where_it_comes_from(world: World) -> None:
     assert result.environment == environment(1)
     assert result.started <= result.ended <= outcome.ended
     assert result.peak_rss_mib > 10
+    assert result.stored_mib == round(world.store.size_bytes(result) / 2**20, 3) > 0.0
 
 
 def test_the_environment_holds_versions_but_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = json.dumps(environment(2))
+    text = json.dumps(dataclasses.asdict(environment(2)))
     found = environment(2)
-    assert found["threads"] == 2
-    assert isinstance(found["packages"], dict)
-    assert "numpy" in found["packages"]
+    assert found.threads == 2
+    assert isinstance(found.packages, dict)
+    assert "numpy" in found.packages
     assert str(Path.home()) not in text
-    assert found["id"] == environment(2)["id"] != environment(1)["id"]
+    assert found.id == environment(2).id != environment(1).id
 
 
 def test_repeats_of_a_random_method_differ_and_come_again(world: World) -> None:
@@ -325,9 +327,9 @@ def test_left_overs_of_killed_runs_are_removed(world: World) -> None:
 
 def test_long_addresses_become_file_names() -> None:
     address = "step@" + ",".join(f"step{i}=variant{i}" for i in range(40))
-    assert len(log_name(address)) == 200
-    assert log_name(address) != log_name(address + "x")
-    assert log_name("a@b=c,d=e#2") == "a@b=c,d=e#2"
+    assert len(cell_file_name(address)) == 200
+    assert cell_file_name(address) != cell_file_name(address + "x")
+    assert cell_file_name("a@b=c,d=e#2") == "a@b=c,d=e#2"
 
 
 def test_a_step_in_this_process_keeps_compiled_code_where_it_is_told(tmp_path: Path) -> None:

@@ -19,8 +19,13 @@ from numpy.typing import NDArray
 
 from orthoflow.engine import CellResult, ProductRef, Store, collect_garbage, list_results
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.result_files import result_from_json, result_to_json
-from orthoflow.engine.results import FigureRef, MetricValue
+from orthoflow.engine.results import (
+    FigureRef,
+    Metric,
+    RecordedEnvironment,
+    result_from_json,
+    result_to_json,
+)
 from orthoflow.engine.store import digest_of
 from orthoflow.errors import ArgumentError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
@@ -172,14 +177,23 @@ def test_a_result_comes_back_equal(store: Store) -> None:
     result = dataclasses.replace(
         ok_result(store, heights()),
         citations=("doi:1",),
-        metrics=(MetricValue(name="rms_mm", value=0.1, unit="mm"),),
+        metrics=(Metric(name="rms_mm", value=0.1, unit="mm"),),
         figures=(
             FigureRef(
                 name="f", caption="c", media_type="image/png", sha256=store.put_blob(b"\x89PNG")
             ),
         ),
         warnings=("half of it is missing",),
-        environment={"id": "sha256:0", "packages": {"numpy": "2"}},
+        environment=RecordedEnvironment(
+            id="sha256:0",
+            python="3",
+            os="Linux",
+            cpu="any",
+            cores=2,
+            threads=1,
+            git_commit="",
+            packages={"numpy": "2"},
+        ),
         log="λ\nline",
         seed=2**53 - 1,
     )
@@ -299,6 +313,50 @@ def test_garbage_collection_keeps_exactly_what_results_need(store: Store) -> Non
     assert [path.name for path in store.objects.iterdir()] == [kept.outputs["p0"].digest[7:]]
     assert list(store.scratch.iterdir()) == []
     assert [item.key for item in store.earlier_preimages("toy.make")] == [KEY]
+
+
+def test_garbage_collection_removes_compiled_kernels_that_nobody_runs_any_more(
+    store: Store,
+) -> None:
+    ages_days = {"fresh": 0.0, "a month less an hour": 30 - 1 / 24, "a month": 30 + 1 / 24}
+    with store.in_use():
+        for name, age_days in ages_days.items():
+            folder = store.folder / "numba" / name
+            (folder / "package").mkdir(parents=True)
+            written = time.time() - age_days * 86400
+            for path in (folder / "package" / "kernel.nbi", folder / "package"):
+                path.touch()
+                os.utime(path, (written, written))
+    # One that was compiled lately keeps the folder, whatever else lies there.
+    kept = store.folder / "numba" / "fresh" / "package" / "forgotten.nbi"
+    kept.touch()
+    os.utime(kept, (0.0, 0.0))
+    freed = collect_garbage(store, dry_run=True)
+    assert (freed.n_results, freed.n_objects, freed.freed_bytes) == (0, 0, 0)
+    assert {path.name for path in (store.folder / "numba").iterdir()} == set(ages_days)
+    collect_garbage(store)
+    assert {path.name for path in (store.folder / "numba").iterdir()} == {
+        "fresh",
+        "a month less an hour",
+    }
+
+
+def test_garbage_collection_removes_half_written_files_and_counts_their_bytes(
+    store: Store,
+) -> None:
+    with store.in_use():
+        store.put_result(KEY, ok_result(store, heights()), "step")
+    halves = [
+        store.results / f".{KEY}.json-0123456789abcdef",
+        store.preimages / "toy.make" / f".{KEY}.json-0123456789abcdef",
+    ]
+    for path in halves:
+        path.write_bytes(bytes(100))
+    assert collect_garbage(store, dry_run=True).freed_bytes == 200
+    assert all(path.exists() for path in halves)
+    assert collect_garbage(store).freed_bytes == 200
+    assert not any(path.exists() for path in halves)
+    assert store.result(KEY) is not None
 
 
 def test_garbage_collection_removes_what_was_not_used_for_long(store: Store) -> None:

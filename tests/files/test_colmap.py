@@ -12,7 +12,7 @@ from orthoflow.errors import ArgumentError
 from orthoflow.files.colmap import write_colmap_model
 from orthoflow.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from orthoflow.products import Camera, Cameras, TieRole
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 from tests import block_scenes as bs
 
 

@@ -18,13 +18,13 @@ from hypothesis import strategies as st
 from orthoflow_provenance.digests import payload_digest, sha256_text
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.model import (
+    Metric,
     PublishedFile,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
     RecordedProduct,
     RunRecord,
 )
@@ -75,11 +75,10 @@ CELL = st.builds(
     wall_s=NUMBER,
     cpu_s=NUMBER,
     peak_rss_mib=NUMBER,
+    stored_mib=st.none() | NUMBER,
     environment=TEXT,
     cached_from=TEXT,
-    metrics=st.lists(st.builds(RecordedMetric, name=TEXT, value=NUMBER, unit=TEXT), max_size=3).map(
-        tuple
-    ),
+    metrics=st.lists(st.builds(Metric, name=TEXT, value=NUMBER, unit=TEXT), max_size=3).map(tuple),
     figures=st.lists(
         st.builds(
             RecordedFigure, name=TEXT, caption=TEXT, media_type=TEXT, data=st.binary(max_size=20)
@@ -294,7 +293,7 @@ def test_a_newer_format_is_refused_with_a_sentence(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     with h5py.File(path, "r+") as file:
         file.attrs["format_version"] = np.bytes_(b"2.0")
-    message = r"run\.h5 has format version 2\.0, this program reads version 1\.1: use a newer"
+    message = r"run\.h5 has format version 2\.0, this program reads version 1\.2: use a newer"
     with pytest.raises(RecordFormatError, match=message):
         read_record(path)
     (finding,) = verify_record(path)

@@ -14,15 +14,16 @@ from orthoflow_provenance.payloads import write_product_file
 from orthoflow_provenance.writer import write_record
 
 import orthoflow
+from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.products import Planes
 from orthoflow.records import (
+    Metric,
     RecordedCell,
     RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
-    RecordedMetric,
     RecordedProduct,
     Run,
     cell_metrics,
@@ -30,7 +31,7 @@ from orthoflow.records import (
     verify_run,
 )
 from orthoflow.records.metrics import write_metrics_csv
-from orthoflow.records.published import folder_name, publish_products
+from orthoflow.records.published import publish_products
 
 PNG = b"\x89PNG\r\n\x1a\n picture"
 PREIMAGE = '{"method":"plane.given"}'
@@ -80,7 +81,7 @@ def planes_cell(digest: str) -> RecordedCell:
         wall_s=1.5,
         cpu_s=1.25,
         peak_rss_mib=128.0,
-        metrics=(RecordedMetric(name="rms_mm", value=2.0, unit="mm"),),
+        metrics=(Metric(name="rms_mm", value=2.0, unit="mm"),),
         figures=(RecordedFigure(name="plan", caption="seen", media_type="image/png", data=PNG),),
         warnings=("the side of the viewer is a guess",),
         inputs={
@@ -221,9 +222,7 @@ def test_published_files_and_metrics_lie_below_products(run: Run) -> None:
 
 def test_numbers_in_metrics_csv_keep_every_digit(tmp_path: Path) -> None:
     value = 0.1 + 0.2
-    cell = dataclasses.replace(
-        cloud_cell(), metrics=(RecordedMetric(name="x", value=value, unit="1"),)
-    )
+    cell = dataclasses.replace(cloud_cell(), metrics=(Metric(name="x", value=value, unit="1"),))
     write_metrics_csv(tmp_path / "metrics.csv", cell_metrics(cell))
     with (tmp_path / "metrics.csv").open(encoding="utf-8", newline="") as file:
         assert float(next(iter(csv.DictReader(file)))["value"]) == value
@@ -254,8 +253,8 @@ def test_orthoimages_come_in_the_order_of_the_walls(run: Run) -> None:
 def test_a_long_address_gets_a_folder_name_that_file_systems_take() -> None:
     address = "ortho@" + ",".join(f"step{i}=variant{i}" for i in range(40))
     other = address + "x"
-    assert len(folder_name(address).encode()) <= 200
-    assert folder_name(address) != folder_name(other)
+    assert len(cell_file_name(address).encode()) <= 200
+    assert cell_file_name(address) != cell_file_name(other)
 
 
 @pytest.mark.parametrize(

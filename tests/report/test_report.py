@@ -19,10 +19,8 @@ from orthoflow.report.figures import figure_groups
 from orthoflow.report.numbers import number_with_unit
 from orthoflow.report.overlays import magnification_for, residuals_on_wall
 from orthoflow.report.pages import cited
-from orthoflow.report.pictures import Picture, depth_colours, side_px
-from orthoflow.report.rankings import Mark, Value, rank
-from orthoflow.report.senses import Sense, sense_of
-from orthoflow.report.sliders import sliders
+from orthoflow.report.pictures import Picture, depth_colours, side_px, sliders
+from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
 from orthoflow.report.summaries import answers, limits
 from tests.report_runs import (
     FOCAL_PX,

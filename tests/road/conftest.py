@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.engine.sources import compiled_digest
+from orthoflow.engine.keys import compiled_digest
 from orthoflow.engine.store import Store
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -17,8 +17,7 @@ from orthoflow.products.product import Tolerance
 from orthoflow.sdk import Method, MethodParams, Ports
 from orthoflow.testing import golden
 from orthoflow.testing.examples import example_room
-from orthoflow.testing.golden import golden_problem
-from orthoflow.testing.samples import Sample, sample_of, sample_problem
+from orthoflow.testing.golden import Sample, golden_problem, sample_of, sample_problem
 from orthoflow.testing.trials import Trial
 
 

@@ -26,7 +26,7 @@ from orthoflow.products import (
     Wall,
 )
 from orthoflow.sdk import StepContext
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 from tests import scenes
 from tests.inspecting import BUFFER_M, inspect
 

@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter, shift
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, Photos, Ties, Walls
 from orthoflow.sdk import StepContext
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 
 SEARCH = SearchRule(radius_cells=6, half_patch_cells=10, score_least=0.3, distinct_least=0.05)
 # Turned by 0.3 degrees and shifted by 2 cm: about five cells on the wall.

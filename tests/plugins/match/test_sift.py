@@ -24,7 +24,7 @@ from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image, encode_png
 from orthoflow.products import Photo, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import StepContext
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 
 RULE = FeatureRule(n_most=3000, contrast_threshold=0.02, edge_threshold=10.0)
 

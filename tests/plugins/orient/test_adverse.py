@@ -10,7 +10,7 @@ from orthoflow_plugins.orient.pnp import OrientPnp
 
 from orthoflow.products import Camera
 from orthoflow.sdk import StepContext
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 from tests.adverse_cases import GSD_M, KINDS, AdverseCase, adverse_case, every_case
 from tests.long_loops import IS_LONG
 

@@ -17,7 +17,7 @@ from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import StepContext
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 from tests import block_scenes as bs
 from tests.scenes import SURVEY_SHIFT_M
 

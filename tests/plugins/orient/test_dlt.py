@@ -25,7 +25,7 @@ from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Cameras, Photo, Photos, Ties, TieWall
 from orthoflow.sdk import StepContext
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 from tests.scenes import SURVEY_SHIFT_M
 
 SIZE_PX = (4000, 3000)

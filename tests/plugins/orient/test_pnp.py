@@ -21,7 +21,7 @@ from orthoflow.geometry.lenses import LensFreedom, stepped
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties, TieWall
 from orthoflow.sdk import StepContext
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 from tests.scenes import SURVEY_SHIFT_M
 
 PIXEL = Photo(

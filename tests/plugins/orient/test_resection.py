@@ -18,7 +18,7 @@ from orthoflow.geometry.resection import (
     predicted_covariances,
 )
 from orthoflow.geometry.rotations import rotation_from_vector
-from orthoflow.testing import textured_walls as ms
+from orthoflow.testing import photographed as ms
 from tests.scenes import SURVEY_SHIFT_M
 
 

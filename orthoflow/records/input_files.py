@@ -1,16 +1,21 @@
-"""Finding the input files of a record again: by content, wherever they may lie now."""
+"""The input files of a record, found again: by content wherever they lie now, or in the record."""
 
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from orthoflow_provenance.input_files import extract_files
 from orthoflow_provenance.model import RecordedFile, RecordedInput
 
+from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
+from orthoflow.records.runs import Run, record_errors
 from orthoflow.workflow import Workflow, WorkflowInputSpec, resolve_input_files
 from orthoflow.workflow.inputs import override_inputs, read_input_options, read_inputs
 from orthoflow.workflow.positions import Table, read_yaml
@@ -73,6 +78,29 @@ def find_inputs(
                 problems.append(where)
         paths[entry.name] = tuple(found)
     return InputSearch(paths=paths, problems=tuple(problems))
+
+
+@contextmanager
+def embedded_inputs(run: Run, beside: Path) -> Iterator[Mapping[str, tuple[Path, ...]]]:
+    """Give the input files that lie in a record as files, as long as the context lasts.
+
+    Args:
+        run: the run.
+        beside: folder on a disk with room for them, made when missing.
+
+    Raises:
+        RecordError: the record is damaged.
+        StoreError: the disk refuses.
+    """
+    if not any(entry.embedded for entry in run.record.inputs):
+        yield {}
+        return
+    with writing_to(beside):
+        beside.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".inputs-", dir=beside) as folder:
+        with record_errors(run.path), writing_to(Path(folder)):
+            files = extract_files(run.path, run.record.inputs, Path(folder))
+        yield files
 
 
 def _find(name: str, file: RecordedFile, places: _Places, digests: FileDigests) -> Path | str:

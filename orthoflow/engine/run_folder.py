@@ -1,0 +1,221 @@
+"""A run folder: names of what lies in it, and its journal, the truth while the run goes on."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import uuid
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Literal, Self, TypeAlias
+
+from pydantic import TypeAdapter
+
+from orthoflow.engine.clock import now, time_in_a_name
+from orthoflow.engine.durability import sync_folder, writing_to
+from orthoflow.engine.results import CellStatus
+from orthoflow.errors import ArgumentError, StoreError
+
+JOURNAL: Final = "journal.jsonl"
+RECORD_FILE: Final = "run.h5"
+LOGS: Final = "logs"
+_FORMAT: Final = "orthoflow/journal/1"
+_LONGEST_FILE_NAME: Final = 200  # bytes, with room for a suffix; file systems stop at 255
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunBegan:
+    """The first line of a journal.
+
+    Attributes:
+        time: ISO 8601 UTC, as in every line; who resumes takes the run's start from here.
+        format: of the journal.
+        run_id: id of the run.
+        workflow: name of the workflow.
+    """
+
+    event: Literal["run"] = "run"
+    time: str
+    format: str = _FORMAT
+    run_id: str
+    workflow: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunWent:
+    """The run as a whole went on, was broken off, or ended."""
+
+    event: Literal["resumed", "interrupted", "ended"]
+    time: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellBegan:
+    """A cell was given to the executor."""
+
+    event: Literal["started"] = "started"
+    time: str
+    address: str
+    key: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellEnded:
+    """A cell has its outcome; `cached` when it was in the store."""
+
+    event: Literal["finished"] = "finished"
+    time: str
+    address: str
+    key: str
+    status: CellStatus
+    cached: bool
+    error: str
+
+
+JournalLine: TypeAlias = RunBegan | RunWent | CellBegan | CellEnded
+
+
+class Journal:
+    """An open run folder, locked for this process.
+
+    Attributes:
+        run_id: of the run; kept when it is resumed.
+        is_resumed: the folder held an unfinished run.
+        started: ISO 8601 UTC, of the first attempt.
+        finished_keys: keys of the cells that this run has computed before it was interrupted.
+    """
+
+    def __init__(self, folder: Path, name: str, *, run_id: str = "") -> None:
+        """Open or make a run folder.
+
+        Args:
+            folder: the run folder.
+            name: name of the workflow.
+            run_id: id of a new run, made up when empty; a resumed run keeps its own.
+
+        Raises:
+            ArgumentError: the folder holds a finished run, another workflow's run, or other files.
+            StoreError: it is in use by another run, or the disk refuses.
+        """
+        self._folder = folder
+        self._path = folder / JOURNAL
+        _check_folder(folder)
+        with writing_to(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            self._begin(name, run_id)
+        except BaseException:
+            os.close(self._descriptor)
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        os.close(self._descriptor)
+
+    def write(self, line: JournalLine) -> None:
+        """Add a line and bring it to the disk.
+
+        Raises:
+            StoreError: the disk refuses.
+        """
+        content = _codec().dump_python(line, mode="json")
+        text = json.dumps(content, ensure_ascii=False, allow_nan=False).encode() + b"\n"
+        with writing_to(self._folder):
+            while text:
+                text = text[os.write(self._descriptor, text) :]
+            os.fsync(self._descriptor)
+
+    def _begin(self, name: str, run_id: str) -> None:
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise StoreError(
+                f"the run folder {self._folder} is in use by another run; wait for its end, or "
+                f"choose another folder with -o"
+            ) from error
+        lines = self._read_lines()
+        self.is_resumed = bool(lines)
+        first = next((line for line in lines if isinstance(line, RunBegan)), None)
+        if lines and first is None:
+            raise self._damage()
+        first = first or RunBegan(time=now(), run_id=run_id or new_run_id(), workflow=name)
+        if first.workflow != name:
+            raise ArgumentError(
+                f"{self._folder} holds an unfinished run of {first.workflow}, not of "
+                f"{name}; choose another folder with -o"
+            )
+        self.run_id = first.run_id
+        self.started = first.time
+        self.finished_keys = frozenset(
+            line.key
+            for line in lines
+            if isinstance(line, CellEnded) and line.status == "ok" and not line.cached
+        )
+        if self.is_resumed:
+            self.write(RunWent(event="resumed", time=now()))
+            return
+        self.write(first)
+        with writing_to(self._folder):
+            sync_folder(self._folder)
+
+    def _read_lines(self) -> list[JournalLine]:
+        """Read whole lines; a last one that was cut off by a kill is removed."""
+        content = self._path.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        with writing_to(self._folder):
+            os.ftruncate(self._descriptor, len(whole))
+            os.lseek(self._descriptor, 0, os.SEEK_END)
+        try:
+            return [_codec().validate_json(line, strict=True) for line in whole.splitlines()]
+        except ValueError as error:
+            raise self._damage() from error
+
+    def _damage(self) -> StoreError:
+        return StoreError(
+            f"{self._path} is damaged; remove {self._folder} or choose another folder with -o"
+        )
+
+
+@cache
+def _codec() -> TypeAdapter[JournalLine]:
+    return TypeAdapter(JournalLine)
+
+
+def _check_folder(folder: Path) -> None:
+    if (folder / RECORD_FILE).exists():
+        raise ArgumentError(
+            f"{folder} holds a finished run ({RECORD_FILE}); choose another folder with -o"
+        )
+    if folder.is_dir() and not (folder / JOURNAL).exists() and any(folder.iterdir()):
+        raise ArgumentError(
+            f"{folder} is not empty and holds no unfinished run; choose another folder with -o"
+        )
+
+
+def new_run_id() -> str:
+    """Make up the id of a run: its time in UTC, and something random."""
+    return f"{time_in_a_name()}-{uuid.uuid4().hex[:6]}"
+
+
+def cell_file_name(address: str) -> str:
+    """Name, without suffix, of what belongs to a cell: its address, shortened where too long.
+
+    >>> cell_file_name("ortho@plane=ransac,orient=pnp")
+    'ortho@plane=ransac,orient=pnp'
+    """
+    if len(address.encode()) <= _LONGEST_FILE_NAME:
+        return address
+    digest = hashlib.sha256(address.encode()).hexdigest()[:12]
+    return f"{address.encode()[: _LONGEST_FILE_NAME - 13].decode(errors='ignore')}-{digest}"
