@@ -14,7 +14,7 @@ from pydantic import Field
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
+from orthoflow.products import IntensitySource, Planes, PointCloud, SurfaceMask, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
@@ -181,10 +181,10 @@ class RasterGrid(Method):
                 intensity_source=source,
                 buffer_front_m=slab.front_m,
                 buffer_behind_m=slab.behind_m,
+                percentiles=params.percentiles,
                 details={
                     "surface": params.surface,
                     "scan_step_m": [raster.scan_step_m for raster in rasters],
-                    "percentiles": list(params.percentiles),
                 },
             )
         )
@@ -353,7 +353,7 @@ def _require_points_near(walls: tuple[Wall, ...], slab: Slab) -> None:
         )
 
 
-def _intensity_source(cloud: PointCloud) -> str:
+def _intensity_source(cloud: PointCloud) -> IntensitySource:
     if cloud.intensity is not None:
         return "laser"
     return "none" if cloud.rgb is None else "luminance"

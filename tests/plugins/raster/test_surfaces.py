@@ -167,7 +167,7 @@ def test_percentiles_are_numpys(tmp_path: Path) -> None:
         wall.percentiles_m[4, 3], np.percentile(depths_m, [0, 10, 50, 97.5]), atol=1e-6
     )
     assert np.isnan(wall.percentiles_m[4, 4]).all()
-    assert walls.details["percentiles"] == [0, 10, 50, 97.5]
+    assert walls.percentiles == (0, 10, 50, 97.5)
 
 
 def test_the_buffer_is_three_tolerances_of_the_planes_unless_set(tmp_path: Path) -> None:
