@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.point_kernels import Offsets, read_only
-from orthoflow.geometry.slabs import OffsetPoints
-from orthoflow.geometry.threads import in_threads
-from orthoflow.geometry.visibility_kernels import (
+from orthoflow.geometry.depth_buffer_kernels import (
     DepthBuffer,
     VoxelGrid,
     count_in_voxels,
     splat_points,
 )
+from orthoflow.geometry.point_kernels import Offsets, read_only
+from orthoflow.geometry.slabs import OffsetPoints
+from orthoflow.geometry.threads import in_threads
 
 _LONGEST_SIDE_PX: Final = 2048
 _VOXELS_MOST: Final = 1 << 24

@@ -17,7 +17,7 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.colour.sightings import SeenBlock, blocks, box_of, is_seen
 
 if TYPE_CHECKING:
-    from orthoflow.geometry.visibility_kernels import DepthBuffer
+    from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 
 _UNSEEN_GREY: Final = 128
 # Towards the border of a photo its lens is known less well: worth falls to 0 over this share.

@@ -13,8 +13,8 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import PointCloud
 
 if TYPE_CHECKING:
+    from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
     from orthoflow.geometry.occluders import Box
-    from orthoflow.geometry.visibility_kernels import DepthBuffer
 
 AT_ONCE: Final = 1 << 19
 _SAMPLE: Final = 200_000

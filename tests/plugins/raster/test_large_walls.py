@@ -32,8 +32,8 @@ N_CELLS = SHAPE[0] * SHAPE[1]
 def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let walls of a megacell count as large."""
     monkeypatch.setattr(row_bands, "_BAND_CELLS", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.ortho.sights._IN_MEMORY_MOST", 0)
-    monkeypatch.setattr("orthoflow_plugins.ortho.dsm_backward_painting.TILE_CELLS", 128)
+    monkeypatch.setattr("orthoflow_plugins.ortho.surfaces._IN_MEMORY_MOST", 0)
+    monkeypatch.setattr("orthoflow_plugins.ortho.painting.TILE_CELLS", 128)
     monkeypatch.setattr("orthoflow_plugins.mosaic.seams._IN_MEMORY_MOST", 0)
     monkeypatch.setattr("orthoflow_plugins.mosaic.seams._ROWS_AT_ONCE", 64)
     monkeypatch.setattr("orthoflow_plugins.mosaic.colours._ROWS_AT_ONCE", 64)

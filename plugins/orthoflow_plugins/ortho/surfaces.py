@@ -1,28 +1,116 @@
-"""What of a wall's surface hides what: its depth without spikes, bounds per block."""
+"""Walls as photos look at them: what of a surface hides what, and cameras in its axes."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.rastering import in_parts
-from orthoflow.geometry.relief_kernels import bound_blocks, make_occluding
 from orthoflow.geometry.row_bands import Allocate
-from orthoflow.geometry.visibility_kernels import (
-    BLOCK_CELLS,
-    FINE_CELLS,
-    NOTHING_M,
-    Relief,
-)
-from orthoflow.products import Wall
+from orthoflow.products import Wall, Walls
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.relief_kernels import bound_blocks, make_occluding
+from orthoflow_plugins.ortho.views import BLOCK_CELLS, FINE_CELLS, NOTHING_M, Relief, WallView
 
+# Of walls with more cells lies in files what is looked up while photos are laid.
+_IN_MEMORY_MOST: Final = 1 << 26
 # Heights fit into 16 bits with room for rounding.
 _STEPS: Final = 32_000
 # Cells so much lower than one beside them, in cells, lie at an edge: steeper than 79 degrees.
 _EDGE_CELLS: Final = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """A wall as it is looked at.
+
+    Attributes:
+        frame: where the cells lie.
+        relief: their depths, and what they hide.
+        front_m: up to this depth the relief holds all points there are.
+        tolerance_m: how far a surface must be above a ray to hide it.
+    """
+
+    frame: WallFrame
+    relief: Relief
+    front_m: float
+    tolerance_m: float
+
+
+def surfaces_of(
+    walls: Walls, params: VisibilityParams, ctx: StepContext, *, hides: bool = True
+) -> list[Surface]:
+    """Give each wall as the surface that rays meet; with `hides` false its relief hides nothing."""
+
+    def prepared(index: int, wall: Wall) -> Relief:
+        if not hides:
+            return transparent_relief_of(wall, threads=ctx.cores)
+        return relief_of(wall, threads=ctx.cores, allocate=partial(_allocated, ctx, index))
+
+    return [
+        Surface(
+            frame=wall.frame,
+            relief=prepared(index, wall),
+            front_m=walls.buffer_front_m,
+            tolerance_m=params.tolerance_sigma * depth_noise_m(wall.depth_m)
+            + params.tolerance_cells * wall.frame.gsd_m,
+        )
+        for index, wall in enumerate(walls.walls)
+    ]
+
+
+def _allocated(
+    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
+) -> NDArray[np.generic]:
+    """What is prepared of a wall, in a file for a large one."""
+    if math.prod(shape) <= _IN_MEMORY_MOST:
+        return np.empty(shape, dtype=dtype)
+    return ctx.allocate("relief", f"{wall}.{name}", shape, dtype)
+
+
+def view_of(
+    camera: ViewingCamera, surface: Surface, params: VisibilityParams, *, is_exact: bool = False
+) -> WallView:
+    """Give a camera in the axes of a wall; survey coordinates lose nothing on the way.
+
+    Args:
+        camera: of the photo.
+        surface: the wall.
+        params: when the photo counts as seeing a cell.
+        is_exact: project every cell by itself.
+    """
+    frame = surface.frame
+    axes = np.column_stack([frame.u_world, frame.v_world, frame.normal_world])
+    near = camera.shifted(frame.origin_world)
+    flat = near.flat.copy()
+    flat[:9] = (near.rotation @ axes).ravel()
+    centre = axes.T @ near.centre_world
+    return WallView(
+        camera=flat,
+        column=float(centre[0]) / frame.gsd_m - 0.5,
+        row=float(centre[1]) / frame.gsd_m - 0.5,
+        height_m=float(centre[2]),
+        gsd_m=float(frame.gsd_m),
+        front_m=float(surface.front_m),
+        tolerance_m=float(surface.tolerance_m),
+        cosine_least=math.cos(math.radians(params.incidence_max_deg)),
+        border_px=max(1.0, params.border_share * min(camera.width, camera.height)),
+        is_exact=is_exact,
+    )
+
+
+def is_before(view: WallView, surface: Surface) -> bool:
+    """Whether a camera stands before any of a wall; from behind it shows nothing."""
+    return view.height_m > float(surface.relief.bottoms.min())
 
 
 def relief_of(wall: Wall, *, threads: int, allocate: Allocate | None = None) -> Relief:
