@@ -312,8 +312,9 @@ def look_at_unoccluded_block(
     """Fill in the cells of a block that a photo surely sees where they are known.
 
     Places and quality follow parabolas over the block and are linear in depth: the projection
-    itself would take several times as long. Each loop writes one array and has no branches: the processor
-    then takes eight cells at once. Handing rows to functions of their own would take longer.
+    itself would take several times as long. Each loop writes one array and has no branches: the
+    processor then takes eight cells at once. Handing rows to functions of their own would take
+    longer.
 
     Args:
         view: the camera before the wall.

@@ -149,7 +149,7 @@ def hand_over(
     masks = canvas.mask.reshape(canvas.mask.size)
     qualities = canvas.quality.view(np.uint32).reshape(canvas.quality.size)
     seen = visible.mask.reshape(visible.mask.size)
-    qualities_seen = visible.quality.view(np.uint32).reshape(visible.quality.size)
+    qualities_in = visible.quality.view(np.uint32).reshape(visible.quality.size)
     near = is_near.reshape(is_near.size)
     painted, occluded = np.uint8(PAINTED), np.uint8(OCCLUDED)
     zero, bits = np.uint32(0), _QUALITY_BITS
@@ -166,7 +166,7 @@ def hand_over(
                 masks[first + np.uintp(j)] = occluded if is_lost else seen[source + np.uintp(j)]
         for j in range(n_columns):
             is_bare = masks[first + np.uintp(j)] != painted
-            value = np.uint32(qualities_seen[source + np.uintp(j)] & bits)
+            value = np.uint32(qualities_in[source + np.uintp(j)] & bits)
             qualities[first + np.uintp(j)] = zero if is_bare else value
     _take_colours(canvas, tile)
 
