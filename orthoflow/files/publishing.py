@@ -32,7 +32,7 @@ from orthoflow.files.sidecars import (
     write_text,
 )
 from orthoflow.geometry import WallFrame, omega_phi_deg
-from orthoflow.geometry.row_bands import row_bands
+from orthoflow.geometry.bands import row_bands
 from orthoflow.products import (
     Calibration,
     Camera,

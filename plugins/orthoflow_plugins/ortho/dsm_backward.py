@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from orthoflow.geometry.row_bands import Allocate, holds_cells
+from orthoflow.geometry.bands import Allocate, holds_cells
 from orthoflow.products import Layer, LayerMask, Layers
 from orthoflow.sdk import Determinism, Method, Ports, StepContext
 from orthoflow_plugins.ortho.layers import LayerStack
@@ -110,27 +110,36 @@ class DsmBackward(Method):
             buffer = depth_buffer_of(occluders, viewer)
             looked = time.perf_counter()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
-            painted: list[str] = []
-            for index, surface in enumerate(surfaces):
-                allocate = stack.allocator(index)
-                painting = _painting(opened, surface, params, allocate, threads=ctx.cores)
-                if painting is None:
-                    continue
-                footprints += [painting.footprints[key] for key in sorted(painting.footprints)]
-                layer = _layer(painting, photo.name, surface, index)
-                if layer is None:
-                    stack.note_reached(index, painting.mask)
-                    continue
-                stack.add(layer)
-                painted.append(inputs.walls.walls[index].name)
+            footprints += _lay(opened, stack, params, threads=ctx.cores)
             seconds["decoding_s"] += decoded - started
             seconds["occluders_s"] += looked - decoded
             seconds["painting_s"] += time.perf_counter() - looked
-            ctx.log(f"{photo.name}: paints {', '.join(painted) or 'no wall'}")
+            # The next photo is decoded without this one in memory.
+            del pixels, buffer, opened
         profile = shared_profile([photo for photo, _ in oriented], ctx)
         layers = stack.complete()
         _report(ctx, stack, layers, footprints, seconds)
         return self.Out(layers=replace(layers, icc_profile=profile))
+
+
+def _lay(
+    photo: OpenedPhoto, stack: LayerStack, params: DsmBackward.Params, *, threads: int
+) -> list[CellFootprint]:
+    """Lay a photo onto all walls; give how it sees the tiles that it paints."""
+    footprints: list[CellFootprint] = []
+    with stack.painting_from(photo.name):
+        for index, surface in enumerate(stack.surfaces):
+            allocate = stack.allocator(index)
+            painting = _painting(photo, surface, params, allocate, threads=threads)
+            if painting is None:
+                continue
+            footprints += [painting.footprints[key] for key in sorted(painting.footprints)]
+            layer = _layer(painting, photo.name, surface, index)
+            if layer is None:
+                stack.note_reached(index, painting.mask)
+            else:
+                stack.add(layer)
+    return footprints
 
 
 def _painting(

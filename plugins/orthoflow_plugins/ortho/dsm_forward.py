@@ -83,15 +83,13 @@ class DsmForward(Method):
             buffer = depth_buffer_of(occluders, viewer)
             looked = time.perf_counter()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
-            painted: list[str] = []
-            for index, surface in enumerate(surfaces):
-                layer = _layer(opened, surface, index, params, threads=ctx.cores)
-                if layer is not None:
-                    stack.add(layer)
-                    painted.append(inputs.walls.walls[index].name)
+            with stack.painting_from(photo.name):
+                for index, surface in enumerate(surfaces):
+                    layer = _layer(opened, surface, index, params, threads=ctx.cores)
+                    if layer is not None:
+                        stack.add(layer)
             seconds["occluders_s"] += looked - started
             seconds["painting_s"] += time.perf_counter() - looked
-            ctx.log(f"{photo.name}: paints {', '.join(painted) or 'no wall'}")
         profile = shared_profile([photo for photo, _ in oriented], ctx)
         layers = stack.complete()
         _report(ctx, stack, layers, seconds)
@@ -102,7 +100,7 @@ def _layer(
     photo: OpenedPhoto, surface: Surface, wall: int, params: DsmForward.Params, *, threads: int
 ) -> Layer | None:
     """Throw a photo onto one wall; None where no pixel meets it."""
-    from orthoflow.geometry.rastering import lenders_in_gaps
+    from orthoflow.geometry.narrow_gaps import lenders_in_gaps
     from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch, throw_pixels
     from orthoflow_plugins.ortho.surfaces import is_before, view_of
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -9,7 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.row_bands import Allocate, count_known, row_bands
+from orthoflow.geometry.bands import Allocate, count_known, row_bands
 from orthoflow.products import Layer, LayerMask, Layers, Walls
 from orthoflow.sdk import StepContext
 
@@ -42,13 +44,14 @@ class LayerStack:
     """Layers of walls, added photo by photo.
 
     Attributes:
-        painted: those of photos, as they were added.
+        surfaces: the walls.
+        painted: layers of photos, as they were added.
     """
 
     def __init__(self, walls: Walls, surfaces: list[Surface], ctx: StepContext) -> None:
+        self.surfaces = surfaces
         self.painted: list[Layer] = []
         self._names = tuple(wall.name for wall in walls.walls)
-        self._surfaces = surfaces
         self._ctx = ctx
         # What photos reach of walls that none has painted so far.
         self._reached: dict[int, NDArray[np.uint8]] = {}
@@ -61,6 +64,14 @@ class LayerStack:
             return self._ctx.allocate("layers", f"{prefix}.{name}", shape, dtype)
 
         return allocate
+
+    @contextmanager
+    def painting_from(self, source: str) -> Iterator[None]:
+        """Log which walls a photo painted once it was laid onto all of them."""
+        n_before = len(self.painted)
+        yield
+        names = [self._names[layer.wall] for layer in self.painted[n_before:]]
+        self._ctx.log(f"{source}: paints {', '.join(names) or 'no wall'}")
 
     def add(self, layer: Layer) -> None:
         """Add the layer of a photo that paints something."""
@@ -105,7 +116,7 @@ class LayerStack:
     def count_cells(self, layers: Layers) -> CellCounts:
         """Count the cells of all walls by what the layers show of them."""
         n_surface = n_painted = n_hidden = 0
-        for wall, surface in enumerate(self._surfaces):
+        for wall, surface in enumerate(self.surfaces):
             masks = [layer.mask for layer in layers.layers if layer.wall == wall]
             n_surface += count_known(surface.relief.depth)
             for rows in row_bands(surface.frame.shape):
@@ -117,7 +128,7 @@ class LayerStack:
 
     def _bare_layer(self, wall: int) -> Layer:
         """The layer of a wall that no photo paints."""
-        surface = self._surfaces[wall]
+        surface = self.surfaces[wall]
         mask = self._reached.get(wall)
         if mask is None:
             depth = surface.relief.depth

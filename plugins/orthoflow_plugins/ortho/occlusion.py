@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.occluders import (
@@ -17,7 +18,6 @@ from orthoflow.geometry.occluders import (
     nothing_in_the_way,
     occluders_in,
 )
-from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import PointCloud, Walls
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.ortho.photos_on_walls import PhotosOnWalls, VisibilityParams

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.bands import Allocate
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
-from orthoflow.geometry.row_bands import Allocate
 from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.ortho.painting_kernels import Canvas, hand_over
 from orthoflow_plugins.ortho.sampling import CellFootprint, Resampling, footprint_of, sample

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.bands import Allocate
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_noise import depth_noise_m
-from orthoflow.geometry.rastering import in_parts
-from orthoflow.geometry.row_bands import Allocate
+from orthoflow.geometry.threads import in_parts
 from orthoflow.products import Wall, Walls
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
@@ -128,7 +128,7 @@ def relief_of(wall: Wall, *, threads: int, allocate: Allocate | None = None) -> 
     fine_tops = np.empty_like(relief.fine_bottoms)
     edge_m = _EDGE_CELLS * wall.frame.gsd_m
     task = partial(make_occluding, relief.depth, step_m, edge_m, occluding, fine_tops)
-    in_parts(fine_tops.shape[0], threads, task)
+    in_parts(task, fine_tops.shape[0], threads=threads)
     # Kernels are compiled once, for arrays that cannot be written to.
     occluding.flags.writeable = False
     tops = _coarse(fine_tops, np.maximum)
@@ -153,7 +153,7 @@ def transparent_relief_of(wall: Wall, *, threads: int) -> Relief:
     shape = tuple(-(-side // FINE_CELLS) for side in depth.shape)
     fine_bottoms = np.empty(shape, dtype=np.float32)
     fine_crests = np.empty_like(fine_bottoms)
-    in_parts(shape[0], threads, partial(bound_blocks, depth, fine_bottoms, fine_crests))
+    in_parts(partial(bound_blocks, depth, fine_bottoms, fine_crests), shape[0], threads=threads)
     nothing = np.empty(0, dtype=np.int16)
     nothing.flags.writeable = False
     bottoms = _coarse(fine_bottoms, np.minimum)
