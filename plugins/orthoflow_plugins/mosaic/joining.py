@@ -21,8 +21,6 @@ SeamRule = Literal["best-view", "voronoi", "graph-cut", "priority"]
 # Preference (rows, cols) of a layer in some rows of its wall, made when they are joined: those of a
 # large wall would not fit into memory.
 Preference = Callable[[slice], NDArray[np.float32]]
-# Preferences of layers that paint a wall together.
-Preferring = Callable[[Sequence[Layer]], Sequence[Preference]]
 
 NOBODY: Final = -1
 # Walls with more cells are joined in bands of so many.
@@ -105,8 +103,10 @@ def joined(
     layers: tuple[Layer, ...],
     name: str,
     *,
+    rule: SeamRule,
+    priority: Sequence[str],
+    wall: Wall | None,
     island_cells_min: int,
-    prefer: Preferring,
     allocate: Allocate,
 ) -> Orthoimage:
     """Join the layers of one wall, a large one band by band.
@@ -114,9 +114,11 @@ def joined(
     Args:
         layers: all of one wall, at least one.
         name: of the wall.
+        rule: says which layer paints a cell that several show as well.
+        priority: names of photos, for that rule.
+        wall: its surface, for seams off its depth edges, or None.
         island_cells_min: smaller patches from one source are painted from the source around
             them, where that one sees them too.
-        prefer: says which layer paints a cell that several show as well.
         allocate: gives the arrays of the orthoimage, by name.
 
     Raises:
@@ -132,24 +134,15 @@ def joined(
     # What paints nothing is no source; it still tells what is hidden.
     painters = [layer for layer in layers if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in layers if all(layer is not painter for painter in painters)]
-    preferred = prefer(painters) if painters else []
+    preferred = preferences(painters, rule, priority=priority, wall=wall) if painters else []
     shape = first.frame.shape
     rgb = np.asarray(allocate("rgb", (*shape, 3), np.uint8), np.uint8)
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
     reach = _island_reach(island_cells_min)
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
-        rows, around = band.rows, band.around
-        choice = best_views(
-            [_part(layer, around) for layer in [*painters, *others]],
-            [
-                *(preference(around) for preference in preferred),
-                *(layer.quality[around] for layer in others),
-            ],
-        )
-        if island_cells_min > 1 and len(painters) > 1:
-            parts = [_part(layer, around) for layer in painters]
-            choice = without_islands(choice, parts, island_cells_min)
+        rows = band.rows
+        choice = _choice_in(band.around, painters, others, preferred, island_cells_min)
         mask[rows] = _MASK_OF_RANK[choice.rank[band.inner]]
         source[rows] = choice.source[band.inner]
         for index, layer in enumerate(painters):
@@ -164,6 +157,27 @@ def joined(
         source=source,
         sources=tuple(layer.source for layer in painters),
     )
+
+
+def _choice_in(
+    rows: slice,
+    painters: Sequence[Layer],
+    others: Sequence[Layer],
+    preferred: Sequence[Preference],
+    island_cells_min: int,
+) -> Choice:
+    """What becomes of the cells of some rows."""
+    parts = [_part(layer, rows) for layer in painters]
+    choice = best_views(
+        [*parts, *(_part(layer, rows) for layer in others)],
+        [
+            *(preference(rows) for preference in preferred),
+            *(layer.quality[rows] for layer in others),
+        ],
+    )
+    if island_cells_min > 1 and len(painters) > 1:
+        return without_islands(choice, parts, island_cells_min)
+    return choice
 
 
 def _island_reach(cells_min: int) -> int:

@@ -41,7 +41,6 @@ from orthoflow_plugins.mosaic.joining import (
     NOBODY,
     SeamRule,
     joined,
-    preferences,
     require_sources,
 )
 
@@ -194,8 +193,10 @@ def _join(
     image = joined(
         group,
         name,
+        rule=params.seams,
+        priority=params.priority,
+        wall=wall,
         island_cells_min=params.island_cells_min,
-        prefer=partial(preferences, rule=params.seams, priority=params.priority, wall=wall),
         allocate=allocate,
     )
     n_seam, n_edge_seam = count_seams(image.source, None if wall is None else wall.depth_m)
