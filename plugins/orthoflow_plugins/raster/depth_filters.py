@@ -14,15 +14,15 @@ from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.threads import in_parts
 
 # Cells within so many rows and columns are around.
-_NEAR_CELLS = 2
+_NEAR_CELLS: Final = 2
 # Fewer of them known say nothing, fewer of the known ones in agreement make a speck.
-_KNOWN_LEAST = 6
-_AGREEING_LEAST = 2
+_KNOWN_LEAST: Final = 6
+_AGREEING_LEAST: Final = 2
 # Where cells are sparse more of them are asked, and more must agree: at least half of the known.
-_SPARSE_CELLS = 4
-_SPARSE_LEAST = 3
+_SPARSE_CELLS: Final = 4
+_SPARSE_LEAST: Final = 3
 # Steepest surface whose sparse cells agree: 27 degrees.
-_SLOPE = 0.5
+_SLOPE: Final = 0.5
 # A cell is sparse where less than this share of the cells is known as somewhere around is.
 _SPARSE_SHARE: Final = 0.35
 # The shadow of an edge is narrower than twice this reach, in cells.
