@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.rastering import lenders_in_gaps
+from orthoflow.geometry.narrow_gaps import lenders_in_gaps
 
 SHAPE = (1733, 3066)
 RADII_CELLS = (1, 2, 3, 5, 10)

@@ -21,14 +21,15 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from ortho_backward import GSD_M, camera
-from orthoflow_plugins.ortho.dsm_backward_occluders import nothing_in_the_way
-from orthoflow_plugins.ortho.dsm_backward_painting import SightRule, Surface, paint, view_of
-from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of
+from orthoflow_plugins.ortho.painting import PaintRule, paint
+from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.surfaces import Surface, relief_of, view_of
 
 from orthoflow.files.geotiff import read_raster, write_orthoimage
 from orthoflow.files.images import preview_png
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.geometry.occluders import nothing_in_the_way
 from orthoflow.products import LayerMask, Wall
 
 BAND_ROWS = 256
@@ -117,17 +118,12 @@ def main() -> None:
                 front_m=0.15,
                 tolerance_m=3.0 * depth_noise_m(raster.depth_m) + 0.5 * GSD_M,
             )
-        rule = SightRule(
-            resampling="bilinear",
-            is_filtered=True,
-            incidence_max_deg=80.0,
-            erosion_cells=1,
-            border_share=0.05,
-        )
+        rule = PaintRule(resampling="bilinear", is_filtered=True, erosion_cells=1)
+        params = VisibilityParams(incidence_max_deg=80.0, border_share=0.05)
         with measured("painting"):
             painting = paint(
                 photo,
-                view_of(viewer, surface, rule),
+                view_of(viewer, surface, params),
                 surface,
                 nothing_in_the_way(viewer),
                 rule,

@@ -25,22 +25,14 @@ import cv2
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-from orthoflow_plugins.ortho.dsm_backward_occluders import (
-    depth_buffer,
-    find_occluders,
-    nothing_in_the_way,
-)
-from orthoflow_plugins.ortho.dsm_backward_painting import (
-    SightRule,
-    Surface,
-    paint,
-    view_of,
-)
-from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
+from orthoflow_plugins.ortho.occlusion import find_occluders
+from orthoflow_plugins.ortho.painting import PaintRule, paint
+from orthoflow_plugins.ortho.surfaces import Surface, relief_of, transparent_relief_of, view_of
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.depth_noise import depth_noise_m
+from orthoflow.geometry.occluders import depth_buffer, nothing_in_the_way
 from orthoflow.products import PointCloud, Wall, Walls
 
 GSD_M = 0.003
@@ -196,12 +188,10 @@ def main() -> None:
         resampling: str, *, is_seen_through: bool = False, is_fresh: bool = options.fresh
     ) -> Callable[[], object]:
         params = DsmBackward.Params.model_validate({"resampling": resampling})
-        rule = SightRule(
+        rule = PaintRule(
             resampling=params.resampling,
             is_filtered=params.antialias,
-            incidence_max_deg=params.incidence_max_deg,
             erosion_cells=0 if is_seen_through else params.erosion_cells,
-            border_share=params.border_share,
         )
 
         allocate = allocate_anew if is_fresh else kept
@@ -217,7 +207,7 @@ def main() -> None:
             )
             return paint(
                 photo,
-                view_of(viewer, surface, rule),
+                view_of(viewer, surface, params, is_exact=resampling == "nearest"),
                 surface,
                 nothing_in_the_way(viewer) if is_seen_through else buffer,
                 rule,

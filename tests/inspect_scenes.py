@@ -15,6 +15,7 @@ from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame
 from orthoflow.products import (
     CheckPoints,
+    IntensitySource,
     Orthoimage,
     Orthoimages,
     OrthoMask,
@@ -53,7 +54,7 @@ def texture() -> NDArray[np.float64]:
     return np.asarray(np.clip(128.0 + 45.0 * spread, 30.0, 225.0))
 
 
-def walls(*, source: str = "laser", where: WallFrame | None = None) -> Walls:
+def walls(*, source: IntensitySource = "laser", where: WallFrame | None = None) -> Walls:
     """The wall, flat, as a laser sees it: another brightness, noise, and a void of no points."""
     rng = np.random.default_rng(12)
     seen = (texture() / 255.0) ** 1.5 + 0.02 * rng.normal(size=SHAPE)

@@ -10,6 +10,7 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -32,8 +33,8 @@ from orthoflow.files.sidecars import (
     write_text,
 )
 from orthoflow.geometry import WallFrame, omega_phi_deg
+from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
-from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import (
     Calibration,
     Camera,
@@ -100,31 +101,31 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
 
     Percentiles of the depths follow as `wall_<k>_depth_p<percent>.tif` where they were wanted.
     """
-    told = product.details.get("percentiles")
-    percents = told if isinstance(told, list) else []
     for index, wall in enumerate(product.walls):
-        details: dict[str, JsonValue] = {
+        about: dict[str, JsonValue] = {
             "plane_index": wall.plane_index,
             "intensity_source": product.intensity_source,
             "buffer": {"front_m": product.buffer_front_m, "behind_m": product.buffer_behind_m},
         }
+        publish = partial(_publish_raster, wall=wall, about=about, digest=digest)
         depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
+        in_metres = {"unit": "m"}
         stem = f"wall_{index}_depth"
-        _publish_band(folder / stem, wall.depth_m, wall, digest, details | {"content": depth})
+        publish(folder / stem, wall.depth_m, content=depth, tags=in_metres)
         if wall.percentiles_m is not None:
-            for k, percent in enumerate(percents):
-                _publish_band(
+            for k, percent in enumerate(product.percentiles):
+                publish(
                     folder / f"{stem}_p{percent}".replace(".", "_"),
                     np.ascontiguousarray(wall.percentiles_m[:, :, k]),
-                    wall,
-                    digest,
-                    details | {"content": f"percentile {percent} of the cell's points: {depth}"},
+                    content=f"percentile {percent} of the cell's points: {depth}",
+                    tags=in_metres,
                 )
         if wall.intensity is not None:
-            content = f"intensity 0..1 ({product.intensity_source}); NaN = nothing"
-            stem = f"wall_{index}_intensity"
-            _publish_band(
-                folder / stem, wall.intensity, wall, digest, details | {"content": content}
+            publish(
+                folder / f"wall_{index}_intensity",
+                wall.intensity,
+                content=f"intensity 0..1 ({product.intensity_source}); NaN = nothing",
+                tags={"unit": "1", "intensity_source": product.intensity_source},
             )
 
 
@@ -216,27 +217,35 @@ def _table_text(rows: Sequence[ResidualRow]) -> str:
     return text.getvalue()
 
 
-def _publish_band(
+def _publish_raster(
     stem: Path,
     values: NDArray[np.float32],
+    *,
     wall: Wall,
+    about: Mapping[str, JsonValue],
+    content: str,
+    tags: Mapping[str, str],
     digest: str,
-    details: dict[str, JsonValue],
 ) -> None:
-    """Write one float raster of a wall with its sidecar and preview."""
-    content = str(details["content"])
-    is_depth = content.startswith(("depth", "percentile"))
-    tags = raster_tags(
-        wall.frame, digest=digest, name=wall.name, content=content, extra={"unit": "m"}
-    )
-    if not is_depth:
-        tags |= {"unit": "1", "intensity_source": str(details["intensity_source"])}
-    write_raster(stem.with_suffix(".tif"), values, gsd_m=wall.frame.gsd_m, tags=tags)
+    """Write one float raster of a wall with its sidecar and preview.
+
+    Args:
+        stem: path without a suffix.
+        values: (rows, cols).
+        wall: whose raster it is.
+        about: what the sidecar says of the wall besides.
+        content: what the values are.
+        tags: of the GeoTIFF: the unit, and what else it says of the values.
+        digest: of the product.
+    """
+    all_tags = raster_tags(wall.frame, digest=digest, name=wall.name, content=content, extra=tags)
+    write_raster(stem.with_suffix(".tif"), values, gsd_m=wall.frame.gsd_m, tags=all_tags)
     write_json(
         stem.with_suffix(".json"),
-        frame_json(wall.frame)
-        | details
-        | {
+        {
+            **frame_json(wall.frame),
+            **about,
+            "content": content,
             "name": wall.name,
             "mask": mask_meanings(SURFACE_MASK_MEANINGS),
             "mask_counts": _counts(wall.mask),

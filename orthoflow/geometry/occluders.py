@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.point_kernels import Offsets, read_only
-from orthoflow.geometry.slabs import OffsetPoints
-from orthoflow.geometry.threads import in_threads
-from orthoflow.geometry.visibility_kernels import (
+from orthoflow.geometry.depth_buffer_kernels import (
     DepthBuffer,
     VoxelGrid,
     count_in_voxels,
     splat_points,
 )
+from orthoflow.geometry.point_kernels import Offsets, read_only
+from orthoflow.geometry.slabs import OffsetPoints
+from orthoflow.geometry.threads import even_parts, in_threads
 
 _LONGEST_SIDE_PX: Final = 2048
 _VOXELS_MOST: Final = 1 << 24
@@ -106,18 +106,18 @@ def depth_buffer(occluders: Occluders, camera: ViewingCamera) -> DepthBuffer:
         DepthBuffer(nearest=np.full(shape, np.inf, dtype=np.float32), reduction=float(reduction))
         for _ in range(occluders.threads)
     ]
-    edges = np.linspace(0, len(occluders.points.x), occluders.threads + 1).astype(np.int64)
+    parts = even_parts(len(occluders.points.x), occluders.threads)
     in_threads(
         [
             partial(
                 splat_points,
-                _part(occluders.points, slice(int(edges[k]), int(edges[k + 1]))),
+                _part(occluders.points, part),
                 flat,
                 occluders.around,
                 occluders.n_least,
                 buffer,
             )
-            for k, buffer in enumerate(buffers)
+            for part, buffer in zip(parts, buffers, strict=True)
         ]
     )
     nearest = np.minimum.reduce([buffer.nearest for buffer in buffers])

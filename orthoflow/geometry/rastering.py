@@ -12,14 +12,12 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import raster_gap_kernels as gaps
 from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.point_kernels import Offsets, read_only
-from orthoflow.geometry.raster_entry_kernels import BLOCK, Entries, Target, project_points
-from orthoflow.geometry.raster_kernels import WINNER
+from orthoflow.geometry.raster_kernels import BLOCK, WINNER, Entries, Target, project_points
 from orthoflow.geometry.slabs import OffsetPoints, Slab
-from orthoflow.geometry.threads import even_parts, in_threads
+from orthoflow.geometry.threads import in_parts, in_threads
 
 # 2^20 points: their entries (16 MB) stay in the processor's cache between the passes, and threads
 # wait for each other seldom.
@@ -60,7 +58,7 @@ def entries_inside(points: OffsetPoints, slab: Slab, *, threads: int) -> Iterato
         n_blocks = -(-(part.stop - part.start) // BLOCK)
         entries = buffers._replace(n_inside=buffers.n_inside[:n_blocks])
         chunk = Offsets(x[part], y[part], z[part])
-        in_parts(n_blocks, threads, partial(project_points, chunk, first, target, entries))
+        in_parts(partial(project_points, chunk, first, target, entries), n_blocks, threads=threads)
         yield entries
 
 
@@ -80,12 +78,6 @@ def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:
     in_threads([partial(visit, owner) for owner in range(owners)])
 
 
-def in_parts(n_items: int, threads: int, task: Callable[[int, int], None]) -> None:
-    """Run a task on parts of a range, given by first and end, one part per thread."""
-    parts = even_parts(n_items, threads)
-    in_threads([partial(task, part.start, part.stop) for part in parts])
-
-
 def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> NDArray[np.void]:
     """The point nearest to the viewer in each cell: the rule of skarlatos2012.
 
@@ -103,7 +95,7 @@ def topmost_points(points: OffsetPoints, slab: Slab, *, threads: int) -> NDArray
 def empty_winners(n_cells: int, *, threads: int) -> NDArray[np.void]:
     """Give cells that nobody has won yet."""
     winners = np.empty(n_cells, dtype=WINNER)
-    in_parts(n_cells, threads, partial(kernels.empty_cells, winners))
+    in_parts(partial(kernels.empty_cells, winners), n_cells, threads=threads)
     return winners
 
 
@@ -122,92 +114,9 @@ def values_of_winners(
     seen = np.asarray(values).view(np.ndarray)
     seen.flags.writeable = False
     void = values.dtype.type(nothing)
-    in_parts(winners.size, threads, partial(kernels.take_values, winners, seen, void, taken))
+    task = partial(kernels.take_values, winners, seen, void, taken)
+    in_parts(task, winners.size, threads=threads)
     return taken
-
-
-def spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Sample standard deviation of the depths in each cell.
-
-    Args:
-        n_points: (cells,).
-        moments: (cells, 2) sums of depths and squared depths; used up.
-
-    Returns:
-        (cells,) metres, NaN with fewer than two points.
-    """
-    mean, squares = moments.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        np.divide(mean, n_points, out=mean)
-        squares -= mean * mean * n_points
-        np.maximum(squares, 0.0, out=squares)
-        # 1.0, not 1: unsigned, 0 - 1 would be four thousand million points.
-        np.divide(squares, n_points - 1.0, out=squares)
-        np.sqrt(squares, out=squares)
-    squares[n_points < 2] = np.nan
-    sigma_m: NDArray[np.float32] = squares.astype(np.float32)
-    return sigma_m
-
-
-def disc_offsets(radius_cells: int) -> NDArray[np.int64]:
-    """Cells (k, 2) = (row, column) within a radius of a centre cell, nearest first, without it."""
-    steps = np.arange(-radius_cells, radius_cells + 1, dtype=np.int64)
-    rows, columns = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
-    squares = rows * rows + columns * columns
-    order = np.argsort(squares, kind="stable")
-    order = order[(squares[order] > 0) & (squares[order] <= radius_cells * radius_cells)]
-    return np.column_stack([rows[order], columns[order]])
-
-
-def lenders_in_gaps(
-    is_measured: NDArray[np.bool_], radius_cells: int, *, threads: int
-) -> NDArray[np.int64]:
-    """For each void cell of a narrow gap the measured cell nearest to it.
-
-    A gap is narrow where no disc of the radius fits into it: what stays void is the morphological
-    opening of the void cells, so that windows and outlines keep their shape to the cell. Cells
-    outside the raster count as void. Of cells equally near, the upper and then the left one lends.
-
-    Args:
-        is_measured: (rows, cols).
-        radius_cells: radius of the disc; 0 finds no gap.
-        threads: how many threads work.
-
-    Returns:
-        (k, 2) flat indices: the void cell, and the measured cell that lends its values.
-    """
-    if radius_cells == 0:
-        return np.empty((0, 2), dtype=np.int64)
-    rows, columns = is_measured.shape
-    # Framed with void, so that discs may lie half outside the raster.
-    framed: NDArray[np.bool_] = np.pad(is_measured, radius_cells)
-    is_touched = _met_by_discs(framed, radius_cells, threads=threads)
-    is_open = _met_by_discs(~is_touched, radius_cells, threads=threads)
-    inner = np.s_[radius_cells : radius_cells + rows, radius_cells : radius_cells + columns]
-    is_narrow = np.logical_not(is_open[inner] | is_measured)
-    void = np.flatnonzero(is_narrow)
-    lent = np.column_stack([void, void])
-    del void, framed, is_touched, is_open, is_narrow  # Of sparse rasters as large as what is given.
-    measured = np.ascontiguousarray(is_measured)
-    task = partial(gaps.nearest_within, measured, disc_offsets(radius_cells), lent)
-    in_parts(len(lent), threads, task)
-    return lent
-
-
-def _met_by_discs(
-    is_in_set: NDArray[np.bool_], radius_cells: int, *, threads: int
-) -> NDArray[np.bool_]:
-    """Cells (rows, cols) about which a disc holds a cell of a set; outside there is none."""
-    rows, columns = is_in_set.shape
-    steps = np.arange(-radius_cells, radius_cells + 1)
-    heights = np.floor(np.sqrt(radius_cells**2 - steps**2)).astype(np.uint8)
-    far = radius_cells + 1
-    distances = np.full((rows, columns + 2 * radius_cells), far, dtype=np.uint8)
-    inner = distances[:, radius_cells : radius_cells + columns]
-    in_parts(columns, threads, partial(gaps.find_distances_down, is_in_set, far, inner))
-    is_met = np.empty(is_in_set.shape, dtype=np.bool_)
-    in_parts(rows, threads, partial(gaps.find_discs, distances, heights, is_met))
-    return is_met
 
 
 def _empty_entries(n_points: int) -> Entries:

@@ -52,6 +52,12 @@ def even_parts(n_items: int, n_parts: int, *, multiple: int = 1) -> list[slice]:
     return [slice(first, end) for first, end in itertools.pairwise(edges)]
 
 
+def in_parts(work: Callable[[int, int], None], n_items: int, *, threads: int) -> None:
+    """Call `work(first, end)` over one part of a range per thread."""
+    parts = even_parts(n_items, threads)
+    in_threads([partial(work, part.start, part.stop) for part in parts])
+
+
 def in_runs(
     work: Callable[[int, int], None], n_items: int, *, n_per_run: int, threads: int
 ) -> None:

@@ -18,6 +18,7 @@ from orthoflow.products.photographs import (
 from orthoflow.products.planes import Planes, PointLabels
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 from orthoflow.products.walls import (
+    IntensitySource,
     Layer,
     LayerMask,
     Layers,
@@ -38,6 +39,7 @@ __all__ = [
     "Finding",
     "InputFiles",
     "Inspection",
+    "IntensitySource",
     "Intrinsics",
     "JsonValue",
     "Layer",

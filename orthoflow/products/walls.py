@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import WallFrame
-from orthoflow.products.product import Array, JsonValue, Product, Tolerance
+from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
+
+# What the intensity of a wall is: of the laser; the grey of the colours instead; or there is none.
+IntensitySource = Literal["laser", "luminance", "none"]
 
 
 class SurfaceMask(IntEnum):
@@ -58,8 +61,8 @@ class Wall:
             colour.
         rgb: (rows, cols, 3) uint8, or None.
         rgb_mask: uint8, 1 where rgb holds a colour; None without rgb.
-        percentiles_m: (rows, cols, k) float32 metres, percentiles of the depths in the cell (which
-            ones say the details of `Walls`), NaN in cells without points; None if not wanted.
+        percentiles_m: (rows, cols, k) float32 metres, `Walls.percentiles` of the depths in the
+            cell, NaN in cells without points; None if not wanted.
     """
 
     frame: WallFrame
@@ -100,10 +103,13 @@ class Walls(Product):
             in) or `none`.
         buffer_front_m: how far in front of the plane points were taken.
         buffer_behind_m: how far behind.
+        percentiles: which percentiles (0..100) of the depths in a cell each `Wall.percentiles_m`
+            has, in its order; empty if none were wanted.
         details: what else the method says, JSON.
     """
 
     type_name: ClassVar[str] = "walls"
+    encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "depth_m": Tolerance(limit=1e-4, unit="m"),
         "sigma_m": Tolerance(limit=1e-4, unit="m"),
@@ -118,10 +124,31 @@ class Walls(Product):
 
     walls: tuple[Wall, ...]
     up: NDArray[np.float64]
-    intensity_source: str
+    intensity_source: IntensitySource
     buffer_front_m: float
     buffer_behind_m: float
+    percentiles: tuple[float, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for wall in self.walls:
+            rasters = wall.percentiles_m
+            if rasters is not None and rasters.shape[2:] != (len(self.percentiles),):
+                raise ProductError(
+                    f"wall {wall.name}: percentiles_m has shape {rasters.shape}, but the walls "
+                    f"have {len(self.percentiles)} percentiles"
+                )
+
+    @classmethod
+    def upgraded(cls, payload: Payload) -> Payload:
+        """Move the percentiles, which stood in the details before version 2."""
+        metadata = dict(payload.metadata)
+        if isinstance(details := metadata.get("details"), dict):
+            metadata["details"] = {
+                name: value for name, value in details.items() if name != "percentiles"
+            }
+            metadata["percentiles"] = details.get("percentiles", [])
+        return super().upgraded(replace(payload, metadata=metadata))
 
 
 @dataclass(frozen=True, kw_only=True)

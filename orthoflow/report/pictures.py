@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.images import Part, cells_webp, grey_cells, sampled_rows
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.row_bands import count_cells
+from orthoflow.geometry.bands import count_cells
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
 from orthoflow.records import Run
 

@@ -7,7 +7,7 @@ import zlib
 
 import numpy as np
 import pytest
-from orthoflow_plugins.ortho.oriented_photos import shared_profile
+from orthoflow_plugins.ortho.photos_on_walls import shared_profile
 
 from orthoflow.files.containers import icc_profile
 from orthoflow.files.images import encode_jpeg, encode_png

@@ -187,12 +187,12 @@ def test_the_profile_of_the_photos_goes_into_the_file(tmp_path: Path, frame: Wal
 
 
 def test_percentiles_get_rasters_of_their_own(tmp_path: Path, frame: WallFrame) -> None:
-    plain = walls(frame, None)
+    plain = walls(frame, np.full(frame.shape, 0.5, np.float32))
     layered = np.stack([plain.walls[0].depth_m - 0.01, plain.walls[0].depth_m + 0.01], axis=2)
     product = dataclasses.replace(
         plain,
         walls=(dataclasses.replace(plain.walls[0], percentiles_m=layered),),
-        details={"percentiles": [5.0, 97.5]},
+        percentiles=(5.0, 97.5),
     )
     publishing.publish_walls(product, tmp_path, DIGEST)
     low = geotiff.read_raster(tmp_path / "wall_0_depth_p5_0.tif")
@@ -200,6 +200,9 @@ def test_percentiles_get_rasters_of_their_own(tmp_path: Path, frame: WallFrame) 
     np.testing.assert_array_equal(low.values, layered[:, :, 0])
     np.testing.assert_array_equal(high.values, layered[:, :, 1])
     assert high.tags["content"].startswith("percentile 97.5")
+    assert (low.tags["unit"], high.tags["unit"]) == ("m", "m")
+    intensity = geotiff.read_raster(tmp_path / "wall_0_intensity.tif")
+    assert (intensity.tags["unit"], intensity.tags["intensity_source"]) == ("1", "laser")
 
 
 def test_the_sidecar_places_the_raster_in_the_world(tmp_path: Path, frame: WallFrame) -> None:

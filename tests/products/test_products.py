@@ -10,9 +10,11 @@ import pytest
 from orthoflow.errors import ProductError
 from orthoflow.geometry import WallFrame
 from orthoflow.products import (
+    Array,
     Camera,
     Cameras,
     Intrinsics,
+    JsonValue,
     Payload,
     Photo,
     Photos,
@@ -153,9 +155,72 @@ def test_a_payload_of_another_type_is_refused() -> None:
 
 
 def test_a_payload_of_a_newer_encoding_is_refused() -> None:
-    payload = dataclasses.replace(walls().to_payload(), encoding_version=2)
-    with pytest.raises(ProductError, match="encoding version 2, this orthoflow reads version 1"):
+    payload = dataclasses.replace(walls().to_payload(), encoding_version=3)
+    with pytest.raises(ProductError, match="encoding version 3, this orthoflow reads version 2"):
         Walls.from_payload(payload)
+
+
+def walls_of_version_1(details: dict[str, JsonValue], n_percentiles: int) -> Payload:
+    raster = frame()
+    arrays: dict[str, Array] = {
+        "up": np.array([0.0, 0.0, 1.0]),
+        "walls/0/frame/origin_world": raster.origin_world,
+        "walls/0/frame/u_world": raster.u_world,
+        "walls/0/frame/v_world": raster.v_world,
+        "walls/0/frame/normal_world": raster.normal_world,
+        "walls/0/depth_m": np.zeros(raster.shape, np.float32),
+        "walls/0/sigma_m": np.zeros(raster.shape, np.float32),
+        "walls/0/count": np.ones(raster.shape, np.uint32),
+        "walls/0/mask": np.ones(raster.shape, np.uint8),
+    }
+    array: JsonValue = {"$array": "numeric"}
+    axes = dict.fromkeys(("origin_world", "u_world", "v_world", "normal_world"), array)
+    wall: dict[str, JsonValue] = {
+        "frame": {**axes, "gsd_m": 0.01, "width": 4, "height": 3},
+        "plane_index": 2,
+        "name": "wall 0",
+        **dict.fromkeys(("depth_m", "sigma_m", "count", "mask"), array),
+    }
+    if n_percentiles:
+        wall["percentiles_m"] = array
+        shape = (*raster.shape, n_percentiles)
+        arrays["walls/0/percentiles_m"] = np.zeros(shape, np.float32)
+    metadata: dict[str, JsonValue] = {
+        "walls": [wall],
+        "up": array,
+        "intensity_source": "none",
+        "buffer_front_m": 0.15,
+        "buffer_behind_m": 0.2,
+        "details": details,
+    }
+    return Payload(type_name="walls", encoding_version=1, metadata=metadata, arrays=arrays)
+
+
+@pytest.mark.parametrize(
+    ("details", "percentiles"),
+    [
+        ({"percentiles": [5.0, 97.5], "surface": "median"}, (5.0, 97.5)),
+        ({"percentiles": [], "surface": "median"}, ()),
+        ({"surface": "median"}, ()),
+    ],
+    ids=["some", "none wanted", "not said"],
+)
+def test_walls_of_the_first_encoding_have_their_percentiles_from_the_details(
+    details: dict[str, JsonValue], percentiles: tuple[float, ...]
+) -> None:
+    read = Walls.from_payload(walls_of_version_1(details, len(percentiles)))
+    assert read.percentiles == percentiles
+    assert read.details == {"surface": "median"}
+    payload = read.to_payload()
+    assert payload.encoding_version == 2
+    assert Walls.from_payload(payload).percentiles == percentiles
+
+
+def test_percentiles_that_do_not_fit_their_rasters_are_refused() -> None:
+    percentiles_m = np.zeros((*frame().shape, 2), np.float32)
+    wall = dataclasses.replace(walls().walls[0], percentiles_m=percentiles_m)
+    with pytest.raises(ProductError, match=r"\(3, 4, 2\), but the walls have 1 percentiles"):
+        dataclasses.replace(walls(), walls=(wall,), percentiles=(50.0,))
 
 
 def test_a_payload_that_lacks_an_array_is_refused() -> None:

@@ -1,22 +1,26 @@
-"""Which layer paints each cell of a wall: the best view, in patches rather than in specks."""
+"""Which layer paints each cell of a wall: by a rule, in patches rather than in specks."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import partial
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.row_bands import Allocate, holds_cells
-from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask
-from orthoflow_plugins.mosaic.preferring import Preference
+from orthoflow.geometry.bands import Allocate, bands_with_reach, holds_cells
+from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask, Wall
+from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
 
-# Preferences of layers that paint a wall together.
-Preferring = Callable[[Sequence[Layer]], Sequence[Preference]]
+SeamRule = Literal["best-view", "voronoi", "graph-cut", "priority"]
+
+# Preference (rows, cols) of a layer in some rows of its wall, made when they are joined: those of a
+# large wall would not fit into memory.
+Preference = Callable[[slice], NDArray[np.float32]]
 
 NOBODY: Final = -1
 # Walls with more cells are joined in bands of so many.
@@ -50,12 +54,59 @@ class Choice:
     source: NDArray[np.int16]
 
 
+def preferences(
+    layers: Sequence[Layer],
+    rule: SeamRule,
+    *,
+    priority: Sequence[str] = (),
+    wall: Wall | None = None,
+) -> list[Preference]:
+    """Say by a rule how much each layer is preferred in rows of the wall, larger is more.
+
+    `best-view` is the layers' own quality: incidence, resolution, distance to the photo's border.
+    `voronoi` prefers the layer whose painted area ends farthest off, so that seams lie in the
+    middle of overlaps. `priority` takes photos in the given order, the others by their quality.
+    `graph-cut` lays seams where the layers look alike and away from depth edges of the wall.
+
+    Raises:
+        MethodError: `priority` names what is no layer of any wall.
+    """
+    if rule == "voronoi":
+        return [partial(_rows_of, _depth_inside(layer)) for layer in layers]
+    if rule == "priority":
+        return _by_order(layers, priority)
+    if rule == "graph-cut" and len(layers) > 1:
+        cut = cut_labels(layers, wall)
+        return [
+            partial(_cut_off, layer, index, cut, _best(layers))
+            for index, layer in enumerate(layers)
+        ]
+    return [partial(_rows_of, layer.quality) for layer in layers]
+
+
+def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
+    """Refuse names in `priority` that no layer has.
+
+    Raises:
+        MethodError: there is such a name.
+    """
+    sources = {layer.source for layer in layers}
+    unknown = [name for name in priority if name not in sources]
+    if unknown:
+        raise MethodError(
+            f"priority names {', '.join(unknown)}, but the layers are of "
+            f"{', '.join(sorted(sources))} (mosaic.seams)"
+        )
+
+
 def joined(
     layers: tuple[Layer, ...],
     name: str,
     *,
+    rule: SeamRule,
+    priority: Sequence[str],
+    wall: Wall | None,
     island_cells_min: int,
-    prefer: Preferring,
     allocate: Allocate,
 ) -> Orthoimage:
     """Join the layers of one wall, a large one band by band.
@@ -63,9 +114,11 @@ def joined(
     Args:
         layers: all of one wall, at least one.
         name: of the wall.
+        rule: says which layer paints a cell that several show as well.
+        priority: names of photos, for that rule.
+        wall: its surface, for seams off its depth edges, or None.
         island_cells_min: smaller patches from one source are painted from the source around
             them, where that one sees them too.
-        prefer: says which layer paints a cell that several show as well.
         allocate: gives the arrays of the orthoimage, by name.
 
     Raises:
@@ -81,24 +134,17 @@ def joined(
     # What paints nothing is no source; it still tells what is hidden.
     painters = [layer for layer in layers if holds_cells(layer.mask, LayerMask.PAINTED)]
     others = [layer for layer in layers if all(layer is not painter for painter in painters)]
-    preferred = prefer(painters) if painters else []
+    preferred = preferences(painters, rule, priority=priority, wall=wall) if painters else []
     shape = first.frame.shape
     rgb = np.asarray(allocate("rgb", (*shape, 3), np.uint8), np.uint8)
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
-    for rows, around in _bands(shape, _island_reach(island_cells_min)):
-        choice = best_views(
-            [_part(layer, around) for layer in [*painters, *others]],
-            [
-                *(preference(around) for preference in preferred),
-                *(layer.quality[around] for layer in others),
-            ],
-        )
-        if island_cells_min > 1 and len(painters) > 1:
-            parts = [_part(layer, around) for layer in painters]
-            choice = without_islands(choice, parts, island_cells_min)
-        inner = slice(rows.start - around.start, rows.stop - around.start)
-        mask[rows], source[rows] = _MASK_OF_RANK[choice.rank[inner]], choice.source[inner]
+    reach = _island_reach(island_cells_min)
+    for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
+        rows = band.rows
+        choice = _choice_in(band.around, painters, others, preferred, island_cells_min)
+        mask[rows] = _MASK_OF_RANK[choice.rank[band.inner]]
+        source[rows] = choice.source[band.inner]
         for index, layer in enumerate(painters):
             is_mine = source[rows] == index
             rgb[rows][is_mine] = layer.rgb[rows][is_mine]
@@ -113,18 +159,30 @@ def joined(
     )
 
 
+def _choice_in(
+    rows: slice,
+    painters: Sequence[Layer],
+    others: Sequence[Layer],
+    preferred: Sequence[Preference],
+    island_cells_min: int,
+) -> Choice:
+    """What becomes of the cells of some rows."""
+    parts = [_part(layer, rows) for layer in painters]
+    choice = best_views(
+        [*parts, *(_part(layer, rows) for layer in others)],
+        [
+            *(preference(rows) for preference in preferred),
+            *(layer.quality[rows] for layer in others),
+        ],
+    )
+    if island_cells_min > 1 and len(painters) > 1:
+        return without_islands(choice, parts, island_cells_min)
+    return choice
+
+
 def _island_reach(cells_min: int) -> int:
     """How many rows away a cell may lie that decides who paints another."""
     return cells_min + math.ceil(math.sqrt(cells_min)) + 1 if cells_min > 1 else 0
-
-
-def _bands(shape: tuple[int, int], reach: int) -> Iterator[tuple[slice, slice]]:
-    """Cut a large wall into bands of rows; give each with a reach of rows about it."""
-    rows, columns = shape
-    height = max(1, _BAND_CELLS // max(1, columns) - 2 * reach)
-    for first in range(0, rows, height):
-        end = min(rows, first + height)
-        yield slice(first, end), slice(max(0, first - reach), min(rows, end + reach))
 
 
 def _part(layer: Layer, rows: slice) -> Layer:
@@ -197,3 +255,39 @@ def _ranks(layer: Layer) -> NDArray[np.uint8]:
         is_filled = (layer.filled > 0) & (layer.mask == LayerMask.PAINTED)
         ranks[is_filled] = _RANKED.index(OrthoMask.FILLED)
     return ranks
+
+
+def _best(layers: Sequence[Layer]) -> np.float32:
+    return np.float32(max(1e-6, *(float(layer.quality.max()) for layer in layers)))
+
+
+def _depth_inside(layer: Layer) -> NDArray[np.float32]:
+    """Distance in cells to the nearest cell that the layer does not paint, or to the rim."""
+    import cv2
+
+    painted = np.pad((layer.mask == LayerMask.PAINTED).astype(np.uint8), 1)
+    distance = cv2.distanceTransform(painted, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distance[1:-1, 1:-1], dtype=np.float32)
+
+
+def _by_order(layers: Sequence[Layer], priority: Sequence[str]) -> list[Preference]:
+    places = {name: len(priority) - place for place, name in enumerate(priority)}
+    bonus = np.float32(2.0) * _best(layers)
+    return [
+        partial(_raised, layer, np.float32(places.get(layer.source, 0)) * bonus) for layer in layers
+    ]
+
+
+def _rows_of(values: NDArray[np.float32], rows: slice) -> NDArray[np.float32]:
+    return values[rows]
+
+
+def _raised(layer: Layer, bonus: np.float32, rows: slice) -> NDArray[np.float32]:
+    return layer.quality[rows] + bonus
+
+
+def _cut_off(
+    layer: Layer, index: int, cut: CutLabels, best: np.float32, rows: slice
+) -> NDArray[np.float32]:
+    is_mine = cut.in_rows(rows) == index
+    return layer.quality[rows] + np.where(is_mine, np.float32(2.0) * best, np.float32(0.0))

@@ -14,7 +14,8 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.row_bands import Allocate, count_cells, holds_cells
+from orthoflow.files.images import encode_webp
+from orthoflow.geometry.bands import Allocate, count_cells, holds_cells
 from orthoflow.products import (
     JsonValue,
     Layer,
@@ -28,16 +29,38 @@ from orthoflow.products import (
 )
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.mosaic.colours import SeamSteps, balanced, estimate_gains, seam_steps
-from orthoflow_plugins.mosaic.cutting import depth_edges
-from orthoflow_plugins.mosaic.joining import NOBODY, joined
-from orthoflow_plugins.mosaic.overlaps import displacements_cells
-from orthoflow_plugins.mosaic.preferring import SeamRule, preferences, require_sources
-from orthoflow_plugins.mosaic.source_maps import caption, is_seam, source_map
+from orthoflow_plugins.mosaic.agreement import (
+    SeamSteps,
+    count_seams,
+    displacements_cells,
+    is_seam,
+    seam_steps,
+)
+from orthoflow_plugins.mosaic.gains import balanced, estimate_gains
+from orthoflow_plugins.mosaic.joining import (
+    NOBODY,
+    SeamRule,
+    joined,
+    require_sources,
+)
 
-_ROWS_AT_ONCE: Final = 1024
 # Arrays of more values than this lie in files.
 _IN_MEMORY_MOST: Final = 1 << 27
+# Of the map of sources: its longest side, its colours, and their share beside the grey.
+_LONGEST_PX: Final = 900
+_COLOURS: Final = {
+    "blue": (31, 119, 180),
+    "orange": (255, 127, 14),
+    "green": (44, 160, 44),
+    "red": (214, 39, 40),
+    "purple": (148, 103, 189),
+    "brown": (140, 86, 75),
+    "pink": (227, 119, 194),
+    "grey": (127, 127, 127),
+    "olive": (188, 189, 34),
+    "cyan": (23, 190, 207),
+}
+_TINT: Final = 0.45
 
 
 class MosaicSeams(Method):
@@ -170,11 +193,13 @@ def _join(
     image = joined(
         group,
         name,
+        rule=params.seams,
+        priority=params.priority,
+        wall=wall,
         island_cells_min=params.island_cells_min,
-        prefer=partial(preferences, rule=params.seams, priority=params.priority, wall=wall),
         allocate=allocate,
     )
-    n_seam, n_edge_seam = _count_seams(image.source, None if wall is None else wall.depth_m)
+    n_seam, n_edge_seam = count_seams(image.source, None if wall is None else wall.depth_m)
     return _Joined(
         image=image,
         shifts_cells=displacements_cells(group),
@@ -183,19 +208,6 @@ def _join(
         n_edge_seam=None if wall is None else n_edge_seam,
         gains=gains,
     )
-
-
-def _count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) -> tuple[int, int]:
-    """Cells at seams, and those of them at depth edges; some rows at a time."""
-    n_seam = n_edge_seam = 0
-    for first in range(0, source.shape[0], _ROWS_AT_ONCE):
-        # The row below tells of the last one.
-        rows = slice(first, first + _ROWS_AT_ONCE + 1)
-        seam = is_seam(source[rows])[:_ROWS_AT_ONCE]
-        n_seam += int(np.count_nonzero(seam))
-        if depth_m is not None:
-            n_edge_seam += int(np.count_nonzero(seam & depth_edges(depth_m[rows])[:_ROWS_AT_ONCE]))
-    return n_seam, n_edge_seam
 
 
 def _wall(walls: Walls | None, index: int) -> Wall | None:
@@ -210,7 +222,31 @@ def _show(ctx: StepContext, image: Orthoimage) -> None:
     if not image.sources:
         ctx.warn(f"the orthoimage of {image.name} is empty: no source shows any of it")
     if len(image.sources) > 1:
-        ctx.figure(f"wall_{image.wall}_sources", source_map(image), caption(image))
+        ctx.figure(f"wall_{image.wall}_sources", _source_map(image), _caption(image))
+
+
+def _source_map(image: Orthoimage) -> bytes:
+    """Picture of an orthoimage tinted by source, seams in white, nothing in black.
+
+    After markiewicz2015, Figure 24.
+    """
+    step = max(1, -(-max(image.source.shape) // _LONGEST_PX))
+    source = image.source[::step, ::step]
+    palette = np.array(list(_COLOURS.values()), dtype=np.float64)
+    tint = palette[source % len(palette)]
+    grey = image.rgb[::step, ::step].mean(axis=2, keepdims=True)
+    picture = np.where(source[..., None] >= 0, _TINT * tint + (1.0 - _TINT) * grey, 0.0)
+    picture[is_seam(source)] = 255.0
+    return encode_webp(np.rint(picture).astype(np.uint8))
+
+
+def _caption(image: Orthoimage) -> str:
+    """Say which colour of `_source_map` stands for which source."""
+    names = list(_COLOURS)
+    legend = ", ".join(
+        f"{names[index % len(names)]} {name}" for index, name in enumerate(image.sources)
+    )
+    return f"{image.name}, by source: {legend}; seams in white."
 
 
 def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:

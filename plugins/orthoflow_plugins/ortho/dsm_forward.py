@@ -11,27 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from orthoflow.errors import MethodError
 from orthoflow.products import Layer, LayerMask, Layers
 from orthoflow.sdk import Determinism, Method, Ports, StepContext
-from orthoflow_plugins.ortho.oriented_photos import (
-    UNSEEN_WALLS,
-    bare_layer,
+from orthoflow_plugins.ortho.layers import LayerStack
+from orthoflow_plugins.ortho.photos_on_walls import (
+    OpenedPhoto,
+    PhotosOnWalls,
+    VisibilityParams,
     oriented_photos,
     pixels_of,
     shared_profile,
 )
-from orthoflow_plugins.ortho.sights import (
-    PhotosOnWalls,
-    SightParams,
-    occluders_before,
-    surfaces_of,
-)
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
-    from orthoflow.geometry.visibility_kernels import DepthBuffer, Relief
-    from orthoflow_plugins.ortho.dsm_backward_painting import Surface
+    from orthoflow_plugins.ortho.surfaces import Surface
 
 
 class DsmForward(Method):
@@ -50,7 +44,7 @@ class DsmForward(Method):
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7",
     )
 
-    class Params(SightParams):
+    class Params(VisibilityParams):
         """When a pixel counts, and which gaps between pixels are filled."""
 
         fill_gap_cells: int = Field(
@@ -71,7 +65,8 @@ class DsmForward(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Take photo by photo, and throw each onto every wall it sees."""
-        from orthoflow_plugins.ortho.dsm_backward_occluders import depth_buffer, nothing_in_the_way
+        from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_before
+        from orthoflow_plugins.ortho.surfaces import surfaces_of
 
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
         viewers = [camera.viewing() for _, camera in oriented]
@@ -80,67 +75,48 @@ class DsmForward(Method):
         occluders = occluders_before(inputs, viewers, params, ctx, method=self.id)
         seconds["occluders_s"] = time.perf_counter() - started
         surfaces = surfaces_of(inputs.walls, params, ctx)
-        layers: list[Layer] = []
+        stack = LayerStack(inputs.walls, surfaces, ctx)
         for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
             ctx.progress(place / len(oriented), photo.name)
             pixels = pixels_of(photo, camera)
             started = time.perf_counter()
-            buffer = (
-                nothing_in_the_way(viewer) if occluders is None else depth_buffer(occluders, viewer)
-            )
+            buffer = depth_buffer_of(occluders, viewer)
             looked = time.perf_counter()
-            painted = []
-            for index, surface in enumerate(surfaces):
-                layer = _layer(
-                    (index, photo.name), pixels, viewer, surface, buffer, params, threads=ctx.cores
-                )
-                if layer is not None:
-                    layers.append(layer)
-                    painted.append(inputs.walls.walls[index].name)
+            opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
+            with stack.painting_from(photo.name):
+                for index, surface in enumerate(surfaces):
+                    layer = _layer(opened, surface, index, params, threads=ctx.cores)
+                    if layer is not None:
+                        stack.add(layer)
             seconds["occluders_s"] += looked - started
             seconds["painting_s"] += time.perf_counter() - looked
-            ctx.log(f"{photo.name}: paints {', '.join(painted) or 'no wall'}")
-        names = tuple(wall.name for wall in inputs.walls.walls)
         profile = shared_profile([photo for photo, _ in oriented], ctx)
-        finished = _finished(layers, surfaces, names, ctx, seconds)
-        return self.Out(layers=replace(finished, icc_profile=profile))
+        layers = stack.complete()
+        _report(ctx, stack, layers, seconds)
+        return self.Out(layers=replace(layers, icc_profile=profile))
 
 
 def _layer(
-    label: tuple[int, str],
-    pixels: NDArray[np.uint8],
-    viewer: ViewingCamera,
-    surface: Surface,
-    buffer: DepthBuffer,
-    params: DsmForward.Params,
-    *,
-    threads: int,
+    photo: OpenedPhoto, surface: Surface, wall: int, params: DsmForward.Params, *, threads: int
 ) -> Layer | None:
     """Throw a photo onto one wall; None where no pixel meets it."""
-    from orthoflow.geometry.forward_kernels import NO_PIXEL, Catch, throw_pixels
-    from orthoflow.geometry.rastering import lenders_in_gaps
-    from orthoflow_plugins.ortho.dsm_backward_painting import SightRule, view_of
+    from orthoflow.geometry.narrow_gaps import lenders_in_gaps
+    from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch, throw_pixels
+    from orthoflow_plugins.ortho.surfaces import is_before, view_of
 
-    rule = SightRule(
-        resampling="nearest",
-        is_filtered=False,
-        incidence_max_deg=params.incidence_max_deg,
-        erosion_cells=0,
-        border_share=params.border_share,
-    )
-    view = view_of(viewer, surface, rule)
-    if view.height_m <= float(surface.relief.bottoms.min()):
+    view = view_of(photo.viewer, surface, params, is_exact=True)
+    if not is_before(view, surface):
         return None
     shape = surface.frame.shape
     catch = Catch(
         pixel=np.full(shape, NO_PIXEL, dtype=np.int32),
         square=np.full(shape, np.inf, dtype=np.float32),
     )
-    relief: Relief = surface.relief
-    if not throw_pixels(view, relief, buffer, _ray_lattice(viewer, surface), catch):
+    relief = surface.relief
+    if not throw_pixels(view, relief, photo.buffer, _ray_lattice(photo.viewer, surface), catch):
         return None
     is_painted = catch.pixel != NO_PIXEL
-    seen, quality = _worth(viewer, surface, border_px=view.border_px)
+    seen, quality = _seen(photo.viewer, surface, border_px=view.border_px)
     lent = lenders_in_gaps(is_painted, params.fill_gap_cells, threads=threads)
     is_gap = ~np.isnan(relief.depth.ravel()[lent[:, 0]]) & seen.ravel()[lent[:, 0]]
     gaps, lenders = lent[is_gap].T
@@ -149,15 +125,15 @@ def _layer(
     filled = np.zeros(shape, dtype=np.uint8)
     filled.ravel()[gaps] = 1
     is_shown = is_painted | (filled > 0)
-    rgb = pixels.reshape(-1, 3)[taken].reshape(*shape, 3)
+    rgb = photo.pixels.reshape(-1, 3)[taken].reshape(*shape, 3)
     rgb[~is_shown] = 0
     mask = np.where(seen, LayerMask.OCCLUDED, LayerMask.OUTSIDE)
     mask[np.isnan(relief.depth)] = LayerMask.NO_SURFACE
     mask[is_shown] = LayerMask.PAINTED
     return Layer(
         frame=surface.frame,
-        wall=label[0],
-        source=label[1],
+        wall=wall,
+        source=photo.name,
         rgb=rgb,
         mask=mask.astype(np.uint8),
         quality=np.where(is_shown, quality, np.float32(0.0)),
@@ -167,7 +143,7 @@ def _layer(
 
 def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
     """Rays (n, m, 3) of every sixteenth pixel: columns, rows, metres of height per metre."""
-    from orthoflow.geometry.forward_kernels import RAY_STEP_PX
+    from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
 
     frame = surface.frame
     counts = (viewer.height // RAY_STEP_PX + 2, viewer.width // RAY_STEP_PX + 2)
@@ -185,7 +161,7 @@ def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]
 
 def _stretched(rays: NDArray[np.float64], size_px: int, axis: int) -> NDArray[np.float64]:
     """Move the rays at the image's border on to where the lattice has its last place."""
-    from orthoflow.geometry.forward_kernels import RAY_STEP_PX
+    from orthoflow_plugins.ortho.forward_kernels import RAY_STEP_PX
 
     moved = np.moveaxis(rays.copy(), axis, 0)
     border = size_px / RAY_STEP_PX
@@ -196,7 +172,7 @@ def _stretched(rays: NDArray[np.float64], size_px: int, axis: int) -> NDArray[np
     return np.moveaxis(moved, 0, axis)
 
 
-def _worth(
+def _seen(
     viewer: ViewingCamera, surface: Surface, *, border_px: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """Which cells lie in the photo, and how many of its pixels each covers."""
@@ -214,43 +190,19 @@ def _worth(
             cosine = towards @ frame.normal_world / np.linalg.norm(towards, axis=1)
             seen[row] = (u >= 0) & (u < viewer.width) & (v >= 0) & (v < viewer.height)
             border = np.minimum(np.minimum(u, viewer.width - u), np.minimum(v, viewer.height - v))
-            worth = cosine * area_px / distance**2 * np.clip(border / border_px, 0.0, 1.0)
-        quality[row] = np.where(seen[row], np.nan_to_num(worth), 0.0)
+            value = cosine * area_px / distance**2 * np.clip(border / border_px, 0.0, 1.0)
+        quality[row] = np.where(seen[row], np.nan_to_num(value), 0.0)
     return seen, np.maximum(quality, 0.0)
 
 
-def _finished(
-    layers: list[Layer],
-    surfaces: list[Surface],
-    names: tuple[str, ...],
-    ctx: StepContext,
-    seconds: dict[str, float],
-) -> Layers:
-    """Order the layers by wall, add an empty one for each wall that nothing paints, and report.
-
-    Raises:
-        MethodError: no photo paints any wall.
-    """
-    if not layers:
-        raise MethodError(UNSEEN_WALLS)
-    ctx.metric("n_layers", len(layers), "1")
-    n_surface = n_painted = n_filled = 0
-    complete = list(layers)
-    for index, surface in enumerate(surfaces):
-        own = [layer for layer in layers if layer.wall == index]
-        n_surface += int(np.count_nonzero(~np.isnan(surface.relief.depth)))
-        if not own:
-            ctx.warn(f"no photo shows {names[index]}: the orthoimage stays empty")
-            complete.append(bare_layer(surface.frame, index, surface.relief.depth))
-            continue
-        n_painted += int(np.count_nonzero(sum(layer.mask == LayerMask.PAINTED for layer in own)))
-        n_filled += sum(
-            int(np.count_nonzero(layer.filled)) for layer in own if layer.filled is not None
-        )
-    n_shown = sum(int(np.count_nonzero(layer.mask == LayerMask.PAINTED)) for layer in layers)
-    ctx.metric("painted_share", n_painted / max(1, n_surface), "1")
+def _report(ctx: StepContext, stack: LayerStack, layers: Layers, seconds: dict[str, float]) -> None:
+    counts = stack.count_cells(layers)
+    n_filled = sum(
+        int(np.count_nonzero(layer.filled)) for layer in stack.painted if layer.filled is not None
+    )
+    n_shown = sum(int(np.count_nonzero(layer.mask == LayerMask.PAINTED)) for layer in stack.painted)
+    ctx.metric("n_layers", len(stack.painted), "1")
+    ctx.metric("painted_share", counts.n_painted / max(1, counts.n_surface), "1")
     ctx.metric("filled_share", n_filled / max(1, n_shown), "1")
     for name, value in seconds.items():
         ctx.metric(name, value, "s")
-    complete.sort(key=lambda layer: layer.wall)
-    return Layers(layers=tuple(complete), names=names)

@@ -18,7 +18,7 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 
 if TYPE_CHECKING:
-    from orthoflow.geometry.raster_entry_kernels import Entries
+    from orthoflow.geometry.raster_kernels import Entries
 
 Colouring = Literal["topmost", "centre", "gaussian", "median"]
 
@@ -134,7 +134,7 @@ def _on_top(
 
 def _slots(entries: Entries) -> NDArray[np.int64]:
     """Slots of a chunk that hold a point."""
-    from orthoflow.geometry.raster_entry_kernels import BLOCK
+    from orthoflow.geometry.raster_kernels import BLOCK
 
     is_used = np.arange(BLOCK) < entries.n_inside[:, np.newaxis]
     return np.flatnonzero(is_used)

@@ -15,9 +15,13 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.ortho.gaps import Inpainting, fillable_gaps, inpainted
+from orthoflow_plugins.ortho.filling import (
+    Inpainting,
+    fillable_gaps,
+    filling_preview,
+    inpainted,
+)
 from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, colours_of
-from orthoflow_plugins.ortho.previews import filling_preview
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,43 +1,31 @@
-"""Where the cells of a surface come from: measured, recovered in narrow gaps, or void."""
+"""Where the cells of a surface come from: measured, recovered in narrow gaps, or void.
+
+A gap is recovered between points that lie side by side in a scan, where its rows and columns are
+known; else with the nearest measured cell.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Iterator
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.rastering import lenders_in_gaps
+from orthoflow.geometry.narrow_gaps import lenders_in_gaps
+from orthoflow.geometry.point_kernels import read_only
+from orthoflow.geometry.raster_kernels import BLOCK
+from orthoflow.geometry.rastering import entries_inside, wall_from_offset
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud, SurfaceMask
-from orthoflow_plugins.raster.scan_neighbours import SpanRule, recover_between_neighbours
+from orthoflow_plugins.raster.rules import GapRule
+from orthoflow_plugins.raster.scan_grid_kernels import CellValues, Reach, ScanGrid, recover_between
 from orthoflow_plugins.raster.surfaces import CELLS_AT_ONCE, CellSurface
 
-# Neighbours in the scan may lie so many widths of a narrow gap's radius apart.
-_SPAN_GAPS: Final = 4
+# A scan with more rows times columns than this has numbers that are no grid (2 GB of indices).
+_GRID_CELLS_MOST: Final = 1 << 28
 
-
-@dataclass(frozen=True, kw_only=True)
-class GapRule:
-    """Which gaps close.
-
-    Attributes:
-        gap_cells: no disc of this radius fits into a narrow gap; 0 closes none.
-        scan_steps: rows or columns of a scan between neighbours that span a gap, at most.
-        layer_m: how far apart their depths are, at most.
-        threads: how many threads work.
-    """
-
-    gap_cells: int
-    scan_steps: int
-    layer_m: float
-    threads: int
-
-    @property
-    def reach_cells(self) -> int:
-        """How far away a cell may lie that decides what becomes of another, at most."""
-        return (_SPAN_GAPS + 2) * self.gap_cells
+_Number = TypeVar("_Number", np.float32, np.uint8)
 
 
 def close_gaps(
@@ -52,13 +40,7 @@ def close_gaps(
     mask = np.full(is_known.shape, SurfaceMask.RECOVERED, dtype=np.uint8)
     mask[surface.count > 0] = SurfaceMask.MEASURED
     mask[~is_known] = SurfaceMask.VOID
-    spans = SpanRule(
-        steps=rule.scan_steps,
-        side_cells=_SPAN_GAPS * rule.gap_cells,
-        layer_m=rule.layer_m,
-        threads=rule.threads,
-    )
-    mask[recover_between_neighbours(cloud, slab, surface, spans)] = SurfaceMask.RECOVERED
+    mask[_recover_between_neighbours(cloud, slab, surface, rule)] = SurfaceMask.RECOVERED
     lent = lenders_in_gaps(is_known.reshape(slab.frame.shape), rule.gap_cells, threads=rule.threads)
     for first in range(0, len(lent), CELLS_AT_ONCE):
         part = lent[first : first + CELLS_AT_ONCE]
@@ -69,3 +51,103 @@ def close_gaps(
             if values is not None:
                 values[void] = values[lender]
     return mask
+
+
+def _recover_between_neighbours(
+    cloud: PointCloud, slab: Slab, surface: CellSurface, rule: GapRule
+) -> NDArray[np.bool_]:
+    """Fill void cells of a surface between neighbours in the scans' grids, linear between them.
+
+    A point that the scanner missed lies between its neighbours in the scan, whatever the raster
+    makes of their distance. So a gap between points that are neighbours, or nearly, and on one
+    surface is recovered between them; one that the scanner looked through is not, since no
+    neighbours span it.
+
+    Args:
+        cloud: with rows and columns; without them nothing is filled.
+        slab: of the wall.
+        surface: filled in place; its spreads stay unknown and its counts 0.
+        rule: what neighbours are.
+
+    Returns:
+        (cells,) which were filled.
+    """
+    was_void = ~np.isfinite(surface.depth_m)
+    is_void = was_void.reshape(slab.frame.shape).copy()
+    if rule.scan_steps == 0 or cloud.row is None or cloud.column is None or not is_void.any():
+        return np.zeros(was_void.size, dtype=np.bool_)
+    no_intensity, no_rgb = np.empty(0, dtype=np.float32), np.empty((0, 3), dtype=np.uint8)
+    intensity = _unchanged(no_intensity if cloud.intensity is None else cloud.intensity)
+    rgb = _unchanged(no_rgb if cloud.rgb is None else cloud.rgb)
+    values = CellValues(
+        surface.depth_m,
+        no_intensity.copy() if surface.intensity is None else surface.intensity,
+        no_rgb.copy() if surface.rgb is None else surface.rgb,
+    )
+    matrix = wall_from_offset(slab.frame, cloud.origin)
+    offsets = read_only(cloud.x, cloud.y, cloud.z)
+    reach = Reach(rule.scan_steps, float(rule.span_cells), rule.layer_m)
+    near = _near(is_void, rule.span_cells)
+    for points in _grids(cloud, slab, surface, near, rule):
+        recover_between(ScanGrid(points, offsets, matrix), intensity, rgb, reach, is_void, values)
+    return was_void & ~is_void.ravel()
+
+
+def _unchanged(values: NDArray[_Number]) -> NDArray[_Number]:
+    """An array in the one form that kernels are compiled for."""
+    view = np.asarray(values).view(np.ndarray)
+    view.flags.writeable = False
+    return view
+
+
+def _near(is_void: NDArray[np.bool_], reach_cells: int) -> NDArray[np.bool_]:
+    """Cells (flat) whose points may span a void cell."""
+    import cv2
+
+    window = np.ones((2 * reach_cells + 1,) * 2, dtype=np.uint8)
+    return np.asarray(cv2.dilate(is_void.view(np.uint8), window), dtype=np.bool_).ravel()
+
+
+def _grids(
+    cloud: PointCloud,
+    slab: Slab,
+    surface: CellSurface,
+    near: NDArray[np.bool_],
+    rule: GapRule,
+) -> Iterator[NDArray[np.int64]]:
+    """For each scan the indices of its points beside void cells, by row and column."""
+    chosen = _points_beside_voids(cloud, slab, surface, near, rule)
+    if cloud.row is None or cloud.column is None:
+        raise AssertionError("a grid was asked of a cloud without rows and columns")
+    scans = np.zeros(len(chosen), dtype=np.uint16) if cloud.scan is None else cloud.scan[chosen]
+    for scan in np.unique(scans):
+        points = chosen[scans == scan]
+        rows, columns = cloud.row[points], cloud.column[points]
+        shape = (int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1)
+        if shape[0] * shape[1] > _GRID_CELLS_MOST:
+            continue
+        grid = np.full(shape, -1, dtype=np.int64)
+        grid[rows - rows.min(), columns - columns.min()] = points
+        yield grid
+
+
+def _points_beside_voids(
+    cloud: PointCloud,
+    slab: Slab,
+    surface: CellSurface,
+    near: NDArray[np.bool_],
+    rule: GapRule,
+) -> NDArray[np.uint32]:
+    """Indices of the points that lie on the surface of a cell near a void one."""
+    found = [np.empty(0, dtype=np.uint32)]
+    for entries in entries_inside(cloud, slab, threads=rule.threads):
+        for block, n_inside in enumerate(entries.n_inside):
+            part = slice(block * BLOCK, block * BLOCK + int(n_inside))
+            cells = entries.cells[part]
+            beside = near[cells]
+            if not beside.any():
+                continue
+            cells, depths_m = cells[beside], entries.depths_m[part][beside]
+            on_surface = np.abs(depths_m - surface.depth_m[cells]) <= rule.layer_m
+            found.append(entries.points[part][beside][on_surface])
+    return np.concatenate(found)

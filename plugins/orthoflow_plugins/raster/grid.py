@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final
+from typing import Annotated, ClassVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
+from orthoflow.products import IntensitySource, Planes, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
-from orthoflow_plugins.raster.reporting import WallRaster, report, warn
-from orthoflow_plugins.raster.rules import Surface, SurfaceRule
-from orthoflow_plugins.raster.scan_steps import scan_step_m
+from orthoflow_plugins.raster.reporting import report, warn
+from orthoflow_plugins.raster.rules import GapRule, RasterRule, Surface, SurfaceRule
 from orthoflow_plugins.raster.selection import Constraint, WallChoice, chosen_planes, frame_of
-
-if TYPE_CHECKING:
-    from orthoflow.geometry.row_bands import Allocate
-    from orthoflow_plugins.raster.banding import Raster
-    from orthoflow_plugins.raster.gaps import GapRule
-
-# Rec. 601 luma on the sRGB values as they are: the grey of cv2.cvtColor.
-_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
-# Bytes per cell: what a finished wall keeps, and what the passes over one wall hold on top.
-_BYTES_KEPT: Final = 25
-_BYTES_WORKING: Final = 90
-_MEMORY_SHARE: Final = 0.75
-# Larger walls are rastered in bands of so many cells: 3 GB of memory.
-_BAND_CELLS: Final = 1 << 25
+from orthoflow_plugins.raster.walls import WallRaster, rastered_wall, require_memory
 
 
 class RasterGrid(Method):
@@ -153,6 +136,7 @@ class RasterGrid(Method):
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
         slabs = _slabs(planes, params)
+        rule = _raster_rule(params, threads=ctx.cores)
         rasters: list[WallRaster] = []
         source = _intensity_source(cloud)
         if params.balance_intensity:
@@ -160,13 +144,13 @@ class RasterGrid(Method):
         for k, (index, slab) in enumerate(slabs.items()):
             ctx.progress(k / len(slabs), planes.names[index])
             rasters.append(
-                _wall(
+                rastered_wall(
                     cloud,
                     slab,
-                    params,
-                    plane=(planes, index),
+                    rule,
+                    planes=planes,
+                    index=index,
                     allocate=partial(_allocated, ctx, k),
-                    threads=ctx.cores,
                 )
             )
         walls = tuple(raster.wall for raster in rasters)
@@ -181,10 +165,10 @@ class RasterGrid(Method):
                 intensity_source=source,
                 buffer_front_m=slab.front_m,
                 buffer_behind_m=slab.behind_m,
+                percentiles=params.percentiles,
                 details={
                     "surface": params.surface,
                     "scan_step_m": [raster.scan_step_m for raster in rasters],
-                    "percentiles": list(params.percentiles),
                 },
             )
         )
@@ -216,132 +200,31 @@ def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
         )
         for index in chosen_planes(planes, choice)
     }
-    _require_memory([slab.frame for slab in slabs.values()], params)
+    require_memory([slab.frame for slab in slabs.values()], params.surface)
     return slabs
 
 
-def _require_memory(frames: list[WallFrame], params: RasterGrid.Params) -> None:
-    sizes = [frame.width * frame.height for frame in frames]
-    # What is rastered in bands lies in files, and takes the memory of a band.
-    kept = [
-        size for size, frame in zip(sizes, frames, strict=True) if not _is_banded(frame, params)
-    ]
-    working = max([*kept, _BAND_CELLS] if len(kept) < len(sizes) else kept)
-    needed = _BYTES_KEPT * sum(kept) + _BYTES_WORKING * working
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    # Cells are numbered with 32 bits.
-    if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
-        largest = frames[int(np.argmax(sizes))]
-        raise MethodError(
-            f"cells of gsd_m = {largest.gsd_m:g} m make {sum(sizes):.3g} cells ({largest.width} "
-            f"x {largest.height} on the largest wall), which need {needed / 2**30:.3g} GiB where "
-            f"this machine has {memory / 2**30:.3g} GiB: raise gsd_m, or lower n_walls_max"
-        )
-
-
-def _allocated(
-    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
-) -> NDArray[np.generic]:
-    return ctx.allocate("walls", f"{wall}.{name}", shape, dtype).view(np.ndarray)
-
-
-def _wall(
-    cloud: PointCloud,
-    slab: Slab,
-    params: RasterGrid.Params,
-    *,
-    plane: tuple[Planes, int],
-    allocate: Allocate,
-    threads: int,
-) -> WallRaster:
-    from orthoflow_plugins.raster.banding import rastered_in_bands
-
-    raster_of = partial(_raster, cloud, params=params, threads=threads)
-    if _is_banded(slab.frame, params):
-        raster = rastered_in_bands(
-            slab,
-            raster_of,
-            cells_most=_BAND_CELLS,
-            # Outliers are told from 20 cells around, noise taken out twice.
-            reach_rows=32
-            + 2 * params.denoise_cells
-            + _gap_rule(params, threads=threads).reach_cells,
-            allocate=allocate,
-        )
-    else:
-        raster = raster_of(slab)
-    surface, shape = raster.surface, slab.frame.shape
-    planes, index = plane
-    wall = Wall(
-        frame=slab.frame,
-        plane_index=index,
-        name=planes.names[index],
-        depth_m=surface.depth_m.reshape(shape),
-        sigma_m=surface.sigma_m.reshape(shape),
-        count=surface.count.reshape(shape),
-        mask=raster.mask.reshape(shape),
-        intensity=None if surface.intensity is None else surface.intensity.reshape(shape),
-        rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
-        rgb_mask=None if surface.rgb is None else _where_known(raster.mask, shape, allocate),
-        percentiles_m=None
-        if surface.percentiles_m is None
-        else surface.percentiles_m.reshape(*shape, -1),
-    )
-    return WallRaster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=params.gsd_m))
-
-
-def _where_known(
-    mask: NDArray[np.uint8], shape: tuple[int, int], allocate: Allocate
-) -> NDArray[np.uint8]:
-    """1 where a `SurfaceMask` (cells,) is not void, else 0; of a large wall in a file."""
-    if mask.size <= _BAND_CELLS:
-        return (mask > 0).astype(np.uint8).reshape(shape)
-    known = np.asarray(allocate("rgb_mask", shape, np.uint8), np.uint8)
-    np.minimum(mask.reshape(shape), 1, out=known)
-    return known
-
-
-def _is_banded(frame: WallFrame, params: RasterGrid.Params) -> bool:
-    """Whether a wall is rastered band by band; the triangles of a net know no bands."""
-    return frame.width * frame.height > _BAND_CELLS and params.surface != "tin"
-
-
-def _gap_rule(params: RasterGrid.Params, *, threads: int) -> GapRule:
-    from orthoflow_plugins.raster.gaps import GapRule
-
-    return GapRule(
-        gap_cells=params.recover_gap_cells,
-        scan_steps=params.recover_scan_steps,
-        layer_m=params.layer_m,
-        threads=threads,
-    )
-
-
-def _raster(cloud: PointCloud, slab: Slab, *, params: RasterGrid.Params, threads: int) -> Raster:
-    from orthoflow_plugins.raster.banding import Raster
-    from orthoflow_plugins.raster.gaps import close_gaps
-    from orthoflow_plugins.raster.surfaces import surface_of
-
-    rule = SurfaceRule(
+def _raster_rule(params: RasterGrid.Params, *, threads: int) -> RasterRule:
+    surface = SurfaceRule(
         surface=params.surface,
         layer_m=params.layer_m,
         denoise_cells=params.denoise_cells,
         percentiles=params.percentiles,
         threads=threads,
     )
-    surface = surface_of(cloud, slab, rule)
-    mask = close_gaps(cloud, slab, surface, _gap_rule(params, threads=threads))
-    if surface.intensity is None:
-        surface = replace(surface, intensity=_grey(surface.rgb, mask))
-    return Raster(surface=surface, mask=mask)
+    gaps = GapRule(
+        gap_cells=params.recover_gap_cells,
+        scan_steps=params.recover_scan_steps,
+        layer_m=params.layer_m,
+        threads=threads,
+    )
+    return RasterRule(surface=surface, gaps=gaps)
 
 
-def _grey(rgb: NDArray[np.uint8] | None, mask: NDArray[np.uint8]) -> NDArray[np.float32] | None:
-    if rgb is None:
-        return None
-    grey = rgb.astype(np.float32) @ _LUMA / np.float32(255.0)
-    grey[mask == SurfaceMask.VOID] = np.nan
-    return grey.astype(np.float32)
+def _allocated(
+    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
+) -> NDArray[np.generic]:
+    return ctx.allocate("walls", f"{wall}.{name}", shape, dtype).view(np.ndarray)
 
 
 def _require_points_near(walls: tuple[Wall, ...], slab: Slab) -> None:
@@ -353,7 +236,7 @@ def _require_points_near(walls: tuple[Wall, ...], slab: Slab) -> None:
         )
 
 
-def _intensity_source(cloud: PointCloud) -> str:
+def _intensity_source(cloud: PointCloud) -> IntensitySource:
     if cloud.intensity is not None:
         return "laser"
     return "none" if cloud.rgb is None else "luminance"

@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.images import encode_webp
+from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.depth_noise import depth_noise_m
-from orthoflow.geometry.row_bands import count_cells
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.raster.previews import depth_preview
+from orthoflow_plugins.raster.walls import WallRaster
 
 # Medians of larger walls are told from some of their rows.
 _CELLS_ASKED: Final = 1 << 26
+_LONGEST_PX: Final = 1400
 
 _Number = TypeVar("_Number", np.float32, np.uint32)
-
-
-@dataclass(frozen=True, kw_only=True)
-class WallRaster:
-    """A rastered wall, and how far apart the scan's points lie on it."""
-
-    wall: Wall
-    scan_step_m: float
 
 
 def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str) -> None:
@@ -71,7 +64,7 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
         ctx.metric(f"{state.name.lower()}_share", share, "1")
     ctx.figure(
         "depth",
-        depth_preview(walls[0]),
+        _depth_preview(walls[0]),
         f"Depth of {walls[0].name}: brighter is nearer to the viewer, grey is void.",
     )
 
@@ -79,3 +72,19 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:
     """Rows of a raster, all of them unless it is large."""
     return values[:: max(1, values.size // _CELLS_ASKED)]
+
+
+def _depth_preview(wall: Wall) -> bytes:
+    """Picture of a wall's depth: its inner 98 % spread over a colour scale, void in grey."""
+    import cv2
+
+    step = max(1, -(-max(wall.mask.shape) // _LONGEST_PX))
+    depth, mask = wall.depth_m[::step, ::step], wall.mask[::step, ::step]
+    is_void = mask == SurfaceMask.VOID
+    known = depth[~is_void]
+    low, high = np.percentile(known, [1.0, 99.0]) if known.size else (0.0, 1.0)
+    scaled = (np.nan_to_num(depth) - low) / max(high - low, 1e-6)
+    levels = np.clip(255.0 * scaled, 0.0, 255.0).astype(np.uint8)
+    picture = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)
+    picture[is_void] = 128
+    return encode_webp(np.asarray(picture, dtype=np.uint8)[:, :, ::-1])

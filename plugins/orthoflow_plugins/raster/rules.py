@@ -1,11 +1,16 @@
-"""By which rule the depth of a cell follows from its points."""
+"""By which rules the depth of a cell follows from its points, and gaps close."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 Surface = Literal["median", "denoised", "nearest", "centre", "topmost", "mean", "tin"]
+
+# Neighbours in the scan may lie so many widths of a narrow gap's radius apart.
+_SPAN_GAPS: Final = 4
+# Outliers are told from 20 cells around.
+_REACH_OF_OUTLIERS: Final = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,3 +30,45 @@ class SurfaceRule:
     denoise_cells: int
     percentiles: tuple[float, ...]
     threads: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class GapRule:
+    """Which gaps close.
+
+    Attributes:
+        gap_cells: no disc of this radius fits into a narrow gap; 0 closes none.
+        scan_steps: rows or columns of a scan between neighbours that span a gap, at most.
+        layer_m: how far apart their depths are, at most.
+        threads: how many threads work.
+    """
+
+    gap_cells: int
+    scan_steps: int
+    layer_m: float
+    threads: int
+
+    @property
+    def span_cells(self) -> int:
+        """How far apart on the wall neighbours in the scan lie that span a gap, at most."""
+        return _SPAN_GAPS * self.gap_cells
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterRule:
+    """How a wall is rastered.
+
+    Attributes:
+        surface: how depths follow from points.
+        gaps: which gaps close.
+    """
+
+    surface: SurfaceRule
+    gaps: GapRule
+
+    @property
+    def reach_rows(self) -> int:
+        """How many rows away a cell may lie that decides what becomes of another, at most."""
+        # Noise is taken out twice, and a gap is as wide as what spans it and a disc on either side.
+        gaps = self.gaps.span_cells + 2 * self.gaps.gap_cells
+        return _REACH_OF_OUTLIERS + 2 * self.surface.denoise_cells + gaps

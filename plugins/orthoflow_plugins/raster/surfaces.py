@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -10,26 +10,28 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import raster_kernels as kernels
+from orthoflow.errors import MethodError
 from orthoflow.geometry.point_kernels import read_only
-from orthoflow.geometry.raster_entry_kernels import Entries
+from orthoflow.geometry.raster_kernels import Entries, keep_nearest, keep_topmost
 from orthoflow.geometry.rastering import (
     empty_winners,
     entries_inside,
-    in_parts,
     share_cells,
-    spread_m,
     values_of_winners,
     wall_from_offset,
 )
 from orthoflow.geometry.slabs import Slab
+from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud
-from orthoflow_plugins.raster.denoising import denoised
+from orthoflow_plugins.raster import surface_kernels as kernels
+from orthoflow_plugins.raster.depth_filters import denoised, without_specks
 from orthoflow_plugins.raster.rules import SurfaceRule
-from orthoflow_plugins.raster.specks import without_specks
 
 # What is made of cells for a moment is made of so many.
 CELLS_AT_ONCE: Final = 1 << 20
+# A net of triangles has at most so many, and is laid over so many rows at once.
+_VERTICES_MOST: Final = 2_000_000
+_ROWS_AT_ONCE: Final = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +82,7 @@ def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> Cel
     has_point = winners["n_points"] > 0
     surface = CellSurface(
         depth_m=np.where(has_point, winners["depth_m"], np.float32(np.nan)),
-        sigma_m=spread_m(winners["n_points"], moments),
+        sigma_m=_spread_m(winners["n_points"], moments),
         count=winners["n_points"].copy(),
         intensity=None if intensity is None else taken(intensity[:, np.newaxis], np.nan)[:, 0],
         rgb=None if rgb is None else taken(rgb, 0),
@@ -93,7 +95,7 @@ def _contest(
     cloud: PointCloud, slab: Slab, rule: SurfaceRule, entries: Entries, winners: NDArray[np.void]
 ) -> Callable[[int, int], None]:
     if rule.surface == "topmost":
-        return partial(kernels.keep_topmost, entries, winners)
+        return partial(keep_topmost, entries, winners)
     if rule.surface == "nearest":
         return partial(
             kernels.keep_nearest_around,
@@ -103,15 +105,13 @@ def _contest(
             winners,
             slab.frame.width,
         )
-    return partial(kernels.keep_nearest, entries, winners)
+    return partial(keep_nearest, entries, winners)
 
 
 def _triangulated(
     cloud: PointCloud, slab: Slab, points: NDArray[np.uint32], surface: CellSurface
 ) -> CellSurface:
     """Replace a surface by the net through the points nearest to the centres of their cells."""
-    from orthoflow_plugins.raster.triangulating import interpolated
-
     offsets = np.stack([values[points] for values in (cloud.x, cloud.y, cloud.z)])
     matrix = wall_from_offset(slab.frame, cloud.origin)
     places = (matrix[:2, :3] @ offsets.astype(np.float64)).T + matrix[:2, 3]
@@ -121,13 +121,65 @@ def _triangulated(
         channels.append(surface.intensity[measured, np.newaxis])
     if surface.rgb is not None:
         channels.append(surface.rgb[measured])
-    found = interpolated(places, channels, slab.frame.shape)
+    found = _interpolated(places, channels, slab.frame.shape)
     return replace(
         surface,
         depth_m=np.ascontiguousarray(found[0][:, 0]),
         intensity=None if surface.intensity is None else np.ascontiguousarray(found[1][:, 0]),
         rgb=None if surface.rgb is None else np.rint(np.nan_to_num(found[-1])).astype(np.uint8),
     )
+
+
+def _interpolated(
+    places: NDArray[np.float64],
+    values: Sequence[NDArray[np.generic]],
+    shape: tuple[int, int],
+) -> list[NDArray[np.float32]]:
+    """Values at all cell centres, linear in the triangles of a Delaunay net.
+
+    The net spans every gap, windows included, and lays slopes where depths step.
+
+    Args:
+        places: (n, 2) column and row of the vertices, cell centres at .5.
+        values: arrays (n, channels), each with values at the vertices.
+        shape: rows and columns of the raster.
+
+    Returns:
+        An array (cells, channels) for each of `values`; NaN outside the net.
+
+    Raises:
+        MethodError: the points make no triangle, or too many.
+    """
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import Delaunay, QhullError
+
+    if len(places) > _VERTICES_MOST:
+        raise MethodError(
+            f"surface tin takes at most {_VERTICES_MOST} cells with points, this wall has "
+            f"{len(places)}: raise gsd_m, or take another surface"
+        )
+    stacked = np.column_stack([np.asarray(array, dtype=np.float64) for array in values])
+    no_net = MethodError(
+        f"surface tin needs points that span triangles about the cells of each wall, and the "
+        f"{len(places)} cells with points of this one do not: take another surface"
+    )
+    try:
+        net = Delaunay(places)
+    except (QhullError, ValueError) as error:
+        raise no_net from error
+    look_up = LinearNDInterpolator(net, stacked)
+    rows, columns = shape
+    found = np.empty((rows * columns, stacked.shape[1]), dtype=np.float32)
+    for first in range(0, rows, _ROWS_AT_ONCE):
+        end = min(first + _ROWS_AT_ONCE, rows)
+        row, column = np.mgrid[first:end, :columns] + 0.5
+        found[first * columns : end * columns] = look_up(
+            np.column_stack([column.ravel(), row.ravel()])
+        )
+    if not np.isfinite(found).any():
+        raise no_net
+    widths = np.cumsum([array.shape[1] for array in values])[:-1]
+    return np.split(found, widths, axis=1)
 
 
 def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
@@ -141,7 +193,7 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
         )
     with np.errstate(invalid="ignore"):
         depth_m, layer_m = (moments[:, 0] / count).astype(np.float32), np.inf
-    sigma_m = spread_m(count, moments)
+    sigma_m = _spread_m(count, moments)
     del moments  # A third of what is held here, and what follows takes more.
     if rule.surface != "mean":
         layer_m = rule.layer_m
@@ -162,6 +214,29 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
         intensity=intensity,
         rgb=rgb,
     )
+
+
+def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Sample standard deviation of the depths in each cell.
+
+    Args:
+        n_points: (cells,).
+        moments: (cells, 2) sums of depths and squared depths; used up.
+
+    Returns:
+        (cells,) metres, NaN with fewer than two points.
+    """
+    mean, squares = moments.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        np.divide(mean, n_points, out=mean)
+        squares -= mean * mean * n_points
+        np.maximum(squares, 0.0, out=squares)
+        # 1.0, not 1: unsigned, 0 - 1 would be four thousand million points.
+        np.divide(squares, n_points - 1.0, out=squares)
+        np.sqrt(squares, out=squares)
+    squares[n_points < 2] = np.nan
+    sigma_m: NDArray[np.float32] = squares.astype(np.float32)
+    return sigma_m
 
 
 def _grouped_m(
@@ -190,7 +265,7 @@ def _sorted_medians_m(
     medians_m = np.empty(count.size, dtype=np.float32)
     ends = np.cumsum(count, dtype=np.int64)
     task = partial(kernels.median_depths, ends, grouped_m, rule.layer_m, medians_m)
-    in_parts(count.size, rule.threads, task)
+    in_parts(task, count.size, threads=rule.threads)
     return medians_m
 
 

@@ -295,7 +295,7 @@ def test_a_wall_joined_in_bands_is_the_same(
     layers = Layers(layers=tuple(random_layer(seed) for seed in (1, 2, 3)))
     (whole,) = joined(layers, tmp_path, island_cells_min=4).images
     monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", 1)
-    monkeypatch.setattr("orthoflow_plugins.mosaic.seams._ROWS_AT_ONCE", 3)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.agreement._ROWS_AT_ONCE", 3)
     (banded,) = joined(layers, tmp_path, island_cells_min=4).images
     for name in ("rgb", "mask", "source"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name))

@@ -240,7 +240,7 @@ def test_survey_coordinates_change_nothing(tmp_path: Path) -> None:
 
 
 def test_threads_and_tiles_do_not_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from orthoflow_plugins.ortho import dsm_backward_painting
+    from orthoflow_plugins.ortho import painting
 
     where = scenes.frame()
     inputs = DsmBackward.In(
@@ -256,7 +256,7 @@ def test_threads_and_tiles_do_not_show(tmp_path: Path, monkeypatch: pytest.Monke
         found.append(run(inputs, context(folder, cores=cores)).layers[0])
     folder = tmp_path / "tiles"
     folder.mkdir()
-    monkeypatch.setattr(dsm_backward_painting, "TILE_CELLS", 50)
+    monkeypatch.setattr(painting, "TILE_CELLS", 50)
     tiled = run(inputs, context(folder)).layers[0]
     for layer in found[1:]:
         np.testing.assert_array_equal(layer.mask, found[0].mask)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.ortho.gaps import fillable_gaps, inpainted, void_counts
+from orthoflow_plugins.ortho.filling import fillable_gaps, inpainted, void_counts
 from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 
 from orthoflow.errors import MethodError, ProductError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster.grid import RasterGrid
-from orthoflow_plugins.raster.scan_steps import scan_step_m
+from orthoflow_plugins.raster.walls import scan_step_m
 
 from orthoflow.errors import MethodError, OrthoflowError
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic import colours
+from orthoflow_plugins.mosaic import gains
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.files import geotiff, images, publishing
-from orthoflow.geometry import row_bands
-from orthoflow.geometry.row_bands import count_cells, count_known, holds_cells
+from orthoflow.geometry import bands
+from orthoflow.geometry.bands import count_cells, count_known, holds_cells
 from orthoflow.products import Layer, LayerMask, Layers, Walls
 from tests import inspect_scenes, ortho_scenes, raster_scenes
 from tests.raster_scenes import context
@@ -31,17 +31,16 @@ N_CELLS = SHAPE[0] * SHAPE[1]
 @pytest.fixture
 def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let walls of a megacell count as large."""
-    monkeypatch.setattr(row_bands, "_BAND_CELLS", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.ortho.sights._IN_MEMORY_MOST", 0)
-    monkeypatch.setattr("orthoflow_plugins.ortho.dsm_backward_painting.TILE_CELLS", 128)
+    monkeypatch.setattr(bands, "_BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.ortho.surfaces._IN_MEMORY_MOST", 0)
+    monkeypatch.setattr("orthoflow_plugins.ortho.painting.TILE_CELLS", 128)
     monkeypatch.setattr("orthoflow_plugins.mosaic.seams._IN_MEMORY_MOST", 0)
-    monkeypatch.setattr("orthoflow_plugins.mosaic.seams._ROWS_AT_ONCE", 64)
-    monkeypatch.setattr("orthoflow_plugins.mosaic.colours._ROWS_AT_ONCE", 64)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.agreement._ROWS_AT_ONCE", 64)
     monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.mosaic.source_maps._LONGEST_PX", 100)
-    monkeypatch.setattr("orthoflow_plugins.raster.grid._BAND_CELLS", 2 * BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.mosaic.seams._LONGEST_PX", 100)
+    monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 2 * BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.reporting._CELLS_ASKED", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.raster.previews._LONGEST_PX", 100)
+    monkeypatch.setattr("orthoflow_plugins.raster.reporting._LONGEST_PX", 100)
 
 
 @contextmanager
@@ -198,7 +197,7 @@ def test_bands_do_not_show_in_mosaics_nor_in_what_is_told_of_them(
     params = {"seams": seams, "priority": ["photo 1"], "gains": "global"}
     told = []
     for band_cells in (1 << 24, 270 * 70):
-        monkeypatch.setattr(row_bands, "_BAND_CELLS", band_cells)
+        monkeypatch.setattr(bands, "_BAND_CELLS", band_cells)
         monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", band_cells)
         ctx = context(tmp_path)
         inputs = MosaicSeams.In(layers=Layers(layers=layers))
@@ -215,9 +214,9 @@ def test_an_overlap_is_sampled_as_if_it_lay_in_memory(monkeypatch: pytest.Monkey
     rng = np.random.default_rng(5)
     first, second = (rng.integers(0, 3, (97, 50), dtype=np.uint8) for _ in range(2))
     both = np.flatnonzero((first == LayerMask.PAINTED) & (second == LayerMask.PAINTED))
-    monkeypatch.setattr(colours, "_SAMPLES_MOST", 70)
-    monkeypatch.setattr(row_bands, "_BAND_CELLS", 50 * 4)
-    sampled = colours._sampled_overlap(first, second)
+    monkeypatch.setattr(gains, "_SAMPLES_MOST", 70)
+    monkeypatch.setattr(bands, "_BAND_CELLS", 50 * 4)
+    sampled = gains._sampled_overlap(first, second)
     np.testing.assert_array_equal(sampled, both[:: len(both) // 70])
 
 
@@ -238,10 +237,10 @@ def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPa
     rng = np.random.default_rng(1)
     mask = rng.integers(0, 4, (103, 37), dtype=np.uint8)
     depths = np.where(mask == 2, np.nan, 1.0)
-    monkeypatch.setattr(row_bands, "_BAND_CELLS", 37 * 10)
-    bands = list(row_bands.row_bands(mask.shape, multiple=4))
-    assert [band.stop - band.start for band in bands] == [8] * 12 + [7]
-    assert [band.start for band in bands[1:]] == [band.stop for band in bands[:-1]]
+    monkeypatch.setattr(bands, "_BAND_CELLS", 37 * 10)
+    parts = list(bands.row_bands(mask.shape, multiple=4))
+    assert [part.stop - part.start for part in parts] == [8] * 12 + [7]
+    assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]
     assert count_cells(mask, 3) == np.count_nonzero(mask == 3)
     assert count_known(depths) == np.count_nonzero(mask != 2)
     assert holds_cells(mask, 3)
@@ -268,14 +267,14 @@ def test_rasters_of_large_walls_are_published_the_same(
         folder.mkdir()
         publishing.publish_walls(walls, folder, "sha256:" + "ab" * 32)
         monkeypatch.setattr(geotiff, "_IN_MEMORY_CELLS", 1000)
-        monkeypatch.setattr(row_bands, "_BAND_CELLS", 1000)
+        monkeypatch.setattr(bands, "_BAND_CELLS", 1000)
         monkeypatch.setattr(images, "_WHOLE_PX", 400 * 600)
     for path in sorted(folders[0].iterdir()):
         other = folders[1] / path.name
         if path.suffix == ".tif":
-            whole, bands = geotiff.read_raster(path), geotiff.read_raster(other)
-            np.testing.assert_array_equal(whole.values, bands.values)
-            assert (whole.tags, whole.crs_wkt) == (bands.tags, bands.crs_wkt)
+            whole, banded = geotiff.read_raster(path), geotiff.read_raster(other)
+            np.testing.assert_array_equal(whole.values, banded.values)
+            assert (whole.tags, whole.crs_wkt) == (banded.tags, banded.crs_wkt)
         elif path.suffix == ".png":
             # Black and white are those of every fourth row.
             pictures = [images.decode_image(file.read_bytes()) for file in (path, other)]

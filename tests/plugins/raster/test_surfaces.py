@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.raster.denoising import denoised
+from orthoflow_plugins.raster.depth_filters import denoised
 from orthoflow_plugins.raster.grid import RasterGrid
 from scipy.spatial import cKDTree
 
@@ -167,7 +167,7 @@ def test_percentiles_are_numpys(tmp_path: Path) -> None:
         wall.percentiles_m[4, 3], np.percentile(depths_m, [0, 10, 50, 97.5]), atol=1e-6
     )
     assert np.isnan(wall.percentiles_m[4, 4]).all()
-    assert walls.details["percentiles"] == [0, 10, 50, 97.5]
+    assert walls.percentiles == (0, 10, 50, 97.5)
 
 
 def test_the_buffer_is_three_tolerances_of_the_planes_unless_set(tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ def test_a_wall_rastered_in_bands_is_the_same(
     cloud, *_ = scattered(known, per_cell=1.2, noise_m=NOISE_M)
     params = {"surface": surface, "percentiles": (10.0,)}
     whole = rastered(cloud, known, scenes.context(tmp_path), **params).walls[0]
-    monkeypatch.setattr("orthoflow_plugins.raster.grid._BAND_CELLS", 60 * 180)
+    monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 60 * 180)
     banded = rastered(cloud, known, scenes.context(tmp_path), **params).walls[0]
     for name in ("count", "mask", "rgb", "percentiles_m", "intensity", "depth_m", "sigma_m"):
         one, other = getattr(whole, name), getattr(banded, name)

@@ -1,4 +1,4 @@
-"""What of the whole cloud may stand between photos and walls."""
+"""What stands free between photos and walls, told from the whole cloud."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.occluders import (
     Box,
     Occluders,
@@ -16,10 +18,43 @@ from orthoflow.geometry.occluders import (
     nothing_in_the_way,
     occluders_in,
 )
-from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import PointCloud, Walls
+from orthoflow.sdk import StepContext
+from orthoflow_plugins.ortho.photos_on_walls import PhotosOnWalls, VisibilityParams
 
-__all__ = ["Occluders", "depth_buffer", "find_occluders", "nothing_in_the_way"]
+
+def occluders_before(
+    inputs: PhotosOnWalls,
+    viewers: Sequence[ViewingCamera],
+    params: VisibilityParams,
+    ctx: StepContext,
+    *,
+    method: str,
+) -> Occluders | None:
+    """Find what stands free before the walls; None, with a warning, where no cloud is wired.
+
+    Raises:
+        ProductError: the cloud has fewer than three points.
+    """
+    if inputs.cloud is None:
+        ctx.warn(
+            f"no cloud is wired to {method}: things that stand free before a wall hide nothing, "
+            "and photos paint them onto it"
+        )
+        return None
+    inputs.cloud.require_points(3)
+    return find_occluders(
+        inputs.cloud,
+        inputs.walls,
+        list(viewers),
+        n_least=params.occluder_points_min,
+        threads=ctx.cores,
+    )
+
+
+def depth_buffer_of(occluders: Occluders | None, viewer: ViewingCamera) -> DepthBuffer:
+    """Look at what stands free through a camera; None for nothing."""
+    return nothing_in_the_way(viewer) if occluders is None else depth_buffer(occluders, viewer)
 
 
 def find_occluders(

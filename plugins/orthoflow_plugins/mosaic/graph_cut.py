@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.row_bands import row_bands
+from orthoflow.geometry.bands import row_bands
 from orthoflow.products import Layer, LayerMask, Wall
 
 # Cuts are made on a smaller picture of about so many cells.

@@ -1,26 +1,79 @@
-"""Photos with their cameras, as every method that lays photos onto walls takes them."""
+"""What methods that lay photos onto walls take: ports, what counts as seen, photos with cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.files.containers import icc_profile
 from orthoflow.files.images import decode_image
-from orthoflow.geometry import WallFrame
-from orthoflow.geometry.row_bands import row_bands
-from orthoflow.products import Camera, Cameras, Layer, LayerMask, Photo, Photos, Walls
-from orthoflow.sdk import StepContext
+from orthoflow.products import Camera, Cameras, Photo, Photos, PointCloud, Walls
+from orthoflow.sdk import MethodParams, Ports, StepContext
 
-NO_SOURCE: Final = "no photo"
-UNSEEN_WALLS: Final = (
-    "no oriented photo sees a wall: their cameras stand behind the walls, look past them, or "
-    "something hides the walls; look at cameras.json and planes.json"
-)
+if TYPE_CHECKING:
+    from orthoflow.geometry.cameras import ViewingCamera
+    from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
+
+
+class PhotosOnWalls(Ports):
+    """The walls, the cloud they were made from, and the oriented photos."""
+
+    walls: Walls
+    photos: Photos
+    cameras: Cameras
+    cloud: PointCloud | None = None
+
+
+class VisibilityParams(MethodParams):
+    """When a photo counts as seeing a cell."""
+
+    incidence_max_deg: float = Field(
+        default=80.0, gt=0, lt=90, description="Cells seen more obliquely are not painted."
+    )
+    tolerance_sigma: float = Field(
+        default=3.0,
+        ge=0,
+        description="A surface hides a cell when it is above the ray by more than so many "
+        "standard deviations of depth, and tolerance_cells.",
+    )
+    tolerance_cells: float = Field(
+        default=0.5, ge=0, description="The same in cells, for what the raster cannot hold."
+    )
+    occluder_points_min: int = Field(
+        default=6,
+        ge=1,
+        description="Points of the cloud with fewer about them, themselves included, are "
+        "outliers and hide nothing.",
+    )
+    border_share: float = Field(
+        default=0.05,
+        ge=0,
+        le=0.5,
+        description="Quality falls to 0 over this share of a photo's shorter side.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenedPhoto:
+    """A photo ready to be laid onto walls.
+
+    Attributes:
+        name: of the photo.
+        pixels: (height, width, 3) uint8.
+        viewer: its camera.
+        buffer: what stands free before the camera.
+    """
+
+    name: str
+    pixels: NDArray[np.uint8]
+    viewer: ViewingCamera
+    buffer: DepthBuffer
 
 
 def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tuple[Photo, Camera]]:
@@ -70,38 +123,3 @@ def shared_profile(photos: Sequence[Photo], ctx: StepContext) -> bytes | None:
             "orthoimages get none, and colours may step where photos meet"
         )
     return profiles.pop() if len(profiles) == 1 else None
-
-
-def bare_layer(
-    frame: WallFrame,
-    wall: int,
-    depth: NDArray[np.float32],
-    reached: NDArray[np.uint8] | None = None,
-) -> Layer:
-    """The layer of a wall that no photo paints.
-
-    Args:
-        frame: of the wall.
-        wall: its index.
-        depth: (rows, cols) metres, NaN where void.
-        reached: (rows, cols) `LayerMask`, what photos reach of it, if that is known.
-    """
-    if reached is None:
-        reached = np.full(depth.shape, LayerMask.OUTSIDE, dtype=np.uint8)
-        for rows in row_bands(depth.shape):
-            reached[rows][np.isnan(depth[rows])] = LayerMask.NO_SURFACE
-    return Layer(
-        frame=frame,
-        wall=wall,
-        source=NO_SOURCE,
-        rgb=np.zeros((*reached.shape, 3), dtype=np.uint8),
-        mask=reached,
-        quality=np.zeros(reached.shape, dtype=np.float32),
-    )
-
-
-def weighted_median(values: NDArray[np.float64], weights: NDArray[np.int64]) -> float:
-    """The value below which half of the weight lies."""
-    order = np.argsort(values, kind="stable")
-    totals = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(totals, totals[-1] / 2.0)])

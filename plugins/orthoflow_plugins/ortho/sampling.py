@@ -10,10 +10,11 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.bilinear_kernels import Patch, pack_pixels, sample_bilinear
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import interpreted
-from orthoflow.geometry.visibility_kernels import Sight, WallView
+from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow_plugins.ortho.painting_kernels import Patch, pack_pixels, sample_bilinear
+from orthoflow_plugins.ortho.views import TileVisibility, WallView
 
 Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
 
@@ -25,7 +26,7 @@ _BASE_CELLS: Final = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Footprint:
+class CellFootprint:
     """How a photo sees the middle of a tile.
 
     Attributes:
@@ -43,10 +44,10 @@ class Footprint:
     n_cells: int
 
 
-def footprint_of(view: WallView, sight: Sight) -> Footprint:
+def footprint_of(view: WallView, visible: TileVisibility) -> CellFootprint:
     """Measure the middle of the painted cells of a tile that has some."""
-    n_cells = float(sight.summary[4])
-    column, row, depth = (float(total) / n_cells for total in sight.summary[5:])
+    n_cells = float(visible.summary[4])
+    column, row, depth = (float(total) / n_cells for total in visible.summary[5:])
     centre, beside, below = (
         _project(view.camera, (column + a + 0.5) * view.gsd_m, (row + b + 0.5) * view.gsd_m, depth)
         for a, b in ((0.0, 0.0), (_BASE_CELLS, 0.0), (0.0, _BASE_CELLS))
@@ -55,7 +56,7 @@ def footprint_of(view: WallView, sight: Sight) -> Footprint:
     down = math.hypot(beside[1] - centre[1], below[1] - centre[1]) / _BASE_CELLS
     lift = view.height_m - depth
     aside = view.gsd_m * math.hypot(view.column - column, view.row - row)
-    return Footprint(
+    return CellFootprint(
         # Not a number beyond the lens model, where a neighbour of a painted cell may lie.
         pixels_across=across if math.isfinite(across) else 1.0,
         pixels_down=down if math.isfinite(down) else 1.0,
@@ -70,9 +71,9 @@ _project: Callable[..., tuple[float, float, float]] = interpreted(project_point)
 
 def sample(
     photo: NDArray[np.uint8],
-    sight: Sight,
+    visible: TileVisibility,
     inner: tuple[slice, slice],
-    footprint: Footprint,
+    footprint: CellFootprint,
     resampling: Resampling,
     *,
     is_filtered: bool,
@@ -82,9 +83,9 @@ def sample(
 
     Args:
         photo: (height, width, 3).
-        sight: where the cells of the tile and those around it are in the photo; its places are
+        visible: where the cells of the tile and those around it are in the photo; its places are
             used up.
-        inner: rows and columns of `sight` that are the tile's.
+        inner: rows and columns of `visible` that are the tile's.
         footprint: how many pixels a cell covers.
         resampling: `nearest` gives the pixel's own colour and filters nothing.
         is_filtered: average over what a cell covers where the photo is finer than the wall.
@@ -93,15 +94,15 @@ def sample(
     import cv2
 
     if resampling == "nearest":
-        crop, corner = _crop(photo, sight, reach=0)
+        crop, corner = _crop(photo, visible, reach=0)
         # Whole positions: the pixel that a place lies in, and nothing for OpenCV to round.
-        u, v = (np.floor(places, out=places) for places in (sight.u[inner], sight.v[inner]))
+        u, v = (np.floor(places, out=places) for places in (visible.u[inner], visible.v[inner]))
         return _remapped(crop, u, v, corner, resampling, into)
     sigmas = [
         0.5 * math.sqrt(max(0.0, pixels * pixels - 1.0)) if is_filtered else 0.0
         for pixels in (footprint.pixels_across, footprint.pixels_down)
     ]
-    crop, corner = _crop(photo, sight, reach=_REACH_PX + math.ceil(4.0 * max(sigmas)))
+    crop, corner = _crop(photo, visible, reach=_REACH_PX + math.ceil(4.0 * max(sigmas)))
     if max(sigmas) > _SIGMA_LEAST_PX:
         sizes = [2 * math.ceil(3.0 * sigma) + 1 for sigma in sigmas]
         blurred = cv2.GaussianBlur(
@@ -112,15 +113,15 @@ def sample(
             borderType=cv2.BORDER_REPLICATE,
         )
         crop = np.asarray(blurred, dtype=np.uint8)
-    # OpenCV has (0, 0) at the centre of the first pixel.
-    centre = (corner[0] + np.float32(0.5), corner[1] + np.float32(0.5))
+    half = np.float32(HALF_PIXEL)
+    centre = (corner[0] + half, corner[1] + half)
     if resampling == "bilinear":
         packed = np.empty((crop.shape[0] + 1, crop.shape[1] + 1), dtype=np.uint64)
         pack_pixels(crop, packed)
         patch = Patch(inner[0].start, inner[1].start, into.shape[0], into.shape[1])
-        sample_bilinear(packed, (sight.u, sight.v), centre, patch, into)
+        sample_bilinear(packed, (visible.u, visible.v), centre, patch, into)
         return into
-    return _remapped(crop, sight.u[inner], sight.v[inner], centre, resampling, into)
+    return _remapped(crop, visible.u[inner], visible.v[inner], centre, resampling, into)
 
 
 def _remapped(
@@ -146,10 +147,10 @@ def _remapped(
 
 
 def _crop(
-    photo: NDArray[np.uint8], sight: Sight, *, reach: int
+    photo: NDArray[np.uint8], visible: TileVisibility, *, reach: int
 ) -> tuple[NDArray[np.uint8], tuple[np.float32, np.float32]]:
     """The part of a photo that a tile needs, and its first column and row."""
-    u_least, u_most, v_least, v_most = (math.floor(value) for value in sight.summary[:4])
+    u_least, u_most, v_least, v_most = (math.floor(value) for value in visible.summary[:4])
     first_column, first_row = max(0, u_least - reach), max(0, v_least - reach)
     crop = photo[first_row : v_most + reach + 1, first_column : u_most + reach + 1]
     return crop, (np.float32(first_column), np.float32(first_row))

@@ -1,16 +1,16 @@
-"""Colours of overlapping layers: steps along seams, and gains that make them smaller."""
+"""Gains of overlapping layers: what makes their colours alike."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.row_bands import row_bands
+from orthoflow.geometry.bands import row_bands
 from orthoflow.products import Layer, LayerMask
 
 # Overlaps are compared on every so manieth cell: a few thousand colours say what a gain is.
@@ -20,64 +20,6 @@ _LEAST_SAMPLES: Final = 100
 _DARKEST, _BRIGHTEST = 10, 245
 # As much as a tenth of what an overlap says, so that a chain of photos does not drift.
 _PRIOR: Final = 0.1
-_ROWS_AT_ONCE: Final = 1024
-_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
-
-
-@dataclass(frozen=True, kw_only=True)
-class SeamSteps:
-    """What changes where one source follows another.
-
-    Attributes:
-        grey: (n,) float64 difference in luminance of both sources in a cell at a seam.
-        delta_e: (n,) float64 distance of both colours in CIE L*a*b* (1976).
-    """
-
-    grey: NDArray[np.float64]
-    delta_e: NDArray[np.float64]
-
-
-def seam_steps(source: NDArray[np.int16], layers: Sequence[Layer]) -> SeamSteps:
-    """Compare both sources in the cells on the left of or above seams that both paint.
-
-    Args:
-        source: (rows, cols) index of the layer that paints each cell, -1 for none.
-        layers: what the index counts.
-    """
-    nothing = np.zeros((0, 3), dtype=np.uint8)
-    firsts, seconds = [nothing], [nothing]
-    for axis in (0, 1):
-        rows, columns = _before_seams(source, axis)
-        mine = source[rows, columns]
-        other = source[rows + (axis == 0), columns + (axis == 1)]
-        for index, layer in enumerate(layers):
-            chosen = (other == index) & (layer.mask[rows, columns] == LayerMask.PAINTED)
-            seconds.append(layer.rgb[rows[chosen], columns[chosen]])
-            first = np.zeros((np.count_nonzero(chosen), 3), dtype=np.uint8)
-            for owner, painter in enumerate(layers):
-                is_mine = mine[chosen] == owner
-                first[is_mine] = painter.rgb[rows[chosen][is_mine], columns[chosen][is_mine]]
-            firsts.append(first)
-    one, another = np.concatenate(firsts), np.concatenate(seconds)
-    grey = (one.astype(np.float64) - another) @ _LUMINANCE
-    return SeamSteps(
-        grey=grey, delta_e=np.linalg.norm(_lab(one) - _lab(another), axis=1).astype(np.float64)
-    )
-
-
-def _before_seams(
-    source: NDArray[np.int16], axis: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of the cells above seams (axis 0) or left of them, strip by strip."""
-    found: list[NDArray[np.int64]] = []
-    for first in range(0, source.shape[0], _ROWS_AT_ONCE):
-        strip = source[first : first + _ROWS_AT_ONCE + (axis == 0)]
-        here = strip[:-1] if axis == 0 else strip[:, :-1]
-        there = strip[1:] if axis == 0 else strip[:, 1:]
-        rows, columns = np.nonzero((here != there) & (here >= 0) & (there >= 0))
-        found.append(np.stack([rows + first, columns]))
-    rows, columns = np.concatenate(found, axis=1)
-    return rows, columns
 
 
 def balanced(layers: Sequence[Layer], gains: NDArray[np.float64]) -> list[Layer]:
@@ -160,12 +102,3 @@ def _with_gain(rgb: NDArray[np.uint8], gain: NDArray[np.float64]) -> NDArray[np.
     level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
     table = np.rint(255.0 * level).astype(np.uint8)
     return np.stack([table[rgb[..., band], band] for band in range(3)], axis=-1)
-
-
-def _lab(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    import cv2
-
-    if len(rgb) == 0:
-        return np.zeros((0, 3), dtype=np.float32)
-    levels = rgb[None].astype(np.float32) / np.float32(255.0)
-    return np.asarray(cv2.cvtColor(levels, cv2.COLOR_RGB2Lab)[0], dtype=np.float32)

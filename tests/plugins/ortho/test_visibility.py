@@ -8,34 +8,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
-from orthoflow_plugins.ortho.dsm_backward_occluders import nothing_in_the_way
-from orthoflow_plugins.ortho.dsm_backward_painting import SightRule, Surface, view_of
-from orthoflow_plugins.ortho.dsm_backward_surfaces import relief_of, transparent_relief_of
-
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.relief_kernels import make_occluding
-from orthoflow.geometry.sight_kernels import look_at_cells
-from orthoflow.geometry.visibility_kernels import (
+from orthoflow_plugins.ortho.photos_on_walls import VisibilityParams
+from orthoflow_plugins.ortho.relief_kernels import make_occluding
+from orthoflow_plugins.ortho.surfaces import Surface, relief_of, transparent_relief_of, view_of
+from orthoflow_plugins.ortho.views import (
     FINE_CELLS,
     NOTHING,
     NOTHING_M,
     OCCLUDED,
     PAINTED,
     Relief,
-    Sight,
+    TileVisibility,
     WallView,
 )
+from orthoflow_plugins.ortho.visibility_kernels import look_at_cells
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.occluders import nothing_in_the_way
 from orthoflow.products import LayerMask
 from tests import ortho_scenes as scenes
 from tests.raster_scenes import context
 
-RULE = SightRule(
-    resampling="bilinear",
-    is_filtered=False,
-    incidence_max_deg=80.0,
-    erosion_cells=0,
-    border_share=0.05,
-)
+PARAMS = VisibilityParams(incidence_max_deg=80.0, border_share=0.05)
 
 
 def noisy_depths() -> NDArray[np.float32]:
@@ -56,22 +50,22 @@ def surface_of(depths: NDArray[np.float32], *, is_transparent: bool) -> Surface:
     )
 
 
-def seen(camera: ViewingCamera, *, is_transparent: bool) -> Sight:
+def seen(camera: ViewingCamera, *, is_transparent: bool) -> TileVisibility:
     return seen_of(surface_of(noisy_depths(), is_transparent=is_transparent), camera)
 
 
-def seen_of(surface: Surface, camera: ViewingCamera) -> Sight:
+def seen_of(surface: Surface, camera: ViewingCamera) -> TileVisibility:
     height, width = scenes.SHAPE
-    sight = Sight(
+    visible = TileVisibility(
         u=np.empty((height, width), dtype=np.float32),
         v=np.empty((height, width), dtype=np.float32),
         mask=np.empty((height, width), dtype=np.uint8),
         quality=np.empty((height, width), dtype=np.float32),
         summary=np.empty(8),
     )
-    view = view_of(camera, surface, RULE)
-    look_at_cells(view, surface.relief, nothing_in_the_way(camera), sight, 0, 0)
-    return sight
+    view = view_of(camera, surface, PARAMS)
+    look_at_cells(view, surface.relief, nothing_in_the_way(camera), visible, 0, 0)
+    return visible
 
 
 @pytest.mark.parametrize("aside_m", [-0.7, 0.0, 1.4])
@@ -79,16 +73,16 @@ def seen_of(surface: Surface, camera: ViewingCamera) -> Sight:
 def test_places_are_exact_to_a_twentieth_of_a_pixel(aside_m: float, is_transparent: bool) -> None:
     where = scenes.frame()
     camera = scenes.camera(where, aside_m=aside_m)
-    sight = seen(camera, is_transparent=is_transparent)
-    painted = sight.mask == PAINTED
+    visible = seen(camera, is_transparent=is_transparent)
+    painted = visible.mask == PAINTED
     rows, columns = np.nonzero(painted)
     depths = noisy_depths()[painted].astype(np.float64)
     points = where.world_from_wall(np.column_stack([columns, rows]) + 0.5, depths)
     exact = camera.project(points)
     assert painted.mean() > 0.7
     # Parabolas stray by at most 0.02 px, float32 by less than 0.001.
-    np.testing.assert_allclose(sight.u[painted], exact[:, 0], atol=0.05)
-    np.testing.assert_allclose(sight.v[painted], exact[:, 1], atol=0.05)
+    np.testing.assert_allclose(visible.u[painted], exact[:, 0], atol=0.05)
+    np.testing.assert_allclose(visible.v[painted], exact[:, 1], atol=0.05)
     towards = camera.centre_world - points
     cosine = towards @ where.normal_world / np.linalg.norm(towards, axis=1)
     area = camera.fx * camera.fy * where.gsd_m**2
@@ -96,8 +90,8 @@ def test_places_are_exact_to_a_twentieth_of_a_pixel(aside_m: float, is_transpare
         [exact[:, 0], camera.width - exact[:, 0], exact[:, 1], camera.height - exact[:, 1]]
     )
     border = 0.05 * min(camera.width, camera.height)
-    worth = cosine * area / exact[:, 2] ** 2 * np.clip(inside / border, 0.0, 1.0)
-    np.testing.assert_allclose(sight.quality[painted], worth, rtol=2e-3, atol=2e-3)
+    quality = cosine * area / exact[:, 2] ** 2 * np.clip(inside / border, 0.0, 1.0)
+    np.testing.assert_allclose(visible.quality[painted], quality, rtol=2e-3, atol=2e-3)
 
 
 def are_hidden(view: WallView, relief: Relief, cells: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -135,24 +129,24 @@ def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None
         depths[row : row + rows, column : column + columns] += rng.uniform(0.01, 0.06)
     surface = surface_of(depths, is_transparent=False)
     camera = scenes.camera(scenes.frame(), aside_m=aside_m)
-    view, relief = view_of(camera, surface, RULE), surface.relief
-    sight = seen_of(surface, camera)
-    asked = (sight.mask == PAINTED) | (sight.mask == OCCLUDED)
+    view, relief = view_of(camera, surface, PARAMS), surface.relief
+    visible = seen_of(surface, camera)
+    asked = (visible.mask == PAINTED) | (visible.mask == OCCLUDED)
     # Each ray is followed to the camera, whatever bounds say.
     followed = are_hidden(view, relief, np.argwhere(asked))
     assert 200 < followed.sum() < 0.5 * len(followed)
-    np.testing.assert_array_equal(sight.mask[asked] == OCCLUDED, followed)
+    np.testing.assert_array_equal(visible.mask[asked] == OCCLUDED, followed)
 
 
 def test_without_visibility_only_void_and_the_frame_of_the_photo_count() -> None:
     where = scenes.frame()
     camera = scenes.camera(where, aside_m=1.4)
-    sight, hidden = seen(camera, is_transparent=True), seen(camera, is_transparent=False)
+    visible, hidden = seen(camera, is_transparent=True), seen(camera, is_transparent=False)
     assert (hidden.mask == OCCLUDED).sum() > 100
-    assert not (sight.mask == OCCLUDED).any()
-    differs = sight.mask != hidden.mask
+    assert not (visible.mask == OCCLUDED).any()
+    differs = visible.mask != hidden.mask
     assert (hidden.mask[differs] == OCCLUDED).all()
-    assert (sight.mask[differs] == PAINTED).all()
+    assert (visible.mask[differs] == PAINTED).all()
 
 
 def test_what_hides_is_the_surface_without_spikes_and_with_its_edges_in_full() -> None:

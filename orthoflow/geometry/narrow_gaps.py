@@ -1,16 +1,82 @@
-"""Compiled passes that tell the narrow gaps of a raster from windows, and who lends them values.
+"""The narrow gaps of a raster, told from windows, and which cells lend them values.
 
 A disc holds a cell of a set where, in some column that it crosses, the cell of the set nearest to
 its middle row is within it. So distances down columns are found first; then each row asks the
 columns to its left and right. Both go along rows without branches, 32 cells at once.
+
+Loads numba: methods import it where they run.
 """
 
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.threads import in_parts
+
+
+def lenders_in_gaps(
+    is_measured: NDArray[np.bool_], radius_cells: int, *, threads: int
+) -> NDArray[np.int64]:
+    """For each void cell of a narrow gap the measured cell nearest to it.
+
+    A gap is narrow where no disc of the radius fits into it: what stays void is the morphological
+    opening of the void cells, so that windows and outlines keep their shape to the cell. Cells
+    outside the raster count as void. Of cells equally near, the upper and then the left one lends.
+
+    Args:
+        is_measured: (rows, cols).
+        radius_cells: radius of the disc; 0 finds no gap.
+        threads: how many threads work.
+
+    Returns:
+        (k, 2) flat indices: the void cell, and the measured cell that lends its values.
+    """
+    if radius_cells == 0:
+        return np.empty((0, 2), dtype=np.int64)
+    rows, columns = is_measured.shape
+    # Framed with void, so that discs may lie half outside the raster.
+    framed: NDArray[np.bool_] = np.pad(is_measured, radius_cells)
+    is_touched = _met_by_discs(framed, radius_cells, threads=threads)
+    is_open = _met_by_discs(~is_touched, radius_cells, threads=threads)
+    inner = np.s_[radius_cells : radius_cells + rows, radius_cells : radius_cells + columns]
+    is_narrow = np.logical_not(is_open[inner] | is_measured)
+    void = np.flatnonzero(is_narrow)
+    lent = np.column_stack([void, void])
+    del void, framed, is_touched, is_open, is_narrow  # Of sparse rasters as large as what is given.
+    measured = np.ascontiguousarray(is_measured)
+    task = partial(nearest_within, measured, disc_offsets(radius_cells), lent)
+    in_parts(task, len(lent), threads=threads)
+    return lent
+
+
+def disc_offsets(radius_cells: int) -> NDArray[np.int64]:
+    """Cells (k, 2) = (row, column) within a radius of a centre cell, nearest first, without it."""
+    steps = np.arange(-radius_cells, radius_cells + 1, dtype=np.int64)
+    rows, columns = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+    squares = rows * rows + columns * columns
+    order = np.argsort(squares, kind="stable")
+    order = order[(squares[order] > 0) & (squares[order] <= radius_cells * radius_cells)]
+    return np.column_stack([rows[order], columns[order]])
+
+
+def _met_by_discs(
+    is_in_set: NDArray[np.bool_], radius_cells: int, *, threads: int
+) -> NDArray[np.bool_]:
+    """Cells (rows, cols) about which a disc holds a cell of a set; outside there is none."""
+    rows, columns = is_in_set.shape
+    steps = np.arange(-radius_cells, radius_cells + 1)
+    heights = np.floor(np.sqrt(radius_cells**2 - steps**2)).astype(np.uint8)
+    far = radius_cells + 1
+    distances = np.full((rows, columns + 2 * radius_cells), far, dtype=np.uint8)
+    inner = distances[:, radius_cells : radius_cells + columns]
+    in_parts(partial(find_distances_down, is_in_set, far, inner), columns, threads=threads)
+    is_met = np.empty(is_in_set.shape, dtype=np.bool_)
+    in_parts(partial(find_discs, distances, heights, is_met), rows, threads=threads)
+    return is_met
 
 
 @compiled

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled
-from orthoflow.geometry.visibility_kernels import DepthBuffer, Relief, WallView
+from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
+from orthoflow_plugins.ortho.views import Relief, WallView
 
 # Pixels between two exact rays; in between they are interpolated. With lenses of a metre's focal
 # length in pixels or more the error is below a hundredth of a pixel.

@@ -10,14 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.geometry import frame_over
+from orthoflow.geometry.narrow_gaps import disc_offsets, lenders_in_gaps
 from orthoflow.geometry.raster_kernels import NO_POINT
-from orthoflow.geometry.rastering import (
-    disc_offsets,
-    lenders_in_gaps,
-    topmost_points,
-    values_of_winners,
-    wall_from_offset,
-)
+from orthoflow.geometry.rastering import topmost_points, values_of_winners, wall_from_offset
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes

@@ -1,4 +1,7 @@
-"""Which gaps between painted cells may be filled, and with what colour (skarlatos2012, 3)."""
+"""Gaps between painted cells: which may be filled, with what colour, and a picture of it.
+
+After skarlatos2012, section 3; the picture is the pair of its Figure 5.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,17 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.products import Layer, LayerMask
+
 Inpainting = Literal["telea", "navier-stokes", "none"]
 VoidLimits = tuple[int, int, int]
 
 _WINDOWS: Final = (3, 5, 7)
+# Of the picture: side of the part that is shown, how much larger it is, and what void is.
+_SIDE_CELLS: Final = 240
+_ZOOM: Final = 3
+_GUTTER_PX: Final = 12
+_VOID_RGB: Final = (255, 0, 255)
 
 
 def fillable_gaps(is_void: NDArray[np.bool_], limits: VoidLimits) -> NDArray[np.bool_]:
@@ -84,3 +94,35 @@ def inpainted(
     filled = cv2.inpaint(lent, is_fillable.astype(np.uint8), radius_px, flag)
     is_shown = ~is_void | is_fillable
     return np.where(is_shown[..., np.newaxis], filled, np.uint8(0))
+
+
+def filling_preview(rgb_before: NDArray[np.uint8], layer: Layer) -> bytes:
+    """PNG of the part of a layer where most was filled: left before, right after, enlarged.
+
+    Args:
+        rgb_before: (rows, cols, 3) colours before filling.
+        layer: the layer after it.
+    """
+    import cv2
+
+    is_filled = np.zeros(layer.mask.shape, dtype=bool) if layer.filled is None else layer.filled > 0
+    is_shown = layer.mask == LayerMask.PAINTED
+    part = _busiest_part(is_filled)
+    before, after = rgb_before[part].copy(), layer.rgb[part].copy()
+    before[~is_shown[part] | is_filled[part]] = _VOID_RGB
+    after[~is_shown[part]] = _VOID_RGB
+    pair = [np.repeat(np.repeat(picture, _ZOOM, 0), _ZOOM, 1) for picture in (before, after)]
+    gutter = np.full((pair[0].shape[0], _GUTTER_PX, 3), 255, dtype=np.uint8)
+    picture = np.hstack([pair[0], gutter, pair[1]])
+    return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
+
+
+def _busiest_part(is_filled: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """The tile of `_SIDE_CELLS` with the most filled cells; the first one among equals."""
+    rows, columns = is_filled.shape
+    tiles = [
+        (slice(row, row + _SIDE_CELLS), slice(column, column + _SIDE_CELLS))
+        for row in range(0, rows, _SIDE_CELLS)
+        for column in range(0, columns, _SIDE_CELLS)
+    ]
+    return max(tiles, key=lambda tile: np.count_nonzero(is_filled[tile]))

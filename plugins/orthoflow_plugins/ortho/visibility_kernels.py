@@ -8,17 +8,20 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.block_verdict_kernels import HIDDEN, UNSURE, judge_block
 from orthoflow.geometry.compiling import compiled
-from orthoflow.geometry.plain_block_kernels import (
+from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
+from orthoflow_plugins.ortho.block_kernels import (
+    HIDDEN,
+    UNSURE,
     WIDE_BLOCKS,
     BlockRoom,
+    judge_block,
     look_at_hidden_block,
-    look_at_plain_block,
+    look_at_unoccluded_block,
     room_for_blocks,
     span_block,
 )
-from orthoflow.geometry.ray_kernels import (
+from orthoflow_plugins.ortho.ray_kernels import (
     COLUMN,
     IS_HIDDEN,
     ROW,
@@ -27,15 +30,14 @@ from orthoflow.geometry.ray_kernels import (
     hide_low_cells,
     highest_in_the_way,
 )
-from orthoflow.geometry.visibility_kernels import (
+from orthoflow_plugins.ortho.views import (
     BLOCK_CELLS,
     NO_SURFACE,
     OCCLUDED,
     OUTSIDE,
     PAINTED,
-    DepthBuffer,
     Relief,
-    Sight,
+    TileVisibility,
     WallView,
 )
 
@@ -43,8 +45,8 @@ from orthoflow.geometry.visibility_kernels import (
 _LEAST_SPAN_M: Final = 1e-3
 
 
-class SightRow(NamedTuple):
-    """Part of a row of a `Sight`: u, v, mask and quality of its cells (n,)."""
+class RowVisibility(NamedTuple):
+    """Part of a row of a `TileVisibility`: u, v, mask and quality of its cells (n,)."""
 
     u: NDArray[np.float32]
     v: NDArray[np.float32]
@@ -105,7 +107,7 @@ def look_at_cells(
     view: WallView,
     relief: Relief,
     buffer: DepthBuffer,
-    sight: Sight,
+    visible: TileVisibility,
     first_row: int,
     first_column: int,
 ) -> None:
@@ -118,15 +120,18 @@ def look_at_cells(
         view: the camera before the wall.
         relief: the whole wall.
         buffer: what else stands before the camera.
-        sight: filled; its shape is the tile's.
+        visible: filled; its shape is the tile's.
         first_row: row of the wall where the tile begins.
         first_column: column likewise.
     """
-    end_row, end_column = first_row + sight.mask.shape[0], first_column + sight.mask.shape[1]
+    end_row, end_column = (
+        first_row + visible.mask.shape[0],
+        first_column + visible.mask.shape[1],
+    )
     tile = (first_row, first_column, end_row, end_column)
-    room = room_for_blocks(relief, sight)
+    room = room_for_blocks(relief, visible)
     wide, n_blocks = WIDE_BLOCKS * BLOCK_CELLS, relief.bottoms.shape[1]
-    summary = sight.summary
+    summary = visible.summary
     summary[:] = 0.0
     summary[0], summary[1] = math.inf, -math.inf
     summary[2], summary[3] = math.inf, -math.inf
@@ -134,14 +139,14 @@ def look_at_cells(
         for wide_column in range(first_column // wide, (end_column - 1) // wide + 1):
             first = wide_column * WIDE_BLOCKS
             end = min(n_blocks, first + WIDE_BLOCKS)
-            if look_at_blocks(view, relief, buffer, sight, room, tile, (block_row, first, end)):
+            if look_at_blocks(view, relief, buffer, visible, room, tile, (block_row, first, end)):
                 continue
             first = max(first, first_column // BLOCK_CELLS)
             end = min(end, (end_column - 1) // BLOCK_CELLS + 1)
             for column in range(first, end):
                 blocks = (block_row, column, column + 1)
-                if not look_at_blocks(view, relief, buffer, sight, room, tile, blocks):
-                    _ask_each_cell(view, relief, buffer, sight, room, tile, (block_row, column))
+                if not look_at_blocks(view, relief, buffer, visible, room, tile, blocks):
+                    _ask_each_cell(view, relief, buffer, visible, room, tile, (block_row, column))
 
 
 @compiled
@@ -149,7 +154,7 @@ def look_at_blocks(
     view: WallView,
     relief: Relief,
     buffer: DepthBuffer,
-    sight: Sight,
+    visible: TileVisibility,
     room: BlockRoom,
     tile: tuple[int, int, int, int],
     blocks: tuple[int, int, int],
@@ -160,7 +165,7 @@ def look_at_blocks(
         view: the camera before the wall.
         relief: the wall.
         buffer: what else stands before the camera.
-        sight: of the tile, filled in part.
+        visible: of the tile, filled in part.
         room: of `room_for_blocks`.
         tile: its first row and column, and the row and column after its last ones.
         blocks: row of the blocks, column of the first one, and the column after the last one.
@@ -186,17 +191,17 @@ def look_at_blocks(
         return False
     place = _place_in_tile(tile, rows, columns)
     if verdict == HIDDEN:
-        look_at_hidden_block(relief, sight, place)
+        look_at_hidden_block(relief, visible, place)
         return True
-    n_seen = look_at_plain_block(view, room, place, (rows, columns), depths)
+    n_seen = look_at_unoccluded_block(view, room, place, (rows, columns), depths)
     for column in range(first, end):
         block = (block_row, column)
         top = _highest(view, relief, block)
         if float(relief.bottoms[block]) + view.tolerance_m < top:
             corner, area = (tile[0], tile[1]), _cells_in_tile(tile, block)
-            n_seen -= hide_low_cells(view, relief, sight.mask, corner, area, top, room.rays)
+            n_seen -= hide_low_cells(view, relief, visible.mask, corner, area, top, room.rays)
     if n_seen:
-        summary, box = sight.summary, room.box
+        summary, box = visible.summary, room.box
         summary[0], summary[1] = min(summary[0], box[0]), max(summary[1], box[1])
         summary[2], summary[3] = min(summary[2], box[2]), max(summary[3], box[3])
         summary[4] += n_seen
@@ -210,7 +215,7 @@ def look_at_blocks(
 def _place_in_tile(
     tile: tuple[int, int, int, int], rows: tuple[int, int], columns: tuple[int, int]
 ) -> tuple[int, int, int, int, int, int]:
-    """Give the `place` of `look_at_plain_block` for blocks with such first and last cells."""
+    """Give the `place` of `look_at_unoccluded_block` for blocks with such first and last cells."""
     begin, finish = max(tile[0], rows[0]), min(tile[2], rows[1] + 1)
     start, end = max(tile[1], columns[0]), min(tile[3], columns[1] + 1)
     return (begin, start, finish - begin, end - start, begin - tile[0], start - tile[1])
@@ -242,7 +247,7 @@ def _ask_each_cell(
     view: WallView,
     relief: Relief,
     buffer: DepthBuffer,
-    sight: Sight,
+    visible: TileVisibility,
     room: BlockRoom,
     tile: tuple[int, int, int, int],
     block: tuple[int, int],
@@ -251,19 +256,19 @@ def _ask_each_cell(
     top = _highest(view, relief, block)
     begin, start, finish, end = _cells_in_tile(tile, block)
     for row in range(begin, finish):
-        into = _part(sight, row - tile[0], start - tile[1], end - start)
+        into = _part(visible, row - tile[0], start - tile[1], end - start)
         project_row(view, relief, row, start, room.lanes[:, : end - start])
-        look_at_row(view, relief, buffer, (row, start, top), room, into, sight.summary)
+        look_at_row(view, relief, buffer, (row, start, top), room, into, visible.summary)
 
 
 @compiled
-def _part(sight: Sight, row: int, first_column: int, n_cells: int) -> SightRow:
+def _part(visible: TileVisibility, row: int, first_column: int, n_cells: int) -> RowVisibility:
     end = first_column + n_cells
-    return SightRow(
-        sight.u[row, first_column:end],
-        sight.v[row, first_column:end],
-        sight.mask[row, first_column:end],
-        sight.quality[row, first_column:end],
+    return RowVisibility(
+        visible.u[row, first_column:end],
+        visible.v[row, first_column:end],
+        visible.mask[row, first_column:end],
+        visible.quality[row, first_column:end],
     )
 
 
@@ -274,7 +279,7 @@ def look_at_row(
     buffer: DepthBuffer,
     place: tuple[int, int, float],
     room: BlockRoom,
-    into: SightRow,
+    into: RowVisibility,
     summary: NDArray[np.float64],
 ) -> None:
     """Ask for each cell of a row whether the photo sees it.
@@ -287,7 +292,7 @@ def look_at_row(
             be followed.
         room: its lanes are those of `project_row`.
         into: filled.
-        summary: of the `Sight`, updated.
+        summary: of the `TileVisibility`, updated.
     """
     us, vs, mask, quality = into.u, into.v, into.mask, into.quality
     row, first_column, top = place

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import kernel_part
-from orthoflow.geometry.visibility_kernels import (
+from orthoflow_plugins.ortho.views import (
     FINE_CELLS,
     NOTHING,
     NOTHING_M,
@@ -228,7 +228,7 @@ def hide_low_cells(
     Args:
         view: the camera before the wall.
         relief: the wall.
-        mask: of the tile's `Sight`, changed where cells are hidden.
+        mask: of the tile's `TileVisibility`, changed where cells are hidden.
         corner: row and column of the tile's first cell.
         area: first row and column of the block's cells in the tile, and the row and column after
             its last ones, on the wall.

@@ -1,8 +1,9 @@
-"""Compiled bilinear sampling of a photo: three channels at once, in whole numbers.
+"""Compiled passes that paint a tile: its colours sampled from the photo, and its handing over.
 
-The channels of a pixel stand 21 bits apart in one 64-bit number. Weights in 64ths of a pixel along
-both axes multiply to 12 bits, and 8 + 12 bits do not run over into the next channel: four products
-and three sums give three colours, the same ones on every machine. `cv2.remap` takes twice as long.
+Bilinear sampling takes three channels at once, in whole numbers. The channels of a pixel stand 21
+bits apart in one 64-bit number. Weights in 64ths of a pixel along both axes multiply to 12 bits,
+and 8 + 12 bits do not run over into the next channel: four products and three sums give three
+colours, the same ones on every machine. `cv2.remap` takes twice as long.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow_plugins.ortho.views import OCCLUDED, PAINTED, TileVisibility
 
 _STEPS: Final = 64
 # Places of the channels in a packed pixel.
@@ -20,6 +22,10 @@ _GREEN, _BLUE = np.uint64(21), np.uint64(42)
 _WEIGHT_BITS: Final = np.uint64(12)
 # Half of what a weighted sum is divided by, for each channel: colours are rounded, not cut off.
 _HALF: Final = np.uint64((1 << 11) | (1 << 32) | (1 << 53))
+# Twenty bits tell views apart well enough, and pack to half the size.
+_QUALITY_BITS: Final = np.uint32(0xFFFFF000)
+# Cells that are looked at together: where all are painted, none has to be made bare.
+_RUN: Final = 32
 
 
 @compiled
@@ -105,3 +111,82 @@ def sample_bilinear(
             into[j, 0] = np.uint8((colour >> _WEIGHT_BITS) & np.uint64(255))
             into[j, 1] = np.uint8((colour >> (_WEIGHT_BITS + _GREEN)) & np.uint64(255))
             into[j, 2] = np.uint8((colour >> (_WEIGHT_BITS + _BLUE)) & np.uint64(255))
+
+
+class Canvas(NamedTuple):
+    """A layer that is being painted.
+
+    Attributes:
+        mask: (rows, cols) uint8 states.
+        quality: (rows, cols) float32.
+        rgb: (rows, cols, 3) uint8.
+    """
+
+    mask: NDArray[np.uint8]
+    quality: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+
+
+@compiled
+def hand_over(
+    visible: TileVisibility,
+    is_near: NDArray[np.uint8],
+    inner: tuple[int, int],
+    canvas: Canvas,
+    tile: tuple[slice, slice],
+) -> None:
+    """Write mask and quality of a tile, and take the colours of cells that are not painted.
+
+    Args:
+        visible: of the tile and what is around it.
+        is_near: of the same shape, not 0 where a cell is too near to a hidden patch; or empty.
+        inner: row and column of `visible` where the tile begins.
+        canvas: changed where the tile is.
+        tile: rows and columns of it.
+    """
+    rows, columns = tile
+    n_columns, width = columns.stop - columns.start, canvas.mask.shape[1]
+    masks = canvas.mask.reshape(canvas.mask.size)
+    qualities = canvas.quality.view(np.uint32).reshape(canvas.quality.size)
+    seen = visible.mask.reshape(visible.mask.size)
+    qualities_in = visible.quality.view(np.uint32).reshape(visible.quality.size)
+    near = is_near.reshape(is_near.size)
+    painted, occluded = np.uint8(PAINTED), np.uint8(OCCLUDED)
+    zero, bits = np.uint32(0), _QUALITY_BITS
+    for row in range(rows.start, rows.stop):
+        first = np.uintp(row * width + columns.start)
+        source = np.uintp((row - rows.start + inner[0]) * visible.mask.shape[1] + inner[1])
+        for j in range(n_columns):
+            masks[first + np.uintp(j)] = seen[source + np.uintp(j)]
+        if near.size:
+            for j in range(n_columns):
+                is_lost = (near[source + np.uintp(j)] != 0) & (
+                    seen[source + np.uintp(j)] == painted
+                )
+                masks[first + np.uintp(j)] = occluded if is_lost else seen[source + np.uintp(j)]
+        for j in range(n_columns):
+            is_bare = masks[first + np.uintp(j)] != painted
+            value = np.uint32(qualities_in[source + np.uintp(j)] & bits)
+            qualities[first + np.uintp(j)] = zero if is_bare else value
+    _take_colours(canvas, tile)
+
+
+@kernel_part
+def _take_colours(canvas: Canvas, tile: tuple[slice, slice]) -> None:
+    """Make the cells of a tile black that are not painted."""
+    rows, columns = tile
+    masks, rgb = canvas.mask.reshape(canvas.mask.size), canvas.rgb.reshape(canvas.rgb.size)
+    painted = np.uint8(PAINTED)
+    for row in range(rows.start, rows.stop):
+        for start in range(columns.start, columns.stop, _RUN):
+            first = np.uintp(row * canvas.mask.shape[1] + start)
+            n_cells = min(columns.stop - start, _RUN)
+            has_bare = False
+            for j in range(n_cells):
+                has_bare |= masks[first + np.uintp(j)] != painted
+            if not has_bare:
+                continue
+            for j in range(n_cells):
+                if masks[first + np.uintp(j)] != painted:
+                    for channel in range(3):
+                        rgb[3 * (first + np.uintp(j)) + np.uintp(channel)] = 0

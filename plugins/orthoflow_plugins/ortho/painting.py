@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import partial
 from threading import Lock, local
@@ -11,25 +10,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry import WallFrame
-from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.layer_kernels import Canvas, hand_over
-from orthoflow.geometry.row_bands import Allocate
-from orthoflow.geometry.sight_kernels import look_at_cells
+from orthoflow.geometry.bands import Allocate
+from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.threads import in_threads
-from orthoflow.geometry.visibility_kernels import (
-    OCCLUDED,
-    DepthBuffer,
-    Relief,
-    Sight,
-    WallView,
-)
-from orthoflow_plugins.ortho.dsm_backward_sampling import (
-    Footprint,
-    Resampling,
-    footprint_of,
-    sample,
-)
+from orthoflow_plugins.ortho.painting_kernels import Canvas, hand_over
+from orthoflow_plugins.ortho.sampling import CellFootprint, Resampling, footprint_of, sample
+from orthoflow_plugins.ortho.surfaces import Surface
+from orthoflow_plugins.ortho.views import OCCLUDED, TileVisibility, WallView
+from orthoflow_plugins.ortho.visibility_kernels import look_at_cells
 
 TILE_CELLS: Final = 512
 # What is packed of a photo for a tile stays below 80 MB; cv2.remap takes sides below 32767.
@@ -37,39 +25,18 @@ _CROP_MOST_PX: Final = 3_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class SightRule:
-    """What counts as seen, and how colours are taken.
+class PaintRule:
+    """Which of the cells that a photo sees are painted, and how colours are taken.
 
     Attributes:
         resampling: how colours between pixels are made.
         is_filtered: average over what a cell covers where the photo is finer than the wall.
-        incidence_max_deg: cells seen more obliquely count as hidden.
         erosion_cells: cells so near to a hidden one are not painted.
-        border_share: quality falls to 0 over this share of the photo's shorter side.
     """
 
     resampling: Resampling
     is_filtered: bool
-    incidence_max_deg: float
     erosion_cells: int
-    border_share: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Surface:
-    """A wall as it is looked at.
-
-    Attributes:
-        frame: where the cells lie.
-        relief: their depths, and what they hide.
-        front_m: up to this depth the relief holds all points there are.
-        tolerance_m: how far a surface must be above a ray to hide it.
-    """
-
-    frame: WallFrame
-    relief: Relief
-    front_m: float
-    tolerance_m: float
 
 
 @dataclass(kw_only=True)
@@ -86,30 +53,7 @@ class Painting:
     mask: NDArray[np.uint8]
     rgb: NDArray[np.uint8] | None = None
     quality: NDArray[np.float32] | None = None
-    footprints: dict[tuple[int, int], Footprint] = field(default_factory=dict)
-
-
-def view_of(camera: ViewingCamera, surface: Surface, rule: SightRule) -> WallView:
-    """Give a camera in the axes of a wall; survey coordinates lose nothing on the way."""
-    frame = surface.frame
-    axes = np.column_stack([frame.u_world, frame.v_world, frame.normal_world])
-    near = camera.shifted(frame.origin_world)
-    flat = near.flat.copy()
-    flat[:9] = (near.rotation @ axes).ravel()
-    centre = axes.T @ near.centre_world
-    return WallView(
-        camera=flat,
-        column=float(centre[0]) / frame.gsd_m - 0.5,
-        row=float(centre[1]) / frame.gsd_m - 0.5,
-        height_m=float(centre[2]),
-        gsd_m=float(frame.gsd_m),
-        front_m=float(surface.front_m),
-        tolerance_m=float(surface.tolerance_m),
-        cosine_least=math.cos(math.radians(rule.incidence_max_deg)),
-        border_px=max(1.0, rule.border_share * min(camera.width, camera.height)),
-        # The nearest pixel is another one a hundredth of a pixel farther on.
-        is_exact=rule.resampling == "nearest",
-    )
+    footprints: dict[tuple[int, int], CellFootprint] = field(default_factory=dict)
 
 
 def paint(
@@ -117,7 +61,7 @@ def paint(
     view: WallView,
     surface: Surface,
     buffer: DepthBuffer,
-    rule: SightRule,
+    rule: PaintRule,
     *,
     allocate: Allocate,
     threads: int,
@@ -154,7 +98,7 @@ class _Brush:
         view: WallView,
         surface: Surface,
         buffer: DepthBuffer,
-        rule: SightRule,
+        rule: PaintRule,
         allocate: Allocate,
     ) -> None:
         mask = allocate("mask", surface.frame.shape, np.uint8)
@@ -169,30 +113,30 @@ class _Brush:
         self._scratch = local()
 
     def paint_tile(self, tile: tuple[slice, slice]) -> None:
-        sight, inner = self._look(tile)
-        if not sight.summary[4]:
-            self.painting.mask[tile] = sight.mask[inner]
+        visible, inner = self._look(tile)
+        if not visible.summary[4]:
+            self.painting.mask[tile] = visible.mask[inner]
             return
-        if _crop_side(sight) > _CROP_MOST_PX and sight.mask[inner].size > 1:
+        if _crop_side(visible) > _CROP_MOST_PX and visible.mask[inner].size > 1:
             for quarter in _quarters(tile):
                 self.paint_tile(quarter)
             return
-        footprint = footprint_of(self._view, sight)
+        footprint = footprint_of(self._view, visible)
         canvas = self._canvas()
-        is_near = self._near_hidden(sight)
+        is_near = self._near_hidden(visible)
         sample(
             self._photo,
-            sight,
+            visible,
             inner,
             footprint,
             self._rule.resampling,
             is_filtered=self._rule.is_filtered,
             into=canvas.rgb[tile],
         )
-        hand_over(sight, is_near, (inner[0].start, inner[1].start), canvas, tile)
+        hand_over(visible, is_near, (inner[0].start, inner[1].start), canvas, tile)
         self.painting.footprints[tile[0].start, tile[1].start] = footprint
 
-    def _look(self, tile: tuple[slice, slice]) -> tuple[Sight, tuple[slice, slice]]:
+    def _look(self, tile: tuple[slice, slice]) -> tuple[TileVisibility, tuple[slice, slice]]:
         """See a tile and so much around it as hides cells of it; say where in that the tile is."""
         reach = self._rule.erosion_cells
         reach += 1 if reach else 0  # what is a patch shows one cell farther out
@@ -201,23 +145,23 @@ class _Brush:
             min(size, part.stop + reach) - start
             for size, part, start in zip(self._surface.frame.shape, tile, first, strict=True)
         )
-        sight = self._blank_sight(shape[0], shape[1])
-        look_at_cells(self._view, self._surface.relief, self._buffer, sight, first[0], first[1])
+        visible = self._blank_visibility(shape[0], shape[1])
+        look_at_cells(self._view, self._surface.relief, self._buffer, visible, first[0], first[1])
         rows, columns = (
             slice(part.start - start, part.stop - start)
             for part, start in zip(tile, first, strict=True)
         )
-        return sight, (rows, columns)
+        return visible, (rows, columns)
 
-    def _near_hidden(self, sight: Sight) -> NDArray[np.uint8]:
+    def _near_hidden(self, visible: TileVisibility) -> NDArray[np.uint8]:
         """Not 0 where a cell is too near to a hidden patch; empty where none is."""
         if self._rule.erosion_cells:
-            is_hidden = sight.mask == OCCLUDED
+            is_hidden = visible.mask == OCCLUDED
             if is_hidden.any():
                 return _near_patches(is_hidden, self._rule.erosion_cells)
         return np.empty((0, 0), dtype=np.uint8)
 
-    def _blank_sight(self, rows: int, columns: int) -> Sight:
+    def _blank_visibility(self, rows: int, columns: int) -> TileVisibility:
         """Give arrays for a tile that this thread has used before: fresh memory takes time."""
         if not hasattr(self._scratch, "floats"):
             side = TILE_CELLS + 2 * (self._rule.erosion_cells + 1)
@@ -227,7 +171,7 @@ class _Brush:
             plane[: rows * columns].reshape(rows, columns) for plane in self._scratch.floats
         )
         mask = self._scratch.mask[: rows * columns].reshape(rows, columns)
-        return Sight(u=u, v=v, mask=mask, quality=quality, summary=np.empty(8))
+        return TileVisibility(u=u, v=v, mask=mask, quality=quality, summary=np.empty(8))
 
     def _canvas(self) -> Canvas:
         with self._lock:
@@ -255,8 +199,9 @@ def _near_patches(is_hidden: NDArray[np.bool_], reach: int) -> NDArray[np.uint8]
     return np.asarray(cv2.dilate(lowest, window, anchor=(reach + 1,) * 2), dtype=np.uint8)
 
 
-def _crop_side(sight: Sight) -> float:
-    return float(max(sight.summary[1] - sight.summary[0], sight.summary[3] - sight.summary[2]))
+def _crop_side(visible: TileVisibility) -> float:
+    u_least, u_most, v_least, v_most = visible.summary[:4]
+    return float(max(u_most - u_least, v_most - v_least))
 
 
 def _quarters(tile: tuple[slice, slice]) -> list[tuple[slice, slice]]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-
-from orthoflow.geometry.bilinear_kernels import Patch, pack_pixels, sample_bilinear
+from orthoflow_plugins.ortho.painting_kernels import Patch, pack_pixels, sample_bilinear
 
 HALF_PIXEL = (np.float32(0.5), np.float32(0.5))
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
-from orthoflow.geometry.visibility_kernels import FINE_CELLS, NOTHING, NOTHING_M
+from orthoflow_plugins.ortho.views import FINE_CELLS, NOTHING, NOTHING_M
 
 
 @compiled

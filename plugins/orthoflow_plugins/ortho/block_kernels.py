@@ -1,8 +1,8 @@
 """Compiled passes for blocks of cells that a photo sees as a whole: few projections, many cells.
 
-Bounds at nodes of the block tell that nothing hides any of it; parabolas through them then give
-the places of its cells in the photo. Where that is not exact enough, or not sure, the block is not
-plain, and `sight_kernels` asks each cell.
+Bounds at nodes of the block tell that nothing hides any of it, or that the cloud hides all of it;
+parabolas through the nodes then give the places of its cells in the photo. Where that is not exact
+enough, or not sure, `visibility_kernels` asks each cell.
 """
 
 from __future__ import annotations
@@ -13,27 +13,37 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.block_verdict_kernels import parabola
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import compiled, kernel_part
-from orthoflow.geometry.ray_kernels import N_LANES
-from orthoflow.geometry.visibility_kernels import (
+from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
+from orthoflow_plugins.ortho.ray_kernels import N_LANES
+from orthoflow_plugins.ortho.views import (
     BLOCK_CELLS,
     FINE_CELLS,
     NO_SURFACE,
     OCCLUDED,
     PAINTED,
     Relief,
-    Sight,
+    TileVisibility,
     WallView,
 )
 
+# What `judge_block` finds.
+HIDDEN: Final = -1
+UNSURE: Final = 0
+SEEN: Final = 1
 # How far interpolated places may be off, in photo pixels; `cv2.remap` knows 32nds of them.
 PARABOLA_PX: Final = 0.02
 # Blocks that are looked at together where parabolas reach so far.
 WIDE_BLOCKS: Final = 4
 # What describes a row of a block: see `_fit_block`.
 N_TERMS: Final = 15
+
+
+@compiled
+def parabola(x: float) -> tuple[float, float, float]:
+    """Weights of the values at 0, 0.5 and 1 in the parabola through them."""
+    return (2.0 * (x - 0.5) * (x - 1.0), 4.0 * x * (1.0 - x), 2.0 * x * (x - 0.5))
 
 
 @compiled
@@ -111,26 +121,134 @@ def _project_node(
 
 
 @compiled
+def judge_block(
+    view: WallView,
+    buffer: DepthBuffer,
+    high: float,
+    rows: tuple[int, int],
+    columns: tuple[int, int],
+    nodes: NDArray[np.float64],
+    box: NDArray[np.float64],
+) -> int:
+    """Tell whether a photo surely sees all known cells of a block, so that none need be asked.
+
+    What counts for a cell is monotonous over the block or nearly linear, so that the nodes at the
+    lowest and the highest depth bound it. The rays to the camera are known to be free of relief.
+
+    Args:
+        view: the camera before the wall.
+        buffer: what else stands before the camera.
+        high: the highest depth.
+        rows: first and last row of the cells.
+        columns: first and last column.
+        nodes: of `span_block`.
+        box: (4,) filled with the smallest and largest u, the smallest and largest v.
+
+    Returns:
+        `SEEN`, `HIDDEN` where the cloud surely hides all of them, or `UNSURE`.
+    """
+    farthest_row = max(abs(view.row - rows[0]), abs(view.row - rows[1])) * view.gsd_m
+    farthest_column = max(abs(view.column - columns[0]), abs(view.column - columns[1])) * view.gsd_m
+    lift = view.height_m - high
+    aside = farthest_row * farthest_row + farthest_column * farthest_column
+    if lift <= view.cosine_least * math.sqrt(lift * lift + aside):
+        return UNSURE
+    box[0], box[1], box[2], box[3] = math.inf, -math.inf, math.inf, -math.inf
+    # The distance to the camera changes over a wide block: each of its parts is asked by itself.
+    n_parts = max(1, (columns[1] - columns[0] + 1) // BLOCK_CELLS)
+    is_seen, is_hidden = True, True
+    for part in range(n_parts):
+        starts, ends = parabola(part / n_parts), parabola((part + 1) / n_parts)
+        middles = parabola((part + 0.5) / n_parts)
+        u_least, u_most = _bounds(nodes, 0, starts, middles, ends)
+        v_least, v_most = _bounds(nodes, 1, starts, middles, ends)
+        first, last = _bounds(nodes, 3, starts, middles, ends)
+        # Between the nodes edges bend, by far less than this.
+        margin = 1.0 + 0.02 * max(u_most - u_least, v_most - v_least)
+        left, right, upper, lower = (
+            u_least - margin,
+            u_most + margin,
+            v_least - margin,
+            v_most + margin,
+        )
+        box[0], box[1] = min(box[0], left), max(box[1], right)
+        box[2], box[3] = min(box[2], upper), max(box[3], lower)
+        if left < 0.0 or right >= view.camera[21] or upper < 0.0 or lower >= view.camera[22]:
+            return UNSURE
+        nearest, farthest = _bound_cloud(buffer, left, right, upper, lower)
+        is_seen &= nearest >= last - view.tolerance_m
+        is_hidden &= farthest < first - view.tolerance_m
+        if not (is_seen or is_hidden):
+            return UNSURE
+    return SEEN if is_seen else HIDDEN
+
+
+@compiled
+def _bounds(
+    nodes: NDArray[np.float64],
+    k: int,
+    starts: tuple[float, float, float],
+    middles: tuple[float, float, float],
+    ends: tuple[float, float, float],
+) -> tuple[float, float]:
+    """Bound a quantity over some columns of a block, by its values at three of them.
+
+    Args:
+        nodes: of `span_block`.
+        k: which quantity of the nodes.
+        starts: weights of the nodes of a row at the first column; those of the others likewise.
+        middles: at the middle one.
+        ends: at the last one.
+    """
+    least, most = math.inf, -math.inf
+    for layer in range(2):
+        for i in range(3):
+            at_start, at_middle, at_end = 0.0, 0.0, 0.0
+            for j in range(3):
+                value = nodes[layer, i, j, k]
+                at_start += starts[j] * value
+                at_middle += middles[j] * value
+                at_end += ends[j] * value
+            least = min(least, at_start, at_middle, at_end)
+            most = max(most, at_start, at_middle, at_end)
+    return least, most
+
+
+@compiled
+def _bound_cloud(
+    buffer: DepthBuffer, left: float, right: float, upper: float, lower: float
+) -> tuple[float, float]:
+    """Give the nearest and the farthest depth in a part of a photo."""
+    nearest, farthest = np.float32(np.inf), np.float32(0.0)
+    per_pixel = 1.0 / buffer.reduction
+    for row in range(int(upper * per_pixel), int(lower * per_pixel) + 1):
+        for column in range(int(left * per_pixel), int(right * per_pixel) + 1):
+            nearest = min(nearest, buffer.nearest[row, column])
+            farthest = max(farthest, buffer.nearest[row, column])
+    return float(nearest), float(farthest)
+
+
+@compiled
 def look_at_hidden_block(
-    relief: Relief, sight: Sight, place: tuple[int, int, int, int, int, int]
+    relief: Relief, visible: TileVisibility, place: tuple[int, int, int, int, int, int]
 ) -> None:
-    """Fill in the cells of a block that the cloud hides; see `look_at_plain_block`."""
+    """Fill in the cells of a block that the cloud hides; see `look_at_unoccluded_block`."""
     first_row, first_column, n_rows, n_columns, tile_row, tile_column = place
     for i in range(n_rows):
         for j in range(n_columns):
             depth = relief.depth[first_row + i, first_column + j]
             at_row, at_column = tile_row + i, tile_column + j
-            sight.mask[at_row, at_column] = NO_SURFACE if math.isnan(depth) else OCCLUDED
-            sight.u[at_row, at_column] = 0.0
-            sight.v[at_row, at_column] = 0.0
+            visible.mask[at_row, at_column] = NO_SURFACE if math.isnan(depth) else OCCLUDED
+            visible.u[at_row, at_column] = 0.0
+            visible.v[at_row, at_column] = 0.0
 
 
 class BlockRoom(NamedTuple):
-    """The arrays of a tile that plain blocks fill, flat, and room for what is needed in between.
+    """The arrays of a tile that blocks fill, flat, and room for what is needed in between.
 
     Attributes:
         heights: (cells of the wall,) float32 metres.
-        u: (cells of the tile,) as in `Sight`; v, mask and quality likewise.
+        u: (cells of the tile,) as in `TileVisibility`; v, mask and quality likewise.
         bends: (3, N_TERMS) of `_fit_block`; along (3, 5) likewise.
         terms: (N_TERMS,) of one row.
         rises: (WIDE_BLOCKS * BLOCK_CELLS,) metres above the lower of the two depths, 0 where void.
@@ -138,7 +256,7 @@ class BlockRoom(NamedTuple):
         wall_columns: columns of the wall; tile_columns those of the tile.
         nodes: (2, 3, 3, 4) of `span_block`.
         box: (4,) of `judge_block`.
-        lanes: (5, BLOCK_CELLS) of `sight_kernels.project_row`.
+        lanes: (5, BLOCK_CELLS) of `visibility_kernels.project_row`.
         rays: (FINE_CELLS * FINE_CELLS, N_LANES) of `ray_kernels.follow_rays`.
     """
 
@@ -161,21 +279,21 @@ class BlockRoom(NamedTuple):
 
 
 @compiled
-def room_for_blocks(relief: Relief, sight: Sight) -> BlockRoom:
-    """Give the room that `look_at_plain_block` needs for the blocks of a tile."""
+def room_for_blocks(relief: Relief, visible: TileVisibility) -> BlockRoom:
+    """Give the room that `look_at_unoccluded_block` needs for the blocks of a tile."""
     return BlockRoom(
         relief.depth.reshape(relief.depth.size),
-        sight.u.reshape(sight.u.size),
-        sight.v.reshape(sight.v.size),
-        sight.mask.reshape(sight.mask.size),
-        sight.quality.reshape(sight.quality.size),
+        visible.u.reshape(visible.u.size),
+        visible.v.reshape(visible.v.size),
+        visible.mask.reshape(visible.mask.size),
+        visible.quality.reshape(visible.quality.size),
         np.empty((3, N_TERMS)),
         np.empty((3, 5)),
         np.empty(N_TERMS, dtype=np.float32),
         np.empty(WIDE_BLOCKS * BLOCK_CELLS, dtype=np.float32),
         np.arange(WIDE_BLOCKS * BLOCK_CELLS).astype(np.float32),
         relief.depth.shape[1],
-        sight.mask.shape[1],
+        visible.mask.shape[1],
         np.empty((2, 3, 3, 4)),
         np.empty(4),
         np.empty((5, BLOCK_CELLS)),
@@ -184,7 +302,7 @@ def room_for_blocks(relief: Relief, sight: Sight) -> BlockRoom:
 
 
 @compiled
-def look_at_plain_block(
+def look_at_unoccluded_block(
     view: WallView,
     room: BlockRoom,
     place: tuple[int, int, int, int, int, int],
@@ -193,9 +311,10 @@ def look_at_plain_block(
 ) -> int:
     """Fill in the cells of a block that a photo surely sees where they are known.
 
-    Places and worth follow parabolas over the block and are linear in depth: the projection itself
-    would take several times as long. Each loop writes one array and has no branches: the processor
-    then takes eight cells at once. Handing rows to functions of their own would take longer.
+    Places and quality follow parabolas over the block and are linear in depth: the projection
+    itself would take several times as long. Each loop writes one array and has no branches: the
+    processor then takes eight cells at once. Handing rows to functions of their own would take
+    longer.
 
     Args:
         view: the camera before the wall.
@@ -284,7 +403,7 @@ def _fit_block(
         per_column: one over the distance of the first and last column.
         per_depth: one over the distance of the two depths.
         bends: (3, N_TERMS) set: level, slope and bend down the block of five terms each for u, v
-            and worth: level, slope and bend along the row, and level and slope of what a metre of
+            and quality: level, slope and bend along the row, and level and slope of what a metre of
             depth adds.
         along: (3, 5) room for what is needed in between.
     """

@@ -1,0 +1,171 @@
+"""How well the sources of a wall agree: in place where they overlap, in colour along seams."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.bands import row_bands
+from orthoflow.products import Layer, LayerMask
+from orthoflow_plugins.mosaic.graph_cut import depth_edges
+
+PATCH_CELLS: Final = 64
+_PATCHES_MOST: Final = 200
+# Flat patches show no displacement, and weak peaks show chance.
+_CONTRAST_LEAST_GREY: Final = 3.0
+_RESPONSE_LEAST: Final = 0.15
+_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
+_ROWS_AT_ONCE: Final = 1024
+
+
+def displacements_cells(layers: Sequence[Layer]) -> NDArray[np.float64]:
+    """Displacements (n, 2) = (u, v) in cells between the two best layers of patches of a wall.
+
+    Patches of 64 x 64 cells that both layers paint wholly are compared by phase correlation, which
+    is good to about a tenth of a cell.
+    """
+    import cv2
+
+    pairs = _best_pairs(layers)
+    chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), _PATCHES_MOST)).round().astype(int)
+    window = cv2.createHanningWindow((PATCH_CELLS, PATCH_CELLS), cv2.CV_32F)
+    found = []
+    for row, column, first, second in (pairs[place] for place in chosen):
+        part = (slice(row, row + PATCH_CELLS), slice(column, column + PATCH_CELLS))
+        patches = [_grey(layers[index].rgb[part]) for index in (first, second)]
+        if min(float(patch.std()) for patch in patches) < _CONTRAST_LEAST_GREY:
+            continue
+        shift, response = cv2.phaseCorrelate(patches[0], patches[1], window)
+        if response >= _RESPONSE_LEAST:
+            found.append(shift)
+    return np.array(found, dtype=np.float64).reshape(-1, 2)
+
+
+def _best_pairs(layers: Sequence[Layer]) -> list[tuple[int, int, int, int]]:
+    """Row and column of patches, and the two best layers that paint them wholly."""
+    n_rows, n_columns = (side // PATCH_CELLS for side in layers[0].frame.shape)
+    if len(layers) < 2 or not n_rows or not n_columns:
+        return []
+    qualities = np.stack([_patch_qualities(layer, (n_rows, n_columns)) for layer in layers])
+    order = np.argsort(-qualities, axis=0, kind="stable")[:2]
+    second = np.take_along_axis(qualities, order[1:], axis=0)[0]
+    return [
+        (
+            int(row) * PATCH_CELLS,
+            int(column) * PATCH_CELLS,
+            int(order[0, row, column]),
+            int(order[1, row, column]),
+        )
+        for row, column in np.argwhere(second > 0.0)
+    ]
+
+
+def _patch_qualities(layer: Layer, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Mean quality of each patch, 0 where the layer does not paint all of it."""
+    qualities: list[NDArray[np.float64]] = []
+    columns = shape[1] * PATCH_CELLS
+    for rows in row_bands((shape[0] * PATCH_CELLS, columns), multiple=PATCH_CELLS):
+        blocks = (-1, PATCH_CELLS, shape[1], PATCH_CELLS)
+        is_painted = layer.mask[rows, :columns] == LayerMask.PAINTED
+        whole = is_painted.reshape(blocks).all(axis=(1, 3))
+        quality = layer.quality[rows, :columns].reshape(blocks)
+        qualities.append(np.where(whole, quality.mean(axis=(1, 3), dtype=np.float64), 0.0))
+    return np.concatenate(qualities)
+
+
+def _grey(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(rgb.mean(axis=2, dtype=np.float32))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeamSteps:
+    """What changes where one source follows another.
+
+    Attributes:
+        grey: (n,) float64 difference in luminance of both sources in a cell at a seam.
+        delta_e: (n,) float64 distance of both colours in CIE L*a*b* (1976).
+    """
+
+    grey: NDArray[np.float64]
+    delta_e: NDArray[np.float64]
+
+
+def seam_steps(source: NDArray[np.int16], layers: Sequence[Layer]) -> SeamSteps:
+    """Compare both sources in the cells on the left of or above seams that both paint.
+
+    Args:
+        source: (rows, cols) index of the layer that paints each cell, -1 for none.
+        layers: what the index counts.
+    """
+    nothing = np.zeros((0, 3), dtype=np.uint8)
+    firsts, seconds = [nothing], [nothing]
+    for axis in (0, 1):
+        rows, columns = _before_seams(source, axis)
+        mine = source[rows, columns]
+        other = source[rows + (axis == 0), columns + (axis == 1)]
+        for index, layer in enumerate(layers):
+            chosen = (other == index) & (layer.mask[rows, columns] == LayerMask.PAINTED)
+            seconds.append(layer.rgb[rows[chosen], columns[chosen]])
+            first = np.zeros((np.count_nonzero(chosen), 3), dtype=np.uint8)
+            for owner, painter in enumerate(layers):
+                is_mine = mine[chosen] == owner
+                first[is_mine] = painter.rgb[rows[chosen][is_mine], columns[chosen][is_mine]]
+            firsts.append(first)
+    one, another = np.concatenate(firsts), np.concatenate(seconds)
+    grey = (one.astype(np.float64) - another) @ _LUMINANCE
+    return SeamSteps(
+        grey=grey, delta_e=np.linalg.norm(_lab(one) - _lab(another), axis=1).astype(np.float64)
+    )
+
+
+def _before_seams(
+    source: NDArray[np.int16], axis: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the cells above seams (axis 0) or left of them, strip by strip."""
+    found: list[NDArray[np.int64]] = []
+    for first in range(0, source.shape[0], _ROWS_AT_ONCE):
+        strip = source[first : first + _ROWS_AT_ONCE + (axis == 0)]
+        here = strip[:-1] if axis == 0 else strip[:, :-1]
+        there = strip[1:] if axis == 0 else strip[:, 1:]
+        rows, columns = np.nonzero((here != there) & (here >= 0) & (there >= 0))
+        found.append(np.stack([rows + first, columns]))
+    rows, columns = np.concatenate(found, axis=1)
+    return rows, columns
+
+
+def count_seams(source: NDArray[np.int16], depth_m: NDArray[np.float32] | None) -> tuple[int, int]:
+    """Cells at seams, and those of them at depth edges; some rows at a time."""
+    n_seam = n_edge_seam = 0
+    for first in range(0, source.shape[0], _ROWS_AT_ONCE):
+        # The row below tells of the last one.
+        rows = slice(first, first + _ROWS_AT_ONCE + 1)
+        seam = is_seam(source[rows])[:_ROWS_AT_ONCE]
+        n_seam += int(np.count_nonzero(seam))
+        if depth_m is not None:
+            n_edge_seam += int(np.count_nonzero(seam & depth_edges(depth_m[rows])[:_ROWS_AT_ONCE]))
+    return n_seam, n_edge_seam
+
+
+def is_seam(source: NDArray[np.int16]) -> NDArray[np.bool_]:
+    """Cells whose right or lower neighbour comes from another source."""
+    seam = np.zeros(source.shape, dtype=np.bool_)
+    seam[:, :-1] |= _differ(source[:, :-1], source[:, 1:])
+    seam[:-1] |= _differ(source[:-1], source[1:])
+    return seam
+
+
+def _differ(one: NDArray[np.int16], other: NDArray[np.int16]) -> NDArray[np.bool_]:
+    return np.asarray((one != other) & (one >= 0) & (other >= 0), dtype=np.bool_)
+
+
+def _lab(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    import cv2
+
+    if len(rgb) == 0:
+        return np.zeros((0, 3), dtype=np.float32)
+    levels = rgb[None].astype(np.float32) / np.float32(255.0)
+    return np.asarray(cv2.cvtColor(levels, cv2.COLOR_RGB2Lab)[0], dtype=np.float32)

@@ -1,0 +1,220 @@
+"""Walls rastered one by one: surface and narrow gaps, a large wall in bands of rows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.bands import Allocate, bands_with_reach
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
+from orthoflow_plugins.raster.rules import RasterRule, Surface
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.raster.surfaces import CellSurface
+
+# Rec. 601 luma on the sRGB values as they are: the grey of cv2.cvtColor.
+_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+# Bytes per cell: what a finished wall keeps, and what the passes over one wall hold on top.
+_BYTES_KEPT: Final = 25
+_BYTES_WORKING: Final = 90
+_MEMORY_SHARE: Final = 0.75
+# Larger walls are rastered in bands of so many cells: 3 GB of memory.
+_BAND_CELLS: Final = 1 << 25
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallRaster:
+    """A rastered wall, and how far apart the scan's points lie on it."""
+
+    wall: Wall
+    scan_step_m: float
+
+
+def require_memory(frames: Sequence[WallFrame], surface: Surface) -> None:
+    """Refuse cells that are too fine for the machine.
+
+    Raises:
+        MethodError: the rasters would not fit into memory.
+    """
+    sizes = [frame.width * frame.height for frame in frames]
+    # What is rastered in bands lies in files, and takes the memory of a band.
+    kept = [
+        size for size, frame in zip(sizes, frames, strict=True) if not _is_banded(frame, surface)
+    ]
+    working = max([*kept, _BAND_CELLS] if len(kept) < len(sizes) else kept)
+    needed = _BYTES_KEPT * sum(kept) + _BYTES_WORKING * working
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    # Cells are numbered with 32 bits.
+    if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
+        largest = frames[int(np.argmax(sizes))]
+        raise MethodError(
+            f"cells of gsd_m = {largest.gsd_m:g} m make {sum(sizes):.3g} cells ({largest.width} "
+            f"x {largest.height} on the largest wall), which need {needed / 2**30:.3g} GiB where "
+            f"this machine has {memory / 2**30:.3g} GiB: raise gsd_m, or lower n_walls_max"
+        )
+
+
+def rastered_wall(
+    cloud: PointCloud,
+    slab: Slab,
+    rule: RasterRule,
+    *,
+    planes: Planes,
+    index: int,
+    allocate: Allocate,
+) -> WallRaster:
+    """Raster the wall of a plane.
+
+    Args:
+        cloud: the points.
+        slab: of the wall.
+        rule: how.
+        planes: of which the wall is one.
+        index: of the wall's plane.
+        allocate: gives the arrays of a large wall, by name.
+    """
+    if _is_banded(slab.frame, rule.surface.surface):
+        raster = _rastered_in_bands(cloud, slab, rule, allocate)
+    else:
+        raster = _rastered(cloud, slab, rule)
+    surface, shape = raster.surface, slab.frame.shape
+    wall = Wall(
+        frame=slab.frame,
+        plane_index=index,
+        name=planes.names[index],
+        depth_m=surface.depth_m.reshape(shape),
+        sigma_m=surface.sigma_m.reshape(shape),
+        count=surface.count.reshape(shape),
+        mask=raster.mask.reshape(shape),
+        intensity=None if surface.intensity is None else surface.intensity.reshape(shape),
+        rgb=None if surface.rgb is None else surface.rgb.reshape(*shape, 3),
+        rgb_mask=None if surface.rgb is None else _where_known(raster.mask, shape, allocate),
+        percentiles_m=None
+        if surface.percentiles_m is None
+        else surface.percentiles_m.reshape(*shape, -1),
+    )
+    return WallRaster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=slab.frame.gsd_m))
+
+
+def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
+    """Distance between neighbouring points on the wall, estimated from the points per cell.
+
+    Cells are joined, 2 x 2, until a block that holds points holds at least four on average: from
+    then on chance hardly leaves a block of scanned surface empty, so that the blocks show the
+    scanned area.
+
+    Args:
+        count: (rows, cols) points per cell.
+        gsd_m: side of a cell in metres.
+
+    Returns:
+        Side of the square that each point has for itself, metres; 0 without points.
+    """
+    # Sums over ever larger blocks stay below the number of points, which 32 bits hold.
+    blocks, side_m = count, gsd_m
+    while blocks.any():
+        per_block = blocks.sum(dtype=np.int64) / np.count_nonzero(blocks)
+        if per_block >= 4.0 or blocks.size == 1:
+            return float(side_m / np.sqrt(per_block))
+        blocks = _joined(blocks)
+        side_m *= 2.0
+    return 0.0
+
+
+def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Sums of 2 x 2 blocks; at the right and below what is left over counts as it is."""
+    rows, columns = blocks.shape
+    sums = np.zeros((-(-rows // 2), -(-columns // 2)), dtype=np.uint32)
+    for first_row in (0, 1):
+        for first_column in (0, 1):
+            quarter = blocks[first_row::2, first_column::2]
+            sums[: quarter.shape[0], : quarter.shape[1]] += quarter
+    return sums
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Raster:
+    """The surface over a slab, and where it comes from.
+
+    Attributes:
+        surface: flat over the cells.
+        mask: (cells,) uint8 `SurfaceMask`.
+    """
+
+    surface: CellSurface
+    mask: NDArray[np.uint8]
+
+
+def _is_banded(frame: WallFrame, surface: Surface) -> bool:
+    """Whether a wall is rastered band by band; the triangles of a net know no bands."""
+    return frame.width * frame.height > _BAND_CELLS and surface != "tin"
+
+
+def _rastered(cloud: PointCloud, slab: Slab, rule: RasterRule) -> _Raster:
+    from orthoflow_plugins.raster.gaps import close_gaps
+    from orthoflow_plugins.raster.surfaces import surface_of
+
+    surface = surface_of(cloud, slab, rule.surface)
+    mask = close_gaps(cloud, slab, surface, rule.gaps)
+    if surface.intensity is None:
+        surface = replace(surface, intensity=_grey(surface.rgb, mask))
+    return _Raster(surface=surface, mask=mask)
+
+
+def _rastered_in_bands(
+    cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: Allocate
+) -> _Raster:
+    """Raster a wall band by band; memory is that of one band."""
+    from orthoflow_plugins.raster.surfaces import CellSurface
+
+    whole: dict[str, NDArray[np.generic]] = {}
+    frame, width = slab.frame, slab.frame.width
+    for band in bands_with_reach(frame.shape, cells_most=_BAND_CELLS, reach_rows=rule.reach_rows):
+        corner = frame.origin_world + band.around.start * frame.gsd_m * frame.v_world
+        height = band.around.stop - band.around.start
+        part = replace(frame, origin_world=corner, height=height)
+        raster = _rastered(cloud, replace(slab, frame=part), rule)
+        cells = slice(band.rows.start * width, band.rows.stop * width)
+        inner = slice(band.inner.start * width, band.inner.stop * width)
+        arrays = {"mask": raster.mask} | {
+            field.name: getattr(raster.surface, field.name) for field in fields(CellSurface)
+        }
+        for name, values in arrays.items():
+            if values is None:
+                continue
+            if name not in whole:
+                shape = (slab.n_cells, *values.shape[1:])
+                whole[name] = allocate(name, shape, values.dtype)
+            whole[name][cells] = values[inner]
+    mask = whole.pop("mask")
+    absent = dict.fromkeys(("intensity", "rgb", "percentiles_m"))
+    # The arrays have the types of the bands' own.
+    surface = CellSurface(**cast("dict[str, Any]", absent | whole))
+    return _Raster(surface=surface, mask=mask.astype(np.uint8, copy=False))
+
+
+def _where_known(
+    mask: NDArray[np.uint8], shape: tuple[int, int], allocate: Allocate
+) -> NDArray[np.uint8]:
+    """1 where a `SurfaceMask` (cells,) is not void, else 0; of a large wall in a file."""
+    if mask.size <= _BAND_CELLS:
+        return (mask > 0).astype(np.uint8).reshape(shape)
+    known = np.asarray(allocate("rgb_mask", shape, np.uint8), np.uint8)
+    np.minimum(mask.reshape(shape), 1, out=known)
+    return known
+
+
+def _grey(rgb: NDArray[np.uint8] | None, mask: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    if rgb is None:
+        return None
+    grey = rgb.astype(np.float32) @ _LUMA / np.float32(255.0)
+    grey[mask == SurfaceMask.VOID] = np.nan
+    return grey.astype(np.float32)
