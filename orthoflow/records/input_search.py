@@ -11,10 +11,10 @@ from typing import Final
 from orthoflow_provenance.model import RecordedFile, RecordedInput
 
 from orthoflow.engine.file_digests import FileDigests
+from orthoflow.files.yaml_positions import Table, read_yaml
 from orthoflow.workflow import Workflow, resolve_input_files
 from orthoflow.workflow.input_options import override_inputs, read_input_options
 from orthoflow.workflow.model import WorkflowInputSpec
-from orthoflow.workflow.positions import Table, read_yaml
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.sections import read_inputs
 

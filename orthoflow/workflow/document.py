@@ -10,6 +10,7 @@ from typing import Final
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import WorkflowError
+from orthoflow.files.yaml_positions import Entry, Table, read_yaml
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.expectations import (
     check_name,
@@ -21,7 +22,6 @@ from orthoflow.workflow.input_options import override_inputs, read_input_options
 from orthoflow.workflow.model import Comparison, StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.overrides import CallName, assign_overrides
 from orthoflow.workflow.parameters import resolve_params
-from orthoflow.workflow.positions import Entry, Table, read_yaml
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.recipes import find_workflow
 from orthoflow.workflow.sections import check_baseline, read_compare, read_inputs

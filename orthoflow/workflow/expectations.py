@@ -7,7 +7,7 @@ from collections.abc import Collection
 from typing import Final
 
 from orthoflow.catalog import did_you_mean
-from orthoflow.workflow.positions import (
+from orthoflow.files.yaml_positions import (
     Entry,
     Listing,
     Position,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import ArgumentError
+from orthoflow.files.yaml_positions import plain, read_yaml
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.positions import plain, read_yaml
 from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
 from orthoflow.workflow.steps import DraftStep, DraftVariant
 

@@ -10,10 +10,10 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from orthoflow.catalog import did_you_mean
+from orthoflow.files.yaml_positions import Listing, Position, Table, Value, describe_scalar, plain
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.methods import MethodInfo
 from orthoflow.workflow.overrides import Override
-from orthoflow.workflow.positions import Listing, Position, Table, Value, describe_scalar, plain
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.steps import DraftVariant
 

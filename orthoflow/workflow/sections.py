@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.catalog import did_you_mean
+from orthoflow.files.yaml_positions import Entry, Listing, Position, Table, Value, describe, join
 from orthoflow.workflow.expectations import (
     expect_flag,
     expect_named,
@@ -17,7 +18,6 @@ from orthoflow.workflow.expectations import (
     expect_texts,
 )
 from orthoflow.workflow.model import Comparison, Design, WorkflowInputSpec
-from orthoflow.workflow.positions import Entry, Listing, Position, Table, Value, describe, join
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.steps import DraftStep
 

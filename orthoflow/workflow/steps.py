@@ -9,6 +9,16 @@ from typing import Final
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
+from orthoflow.files.yaml_positions import (
+    Entry,
+    Listing,
+    Position,
+    Table,
+    Text,
+    Value,
+    describe,
+    join,
+)
 from orthoflow.sdk.hooks import KindSpec
 from orthoflow.workflow.expectations import (
     NAME,
@@ -19,16 +29,6 @@ from orthoflow.workflow.expectations import (
 )
 from orthoflow.workflow.methods import MethodInfo, describe_method
 from orthoflow.workflow.model import INPUTS, Reference
-from orthoflow.workflow.positions import (
-    Entry,
-    Listing,
-    Position,
-    Table,
-    Text,
-    Value,
-    describe,
-    join,
-)
 from orthoflow.workflow.problems import ProblemLog
 
 _CALL_KEYS: Final = ("use", "params", "repeat", "resources", "timeout")

@@ -10,7 +10,7 @@ import re
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from typing import Final, Protocol, TypeAlias
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -23,7 +23,6 @@ from ruamel.yaml.events import (
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.problems import ProblemLog
 
 MAX_NODES: Final = 10_000
 MAX_DEPTH: Final = 60
@@ -86,6 +85,13 @@ class Table:
 Value: TypeAlias = Text | Listing | Table
 
 
+class Problems(Protocol):
+    """Takes in what is wrong with a document."""
+
+    def add(self, position: Position, path: str, message: str) -> None:
+        """Keep a problem: its place, the keys that lead to it joined by dots, and one sentence."""
+
+
 def plain(value: Value) -> JsonValue:
     """Give a value without positions."""
     if isinstance(value, Text):
@@ -119,7 +125,7 @@ def describe_scalar(value: object) -> str:
     return str(value)
 
 
-def read_yaml(text: str, log: ProblemLog) -> Value | None:
+def read_yaml(text: str, log: Problems) -> Value | None:
     """Read a document; problems go to the log, None when nothing can be read."""
     try:
         return _Converter(log=log).convert(_compose(text), "", 0)
@@ -198,7 +204,7 @@ def _first_line(error: YAMLError) -> str:
 class _Converter:
     """Turns composed nodes into values; aliases are expanded and counted."""
 
-    log: ProblemLog
+    log: Problems
     n_nodes: int = 0
     open_nodes: set[int] = field(default_factory=set)
 
