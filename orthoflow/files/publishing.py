@@ -31,6 +31,7 @@ from orthoflow.files.sidecars import (
     write_text,
 )
 from orthoflow.geometry import WallFrame, omega_phi_deg
+from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.geometry.row_bands import row_bands
 from orthoflow.products import (
     Calibration,
@@ -47,8 +48,6 @@ from orthoflow.products import (
     Walls,
 )
 
-# OpenCV puts (0, 0) at the centre of the first pixel, orthoflow (0.5, 0.5).
-OPENCV_SHIFT_PX: Final = -0.5
 PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
 TIE_COLUMNS: Final = (
     "photo",
@@ -159,7 +158,7 @@ def publish_ties(product: Ties, folder: Path, digest: str) -> None:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(TIE_COLUMNS)
-    pixels = product.pixels_photo + OPENCV_SHIFT_PX
+    pixels = to_opencv(product.pixels_photo)
     for index in range(len(product.photo)):
         table.writerow(
             [
@@ -284,11 +283,7 @@ def _camera_json(camera: Camera) -> JsonValue:
     entry: dict[str, JsonValue] = {"status": camera.status}
     inner = camera.intrinsics
     if inner is not None:
-        entry["K"] = [
-            [inner.fx, 0.0, inner.cx + OPENCV_SHIFT_PX],
-            [0.0, inner.fy, inner.cy + OPENCV_SHIFT_PX],
-            [0.0, 0.0, 1.0],
-        ]
+        entry["K"] = numbers(opencv_matrix(inner))
         entry["distortion"] = list(inner.distortion)
         entry["width"] = inner.width
         entry["height"] = inner.height
