@@ -209,8 +209,10 @@ class _Reader:
         missing = [key for key in _REQUIRED if key not in given]
         if missing:
             self._add(entry.position, f"{path}: {', '.join(missing)} missing")
-        sizes = {key: self._size(given[key], path) for key in _SIZES if key in given}
-        numbers = {
+        sizes: dict[str, int] = {
+            key: self._size(given[key], path) for key in _SIZES if key in given
+        }
+        numbers: dict[str, float] = {
             key: self._number(given[key], f"{path}.{key}", given[key].value)
             for key in (*_FOCALS, *_CENTRES)
             if key in given
