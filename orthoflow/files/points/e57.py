@@ -19,7 +19,7 @@ from orthoflow.files.points.blocks import (
     point_fields,
     short_file_error,
 )
-from orthoflow.files.points.foreign import load_library, reading
+from orthoflow.files.points.libraries import load_library, reading
 
 FORMAT: Final = "E57"
 

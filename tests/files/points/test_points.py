@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, OrthoflowError, PluginError
-from orthoflow.files.points import PointBlock, las_decoding, open_scan
+from orthoflow.files.points import PointBlock, las, open_scan
 from orthoflow.files.points import blocks as blocks_module
 from orthoflow.files.points.columns import Columns, columns_of_text
-from orthoflow.files.points.foreign import guarded, load_library, reading
+from orthoflow.files.points.libraries import guarded, load_library, reading
 from orthoflow.files.points.lzf_kernels import decompress_lzf
 from tests import scan_files
 
@@ -75,8 +75,8 @@ def test_las_blocks_keep_the_order_of_the_file_for_any_number_of_processes(
     # Four chunks of 50 000 points, the last one not full; one to a block.
     many = np.random.default_rng(0).uniform(0, 5, (170_000, 3))
     path = scan_files.write_las(tmp_path / f"a{suffix}", many, withheld=np.arange(170_000) == 9)
-    monkeypatch.setattr(las_decoding, "BLOCK_POINTS", 50_000)
-    monkeypatch.setattr(las_decoding, "_BLOCKS_LEAST", 1)
+    monkeypatch.setattr(las, "BLOCK_POINTS", 50_000)
+    monkeypatch.setattr(las, "_BLOCKS_LEAST", 1)
     blocks = list(open_scan(path, cores=cores).read())
     assert [block.n_read for block in blocks] == [50_000, 50_000, 50_000, 20_000]
     found = np.concatenate([block.points for block in blocks])
@@ -99,8 +99,8 @@ def test_a_decoder_that_fails_ends_in_one_sentence(
 ) -> None:
     many = np.random.default_rng(0).uniform(0, 5, (5000, 3))
     path = scan_files.write_las(tmp_path / "a.laz", many)
-    monkeypatch.setattr(las_decoding, "_BLOCKS_LEAST", 0)
-    monkeypatch.setattr(las_decoding, "_WORKER", tmp_path / "worker.py")
+    monkeypatch.setattr(las, "_BLOCKS_LEAST", 0)
+    monkeypatch.setattr(las, "_WORKER", tmp_path / "worker.py")
     (tmp_path / "worker.py").write_text(worker)
     with pytest.raises(InputError, match=f"a.laz cannot be read as LAS/LAZ: {reason};"):
         list(open_scan(path, cores=2).read())
