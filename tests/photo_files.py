@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.files.images import encode_jpeg, encode_png
 
 ORIENTATION, MAKE, MODEL = 0x0112, 0x010F, 0x0110
-FOCAL, FOCAL_35MM = 0x920A, 0xA405
+FOCAL, FOCAL_35MM, MAKER_NOTE = 0x920A, 0xA405, 0x927C
 WIDTH, HEIGHT = 0xA002, 0xA003
 RESOLUTION_X, RESOLUTION_Y, RESOLUTION_UNIT = 0xA20E, 0xA20F, 0xA210
 

@@ -90,6 +90,7 @@ LIBRARIES: Final = (
     Library(distribution="lazrs", module="lazrs", loss="no compressed LAZ files: read.scan"),
     Library(distribution="pye57", module="pye57", loss="no E57 files: read.scan"),
     Library(distribution="pandas", module="pandas", loss="no text files of points: read.scan"),
+    Library(distribution="pillow", module="PIL", loss="no EXIF data of photos: read.photos, ortho"),
     Library(
         distribution="matplotlib",
         module="matplotlib",

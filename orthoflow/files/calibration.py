@@ -16,24 +16,30 @@ from __future__ import annotations
 import difflib
 import json
 import math
-import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from ruamel.yaml import YAML
-from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.constructor import DuplicateKeyError
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.scalarbool import ScalarBoolean
 
 from orthoflow.errors import GeometryError, InputError
 from orthoflow.files.sidecars import write_text
+from orthoflow.files.yaml_positions import (
+    Dialect,
+    Entry,
+    Listing,
+    Position,
+    Table,
+    Text,
+    Value,
+    describe,
+    plain,
+    read_yaml,
+)
+from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
 
-_OPENCV_SHIFT: Final = 0.5
 _MAX_BYTES: Final = 1_000_000
 _SIZES: Final = ("width", "height")
 _FOCALS: Final = ("fx", "fy")
@@ -41,6 +47,13 @@ _CENTRES: Final = ("cx", "cy")
 _DISTORTION: Final = "distortion"
 _REQUIRED: Final = (*_SIZES, *_FOCALS, *_CENTRES)
 _N_DISTORTION: Final = 5
+_START: Final = Position(line=1, column=1)
+_DIALECT: Final = Dialect(
+    is_strict=False,
+    most_values=200_000,
+    empty="the calibration file is empty",
+    duplicate='found duplicate key "{key}"; remove one of them',
+)
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -78,8 +91,8 @@ def calibration_text(calibration: Calibration) -> str:
             "height": camera.height,
             "fx": camera.fx,
             "fy": camera.fy,
-            "cx": camera.cx - _OPENCV_SHIFT,
-            "cy": camera.cy - _OPENCV_SHIFT,
+            "cx": camera.cx - HALF_PIXEL,
+            "cy": camera.cy - HALF_PIXEL,
             _DISTORTION: list(camera.distortion),
         }
         lines.append(f"  {json.dumps(pattern, ensure_ascii=False)}:")
@@ -150,73 +163,63 @@ class _Reader:
 
     def __init__(self, file_name: str) -> None:
         self.file_name = file_name
-        self.problems: list[tuple[tuple[int, int], str]] = []
+        self.problems: list[tuple[Position, str]] = []
 
     def read(self, text: str) -> Calibration | None:
-        document = self._document(text)
+        document = read_yaml(text, self, _DIALECT)
         if document is None:
             return None
-        if not isinstance(document, CommentedMap) or "cameras" not in document:
-            self._add((0, 0), "expected the key cameras with one entry per photo name or pattern")
+        if isinstance(document, Text) and document.value is None:
+            self._add(_START, _DIALECT.empty)
+            return None
+        section = document.get("cameras") if isinstance(document, Table) else None
+        if not isinstance(document, Table) or section is None:
+            self._add(_START, "expected the key cameras with one entry per photo name or pattern")
             return None
         self._refuse_unknown(document, ("cameras",), "")
-        entries = document["cameras"]
-        if not isinstance(entries, CommentedMap) or not entries:
-            self._add(
-                _place(document, "cameras"),
-                "cameras: expected one entry per photo name or pattern",
-            )
+        if not isinstance(section.value, Table) or not section.value.entries:
+            self._add(section.position, "cameras: expected one entry per photo name or pattern")
             return None
         cameras: dict[str, Intrinsics] = {}
-        for name, entry in entries.items():
-            camera = self._camera(entries, name, entry)
+        for entry in section.value:
+            camera = self._camera(entry)
             if camera is not None:
-                cameras[str(name)] = camera
+                cameras[entry.key] = camera
         return Calibration(patterns=tuple(cameras), intrinsics=tuple(cameras.values()))
 
-    def _document(self, text: str) -> object:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
-                document: object = YAML(typ="rt", pure=True).load(text)
-        except DuplicateKeyError as error:
-            # Its text goes on about switching the check off.
-            words = str(error.problem).split(" with value")[0]
-            self._add(_mark(error), f"{words}; remove one of them")
-        except MarkedYAMLError as error:
-            words = ", ".join(str(part) for part in (error.context, error.problem) if part)
-            self._add(_mark(error), f"this is not YAML: {words}")
-        except (YAMLError, ValueError, RecursionError) as error:
-            self._add((0, 0), f"this is not YAML: {(str(error).splitlines() or ['?'])[0]}")
-        else:
-            if document is None:
-                self._add((0, 0), "the calibration file is empty")
-            return document
-        return None
+    def add(self, position: Position, path: str, message: str) -> None:
+        """Keep a problem of the YAML; places are told by line and column."""
+        del path
+        self._add(position, message)
 
-    def _camera(self, entries: CommentedMap, name: object, entry: object) -> Intrinsics | None:
-        place = _place(entries, name)
-        if not isinstance(name, str):
-            self._add(place, f'cameras: a photo name must be text, got {name}; write "{name}"')
+    def _camera(self, entry: Entry) -> Intrinsics | None:
+        name, values = entry.key, entry.value
+        if not entry.is_text:
+            self._add(
+                entry.position, f'cameras: a photo name must be text, got {name}; write "{name}"'
+            )
             return None
         path = f'cameras."{name}"'
-        if not isinstance(entry, CommentedMap):
-            self._add(place, f"{path}: expected {', '.join(_REQUIRED)} [, {_DISTORTION}]")
+        if not isinstance(values, Table):
+            self._add(entry.position, f"{path}: expected {', '.join(_REQUIRED)} [, {_DISTORTION}]")
             return None
         n_before = len(self.problems)
-        self._refuse_unknown(entry, (*_REQUIRED, _DISTORTION), path + ".")
-        missing = [key for key in _REQUIRED if key not in entry]
+        self._refuse_unknown(values, (*_REQUIRED, _DISTORTION), path + ".")
+        given = {item.key: item for item in values}
+        missing = [key for key in _REQUIRED if key not in given]
         if missing:
-            self._add(place, f"{path}: {', '.join(missing)} missing")
-        sizes = {key: self._size(entry, key, path) for key in _SIZES if key in entry}
-        numbers = {
-            key: self._number(entry, key, f"{path}.{key}", entry[key])
-            for key in (*_FOCALS, *_CENTRES)
-            if key in entry
+            self._add(entry.position, f"{path}: {', '.join(missing)} missing")
+        sizes: dict[str, int] = {
+            key: self._size(given[key], path) for key in _SIZES if key in given
         }
-        distortion = self._distortion(entry, path)
+        numbers: dict[str, float] = {
+            key: self._number(given[key], f"{path}.{key}", given[key].value)
+            for key in (*_FOCALS, *_CENTRES)
+            if key in given
+        }
+        distortion = self._distortion(given.get(_DISTORTION), path)
         if len(self.problems) == n_before:
-            self._check_pixels(entry, path, sizes, numbers)
+            self._check_pixels(given, path, sizes, numbers)
         if len(self.problems) > n_before:
             return None
         camera = Intrinsics(
@@ -224,56 +227,61 @@ class _Reader:
             height=sizes["height"],
             fx=numbers["fx"],
             fy=numbers["fy"],
-            cx=numbers["cx"] + _OPENCV_SHIFT,
-            cy=numbers["cy"] + _OPENCV_SHIFT,
+            cx=numbers["cx"] + HALF_PIXEL,
+            cy=numbers["cy"] + HALF_PIXEL,
             distortion=distortion,
         )
         if _folds(camera):
             self._add(
-                _place(entry, _DISTORTION),
+                given[_DISTORTION].position,
                 f"{path}.{_DISTORTION}: the lens model folds back inside the image, so that two "
                 "directions share a pixel; expected k1, k2, p1, p2, k3 of a calibration that "
                 "covers the whole image",
             )
         return camera
 
-    def _size(self, entry: CommentedMap, key: str, path: str) -> int:
-        value = entry[key]
-        if isinstance(value, bool | ScalarBoolean) or not isinstance(value, int) or value < 1:
+    def _size(self, entry: Entry, path: str) -> int:
+        value = plain(entry.value)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             self._add(
-                _place(entry, key), f"{path}.{key}: expected a whole number of pixels, got {value}"
+                entry.position,
+                f"{path}.{entry.key}: expected a whole number of pixels, got {value}",
             )
             return 0
-        return int(value)
+        return value
 
-    def _number(self, parent: CommentedMap, key: str, path: str, value: object) -> float:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool | ScalarBoolean)
-        if not is_number or not math.isfinite(float(str(value))):
-            self._add(_place(parent, key), f"{path}: expected a number, got {_shown(value)}")
+    def _number(self, entry: Entry, path: str, value: Value) -> float:
+        given = value.value if isinstance(value, Text) else None
+        is_number = isinstance(given, int | float) and not isinstance(given, bool)
+        # Through text: whole numbers may be larger than a float can be.
+        number = float(str(given)) if is_number else math.nan
+        if not math.isfinite(number):
+            got = describe(value) if isinstance(value, Text) else "a list or mapping"
+            self._add(entry.position, f"{path}: expected a number, got {got}")
             return 0.0
-        return float(str(value))
+        return number
 
-    def _distortion(self, entry: CommentedMap, path: str) -> tuple[float, ...]:
+    def _distortion(self, entry: Entry | None, path: str) -> tuple[float, ...]:
         path = f"{path}.{_DISTORTION}"
-        if _DISTORTION not in entry:
+        if entry is None:
             return (0.0,) * _N_DISTORTION
-        values = entry[_DISTORTION]
-        if not isinstance(values, CommentedSeq) or len(values) != _N_DISTORTION:
-            got = f"{len(values)} values" if isinstance(values, CommentedSeq) else _shown(values)
+        values = entry.value
+        if not isinstance(values, Listing) or len(values.items) != _N_DISTORTION:
+            got = f"{len(values.items)} values" if isinstance(values, Listing) else describe(values)
             self._add(
-                _place(entry, _DISTORTION),
+                entry.position,
                 f"{path}: expected the five numbers [k1, k2, p1, p2, k3], got {got}; fill up with "
                 "0, other lens models are not read",
             )
             return ()
         return tuple(
-            self._number(entry, _DISTORTION, f"{path}[{index}]", value)
-            for index, value in enumerate(values)
+            self._number(entry, f"{path}[{index}]", value)
+            for index, value in enumerate(values.items)
         )
 
     def _check_pixels(
         self,
-        entry: CommentedMap,
+        given: Mapping[str, Entry],
         path: str,
         sizes: Mapping[str, int],
         numbers: Mapping[str, float],
@@ -283,55 +291,30 @@ class _Reader:
         for key in _FOCALS:
             if key in numbers and not numbers[key] >= 0.1 * longest:
                 self._add(
-                    _place(entry, key),
+                    given[key].position,
                     f"{path}.{key}: expected the focal length in pixels, at least a tenth of the "
                     f"image's {longest}, got {numbers[key]:g}",
                 )
         for key, side in zip(_CENTRES, _SIZES, strict=True):
             if not -sizes[side] <= numbers[key] <= 2 * sizes[side]:
                 self._add(
-                    _place(entry, key),
+                    given[key].position,
                     f"{path}.{key}: expected the principal point in pixels, in or near the "
                     f"image's {sizes[side]}, got {numbers[key]:g}",
                 )
 
-    def _refuse_unknown(self, table: CommentedMap, known: Iterable[str], path: str) -> None:
-        for key in table:
-            if key not in known:
-                near = difflib.get_close_matches(str(key), list(known), n=1)
+    def _refuse_unknown(self, table: Table, known: Collection[str], path: str) -> None:
+        for entry in table:
+            if entry.key not in known:
+                near = difflib.get_close_matches(entry.key, known, n=1)
                 hint = f" (did you mean {near[0]}?)" if near else ""
                 self._add(
-                    _place(table, key),
-                    f"{path}{key}: unknown key{hint}; expected {', '.join(known)}",
+                    entry.position,
+                    f"{path}{entry.key}: unknown key{hint}; expected {', '.join(known)}",
                 )
 
-    def _add(self, place: tuple[int, int], message: str) -> None:
-        line, column = place
-        self.problems.append((place, f"{self.file_name}:{line + 1}:{column + 1}: {message}"))
-
-
-def _place(table: CommentedMap, key: object) -> tuple[int, int]:
-    """Line and column of a key, counted from 0; of its table for keys merged in from another."""
-    data: Mapping[object, list[int]] = table.lc.data or {}
-    line, column = data[key][:2] if key in data else (table.lc.line or 0, table.lc.col or 0)
-    return int(line), int(column)
-
-
-def _mark(error: MarkedYAMLError) -> tuple[int, int]:
-    mark = error.problem_mark
-    return (0, 0) if mark is None else (int(mark.line), int(mark.column))
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, str):
-        return f'the text "{value}"'
-    return (
-        "nothing"
-        if value is None
-        else "a list or mapping"
-        if isinstance(value, CommentedMap | CommentedSeq)
-        else str(value)
-    )
+    def _add(self, place: Position, message: str) -> None:
+        self.problems.append((place, f"{self.file_name}:{place.line}:{place.column}: {message}"))
 
 
 def _folds(camera: Intrinsics) -> bool:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
+
+from orthoflow.files.tiff_tags import read_directory
 
 ImageFormat = Literal["JPEG", "PNG", "TIFF"]
 
@@ -93,7 +94,7 @@ def icc_profile(encoded: bytes) -> bytes | None:
     """
     match image_format(encoded):
         case "TIFF":
-            return _tiff_profile(encoded)
+            return read_directory(encoded, most_bytes=len(encoded)).content(_ICC_TAG)
         case "PNG":
             for segment in _png_chunks(encoded):
                 if segment.kind == b"iCCP":
@@ -110,24 +111,6 @@ def icc_profile(encoded: bytes) -> bytes | None:
                     parts[number] = content[14:]
             if parts and sorted(parts) == list(range(1, count + 1)):
                 return b"".join(parts[number] for number in sorted(parts))
-    return None
-
-
-def _tiff_profile(encoded: bytes) -> bytes | None:
-    """Profile that the first directory of a TIFF file points to."""
-    order = ">" if encoded.startswith(b"MM") else "<"
-    try:
-        (first,) = struct.unpack_from(order + "I", encoded, 4)
-        (count,) = struct.unpack_from(order + "H", encoded, first)
-        for index in range(count):
-            tag, _, size, place = struct.unpack_from(
-                order + "HHII", encoded, first + 2 + 12 * index
-            )
-            if tag == _ICC_TAG:
-                profile = encoded[place : place + size]
-                return profile if len(profile) == size > 0 else None
-    except struct.error:
-        return None
     return None
 
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from orthoflow.files.containers import exif_block, image_format
+from orthoflow.files.tiff_tags import Directory, read_directory
 
 # Diagonal of 36 x 24 mm. CIPA DCG-001 defines the 35 mm equivalent by equal angle over the
 # diagonal, and the cameras we could check keep to it: a Redmi Note 9S (4.74 mm, sensor diagonal
@@ -31,23 +33,11 @@ _RESOLUTION_Y: Final = 0xA20F
 _RESOLUTION_UNIT: Final = 0xA210
 _FOCAL_LENGTH_35MM: Final = 0xA405
 
+_SHORT: Final = 3
+# More than what cameras write beside the picture, notes of makers included.
+_MOST_BYTES: Final = 1 << 20
 _UNIT_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH: Final = 2
-_TYPES: Final = {
-    1: "B",
-    3: "H",
-    4: "I",
-    5: "II",
-    6: "b",
-    8: "h",
-    9: "i",
-    10: "ii",
-    11: "f",
-    12: "d",
-}
-_TEXT: Final = 2
-_MAX_ENTRIES: Final = 1000
-_MAX_TEXT: Final = 200
 # Longest side of sensors, from the smallest phone to large format scanning backs.
 _SENSOR_MM: Final = (1.5, 130.0)
 _CROPPED: Final = 0.02
@@ -106,20 +96,21 @@ def read_exif(encoded: bytes) -> Exif:
     block = exif_block(encoded)
     if block is None:
         return Exif()
-    directories = _Directories(block)
-    main = directories.read(directories.first_offset())
-    inner = directories.read(main.number(_EXIF_DIRECTORY))
-    orientation = int(main.positive(_ORIENTATION) or 1)
+    main = read_directory(block, most_bytes=_MOST_BYTES)
+    start = main.number(_EXIF_DIRECTORY)
+    inner = (
+        Directory() if start is None else read_directory(block, int(start), most_bytes=_MOST_BYTES)
+    )
     return Exif(
-        orientation=orientation if orientation <= 8 else 1,
+        orientation=_orientation(main),
         make=main.text(_MAKE),
         model=main.text(_MODEL),
-        focal_mm=inner.positive(_FOCAL_LENGTH),
-        focal_35mm=inner.positive(_FOCAL_LENGTH_35MM),
+        focal_mm=inner.number(_FOCAL_LENGTH),
+        focal_35mm=inner.number(_FOCAL_LENGTH_35MM),
         resolution_px_per_mm=_resolution(inner),
-        width=_whole(inner.positive(_WIDTH)),
-        height=_whole(inner.positive(_HEIGHT)),
-        is_damaged=directories.is_damaged,
+        width=_whole(inner.number(_WIDTH)),
+        height=_whole(inner.number(_HEIGHT)),
+        is_damaged=main.is_damaged or inner.is_damaged,
     )
 
 
@@ -168,13 +159,18 @@ def without_orientation(encoded: bytes) -> bytes:
     """
     if image_format(encoded) != "TIFF":
         return encoded
-    directories = _Directories(encoded)
-    main = directories.read(directories.first_offset())
-    if main.number(_ORIENTATION) in (None, 1):
+    main = read_directory(encoded, most_bytes=_MOST_BYTES)
+    orientation = _orientation(main)
+    if orientation == 1:
         return encoded
-    place = main.places[_ORIENTATION]
-    one = struct.pack(directories.order + "H", 1)
-    return encoded[:place] + one + encoded[place + 2 :]
+    entry = partial(struct.pack, f"{main.order}HHIH", _ORIENTATION, _SHORT, 1)
+    before, directory = encoded[: main.start], encoded[main.start :]
+    return before + directory.replace(entry(orientation), entry(1), 1)
+
+
+def _orientation(main: Directory) -> int:
+    orientation = main.number(_ORIENTATION) or 1.0
+    return int(orientation) if 1.0 <= orientation < 9.0 else 1
 
 
 def _is_cropped(exif: Exif, width: int, height: int) -> bool:
@@ -204,92 +200,11 @@ def _whole(value: float | None) -> int | None:
     return None if value is None else int(value)
 
 
-def _resolution(directory: _Directory) -> float | None:
+def _resolution(directory: Directory) -> float | None:
     """Pixels per millimetre, the mean of both axes where both are said."""
-    unit_mm = _UNIT_MM.get(int(directory.positive(_RESOLUTION_UNIT) or _INCH))
-    said = [directory.positive(tag) for tag in (_RESOLUTION_X, _RESOLUTION_Y)]
+    unit_mm = _UNIT_MM.get(int(directory.number(_RESOLUTION_UNIT) or _INCH))
+    said = [directory.number(tag) for tag in (_RESOLUTION_X, _RESOLUTION_Y)]
     known = [value for value in said if value is not None]
     if unit_mm is None or not known:
         return None
     return math.fsum(known) / len(known) / unit_mm
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Directory:
-    """Tags of one directory: first value of each, and where it lies in the block."""
-
-    values: dict[int, float | str]
-    places: dict[int, int]
-
-    def number(self, tag: int) -> float | None:
-        value = self.values.get(tag)
-        return None if isinstance(value, str) else value
-
-    def positive(self, tag: int) -> float | None:
-        value = self.number(tag)
-        return value if value is not None and 0.0 < value < math.inf else None
-
-    def text(self, tag: int) -> str:
-        value = self.values.get(tag)
-        return value if isinstance(value, str) else ""
-
-
-class _Directories:
-    """Reads directories of a TIFF structure; what lies outside the block counts as damage."""
-
-    def __init__(self, block: bytes) -> None:
-        self.block = block
-        self.order = ">" if block[:2] == b"MM" else "<"
-        self.is_damaged = False
-
-    def first_offset(self) -> float | None:
-        if self.block[:2] not in (b"II", b"MM"):
-            self.is_damaged = True
-            return None
-        return self._unpack("I", 4)
-
-    def read(self, offset: float | None) -> _Directory:
-        directory = _Directory(values={}, places={})
-        count = None if offset is None else self._unpack("H", int(offset))
-        if offset is None or count is None:
-            return directory
-        if count > _MAX_ENTRIES:
-            self.is_damaged = True
-            return directory
-        for index in range(int(count)):
-            self._read_entry(int(offset) + 2 + 12 * index, directory)
-        return directory
-
-    def _read_entry(self, offset: int, directory: _Directory) -> None:
-        header = self._slice(offset, 12)
-        if header is None:
-            return
-        tag, kind, count = struct.unpack(self.order + "HHI", header[:8])
-        layout = f"{count}s" if kind == _TEXT else _TYPES.get(kind)
-        if layout is None or count == 0 or (kind == _TEXT and count > _MAX_TEXT):
-            return
-        size = struct.calcsize("=" + layout) * (1 if kind == _TEXT else count)
-        place = offset + 8 if size <= 4 else int(struct.unpack(self.order + "I", header[8:])[0])
-        value = self._text(place, count) if kind == _TEXT else self._unpack(layout, place)
-        if value is not None:
-            directory.values[tag] = value
-            directory.places[tag] = place
-
-    def _text(self, place: int, count: int) -> str | None:
-        raw = self._slice(place, count)
-        return None if raw is None else raw.split(b"\0")[0].decode("ascii", "replace").strip()
-
-    def _unpack(self, layout: str, place: int) -> float | None:
-        raw = self._slice(place, struct.calcsize("=" + layout))
-        if raw is None:
-            return None
-        numbers = struct.unpack(self.order + layout, raw)
-        if len(numbers) == 1:
-            return float(numbers[0])
-        return float(numbers[0] / numbers[1]) if numbers[1] else None
-
-    def _slice(self, start: int, length: int) -> bytes | None:
-        if start < 0 or start + length > len(self.block):
-            self.is_damaged = True
-            return None
-        return self.block[start : start + length]

@@ -15,10 +15,10 @@ from orthoflow_provenance.model import RecordedFile, RecordedInput
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import FileDigests
+from orthoflow.files.yaml_positions import Table, read_yaml
 from orthoflow.records.runs import Run, record_errors
 from orthoflow.workflow import Workflow, WorkflowInputSpec, resolve_input_files
 from orthoflow.workflow.inputs import override_inputs, read_input_options, read_inputs
-from orthoflow.workflow.positions import Table, read_yaml
 from orthoflow.workflow.problems import ProblemLog
 
 # A run lies in runs/<name>/ below the folder of its workflow, when nobody says otherwise.

@@ -9,6 +9,7 @@ from typing import Final, TypeAlias
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import WorkflowError
+from orthoflow.files.yaml_positions import Position, Table, Value, join
 from orthoflow.workflow.format import (
     BASELINE,
     COMPARE,
@@ -19,7 +20,6 @@ from orthoflow.workflow.format import (
     Comparison,
     Workflow,
 )
-from orthoflow.workflow.positions import Position, Table, Value, join
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import TEXT
 from orthoflow.workflow.steps import DraftStep

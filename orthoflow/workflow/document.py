@@ -9,6 +9,7 @@ from typing import Final
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import WorkflowError
+from orthoflow.files.yaml_positions import Entry, Table, read_yaml
 from orthoflow.workflow.comparison import check_baseline, read_compare
 from orthoflow.workflow.format import (
     COMPARE,
@@ -24,7 +25,6 @@ from orthoflow.workflow.format import (
 )
 from orthoflow.workflow.inputs import override_inputs, read_input_options, read_inputs
 from orthoflow.workflow.parameters import CallName, assign_overrides, resolve_params
-from orthoflow.workflow.positions import Entry, Table, read_yaml
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.recipes import find_workflow
 from orthoflow.workflow.shapes import check_name

@@ -9,9 +9,9 @@ from pathlib import Path
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import InputError
+from orthoflow.files.yaml_positions import Value, join
 from orthoflow.products.input_files import InputFiles
 from orthoflow.workflow.format import FILES, INPUT, INPUTS, OPTIONAL, Workflow, WorkflowInputSpec
-from orthoflow.workflow.positions import Value, join
 from orthoflow.workflow.problems import ProblemLog
 
 

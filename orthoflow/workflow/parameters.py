@@ -11,9 +11,7 @@ from pydantic_core import ErrorDetails
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import ArgumentError
-from orthoflow.products.product import JsonValue
-from orthoflow.workflow.methods import MethodInfo
-from orthoflow.workflow.positions import (
+from orthoflow.files.yaml_positions import (
     Listing,
     Position,
     Table,
@@ -22,6 +20,8 @@ from orthoflow.workflow.positions import (
     plain,
     read_yaml,
 )
+from orthoflow.products.product import JsonValue
+from orthoflow.workflow.methods import MethodInfo
 from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
 from orthoflow.workflow.steps import DraftStep, DraftVariant
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NoReturn
 from orthoflow.errors import ArgumentError, PluginError, WorkflowError
 
 if TYPE_CHECKING:
-    from orthoflow.workflow.positions import Position
+    from orthoflow.files.yaml_positions import Position
 
 
 _SNIPPET_WIDTH: Final = 120

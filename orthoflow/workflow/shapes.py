@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from orthoflow.catalog import NAME_PATTERN, did_you_mean
-from orthoflow.products.product import JsonValue
-from orthoflow.workflow.positions import (
+from orthoflow.files.yaml_positions import (
     Entry,
     Listing,
     Position,
@@ -25,6 +24,7 @@ from orthoflow.workflow.positions import (
     describe,
     join,
 )
+from orthoflow.products.product import JsonValue
 from orthoflow.workflow.problems import ProblemLog
 
 INPUTS_NAME: Final = "inputs"

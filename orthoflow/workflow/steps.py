@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
+from orthoflow.files.yaml_positions import Entry, Position, Table, Value, join
 from orthoflow.sdk.hooks import KindSpec
 from orthoflow.workflow.format import (
     CALL,
@@ -23,7 +24,6 @@ from orthoflow.workflow.format import (
     StepVariant,
 )
 from orthoflow.workflow.methods import MethodInfo, describe_method
-from orthoflow.workflow.positions import Entry, Position, Table, Value, join
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import PlacedPort, PlacedReference
 

@@ -9,8 +9,8 @@ import networkx as nx
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.catalog.loading import FILES
+from orthoflow.files.yaml_positions import join
 from orthoflow.workflow.format import WorkflowStep
-from orthoflow.workflow.positions import join
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import INPUTS_NAME, PlacedPort, PlacedReference
 from orthoflow.workflow.steps import DraftStep

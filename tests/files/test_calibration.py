@@ -96,6 +96,110 @@ def test_values_may_be_shared_between_cameras(tmp_path: Path) -> None:
     assert [item.fy for item in calibration.intrinsics] == [3001.5] * 3
 
 
+def test_shared_values_stand_behind_own_ones_and_only_without_quotes(tmp_path: Path) -> None:
+    good = "{" + GOOD + "}"
+    shared = f"[{{a.jpg: {good}, b*: {good}}}, {{a.jpg: 5, c*: {good}}}]"
+    own = good.replace("fx: 3000", "fx: 2900")
+    text = f"cameras:\n  <<: {shared}\n  b*: {own}\n"
+    calibration = read(tmp_path, text)
+    assert calibration.patterns == ("b*", "a.jpg", "c*")
+    assert [item.fx for item in calibration.intrinsics] == [2900.0, 3000.0, 3000.0]
+    quoted = 'cameras:\n  a.jpg: {"<<": {fx: 3}, ' + GOOD + "}"
+
+    assert '2:11: cameras."a.jpg".<<: unknown key' in refusal(tmp_path, quoted)
+    number = "cameras:\n  a.jpg: {<<: 5, " + GOOD + "}"
+    assert "2:11: expected a mapping or a list of mappings to merge, got 5" in refusal(
+        tmp_path, number
+    )
+
+
+NUMBERS = {
+    "width": 4000.0,
+    "height": 3000.0,
+    "fx": 3001.0,
+    "fy": 3002.0,
+    "cx": 1999.0,
+    "cy": 1498.0,
+    "k1": -0.031,
+    "k2": 0.0113,
+    "p1": 0.00017,
+    "p2": -0.00029,
+    "k3": 0.0037,
+}
+
+
+@pytest.mark.parametrize("moved", list(NUMBERS))
+def test_each_number_arrives_in_its_own_place(tmp_path: Path, moved: str) -> None:
+    values = NUMBERS | {moved: NUMBERS[moved] + (16.0 if abs(NUMBERS[moved]) > 1.0 else 2.0**-14)}
+    given = {key: f"{value:.0f}" if value > 1.0 else repr(value) for key, value in values.items()}
+    lens = ", ".join(given.pop(key) for key in ("k1", "k2", "p1", "p2", "k3"))
+    entry = ", ".join(f"{key}: {value}" for key, value in given.items())
+    (camera,) = read(tmp_path, f"cameras: {{a.jpg: {{{entry}, distortion: [{lens}]}}}}").intrinsics
+    k1, k2, p1, p2, k3 = camera.distortion
+    assert values == {
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        # OpenCV's first pixel centre is at 0, ours at 0.5.
+        "cx": camera.cx - 0.5,
+        "cy": camera.cy - 0.5,
+        "k1": k1,
+        "k2": k2,
+        "p1": p1,
+        "p2": p2,
+        "k3": k3,
+    }
+
+
+def folds(radii: np.ndarray, k1: float, k2: float, k3: float) -> bool:
+    """Whether the distorted radius ever shrinks on the way to the corner, by plain differences."""
+    squares = radii**2
+    bent = radii * (1.0 + squares * (k1 + squares * (k2 + squares * k3)))
+    return bool((np.diff(bent) <= 0.0).any())
+
+
+@pytest.mark.parametrize("place", [0, 1, 4], ids=["k1", "k2", "k3"])
+def test_a_lens_is_refused_just_where_its_radius_turns_back(tmp_path: Path, place: int) -> None:
+    # Of a single coefficient k of r^(2n) the radius grows as 1 + (2n + 1) k r^(2n): it turns back
+    # at (1 + 2n) k r^(2n) = -1. The corner of this image lies at the bent radius 0.5.
+    order = {0: 1, 1: 2, 4: 3}[place]
+    entry = "width: 800, height: 600, fx: 1000, fy: 1000, cx: 399.5, cy: 299.5"
+    radius = 0.5 * (2 * order + 1) / (2 * order)  # bent by 2n / (2n + 1) where it turns back
+    limit = -1.0 / ((2 * order + 1) * radius ** (2 * order))
+    for share, is_refused in ((0.97, False), (1.03, True)):
+        lens = [0.0] * 5
+        lens[place] = share * limit
+        radii = np.linspace(0.0, radius, 2000)
+        assert folds(radii, lens[0], lens[1], lens[4]) is is_refused
+        text = f"cameras: {{a.jpg: {{{entry}, distortion: {lens}}}}}"
+        if is_refused:
+            assert "the lens model folds back inside the image" in refusal(tmp_path, text)
+        else:
+            assert read(tmp_path, text).intrinsics[0].distortion == tuple(lens)
+
+
+@pytest.mark.parametrize(("dip", "is_refused"), [(-0.1, True), (0.05, False)])
+def test_a_lens_that_folds_and_unfolds_again_is_refused(
+    tmp_path: Path, dip: float, is_refused: bool
+) -> None:
+    # With u = r^2 / 0.09 the radius grows as (1 - u)^2 (1 + u) = 1 - u - u^2 + u^3, which touches
+    # zero at u = 1, raised there by `dip`; the ends of the image lie near u = 2, where it
+    # grows. A flat image: few of its pixels are looked at, and all of them have a ray.
+    k1, k2, k3 = -(1.0 - dip) / (3 * 0.09), -1.0 / (5 * 0.09**2), 1.0 / (7 * 0.09**3)
+    entry = "width: 500, height: 4, fx: 1000, fy: 1000, cx: 249.5, cy: 1.5"
+    text = f"cameras: {{a.jpg: {{{entry}, distortion: [{k1}, {k2}, 0, 0, {k3}]}}}}"
+    if is_refused:
+        assert "the lens model folds back inside the image" in refusal(tmp_path, text)
+    else:
+        assert read(tmp_path, text).intrinsics[0].distortion == (k1, k2, 0.0, 0.0, k3)
+
+
+def test_a_calibration_may_hold_more_values_than_a_workflow(tmp_path: Path) -> None:
+    text = "cameras:\n  p0: &c {" + GOOD + "}\n" + "".join(f"  p{k}: *c\n" for k in range(1, 700))
+    assert read(tmp_path, text).patterns == tuple(f"p{k}" for k in range(700))
+
+
 @pytest.mark.parametrize(
     ("name", "pattern"),
     [
@@ -213,5 +317,5 @@ def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"gone\.yaml cannot be read: No such file"):
         read_calibration(tmp_path / "gone.yaml")
     path.write_text("[" * 1200)
-    with pytest.raises(InputError, match="this is not YAML"):
+    with pytest.raises(InputError, match="1:61: the document is nested deeper than 60 levels"):
         read_calibration(path)

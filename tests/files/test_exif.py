@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import struct
+import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthoflow.files.containers import image_format, is_cut_off
+from orthoflow.files.containers import icc_profile, image_format, is_cut_off
 from orthoflow.files.exif import Exif, focal_length, read_exif, without_orientation
 from orthoflow.files.images import decode_image, encode_jpeg, encode_png
 from tests import photo_files as made
@@ -90,6 +94,79 @@ def test_a_damaged_block_gives_what_is_left_of_it() -> None:
     assert (exif.orientation, exif.model) == (6, "NIKON D3X")
 
 
+def test_notes_of_the_maker_that_lie_outside_the_block_hide_nothing_else() -> None:
+    block = made.exif_block(MAIN, INNER | {made.MAKER_NOTE: "notes of the maker"})
+    at = block.index(b"notes of the maker")
+    entry = struct.pack("<HHII", made.MAKER_NOTE, 2, 19, at)
+    moved = block.replace(entry, struct.pack("<HHII", made.MAKER_NOTE, 7, 19, len(block) + 5))
+    exif = read_exif(made.jpeg(made.picture(), moved))
+    assert exif.is_damaged
+    whole = read_exif(made.jpeg(made.picture(), made.exif_block(MAIN, INNER)))
+    assert dataclasses.replace(exif, is_damaged=False) == whole
+
+
+def test_a_tag_of_one_byte_is_a_number_and_one_of_no_type_is_none() -> None:
+    block = made.exif_block(MAIN, INNER)
+    entry = struct.pack("<HHI", made.ORIENTATION, 3, 1)
+    for kind, orientation in ((1, 6), (4, 6), (7, 1), (99, 1)):
+        changed = block.replace(entry, struct.pack("<HHI", made.ORIENTATION, kind, 1))
+        assert read_exif(made.jpeg(made.picture(), changed)).orientation == orientation
+
+
+@pytest.mark.parametrize(
+    ("tag", "kind", "unit"),
+    [(made.ORIENTATION, 5, 8), (made.ORIENTATION, 3, 2), (made.MAKE, 2, 1), (0x8773, 5, 8)],
+    ids=["rationals", "shorts", "text", "profile"],
+)
+def test_a_tag_as_large_as_its_file_is_not_taken_apart(tag: int, kind: int, unit: int) -> None:
+    # Pillow would make objects of them for a minute.
+    count = 20_000_000 // unit
+    head = b"II*\0" + struct.pack("<IHHHIII", 8, 1, tag, kind, count, 26, 0)
+    started = time.process_time()
+    assert read_exif(head + b"\1" * (count * unit)) == Exif()
+    assert icc_profile(head + b"\1" * (count * unit)) is None
+    assert time.process_time() - started < 3.0
+
+
+def test_tags_that_share_the_bytes_of_a_file_take_no_more_memory_than_it() -> None:
+    entries = b"".join(struct.pack("<HHII", tag, 7, 5_000_000, 8) for tag in range(1, 1000))
+    file = b"II*\0" + struct.pack("<IH", 8, 999) + entries + bytes(4)
+    tracemalloc.start()
+    read_exif(file.ljust(5_000_100, b"\1"))
+    icc_profile(file.ljust(5_000_100, b"\1"))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 30_000_000
+
+
+def test_a_large_tiff_keeps_its_exif_behind_its_pixels_and_its_other_tags() -> None:
+    # As image editors write them: megabytes of history and layers among the tags.
+    block = made.exif_block(MAIN | {0x2BC: "h" * 1_500_000, 0x935C: "l" * 1_500_000}, INNER)
+    start = struct.pack("<I", 8)
+    moved = b"II*\0" + struct.pack("<I", 2_000_008) + b"\x06" * 2_000_000
+    assert block[4:8] == start
+    exif = read_exif(moved + shifted(block[8:], 2_000_000))
+    assert exif == read_exif(made.jpeg(made.picture(), made.exif_block(MAIN, INNER)))
+
+
+def shifted(directories: bytes, by: int) -> bytes:
+    """Directories of `made.exif_block` whose places are so many bytes further on."""
+    changed = bytearray(directories)
+    start = 0
+    for _ in range(2):
+        (count,) = struct.unpack_from("<H", changed, start)
+        inner = 0
+        for entry in range(start + 2, start + 2 + 12 * count, 12):
+            tag, kind, n_values, place = struct.unpack_from("<HHII", changed, entry)
+            if tag == 0x8769:
+                inner = place - 8
+            if tag == 0x8769 or (kind == 2 and n_values > 4) or kind == 5:
+                struct.pack_into("<I", changed, entry + 8, place + by)
+        start = inner
+    return bytes(changed)
+
+
+@settings(deadline=None)  # the first example loads Pillow
 @given(st.binary(max_size=200), st.integers(0, 200))
 def test_no_block_of_any_content_raises(noise: bytes, at: int) -> None:
     block = made.exif_block(MAIN, INNER)

@@ -10,8 +10,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.files.yaml_positions import read_yaml
 from orthoflow.workflow import InvalidWorkflowError, load_workflow, workflow_schema
-from orthoflow.workflow.positions import read_yaml
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import Key
 from tests import workflow_format

@@ -7,7 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthoflow.errors import InputError
+from orthoflow.files.points.blocks import PointBlock
 
 IGNORED: Final = "_"
 NAMES: Final = ("x", "y", "z", "r", "g", "b", "intensity", "row", "column")
@@ -122,6 +126,23 @@ def columns_of_count(
     raise InputError(
         f"{file_name} has {count} columns and no header that names them: say what they are with "
         "the parameter columns, e.g. columns: 'x y z r g b intensity', with _ for one to skip"
+    )
+
+
+def point_block(table: NDArray[np.float64], columns: Columns) -> PointBlock:
+    """Sort the columns of a table, which are `columns.used`, into a block of points."""
+    intensity = columns.index_of(["intensity"])
+    colours = columns.index_of(["r", "g", "b"])
+    grid = columns.index_of(["row", "column"])
+    rows = np.nan_to_num(table[:, grid]).astype(np.int64) if grid else None
+    return PointBlock(
+        points=table[:, :3],
+        scan=0,
+        n_read=len(table),
+        intensity=table[:, intensity[0]].astype(np.float32) if intensity else None,
+        rgb=table[:, colours] if colours else None,
+        row=None if rows is None else rows[:, 0],
+        column=None if rows is None else rows[:, 1],
     )
 
 

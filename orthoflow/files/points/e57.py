@@ -19,7 +19,7 @@ from orthoflow.files.points.blocks import (
     point_fields,
     short_file_error,
 )
-from orthoflow.files.points.foreign import load_library, reading
+from orthoflow.files.points.libraries import load_library, reading
 
 FORMAT: Final = "E57"
 
@@ -136,17 +136,15 @@ def _pose(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _rotation(quaternion: list[float]) -> NDArray[np.float64]:
-    length = math.sqrt(sum(item * item for item in quaternion))
+    """World-from-scan of a quaternion w, x, y, z of any length; the identity for one without."""
+    from scipy.spatial.transform import Rotation
+
+    length = math.hypot(*quaternion)
     if not (math.isfinite(length) and length > 0.0):
         return np.eye(3)
-    w, x, y, z = (item / length for item in quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    # Of length 1 before scipy squares it: squares of what files hold may be too large or too small.
+    unit = [item / length for item in quaternion]
+    return np.asarray(Rotation.from_quat(unit, scalar_first=True).as_matrix(), dtype=np.float64)
 
 
 def _value(node: Any) -> float:

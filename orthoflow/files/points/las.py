@@ -1,8 +1,27 @@
-"""LAS, LAZ and COPC through laspy, chunk by chunk."""
+"""LAS, LAZ and COPC through laspy, block by block.
+
+Header and chunk table are checked before the libraries believe them: a damaged count of records
+keeps laspy busy for hours, and a damaged chunk table makes the decompressor ask for any amount of
+memory, which ends the process without a word that Python could catch.
+
+The decompressor keeps Python's lock while it decodes, so that in one process nothing else gets on
+meanwhile. Of a large file other processes decode blocks of whole chunks, in turns, into memory that
+they share with this one, which converts and stores a block while the next ones are decoded.
+
+Of point formats 6 and up, whose fields are compressed apart, only the fields are decoded that make
+a cloud.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import mmap
+import os
+import struct
+import subprocess
+import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,20 +29,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import PointBlock, ScanFile, point_fields, short_file_error
-from orthoflow.files.points.foreign import guarded, load_library, reading
-from orthoflow.files.points.las_decoding import records
-from orthoflow.files.points.las_headers import check_chunks, check_header
+from orthoflow.files.points.blocks import (
+    BLOCK_POINTS,
+    PointBlock,
+    ScanFile,
+    point_fields,
+    short_file_error,
+)
+from orthoflow.files.points.libraries import guarded, load_library, reading
 
 FORMAT: Final = "LAS/LAZ"
 _FARTHEST: Final = 1e12
 _PART_POINTS: Final = 1 << 15
+_HEADER_BYTES: Final = 375
+_VLR_BYTES: Final = 54
+_EVLR_BYTES: Final = 60
+_OFFSET_BYTES: Final = 8
+_CHUNKED: Final = (2, 3)
+_MOST_FIXED_CHUNK: Final = 50_000_000
+_WORKER: Final = Path(__file__).with_name("las_worker.py")
+# Blocks that a process may be ahead.
+_SLOTS: Final = 2
+# Files with fewer blocks are read before other processes would be up.
+_BLOCKS_LEAST: Final = 8
+# Chunks much larger than a block would be decoded again for each block that begins within.
+_LARGEST_CHUNK: Final = 2 * BLOCK_POINTS
+_PROCESSES_MOST: Final = 16
 
 
 def open_las(path: Path, *, cores: int = 1) -> ScanFile:
     """Open a LAS, LAZ or COPC file; so many processes may decode its points."""
     laspy = load_library("laspy", path)
-    check_header(path)
+    _check_header(path)
     with reading(path, FORMAT), laspy.open(path) as reader:
         header = reader.header
         names = set(header.point_format.dimension_names)
@@ -35,7 +72,7 @@ def open_las(path: Path, *, cores: int = 1) -> ScanFile:
             "scale": float(np.max(header.scales)),
         }
         if n_points > 0:
-            check_chunks(path, header)
+            _check_chunks(path, header)
     notes: list[str] = []
     return ScanFile(
         name=path.name,
@@ -61,7 +98,7 @@ def _blocks(
 ) -> Iterator[PointBlock]:
     n_read = 0
     n_outside = 0
-    for chunk in guarded(records(path, laspy, cores=cores), path, FORMAT):
+    for chunk in guarded(_records(path, laspy, cores=cores), path, FORMAT):
         with reading(path, FORMAT):
             block = _block(chunk)
         n_read += block.n_read
@@ -156,3 +193,240 @@ def _outside(path: Path, block: PointBlock, bounds: NDArray[np.float64]) -> int:
             f"states ({low.tolist()} to {high.tolist()}); copy or export it again"
         )
     return int(np.count_nonzero(beyond > slack))
+
+
+def _check_header(path: Path) -> None:
+    """Compare the counts and offsets of the header with the file's size.
+
+    Raises:
+        InputError: they do not fit.
+    """
+    n_file = path.stat().st_size
+    with path.open("rb") as file:
+        header = file.read(_HEADER_BYTES)
+    if len(header) < 227:
+        raise _damaged(path, "it ends within its header")
+    header_size, start, n_records = struct.unpack_from("<HII", header, 94)
+    if not header_size <= start <= n_file:
+        raise _damaged(path, "its points begin outside the file, which is cut off")
+    if n_records * _VLR_BYTES > start - header_size:
+        raise _damaged(path, f"its header states {n_records} records that have no room")
+    if header[25] >= 4 and len(header) >= _HEADER_BYTES:
+        first, n_extended = struct.unpack_from("<QI", header, 235)
+        if n_extended and first + n_extended * _EVLR_BYTES > n_file:
+            raise _damaged(path, "records at its end are missing, it is cut off")
+
+
+def _check_chunks(path: Path, header: Any) -> None:
+    """Compare the chunk table with the file's size and the header's number of points.
+
+    Args:
+        path: the file.
+        header: laspy's header of it.
+
+    Raises:
+        InputError: the table cannot belong to this file.
+    """
+    if not header.are_points_compressed:
+        return
+    record = header.vlrs[header.vlrs.index("LasZipVlr")].record_data
+    if len(record) < 2 or struct.unpack_from("<H", record)[0] not in _CHUNKED:
+        return
+    lazrs = load_library("lazrs", path)
+    compression = lazrs.LazVlr(record)
+    if compression.item_size() != header.point_format.size:
+        raise _damaged(path, "its points are not as large as its header states")
+    start = int(header.offset_to_point_data)
+    with path.open("rb") as file:
+        n_bytes = _check_size(path, file, start, int(header.point_count))
+        file.seek(start)
+        table = lazrs.read_chunk_table(file, compression)
+    if sum(size for _, size in table) > n_bytes:
+        raise _damaged(path, "its chunks are larger than the file")
+    is_variable = compression.uses_variable_size_chunks()
+    if not is_variable and compression.chunk_size() > max(
+        _MOST_FIXED_CHUNK, 2 * header.point_count
+    ):
+        raise _damaged(path, f"its chunks are said to hold {compression.chunk_size()} points each")
+    n_points = sum(count for count, _ in table)
+    if n_points < header.point_count or (is_variable and n_points != header.point_count):
+        raise _damaged(
+            path, f"its chunks hold {n_points} points, its header states {header.point_count}"
+        )
+
+
+def _check_size(path: Path, file: Any, start: int, n_points: int) -> int:
+    """Check where the table lies and how long it is; give the bytes of the chunks before it."""
+    n_file = path.stat().st_size
+    file.seek(start)
+    table = _read_offset(path, file)
+    if table <= 0:
+        # Written at the end by programs that could not go back.
+        file.seek(n_file - _OFFSET_BYTES)
+        table = _read_offset(path, file)
+    if not start + _OFFSET_BYTES <= table <= n_file - _OFFSET_BYTES:
+        raise _damaged(path, "its chunk table lies outside the file, which is cut off")
+    file.seek(table)
+    _, n_chunks = struct.unpack("<II", file.read(_OFFSET_BYTES))
+    n_bytes = table - start - _OFFSET_BYTES
+    if n_chunks > min(n_points, n_bytes):
+        raise _damaged(path, f"its chunk table states {n_chunks} chunks")
+    return n_bytes
+
+
+def _read_offset(path: Path, file: Any) -> int:
+    raw = file.read(_OFFSET_BYTES)
+    if len(raw) < _OFFSET_BYTES:
+        raise _damaged(path, "it ends before its points begin")
+    return int(struct.unpack("<q", raw)[0])
+
+
+def _damaged(path: Path, reason: str) -> InputError:
+    return InputError(f"{path.name} cannot be read as LAS/LAZ: {reason}; copy or export it again")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Layout:
+    """What other processes must know of a compressed file.
+
+    Attributes:
+        step: points of a block; whole chunks.
+        start: of the compressed points in the file, bytes.
+        record: description of the compression, as the file has it.
+        point_bytes: of a point that is not compressed.
+    """
+
+    step: int
+    start: int
+    record: bytes
+    point_bytes: int
+
+
+def _records(path: Path, laspy: Any, *, cores: int) -> Iterator[Any]:
+    """Give laspy's records of up to `BLOCK_POINTS` points each, in the order of the file.
+
+    A record is to be done with before the next one is asked for.
+
+    Args:
+        path: the file; its header and chunk table have been checked.
+        laspy: the library.
+        cores: processes that may decode at the same time.
+
+    Raises:
+        BaseException: whatever the library throws at a damaged file.
+    """
+    fields = laspy.DecompressionSelection
+    wanted = fields.base().decompress_z().decompress_flags()
+    wanted = wanted.decompress_intensity().decompress_rgb()
+    with laspy.open(path, decompression_selection=wanted) as reader:
+        # Where memory cannot be shared without a name, this process decodes all by itself.
+        is_shared_out = cores > 1 and hasattr(os, "memfd_create")
+        layout = _layout(path, reader.header) if is_shared_out else None
+        if layout is None:
+            yield from reader.chunk_iterator(BLOCK_POINTS)
+        else:
+            n_processes = min(cores, _PROCESSES_MOST)
+            yield from _decoded_elsewhere(path, laspy, reader.header, layout, n_processes)
+
+
+def _layout(path: Path, header: Any) -> _Layout | None:
+    """How to share a file out; None for small files, and where blocks cannot begin at a chunk."""
+    if not header.are_points_compressed or header.point_count < _BLOCKS_LEAST * BLOCK_POINTS:
+        return None
+    record = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    compression = load_library("lazrs", path).LazVlr(record)
+    size = int(compression.chunk_size())
+    if compression.uses_variable_size_chunks() or not 0 < size <= _LARGEST_CHUNK:
+        return None
+    return _Layout(
+        step=size * max(1, BLOCK_POINTS // size),
+        start=int(header.offset_to_point_data),
+        record=record,
+        point_bytes=int(header.point_format.size),
+    )
+
+
+class _Decoder:
+    """A process that decodes every n-th block into memory shared with it."""
+
+    def __init__(
+        self, path: Path, layout: _Layout, *, first: int, stride: int, n_points: int
+    ) -> None:
+        slot_bytes = layout.step * layout.point_bytes
+        shared = os.memfd_create("points")
+        try:
+            os.ftruncate(shared, _SLOTS * slot_bytes)
+            self._memory = mmap.mmap(shared, _SLOTS * slot_bytes)
+            self._process = subprocess.Popen(
+                [
+                    *(sys.executable, "-P", str(_WORKER), str(path), str(shared)),
+                    *(str(layout.start), layout.record.hex()),
+                    *(str(slot_bytes), str(layout.step), str(layout.point_bytes)),
+                    *(str(first), str(stride), str(n_points)),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                bufsize=0,
+                pass_fds=(shared,),
+                # It imports what this process would, wherever that came from.
+                env=dict(os.environ) | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            )
+        finally:
+            os.close(shared)
+        self._slot_bytes = slot_bytes
+        self._slot = 0
+        for _ in range(_SLOTS):
+            self.allow()
+
+    def allow(self) -> None:
+        """Let it decode one more block, since the oldest one is done with."""
+        assert self._process.stdin is not None  # noqa: S101 - of a pipe that was asked for
+        # Where it has ended, the next block says why.
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(b"\n")
+
+    def block(self, n_bytes: int) -> memoryview:
+        """Wait for its next block.
+
+        Raises:
+            ValueError: the decompressor failed, with what it said.
+        """
+        assert self._process.stdout is not None  # noqa: S101 - as above
+        said = self._process.stdout.readline().decode("utf-8", errors="replace").strip()
+        if said != "decoded":
+            raise ValueError(said or f"its decoder ended with {self._process.wait()}")
+        start = self._slot * self._slot_bytes
+        self._slot = (self._slot + 1) % _SLOTS
+        return memoryview(self._memory)[start : start + n_bytes]
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.kill()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+        self._process.wait()
+
+
+def _decoded_elsewhere(
+    path: Path, laspy: Any, header: Any, layout: _Layout, n_processes: int
+) -> Iterator[Any]:
+    with contextlib.ExitStack() as stack:
+        decoders = []
+        for first in range(n_processes):
+            decoder = _Decoder(
+                path, layout, first=first, stride=n_processes, n_points=header.point_count
+            )
+            stack.callback(decoder.close)
+            decoders.append(decoder)
+        for block, start in enumerate(range(0, header.point_count, layout.step)):
+            decoder = decoders[block % n_processes]
+            count = min(layout.step, header.point_count - start)
+            decoded = decoder.block(count * layout.point_bytes)
+            yield laspy.ScaleAwarePointRecord(
+                np.frombuffer(decoded, dtype=header.point_format.dtype()),
+                header.point_format,
+                header.scales,
+                header.offsets,
+            )
+            decoder.allow()

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ArgumentError
-from orthoflow.files.points.foreign import load_library
+from orthoflow.files.points.libraries import load_library
 from orthoflow.products import PointCloud, PointLabels
 
 # LAS 1.4 with colours; numbers of planes are a field of their own.

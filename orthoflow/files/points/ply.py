@@ -18,9 +18,8 @@ from orthoflow.files.points.blocks import (
     point_fields,
     short_file_error,
 )
-from orthoflow.files.points.columns import Columns, columns_of_header
+from orthoflow.files.points.columns import Columns, columns_of_header, point_block
 from orthoflow.files.points.tables import Layout, read_table
-from orthoflow.files.points.text import point_block
 
 FORMAT: Final = "PLY"
 _TYPES: Final = {

@@ -19,9 +19,8 @@ from orthoflow.files.points.blocks import (
     point_fields,
     short_file_error,
 )
-from orthoflow.files.points.columns import Columns
+from orthoflow.files.points.columns import Columns, point_block
 from orthoflow.files.points.tables import Layout, count_lines, find_layout, read_table
-from orthoflow.files.points.text import point_block
 
 FORMAT: Final = "PTX"
 HEADER_LINES: Final = 10

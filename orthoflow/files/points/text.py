@@ -9,9 +9,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import (
     BLOCK_POINTS,
@@ -24,6 +21,7 @@ from orthoflow.files.points.columns import (
     Columns,
     columns_of_count,
     columns_of_header,
+    point_block,
 )
 from orthoflow.files.points.tables import (
     Layout,
@@ -76,23 +74,6 @@ def open_text(path: Path, columns: Columns | None = None) -> ScanFile:
         ),
         read=lambda: _blocks(path, head),
         details={"columns": " ".join(head.columns.names), "columns_from": head.columns.rule},
-    )
-
-
-def point_block(table: NDArray[np.float64], columns: Columns) -> PointBlock:
-    """Sort the columns of a table, which are `columns.used`, into a block of points."""
-    intensity = columns.index_of(["intensity"])
-    colours = columns.index_of(["r", "g", "b"])
-    grid = columns.index_of(["row", "column"])
-    rows = np.nan_to_num(table[:, grid]).astype(np.int64) if grid else None
-    return PointBlock(
-        points=table[:, :3],
-        scan=0,
-        n_read=len(table),
-        intensity=table[:, intensity[0]].astype(np.float32) if intensity else None,
-        rgb=table[:, colours] if colours else None,
-        row=None if rows is None else rows[:, 0],
-        column=None if rows is None else rows[:, 1],
     )
 
 

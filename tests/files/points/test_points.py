@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, OrthoflowError, PluginError
-from orthoflow.files.points import PointBlock, las_decoding, open_scan
+from orthoflow.files.points import PointBlock, las, open_scan
 from orthoflow.files.points import blocks as blocks_module
 from orthoflow.files.points.columns import Columns, columns_of_text
-from orthoflow.files.points.foreign import guarded, load_library, reading
+from orthoflow.files.points.libraries import guarded, load_library, reading
 from orthoflow.files.points.lzf_kernels import decompress_lzf
 from tests import scan_files
 
@@ -75,8 +75,8 @@ def test_las_blocks_keep_the_order_of_the_file_for_any_number_of_processes(
     # Four chunks of 50 000 points, the last one not full; one to a block.
     many = np.random.default_rng(0).uniform(0, 5, (170_000, 3))
     path = scan_files.write_las(tmp_path / f"a{suffix}", many, withheld=np.arange(170_000) == 9)
-    monkeypatch.setattr(las_decoding, "BLOCK_POINTS", 50_000)
-    monkeypatch.setattr(las_decoding, "_BLOCKS_LEAST", 1)
+    monkeypatch.setattr(las, "BLOCK_POINTS", 50_000)
+    monkeypatch.setattr(las, "_BLOCKS_LEAST", 1)
     blocks = list(open_scan(path, cores=cores).read())
     assert [block.n_read for block in blocks] == [50_000, 50_000, 50_000, 20_000]
     found = np.concatenate([block.points for block in blocks])
@@ -99,8 +99,8 @@ def test_a_decoder_that_fails_ends_in_one_sentence(
 ) -> None:
     many = np.random.default_rng(0).uniform(0, 5, (5000, 3))
     path = scan_files.write_las(tmp_path / "a.laz", many)
-    monkeypatch.setattr(las_decoding, "_BLOCKS_LEAST", 0)
-    monkeypatch.setattr(las_decoding, "_WORKER", tmp_path / "worker.py")
+    monkeypatch.setattr(las, "_BLOCKS_LEAST", 0)
+    monkeypatch.setattr(las, "_WORKER", tmp_path / "worker.py")
     (tmp_path / "worker.py").write_text(worker)
     with pytest.raises(InputError, match=f"a.laz cannot be read as LAS/LAZ: {reason};"):
         list(open_scan(path, cores=2).read())
@@ -258,6 +258,48 @@ def test_e57_scans_are_placed_by_their_poses(tmp_path: Path, points: NDArray[np.
     assert second.station is not None
     np.testing.assert_array_equal(second.station, [634512.347, 486215.781, 112.193])
     assert (first.station_is_posed, second.station_is_posed) == (False, True)
+
+
+HALF = np.sqrt(0.5)
+# Quaternion w, x, y, z and where the axes x, y, z of the scan point to in the world.
+POSES = {
+    "90 degrees about x": ((HALF, HALF, 0, 0), [(1, 0, 0), (0, 0, 1), (0, -1, 0)]),
+    "90 degrees about y": ((HALF, 0, HALF, 0), [(0, 0, -1), (0, 1, 0), (1, 0, 0)]),
+    "90 degrees about z": ((HALF, 0, 0, HALF), [(0, 1, 0), (-1, 0, 0), (0, 0, 1)]),
+    "180 degrees about x": ((0, 1, 0, 0), [(1, 0, 0), (0, -1, 0), (0, 0, -1)]),
+    "120 degrees about the diagonal": ((0.5, 0.5, 0.5, 0.5), [(0, 1, 0), (0, 0, 1), (1, 0, 0)]),
+    "the other way about the diagonal": (
+        (0.5, -0.5, -0.5, -0.5),
+        [(0, 0, 1), (1, 0, 0), (0, 1, 0)],
+    ),
+    # Cosine 0.28 and sine 0.96; about x, then about y: 3-4-5 halves of the angles, exact.
+    "tilted about x": ((0.8, 0.6, 0, 0), [(1, 0, 0), (0, 0.28, 0.96), (0, -0.96, 0.28)]),
+    "tilted about y": ((0.8, 0, 0.6, 0), [(0.28, 0, -0.96), (0, 1, 0), (0.96, 0, 0.28)]),
+    "tilted about x, then y": (
+        (0.64, 0.48, 0.48, -0.36),
+        [(0.28, 0, -0.96), (0.9216, 0.28, 0.2688), (0.2688, -0.96, 0.0784)],
+    ),
+    "not of length 1": ((8, 6, 0, 0), [(1, 0, 0), (0, 0.28, 0.96), (0, -0.96, 0.28)]),
+    "very short": ((8e-170, 6e-170, 0, 0), [(1, 0, 0), (0, 0.28, 0.96), (0, -0.96, 0.28)]),
+    "very long": ((8e170, 6e170, 0, 0), [(1, 0, 0), (0, 0.28, 0.96), (0, -0.96, 0.28)]),
+    "of no direction": ((0, 0, 0, 0), [(1, 0, 0), (0, 1, 0), (0, 0, 1)]),
+}
+
+
+@pytest.mark.parametrize(("rotation", "axes_world"), POSES.values(), ids=POSES.keys())
+def test_a_tilted_e57_scanner_turns_each_axis_where_its_pose_says(
+    tmp_path: Path, rotation: tuple[float, ...], axes_world: list[tuple[float, ...]]
+) -> None:
+    station = np.array([4.0, -2.0, 1.0])
+    scan = {
+        "fields": cartesian(np.vstack([np.zeros(3), np.eye(3), [[2.0, 3.0, 5.0]]])),
+        "rotation": rotation,
+        "translation": station,
+    }
+    (block,) = read_all(scan_files.write_e57(tmp_path / "a.e57", [scan]))
+    x, y, z = np.array(axes_world)
+    expected = station + np.array([np.zeros(3), x, y, z, 2.0 * x + 3.0 * y + 5.0 * z])
+    np.testing.assert_allclose(block.points, expected, atol=1e-14)
 
 
 def test_e57_rows_columns_colours_and_limits_are_kept(
@@ -521,6 +563,68 @@ def test_lzf_gives_back_what_was_packed(seed: int) -> None:
     unpacked = np.zeros(5000, np.uint8)
     assert decompress_lzf(packed, unpacked) == 5000
     np.testing.assert_array_equal(unpacked, plain)
+
+
+# Nothing checks indices in compiled code: each case is tried in arrays that go on behind their end.
+GUARD = 0xAA
+
+
+def unpack(packed: list[int], n_plain: int) -> tuple[int, list[int]]:
+    """Unpack into so many bytes; gives what was said and written, and asserts nothing was beyond.
+
+    Behind the packed bytes lie more that could be read.
+    """
+    source = np.array([*packed, 0, 7, 7, 7, 7], np.uint8)[: len(packed)]
+    memory = np.full(n_plain + 300, GUARD, np.uint8)
+    said = decompress_lzf(source, memory[:n_plain])
+    assert (memory[n_plain:] == GUARD).all()
+    return int(said), memory[:n_plain].tolist()
+
+
+@pytest.mark.parametrize("count", [1, 2, 31, 32])
+def test_lzf_literals_fit_exactly_or_not_at_all(count: int) -> None:
+    literals = list(range(1, count + 1))
+    packed = [count - 1, *literals]
+    assert unpack(packed, count) == (count, literals)
+    assert unpack(packed, count + 1) == (count, [*literals, GUARD])
+    assert unpack(packed, count - 1)[0] == -1
+    assert unpack(packed[:-1], count)[0] == -1
+
+
+@pytest.mark.parametrize("length", [3, 8, 9, 10, 263, 264])
+def test_lzf_back_references_fit_exactly_or_not_at_all(length: int) -> None:
+    # Three literals, then a reference to the first of them; from nine bytes on the length takes a
+    # byte of its own.
+    long = [7 << 5, length - 9, 2] if length >= 9 else [(length - 2) << 5, 2]
+    packed = [2, 11, 12, 13, *long]
+    repeated = [11, 12, 13] * 90
+    whole = repeated[: 3 + length]
+    assert unpack(packed, 3 + length) == (3 + length, whole)
+    assert unpack(packed, 4 + length) == (3 + length, [*whole, GUARD])
+    assert unpack(packed, 2 + length)[0] == -1
+    for n_missing in range(1, len(long)):
+        assert unpack(packed[:-n_missing], 3 + length)[0] == -1
+
+
+@pytest.mark.parametrize("distance", [1, 2, 256, 257, 8191, 8192])
+def test_lzf_back_references_reach_the_first_byte_and_none_before(distance: int) -> None:
+    literals = [1 + k % 150 for k in range(distance)]
+    packed: list[int] = []
+    for start in range(0, distance, 32):
+        part = literals[start : start + 32]
+        packed += [len(part) - 1, *part]
+    reference = [(1 << 5) | ((distance - 1) >> 8), (distance - 1) & 255]
+    whole = (literals * 4)[: distance + 3]
+    assert unpack(packed + reference, distance + 3) == (distance + 3, whole)
+    # One literal less: the same reference points before the first byte.
+    shorter = [*packed[: -(len(part) + 1)], *([len(part) - 2, *part[1:]] if len(part) > 1 else [])]
+    assert unpack(shorter + reference, distance + 2)[0] == -1
+
+
+def test_lzf_data_without_anything_give_nothing() -> None:
+    assert unpack([], 0) == (0, [])
+    assert unpack([], 2) == (0, [GUARD, GUARD])
+    assert unpack([0], 2)[0] == -1
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -441,11 +441,11 @@ def test_reading_twice_gives_the_same_bits(
 def test_the_way_a_file_is_cut_into_blocks_does_not_show(
     tmp_path: Path, read: Reader, points: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from orthoflow.files.points import las_decoding
+    from orthoflow.files.points import las
 
     path = scan_files.write_las(tmp_path / "a.laz", points, intensity=np.arange(400))
     whole = read(path)
-    monkeypatch.setattr(las_decoding, "BLOCK_POINTS", 399)
+    monkeypatch.setattr(las, "BLOCK_POINTS", 399)
     parted = read(path)
     np.testing.assert_array_equal(parted.points_world(), whole.points_world())
     np.testing.assert_array_equal(parted.intensity, whole.intensity)

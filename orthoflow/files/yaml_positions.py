@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Final, Protocol, TypeAlias
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -23,11 +23,10 @@ from ruamel.yaml.events import (
 from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.problems import ProblemLog
 
-MAX_NODES: Final = 10_000
 MAX_DEPTH: Final = 60
 _TAG: Final = "tag:yaml.org,2002:"
+_MERGE: Final = "<<"
 
 Scalar: TypeAlias = bool | int | float | str | None
 
@@ -61,11 +60,12 @@ class Listing:
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A key with its value."""
+    """A key with its value; whether the key is text, and no number, date, true, false or null."""
 
     position: Position
     key: str
     value: Value
+    is_text: bool = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +84,36 @@ class Table:
 
 
 Value: TypeAlias = Text | Listing | Table
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dialect:
+    """What a kind of document may hold, and how some of its mistakes are told.
+
+    Attributes:
+        is_strict: tags, keys that are no text and versions of YAML other than 1.2 are problems, and
+            `<<` is a key as any other. Else tags and versions are read over, `Entry.is_text` tells
+            what keys are, and `<<` takes in the entries of other mappings: behind the table's own
+            ones, which count first, and with the position of the table.
+        most_values: larger documents are refused, aliases expanded.
+        empty: the sentence for a document without any value.
+        duplicate: the one for a key that is there again; may name `{key}` and its first `{line}`.
+    """
+
+    is_strict: bool = True
+    most_values: int = 10_000
+    empty: str = "the document is empty"
+    duplicate: str = "the key is there already, in line {line}; remove one of them"
+
+
+STRICT: Final = Dialect()
+
+
+class Problems(Protocol):
+    """Takes in what is wrong with a document."""
+
+    def add(self, position: Position, path: str, message: str) -> None:
+        """Keep a problem: its place, the keys that lead to it joined by dots, and one sentence."""
 
 
 def plain(value: Value) -> JsonValue:
@@ -119,10 +149,10 @@ def describe_scalar(value: object) -> str:
     return str(value)
 
 
-def read_yaml(text: str, log: ProblemLog) -> Value | None:
+def read_yaml(text: str, log: Problems, dialect: Dialect = STRICT) -> Value | None:
     """Read a document; problems go to the log, None when nothing can be read."""
     try:
-        return _Converter(log=log).convert(_compose(text), "", 0)
+        return _Converter(log=log, dialect=dialect).convert(_compose(text, dialect), "", 0)
     except _UnreadableError as error:
         log.add(error.position, "", str(error))
         return None
@@ -134,15 +164,15 @@ class _UnreadableError(Exception):
         self.position = position
 
 
-def _compose(text: str) -> Node:
-    if re.search(r"^%YAML +(?!1\.2\s)", text, re.MULTILINE):
+def _compose(text: str, dialect: Dialect) -> Node:
+    if dialect.is_strict and re.search(r"^%YAML +(?!1\.2\s)", text, re.MULTILINE):
         raise _UnreadableError(
             _START, "expected YAML 1.2, got a %YAML line that asks for another version"
         )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an anchor defined twice is legal YAML 1.2
-            _check_size(text)
+            _check_size(text, dialect)
             node: Node | None = YAML(typ="safe", pure=True).compose(text)
     except MarkedYAMLError as error:
         raise _UnreadableError(
@@ -153,11 +183,11 @@ def _compose(text: str) -> Node:
             _reader_position(text, error), f"this is not YAML: {_first_line(error)}"
         ) from error
     if node is None:
-        raise _UnreadableError(_START, "the document is empty")
+        raise _UnreadableError(_START, dialect.empty)
     return node
 
 
-def _check_size(text: str) -> None:
+def _check_size(text: str, dialect: Dialect) -> None:
     # Events come one by one, so this stops early where composing would take minutes.
     depth = n_nodes = 0
     for event in YAML(typ="safe", pure=True).parse(text):
@@ -166,12 +196,12 @@ def _check_size(text: str) -> None:
             continue
         n_nodes += isinstance(event, NodeEvent)
         depth += isinstance(event, CollectionStartEvent)
-        if depth > MAX_DEPTH or n_nodes > MAX_NODES:
+        if depth > MAX_DEPTH or n_nodes > dialect.most_values:
             raise _UnreadableError(
                 _mark_position(event.start_mark),
                 f"the document is nested deeper than {MAX_DEPTH} levels"
                 if depth > MAX_DEPTH
-                else f"the document has more than {MAX_NODES} values",
+                else f"the document has more than {dialect.most_values} values",
             )
 
 
@@ -198,16 +228,19 @@ def _first_line(error: YAMLError) -> str:
 class _Converter:
     """Turns composed nodes into values; aliases are expanded and counted."""
 
-    log: ProblemLog
+    log: Problems
+    dialect: Dialect
     n_nodes: int = 0
     open_nodes: set[int] = field(default_factory=set)
 
     def convert(self, node: Node, path: str, depth: int) -> Value:
         position = _mark_position(node.start_mark)
         self.n_nodes += 1
-        if self.n_nodes > MAX_NODES:
+        if self.n_nodes > self.dialect.most_values:
             raise _UnreadableError(
-                position, f"the document has more than {MAX_NODES} values once aliases are expanded"
+                position,
+                f"the document has more than {self.dialect.most_values} values once aliases are "
+                "expanded",
             )
         if id(node) in self.open_nodes:
             raise _UnreadableError(position, "the value contains itself through its anchor")
@@ -234,24 +267,48 @@ class _Converter:
         entries: dict[str, Entry] = {}
         for key_node, value_node in node.value:
             key_position = _mark_position(key_node.start_mark)
-            key = self._key(key_node, key_position, path)
+            key, is_text = self._key(key_node, key_position, path)
             value = self.convert(value_node, join(path, key), depth + 1)
             if key in entries:
                 first = entries[key].position.line
-                message = f"the key is there already, in line {first}; remove one of them"
+                message = self.dialect.duplicate.format(key=key, line=first)
                 self.log.add(key_position, join(path, key), message)
             else:
-                entries[key] = Entry(position=key_position, key=key, value=value)
+                entries[key] = Entry(position=key_position, key=key, value=value, is_text=is_text)
+        if not self.dialect.is_strict:
+            self._merge(entries, position, path)
         return Table(position=position, entries=tuple(entries.values()))
 
-    def _key(self, node: Node, position: Position, path: str) -> str:
-        if isinstance(node, ScalarNode) and str(node.tag) in (_TAG + "str", _TAG + "merge"):
-            return str(node.value)
-        if isinstance(node, ScalarNode):
+    def _key(self, node: Node, position: Position, path: str) -> tuple[str, bool]:
+        """Give a key and whether it is text."""
+        if not isinstance(node, ScalarNode):
+            self.log.add(position, path, "a key must be text, got a list or mapping")
+            return "?", True
+        is_text = str(node.tag) == _TAG + "str"
+        if self.dialect.is_strict and str(node.tag) == _TAG + "merge":
+            return str(node.value), True
+        if self.dialect.is_strict and not is_text:
             self.log.add(position, path, f"a key must be text, got {node.value or 'nothing'}")
-            return str(node.value)
-        self.log.add(position, path, "a key must be text, got a list or mapping")
-        return "?"
+        return str(node.value), is_text
+
+    def _merge(self, entries: dict[str, Entry], position: Position, path: str) -> None:
+        """Put what `<<` takes in behind the entries of a table, which has this position."""
+        merged = entries.get(_MERGE)
+        # In quotes it is a key as any other.
+        if merged is None or merged.is_text:
+            return
+        del entries[_MERGE]
+        tables = merged.value.items if isinstance(merged.value, Listing) else (merged.value,)
+        for table in tables:
+            if not isinstance(table, Table):
+                self.log.add(
+                    merged.position,
+                    join(path, _MERGE),
+                    f"expected a mapping or a list of mappings to merge, got {describe(table)}",
+                )
+                continue
+            for entry in table:
+                entries.setdefault(entry.key, replace(entry, position=position))
 
     def _scalar(self, node: ScalarNode, position: Position, path: str) -> Scalar:
         tag, text = str(node.tag), str(node.value)
@@ -264,7 +321,8 @@ class _Converter:
         return text
 
     def _refuse_tag(self, node: Node, position: Position, path: str) -> None:
-        self.log.add(position, path, f"tags are not allowed in a workflow, got {node.tag}")
+        if self.dialect.is_strict:
+            self.log.add(position, path, f"tags are not allowed in a workflow, got {node.tag}")
 
 
 def join(path: str, key: str) -> str:
