@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Final
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import (
     Calibration,
+    Camera,
     Cameras,
     CheckPoints,
     Intrinsics,
@@ -22,6 +24,7 @@ from orthoflow.products import (
     Ties,
     Walls,
 )
+from orthoflow.testing.surveyed import settled
 from orthoflow.testing.textured_walls import (
     SIZE_M,
     TexturedWall,
@@ -70,8 +73,24 @@ def _photos() -> Photos:
 def _cameras() -> Cameras:
     return Cameras(
         cameras=tuple(
-            oriented(camera, name=name) for name, camera in photographing_cameras().items()
+            settled_camera(oriented(camera, name=name))
+            for name, camera in photographing_cameras().items()
         )
+    )
+
+
+def settled_camera(camera: Camera) -> Camera:
+    """Give an orientation the same bits on every processor."""
+    rotation, translation = (
+        camera.rotation_camera_from_world,
+        camera.translation_camera_from_world,
+    )
+    assert rotation is not None  # noqa: S101 - both are oriented
+    assert translation is not None  # noqa: S101
+    return replace(
+        camera,
+        rotation_camera_from_world=settled(rotation),
+        translation_camera_from_world=settled(translation),
     )
 
 
@@ -127,8 +146,9 @@ def example_ties() -> Ties:
         photo_names=tuple(photographing_cameras()),
         photo=photo.astype(np.int32),
         wall=wall.astype(np.int32),
-        pixels_photo=pixels,
-        points_world=points,
+        # Rounding errors of pixels are a millionth of what is left.
+        pixels_photo=settled(pixels, 6),
+        points_world=settled(points),
         sigma_px=np.full(count, _TIE_SIGMA_PX),
         sigma_m=np.full(count, _TIE_SIGMA_M),
         role=np.full(count, TieRole.CONTROL, dtype=np.uint8),

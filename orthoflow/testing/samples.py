@@ -65,15 +65,28 @@ def sample_of(product: Product) -> dict[str, Sample]:
 
 
 def sample_problem(
-    before: Mapping[str, Sample], after: Mapping[str, Sample], tolerances: Mapping[str, Tolerance]
+    before: Mapping[str, Sample],
+    after: Mapping[str, Sample],
+    tolerances: Mapping[str, Tolerance],
+    *,
+    numbers_stated: bool = True,
 ) -> str:
-    """Say what moved between two samples by more than a product's tolerances; empty for nothing."""
+    """Say what moved between two samples by more than a product's tolerances; empty for nothing.
+
+    Args:
+        before: of one product.
+        after: of the other.
+        tolerances: of its type.
+        numbers_stated: the numbers in the metadata count as well, not only how many there are.
+    """
     for name in sorted({*before, *after}):
         if name not in before or name not in after:
             return f"only one of them has {name}"
         old, new = before[name], after[name]
         if list(old.shape) != list(new.shape):
             return f"{name} had {list(old.shape)} values, now {list(new.shape)}"
+        if name == _METADATA and not numbers_stated:
+            continue
         limit = _limit(name, tolerances)
         n_apart = sum(_is_apart(a, b, limit) for a, b in zip(old.values, new.values, strict=True))
         if n_apart > _STRAY_SHARE * len(old.values):
