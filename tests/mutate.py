@@ -175,6 +175,10 @@ def files_of(tree: Tree, path: str) -> list[str]:
         for place, folder in enumerate(folders_of(tree, path))
         for file in sorted((tree.root / folder).rglob("test_*.py"))
     ]
+    if kinds_of(tree, path):
+        # What holds for the methods of all kinds.
+        shared = sorted((tree.root / "tests/plugins").glob("test_*.py"))
+        ranked += [((4, 0, file.name), str(file.relative_to(tree.root))) for file in shared]
     return list(dict.fromkeys(file for _, file in sorted(ranked)))
 
 
@@ -396,6 +400,7 @@ def run(
     work: Path,
     n_workers: int,
     timeout_s: float,
+    is_checked: bool,
     tell: Callable[[Verdict], None],
 ) -> list[Verdict]:
     """Try mutations and give their verdicts.
@@ -412,8 +417,8 @@ def run(
         worker = Worker(folder=work / f"worker-{number}", least_timeout_s=timeout_s)
         worker.prepare(ROOT)
         for mutation in share:
-            problem = worker.first_problem(folders_of(tree, mutation.path))
-            if problem:
+            folders = folders_of(tree, mutation.path) if is_checked else []
+            if problem := worker.first_problem(folders):
                 problems.append(problem)
                 return
             verdict = worker.verdict(mutation, tree)
@@ -458,6 +463,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=Path(tempfile.gettempdir())
         / f"orthoflow-mutate-{hashlib.sha256(str(ROOT).encode()).hexdigest()[:8]}",
     )
+    parser.add_argument(
+        "--unchecked", action="store_true", help="do not run the tests without mutations first"
+    )
     parser.add_argument("--list", action="store_true", help="print what is drawn, run nothing")
     given = parser.parse_args(arguments)
     mutations = drawn(list(all_mutations(given.only)), seed=given.seed, count=given.count)
@@ -471,6 +479,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             work=given.work,
             n_workers=given.jobs,
             timeout_s=given.timeout,
+            is_checked=not given.unchecked,
             tell=_print,
         )
     except RuntimeError as error:

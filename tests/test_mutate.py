@@ -124,8 +124,9 @@ def test_a_modules_tests_are_in_the_folder_of_its_name(
 def test_the_file_of_its_name_goes_first_and_kinds_follow_geometry(tree: mutate.Tree) -> None:
     files = mutate.files_of(tree, "plugins/orthoflow_plugins/plane/hough3d.py")
     assert files[0] == "tests/plugins/plane/test_hough3d.py"
-    there = (mutate.ROOT / "tests/plugins/plane").glob("test_*.py")
-    assert sorted(files) == sorted(f"tests/plugins/plane/{file.name}" for file in there)
+    folders = ("tests/plugins/plane", "tests/plugins")
+    there = [file for folder in folders for file in (mutate.ROOT / folder).glob("test_*.py")]
+    assert sorted(files) == sorted(str(file.relative_to(mutate.ROOT)) for file in there)
     folders = mutate.folders_of(tree, "orthoflow/geometry/threads.py")
     assert folders[0] == "tests/geometry"
     assert {"tests/plugins/plane", "tests/plugins/ortho"} <= set(folders)
