@@ -68,7 +68,9 @@ _UNSEEN_KEYWORDS: Final = re.compile(
     r"|pad|rotation_mode|interpolation|frameon|loc|ncols|capsize|hspace|wspace|description|examples"
     r"|title|help|compresslevel|quality)$"
 )
-_UNSEEN_NAMES: Final = re.compile(r"AT_ONCE|PER_RUN|CHUNK|_POLL|result_version|citations")
+_UNSEEN_NAMES: Final = re.compile(
+    r"AT_ONCE|PER_RUN|CHUNK|_POLL|^(result_version|citations|cores|threads)$"
+)
 _GUARD: Final = 1e-6
 
 
@@ -147,7 +149,9 @@ class _Finder(ast.NodeVisitor):
 
     def visit_Call(self, node: ast.Call) -> None:
         name = _name_of(node.func)
-        if not _TOLD.match(name) and not name.endswith(("Error", "Warning")):
+        # Any negative length means the one that is left.
+        is_flat = name == "reshape" and any(ast.unparse(item) == "-1" for item in node.args)
+        if not _TOLD.match(name) and not name.endswith(("Error", "Warning")) and not is_flat:
             self.generic_visit(node)
 
     def visit_keyword(self, node: ast.keyword) -> None:
@@ -161,8 +165,11 @@ class _Finder(ast.NodeVisitor):
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         if node.name == "__repr__":
             return
-        for default in (*node.args.defaults, *node.args.kw_defaults):
-            if default is not None:
+        args = node.args
+        positional = [*args.posonlyargs, *args.args]
+        names = [*positional[len(positional) - len(args.defaults) :], *args.kwonlyargs]
+        for named, default in zip(names, [*args.defaults, *args.kw_defaults], strict=True):
+            if default is not None and not _UNSEEN_NAMES.search(named.arg):
                 self.visit(default)
         for item in node.body:
             self.visit(item)

@@ -71,6 +71,9 @@ def test_each_operator_changes_what_it_says(source: str, kind: str, lines: set[s
         "a = b / 'name'",
         "a = 1e-12",
         "_ROWS_AT_ONCE = 64",
+        "def f(*, cores: int = 1): ...",
+        "class A:\n    cores: int = 1",
+        "b.reshape(-1)",
         "return None",
     ],
 )
