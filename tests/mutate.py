@@ -20,8 +20,8 @@ assertions of what cannot happen, version numbers of results, and what changes s
 (threads, sizes of parts, arguments of drawings, floats below a millionth that guard a division).
 
 The tests of `orthoflow/engine/x.py` are those in `tests/engine`, of a plugin's module those of its
-kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it; a file of
-the module's own name goes first, then those that name the module, and the first failure ends a run.
+kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it; the module's
+doctests and a file of its own name go first, then those that name the module, and the first failure ends a run.
 The conformance suite takes part for modules of kinds, without the golden results: these would
 notice everything, but know yesterday's numbers only. A run that takes far longer than without a
 mutation is stopped, which kills the mutation as well.
@@ -179,6 +179,8 @@ def files_of(tree: Tree, path: str) -> list[str]:
         # What holds for the methods of all kinds.
         shared = sorted((tree.root / "tests/plugins").glob("test_*.py"))
         ranked += [((4, 0, file.name), str(file.relative_to(tree.root))) for file in shared]
+    if ">>> " in (tree.root / path).read_text(encoding="utf-8"):
+        ranked.append(((-1, 0, ""), path))
     return list(dict.fromkeys(file for _, file in sorted(ranked)))
 
 

@@ -30,18 +30,11 @@ from orthoflow.engine.store import digest_of
 from orthoflow.errors import InputError
 from orthoflow.products import Product
 from orthoflow.sdk import Method
+from orthoflow.testing.isolation import INSTRUCTION_SWITCHES
 from orthoflow.testing.samples import Sample, sample_of, sample_problem
 from orthoflow.testing.trials import Trial
 
 _CPU: Final = Path("/proc/cpuinfo")
-# With these a library computes with other instructions than the processor has.
-_SWITCHES: Final = (
-    "NPY_DISABLE_CPU_FEATURES",
-    "NUMBA_CPU_FEATURES",
-    "NUMBA_CPU_NAME",
-    "OPENBLAS_CORETYPE",
-    "OPENCV_CPU_DISABLE",
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +170,7 @@ def _environment() -> str:
         platform.machine(),
         *platform.libc_ver(),
         *sorted({line for line in cpu if line.startswith(("model", "flags"))}),
-        *(f"{name}={os.environ[name]}" for name in _SWITCHES if name in os.environ),
+        *(f"{name}={os.environ[name]}" for name in INSTRUCTION_SWITCHES if name in os.environ),
         *sorted(f"{name} {version}" for name, version in installed),
     ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

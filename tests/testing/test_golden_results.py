@@ -18,6 +18,7 @@ from orthoflow.sdk import Method, MethodParams, Ports
 from orthoflow.testing import golden
 from orthoflow.testing.examples import example_room
 from orthoflow.testing.golden import golden_problem
+from orthoflow.testing.isolation import INSTRUCTION_SWITCHES
 from orthoflow.testing.samples import Sample, sample_of, sample_problem
 from orthoflow.testing.trials import Trial
 
@@ -137,10 +138,15 @@ def test_switched_off_instructions_are_another_environment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     environment = golden._environment.__wrapped__
+    for name in INSTRUCTION_SWITCHES:
+        monkeypatch.delenv(name, raising=False)
     here = environment()
     assert environment() == here
-    monkeypatch.setenv("OPENBLAS_CORETYPE", "Nehalem")
-    assert environment() != here
+    seen = {here}
+    for name in INSTRUCTION_SWITCHES:
+        monkeypatch.setenv(name, "Nehalem")
+        seen.add(environment())
+    assert len(seen) == 1 + len(INSTRUCTION_SWITCHES)
 
 
 def test_an_output_that_appears_is_noticed(file: Path) -> None:
