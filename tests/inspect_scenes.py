@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,13 +14,19 @@ from scipy.ndimage import gaussian_filter, shift
 
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
+from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import (
     CheckPoints,
     IntensitySource,
     Orthoimage,
     Orthoimages,
     OrthoMask,
+    Planes,
+    PointLabels,
+    Product,
     SurfaceMask,
+    Truth,
     Wall,
     Walls,
 )
@@ -127,6 +134,124 @@ def checkpoint_inputs() -> Mapping[str, Orthoimages | Walls | CheckPoints]:
     points = points_at(frame().world_from_wall(places), pixels=places + np.array([[0.5, -0.25]]))
     return {"orthoimages": Orthoimages(images=(displaced(0, 0),)), "walls": walls()} | {
         "checkpoints": points
+    }
+
+
+# A wall of 1.2 m x 0.8 m that faces -y, a board 6 cm before it and a chair 40 cm before it. All
+# rims lie on borders of cells, between the rays that look at them. The frame lies 3 mm before it.
+TRUE_FRAME = WallFrame(
+    origin_world=np.array([0.0, -0.003, 0.8]),
+    u_world=np.array([1.0, 0.0, 0.0]),
+    v_world=np.array([0.0, 0.0, -1.0]),
+    normal_world=np.array([0.0, -1.0, 0.0]),
+    gsd_m=0.008,
+    width=150,
+    height=100,
+)
+
+
+def truth_scene() -> Scene:
+    """Wall, board and chair, each with stains of another seed."""
+    count = 3
+    return Scene(
+        origin=np.zeros(3),
+        centre=np.array([[0.6, 0.0, 0.4], [0.28, -0.06, 0.4], [0.88, -0.4, 0.16]]),
+        axis_a=np.tile([1.0, 0.0, 0.0], (count, 1)),
+        axis_b=np.tile([0.0, 0.0, 1.0], (count, 1)),
+        extent=np.array(
+            [[-0.6, 0.6, -0.4, 0.4], [-0.12, 0.12, -0.16, 0.16], [-0.08, 0.08, -0.16, 0.16]]
+        ),
+        plane_index=np.array([0, 1, -1], dtype=np.int16),
+        role=np.array([SurfaceRole.WALL, SurfaceRole.RELIEF, SurfaceRole.OBJECT], dtype=np.uint8),
+        texture=np.full(count, TextureKind.PLAIN, dtype=np.int32),
+        texture_params=np.array(
+            [[150.0, 120.0, 90.0, 0.6, 0.8, 0.25, seed, 0.0] for seed in (11.0, 12.0, 13.0)[:count]]
+        ),
+        hole_rectangle=np.zeros(0, dtype=np.int32),
+        hole_extent=np.zeros((0, 4)),
+    )
+
+
+def true_planes(*, lift_m: float = 0.0) -> Planes:
+    """Wall and board."""
+    corners = np.array(
+        [
+            [[0.0, 0.0, 0.8], [0.0, 0.0, 0.0], [1.2, 0.0, 0.0], [1.2, 0.0, 0.8]],
+            [[0.16, -0.06, 0.56], [0.16, -0.06, 0.24], [0.4, -0.06, 0.24], [0.4, -0.06, 0.56]],
+        ]
+    )
+    return Planes(
+        normal=np.tile([0.0, -1.0, 0.0], (2, 1)),
+        offset=np.array([0.0, 0.06]) + lift_m,
+        corners=corners - np.array([0.0, lift_m, 0.0]),
+        covariance=np.zeros((2, 4, 4)),
+        n_points=np.array([600, 200]),
+        rms_m=np.full(2, 0.001),
+        up=UP,
+        names=("main wall", "board"),
+        viewpoint="stations",
+    )
+
+
+def true_orthoimage(*, right_cells: float = 0.0, down_cells: float = 0.0) -> TrueOrthoimage:
+    """What there is to see, shown too far to the right and too low."""
+    moved = TRUE_FRAME.world_from_wall(np.array([[-right_cells, -down_cells]]))[0]
+    image = render_frame(
+        truth_scene(),
+        replace(TRUE_FRAME, origin_world=moved),
+        buffer_front_m=BUFFER_M,
+        buffer_behind_m=BUFFER_M,
+    )
+    return replace(image, frame=TRUE_FRAME)
+
+
+def truth_inputs() -> Mapping[str, Product]:
+    """What `inspect.truth` takes: every error is put in, and large enough to be told from noise.
+
+    Displaced by 0.5 and -0.25 cells; 2 mm too near, and 8 mm on the left, four times what is
+    stated; two white spots, one behind the chair; a part that is filled and one that nothing
+    shows; planes 4 mm off; a tenth of the labels missing.
+    """
+    shown, true = true_orthoimage(right_cells=0.5, down_cells=-0.25), true_orthoimage()
+    rgb = np.nan_to_num(shown.rgb).round().astype(np.uint8)
+    rgb[70:80, 20:40] = rgb[70:80, 114:120] = 255
+    mask = np.full(TRUE_FRAME.shape, OrthoMask.PAINTED, dtype=np.uint8)
+    mask[5:15, 60:90] = OrthoMask.FILLED
+    mask[40:50, 120:140] = OrthoMask.NONE
+    depth = true.depth_m + np.float32(2.0**-9)
+    depth[:, :20] = true.depth_m[:, :20] + np.float32(2.0**-7)
+    depth[60:70, 60:80] = np.nan
+    known = np.isfinite(depth)
+    image = replace(image_of(np.zeros(TRUE_FRAME.shape), TRUE_FRAME), rgb=rgb, mask=mask)
+    wall = Wall(
+        frame=TRUE_FRAME,
+        plane_index=0,
+        name="main wall",
+        depth_m=depth,
+        sigma_m=np.where(known, 2.0**-9, np.nan).astype(np.float32),
+        count=known.astype(np.uint32),
+        mask=np.where(known, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
+    )
+    labels = np.repeat([0, 1, -1], [600, 200, 200]).astype(np.int16)
+    found = np.where(labels < 0, -1, 1 - labels)
+    found[::10] = -1
+    return {
+        "truth": Truth(
+            scene=truth_scene(),
+            planes=true_planes(),
+            labels=labels,
+            stations=np.array([[0.5, -2.0, 0.3]]),
+        ),
+        "orthoimages": Orthoimages(images=(image,)),
+        "walls": Walls(
+            walls=(wall,),
+            up=UP,
+            intensity_source="none",
+            buffer_front_m=BUFFER_M,
+            buffer_behind_m=BUFFER_M,
+        ),
+        "planes": true_planes(lift_m=0.004),
+        "labels": PointLabels(plane_index=found.astype(np.int16)),
     }
 
 

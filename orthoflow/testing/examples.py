@@ -1,35 +1,21 @@
-"""Small inputs to try a method on: an analytic room, and what the built-in road makes of one."""
+"""Small inputs to try a method on: an analytic room, and an example of every product type."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
-from functools import cache
+from collections.abc import Collection
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.errors import OrthoflowError
 from orthoflow.geometry import up_vector, wall_axes
 from orthoflow.products import InputFiles, Planes, PointCloud, Product
-from orthoflow.sdk import Method, StepContext, port_specs
+from orthoflow.sdk import Method, port_specs
 from orthoflow.testing.photographed import PHOTOGRAPHED
-
-# The road of built-in methods that makes an example of each product type, with parameters small
-# enough for a test: product type -> (method, output port, parameters, inputs by port).
-_ROAD: Final[Mapping[str, tuple[str, str, Mapping[str, object], Mapping[str, str]]]] = {
-    "cloud": ("simulate.room", "cloud", {"scan_step_m": 0.08}, {}),
-    "truth": ("simulate.room", "truth", {"scan_step_m": 0.08}, {}),
-    "planes": ("plane.hough2d", "planes", {"n_planes_max": 2}, {"cloud": "cloud"}),
-    "labels": ("plane.hough2d", "labels", {"n_planes_max": 2}, {"cloud": "cloud"}),
-    "walls": ("raster.grid", "walls", {"gsd_m": 0.05}, {"cloud": "cloud", "planes": "planes"}),
-    "layers": ("ortho.pointcloud-direct", "layers", {}, {"cloud": "cloud", "walls": "walls"}),
-    "orthoimages": ("mosaic.seams", "orthoimages", {}, {"layers": "layers"}),
-}
+from orthoflow.testing.surveyed import SURVEYED
 
 
 class ExampleError(OrthoflowError, LookupError):
@@ -65,18 +51,17 @@ def example(type_name: str) -> Product | InputFiles:
     """Give a small product of a type, the same in every process.
 
     Raises:
-        ExampleError: the type is a plugin's own, or no built-in method makes it.
+        ExampleError: the type is a plugin's own, or nothing is known of it here.
     """
     if type_name == "files":
         return _example_files()
-    if type_name in PHOTOGRAPHED and type_name not in _ROAD:
-        return PHOTOGRAPHED[type_name]()
-    if type_name not in _ROAD:
+    make = SURVEYED.get(type_name) or PHOTOGRAPHED.get(type_name)
+    if make is None:
         raise ExampleError(
             f"there is no example of a {type_name} product: give one in `inputs` of "
             "conformance_cases"
         )
-    return _on_the_road(type_name)
+    return make()
 
 
 def example_room(
@@ -182,29 +167,3 @@ def _example_files() -> InputFiles:
     rows = np.column_stack([cloud.points_world(), np.full((len(cloud), 3), 128)])
     np.savetxt(path, rows, fmt="%.4f %.4f %.4f %d %d %d", header="x y z r g b", comments="//")
     return InputFiles(name="scan", paths=(path,))
-
-
-@cache
-def _catalog() -> Catalog:
-    return discover_catalog()
-
-
-@cache
-def _on_the_road(type_name: str) -> Product:
-    method_id, port, params, wired = _ROAD[type_name]
-    outputs = _run_once(method_id, tuple(params.items()), tuple(wired.items()))
-    product: Product = getattr(outputs, port)
-    return product
-
-
-@cache
-def _run_once(
-    method_id: str, params: tuple[tuple[str, object], ...], wired: tuple[tuple[str, str], ...]
-) -> object:
-    method = _catalog().method(method_id).load()
-    inputs: Callable[..., object] = method.In
-    ctx = StepContext(
-        rng=np.random.default_rng(1), cores=1, scratch=Path(mkdtemp(prefix="orthoflow-example-"))
-    )
-    products = {port: _on_the_road(type_name) for port, type_name in wired}
-    return method().run(inputs(**products), method.Params(**dict(params)), ctx)

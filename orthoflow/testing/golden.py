@@ -3,6 +3,9 @@
 Bits of a result hang on more than the method: on the processor, and on the version of every library
 that computes. So the file keeps both the digest, which must come again where it was recorded, and a
 sample of the numbers, which must come again anywhere within the tolerances of the product types.
+Numbers that a product states about itself have no tolerance, and a share over few cells may move by
+any amount with the last bits of what goes in. So they are held to the file where the same bits go
+in: give a method inputs that no other method computed.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import os
 import platform
 import re
 import sys
@@ -29,6 +33,7 @@ from orthoflow.errors import InputError
 from orthoflow.products import JsonValue, Product
 from orthoflow.products.product import Payload, Tolerance
 from orthoflow.sdk import Method
+from orthoflow.testing.isolation import INSTRUCTION_SWITCHES
 from orthoflow.testing.trials import Trial
 
 _CPU: Final = Path("/proc/cpuinfo")
@@ -157,22 +162,22 @@ def _moved(
     old, new = before.outputs[port], now.outputs[port]
     if old.digest == new.digest:
         return ""
-    problem = sample_problem(old.sample, new.sample, product.tolerances)
-    if problem or method.determinism == "loose" or not _must_be_alike(before, now):
+    same_went_in = all(
+        before.inputs[port].digest == given.digest for port, given in now.inputs.items()
+    )
+    problem = sample_problem(
+        old.sample, new.sample, product.tolerances, numbers_stated=same_went_in
+    )
+    # The same bits come out where the same go in, at the same place.
+    must_be_alike = same_went_in and before.environment == now.environment
+    if problem or method.determinism == "loose" or not must_be_alike:
         return problem
     return "in bits, not beyond the tolerances of its type, where libraries and processor are alike"
 
 
-def _must_be_alike(before: Golden, now: Golden) -> bool:
-    """Whether the same bits have to come out: the same went in, at the same place."""
-    return before.environment == now.environment and all(
-        before.inputs[port].digest == given.digest for port, given in now.inputs.items()
-    )
-
-
 @cache
 def _environment() -> str:
-    """Digest of Python, processor and every installed distribution."""
+    """Digest of Python, processor, what of it is switched off, and every installed distribution."""
     cpu = _CPU.read_text(encoding="utf-8").splitlines() if _CPU.is_file() else []
     installed = {(found.metadata["Name"], found.version) for found in metadata.distributions()}
     parts = [
@@ -180,6 +185,7 @@ def _environment() -> str:
         platform.machine(),
         *platform.libc_ver(),
         *sorted({line for line in cpu if line.startswith(("model", "flags"))}),
+        *(f"{name}={os.environ[name]}" for name in INSTRUCTION_SWITCHES if name in os.environ),
         *sorted(f"{name} {version}" for name, version in installed),
     ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
@@ -257,15 +263,28 @@ def sample_of(product: Product) -> dict[str, Sample]:
 
 
 def sample_problem(
-    before: Mapping[str, Sample], after: Mapping[str, Sample], tolerances: Mapping[str, Tolerance]
+    before: Mapping[str, Sample],
+    after: Mapping[str, Sample],
+    tolerances: Mapping[str, Tolerance],
+    *,
+    numbers_stated: bool = True,
 ) -> str:
-    """Say what moved between two samples by more than a product's tolerances; empty for nothing."""
+    """Say what moved between two samples by more than a product's tolerances; empty for nothing.
+
+    Args:
+        before: of one product.
+        after: of the other.
+        tolerances: of its type.
+        numbers_stated: the numbers in the metadata count as well, not only how many there are.
+    """
     for name in sorted({*before, *after}):
         if name not in before or name not in after:
             return f"only one of them has {name}"
         old, new = before[name], after[name]
         if list(old.shape) != list(new.shape):
             return f"{name} had {list(old.shape)} values, now {list(new.shape)}"
+        if name == _METADATA and not numbers_stated:
+            continue
         limit = _limit(name, tolerances)
         n_apart = sum(_is_apart(a, b, limit) for a, b in zip(old.values, new.values, strict=True))
         if n_apart > _STRAY_SHARE * len(old.values):

@@ -28,6 +28,14 @@ from orthoflow.engine.store import Store
 from orthoflow.products import InputFiles, Product
 from orthoflow.testing.trials import Trial, run_trial
 
+# With these, libraries compute with other instructions than the processor has, and to other bits.
+INSTRUCTION_SWITCHES: Final = (
+    "NPY_DISABLE_CPU_FEATURES",
+    "NUMBA_CPU_FEATURES",
+    "NUMBA_CPU_NAME",
+    "OPENBLAS_CORETYPE",
+    "OPENCV_CPU_DISABLE",
+)
 _LIMIT_S: Final = 600
 # Slow to import, harmless to fork after; the server imports them once the session has.
 _SHARED_LIBRARIES: Final = ("numba", "scipy.ndimage", "scipy.spatial", "cv2", "matplotlib.figure")
@@ -123,7 +131,8 @@ def _server() -> _Server:
 
 def _environment(folder: Path) -> dict[str, str]:
     # The parent's import path, so that an uninstalled checkout tests itself and nothing else.
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    names = ("PATH", "LD_LIBRARY_PATH", *INSTRUCTION_SWITCHES)
+    kept = {name: os.environ[name] for name in names if name in os.environ}
     one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return {
         **kept,

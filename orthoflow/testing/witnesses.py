@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.engine.store import digest_of
 from orthoflow.products import Product
@@ -16,6 +17,8 @@ from orthoflow.sdk import Method
 from orthoflow.testing.examples import example_inputs
 from orthoflow.testing.isolation import ElsewhereRun, run_elsewhere
 from orthoflow.testing.trials import Trial, TrialRun, run_trial
+
+Array = NDArray[np.generic]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,15 +48,19 @@ class Witness:
 
     @cached_property
     def first(self) -> WatchedRun:
-        """The run, watched."""
+        """The run, watched; inputs that it changed are as before afterwards."""
         inputs, state = _digests(self.trial.inputs), _global_state()
-        run = _run(self.trial)
-        after = _digests(self.trial.inputs)
-        return WatchedRun(
-            run=run,
-            changed_inputs=tuple(name for name in inputs if inputs[name] != after[name]),
-            drew_globally=state != _global_state(),
-        )
+        copies = {name: _copied(_arrays(self.trial.inputs[name])) for name in inputs}
+        changed: tuple[str, ...] = ()
+        try:
+            run = _run(self.trial)
+        finally:
+            after = _digests(self.trial.inputs)
+            changed = tuple(name for name in inputs if inputs[name] != after[name])
+            # Other methods are tried on the same examples.
+            for name in changed:
+                _put_back(_arrays(self.trial.inputs[name]), copies[name])
+        return WatchedRun(run=run, changed_inputs=changed, drew_globally=state != _global_state())
 
     @cached_property
     def again(self) -> TrialRun:
@@ -82,6 +89,20 @@ def _run(trial: Trial) -> TrialRun:
 
 def _digests(inputs: Mapping[str, object]) -> dict[str, str]:
     return {name: digest_of(given) for name, given in inputs.items() if isinstance(given, Product)}
+
+
+def _arrays(given: object) -> list[Array]:
+    return list(given.to_payload().arrays.values()) if isinstance(given, Product) else []
+
+
+def _copied(arrays: list[Array]) -> list[Array]:
+    return [array.copy() for array in arrays]
+
+
+def _put_back(arrays: list[Array], copies: list[Array]) -> None:
+    for array, copy in zip(arrays, copies, strict=True):
+        if array.flags.writeable:
+            np.copyto(array, copy)
 
 
 def _global_state() -> str:

@@ -11,9 +11,9 @@ import pytest
 
 from orthoflow.catalog import discover_catalog
 from orthoflow.files.images import encode_jpeg
-from orthoflow.products import InputFiles, Product
+from orthoflow.products import Cameras, InputFiles, Product
 from orthoflow.testing import ConformanceCase, conformance_cases
-from orthoflow.testing.examples import example
+from orthoflow.testing.photographed import settled_camera
 from tests import inspect_scenes, ortho_scenes, photo_files
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
@@ -53,9 +53,6 @@ FILES: dict[str, str] = {
 def inputs(method_id: str) -> Mapping[str, Product | InputFiles]:
     if method_id in FILES:
         return {"files": example_files(FILES[method_id])}
-    if method_id == "inspect.truth":
-        # None of them alone is required: it judges orthoimages, or planes where there are none.
-        return {name: example(name) for name in ("orthoimages", "walls", "planes", "labels")}
     if method_id in SCENES:
         return SCENES[method_id]()
     return {}
@@ -75,10 +72,11 @@ def example_files(name: str) -> InputFiles:
 def coloured_wall() -> Mapping[str, Product | InputFiles]:
     """A wall and a board before it as bare points, and a photo of them."""
     where = ortho_scenes.frame()
+    oriented = ortho_scenes.cameras(ortho_scenes.camera(where))
     return {
         "cloud": ortho_scenes.cloud(where, spacing_cells=2.0),
         "photos": ortho_scenes.photos(ortho_scenes.rendered()),
-        "cameras": ortho_scenes.cameras(ortho_scenes.camera(where)),
+        "cameras": Cameras(cameras=tuple(map(settled_camera, oriented.cameras))),
     }
 
 
@@ -86,6 +84,7 @@ def coloured_wall() -> Mapping[str, Product | InputFiles]:
 SCENES: dict[str, Callable[[], Mapping[str, Product | InputFiles]]] = {
     "inspect.surf": inspect_scenes.surf_inputs,
     "inspect.checkpoints": inspect_scenes.checkpoint_inputs,
+    "inspect.truth": inspect_scenes.truth_inputs,
     "register.similarity": inspect_scenes.register_inputs,
     "colour.photos": coloured_wall,
 }

@@ -18,6 +18,7 @@ from orthoflow.sdk import Method, MethodParams, Ports
 from orthoflow.testing import golden
 from orthoflow.testing.examples import example_room
 from orthoflow.testing.golden import Sample, golden_problem, sample_of, sample_problem
+from orthoflow.testing.isolation import INSTRUCTION_SWITCHES
 from orthoflow.testing.trials import Trial
 
 
@@ -102,6 +103,49 @@ def test_a_result_of_something_else_records_anew(file: Path) -> None:
     assert golden_problem(file, trial(input_lift_m=0.1), moved) == ""
     assert golden_problem(file, trial(input_lift_m=0.1), {"planes": planes()}).startswith(MOVED)
     assert golden_problem(file, trial(input_lift_m=0.1, cell_m=0.2), {"planes": planes()}) == ""
+
+
+def stating(*rmse_grey: float, lift_m: float = 0.0) -> Mapping[str, Product]:
+    """Planes that say something of themselves, as an inspection does: an RMSE over few cells."""
+    return {"planes": replace(planes(lift_m), details={"rmse_grey": list(rmse_grey)})}
+
+
+def test_stated_numbers_count_where_the_same_bits_went_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "golden.json"
+    assert golden_problem(file, trial(), stating(19.55, 4.09, 0.0259)) == ""
+    other_machine(monkeypatch)
+    moved = "output planes is another one than golden.json has (3 of 3 sampled values of metadata"
+    assert golden_problem(file, trial(), stating(20.23, 4.20, 0.0254)).startswith(moved)
+    assert golden_problem(file, trial(), stating(19.56, 4.09, 0.0259)) == ""
+
+
+def test_what_other_bits_went_into_is_held_to_its_tolerances_alone(tmp_path: Path) -> None:
+    file = tmp_path / "golden.json"
+    assert golden_problem(file, trial(), stating(19.55, 4.09, 0.0259)) == ""
+    before, elsewhere = file.read_text(), trial(input_lift_m=1e-12)
+    assert golden_problem(file, elsewhere, stating(20.23, 4.20, 0.0254)) == ""
+    lifted = stating(20.23, 4.20, 0.0254, lift_m=2e-5)
+    assert golden_problem(file, elsewhere, lifted).startswith(MOVED)
+    one_less = golden_problem(file, elsewhere, stating(20.23, 4.20))
+    assert "(metadata had [3] values, now [2])" in one_less
+    assert file.read_text() == before
+
+
+def test_switched_off_instructions_are_another_environment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    environment = golden._environment.__wrapped__
+    for name in INSTRUCTION_SWITCHES:
+        monkeypatch.delenv(name, raising=False)
+    here = environment()
+    assert environment() == here
+    seen = {here}
+    for name in INSTRUCTION_SWITCHES:
+        monkeypatch.setenv(name, "Nehalem")
+        seen.add(environment())
+    assert len(seen) == 1 + len(INSTRUCTION_SWITCHES)
 
 
 def test_an_output_that_appears_is_noticed(file: Path) -> None:

@@ -61,6 +61,16 @@ CASES = {
         "steps.x.params.normal[2]",
         'input should be a valid number, got the text "up"',
     ),
+    "list instead of a number": (
+        STEP % ", params: {cell_m: [0.02]}",
+        "steps.x.params.cell_m",
+        "cell_m: input should be a valid number, got a list",
+    ),
+    "mapping instead of a number": (
+        STEP % ", params: {cell_m: {low_m: 0.02}}",
+        "steps.x.params.cell_m",
+        "cell_m: input should be a valid number, got a mapping",
+    ),
     "nested parameter": (
         STEP % ", params: {limits: {low_m: true}}",
         "steps.x.params.limits.low_m",

@@ -1,0 +1,140 @@
+"""The mutations of `tests/mutate.py`: what is changed, what is left alone, and which tests run."""
+
+from __future__ import annotations
+
+import ast
+import textwrap
+from collections import Counter
+
+import pytest
+
+from tests import mutate
+from tests.mutations import drawn, mutations_of
+
+PATH = "orthoflow/engine/example.py"
+
+
+def changes(source: str) -> dict[str, set[str]]:
+    """Operator -> the lines that it makes, of a module."""
+    text = textwrap.dedent(source).encode()
+    found: dict[str, set[str]] = {}
+    for mutation in mutations_of(text, PATH):
+        changed = mutation.applied(text).decode()
+        ast.parse(changed)
+        line = changed.splitlines()[mutation.line - 1].strip()
+        found.setdefault(mutation.kind, set()).add(line)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("source", "kind", "lines"),
+    [
+        ("a = b + c", "arithmetic", {"a = (b - c)"}),
+        ("a = b - c * d", "arithmetic", {"a = (b + c * d)", "a = b - (c / d)"}),
+        ("a += b", "arithmetic", {"a -= b"}),
+        ("a = n < k", "comparison", {"a = (n >= k)", "a = (n <= k)"}),
+        ("a = far_m < 0.5", "comparison", {"a = (far_m >= 0.5)"}),
+        ("a = b == c", "comparison", {"a = (b != c)"}),
+        ("a = b is None", "comparison", {"a = (b is not None)"}),
+        ("a = b in c", "comparison", {"a = (b not in c)"}),
+        ("a = b and c", "boolean", {"a = (b or c)"}),
+        ("a = not b", "boolean", {"a = (b)"}),
+        ("a = 3", "constant", {"a = (4)"}),
+        ("a = 0.25", "constant", {"a = (0.5)"}),
+        ("a = 0.0", "constant", {"a = (1.0)"}),
+        ("a = True", "constant", {"a = (False)"}),
+        ("def f(a=2): ...", "constant", {"def f(a=(3)): ..."}),
+        ("def f(*, a=False): ...", "constant", {"def f(*, a=(True)): ..."}),
+        ("def f(): return g()", "return", {"def f(): return (None)"}),
+        ("a = b if c else d", "branch", {"a = b if (True) else d", "a = b if (False) else d"}),
+        ("if a:\n    b()", "branch", {"if (True):", "if (False):"}),
+    ],
+)
+def test_each_operator_changes_what_it_says(source: str, kind: str, lines: set[str]) -> None:
+    assert changes(source)[kind] == lines
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""Two + two."""',
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import x",
+        'a: Final = "larger by " + "one"',
+        'raise ValueError(f"{n + 1} of {k - 1}")',
+        "assert n + 1 < 3",
+        'ctx.progress(0.5 + 0.1, "half")',
+        "class A:\n    def __repr__(self): return str(1 + 1)",
+        "class A:\n    result_version: ClassVar[int] = 3",
+        "@compiled(cache=True)\ndef f(): ...",
+        "zip(a, b, strict=True)",
+        "a: tuple[float, float]",
+        "a = b / 'name'",
+        "a = 1e-12",
+        "_ROWS_AT_ONCE = 64",
+        "def f(*, cores: int = 1): ...",
+        "class A:\n    cores: int = 1",
+        "b.reshape(-1)",
+        "return None",
+    ],
+)
+def test_what_no_test_should_hold_is_left_alone(source: str) -> None:
+    assert changes(source) == {}
+
+
+def test_an_expression_over_several_lines_is_changed_as_a_whole() -> None:
+    text = b"a = (\n    b  # \xc3\xa4\n    + c\n)\nd = 1\n"
+    arithmetic = next(item for item in mutations_of(text, PATH) if item.kind == "arithmetic")
+    names: dict[str, int] = {"b": 5, "c": 3}
+    exec(compile(arithmetic.applied(text), PATH, "exec"), {}, names)
+    assert (names["a"], names["d"]) == (2, 1)
+
+
+def test_a_seed_draws_each_line_once_and_the_same_again() -> None:
+    text = "\n".join(f"a{n} = b{n} + {n}" for n in range(200)).encode()
+    found = mutations_of(text, PATH)
+    chosen = drawn(found, seed=5, count=40)
+    assert chosen == drawn(found, seed=5, count=40) != drawn(found, seed=6, count=40)
+    assert len({mutation.line for mutation in chosen}) == 40
+    assert len(drawn(found, seed=5, count=1000)) == 200
+    # Lines are as likely as each other, whatever there is on them.
+    times = Counter(m.line for seed in range(300) for m in drawn(found, seed=seed, count=40))
+    assert min(times.values()) > 25  # 60 expected, 7 their standard deviation
+    assert max(times.values()) < 95
+
+
+@pytest.fixture(scope="module")
+def tree() -> mutate.Tree:
+    return mutate.Tree.of(mutate.ROOT)
+
+
+@pytest.mark.parametrize(
+    ("path", "folder"),
+    [
+        ("orthoflow/engine/store.py", "tests/engine"),
+        ("orthoflow/files/points/e57.py", "tests/files/points"),
+        ("plugins/orthoflow_plugins/plane/ransac.py", "tests/plugins/plane"),
+        ("provenance/orthoflow_provenance/safe.py", "tests/provenance"),
+        ("orthoflow/geometry/planes.py", "tests/geometry"),
+        ("orthoflow/errors.py", "tests/cli"),
+    ],
+)
+def test_a_modules_tests_are_in_the_folder_of_its_name(
+    tree: mutate.Tree, path: str, folder: str
+) -> None:
+    assert mutate.folders_of(tree, path)[0] == folder
+
+
+def test_the_file_of_its_name_goes_first_and_kinds_follow_geometry(tree: mutate.Tree) -> None:
+    files = mutate.files_of(tree, "plugins/orthoflow_plugins/plane/hough3d.py")
+    assert files[0] == "tests/plugins/plane/test_hough3d.py"
+    folders = ("tests/plugins/plane", "tests/plugins")
+    there = [file for folder in folders for file in (mutate.ROOT / folder).glob("test_*.py")]
+    assert sorted(files) == sorted(str(file.relative_to(mutate.ROOT)) for file in there)
+    folders = mutate.folders_of(tree, "orthoflow/geometry/threads.py")
+    assert folders[0] == "tests/geometry"
+    assert {"tests/plugins/plane", "tests/plugins/ortho"} <= set(folders)
+
+
+def test_importers_are_found_by_way_of_others(tree: mutate.Tree) -> None:
+    assert "orthoflow.engine.child" in tree.importers("orthoflow.errors")
+    assert tree.importers("orthoflow.__main__") == {"orthoflow.__main__"}

@@ -1,0 +1,110 @@
+"""The examples: the same bits on every processor, and what methods need to show anything."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from orthoflow.engine.store import digest_of
+from orthoflow.geometry import Plane
+from orthoflow.products import (
+    LayerMask,
+    Layers,
+    Orthoimages,
+    OrthoMask,
+    Planes,
+    PointCloud,
+    PointLabels,
+    SurfaceMask,
+    Truth,
+    Walls,
+)
+from orthoflow.testing.examples import example
+from orthoflow.testing.photographed import PHOTOGRAPHED
+from orthoflow.testing.surveyed import SURVEYED, settled
+
+_DIGESTS = """
+import json
+from orthoflow.engine.store import digest_of
+from orthoflow.testing.photographed import PHOTOGRAPHED
+from orthoflow.testing.surveyed import SURVEYED
+both = {"surveyed": SURVEYED, "photographed": PHOTOGRAPHED}
+print(json.dumps({f"{a} {b}": digest_of(make()) for a in both for b, make in both[a].items()}))
+"""
+
+
+def test_examples_keep_their_bits_without_wide_instructions() -> None:
+    switched_off = {"NPY_DISABLE_CPU_FEATURES": "X86_V3", "OPENBLAS_CORETYPE": "Nehalem"}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", _DIGESTS],
+        env={**os.environ, **switched_off, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    both = {"surveyed": SURVEYED, "photographed": PHOTOGRAPHED}
+    here = {f"{a} {b}": digest_of(make()) for a in both for b, make in both[a].items()}
+    assert json.loads(done.stdout) == here
+
+
+@pytest.mark.parametrize("noise", [1e-16, -3e-13])
+def test_settled_numbers_lose_rounding_errors_and_the_sign_of_zero(noise: float) -> None:
+    exact = np.array([0.0, 1.25, -2.4, 0.978052255])
+    assert settled(exact + noise).tobytes() == settled(exact).tobytes() == exact.tobytes()
+    assert not np.signbit(settled(np.array([-1e-15]))[0])
+
+
+def test_the_rasters_lie_on_the_planes_that_the_cloud_shows() -> None:
+    planes, walls, cloud = example("planes"), example("walls"), example("cloud")
+    labels, truth = example("labels"), example("truth")
+    assert isinstance(planes, Planes)
+    assert isinstance(walls, Walls)
+    assert isinstance(cloud, PointCloud)
+    assert isinstance(labels, PointLabels)
+    assert isinstance(truth, Truth)
+    points = cloud.points_world()
+    for index, wall in enumerate(walls.walls):
+        plane = planes.plane(index)
+        assert isinstance(plane, Plane)
+        np.testing.assert_allclose(plane.distances_m(wall.frame.corners_world()), 0.0, atol=1e-8)
+        on_plane = labels.plane_index == index
+        np.testing.assert_array_equal(on_plane, truth.labels == index)
+        distances = np.abs(plane.distances_m(points[on_plane]))
+        assert np.median(distances) < 0.003  # metres; the scanner's noise is 1.5 mm
+        cells = wall.frame.wall_from_world(points[on_plane])[:, :2]
+        assert (cells > -1.0).all()
+        assert (cells < [wall.frame.width + 1.0, wall.frame.height + 1.0]).all()
+
+
+def test_every_state_of_a_cell_occurs() -> None:
+    walls, layers, orthoimages = example("walls"), example("layers"), example("orthoimages")
+    assert isinstance(walls, Walls)
+    assert isinstance(layers, Layers)
+    assert isinstance(orthoimages, Orthoimages)
+    for wall in walls.walls:
+        assert set(np.unique(wall.mask)) == set(SurfaceMask)
+        void = wall.mask == SurfaceMask.VOID
+        np.testing.assert_array_equal(np.isnan(wall.depth_m), void)
+        assert wall.intensity is not None
+        np.testing.assert_array_equal(np.isnan(wall.intensity), void)
+        np.testing.assert_array_equal(wall.count > 0, wall.mask == SurfaceMask.MEASURED)
+    for layer in layers.layers:
+        assert set(np.unique(layer.mask)) == set(LayerMask)
+        painted = layer.mask == LayerMask.PAINTED
+        np.testing.assert_array_equal(layer.quality > 0.0, painted)
+        assert layer.filled is not None
+        assert layer.filled.any()
+        assert painted[layer.filled > 0].all()
+        assert not layer.rgb[~painted].any()
+    for index, image in enumerate(orthoimages.images):
+        assert set(np.unique(image.mask)) == set(OrthoMask) - {OrthoMask.NONE}
+        left, right = layers.layers[2 * index : 2 * index + 2]
+        for place, layer in enumerate((left, right)):
+            shown = image.source == place
+            np.testing.assert_array_equal(image.rgb[shown], layer.rgb[shown])
+            assert (layer.mask[shown] == LayerMask.PAINTED).all()

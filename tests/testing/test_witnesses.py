@@ -1,0 +1,92 @@
+"""What a watched run leaves behind: nothing that the next method's trial would notice."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthoflow.engine.store import digest_of
+from orthoflow.products import Planes, PointCloud
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.testing import isolation
+from orthoflow.testing.examples import example_room
+from orthoflow.testing.trials import Trial
+from orthoflow.testing.witnesses import Witness
+
+
+class Meddling(Method):
+    """Moves the first point of its input, and fails where it is told to."""
+
+    id = "plane.meddling"
+
+    class Params(MethodParams):
+        """Whether it fails."""
+
+        fails: bool = False
+
+    class In(Ports):
+        """What it spoils."""
+
+        cloud: PointCloud
+
+    class Out(Ports):
+        """Nothing of interest."""
+
+        planes: Planes
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Spoil it."""
+        inputs.cloud.x.flags.writeable = True
+        inputs.cloud.x[0] += 1.0
+        if params.fails:
+            raise ValueError("no wall")
+        return self.Out(planes=example_room()[1])
+
+
+def test_inputs_that_a_method_changed_are_as_before_for_the_next_one() -> None:
+    cloud, _ = example_room(n_points=1000)
+    before = digest_of(cloud)
+    first = Witness(Trial(method=Meddling, inputs={"cloud": cloud})).first
+    assert first.changed_inputs == ("cloud",)
+    assert digest_of(cloud) == before
+
+
+def test_they_are_also_where_the_method_fails() -> None:
+    cloud, _ = example_room(n_points=1000)
+    before = digest_of(cloud)
+    with pytest.raises(ValueError, match="no wall"):
+        _ = Witness(Trial(method=Meddling, inputs={"cloud": cloud}, params={"fails": True})).first
+    assert digest_of(cloud) == before
+
+
+def test_drawing_from_numpys_own_generator_is_seen() -> None:
+    class Dicing(Meddling):
+        id = "plane.dicing"
+
+        def run(
+            self, inputs: Meddling.In, params: Meddling.Params, ctx: StepContext
+        ) -> Meddling.Out:
+            np.random.random()  # noqa: NPY002 - the global one is what is watched
+            return self.Out(planes=example_room()[1])
+
+    cloud, _ = example_room(n_points=1000)
+    first = Witness(Trial(method=Dicing, inputs={"cloud": cloud})).first
+    assert (first.changed_inputs, first.drew_globally) == ((), True)
+
+
+def test_a_new_process_computes_with_the_same_instructions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in isolation.INSTRUCTION_SWITCHES:
+        monkeypatch.setenv(name, f"switched by {name}")
+    monkeypatch.setenv("ORTHOFLOW_SECRET", "not for methods")
+    environment = isolation._environment(tmp_path)
+    for name in isolation.INSTRUCTION_SWITCHES:
+        assert environment[name] == f"switched by {name}"
+    assert "ORTHOFLOW_SECRET" not in environment
+    monkeypatch.delenv("OPENBLAS_CORETYPE")
+    assert "OPENBLAS_CORETYPE" not in isolation._environment(tmp_path)
+    assert environment["PATH"] == os.environ["PATH"]
