@@ -13,7 +13,7 @@ from orthoflow.products.photographs import (
     TieRole,
     Ties,
 )
-from orthoflow.products.planes import Planes, PointLabels
+from orthoflow.products.planes import Planes, PointLabels, ScanRow, Spread, Thickness
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 from orthoflow.products.walls import (
     Layer,
@@ -51,7 +51,10 @@ __all__ = [
     "PointCloud",
     "PointLabels",
     "Product",
+    "ScanRow",
+    "Spread",
     "SurfaceMask",
+    "Thickness",
     "TieRole",
     "Ties",
     "Tolerance",
