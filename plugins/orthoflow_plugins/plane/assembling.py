@@ -127,15 +127,7 @@ def assemble(
         ),
         viewpoint=viewpoint,
         tolerance_m=ordered.find_m,
-        details={
-            "fit_n_points": [int(n) for n in ordered.n_fit],
-            "fit_rms_m": [float(value) for value in ordered.rms_fit_m],
-            "n_independent": [item.stated.n_independent for item in faced],
-            "normality": [None if item is None else item.to_json() for item in normalities],
-            "fit_tolerance_m": ordered.fit_m,
-            "raw": [item.to_json() for item in raw],
-            "guessed_sides": [index for index, item in enumerate(faced) if item.is_guessed],
-        },
+        details=_details(faced, ordered, normalities, raw),
     )
     labels = np.full(len(found) + 1, -1, dtype=np.int16)
     labels[order] = np.arange(len(found), dtype=np.int16)
@@ -362,6 +354,24 @@ def _faced(
         part_corners_m=np.array([enclosing(part, plane, turned) for part in parts_m]),
         is_guessed=is_guessed,
     )
+
+
+def _details(
+    faced: list[_Faced],
+    ordered: Deviations,
+    normalities: tuple[Normality | None, ...],
+    raw: tuple[RawPlane, ...],
+) -> dict[str, JsonValue]:
+    """What a detector says about its planes besides, for people."""
+    return {
+        "fit_n_points": [int(n) for n in ordered.n_fit],
+        "fit_rms_m": [float(value) for value in ordered.rms_fit_m],
+        "n_independent": [item.stated.n_independent for item in faced],
+        "normality": [None if item is None else item.to_json() for item in normalities],
+        "fit_tolerance_m": ordered.fit_m,
+        "raw": [item.to_json() for item in raw],
+        "guessed_sides": [index for index, item in enumerate(faced) if item.is_guessed],
+    }
 
 
 def _raw(candidate: Candidate, faced: _Faced, cloud: PointCloud) -> RawPlane:

@@ -117,7 +117,7 @@ def _new_row(brick: int, bricks: NDArray[np.int32], n_used: NDArray[np.int64]) -
 
 
 @kernel_part
-def _add_voxels(
+def _add_to_voxel(
     key: int,
     count: int,
     bricks: NDArray[np.int32],
@@ -167,9 +167,9 @@ def count_voxels(
         for i in range(1, count):
             # A scan's neighbours share a voxel: runs of them are added at once.
             if keys[i] != key:
-                _add_voxels(key, i - first, bricks, counts, n_used)
+                _add_to_voxel(key, i - first, bricks, counts, n_used)
                 first, key = i, keys[i]
-        _add_voxels(key, count - first, bricks, counts, n_used)
+        _add_to_voxel(key, count - first, bricks, counts, n_used)
         start += BLOCK_POINTS
     return points.x.size
 
