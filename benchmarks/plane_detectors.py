@@ -26,18 +26,16 @@ import numpy as np
 from great_room import FULL_POINTS, great_room
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
-from orthoflow_plugins.plane.candidates import FoundPlane
+from orthoflow_plugins.plane.candidates import FoundPlane, Rules
 from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
-from orthoflow_plugins.plane.detecting import rules_of, search_sample
-from orthoflow_plugins.plane.deviations import measure_planes
+from orthoflow_plugins.plane.detecting import Proposer, find_planes, rules_of
+from orthoflow_plugins.plane.final_fit import name_points
+from orthoflow_plugins.plane.measuring import measure_planes
 from orthoflow_plugins.plane.parameters import DetectorParams
-from orthoflow_plugins.plane.preparing import prepare
-from orthoflow_plugins.plane.region_proposer import RegionProposer
-from orthoflow_plugins.plane.regions import Growth, Regions, grow
-from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.settling import name_points
+from orthoflow_plugins.plane.regions import Growth, RegionProposer, Regions, grow
+from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare
 from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
-from orthoflow_plugins.plane.surface_cells import Neighbourhood, surface_cells
+from orthoflow_plugins.plane.surface_voxels import Neighbourhood, surface_voxels
 from plane_peers import PEERS, measured
 
 from orthoflow.geometry import basis_from_up
@@ -68,11 +66,11 @@ def times_s(task: Callable[[], object], repeats: int) -> tuple[float, float, flo
 
 def detect(
     method: str, cloud: PointCloud, *, most: int, cores: int
-) -> tuple[Remainder, list[FoundPlane]]:
+) -> tuple[PreparedCloud, list[FoundPlane]]:
     """What a method does up to its labels, without statistics, files and figures."""
     rules = replace(rules_of(DetectorParams()), n_planes_most=most, least_share=SHARE)
     cell_m = CELL_M if method == "hough2d" else 0.5
-    remainder = prepare(
+    prepared = prepare(
         cloud,
         basis_from_up(cloud.up),
         cell_m=cell_m,
@@ -91,37 +89,46 @@ def detect(
             least_share=SHARE,
         )
         rng = np.random.default_rng(0)
-        found = search_sample(
-            remainder, rules, _listen, lambda sample: ConsensusProposer(sample, search, rng)
-        )
+
+        def proposer_of(_: PreparedCloud, unassigned: Unassigned, __: Rules) -> Proposer:
+            return ConsensusProposer(unassigned, search, rng)
+
     elif method == "region":
         wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, cell_m=0.1 / 3.0)
         growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=0.2 * SHARE * len(cloud))
-        regions = grow(surface_cells(remainder, wanted), growth, np.zeros(3))
-        found = search_sample(
-            remainder, rules, _listen, lambda sample: region_proposer(regions, sample)
-        )
+
+        def proposer_of(cloud: PreparedCloud, unassigned: Unassigned, _: Rules) -> Proposer:
+            regions = grow(surface_voxels(cloud, wanted), growth, np.zeros(3))
+            return region_proposer(regions, unassigned)
+
     elif method.startswith("hough3d"):
         coarser = 1.0 if method == "hough3d-full" else 2.0
         space = SpaceVoting(
             cell_m=coarser * CELL_M, angle_step_deg=coarser, least_points=SHARE * len(cloud)
         )
-        found = search_sample(remainder, rules, _listen, lambda _: SpaceProposer(remainder, space))
+
+        def proposer_of(cloud: PreparedCloud, _: Unassigned, __: Rules) -> Proposer:
+            return SpaceProposer(cloud, space)
+
     else:
         voting = Voting(angle_step_deg=1.0, least_points=SHARE * len(cloud))
-        found = search_sample(remainder, rules, _listen, lambda _: PlanProposer(remainder, voting))
+
+        def proposer_of(cloud: PreparedCloud, _: Unassigned, __: Rules) -> Proposer:
+            return PlanProposer(cloud, voting)
+
+    found = find_planes(prepared, proposer_of, rules, _listen)
     labels = np.empty(len(cloud), dtype=np.int16)
-    name_points(remainder, np.arange(len(found) + 1, dtype=np.int16), labels)
-    return remainder, found
+    name_points(prepared, np.arange(len(found) + 1, dtype=np.int16), labels)
+    return prepared, found
 
 
-def region_proposer(regions: Regions, sample: Remainder) -> RegionProposer:
+def region_proposer(regions: Regions, unassigned: Unassigned) -> RegionProposer:
     return RegionProposer(
         regions=regions,
-        region_of_sample=regions.region_of(sample.points),
+        region_of_sample=regions.region_of(unassigned.sample.points),
         family="any",
         tilt_most_deg=10.0,
-        least_points=SHARE * len(sample.claims),
+        least_points=SHARE * len(unassigned.claims),
         proposes_once=False,
     )
 
@@ -216,15 +223,15 @@ def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
     cloud, cores = room.cloud, options.cores
     detect(method, cloud, most=2, cores=cores)  # warm
     before_mib = forget_peak()
-    remainder, found = detect(method, cloud, most=16, cores=cores)
+    prepared, found = detect(method, cloud, most=16, cores=cores)
     grown_mib = peak_mib() - before_mib
     slabs = np.array([item.raster.slab() for item in found])
-    bounds = np.array([item.footprint.bounds_m for item in found])
+    bounds = np.array([item.support.bounds_m for item in found])
     cells = []
     for task in (
         lambda: detect(method, cloud, most=1, cores=cores),
         lambda: detect(method, cloud, most=16, cores=cores),
-        lambda: measure_planes(remainder, slabs, bounds, find_m=0.05, fit_m=0.015),
+        lambda: measure_planes(prepared, slabs, bounds, find_m=0.05, fit_m=0.015),
     ):
         fastest, slowest, cpu_s = times_s(task, options.repeats)
         # Measured beside each task: other work on the machine slows both.
@@ -234,12 +241,12 @@ def report_method(method: str, room: Room, options: argparse.Namespace) -> Room:
             f" = {fastest / room.floor_s:.0f} F, {cpu_s / room.floor_s:.0f} F"
         )
     share = grown_mib * 2**20 / (12 * len(cloud))
-    cells += [f"{grown_mib:.0f} MiB = {share:.2f} of the input", *accuracy(room, remainder, found)]
+    cells += [f"{grown_mib:.0f} MiB = {share:.2f} of the input", *accuracy(room, prepared, found)]
     print(f"| {method}, {len(found)} planes | {' | '.join(cells)} |", flush=True)
     return room
 
 
-def accuracy(room: Room, remainder: Remainder, found: list[FoundPlane]) -> tuple[str, str]:
+def accuracy(room: Room, prepared: PreparedCloud, found: list[FoundPlane]) -> tuple[str, str]:
     """How near the planes come to the true ones: of the main wall, and the worst of the others."""
     nearest = [_nearest(normal, offset, centre, found) for _, normal, offset, centre in room.truth]
     hits = [item for item in nearest if item is not None]
@@ -257,7 +264,7 @@ def accuracy(room: Room, remainder: Remainder, found: list[FoundPlane]) -> tuple
     a, b, c = plane.normal.astype(np.float32)
     cloud = room.cloud
     apart = np.abs(a * cloud.x + b * cloud.y + c * cloud.z - np.float32(plane.offset_m))
-    chosen = (remainder.claims == index) & (apart <= 0.015)
+    chosen = (prepared.claims == index) & (apart <= 0.015)
     both = np.count_nonzero(chosen & room.is_main)
     precision, recall = both / np.count_nonzero(chosen), both / np.count_nonzero(room.is_main)
     return (

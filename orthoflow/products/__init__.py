@@ -15,7 +15,7 @@ from orthoflow.products.photographs import (
     Ties,
     TieWall,
 )
-from orthoflow.products.planes import Planes, PointLabels
+from orthoflow.products.planes import Planes, PointLabels, ScanRow, Spread, Thickness
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 from orthoflow.products.walls import (
     IntensitySource,
@@ -56,8 +56,11 @@ __all__ = [
     "PointLabels",
     "Product",
     "ResidualRow",
+    "ScanRow",
+    "Spread",
     "SurfaceMask",
     "TakenPhoto",
+    "Thickness",
     "TieRole",
     "TieWall",
     "Ties",

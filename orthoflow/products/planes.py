@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Final
 
 import numpy as np
@@ -12,9 +12,72 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane
-from orthoflow.products.product import JsonValue, Product, Tolerance
+from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 
+# That of markiewicz2015.
 _USUAL_TOLERANCE_M: Final = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Thickness of the cloud where its points are of one class.
+
+    Attributes:
+        low: smallest value of the class, in its unit.
+        high: largest value of the class.
+        n_points: points that were measured.
+        sigma_m: robust standard deviation of their distances.
+        name: of the class, where it has one.
+    """
+
+    low: float
+    high: float
+    n_points: int
+    sigma_m: float
+    name: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thickness:
+    """Thickness of the cloud on one plane; classes are empty where nothing is known of them.
+
+    Attributes:
+        sigma_m: robust standard deviation of the distances, relief apart.
+        width_95_m: width that holds 95 % of them.
+        scan_step_m: distance between neighbouring points on the plane, median.
+        incidence_deg: by the angle of incidence.
+        range_m: by the distance from the scanner.
+        intensity: by the intensity, 0..1.
+        material: by the materials that were named.
+    """
+
+    sigma_m: float
+    width_95_m: float
+    scan_step_m: float
+    incidence_deg: tuple[Spread, ...] = ()
+    range_m: tuple[Spread, ...] = ()
+    intensity: tuple[Spread, ...] = ()
+    material: tuple[Spread, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanRow:
+    """Thickness of the cloud along one row of a scan on the first plane.
+
+    Attributes:
+        row: number of the row.
+        scan: number of the scan.
+        n_points: points of the row on the plane.
+        sigma_m: robust standard deviation of their distances, relief apart; None where the row is
+            too thin for one.
+        material: by the materials that were named.
+    """
+
+    row: int
+    scan: int
+    n_points: int
+    sigma_m: float | None = None
+    material: tuple[Spread, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +97,16 @@ class Planes(Product):
         part_corners: (p, 4, 3) float64 rectangles of connected parts, or None.
         part_plane: (p,) int32 index of the plane a part lies on, or None.
         viewpoint: how the normals' side was chosen: `stations`, `view_from`, `given` or `guess`.
+        tolerance_m: distance within which points counted when the planes were found; a method that
+            does not say is taken to have used that of markiewicz2015.
+        thickness: of the cloud on each plane, None where too few points show it; empty where
+            nobody measured it.
+        scan_row: of a cloud that knows its rows, the row that shows most of the first plane.
         details: what else the method says about itself, JSON.
     """
 
     type_name: ClassVar[str] = "planes"
+    encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "normal": Tolerance(limit=1e-6, unit="1"),
         "offset": Tolerance(limit=1e-5, unit="m"),
@@ -59,6 +128,9 @@ class Planes(Product):
     part_corners: NDArray[np.float64] | None = None
     part_plane: NDArray[np.int32] | None = None
     viewpoint: str = "guess"
+    tolerance_m: float = _USUAL_TOLERANCE_M
+    thickness: tuple[Thickness | None, ...] = ()
+    scan_row: ScanRow | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -77,21 +149,33 @@ class Planes(Product):
         lengths = np.linalg.norm(self.normal, axis=1)
         if not np.allclose(lengths, 1.0, atol=1e-9):
             raise ProductError(f"planes.normal must be unit vectors, got lengths {lengths}")
+        if not self.tolerance_m > 0.0:
+            raise ProductError(f"planes.tolerance_m must be positive, got {self.tolerance_m}")
+        if self.thickness and len(self.thickness) != count:
+            raise ProductError(
+                f"planes.thickness must be empty or one per plane, got {len(self.thickness)} for "
+                f"{count}"
+            )
+
+    @classmethod
+    def upgraded(cls, payload: Payload) -> Payload:
+        """Move what stood in the details of version 1: tolerance, thickness, row of the scan."""
+        stored = payload.metadata.get("details")
+        details = dict(stored) if isinstance(stored, dict) else {}
+        moved: dict[str, JsonValue] = {}
+        given = [details.pop(name, None) for name in ("find_tolerance_m", "tolerance_m")]
+        for value in given:
+            if isinstance(value, float | int) and value > 0.0 and "tolerance_m" not in moved:
+                moved["tolerance_m"] = float(value)
+        for name in ("thickness", "scan_row"):
+            value = details.pop(name, None)
+            if value is not None:
+                moved[name] = value
+        metadata = {**payload.metadata, **moved, "details": details}
+        return replace(payload, encoding_version=cls.encoding_version, metadata=metadata)
 
     def __len__(self) -> int:
         return len(self.offset)
-
-    @property
-    def tolerance_m(self) -> float:
-        """Distance within which points counted when the planes were found.
-
-        A method that does not say so in its details is taken to have used that of markiewicz2015.
-        """
-        for name in ("find_tolerance_m", "tolerance_m"):
-            told = self.details.get(name)
-            if isinstance(told, float | int) and told > 0.0:
-                return float(told)
-        return _USUAL_TOLERANCE_M
 
     def plane(self, index: int) -> Plane:
         """Give one of the planes, 0 the one with the largest support."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from orthoflow.geometry import omega_phi_deg
-from orthoflow.products import Planes
+from orthoflow.products import Planes, Spread, Thickness
 from orthoflow.records import Run
 from orthoflow.report.pictures import embedded_products
 
@@ -74,47 +73,33 @@ def _plane_row(planes: Planes, index: int) -> PlaneRow:
         omega_deg=omega,
         phi_deg=phi,
         offset_m=float(planes.offset[index]),
-        sigma_mm=1000 * _offset_sigma_m(planes, index),
+        sigma_mm=1000 * planes.sigma_offset_m(index),
         size=f"{width_m:.2f} x {height_m:.2f} m",
         n_points=int(planes.n_points[index]),
         rms_mm=1000 * float(planes.rms_m[index]),
-        thickness_mm=_in_mm(thickness.get("sigma_m")),
-        scan_step_mm=_in_mm(thickness.get("scan_step_m")),
+        thickness_mm=None if thickness is None else 1000.0 * thickness.sigma_m,
+        scan_step_mm=None if thickness is None else 1000.0 * thickness.scan_step_m,
     )
 
 
-def _thickness(planes: Planes, index: int) -> Mapping[str, object]:
+def _thickness(planes: Planes, index: int) -> Thickness | None:
     """What a detector measured on a plane; nothing for planes that were given."""
-    told = planes.details.get("thickness")
-    item = told[index] if isinstance(told, Sequence) and index < len(told) else None
-    return item if isinstance(item, Mapping) else {}
+    return planes.thickness[index] if planes.thickness else None
 
 
 def _material_rows(planes: Planes) -> Iterator[MaterialRow]:
-    places = [(planes.names[k], _thickness(planes, k)) for k in range(len(planes))]
-    row = planes.details.get("scan_row")
-    if isinstance(row, Mapping):
-        places.append((f"row {row.get('row')} of scan {row.get('scan')}, {planes.names[0]}", row))
-    for place, told in places:
-        found = told.get("material", ())
-        for item in found if isinstance(found, Sequence) else ():
-            if isinstance(item, Mapping):
-                yield MaterialRow(
-                    place=place,
-                    material=str(item["name"]),
-                    n_points=int(str(item["n_points"])),
-                    thickness_mm=1000.0 * float(str(item["sigma_m"])),
-                )
-
-
-def _in_mm(value: object) -> float | None:
-    return 1000.0 * value if isinstance(value, float) else None
-
-
-def _offset_sigma_m(planes: Planes, index: int) -> float:
-    # Along the normal at the rectangle's centre, not at the far origin, where the angle's
-    # uncertainty would swamp it: offset error = n' x - d with x fixed.
-    centre = planes.corners[index].mean(axis=0)
-    gradient = np.append(centre, -1.0)
-    variance = float(gradient @ planes.covariance[index] @ gradient)
-    return math.sqrt(max(0.0, variance))
+    places: list[tuple[str, tuple[Spread, ...]]] = []
+    for name, thickness in zip(planes.names, planes.thickness, strict=False):
+        if thickness is not None:
+            places.append((name, thickness.material))
+    row = planes.scan_row
+    if row is not None:
+        places.append((f"row {row.row} of scan {row.scan}, {planes.names[0]}", row.material))
+    for place, spreads in places:
+        for spread in spreads:
+            yield MaterialRow(
+                place=place,
+                material=str(spread.name),
+                n_points=spread.n_points,
+                thickness_mm=1000.0 * spread.sigma_m,
+            )

@@ -64,7 +64,9 @@ def _room() -> tuple[PointCloud, Truth]:
     method = discover_catalog().method("simulate.room").load()
     with TemporaryDirectory(prefix="orthoflow-example-") as folder:
         ctx = StepContext(rng=np.random.default_rng(1), cores=1, scratch=Path(folder))
-        outputs = method().run(method.In(), method.Params.model_validate({"scan_step_m": _SCAN_STEP_M}), ctx)
+        outputs = method().run(
+            method.In(), method.Params.model_validate({"scan_step_m": _SCAN_STEP_M}), ctx
+        )
     made = vars(outputs)
     cloud, truth = made["cloud"], made["truth"]
     scene = replace(

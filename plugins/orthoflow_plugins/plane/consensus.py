@@ -10,26 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane
-from orthoflow.geometry.consensus_kernels import consensus_sums, distance_histograms
 from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.plane.candidates import Candidate, Family
+from orthoflow_plugins.plane.consensus_kernels import consensus_sums, distance_histograms
 from orthoflow_plugins.plane.fitting import refine_plane
-from orthoflow_plugins.plane.footprints import INNER_SHARE
 from orthoflow_plugins.plane.hypotheses import (
+    MODEL_POINTS,
     Hypotheses,
     Model,
-    curve_order,
-    draw_hypotheses,
-)
-from orthoflow_plugins.plane.rejections import Rejections, alike
-from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.scores import (
-    MODEL_POINTS,
+    Rejections,
     Scores,
     Scoring,
+    alike,
+    curve_order,
+    draw_hypotheses,
     scores_of,
     scores_of_sums,
 )
+from orthoflow_plugins.plane.sample import Unassigned
+from orthoflow_plugins.plane.support import INNER_SHARE
 
 _BINS: Final = 100
 # Points of the sample that hypotheses are drawn from, and that they are scored on, at most.
@@ -91,56 +90,56 @@ class ConsensusProposer:
     Hypotheses that were good stay for the next plane and are scored anew on what remains.
     """
 
-    def __init__(self, sample: Remainder, search: Search, rng: np.random.Generator) -> None:
+    def __init__(self, unassigned: Unassigned, search: Search, rng: np.random.Generator) -> None:
         """Get ready to propose.
 
         Args:
-            sample: the sample as a cloud of its own.
+            unassigned: the sample.
             search: what is looked for.
             rng: source of chance.
         """
         self._search = search
         self._rng = rng
-        points_m = sample.sample.offsets_m
+        points_m = unassigned.sample.offsets_m
         self._centre_m = np.median(points_m, axis=0)
         # Shuffled once, so that any first part of the free points is an even choice of them.
         self._shuffled = rng.permutation(len(points_m))[:_ASKED_MOST]
         drawn = self._shuffled[:_DRAWN_MOST]
         self._order = drawn[curve_order(points_m[drawn])]
         self._ordered_m = points_m[self._order] - self._centre_m
-        corners = sample.box_corners()
+        corners = unassigned.box_corners_m
         self._box_m = corners.max(axis=0) - corners.min(axis=0)
         self._drawn_for = -1
         self._pool: _Pool | None = None
         self._witnesses = self._shuffled[:_SECOND_POINTS]
         self._rejections = Rejections(points_m[self._witnesses] - self._centre_m, search.find_m)
 
-    def propose(self, remainder: Remainder) -> Candidate | None:
+    def propose(self, unassigned: Unassigned) -> Candidate | None:
         """Name the best hypothesis about the points that remain."""
-        if self._drawn_for != remainder.n_unclaimed:
-            self._rejections.take(remainder.sample_claims[self._witnesses] < 0)
-            self._drawn_for = remainder.n_unclaimed
-            self._draw(remainder)
+        if self._drawn_for != unassigned.n_points:
+            self._rejections.take(unassigned.claims[self._witnesses] < 0)
+            self._drawn_for = unassigned.n_points
+            self._draw(unassigned)
         for _ in range(_REDRAWS):
-            candidate = self._best(remainder)
+            candidate = self._best(unassigned)
             if candidate is not None:
                 return candidate
-            self._draw(remainder)
-        return self._best(remainder)
+            self._draw(unassigned)
+        return self._best(unassigned)
 
-    def _best(self, remainder: Remainder) -> Candidate | None:
+    def _best(self, unassigned: Unassigned) -> Candidate | None:
         pool = self._pool
         if pool is None:
             return None
         is_barred = self._rejections.cover(pool.hypotheses)
         for place in range(len(pool.hypotheses)):
-            if is_barred[place] or not self._is_worth_it(pool.scores, place, remainder):
+            if is_barred[place] or not self._is_worth_it(pool.scores, place, unassigned):
                 continue
             hypothesis = pool.hypotheses.chosen(np.array([place]))
-            layer = self._crowded_layer(hypothesis, pool.asked_m, remainder.up)
+            layer = self._crowded_layer(hypothesis, pool.asked_m, unassigned.up)
             if layer is not None:
-                return self._candidate(hypothesis, pool.scores, place, layer, remainder)
-            # Not asked about again; the full examination would cost ten times as much.
+                return self._candidate(hypothesis, pool.scores, place, layer, unassigned)
+            # Not asked about again; the full verification would cost ten times as much.
             self._rejections.add(hypothesis)
             is_barred |= self._alike(pool.hypotheses, hypothesis)[:, 0]
         return None
@@ -151,9 +150,9 @@ class ConsensusProposer:
         offset_m = plane.offset_m - float(plane.normal @ self._centre_m)
         self._rejections.add(Hypotheses(normals=plane.normal[None], offsets_m=np.array([offset_m])))
 
-    def _draw(self, remainder: Remainder) -> None:
-        claims = remainder.sample_claims
-        points_m = remainder.sample.offsets_m
+    def _draw(self, unassigned: Unassigned) -> None:
+        claims = unassigned.claims
+        points_m = unassigned.sample.offsets_m
         free = np.flatnonzero(claims[self._order] < 0)
         earlier = self._pool
         self._pool = None
@@ -161,10 +160,10 @@ class ConsensusProposer:
             return
         count = self._search.n_hypotheses if earlier is None else self._search.n_hypotheses // 2
         drawn = draw_hypotheses(
-            self._ordered_m.take(free, axis=0), count, self._search.model, remainder.up, self._rng
+            self._ordered_m.take(free, axis=0), count, self._search.model, unassigned.up, self._rng
         )
         hypotheses = drawn if earlier is None else drawn.joined(earlier.hypotheses)
-        hypotheses = hypotheses.chosen(self._leans_well(hypotheses, remainder.up))
+        hypotheses = hypotheses.chosen(self._leans_well(hypotheses, unassigned.up))
         hypotheses = hypotheses.chosen(~self._rejections.cover(hypotheses))
         if len(hypotheses) == 0:
             return
@@ -173,7 +172,7 @@ class ConsensusProposer:
         asked = asked[claims[asked] < 0]
         if len(asked) < _SECOND_POINTS:
             asked = self._shuffled[claims[self._shuffled] < 0]
-        parts = remainder.parts
+        parts = unassigned.parts
         asked_m = points_m.take(asked[:_SECOND_POINTS], axis=0) - self._centre_m
         first = self._score(hypotheses, asked_m[:_FIRST_POINTS], parts)
         n_kept = max(_SECOND_LEAST, round(_SECOND_SHARE * len(hypotheses)))
@@ -254,13 +253,15 @@ class ConsensusProposer:
                 break
         return asked[kept]
 
-    def _is_worth_it(self, scores: Scores, place: int, remainder: Remainder) -> bool:
+    def _is_worth_it(self, scores: Scores, place: int, unassigned: Unassigned) -> bool:
         if self._search.scoring == "a-contrario" and scores.value[place] <= 0.0:
             return False
-        asked = min(_SECOND_POINTS, remainder.n_unclaimed)
+        asked = min(_SECOND_POINTS, unassigned.n_points)
         share = scores.n_points[place] / max(1, asked)
-        n_points = share * remainder.n_unclaimed
-        return bool(n_points >= _SUPPORT_CAUTION * self._search.least_share * len(remainder.claims))
+        n_points = share * unassigned.n_points
+        return bool(
+            n_points >= _SUPPORT_CAUTION * self._search.least_share * len(unassigned.claims)
+        )
 
     def _crowded_layer(
         self, hypothesis: Hypotheses, asked_m: NDArray[np.float64], up: NDArray[np.float64]
@@ -286,17 +287,17 @@ class ConsensusProposer:
         scores: Scores,
         place: int,
         layer: Plane,
-        remainder: Remainder,
+        unassigned: Unassigned,
     ) -> Candidate:
         own_m = None
         if self._search.scoring == "a-contrario":
-            hypothesis, own_m = self._polished(hypothesis, scores, place, remainder)
+            hypothesis, own_m = self._polished(hypothesis, scores, place, unassigned)
         normal = hypothesis.normals[0] / np.linalg.norm(hypothesis.normals[0])
         offset_m = float(hypothesis.offsets_m[0]) + float(normal @ self._centre_m)
         return Candidate(
             plane=Plane(normal=normal, offset_m=offset_m),
             family="wall" if self._search.model == "2d" else self._search.family,
-            support=float(scores.value[place]),
+            votes=float(scores.value[place]),
             own_tolerance_m=own_m,
             start=Plane(
                 normal=layer.normal,
@@ -305,15 +306,15 @@ class ConsensusProposer:
         )
 
     def _polished(
-        self, hypothesis: Hypotheses, scores: Scores, place: int, remainder: Remainder
+        self, hypothesis: Hypotheses, scores: Scores, place: int, unassigned: Unassigned
     ) -> tuple[Hypotheses, float]:
         """Fit to the points within the own tolerance, find that anew, while it gets better."""
-        relative_m = (remainder.sample.offsets_m - self._centre_m)[remainder.sample_claims < 0]
+        relative_m = (unassigned.sample.offsets_m - self._centre_m)[unassigned.claims < 0]
         best = self._score(hypothesis, relative_m, 1)
         for _ in range(_POLISHED):
             distances_m = relative_m @ hypothesis.normals[0] - hypothesis.offsets_m[0]
             near_m = relative_m[np.abs(distances_m) <= best.tolerance_m[0]]
-            fitted = _fitted(near_m, self._search.model, remainder.up)
+            fitted = _fitted(near_m, self._search.model, unassigned.up)
             if fitted is None:
                 break
             score = self._score(fitted, relative_m, 1)

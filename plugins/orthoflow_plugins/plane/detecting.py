@@ -1,4 +1,9 @@
-"""What all detectors do around their search: thin, prepare, settle, label, measure, report."""
+"""The road that all detectors share: prepare, search, fit, label, measure, report.
+
+The search is greedy: the best plane first, its points taken away, then the best of what remains. A
+`Proposer` names candidates (an accumulator's maximum, a consensus set); what follows is the same
+for each. All planes are found in the sample; one pass over all points fits them, one labels.
+"""
 
 from __future__ import annotations
 
@@ -8,34 +13,31 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Thread
 from time import perf_counter
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry import basis_from_up
-from orthoflow.products import JsonValue, Planes, PointCloud, PointLabels
+from orthoflow.geometry import angle_between_deg, basis_from_up, omega_phi_deg
+from orthoflow.products import Planes, PointCloud, PointLabels, Thickness
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.plane.assembling import assemble
-from orthoflow_plugins.plane.candidates import FoundPlane, Rules
-from orthoflow_plugins.plane.deviations import measure_planes
-from orthoflow_plugins.plane.examining import as_proposed
-from orthoflow_plugins.plane.figures import draw_deviations
+from orthoflow_plugins.plane.assembling import Assembly, RawPlane, assemble, warn_of_guesses
+from orthoflow_plugins.plane.candidates import Candidate, FoundPlane, Rules, as_proposed, verify
+from orthoflow_plugins.plane.figures import draw_deviations, draw_planes, draw_thickness
+from orthoflow_plugins.plane.final_fit import fit_to_all, label, name_points
+from orthoflow_plugins.plane.measuring import measure_planes, measure_thickness, row_points
 from orthoflow_plugins.plane.parameters import DetectorParams
-from orthoflow_plugins.plane.peeling import PLANE_FOUND, Proposer, find_planes
-from orthoflow_plugins.plane.preparing import prepare, sample_alone
-from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.reporting import report_planes, report_thickness, report_times
-from orthoflow_plugins.plane.sampling import thinned
-from orthoflow_plugins.plane.scan_rows import scan_row
-from orthoflow_plugins.plane.scene_figures import draw_planes
-from orthoflow_plugins.plane.settling import label, name_points, settle
-from orthoflow_plugins.plane.thickness import measure_thickness
-from orthoflow_plugins.plane.thickness_figures import draw_thickness
+from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned, prepare, thinned
 
 Report = Callable[[float, str], None]
+
 # Steps of the robust box of detectors that do not look at the plan.
 _PLAN_CELL_M: Final = 0.5
+# What the report begins with when a plane was found.
+_PLANE_FOUND: Final = "plane"
+# Candidates in a row that turned out to be none, after which the search gives up.
+_REJECTED_MOST: Final = 30
 
 _NO_PLANE: Final = (
     "no plane holds {share:.2%} of the {count} points within {tolerance} m: raise tolerance_m "
@@ -49,6 +51,38 @@ _NO_INTENSITY: Final = (
 )
 
 
+class Proposer(Protocol):
+    """What a detector must do to take part."""
+
+    def propose(self, unassigned: Unassigned) -> Candidate | None:
+        """Name the best candidate among the points that remain, or None when there is none."""
+        raise AssertionError("a protocol is never called")
+
+    def reject(self, candidate: Candidate) -> None:
+        """Hear that the last candidate was none, so as not to name it again."""
+        raise AssertionError("a protocol is never called")
+
+
+ProposerOf = Callable[[PreparedCloud, Unassigned, Rules], Proposer]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detector:
+    """What is a detector's own on the road.
+
+    Attributes:
+        method: id of the method, for messages.
+        proposer_of: makes what proposes planes of a cloud, of which nothing is taken yet.
+        plan_cell_m: side of the plan's cells; None for detectors that do not look at the plan.
+        relabel: changes the claims of the whole cloud once all points have theirs.
+    """
+
+    method: str
+    proposer_of: ProposerOf
+    plan_cell_m: float | None = None
+    relabel: Callable[[list[FoundPlane], PreparedCloud], None] | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Detection:
     """What a detector gives back.
@@ -56,12 +90,12 @@ class Detection:
     Attributes:
         planes: the planes.
         labels: the plane of each point.
-        own_tolerances_m: of each plane the tolerance that the detector found itself, or None.
+        raw: of each plane what its detector itself said.
     """
 
     planes: Planes
     labels: PointLabels
-    own_tolerances_m: tuple[float | None, ...]
+    raw: tuple[RawPlane, ...]
 
 
 def rules_of(params: DetectorParams) -> Rules:
@@ -79,48 +113,16 @@ def rules_of(params: DetectorParams) -> Rules:
     )
 
 
-def search_sample(
-    remainder: Remainder,
-    rules: Rules,
-    report: Report,
-    proposer_of: Callable[[Remainder], Proposer],
-) -> list[FoundPlane]:
-    """Find all planes on the sample, then fit them to all points and label those at once.
-
-    Args:
-        remainder: the cloud; its claims are filled.
-        rules: when a plane counts and when to stop.
-        report: hears progress, 0..1.
-        proposer_of: makes the detector, given the sample as a cloud of its own.
-    """
-    sample = sample_alone(remainder)
-    found = find_planes(sample, proposer_of(sample), rules, report)
-    settled = settle(found, remainder, rules)
-    label(settled, remainder, rules.find_m)
-    return settled
-
-
 def detect(
-    cloud: PointCloud,
-    params: DetectorParams,
-    ctx: StepContext,
-    find: Callable[[Remainder, Rules, Report], list[FoundPlane]],
-    *,
-    method: str,
-    plan_cell_m: float | None = None,
-    relabel: Callable[[list[FoundPlane], Remainder], None] | None = None,
+    cloud: PointCloud, params: DetectorParams, ctx: StepContext, detector: Detector
 ) -> Detection:
-    """Run a search on a cloud and turn what it finds into products.
+    """Find the planes of a cloud and turn them into products.
 
     Args:
         cloud: the cloud.
         params: what every detector takes.
         ctx: the step's context.
-        find: the search: finds planes in a remainder. If it leaves points unclaimed that lie on
-            its planes, they are claimed here.
-        method: id of the method, for messages.
-        plan_cell_m: side of the plan's cells; None for detectors that do not look at the plan.
-        relabel: changes the claims of the whole cloud once all points have theirs.
+        detector: what looks for planes.
 
     Raises:
         ProductError: the cloud has fewer than three points, or coordinates that are not finite.
@@ -129,37 +131,133 @@ def detect(
     """
     rules = rules_of(params)
     if params.materials and cloud.intensity is None:
-        raise MethodError(_NO_INTENSITY.format(method=method))
-    started_s = perf_counter()
+        raise MethodError(_NO_INTENSITY.format(method=detector.method))
+    prepared, found = _found(cloud, params, ctx, detector)
+    ctx.progress(0.8, "measuring deviations")
+    deviations = measure_planes(
+        prepared,
+        np.array([item.raster.slab() for item in found]),
+        np.array([item.support.bounds_m for item in found]),
+        find_m=rules.find_m,
+        fit_m=rules.fit_m,
+    )
+    assembly = assemble(found, prepared, deviations, cloud)
+    labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
+    name_points(prepared, assembly.labels_from_claims, labels)
+    ctx.metric("thinning", params.thinning, "1")
+    _report_planes(ctx, assembly, n_points=len(cloud))
+    ctx.progress(0.9, "drawing")
+    draw_deviations(ctx, assembly)
+    # The last of the labels is for points on no plane: a claim of -1 picks it.
+    plane_of_sample = assembly.labels_from_claims[prepared.sample_claims].astype(np.int64)
+    draw_planes(ctx, assembly.planes, prepared.sample.offsets_m, plane_of_sample, cloud)
+    thickness = measure_thickness(
+        assembly.planes,
+        plane_of_sample,
+        prepared,
+        cloud,
+        reach_m=rules.fit_m,
+        materials=params.materials,
+    )
+    row = row_points(assembly.planes, plane_of_sample, prepared, cloud)
+    _report_thickness(ctx, thickness)
+    draw_thickness(ctx, assembly.planes, thickness, row, params.materials)
+    planes = replace(
+        assembly.planes,
+        thickness=thickness,
+        scan_row=None if row is None else row.measured(params.materials),
+    )
+    return Detection(planes=planes, labels=PointLabels(plane_index=labels), raw=assembly.raw)
+
+
+def find_planes(
+    cloud: PreparedCloud, proposer_of: ProposerOf, rules: Rules, report: Report
+) -> list[FoundPlane]:
+    """Find all planes in the sample of a cloud, then fit them to all points and label those.
+
+    Args:
+        cloud: the cloud; its claims are filled.
+        proposer_of: the detector.
+        rules: when a plane counts and when to stop.
+        report: hears progress, 0..1.
+    """
+    unassigned = Unassigned.of(cloud)
+    found = greedy_search(unassigned, proposer_of(cloud, unassigned, rules), rules, report)
+    fitted = fit_to_all(found, cloud, rules)
+    label(fitted, cloud, rules.find_m)
+    return fitted
+
+
+def greedy_search(
+    unassigned: Unassigned, proposer: Proposer, rules: Rules, report: Report
+) -> list[FoundPlane]:
+    """Find planes one after the other until a stop rule holds.
+
+    Args:
+        unassigned: the sample; its claims are filled.
+        proposer: the detector.
+        rules: when a plane counts and when to stop.
+        report: hears progress, 0..1.
+
+    Returns:
+        The planes in the order they were found; `unassigned.claims` refers to that order.
+    """
+    found: list[FoundPlane] = []
+    n_rejected = 0
+    n_all = len(unassigned.claims)
+    while len(found) < rules.n_planes_most and n_rejected < _REJECTED_MOST:
+        if unassigned.n_points < rules.stop_unclassified_share * n_all:
+            break
+        candidate = proposer.propose(unassigned)
+        if candidate is None:
+            break
+        plane = verify(candidate, unassigned, rules)
+        if plane is None:
+            proposer.reject(candidate)
+            n_rejected += 1
+            continue
+        if plane.support.n_points < rules.stop_rest_share * unassigned.n_points:
+            break
+        found.append(plane)
+        n_rejected = 0
+        unassigned.claim(plane.claim(rules.find_m))
+        report(len(found) / rules.n_planes_most, f"{_PLANE_FOUND} {len(found)}")
+    return found
+
+
+def _found(
+    cloud: PointCloud, params: DetectorParams, ctx: StepContext, detector: Detector
+) -> tuple[PreparedCloud, list[FoundPlane]]:
+    """Prepare a cloud, and find, fit and label its planes; reports how long that takes."""
+    rules = rules_of(params)
+    moments_s = [perf_counter()]
     Thread(target=_load_charts, daemon=True).start()
     ctx.progress(0.0, "preparing the points")
 
-    def prepared(points: PointCloud) -> Remainder:
+    def prepared(points: PointCloud) -> PreparedCloud:
         return prepare(
             points,
             basis_from_up(cloud.up),
-            cell_m=_PLAN_CELL_M if plan_cell_m is None else plan_cell_m,
+            cell_m=_PLAN_CELL_M if detector.plan_cell_m is None else detector.plan_cell_m,
             least_share=params.min_share,
             parts=ctx.cores,
-            counts_plan=plan_cell_m is not None,
+            counts_plan=detector.plan_cell_m is not None,
         )
 
-    whole = remainder = prepared(thinned(cloud, params.thinning))
-    moments_s = [started_s]
-
     def heard(part: float, text: str) -> None:
-        if text.startswith(PLANE_FOUND):
+        if text.startswith(_PLANE_FOUND):
             moments_s.append(perf_counter())
         ctx.progress(0.1 + 0.7 * part, text)
 
-    found = find(remainder, rules, heard)
+    whole = prepared(thinned(cloud, params.thinning))
+    found = find_planes(whole, detector.proposer_of, rules, heard)
     if not found:
         raise MethodError(
             _NO_PLANE.format(
                 share=params.min_share,
                 count=len(cloud),
                 tolerance=params.tolerance_m,
-                method=method,
+                method=detector.method,
             )
         )
     if params.thinning > 1:
@@ -168,52 +266,79 @@ def detect(
     if not params.refit:
         found = [as_proposed(item, whole.up) for item in found]
         label(found, whole, rules.find_m)
-    if relabel is not None:
-        relabel(found, whole)
+    if detector.relabel is not None:
+        detector.relabel(found, whole)
     moments_s.append(perf_counter())
-    report_times(ctx, np.diff(moments_s))
-    ctx.progress(0.8, "measuring deviations")
-    deviations = measure_planes(
-        whole,
-        np.array([item.raster.slab() for item in found]),
-        np.array([item.footprint.bounds_m for item in found]),
-        find_m=rules.find_m,
-        fit_m=rules.fit_m,
-    )
-    assembly = assemble(found, whole, deviations, cloud)
-    labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
-    name_points(whole, assembly.labels_from_claims, labels)
-    ctx.metric("thinning", params.thinning, "1")
-    report_planes(ctx, assembly, n_points=len(cloud))
-    ctx.progress(0.9, "drawing")
-    draw_deviations(ctx, assembly)
-    # The last of the labels is for points on no plane: a claim of -1 picks it.
-    plane_of_sample = assembly.labels_from_claims[whole.sample_claims].astype(np.int64)
-    draw_planes(ctx, assembly.planes, whole.sample.offsets_m, plane_of_sample, cloud)
-    found_thickness = measure_thickness(
-        assembly.planes,
-        plane_of_sample,
-        whole,
-        cloud,
-        reach_m=rules.fit_m,
-        materials=params.materials,
-    )
-    row = scan_row(assembly.planes, plane_of_sample, whole, cloud)
-    report_thickness(ctx, found_thickness)
-    draw_thickness(ctx, assembly.planes, found_thickness, row, params.materials)
-    details: dict[str, JsonValue] = {
-        **assembly.planes.details,
-        "thickness": [None if item is None else item.to_json() for item in found_thickness],
-        "scan_row": None if row is None else row.to_json(params.materials),
-    }
-    return Detection(
-        planes=replace(assembly.planes, details=details),
-        labels=PointLabels(plane_index=labels),
-        own_tolerances_m=assembly.own_tolerances_m,
-    )
+    _report_times(ctx, np.diff(moments_s))
+    return whole, found
 
 
 def _load_charts() -> None:
     """Load what draws, which takes as long as some passes: they leave the interpreter free."""
     with contextlib.suppress(ImportError):
         importlib.import_module("matplotlib.figure")
+
+
+def _report_planes(ctx: StepContext, assembly: Assembly, *, n_points: int) -> None:
+    """Report number, shares, angles and accuracy of the planes."""
+    planes, deviations = assembly.planes, assembly.deviations
+    omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
+    ctx.metric("n_planes", len(planes), "1")
+    ctx.metric("labelled_share", float(deviations.n_find.sum()) / n_points, "1")
+    ctx.metric("first_share", float(deviations.n_find[0]) / n_points, "1")
+    ctx.metric("rms_mm", 1000.0 * float(planes.rms_m[0]), "mm")
+    ctx.metric("fit_rms_mm", 1000.0 * float(deviations.rms_fit_m[0]), "mm")
+    ctx.metric("omega_deg", omega_deg, "deg")
+    ctx.metric("phi_deg", phi_deg, "deg")
+    ctx.metric("offset_m", float(planes.offset[0]), "m")
+    ctx.metric("r_m", abs(float(planes.offset[0])), "m")
+    ctx.metric("sigma_angle_deg", planes.sigma_angle_deg(0), "deg")
+    ctx.metric("sigma_offset_mm", 1000.0 * planes.sigma_offset_m(0), "mm")
+    ctx.metric("n_independent", assembly.n_independent[0], "1")
+    shape = assembly.normalities[0]
+    if shape is not None:
+        ctx.metric("skewness", shape.skewness, "1")
+        ctx.metric("excess_kurtosis", shape.excess_kurtosis, "1")
+        for reach, share in enumerate(shape.within, start=1):
+            ctx.metric(f"within_{reach}_sigma", share, "1")
+    _report_raw(ctx, planes, assembly.raw[0])
+    if assembly.n_guessed:
+        warn_of_guesses(ctx, assembly.n_guessed, len(planes))
+
+
+def _report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
+    """Report the seconds of a detection, loading apart, as Table 1 of markiewicz2015 does.
+
+    Args:
+        ctx: takes the metrics.
+        passed_s: seconds up to each plane, and from the last one to the labels of all points.
+    """
+    ctx.metric("detection_s", float(passed_s.sum()), "s")
+    ctx.metric("first_plane_s", float(passed_s[0]), "s")
+    if len(passed_s) > 2:
+        ctx.metric("next_plane_s", float(passed_s[1:-1].mean()), "s")
+
+
+def _report_thickness(ctx: StepContext, found: tuple[Thickness | None, ...]) -> None:
+    """Report how thick the cloud is on the first plane, beside its scan step, and the worst."""
+    known = [item for item in found if item is not None]
+    if known:
+        ctx.metric("thickest_mm", 1000.0 * max(item.sigma_m for item in known), "mm")
+    first = found[0]
+    if first is not None:
+        ctx.metric("thickness_mm", 1000.0 * first.sigma_m, "mm")
+        ctx.metric("thickness_width_mm", 1000.0 * first.width_95_m, "mm")
+        ctx.metric("scan_step_mm", 1000.0 * first.scan_step_m, "mm")
+        ctx.metric("thickness_scan_steps", first.sigma_m / first.scan_step_m, "1")
+
+
+def _report_raw(ctx: StepContext, planes: Planes, raw: RawPlane) -> None:
+    """Report what the detector itself said about the first plane, and how far the fit moved it."""
+    normal, offset_m = raw.plane.normal, raw.plane.offset_m
+    omega_deg, phi_deg = omega_phi_deg(normal, planes.up)
+    middle = planes.corners[0].mean(axis=0)
+    ctx.metric("raw_omega_deg", omega_deg, "deg")
+    ctx.metric("raw_phi_deg", phi_deg, "deg")
+    ctx.metric("raw_r_m", abs(offset_m), "m")
+    ctx.metric("raw_angle_deg", angle_between_deg(normal, planes.normal[0]), "deg")
+    ctx.metric("raw_offset_mm", 1000.0 * float(offset_m - normal @ middle), "mm")

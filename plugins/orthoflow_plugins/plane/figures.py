@@ -1,32 +1,79 @@
-"""Pictures of a detection: deviations of the points, and the accumulator beside the plan."""
+"""Pictures of what was found: deviations of points, planes in space, thickness of the cloud.
+
+Margins are fixed: engines that find them out draw everything once more to measure it.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.directions import basis_from_up
-from orthoflow.geometry.plane_kernels import HISTOGRAM_BINS
-from orthoflow.geometry.point_kernels import PlanGrid
-from orthoflow.products import Planes, PointCloud
+from orthoflow.products import Planes, PointCloud, Spread, Thickness
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.plane.accumulators import Accumulator
 from orthoflow_plugins.plane.assembling import Assembly
-from orthoflow_plugins.plane.figure_margins import Margins, space_out
-from orthoflow_plugins.plane.normality import Normality
+from orthoflow_plugins.plane.deviation_kernels import HISTOGRAM_BINS
+from orthoflow_plugins.plane.measuring import Materials, Normality, RowPoints
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class Margins:
+    """Where the panels of a figure lie, in inches.
+
+    Attributes:
+        left: from the figure's edge to the panels; right, bottom and top alike.
+        right: see left.
+        bottom: see left.
+        top: see left.
+        across: between panels side by side.
+        down: between panels one above the other.
+    """
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+    across: float
+    down: float = 0.0
+
+
+def space_out(figure: Figure, margins: Margins, *, n_rows: int, n_columns: int) -> None:
+    """Lay the panels of a figure, which stand in equal rows and columns, within its margins."""
+    width, height = figure.get_size_inches()
+    gaps_across, gaps_down = (n_columns - 1) * margins.across, (n_rows - 1) * margins.down
+    panel_width = (width - margins.left - margins.right - gaps_across) / n_columns
+    panel_height = (height - margins.bottom - margins.top - gaps_down) / n_rows
+    figure.subplots_adjust(
+        left=margins.left / width,
+        right=1.0 - margins.right / width,
+        bottom=margins.bottom / height,
+        top=1.0 - margins.top / height,
+        wspace=margins.across / panel_width,
+        hspace=margins.down / panel_height,
+    )
+
 
 _PANELS_MOST: Final = 4
-_PIXELS_MOST: Final = 900
 _DEVIATIONS: Final = Margins(left=0.3, right=0.1, bottom=0.45, top=0.3, across=0.3, down=0.75)
-# Between the panels stands the legend of the first.
-_ACCUMULATOR: Final = Margins(left=0.6, right=0.2, bottom=0.5, top=0.1, across=1.5)
+_POINTS_MOST: Final = 25_000
+_NAMED_MOST: Final = 12
+# The view is from above, a little aside, along parallel lines.
+_AZIMUTH_DEG: Final = -60.0
+_ELEVATION_DEG: Final = 35.0
+_GREY: Final = "#c8c8c8"
+_SCENE: Final = Margins(left=0.05, right=0.05, bottom=0.05, top=0.05, across=0.1)
+_PLANES_MOST: Final = 12
+_THICKNESS: Final = Margins(left=0.7, right=0.1, bottom=0.45, top=0.1, across=0.45, down=0.5)
+# The names of materials stand between panels.
+_WITH_NAMES: Final = replace(_THICKNESS, across=1.3)
 
 
 def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
@@ -65,6 +112,105 @@ def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
     )
 
 
+def draw_planes(
+    ctx: StepContext,
+    planes: Planes,
+    points_m: NDArray[np.float64],
+    plane_of_point: NDArray[np.int64],
+    cloud: PointCloud,
+) -> None:
+    """Draw points coloured by their plane beside the rectangles of the planes' parts.
+
+    Args:
+        ctx: takes the figure.
+        planes: the planes, world.
+        points_m: (m, 3) a sample of the cloud, offsets.
+        plane_of_point: (m,) plane of each, -1 for none.
+        cloud: where they are from.
+    """
+    from matplotlib.figure import Figure
+
+    every = max(1, len(points_m) // _POINTS_MOST)
+    shown = points_m[::every]
+    view = _view(planes.up)
+    flat, index = shown @ view.T, plane_of_point[::every]
+    figure = Figure(figsize=(11.0, 4.8))
+    space_out(figure, _SCENE, n_rows=1, n_columns=2)
+    left, right = figure.subplots(1, 2)
+    on_none = index < 0
+    left.plot(*flat[on_none].T, ".", markersize=0.8, color=_GREY)
+    right.plot(*flat.T, ",", color="#e4e4e4")
+    from_the_front = planes.normal @ np.cross(*view) > 0.0
+    # The smallest last, so that the floor does not hide what stands on it.
+    for k in range(len(planes)):
+        colour = f"C{k % 10}"
+        if from_the_front[k]:
+            left.plot(*flat[index == k].T, ".", markersize=1.5, color=colour)
+        _draw_rectangles(right, planes, k, view, cloud, colour)
+    corners = (planes.corners.reshape(-1, 3) - cloud.origin) @ view.T
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = 0.04 * (high - low)
+    for axes in (left, right):
+        axes.set_aspect("equal")
+        axes.set_xlim(low[0] - margin[0], high[0] + margin[0])
+        axes.set_ylim(low[1] - margin[1], high[1] + margin[1])
+        axes.set_axis_off()
+    right.legend(fontsize=7, loc="upper left", ncols=2)
+    ctx.figure(
+        "planes",
+        figure,
+        "Left: a sample of the points, coloured by plane, without planes seen from behind; on none "
+        f"(grey) are {np.mean(on_none):.1%}. Right: the rectangles of the planes' connected parts.",
+    )
+
+
+def draw_thickness(
+    ctx: StepContext,
+    planes: Planes,
+    found: tuple[Thickness | None, ...],
+    row: RowPoints | None,
+    materials: Materials,
+) -> None:
+    """Draw what is known about the thickness; nothing where no plane has enough points."""
+    from matplotlib.figure import Figure
+
+    known = [(k, item) for k, item in enumerate(found) if item is not None][:_PLANES_MOST]
+    if not known:
+        return
+    classes = [
+        label for label in _classes(known[0][1]) if any(_classes(item)[label] for _, item in known)
+    ]
+    named = any(item.material for _, item in known)
+    n_rows, n_columns = 1 if row is None else 2, 1 + len(classes) + int(named)
+    figure = Figure(figsize=(3.4 * n_columns, 2.9 * n_rows))
+    grid = figure.add_gridspec(n_rows, n_columns)
+    across = _WITH_NAMES if named else _THICKNESS
+    space_out(figure, across, n_rows=n_rows, n_columns=n_columns)
+    _draw_sigmas(figure.add_subplot(grid[0, 0]), planes, known)
+    for place, label in enumerate(classes):
+        axes = figure.add_subplot(grid[0, 1 + place])
+        for k, item in known[:4]:
+            spreads = _classes(item)[label]
+            middles = [0.5 * (spread.low + spread.high) for spread in spreads]
+            sigmas_mm = [1000.0 * spread.sigma_m for spread in spreads]
+            axes.plot(middles, sigmas_mm, "o-", markersize=3, label=planes.names[k])
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlabel(label, fontsize=8)
+        axes.tick_params(labelsize=7)
+        if place == 0:
+            axes.legend(fontsize=7)
+    if named:
+        _draw_materials(figure.add_subplot(grid[0, -1]), planes, known)
+    if row is not None:
+        _draw_row(figure.add_subplot(grid[1, :]), planes, row, materials)
+    ctx.figure(
+        "thickness",
+        figure,
+        "Thickness of the cloud, one standard deviation in millimetres: on each plane beside the "
+        "scan step there, by class and by material. Below, one row of the scan on the first plane.",
+    )
+
+
 def _draw_quantiles(axes: Axes, shape: Normality) -> None:
     reach = float(shape.expected_sigmas[-1])
     axes.plot([-reach, reach], [-reach, reach], color="#b03a2e", linewidth=1.0)
@@ -76,88 +222,80 @@ def _draw_quantiles(axes: Axes, shape: Normality) -> None:
     axes.tick_params(labelsize=7)
 
 
-@dataclass(frozen=True, kw_only=True)
-class VotePicture:
-    """What a plan looked like before any plane was taken from it.
-
-    Attributes:
-        grid: where the cells of the plan lie.
-        plan: (e1, e2) points per cell.
-        accumulator: votes of that plan.
-        voters: who voted, to finish a sentence.
-    """
-
-    grid: PlanGrid
-    plan: NDArray[np.int64]
-    accumulator: Accumulator
-    voters: str
+def _view(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2, 3) directions to the right and up in the picture, in world axes."""
+    azimuth, elevation = math.radians(_AZIMUTH_DEG), math.radians(_ELEVATION_DEG)
+    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
+    towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    rise = math.cos(elevation) * np.array([0.0, 0.0, 1.0]) - math.sin(elevation) * towards
+    view: NDArray[np.float64] = np.array([right, rise]) @ basis_from_up(up)
+    return view
 
 
-def draw_accumulator(
-    ctx: StepContext, picture: VotePicture, planes: Planes, cloud: PointCloud
+def _draw_rectangles(
+    axes: Axes,
+    planes: Planes,
+    k: int,
+    view: NDArray[np.float64],
+    cloud: PointCloud,
+    colour: str,
 ) -> None:
-    """Draw the plan with the walls found, and the parameter space with their maxima.
-
-    Args:
-        ctx: takes the figure.
-        picture: the plan and its votes.
-        planes: the planes, world.
-        cloud: where they are from.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.6))
-    space_out(figure, _ACCUMULATOR, n_rows=1, n_columns=2)
-    left, right = figure.subplots(1, 2)
-    basis = basis_from_up(planes.up)
-    grid, accumulator = picture.grid, picture.accumulator
-    low = grid.low_m[:2]
-    high = low + grid.cell_m * np.array(grid.shape[:2])
-    image = np.log1p(_thinned_sum(picture.plan))
-    left.imshow(image.T, origin="lower", cmap="gray_r", extent=(low[0], high[0], low[1], high[1]))
-    votes = _thinned_sum(accumulator.votes)
-    reach_m = -accumulator.low_m
-    right.imshow(
-        np.sqrt(votes.T),
-        origin="lower",
-        aspect="auto",
-        cmap="gray",
-        extent=(0.0, 180.0, -reach_m, reach_m),
-    )
-    for index in np.flatnonzero(np.abs(planes.normal @ planes.up) < 0.5):
-        corners = (planes.corners[index] - cloud.origin) @ basis.T
-        left.plot(corners[[1, 2], 0], corners[[1, 2], 1], linewidth=1.2, label=planes.names[index])
-        omega, distance_m = _line_of(corners, basis @ planes.normal[index], accumulator)
-        right.plot(omega, distance_m, "o", fillstyle="none", markersize=9)
-    left.set_xlabel("e1 [m from the cloud's origin]")
-    left.set_ylabel("e2 [m]")
-    right.set_xlabel("direction of the normal [deg]")
-    right.set_ylabel("distance from the middle of the plan [m]")
-    if left.lines:
-        # Beside the plan: one of a single long wall is too narrow to hold it.
-        left.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1.0))
-    ctx.figure(
-        "accumulator",
-        figure,
-        "Left: points per plan cell with the walls found. Right: the parameter space, in which "
-        f"{picture.voters}; circles mark the walls.",
-    )
+    corners = planes.corners[k][None]
+    if planes.part_corners is not None and planes.part_plane is not None:
+        corners = planes.part_corners[planes.part_plane == k]
+    label = planes.names[k] if k < _NAMED_MOST else None
+    for part in corners:
+        around = np.vstack([part, part[:1]]) - cloud.origin
+        axes.plot(*(around @ view.T).T, color=colour, linewidth=1.3, label=label)
+        label = None
 
 
-def _line_of(
-    corners: NDArray[np.float64], normal: NDArray[np.float64], accumulator: Accumulator
-) -> tuple[float, float]:
-    """Where a wall lies in the parameter space: degrees and metres."""
-    angle = math.atan2(normal[1], normal[0]) % math.pi
-    direction = np.array([math.cos(angle), math.sin(angle)])
-    middle = corners.mean(axis=0)[:2] - accumulator.centre_m
-    return math.degrees(angle), float(direction @ middle)
+def _classes(thickness: Thickness) -> dict[str, tuple[Spread, ...]]:
+    """Spreads by the quantity that is drawn along, by its label."""
+    return {
+        "angle of incidence [deg]": thickness.incidence_deg,
+        "range [m]": thickness.range_m,
+        "intensity [0..1]": thickness.intensity,
+    }
 
 
-def _thinned_sum(values: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Sum blocks of an image until it is small enough to draw."""
-    rows, columns = (max(1, -(-size // _PIXELS_MOST)) for size in values.shape)
-    padded = np.pad(values, ((0, -values.shape[0] % rows), (0, -values.shape[1] % columns)))
-    blocks = padded.reshape(padded.shape[0] // rows, rows, padded.shape[1] // columns, columns)
-    thinned: NDArray[np.float64] = blocks.sum(axis=(1, 3)).astype(np.float64)
-    return thinned
+def _draw_sigmas(axes: Axes, planes: Planes, known: list[tuple[int, Thickness]]) -> None:
+    places = range(len(known))
+    axes.barh(places, [1000.0 * item.sigma_m for _, item in known], color="#9db8d2")
+    steps_mm = [1000.0 * item.scan_step_m for _, item in known]
+    axes.plot(steps_mm, places, "|", color="#b03a2e", label="scan step")
+    axes.set_yticks(places, [planes.names[k] for k, _ in known], fontsize=7)
+    axes.invert_yaxis()
+    axes.set_xlabel("thickness [mm]", fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.legend(fontsize=7)
+
+
+def _draw_materials(axes: Axes, planes: Planes, known: list[tuple[int, Thickness]]) -> None:
+    """Thickness of each material on the first planes."""
+    bars = [
+        (f"{spread.name}, {planes.names[k]}", 1000.0 * spread.sigma_m)
+        for k, item in known[:4]
+        for spread in item.material
+    ]
+    places = range(len(bars))
+    axes.barh(places, [sigma_mm for _, sigma_mm in bars], color="#d2b89d")
+    axes.set_yticks(places, [text for text, _ in bars], fontsize=7)
+    axes.invert_yaxis()
+    axes.set_xlabel("thickness by material [mm]", fontsize=8)
+    axes.tick_params(labelsize=7)
+
+
+def _draw_row(axes: Axes, planes: Planes, row: RowPoints, materials: Materials) -> None:
+    """Distances of the points of a scan row from the first plane, coloured by material."""
+    axes.plot(row.along_m, 1000.0 * row.distance_m, ".", markersize=2, color="#333333")
+    if row.intensity is not None:
+        for name, (low, high) in materials.items():
+            mine = (row.intensity >= low) & (row.intensity <= high)
+            distance_mm = 1000.0 * row.distance_m[mine]
+            axes.plot(row.along_m[mine], distance_mm, ".", markersize=2, label=name)
+        if materials:
+            axes.legend(fontsize=7, markerscale=3)
+    axes.set_xlabel(f"along {planes.names[0]} [m], row {row.row} of scan {row.scan}", fontsize=8)
+    axes.set_ylabel("distance [mm]", fontsize=8)
+    axes.tick_params(labelsize=7)

@@ -159,13 +159,13 @@ class GivenPlane(Method):
 
 
 def _ground_m(cloud: PointCloud, up: NDArray[np.float64]) -> float:
-    from orthoflow_plugins.plane.sampling import draw_sample
+    from orthoflow_plugins.plane.sample import draw_sample
 
     return float(np.quantile(draw_sample(cloud).offsets_m @ up, _GROUND_SHARE))
 
 
 def _reach(plane: Plane, cloud: PointCloud) -> tuple[float, float]:
-    from orthoflow_plugins.plane.sampling import draw_sample
+    from orthoflow_plugins.plane.sample import draw_sample
 
     distances_m = plane.distances_m(draw_sample(cloud).offsets_m)
     return float(distances_m.min()), float(distances_m.max())

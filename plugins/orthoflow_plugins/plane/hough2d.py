@@ -11,16 +11,15 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
-    from orthoflow_plugins.plane.detecting import Report
-    from orthoflow_plugins.plane.figures import VotePicture
-    from orthoflow_plugins.plane.remainders import Remainder
+    from orthoflow_plugins.plane.accumulators import PlanProposer
+    from orthoflow_plugins.plane.candidates import Rules
+    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
 
 _VOTERS: Final = {
     "counts": "each cell votes with its number of points",
     "unit": "each cell with points has one vote",
     "canny": "each cell on an edge of the density has one vote",
-    "raw": "each point votes with its own coordinates",
+    "raw": "each point of the sample votes with its own coordinates",
 }
 
 
@@ -41,12 +40,12 @@ class Hough2d(Method):
     estimated from the scatter of tiles between 10 and 80 cm, the size with the largest variance.
 
     For comparison: `accumulator: unit` gives every occupied cell one vote (no clear maximum, as the
-    paper says), `canny` only the cells on edges of the density image; `coordinates: raw` lets every
-    point vote with its own coordinates, which takes a hundred times longer for the same planes.
+    paper says), `canny` only the cells on edges of the density image; `coordinates: raw` lets the
+    points of the sample vote with their own coordinates, which takes longer for the same planes.
     """
 
     id = "plane.hough2d"
-    result_version = 3
+    result_version = 4
     determinism = "exact"
     citations = (
         (
@@ -69,7 +68,8 @@ class Hough2d(Method):
             description="Votes of a cell: its points, one, or one where the density has an edge.",
         )
         coordinates: Literal["cells", "raw"] = Field(
-            "cells", description="What votes: cells of the plan, or every point by itself."
+            "cells",
+            description="What votes: cells of the plan, or points of the sample by themselves.",
         )
 
         @model_validator(mode="after")
@@ -94,36 +94,32 @@ class Hough2d(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
-        from orthoflow_plugins.plane.detecting import detect, search_sample
-        from orthoflow_plugins.plane.figures import VotePicture, draw_accumulator
+        from orthoflow_plugins.plane.detecting import Detector, detect
+        from orthoflow_plugins.plane.search_figures import VotePicture, draw_accumulator
 
-        pictures: list[VotePicture] = []
+        searches: list[tuple[PreparedCloud, PlanProposer]] = []
 
-        def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
+        def proposer_of(cloud: PreparedCloud, _: Unassigned, __: Rules) -> PlanProposer:
             voting = Voting(
                 angle_step_deg=params.angle_step_deg,
-                least_points=params.min_share * len(remainder.claims),
+                least_points=params.min_share * len(cloud.claims),
                 walls=params.constraint != "horizontal",
                 levels=params.constraint != "vertical",
                 accumulator=params.accumulator,
                 is_raw=params.coordinates == "raw",
             )
-            proposer = PlanProposer(remainder, voting)
-            found = search_sample(remainder, rules, report, lambda _: proposer)
-            if proposer.first is not None and remainder.plan is not None:
-                plan = remainder.plan.cells
+            searches.append((cloud, PlanProposer(cloud, voting)))
+            return searches[-1][1]
+
+        detector = Detector(method=self.id, proposer_of=proposer_of, plan_cell_m=params.cell_m)
+        detection = detect(inputs.cloud, params, ctx, detector)
+        for searched, proposer in searches:
+            if proposer.first is not None and searched.plan is not None:
                 picture = VotePicture(
-                    grid=remainder.grid,
-                    plan=plan,
+                    grid=searched.grid,
+                    plan=searched.plan.cells,
                     accumulator=proposer.first,
                     voters=_VOTERS["raw" if params.coordinates == "raw" else params.accumulator],
                 )
-                pictures.append(picture)
-            return found
-
-        detection = detect(
-            inputs.cloud, params, ctx, find, method=self.id, plan_cell_m=params.cell_m
-        )
-        for picture in pictures:
-            draw_accumulator(ctx, picture, detection.planes, inputs.cloud)
+                draw_accumulator(ctx, picture, detection.planes, inputs.cloud)
         return self.Out(planes=detection.planes, labels=detection.labels)

@@ -11,9 +11,9 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
-    from orthoflow_plugins.plane.detecting import Report
-    from orthoflow_plugins.plane.remainders import Remainder
+    from orthoflow_plugins.plane.candidates import Rules
+    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
+    from orthoflow_plugins.plane.space_accumulators import SpaceProposer
 
 
 class Hough3d(Method):
@@ -29,7 +29,7 @@ class Hough3d(Method):
     """
 
     id = "plane.hough3d"
-    result_version = 3
+    result_version = 4
     determinism = "exact"
     citations = (
         (
@@ -57,7 +57,7 @@ class Hough3d(Method):
             "with all of them.",
         )
         coordinates: Literal["cells", "raw"] = Field(
-            "cells", description="What votes: voxels, or every point by itself."
+            "cells", description="What votes: voxels, or points of the sample by themselves."
         )
 
     class In(Ports):
@@ -73,31 +73,29 @@ class Hough3d(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.detecting import detect, search_sample
-        from orthoflow_plugins.plane.scene_figures import draw_sections
+        from orthoflow_plugins.plane.detecting import Detector, detect
+        from orthoflow_plugins.plane.search_figures import draw_sections, draw_space
         from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
-        from orthoflow_plugins.plane.space_figures import SpacePicture, draw_space
 
-        pictures: list[SpacePicture] = []
+        proposers: list[SpaceProposer] = []
         coarser = 1.0 if params.search == "full" else 2.0
 
-        def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
+        def proposer_of(cloud: PreparedCloud, _: Unassigned, __: Rules) -> SpaceProposer:
             voting = SpaceVoting(
                 cell_m=coarser * params.cell_m,
                 angle_step_deg=coarser * params.angle_step_deg,
-                least_points=params.min_share * len(remainder.claims),
+                least_points=params.min_share * len(cloud.claims),
                 family=params.family,
                 tilt_most_deg=params.max_tilt_deg,
                 is_raw=params.coordinates == "raw",
             )
-            proposer = SpaceProposer(remainder, voting)
-            found = search_sample(remainder, rules, report, lambda _: proposer)
-            if proposer.first_picture is not None:
-                pictures.append(proposer.first_picture)
-            return found
+            proposers.append(SpaceProposer(cloud, voting))
+            return proposers[-1]
 
-        detection = detect(inputs.cloud, params, ctx, find, method=self.id)
-        for picture in pictures:
-            draw_space(ctx, picture, detection.planes)
+        detector = Detector(method=self.id, proposer_of=proposer_of)
+        detection = detect(inputs.cloud, params, ctx, detector)
+        for proposer in proposers:
+            if proposer.first_picture is not None:
+                draw_space(ctx, proposer.first_picture, detection.planes)
         draw_sections(ctx, detection.planes, inputs.cloud, cell_m=params.cell_m)
         return self.Out(planes=detection.planes, labels=detection.labels)

@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from orthoflow.errors import MethodError
+from orthoflow.geometry import Plane
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.open3d_ransac import open3d_version
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
-    from orthoflow_plugins.plane.detecting import Report
-    from orthoflow_plugins.plane.remainders import Remainder
+    from orthoflow_plugins.plane.candidates import Candidate, Family, Rules
+    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
+
+# Points of a patch, as a share of those that a plane needs.
+_PART_SHARE: Final = 0.2
 
 
 class Open3dPatches(Method):
     """Find planes with open3d's `detect_planar_patches`, which grows patches by robust statistics.
 
-    For comparison: it needs the normals of nearest neighbours and half a kilobyte for each point
-    (`thinning` helps). `refit: false` shows what it finds by itself: the middle of the box about a
-    patch, which mouldings pull off the wall.
+    For comparison: it looks at the same sample of the cloud as the other detectors, with normals of
+    nearest neighbours there. `refit: false` shows what it finds by itself: the middle of the box
+    about a patch, which mouldings pull off the wall.
     """
 
     id = "plane.open3d-patches"
-    result_version = 3
+    result_version = 4
     determinism = "loose"
     citations = (
         "Zhou, Park, Koltun 2018: Open3D, a modern library for 3D data, arXiv:1801.09847",
@@ -67,27 +74,96 @@ class Open3dPatches(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
         from orthoflow.files.open3d_guard import load_open3d
-        from orthoflow_plugins.plane.detecting import detect
-        from orthoflow_plugins.plane.open3d_proposers import PatchSearch, patches
-        from orthoflow_plugins.plane.peeling import find_planes
+        from orthoflow_plugins.plane.detecting import Detector, detect
 
         open3d = load_open3d(self.id)
 
-        def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
+        def proposer_of(_: PreparedCloud, unassigned: Unassigned, rules: Rules) -> PatchProposer:
+            least_points = _PART_SHARE * rules.least_share * len(unassigned.claims)
             search = PatchSearch(
                 n_neighbours=params.n_neighbours,
                 normal_variance_deg=params.normal_variance_deg,
                 coplanarity_deg=params.coplanarity_deg,
                 outlier_share=params.outlier_share,
-                least_points=max(10, int(0.2 * rules.least_share * len(remainder.claims))),
+                least_points=max(10, int(least_points)),
             )
-            proposer = patches(open3d, remainder, search, params.family)
-            return find_planes(remainder, proposer, rules, report)
+            return patches(open3d, unassigned.sample.offsets_m, search, params.family)
 
-        detection = detect(inputs.cloud, params, ctx, find, method=self.id)
+        detector = Detector(method=self.id, proposer_of=proposer_of)
+        detection = detect(inputs.cloud, params, ctx, detector)
         return self.Out(planes=detection.planes, labels=detection.labels)
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
         """Version of open3d, which decides about results."""
         return open3d_version()
+
+
+@dataclass(kw_only=True)
+class PatchProposer:
+    """Proposes the patches of `detect_planar_patches`, largest first."""
+
+    candidates: list[Candidate]
+
+    def propose(self, unassigned: Unassigned) -> Candidate | None:
+        """Name the next patch."""
+        del unassigned
+        return self.candidates.pop(0) if self.candidates else None
+
+    def reject(self, candidate: Candidate) -> None:
+        """Patches are named once in any case."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchSearch:
+    """What `detect_planar_patches` is asked for, by its own names."""
+
+    n_neighbours: int
+    normal_variance_deg: float
+    coplanarity_deg: float
+    outlier_share: float
+    least_points: int
+
+
+# Any: the library has no types.
+def patches(
+    open3d: Any, points_m: NDArray[np.float64], search: PatchSearch, family: Family
+) -> PatchProposer:
+    """Find all patches at once; a patch counts the points in its box.
+
+    Raises:
+        MethodError: open3d gave up.
+    """
+    from orthoflow_plugins.plane.candidates import Candidate
+
+    cloud = open3d.geometry.PointCloud()
+    cloud.points = open3d.utility.Vector3dVector(points_m)
+    neighbours = open3d.geometry.KDTreeSearchParamKNN(knn=search.n_neighbours)
+    try:
+        cloud.estimate_normals(neighbours)
+        boxes = cloud.detect_planar_patches(
+            normal_variance_threshold_deg=search.normal_variance_deg,
+            coplanarity_deg=search.coplanarity_deg,
+            outlier_ratio=search.outlier_share,
+            min_num_points=search.least_points,
+            search_param=neighbours,
+        )
+    except RuntimeError as error:
+        raise MethodError(
+            f"open3d's detect_planar_patches gave up on the {len(points_m)} points "
+            f"({str(error).splitlines()[0]}): try another n_neighbours or thinning"
+        ) from error
+    candidates = []
+    for box in boxes:
+        normal = np.asarray(box.R, dtype=np.float64)[:, 2]
+        centre_m = np.asarray(box.center, dtype=np.float64)
+        inside = len(box.get_point_indices_within_bounding_box(cloud.points))
+        candidates.append(
+            Candidate(
+                plane=Plane(normal=normal, offset_m=float(normal @ centre_m)),
+                family=family,
+                votes=float(inside),
+            )
+        )
+    candidates.sort(key=lambda candidate: -candidate.votes)
+    return PatchProposer(candidates=candidates)

@@ -11,9 +11,9 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import FoundPlane, Rules
-    from orthoflow_plugins.plane.detecting import Report
-    from orthoflow_plugins.plane.remainders import Remainder
+    from orthoflow_plugins.plane.candidates import Rules
+    from orthoflow_plugins.plane.detecting import Proposer
+    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
 
 
 class Ransac(Method):
@@ -84,9 +84,9 @@ class Ransac(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
-        from orthoflow_plugins.plane.detecting import detect, search_sample
+        from orthoflow_plugins.plane.detecting import Detector, detect
 
-        def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
+        def proposer_of(_: PreparedCloud, unassigned: Unassigned, rules: Rules) -> Proposer:
             search = Search(
                 model=params.model,
                 scoring=params.scoring,
@@ -96,15 +96,11 @@ class Ransac(Method):
                 tilt_most_deg=params.max_tilt_deg,
                 least_share=params.min_share,
             )
-            return search_sample(
-                remainder,
-                rules,
-                report,
-                lambda sample: ConsensusProposer(sample, search, ctx.rng),
-            )
+            return ConsensusProposer(unassigned, search, ctx.rng)
 
-        detection = detect(inputs.cloud, params, ctx, find, method=self.id)
-        own_m = detection.own_tolerances_m[0]
+        detector = Detector(method=self.id, proposer_of=proposer_of)
+        detection = detect(inputs.cloud, params, ctx, detector)
+        own_m = detection.raw[0].own_tolerance_m
         if own_m is not None:
             ctx.metric("own_tolerance_mm", 1000.0 * own_m, "mm")
         return self.Out(planes=detection.planes, labels=detection.labels)

@@ -13,26 +13,24 @@ from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import (
     enclosing,
+    known_viewpoint,
     plane_names,
     rectangle_m,
-)
-from orthoflow_plugins.plane.deviations import Deviations, measure_planes
-from orthoflow_plugins.plane.facing import (
-    known_viewpoint,
     side_of_remaining,
     side_of_stations,
+    warn_of_guesses,
 )
-from orthoflow_plugins.plane.footprints import (
-    Footprint,
+from orthoflow_plugins.plane.final_fit import assign
+from orthoflow_plugins.plane.measuring import Deviations, measure_planes
+from orthoflow_plugins.plane.sample import PreparedCloud, prepare
+from orthoflow_plugins.plane.support import (
+    Support,
     SurfaceRaster,
     cell_for,
-    footprint,
     measure_cells,
+    support_of,
     surface_raster,
 )
-from orthoflow_plugins.plane.preparing import prepare
-from orthoflow_plugins.plane.remainders import Remainder
-from orthoflow_plugins.plane.reporting import warn_of_guesses
 
 _PLAN_CELL_M: Final = 0.05
 # Of so small a share of the points per side the extent does not depend: stray echoes.
@@ -49,14 +47,14 @@ class Reference:
         corners_m: (4, 3) offsets, top-left first, counter-clockwise for the viewer.
         part_corners_m: (p, 4, 3) the same of each connected part.
         viewpoint: how the side was chosen.
-        remainder: the cloud, nothing claimed.
+        prepared: the cloud, nothing claimed.
     """
 
     plane: Plane
     corners_m: NDArray[np.float64]
     part_corners_m: NDArray[np.float64]
     viewpoint: str
-    remainder: Remainder
+    prepared: PreparedCloud
 
 
 def place_reference(
@@ -77,17 +75,17 @@ def place_reference(
     Raises:
         MethodError: the points of the cloud coincide or lie on one line.
     """
-    remainder = prepare(
+    prepared = prepare(
         cloud,
         basis_from_up(cloud.up),
         cell_m=_PLAN_CELL_M,
         least_share=_STRAY_SHARE,
         parts=parts,
     )
-    raster, place = _rectangle(plane, remainder, buffer_m)
+    raster, place = _rectangle(plane, prepared, buffer_m)
     if place is None:
         return None
-    extent_m = _extent(raster, place, remainder, buffer_m)
+    extent_m = _extent(raster, place, prepared, buffer_m)
     corners_m = rectangle_m(plane, raster.axes, extent_m)
     parts_m = [
         rectangle_m(
@@ -97,9 +95,9 @@ def place_reference(
     ]
     viewpoint = "given"
     if not keeps_side:
-        members = remainder.sample.offsets_m
+        members = prepared.sample.offsets_m
         near = np.abs(plane.distances_m(members)) <= (buffer_m or _EVERYWHERE_M)
-        index = remainder.sample.index[near]
+        index = prepared.sample.index[near]
         side = side_of_stations(plane, corners_m.mean(axis=0), cloud, index)
         viewpoint = known_viewpoint(cloud) if side else "guess"
         if side == 0:
@@ -114,7 +112,7 @@ def place_reference(
         corners_m=enclosing(corners_m, plane, axes),
         part_corners_m=np.array([enclosing(part, plane, axes) for part in parts_m]),
         viewpoint=viewpoint,
-        remainder=remainder,
+        prepared=prepared,
     )
 
 
@@ -135,14 +133,14 @@ def lay_reference(
         tolerance_m: how near a point must be.
         ctx: takes metrics and warnings.
     """
-    plane, remainder = reference.plane, reference.remainder
+    plane, prepared = reference.plane, reference.prepared
     axes = wall_axes(plane.normal, cloud.up)
     slabs = np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])[None]
     everywhere = _EVERYWHERE_M * np.array([-1.0, 1.0, -1.0, 1.0])
-    remainder.claim(slabs, np.concatenate([[tolerance_m], everywhere]))
-    labels[:] = remainder.claims
+    assign(prepared, slabs, np.concatenate([[tolerance_m], everywhere])[None])
+    labels[:] = prepared.claims
     deviations = measure_planes(
-        remainder, slabs, everywhere[None], find_m=tolerance_m, fit_m=tolerance_m
+        prepared, slabs, everywhere[None], find_m=tolerance_m, fit_m=tolerance_m
     )
     height_m = reference.corners_m.mean(axis=0) @ cloud.up
     planes = Planes(
@@ -157,48 +155,46 @@ def lay_reference(
         part_corners=cloud.origin + reference.part_corners_m,
         part_plane=np.zeros(len(reference.part_corners_m), dtype=np.int32),
         viewpoint=reference.viewpoint,
-        details={"tolerance_m": tolerance_m},
+        tolerance_m=tolerance_m,
     )
     _report(ctx, planes, deviations, n_points=len(cloud))
     return planes
 
 
 def _rectangle(
-    plane: Plane, remainder: Remainder, buffer_m: float | None
-) -> tuple[SurfaceRaster, Footprint | None]:
+    plane: Plane, prepared: PreparedCloud, buffer_m: float | None
+) -> tuple[SurfaceRaster, Support | None]:
     """Cells of the points near a plane that hang together."""
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
-    points_m = remainder.sample.offsets_m
+    points_m = prepared.sample.offsets_m
     near = points_m[np.abs(plane.distances_m(points_m)) <= reach_m]
-    corners = remainder.box_corners()
-    placed = near @ wall_axes(plane.normal, remainder.up).T
+    corners = prepared.box_corners()
+    placed = near @ wall_axes(plane.normal, prepared.up).T
     # Not the full range: three echoes far away would make the cells as large as the scene.
     low, high = np.quantile(placed, (0.01, 0.99), axis=0) if len(near) else np.zeros((2, 2))
     area_m2 = float(np.prod(high - low))
-    n_near = len(near) * remainder.sample.n_represented
-    raster = surface_raster(plane, corners, remainder.up, cell_m=cell_for(n_near, area_m2))
+    n_near = len(near) * prepared.sample.n_represented
+    raster = surface_raster(plane, corners, prepared.up, cell_m=cell_for(n_near, area_m2))
     sums = measure_cells(
-        remainder.points,
-        remainder.claims,
+        prepared.points,
         raster,
         find_m=reach_m,
         fit_m=reach_m,
-        parts=remainder.parts,
+        parts=prepared.parts,
     )
-    return raster, footprint(raster, sums.n_find > 0, sums)
+    return raster, support_of(raster, sums.n_find > 0, sums)
 
 
 def _extent(
-    raster: SurfaceRaster, place: Footprint, remainder: Remainder, buffer_m: float | None
+    raster: SurfaceRaster, place: Support, prepared: PreparedCloud, buffer_m: float | None
 ) -> NDArray[np.float64]:
     """(4,) smallest and largest u and v of the points near a plane in its cells' rectangle."""
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
     slabs = raster.slab()[None]
-    remainder.claim(slabs, np.concatenate([[reach_m], place.bounds_m]))
+    assign(prepared, slabs, np.concatenate([[reach_m], place.bounds_m])[None])
     deviations = measure_planes(
-        remainder, slabs, place.bounds_m[None], find_m=reach_m, fit_m=reach_m
+        prepared, slabs, place.bounds_m[None], find_m=reach_m, fit_m=reach_m
     )
-    remainder.claims.fill(-1)
     extent_m: NDArray[np.float64] = deviations.extents_m[0]
     return extent_m
 

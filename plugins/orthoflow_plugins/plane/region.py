@@ -12,10 +12,9 @@ from orthoflow_plugins.plane.parameters import DetectorParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import FoundPlane, Rules
-    from orthoflow_plugins.plane.detecting import Report
-    from orthoflow_plugins.plane.regions import Regions
-    from orthoflow_plugins.plane.remainders import Remainder
-    from orthoflow_plugins.plane.surface_cells import Neighbourhood
+    from orthoflow_plugins.plane.regions import RegionProposer, Regions
+    from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
+    from orthoflow_plugins.plane.surface_voxels import Neighbourhood
 
 # What `preset: paper` sets where nothing else is said: markiewicz2015, 4.1.2.
 _PAPER: Final[dict[str, object]] = {
@@ -123,61 +122,61 @@ class Region(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Detect the planes of a cloud."""
-        from orthoflow_plugins.plane.detecting import detect, search_sample
-        from orthoflow_plugins.plane.facing import middle_viewpoint_m
-        from orthoflow_plugins.plane.region_figures import draw_normals
-        from orthoflow_plugins.plane.region_proposer import (
+        from orthoflow_plugins.plane.assembling import middle_viewpoint_m
+        from orthoflow_plugins.plane.detecting import Detector, detect
+        from orthoflow_plugins.plane.regions import (
             PART_SHARE,
+            Growth,
             RegionProposer,
             claim_by_region,
+            grow,
         )
-        from orthoflow_plugins.plane.regions import Growth, grow
-        from orthoflow_plugins.plane.surface_cells import surface_cells
+        from orthoflow_plugins.plane.search_figures import draw_normals
+        from orthoflow_plugins.plane.surface_voxels import surface_voxels
 
         by_normal = params.criterion == "normal"
         grown: list[Regions] = []
 
-        def find(remainder: Remainder, rules: Rules, report: Report) -> list[FoundPlane]:
+        def proposer_of(
+            cloud: PreparedCloud, unassigned: Unassigned, rules: Rules
+        ) -> RegionProposer:
             growth = Growth(
                 angle_deg=params.angle_deg,
                 distance_m=None if by_normal else params.distance_m,
-                least_points=PART_SHARE * rules.least_share * len(remainder.claims),
+                least_points=PART_SHARE * rules.least_share * len(cloud.claims),
             )
-            cells = surface_cells(remainder, _neighbourhood(params))
-            report(0.0, "growing regions")
-            viewer_m = middle_viewpoint_m(inputs.cloud, remainder.sample.offsets_m)
-            regions = grow(cells, growth, viewer_m)
+            voxels = surface_voxels(cloud, _neighbourhood(params))
+            ctx.progress(0.1, "growing regions")
+            viewer_m = middle_viewpoint_m(inputs.cloud, cloud.sample.offsets_m)
+            regions = grow(voxels, growth, viewer_m)
             grown.append(regions)
+            return RegionProposer(
+                regions=regions,
+                region_of_sample=regions.region_of(unassigned.sample.points),
+                family=params.family,
+                tilt_most_deg=params.max_tilt_deg,
+                least_points=rules.least_share * len(unassigned.claims),
+                proposes_once=by_normal,
+            )
 
-            def proposer(sample: Remainder) -> RegionProposer:
-                return RegionProposer(
-                    regions=regions,
-                    region_of_sample=regions.region_of(sample.points),
-                    family=params.family,
-                    tilt_most_deg=params.max_tilt_deg,
-                    least_points=rules.least_share * len(sample.claims),
-                    proposes_once=by_normal,
-                )
-
-            return search_sample(remainder, rules, report, proposer)
-
-        def relabel(found: list[FoundPlane], whole: Remainder) -> None:
+        def relabel(found: list[FoundPlane], cloud: PreparedCloud) -> None:
             if params.labels == "region":
-                claim_by_region(found, grown[0], whole)
+                claim_by_region(found, grown[0], cloud)
 
-        detection = detect(inputs.cloud, params, ctx, find, method=self.id, relabel=relabel)
+        detector = Detector(method=self.id, proposer_of=proposer_of, relabel=relabel)
+        detection = detect(inputs.cloud, params, ctx, detector)
         draw_normals(ctx, grown[0], detection.planes, inputs.cloud)
         return self.Out(planes=detection.planes, labels=detection.labels)
 
 
 def _neighbourhood(params: Region.Params) -> Neighbourhood:
-    from orthoflow_plugins.plane.surface_cells import Neighbourhood
+    from orthoflow_plugins.plane.surface_voxels import Neighbourhood
 
     share = 0.5 if params.neighbourhood == "radius" else 1.0 / 3.0
-    cell_m = share * params.neighbourhood_m if params.cell_m is None else params.cell_m
+    voxel_m = share * params.neighbourhood_m if params.cell_m is None else params.cell_m
     return Neighbourhood(
         shape=params.neighbourhood,
         size_m=params.neighbourhood_m,
         n_points=params.n_neighbours,
-        cell_m=cell_m,
+        voxel_m=voxel_m,
     )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane import settling
+from orthoflow_plugins.plane import final_fit
 from orthoflow_plugins.plane.hough2d import Hough2d
 from orthoflow_plugins.plane.hough3d import Hough3d
 from orthoflow_plugins.plane.ransac import Ransac
@@ -437,7 +437,7 @@ def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
 
     whole = found(1)
     # 88 000 points in blocks of 256: one of three blocks is fitted.
-    monkeypatch.setattr(settling, "_FITTED_MOST", 25_000)
+    monkeypatch.setattr(final_fit, "_FITTED_MOST", 25_000)
     one, three = found(1), found(3)
     np.testing.assert_array_equal(one.normal, three.normal)
     np.testing.assert_array_equal(one.offset, three.offset)

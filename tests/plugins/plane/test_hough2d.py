@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
 from orthoflow_plugins.plane.hough2d import Hough2d
-from orthoflow_plugins.plane.preparing import prepare
+from orthoflow_plugins.plane.sample import Unassigned, prepare
 from pydantic import ValidationError
 
 from orthoflow.errors import MethodError, ProductError
@@ -202,12 +202,12 @@ def test_other_accumulators_find_the_densest_wall(
 def test_the_unit_accumulator_has_the_weaker_maximum(tmp_path: Path) -> None:
     # Half of the floor's cells lie along any line through the room: a wall hardly stands out.
     cloud = cloud_of(sampled(ROOM[:5]))
-    remainder = prepare(cloud, np.eye(3), cell_m=0.02, least_share=0.005, parts=1, counts_plan=True)
+    prepared = prepare(cloud, np.eye(3), cell_m=0.02, least_share=0.005, parts=1, counts_plan=True)
     shares = []
     for accumulator in ("counts", "unit"):
         voting = Voting(angle_step_deg=1.0, least_points=1.0, accumulator=accumulator)
-        proposer = PlanProposer(remainder, voting)
-        proposer.propose(remainder)
+        proposer = PlanProposer(prepared, voting)
+        proposer.propose(Unassigned.of(prepared))
         votes = proposer.first.votes
         shares.append(votes.max() / votes.sum(axis=1).max())
     assert shares[0] > 2.0 * shares[1]

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.hough3d import Hough3d
-from orthoflow_plugins.plane.preparing import prepare
-from orthoflow_plugins.plane.space_accumulators import SpaceProposer, SpaceVoting
-from orthoflow_plugins.plane.space_directions import directions_over
+from orthoflow_plugins.plane.sample import Unassigned, prepare
+from orthoflow_plugins.plane.space_accumulators import (
+    SpaceProposer,
+    SpaceVoting,
+    directions_over,
+)
+from orthoflow_plugins.plane.vote_kernels import VOTE_SHARES, vote_planes
 
 from orthoflow.geometry import angle_between_deg
-from orthoflow.geometry.shear_kernels import VOTE_SHARES
-from orthoflow.geometry.voxel_kernels import vote_planes
 from orthoflow.products import Planes, PointCloud
 from tests.plane_scenes import ROOM, Rectangle, cloud_of, context, sampled
 
@@ -121,8 +123,9 @@ def test_voxels_grow_where_a_scene_would_have_too_many() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-300.0, 300.0, (20_000, 3))
     cloud = cloud_of(points)
-    remainder = prepare(cloud, np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
+    prepared = prepare(cloud, np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
     voting = SpaceVoting(cell_m=0.04, angle_step_deg=4.0, least_points=1_000)
-    proposer = SpaceProposer(remainder, voting)
-    assert proposer._voxels.cell_m > 0.3
-    assert proposer.propose(remainder) is None or proposer._votes.nbytes < 500_000_000
+    proposer = SpaceProposer(prepared, voting)
+    assert proposer._voxels.voxel_m > 0.3
+    found = proposer.propose(Unassigned.of(prepared))
+    assert found is None or proposer._votes.nbytes < 500_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.normality import normality
+from orthoflow_plugins.plane.measuring import normality
 
 FIND_M, FIT_M = 0.05, 0.015
 

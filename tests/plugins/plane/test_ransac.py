@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.hypotheses import curve_order, draw_hypotheses
+from orthoflow_plugins.plane.hypotheses import curve_order, draw_hypotheses, scores_of
 from orthoflow_plugins.plane.ransac import Ransac
-from orthoflow_plugins.plane.scores import scores_of
 from pydantic import ValidationError
 
 from orthoflow.geometry import angle_between_deg

@@ -1,4 +1,4 @@
-"""`plane.region`: cells, normals, growing, the paper's preset; the rest in test_plane_detectors."""
+"""`plane.region`: voxels, normals, growing, the paper's preset; the rest in test_detectors."""
 
 from __future__ import annotations
 
@@ -8,29 +8,35 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.coarser_cells import coarser
-from orthoflow_plugins.plane.preparing import prepare
 from orthoflow_plugins.plane.region import Region
 from orthoflow_plugins.plane.regions import Growth, grow
-from orthoflow_plugins.plane.surface_cells import Neighbourhood, SurfaceCells, surface_cells
+from orthoflow_plugins.plane.sample import prepare
+from orthoflow_plugins.plane.surface_voxels import (
+    Neighbourhood,
+    SurfaceVoxels,
+    coarser,
+    surface_voxels,
+)
+from orthoflow_plugins.plane.voxel_kernels import STEPS_PER_VOXEL
 
 from orthoflow.geometry import angle_between_deg, basis_from_up
-from orthoflow.geometry.cell_kernels import STEPS_PER_CELL
 from orthoflow.sdk import StepContext
 from tests.plane_scenes import Rectangle, cloud_of, context, sampled
 
 STATION = np.array([[0.0, -1.5, 0.0]])
-CUBE = Neighbourhood(shape="cube", size_m=0.15, n_points=30, cell_m=0.05)
+CUBE = Neighbourhood(shape="cube", size_m=0.15, n_points=30, voxel_m=0.05)
 # A wall with a niche a quarter of a metre deep, and a floor before them.
 WALL = Rectangle("wall", (0, 2, 0), (1.5, 0, 0), (0, 0, 1.0), 120_000)
 NICHE = Rectangle("niche", (2.0, 2.25, 0), (0.4, 0, 0), (0, 0, 0.8), 26_000)
 FLOOR = Rectangle("floor", (0, 1, -1.0), (1.5, 0, 0), (0, 1, 0), 40_000)
 
 
-def cells_of(points: NDArray[np.float64], wanted: Neighbourhood, *, parts: int = 1) -> SurfaceCells:
+def voxels_of(
+    points: NDArray[np.float64], wanted: Neighbourhood, *, parts: int = 1
+) -> SurfaceVoxels:
     cloud = cloud_of(points)
-    remainder = prepare(cloud, basis_from_up(cloud.up), cell_m=0.5, least_share=0.005, parts=parts)
-    return surface_cells(remainder, wanted)
+    prepared = prepare(cloud, basis_from_up(cloud.up), cell_m=0.5, least_share=0.005, parts=parts)
+    return surface_voxels(prepared, wanted)
 
 
 def detect(folder: Path, **params: Any) -> tuple[Any, StepContext]:
@@ -45,15 +51,17 @@ def named(ctx: StepContext) -> dict[str, float]:
 
 def test_cells_hold_the_moments_of_their_points() -> None:
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (40_000, 3))
-    cells = cells_of(points, CUBE)
-    cell_of = cells.cell_of(prepared_points(points))
-    assert (cell_of >= 0).mean() > 0.99  # the robust box may leave out a few at its edge
-    kept, cell_of = points[cell_of >= 0], cell_of[cell_of >= 0]
-    np.testing.assert_array_equal(np.bincount(cell_of), cells.counts)
-    means = np.stack([np.bincount(cell_of, axis) for axis in kept.T], axis=1)
-    # Places within a cell are kept in 1024 steps.
-    step_m = cells.grid.cell_m / 1024
-    np.testing.assert_allclose(cells.centroids(), means / cells.counts[:, None], atol=0.6 * step_m)
+    voxels = voxels_of(points, CUBE)
+    voxel_of = voxels.voxel_of(prepared_points(points))
+    assert (voxel_of >= 0).mean() > 0.99  # the robust box may leave out a few at its edge
+    kept, voxel_of = points[voxel_of >= 0], voxel_of[voxel_of >= 0]
+    np.testing.assert_array_equal(np.bincount(voxel_of), voxels.counts)
+    means = np.stack([np.bincount(voxel_of, axis) for axis in kept.T], axis=1)
+    # Places within a voxel are kept in 1024 steps.
+    step_m = voxels.grid.cell_m / 1024
+    np.testing.assert_allclose(
+        voxels.centroids(), means / voxels.counts[:, None], atol=0.6 * step_m
+    )
 
 
 def prepared_points(points: NDArray[np.float64]) -> Any:
@@ -64,24 +72,24 @@ def prepared_points(points: NDArray[np.float64]) -> Any:
 
 def test_the_normal_of_a_neighbourhood_is_that_of_all_its_points() -> None:
     points = sampled((WALL,), noise_m=0.003)
-    cells = cells_of(points, CUBE)
-    cell_of = cells.cell_of(prepared_points(points))
-    for cell in np.random.default_rng(0).choice(len(cells.counts), 25, replace=False):
-        near = np.abs(cells.places - cells.places[cell]).max(axis=1) <= 1
-        members = points[(cell_of >= 0) & near[cell_of]]
+    voxels = voxels_of(points, CUBE)
+    voxel_of = voxels.voxel_of(prepared_points(points))
+    for voxel in np.random.default_rng(0).choice(len(voxels.counts), 25, replace=False):
+        near = np.abs(voxels.places - voxels.places[voxel]).max(axis=1) <= 1
+        members = points[(voxel_of >= 0) & near[voxel_of]]
         variances, directions = np.linalg.eigh(np.cov(members.T, bias=True))
         normal = directions[:, 0]
-        assert abs(abs(normal @ cells.normals[cell]) - 1.0) < 1e-5
-        expected = np.sqrt(np.maximum(variances, 0.0)) / cells.grid.cell_m
-        np.testing.assert_allclose(cells.spreads[cell], expected, rtol=0.01, atol=1e-3)
+        assert abs(abs(normal @ voxels.normals[voxel]) - 1.0) < 1e-5
+        expected = np.sqrt(np.maximum(variances, 0.0)) / voxels.grid.cell_m
+        np.testing.assert_allclose(voxels.spreads[voxel], expected, rtol=0.01, atol=1e-3)
 
 
 @pytest.mark.parametrize("parts", [2, 3])
 def test_neither_threads_nor_the_order_of_points_show(parts: int) -> None:
     points = sampled((WALL, NICHE))[::5]
-    expected = cells_of(points, CUBE)
+    expected = voxels_of(points, CUBE)
     order = np.random.default_rng(1).permutation(len(points))
-    found = cells_of(points[order], CUBE, parts=parts)
+    found = voxels_of(points[order], CUBE, parts=parts)
     # The robust box comes from a sample, which for so few points is all of them.
     for name in ("bricks", "numbers", "places", "sums", "normals", "spreads"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
@@ -94,16 +102,16 @@ def test_neither_threads_nor_the_order_of_points_show(parts: int) -> None:
 def test_neighbourhoods_have_the_cells_of_their_shape(
     shape: Any, size_m: float, count: int
 ) -> None:
-    around = Neighbourhood(shape=shape, size_m=size_m, n_points=9, cell_m=0.01).around()
-    assert len(around) == count - 1  # the cell itself is there without being listed
+    around = Neighbourhood(shape=shape, size_m=size_m, n_points=9, voxel_m=0.01).around()
+    assert len(around) == count - 1  # the voxel itself is there without being listed
     assert (np.diff(around[:, 3]) >= 0).all()
 
 
 def test_nearest_cells_end_when_they_hold_enough_points() -> None:
     points = sampled((Rectangle("dense", (0, 0, 0), (0.5, 0, 0), (0, 0, 0.5), 40_000),))
-    few = cells_of(points, Neighbourhood(shape="knn", size_m=0.1, n_points=30, cell_m=0.02))
-    many = cells_of(points, Neighbourhood(shape="knn", size_m=0.1, n_points=700, cell_m=0.02))
-    # 16 points in a cell: 30 are there within one shell (6 cm), 700 within three (14 cm).
+    few = voxels_of(points, Neighbourhood(shape="knn", size_m=0.1, n_points=30, voxel_m=0.02))
+    many = voxels_of(points, Neighbourhood(shape="knn", size_m=0.1, n_points=700, voxel_m=0.02))
+    # 16 points in a voxel: 30 are there within one shell (6 cm), 700 within three (14 cm).
     middle = (np.abs(few.centroids()[:, [0, 2]]) < 0.3).all(axis=1)
     assert np.median(few.spreads[middle, 2]) == pytest.approx(3 / np.sqrt(12), rel=0.05)
     assert np.median(many.spreads[middle, 2]) == pytest.approx(7 / np.sqrt(12), rel=0.1)
@@ -114,45 +122,45 @@ def test_a_region_is_fitted_by_total_least_squares_through_its_points() -> None:
     wall = Rectangle("lean", (1, 3, 2), (2, 0, 0), (0, np.sin(lean), np.cos(lean)), 80_000)
     points = sampled((wall,), noise_m=0.001)
     growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=100.0)
-    regions = grow(cells_of(points, CUBE), growth, np.zeros(3))
+    regions = grow(voxels_of(points, CUBE), growth, np.zeros(3))
     assert len(regions.planes) == 1
     (plane,) = regions.planes.values()
     centred = points - points.mean(axis=0)
     expected = np.linalg.svd(centred, full_matrices=False)[2][2]
-    # A few cells at the edges do not join, and places are rounded to 50 micrometres.
+    # A few voxels at the edges do not join, and places are rounded to 50 micrometres.
     assert min(angle_between_deg(plane.normal, s * expected) for s in (1, -1)) < 0.002
     assert abs(plane.distances_m(points.mean(axis=0)[None])[0]) < 2e-5
 
 
 def test_wider_cells_have_the_moments_of_their_points() -> None:
     points = sampled((WALL, NICHE))[::7]
-    cells = cells_of(points, CUBE)
-    wide = coarser(cells, np.arange(len(cells.counts)))
-    assert wide.cells.grid.cell_m == 2.0 * cells.grid.cell_m
-    cell_of = cells.cell_of(prepared_points(points))
-    inside = cell_of >= 0
-    wide_of = wide.of_member[cell_of[inside]]
+    voxels = voxels_of(points, CUBE)
+    wide = coarser(voxels, np.arange(len(voxels.counts)))
+    assert wide.voxels.grid.cell_m == 2.0 * voxels.grid.cell_m
+    voxel_of = voxels.voxel_of(prepared_points(points))
+    inside = voxel_of >= 0
+    wide_of = wide.of_member[voxel_of[inside]]
     count = np.bincount(wide_of)
-    np.testing.assert_array_equal(wide.cells.counts, count)
+    np.testing.assert_array_equal(wide.voxels.counts, count)
     mean = (
         np.column_stack([np.bincount(wide_of, column) for column in points[inside].T])
         / count[:, None]
     )
-    step_m = wide.cells.grid.cell_m / STEPS_PER_CELL
-    centroids = wide.cells.centroids() @ wide.cells.grid.basis
+    step_m = wide.voxels.grid.cell_m / STEPS_PER_VOXEL
+    centroids = wide.voxels.centroids() @ wide.voxels.grid.basis
     np.testing.assert_allclose(centroids, mean, atol=step_m)
-    # The kernels find each wide cell where its points are.
-    np.testing.assert_array_equal(wide.cells.cell_of(prepared_points(points))[inside], wide_of)
+    # The kernels find each wide voxel where its points are.
+    np.testing.assert_array_equal(wide.voxels.voxel_of(prepared_points(points))[inside], wide_of)
 
 
 def test_a_thinly_scanned_wall_beside_a_dense_one_is_one_region() -> None:
     # A point per decimetre: neighbourhoods of 10 cm that suit the dense wall hold one of them.
     thin = Rectangle("thin", (3.0, 1.0, 0.0), (0, 3.0, 0), (0, 0, 2.0), 2_400)
     dense = Rectangle("dense", (0.0, 4.0, 0.0), (2.0, 0, 0), (0, 0, 2.0), 90_000)
-    wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, cell_m=0.1 / 3.0)
-    cells = cells_of(sampled((thin, dense), noise_m=0.002), wanted)
+    wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, voxel_m=0.1 / 3.0)
+    voxels = voxels_of(sampled((thin, dense), noise_m=0.002), wanted)
     growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=400.0)
-    regions = grow(cells, growth, np.zeros(3))
+    regions = grow(voxels, growth, np.zeros(3))
     assert len(regions.planes) == 2
     of_thin = min(regions.planes, key=lambda region: regions.n_points[region])
     assert regions.n_points[of_thin] > 0.9 * 2_400
@@ -164,12 +172,12 @@ def test_a_step_of_three_centimetres_parts_regions() -> None:
     upper = Rectangle("upper", (0, 2, 0.5), (1, 0, 0), (0, 0, 0.5), 30_000)
     lower = Rectangle("lower", (0, 2.03, -0.5), (1, 0, 0), (0, 0, 0.5), 25_000)
     growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=2_000.0)
-    cells = cells_of(sampled((upper, lower), noise_m=0.001), CUBE)
-    regions = grow(cells, growth, np.zeros(3))
+    voxels = voxels_of(sampled((upper, lower), noise_m=0.001), CUBE)
+    regions = grow(voxels, growth, np.zeros(3))
     assert len(regions.planes) == 2
     either_depth = Growth(angle_deg=10.0, distance_m=None, least_points=2_000.0)
-    # All but the cells at the step itself, whose neighbourhoods lean.
-    assert grow(cells, either_depth, STATION[0]).n_points.max() > 0.85 * 55_000
+    # All but the voxels at the step itself, whose neighbourhoods lean.
+    assert grow(voxels, either_depth, STATION[0]).n_points.max() > 0.85 * 55_000
 
 
 def test_the_paper_s_preset_does_not_tell_a_niche_from_its_wall(tmp_path: Path) -> None:
@@ -179,7 +187,7 @@ def test_the_paper_s_preset_does_not_tell_a_niche_from_its_wall(tmp_path: Path) 
     niche = slice(WALL.n_points, WALL.n_points + NICHE.n_points)
     of_wall = paper.labels.plane_index[: WALL.n_points]
     wall = int(np.bincount(of_wall[of_wall >= 0]).argmax())
-    # Some cells of a centimetre have too few points for a normal.
+    # Some voxels of a centimetre have too few points for a normal.
     assert np.mean(of_wall == wall) > 0.85
     assert np.mean(paper.labels.plane_index[niche] == wall) > 0.85
     own = np.bincount(ours.labels.plane_index[niche] + 1).argmax() - 1

@@ -63,14 +63,14 @@ def test_noise_that_grows_with_incidence_and_range_is_told_by_class(tmp_path: Pa
     incidence = np.arccos(2.0 / range_m)
     noise_m = 0.001 + 0.003 * incidence
     out, ctx, _ = detect(cloud_of(wall(noise_m), stations=STATION), tmp_path)
-    classes = out.planes.details["thickness"][0]
-    assert len(classes["incidence_deg"]) >= 5
-    for item in classes["incidence_deg"]:
-        middle = np.radians(0.5 * (item["low"] + item["high"]))
-        assert item["sigma_m"] == pytest.approx(0.001 + 0.003 * middle, rel=0.1)
-    sigmas = [item["sigma_m"] for item in classes["range_m"]]
+    classes = out.planes.thickness[0]
+    assert len(classes.incidence_deg) >= 5
+    for item in classes.incidence_deg:
+        middle = np.radians(0.5 * (item.low + item.high))
+        assert item.sigma_m == pytest.approx(0.001 + 0.003 * middle, rel=0.1)
+    sigmas = [item.sigma_m for item in classes.range_m]
     assert sigmas == sorted(sigmas)
-    assert sum(item["n_points"] for item in classes["range_m"]) > 0.95 * N_POINTS
+    assert sum(item.n_points for item in classes.range_m) > 0.95 * N_POINTS
     assert "thickness" in {figure.name for figure in ctx.figures}
 
 
@@ -80,10 +80,10 @@ def test_a_material_that_scatters_more_is_told_by_its_intensity(tmp_path: Path) 
     points = wall(np.where(fabric, 0.004, 0.001))
     intensity = np.where(fabric, 0.2, 0.8) + np.random.default_rng(1).normal(0, 0.02, N_POINTS)
     cloud = dataclasses.replace(cloud_of(points), intensity=intensity.astype(np.float32))
-    classes = detect(cloud, tmp_path)[0].planes.details["thickness"][0]
-    assert "incidence_deg" not in classes
-    assert classes["intensity"][0]["sigma_m"] == pytest.approx(0.004, rel=0.05)
-    assert classes["intensity"][-1]["sigma_m"] == pytest.approx(0.001, rel=0.05)
+    classes = detect(cloud, tmp_path)[0].planes.thickness[0]
+    assert classes.incidence_deg == ()
+    assert classes.intensity[0].sigma_m == pytest.approx(0.004, rel=0.05)
+    assert classes.intensity[-1].sigma_m == pytest.approx(0.001, rel=0.05)
 
 
 @pytest.mark.usefixtures("charts")
@@ -104,12 +104,12 @@ def test_named_materials_have_a_thickness_each_on_the_plane_and_along_a_row(
         Ransac.Params(materials=names)
     del names["glass"]
     out, _, _ = detect(cloud, tmp_path, materials=names)
-    rows = [out.planes.details["thickness"][0]["material"], out.planes.details["scan_row"]]
-    for told, rel in ((rows[0], 0.05), (rows[1]["material"], 0.15)):
-        assert [item["name"] for item in told] == ["fabric", "plaster"]
-        assert told[0]["sigma_m"] == pytest.approx(0.004, rel=rel)
-        assert told[1]["sigma_m"] == pytest.approx(0.001, rel=rel)
-    assert rows[1]["n_points"] == 3000
+    thickness, row = out.planes.thickness[0], out.planes.scan_row
+    for spreads, rel in ((thickness.material, 0.05), (row.material, 0.15)):
+        assert [item.name for item in spreads] == ["fabric", "plaster"]
+        assert spreads[0].sigma_m == pytest.approx(0.004, rel=rel)
+        assert spreads[1].sigma_m == pytest.approx(0.001, rel=rel)
+    assert row.n_points == 3000
 
 
 def test_materials_need_intensities(tmp_path: Path) -> None:
@@ -119,20 +119,20 @@ def test_materials_need_intensities(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("charts")
 def test_one_row_of_the_scan_is_drawn_where_rows_are_known(tmp_path: Path) -> None:
-    from orthoflow_plugins.plane import detecting, scan_rows
+    from orthoflow_plugins.plane import detecting
 
     rows = []
     cloud = cloud_of(wall(0.002), stations=STATION)
     row = np.repeat(np.arange(300), N_POINTS // 300).astype(np.uint32)
     cloud = dataclasses.replace(cloud, row=row, column=np.zeros(N_POINTS, dtype=np.uint32))
-    original = scan_rows.scan_row
+    original = detecting.row_points
 
     def kept(*arguments: Any) -> Any:
         rows.append(original(*arguments))
         return rows[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(detecting, "scan_row", kept)
+        patch.setattr(detecting, "row_points", kept)
         detect(cloud, tmp_path)
     (found,) = rows
     assert len(found.along_m) == 300
@@ -143,5 +143,8 @@ def test_one_row_of_the_scan_is_drawn_where_rows_are_known(tmp_path: Path) -> No
 
 def test_a_view_point_that_was_stated_is_no_station(tmp_path: Path) -> None:
     cloud = cloud_of(wall(0.002), stations=STATION, source="view_from")
-    classes = detect(cloud, tmp_path)[0].planes.details["thickness"][0]
-    assert set(classes) == {"sigma_m", "width_95_m", "scan_step_m"}
+    classes = detect(cloud, tmp_path)[0].planes.thickness[0]
+    assert classes.sigma_m < classes.width_95_m
+    assert classes.scan_step_m > 0.0
+    by_class = (classes.incidence_deg, classes.range_m, classes.intensity, classes.material)
+    assert by_class == ((), (), (), ())

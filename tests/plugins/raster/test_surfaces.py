@@ -174,15 +174,15 @@ def test_the_buffer_is_three_tolerances_of_the_planes_unless_set(tmp_path: Path)
     known = scenes.leaning_wall(shape=(40, 60))
     cloud, _, _ = scattered(known, per_cell=1.0)
 
-    def buffers(details: dict[str, object], **params: object) -> tuple[float, float]:
-        planes = dataclasses.replace(known.planes(), details=details)
+    def buffers(stated: dict[str, float], **params: object) -> tuple[float, float]:
+        planes = dataclasses.replace(known.planes(), **stated)
         inputs = RasterGrid.In(cloud=cloud, planes=planes)
         chosen = RasterGrid.Params.model_validate({"gsd_m": known.gsd_m, **params})
         walls = RasterGrid().run(inputs, chosen, scenes.context(tmp_path)).walls
         return walls.buffer_front_m, walls.buffer_behind_m
 
     assert buffers({}) == pytest.approx((0.15, 0.15))
-    assert buffers({"find_tolerance_m": 0.1}) == pytest.approx((0.3, 0.3))
+    assert buffers({"tolerance_m": 0.1}) == pytest.approx((0.3, 0.3))
     assert buffers({"tolerance_m": 0.04}, buffer_front_m=0.2) == pytest.approx((0.2, 0.12))
     assert buffers({"tolerance_m": 0.04}, buffer_m=0.25) == pytest.approx((0.25, 0.25))
 

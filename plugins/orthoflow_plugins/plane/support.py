@@ -1,4 +1,4 @@
-"""Where on a plane its points lie: a coarse raster, the cells that belong, parts and rectangles.
+"""What supports a plane: a coarse raster on it, the cells that belong, parts and rectangles.
 
 A cell belongs to the plane when its points crowd about it. A floor that a vertical plane cuts, or
 clutter, spreads evenly over the slab instead: that is what tells a wall from the mere smear that
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
-from orthoflow.geometry.plane_kernels import sum_cells
-from orthoflow.geometry.point_kernels import BlockedPoints, each_part, piece_of
+from orthoflow_plugins.plane.block_kernels import BlockedPoints, each_part, piece_of
 from orthoflow_plugins.plane.neighbouring import closed, summed_around
+from orthoflow_plugins.plane.slab_kernels import sum_cells
 
 CELL_LEAST_M: Final = 0.05
 _CELLS_MOST: Final = 1_000_000
@@ -73,7 +73,7 @@ class SurfaceRaster:
 
 @dataclass(frozen=True, kw_only=True)
 class CellSums:
-    """What the unclaimed points in each cell of a surface raster add up to.
+    """What points in each cell of a surface raster add up to.
 
     Attributes:
         n_find: (rows, columns) int64 points within the find tolerance.
@@ -89,9 +89,20 @@ class CellSums:
     steps: NDArray[np.int64]
     squared_steps: NDArray[np.int64]
 
+    @classmethod
+    def of(cls, counts: NDArray[np.int64], sums: NDArray[np.int64]) -> CellSums:
+        """Name the tables (rows, columns, 3) and (rows, columns, 2) of the compiled passes."""
+        return cls(
+            n_find=counts[..., 0],
+            n_inner=counts[..., 1],
+            n_fit=counts[..., 2],
+            steps=sums[..., 0],
+            squared_steps=sums[..., 1],
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
-class Footprint:
+class Support:
     """The cells that belong to a plane.
 
     Attributes:
@@ -139,18 +150,16 @@ def cell_for(n_points: float, area_m2: float) -> float:
 
 def measure_cells(
     points: BlockedPoints,
-    claims: NDArray[np.int8],
     raster: SurfaceRaster,
     *,
     find_m: float,
     fit_m: float,
     parts: int,
 ) -> CellSums:
-    """Sum the unclaimed points near a plane per cell, in one pass.
+    """Sum the points near a plane per cell, in one pass.
 
     Args:
         points: the points.
-        claims: (n,) plane of each point, negative for none.
         raster: cells on the plane.
         find_m: find tolerance, metres.
         fit_m: fit tolerance, metres.
@@ -162,18 +171,10 @@ def measure_cells(
     slab = raster.slab(from_low=True)
 
     def add(part: int, piece: slice) -> None:
-        sum_cells(piece_of(points, piece), claims[piece], slab, limits, counts[part], sums[part])
+        sum_cells(piece_of(points, piece), slab, limits, counts[part], sums[part])
 
-    each_part(len(claims), parts, add)
-    total = counts.sum(axis=0, dtype=np.int64)
-    steps = sums.sum(axis=0)
-    return CellSums(
-        n_find=total[..., 0],
-        n_inner=total[..., 1],
-        n_fit=total[..., 2],
-        steps=steps[..., 0],
-        squared_steps=steps[..., 1],
-    )
+    each_part(len(points.x), parts, add)
+    return CellSums.of(counts.sum(axis=0, dtype=np.int64), sums.sum(axis=0))
 
 
 def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
@@ -192,13 +193,13 @@ def crowded_cells(sums: CellSums) -> NDArray[np.bool_]:
     return result
 
 
-def footprint(
+def support_of(
     raster: SurfaceRaster,
     belongs: NDArray[np.bool_],
     sums: CellSums,
     *,
     joins_parts: bool = True,
-) -> Footprint | None:
+) -> Support | None:
     """Join cells into parts and put rectangles about them.
 
     Parts are connected over gaps of up to four cells. Every part with a fair share of the cells
@@ -206,7 +207,7 @@ def footprint(
     without `joins_parts` only the one with most points.
 
     Returns:
-        The footprint, or None where no cell belongs.
+        The support, or None where no cell belongs.
     """
     from scipy import ndimage
 
@@ -224,7 +225,7 @@ def footprint(
     part_of_cell = np.where(belongs, part_of_name[names], np.int32(-1))
     cells = part_of_cell >= 0
     parts_m = np.array([_bounds(raster, part_of_cell == part) for part in range(len(kept))])
-    return Footprint(
+    return Support(
         cells=cells,
         part_of_cell=part_of_cell,
         parts_m=parts_m,

@@ -1,14 +1,14 @@
-"""Compiled robust fit of a plane to points: total least squares, reweighted until it settles."""
+"""Compiled fits of planes: the flattest plane of moments, and a robust one to points."""
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
-from orthoflow.geometry.region_kernels import flattest
 
 # What a fit may change: everything, a normal kept across up, or one kept along up.
 FREE: Final = 0
@@ -22,6 +22,54 @@ _REACH: Final = 2.0
 _SETTLED_SHARE: Final = 5e-4
 # Points nearer to a line than this (root mean square) do not say how the plane lies about it.
 _LINE_WIDTH_M: Final = 1e-4
+
+
+@compiled
+def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
+    """Set (9,) plane to normal, middle, and the variances along the three principal axes.
+
+    The eigenvalues of a symmetric 3 x 3 matrix in closed form, because the library's solver takes
+    a hundred times as long for so small a one.
+
+    Args:
+        sums: (10,) number of points, sums of a, b, c, and of aa, ab, ac, bb, bc, cc.
+        plane: set; variances ascend.
+    """
+    n = sums[0]
+    ma, mb, mc = sums[1] / n, sums[2] / n, sums[3] / n
+    aa, ab, ac = sums[4] / n - ma * ma, sums[5] / n - ma * mb, sums[6] / n - ma * mc
+    bb, bc, cc = sums[7] / n - mb * mb, sums[8] / n - mb * mc, sums[9] / n - mc * mc
+    mean = (aa + bb + cc) / 3.0
+    da, db, dc = aa - mean, bb - mean, cc - mean
+    off = ab * ab + ac * ac + bc * bc
+    size = math.sqrt((da * da + db * db + dc * dc + 2.0 * off) / 6.0)
+    plane[3], plane[4], plane[5] = ma, mb, mc
+    if size < 1e-12:
+        plane[0], plane[1], plane[2] = 0.0, 0.0, 1.0
+        plane[6], plane[7], plane[8] = mean, mean, mean
+        return
+    determinant = (
+        da * (db * dc - bc * bc) - ab * (ab * dc - bc * ac) + ac * (ab * bc - db * ac)
+    ) / size**3
+    angle = math.acos(min(1.0, max(-1.0, 0.5 * determinant))) / 3.0
+    most = mean + 2.0 * size * math.cos(angle)
+    least = mean + 2.0 * size * math.cos(angle + 2.0 * math.pi / 3.0)
+    plane[6], plane[7], plane[8] = max(least, 0.0), 3.0 * mean - most - least, most
+    # Rows of (matrix - least) are across the normal: the longest cross product of two is the best.
+    ra, rb, rc = aa - least, bb - least, cc - least
+    u0, u1, u2 = ab * bc - ac * rb, ac * ab - ra * bc, ra * rb - ab * ab
+    v0, v1, v2 = ab * rc - ac * bc, ac * ac - ra * rc, ra * bc - ab * ac
+    w0, w1, w2 = rb * rc - bc * bc, bc * ac - ab * rc, ab * bc - rb * ac
+    u, v, w = u0 * u0 + u1 * u1 + u2 * u2, v0 * v0 + v1 * v1 + v2 * v2, w0 * w0 + w1 * w1 + w2 * w2
+    if v > u:
+        u, u0, u1, u2 = v, v0, v1, v2
+    if w > u:
+        u, u0, u1, u2 = w, w0, w1, w2
+    length = math.sqrt(u)
+    if length > 0.0:
+        plane[0], plane[1], plane[2] = u0 / length, u1 / length, u2 / length
+    else:
+        plane[0], plane[1], plane[2] = 0.0, 0.0, 1.0
 
 
 @kernel_part
@@ -117,7 +165,7 @@ def refine_robustly(
     freedom: int,
     up: NDArray[np.float64],
 ) -> bool:
-    """Move a plane to the densest layer of points near it.
+    """Move a plane to the densest layer of points near it: total least squares, reweighted.
 
     Args:
         points: (m, 3) offsets, metres.

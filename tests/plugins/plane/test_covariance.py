@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.plane.adjustment import adjust_plane
-from orthoflow_plugins.plane.footprints import CellSums, SurfaceRaster
+from orthoflow_plugins.plane.fitting import adjust_plane
 from orthoflow_plugins.plane.ransac import Ransac
+from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
+from orthoflow_plugins.plane.support import CellSums, SurfaceRaster
 from scipy import ndimage
 
 from orthoflow.geometry import Plane, angle_between_deg, wall_axes
-from orthoflow.geometry.plane_kernels import STEPS_PER_TOLERANCE
 from orthoflow.products import Planes
 from tests.long_loops import IS_LONG
 from tests.plane_scenes import context

@@ -1,7 +1,7 @@
 """Compiled passes of region growing: planes of neighbourhoods, growing, moments of regions.
 
-All of them work on the cells of `cell_kernels`, of which a room has half a million where it has
-fifty million points. Lengths are in sides of a cell, so that kernels need not know how large one
+All of them work on the voxels of `voxel_kernels`, of which a room has half a million where it has
+fifty million points. Lengths are in sides of a voxel, so that kernels need not know how large one
 is.
 """
 
@@ -13,19 +13,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.cell_kernels import STEPS_PER_CELL
 from orthoflow.geometry.compiling import compiled, kernel_part
-from orthoflow.geometry.voxel_kernels import BRICK_SIDE
+from orthoflow_plugins.plane.fit_kernels import flattest
+from orthoflow_plugins.plane.voxel_kernels import BRICK_SIDE, STEPS_PER_VOXEL
 
 # A region's plane is fitted anew whenever it has grown by this share.
 _REFIT_SHARE: Final = 0.2
-# How often the cells of a region ask their neighbours.
+# How often the voxels of a region ask their neighbours.
 _SWEEPS_MOST: Final = 3
 
 
 @kernel_part
-def cell_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
-    """Give the number of the cell at a place, -1 where none is."""
+def voxel_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[np.int32]) -> int:
+    """Give the number of the voxel at a place, -1 where none is."""
     if a < 0 or b < 0 or c < 0:
         return -1
     p, q, r = a >> 3, b >> 3, c >> 3
@@ -38,64 +38,16 @@ def cell_at(a: int, b: int, c: int, bricks: NDArray[np.int32], numbers: NDArray[
 
 
 @compiled
-def flattest(sums: NDArray[np.float64], plane: NDArray[np.float64]) -> None:
-    """Set (9,) plane to normal, middle, and the variances along the three principal axes.
-
-    The eigenvalues of a symmetric 3 x 3 matrix in closed form, because the library's solver takes
-    a hundred times as long for so small a one.
-
-    Args:
-        sums: (10,) number of points, sums of a, b, c, and of aa, ab, ac, bb, bc, cc.
-        plane: set; variances ascend.
-    """
-    n = sums[0]
-    ma, mb, mc = sums[1] / n, sums[2] / n, sums[3] / n
-    aa, ab, ac = sums[4] / n - ma * ma, sums[5] / n - ma * mb, sums[6] / n - ma * mc
-    bb, bc, cc = sums[7] / n - mb * mb, sums[8] / n - mb * mc, sums[9] / n - mc * mc
-    mean = (aa + bb + cc) / 3.0
-    da, db, dc = aa - mean, bb - mean, cc - mean
-    off = ab * ab + ac * ac + bc * bc
-    size = math.sqrt((da * da + db * db + dc * dc + 2.0 * off) / 6.0)
-    plane[3], plane[4], plane[5] = ma, mb, mc
-    if size < 1e-12:
-        plane[0], plane[1], plane[2] = 0.0, 0.0, 1.0
-        plane[6], plane[7], plane[8] = mean, mean, mean
-        return
-    determinant = (
-        da * (db * dc - bc * bc) - ab * (ab * dc - bc * ac) + ac * (ab * bc - db * ac)
-    ) / size**3
-    angle = math.acos(min(1.0, max(-1.0, 0.5 * determinant))) / 3.0
-    most = mean + 2.0 * size * math.cos(angle)
-    least = mean + 2.0 * size * math.cos(angle + 2.0 * math.pi / 3.0)
-    plane[6], plane[7], plane[8] = max(least, 0.0), 3.0 * mean - most - least, most
-    # Rows of (matrix - least) are across the normal: the longest cross product of two is the best.
-    ra, rb, rc = aa - least, bb - least, cc - least
-    u0, u1, u2 = ab * bc - ac * rb, ac * ab - ra * bc, ra * rb - ab * ab
-    v0, v1, v2 = ab * rc - ac * bc, ac * ac - ra * rc, ra * bc - ab * ac
-    w0, w1, w2 = rb * rc - bc * bc, bc * ac - ab * rc, ab * bc - rb * ac
-    u, v, w = u0 * u0 + u1 * u1 + u2 * u2, v0 * v0 + v1 * v1 + v2 * v2, w0 * w0 + w1 * w1 + w2 * w2
-    if v > u:
-        u, u0, u1, u2 = v, v0, v1, v2
-    if w > u:
-        u, u0, u1, u2 = w, w0, w1, w2
-    length = math.sqrt(u)
-    if length > 0.0:
-        plane[0], plane[1], plane[2] = u0 / length, u1 / length, u2 / length
-    else:
-        plane[0], plane[1], plane[2] = 0.0, 0.0, 1.0
-
-
-@compiled
 def add_moments(
     total: NDArray[np.float64],
     sums: NDArray[np.int64],
     k: int,
     at: tuple[float, float, float],
 ) -> None:
-    """Add cell k to (10,) total, its middle being `at` from where the total is counted."""
+    """Add voxel k to (10,) total, its middle being `at` from where the total is counted."""
     n = float(sums[k, 0])
     a, b, c = at
-    fine = 1.0 / STEPS_PER_CELL
+    fine = 1.0 / STEPS_PER_VOXEL
     # Steps were rounded down: half a step on average.
     sa = sums[k, 1] * fine + 0.5 * fine * n
     sb = sums[k, 2] * fine + 0.5 * fine * n
@@ -133,20 +85,20 @@ def fit_neighbourhoods(  # noqa: PLR0913, PLR0917 - compiled code has no objects
     normals: NDArray[np.float32],
     spreads: NDArray[np.float32],
 ) -> None:
-    """Fit a plane to the neighbourhood of each cell.
+    """Fit a plane to the neighbourhood of each voxel.
 
     Args:
-        places: (m, 3) cells to fit, of which the first has the number `first`.
+        places: (m, 3) voxels to fit, of which the first has the number `first`.
         first: see above.
         bricks: (a, b, c) number of each brick.
-        numbers: (bricks, voxels) number of each cell.
-        sums: (cells, N_SUMS) moments of all cells.
-        around: (o, 4) steps to the cells of a neighbourhood, near ones first, and the shell that
+        numbers: (bricks, VOXELS) number of each voxel.
+        sums: (n, N_SUMS) moments of all voxels.
+        around: (o, 4) steps to the voxels of a neighbourhood, near ones first, and the shell that
             each is in.
         enough: a neighbourhood ends with the shell in which it has so many points.
         normals: (m, 3) set; either side.
         spreads: (m, 3) set to the deviation from the plane and the two extents along it (standard
-            deviations), sides of a cell; the first is infinite with fewer than three points.
+            deviations), sides of a voxel; the first is infinite with fewer than three points.
     """
     total, plane = np.empty(10), np.empty(9)
     for i in range(places.shape[0]):
@@ -160,7 +112,7 @@ def fit_neighbourhoods(  # noqa: PLR0913, PLR0917 - compiled code has no objects
                     break
                 shell = around[j, 3]
             da, db, dc = around[j, 0], around[j, 1], around[j, 2]
-            k = cell_at(a + da, b + db, c + dc, bricks, numbers)
+            k = voxel_at(a + da, b + db, c + dc, bricks, numbers)
             if k >= 0:
                 add_moments(total, sums, k, (float(da), float(db), float(dc)))
         if total[0] < 3.0:
@@ -184,20 +136,20 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
     limits: NDArray[np.float64],
     regions: NDArray[np.int32],
 ) -> int:
-    """Grow regions over neighbouring cells: like normal, and near the region's plane.
+    """Grow regions over neighbouring voxels: like normal, and near the region's plane.
 
     The plane is that of all points of the region so far; it is fitted anew as the region grows, and
-    when nothing more joins, the region's own cells ask their neighbours again with the last one.
+    when nothing more joins, the region's own voxels ask their neighbours again with the last one.
 
     Args:
-        places: (cells, 3) where cells lie.
+        places: (n, 3) where voxels lie.
         bricks: (a, b, c) number of each brick.
-        numbers: (bricks, voxels) number of each cell.
-        sums: (cells, N_SUMS) moments.
-        normals: (cells, 3) of their neighbourhoods.
-        seeds: (s,) cells that may belong to a region, those to start from first.
-        limits: smallest cosine between normals, largest distance in sides of a cell.
-        regions: (cells,) -2 where a cell may join, others stay; set to the region.
+        numbers: (bricks, VOXELS) number of each voxel.
+        sums: (n, N_SUMS) moments.
+        normals: (n, 3) of their neighbourhoods.
+        seeds: (s,) voxels that may belong to a region, those to start from first.
+        limits: smallest cosine between normals, largest distance in sides of a voxel.
+        regions: (n,) -2 where a voxel may join, others stay; set to the region.
 
     Returns:
         The number of regions.
@@ -206,7 +158,7 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
     queue = np.empty(seeds.size, dtype=np.int32)
     total, plane = np.empty(10), np.empty(9)
     n_regions = 0
-    fine = 1.0 / STEPS_PER_CELL
+    fine = 1.0 / STEPS_PER_VOXEL
     for s in range(seeds.size):
         seed = seeds[s]
         if regions[seed] != -2:
@@ -214,7 +166,7 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
         regions[seed] = n_regions
         queue[0] = seed
         length = 1
-        # Counted from the seed's cell, so that a region far from the box's corner loses nothing.
+        # Counted from the seed's voxel, so that a region far from the box's corner loses nothing.
         oa, ob, oc = places[seed, 0], places[seed, 1], places[seed, 2]
         total[:] = 0.0
         add_moments(total, sums, seed, (0.0, 0.0, 0.0))
@@ -225,14 +177,14 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
         for _ in range(_SWEEPS_MOST):
             before, head = length, 0
             while head < length:
-                cell = queue[head]
+                voxel = queue[head]
                 head += 1
                 for da in range(-1, 2):
                     for db in range(-1, 2):
                         for dc in range(-1, 2):
-                            pa, pb = places[cell, 0] + da, places[cell, 1] + db
-                            pc = places[cell, 2] + dc
-                            k = cell_at(pa, pb, pc, bricks, numbers)
+                            pa, pb = places[voxel, 0] + da, places[voxel, 1] + db
+                            pc = places[voxel, 2] + dc
+                            k = voxel_at(pa, pb, pc, bricks, numbers)
                             if k < 0 or regions[k] != -2:
                                 continue
                             turn = (
@@ -258,7 +210,7 @@ def grow_regions(  # noqa: C901, PLR0912, PLR0913, PLR0917 - the loop that growi
                 if length >= refit:
                     flattest(total, plane)
                     refit = int((1.0 + _REFIT_SHARE) * length) + 1
-            # While the plane still swayed it may have passed over cells that it now holds.
+            # While the plane still swayed it may have passed over voxels that it now holds.
             if length == before:
                 break
             if length >= 8:
@@ -274,7 +226,7 @@ def sum_regions(
     regions: NDArray[np.int32],
     totals: NDArray[np.float64],
 ) -> None:
-    """Add the moments of cells to (r, 10) of their regions, from the middle of cell (0, 0, 0)."""
+    """Add the moments of voxels to (r, 10) of their regions, from the middle of voxel (0, 0, 0)."""
     for k in range(regions.size):
         region = regions[k]
         if region >= 0:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.box_kernels import (
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow_plugins.plane.block_kernels import BLOCK_POINTS, BlockedPoints
+from orthoflow_plugins.plane.slab_kernels import (
     ALONG_NORMAL,
+    STEPS_PER_TOLERANCE,
     centre_block,
     place_along,
 )
-from orthoflow.geometry.compiling import compiled, kernel_part
-from orthoflow.geometry.plane_kernels import HISTOGRAM_BINS, STEPS_PER_TOLERANCE
-from orthoflow.geometry.point_kernels import BLOCK_POINTS, BlockedPoints
+
+# Bins that the deviations of a plane's points are counted in.
+HISTOGRAM_BINS: Final = 200
 
 
 @kernel_part

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled
-from orthoflow.geometry.point_kernels import BLOCK_POINTS
+from orthoflow_plugins.plane.block_kernels import BLOCK_POINTS
 
 
 @compiled

@@ -1,0 +1,189 @@
+"""Planes found in the sample, fitted to all points: one pass for all planes, one for labels.
+
+All points take part in the fits, or of more than 24 million every so many'th block of neighbours,
+drawn over the whole cloud: neighbours share their errors, so that those left out say the same.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.threads import in_threads
+from orthoflow_plugins.plane.block_kernels import BLOCK_POINTS, each_part, piece_of
+from orthoflow_plugins.plane.candidates import (
+    FoundPlane,
+    Rules,
+    Verification,
+    carried,
+    verification,
+)
+from orthoflow_plugins.plane.sample import PreparedCloud
+from orthoflow_plugins.plane.slab_kernels import assign_points, name_labels, sum_assigned
+from orthoflow_plugins.plane.support import INNER_SHARE, CellSums, SurfaceRaster, cell_for
+
+_PASSES_MOST: Final = 3
+# A fit that moved by more than this share of the fit tolerance saw its points askew.
+_SETTLED_SHARE: Final = 0.1
+# Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.
+_FITTED_MOST: Final = 12_000_000
+
+
+def fit_to_all(found: list[FoundPlane], cloud: PreparedCloud, rules: Rules) -> list[FoundPlane]:
+    """Fit planes to all points; those that the points do not bear out are left out.
+
+    Args:
+        found: planes of the sample.
+        cloud: the cloud.
+        rules: when a plane counts.
+    """
+    every = max(1, len(cloud.claims) // _FITTED_MOST)
+    unsettled = [True] * len(found)
+    for _ in range(_PASSES_MOST):
+        rasters = [_raster(item, cloud, rules.find_m, every) for item in found]
+        measured = _measured(found, rasters, unsettled, cloud, rules, every)
+        n_least = rules.least_share * len(cloud.claims) / every
+        verdicts = _verified(found, rasters, measured, unsettled, cloud, rules, n_least)
+        kept: list[FoundPlane] = []
+        moves: list[bool] = []
+        for item, raster, verdict, is_new in zip(found, rasters, verdicts, unsettled, strict=True):
+            if not is_new:
+                kept.append(item)
+                moves.append(False)
+            elif verdict is not None:
+                kept.append(
+                    replace(
+                        item,
+                        raster=carried(raster, verdict.adjusted.plane, cloud.up),
+                        support=verdict.support,
+                        adjusted=verdict.adjusted,
+                    )
+                )
+                moves.append(verdict.adjusted.moved_m > _SETTLED_SHARE * rules.fit_m)
+        found, unsettled = kept, moves
+        if not any(unsettled):
+            break
+    return found
+
+
+def _verified(
+    found: list[FoundPlane],
+    rasters: list[SurfaceRaster],
+    measured: list[CellSums],
+    wanted: list[bool],
+    cloud: PreparedCloud,
+    rules: Rules,
+    n_least: float,
+) -> list[Verification | None]:
+    """What the sums say of each plane that is wanted, several planes at a time."""
+    verdicts: list[Verification | None] = [None] * len(found)
+
+    def verify(first: int) -> None:
+        for index in range(first, len(found), cloud.parts):
+            if wanted[index]:
+                freedom = found[index].freedom
+                verdicts[index] = verification(
+                    rasters[index], measured[index], rules, freedom, n_least=n_least
+                )
+
+    in_threads([partial(verify, first) for first in range(cloud.parts)])
+    return verdicts
+
+
+def label(found: list[FoundPlane], cloud: PreparedCloud, find_m: float) -> None:
+    """Claim all points for the nearest plane in whose rectangle they lie."""
+    slabs, bounds = _slabs(found, find_m)
+    assign(cloud, slabs, bounds)
+
+
+def assign(cloud: PreparedCloud, slabs: NDArray[np.float64], bounds_m: NDArray[np.float64]) -> None:
+    """Claim all points for the nearest of slabs (k, 12) in whose bounds (k, 5) they lie."""
+
+    def give(_part: int, piece: slice) -> None:
+        assign_points(piece_of(cloud.points, piece), cloud.claims[piece], slabs, bounds_m)
+
+    each_part(len(cloud.claims), cloud.parts, give)
+
+
+def name_points(cloud: PreparedCloud, names: NDArray[np.int16], labels: NDArray[np.int16]) -> None:
+    """Write the label (n,) of each point; the last of (k + 1,) names is for points on no plane."""
+    by_byte = np.full(256, names[-1], dtype=np.int16)
+    by_byte[: len(names) - 1] = names[:-1]
+    claims = cloud.claims.view(np.uint8)
+
+    def write(_part: int, piece: slice) -> None:
+        name_labels(claims[piece], by_byte, labels[piece])
+
+    each_part(len(labels), cloud.parts, write)
+
+
+def _raster(item: FoundPlane, cloud: PreparedCloud, find_m: float, every: int) -> SurfaceRaster:
+    """Cells over the plane's rectangle alone, as fine as the points that are summed allow."""
+    cells = item.support.cells
+    area_m2 = float(cells.sum()) * item.raster.cell_m**2
+    share = len(cloud.claims) / max(1, len(cloud.sample.index)) / every
+    cell_m = min(item.raster.cell_m, cell_for(item.support.n_points * share, area_m2))
+    left, right, top, bottom = item.label_bounds(find_m)[1:]
+    return SurfaceRaster(
+        plane=item.raster.plane,
+        axes=item.raster.axes,
+        low_m=np.array([left, top]),
+        cell_m=cell_m,
+        shape=(
+            max(1, math.ceil((bottom - top) / cell_m)),
+            max(1, math.ceil((right - left) / cell_m)),
+        ),
+    )
+
+
+def _measured(
+    found: list[FoundPlane],
+    rasters: list[SurfaceRaster],
+    wanted: list[bool],
+    cloud: PreparedCloud,
+    rules: Rules,
+    every: int,
+) -> list[CellSums]:
+    """The sums of the cells of each plane that is wanted; others give no cells."""
+    shapes = [
+        r.shape if is_wanted else (0, 0) for r, is_wanted in zip(rasters, wanted, strict=True)
+    ]
+    sizes = [rows * columns for rows, columns in shapes]
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    rows = np.array(
+        [
+            (*r.low_m, 1.0 / r.cell_m, *shape, start, rules.fit_m, INNER_SHARE * rules.find_m)
+            for r, shape, start in zip(rasters, shapes, starts, strict=False)
+        ]
+    ).reshape(-1, 8)
+    # Flat tables over the cells of all rasters, of each part its own.
+    counts = np.zeros((cloud.parts, int(starts[-1]), 3), dtype=np.int32)
+    sums = np.zeros((cloud.parts, int(starts[-1]), 2), dtype=np.int64)
+    slabs, bounds = _slabs(found, rules.find_m)
+
+    def add(part: int, piece: slice) -> None:
+        points, drawn = piece_of(cloud.points, piece), (every, piece.start // BLOCK_POINTS)
+        sum_assigned(points, slabs, bounds, rows, counts[part], sums[part], drawn)
+
+    each_part(len(cloud.claims), cloud.parts, add)
+    all_counts, all_sums = counts.sum(axis=0, dtype=np.int64), sums.sum(axis=0)
+    measured = []
+    for shape, start, size in zip(shapes, starts, sizes, strict=False):
+        cells = slice(start, start + size)
+        measured.append(
+            CellSums.of(all_counts[cells].reshape(*shape, 3), all_sums[cells].reshape(*shape, 2))
+        )
+    return measured
+
+
+def _slabs(
+    found: list[FoundPlane], find_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slabs (k, 12) of planes and their bounds (k, 5), as the compiled passes take them."""
+    slabs = np.array([item.raster.slab() for item in found]).reshape(-1, 12)
+    return slabs, np.array([item.label_bounds(find_m) for item in found]).reshape(-1, 5)

@@ -1,0 +1,383 @@
+"""Compiled votes of the Hough transforms: for lines of a plan, and for planes in space.
+
+What is many votes is an image whose rows, or columns, are shifted and added to one line for each
+direction: the sum is what lines of that slope meet. That is as exact as voting cell by cell up to
+rounding to cells, and many times faster, because whole rows are added and nothing is scattered.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow_plugins.plane.block_kernels import BlockedPoints
+
+# A vote is counted in quarters, so that it can be shared between two bins without a rounding that
+# would not cancel when it is taken back.
+VOTE_SHARES: Final = 4
+# Side of the tiles that an image is turned by.
+_TILE: Final = 16
+
+
+@compiled
+def vote_image(
+    image: NDArray[np.int32], angles_rad: NDArray[np.float64], votes: NDArray[np.int64]
+) -> None:
+    """Let the cells of an image vote for all lines through them.
+
+    Args:
+        image: (rows, columns) votes of each cell; negative ones take votes back.
+        angles_rad: (a,) directions of the lines' normals, from the rows' axis to the columns'.
+        votes: (a, bins) added to, VOTE_SHARES per vote; bins are as wide as cells, and the middle
+            edge is the line through the middle of the image. Equation 4 of markiewicz2015.
+    """
+    n_rows, n_columns = image.shape
+    turned = np.zeros((n_columns, n_rows), dtype=np.int32)
+    spans = np.empty((n_rows, 2), dtype=np.int32)
+    turned_spans = np.empty((n_columns, 2), dtype=np.int32)
+    line = np.zeros(n_rows + n_columns + 4, dtype=np.int32)
+    turn_image(image, (0, n_rows, 0, n_columns), turned)
+    span_rows(image, (0, n_rows, 0, n_columns), spans)
+    span_rows(turned, (0, n_columns, 0, n_rows), turned_spans)
+    for a in range(angles_rad.size):
+        cosine, sine = math.cos(angles_rad[a]), math.sin(angles_rad[a])
+        if abs(sine) >= abs(cosine):
+            piece = add_sheared(image, spans, cosine / sine, line)
+            share_out(line, piece, (n_rows, n_columns), sine, votes[a])
+        else:
+            piece = add_sheared(turned, turned_spans, sine / cosine, line)
+            share_out(line, piece, (n_columns, n_rows), cosine, votes[a])
+
+
+@compiled
+def vote_lines(
+    cells: NDArray[np.float32],
+    weights: NDArray[np.int64],
+    angles_rad: NDArray[np.float64],
+    low_m: float,
+    bin_m: float,
+    votes: NDArray[np.int64],
+) -> None:
+    """Let each plan cell vote for all lines through it.
+
+    Args:
+        cells: (m, 2) centres in the plan, metres.
+        weights: (m,) votes a cell has.
+        angles_rad: (a,) directions of the lines' normals.
+        low_m: distance of the first bin's lower edge; bins that miss the table are dropped.
+        bin_m: width of a bin.
+        votes: (a, bins) table, added to. Equation 4 of markiewicz2015: r = x cos + y sin.
+    """
+    n_bins = votes.shape[1]
+    for angle in range(angles_rad.size):
+        cosine = math.cos(angles_rad[angle]) / bin_m
+        sine = math.sin(angles_rad[angle]) / bin_m
+        start = low_m / bin_m
+        for i in range(cells.shape[0]):
+            position = cells[i, 0] * cosine + cells[i, 1] * sine - start
+            if 0.0 <= position < n_bins:
+                votes[angle, int(position)] += weights[i]
+
+
+@compiled
+def vote_points(
+    points: BlockedPoints,
+    plan: NDArray[np.float64],
+    angles_rad: NDArray[np.float64],
+    low_m: float,
+    bin_m: float,
+    votes: NDArray[np.int64],
+) -> None:
+    """Let each point vote with its own coordinates; otherwise as `vote_lines`.
+
+    Args:
+        points: (n,) offsets in blocks.
+        plan: (2, 4) e1 and e2, each with the position of the plan's centre along it.
+        angles_rad: (a,) directions of the lines' normals.
+        low_m: distance of the first bin's lower edge.
+        bin_m: width of a bin.
+        votes: (a, bins) table, added to.
+    """
+    x, y, z = points.x, points.y, points.z
+    n_bins = votes.shape[1]
+    for angle in range(angles_rad.size):
+        cosine = math.cos(angles_rad[angle]) / bin_m
+        sine = math.sin(angles_rad[angle]) / bin_m
+        a = cosine * plan[0, 0] + sine * plan[1, 0]
+        b = cosine * plan[0, 1] + sine * plan[1, 1]
+        c = cosine * plan[0, 2] + sine * plan[1, 2]
+        start = low_m / bin_m + cosine * plan[0, 3] + sine * plan[1, 3]
+        for i in range(x.size):
+            position = a * x[i] + b * y[i] + c * z[i] - start
+            if 0.0 <= position < n_bins:
+                votes[angle, int(position)] += 1
+
+
+@kernel_part
+def _count_upright(
+    places: NDArray[np.float32],
+    weights: NDArray[np.int32],
+    omega_rad: float,
+    bin_m: float,
+    cells: NDArray[np.int32],
+    image: NDArray[np.int32],
+) -> tuple[int, int, int, int]:
+    """Count places in an upright image along a direction; (m,) cells is scratch.
+
+    Gives the window that they lie in: first row, row behind the last, and the same for columns.
+    """
+    n_rows, n_columns = image.shape
+    cosine, sine = np.float32(math.cos(omega_rad) / bin_m), np.float32(math.sin(omega_rad) / bin_m)
+    per_m, zero, none = np.float32(1.0 / bin_m), np.float32(0.0), np.int32(-1)
+    half_columns, half_rows = np.float32(0.5 * n_columns), np.float32(0.5 * n_rows)
+    top_columns, top_rows = np.float32(n_columns), np.float32(n_rows)
+    width = np.int32(n_columns)
+    xs, ys, zs = places[0], places[1], places[2]
+    left, right, bottom, top = top_columns, zero, top_rows, zero
+    # Without branches, so that the processor takes several places at once.
+    for i in range(cells.size):
+        column = cosine * xs[i] + sine * ys[i] + half_columns
+        row = zs[i] * per_m + half_rows
+        within = (column >= zero) & (column < top_columns) & (row >= zero) & (row < top_rows)
+        left, right = min(left, column), max(right, column)
+        bottom, top = min(bottom, row), max(top, row)
+        column = column if within else zero
+        row = row if within else zero
+        cells[i] = np.int32(row) * width + np.int32(column) if within else none
+    flat = image.reshape(image.size)
+    for i in range(cells.size):
+        if cells[i] >= 0:
+            flat[cells[i]] += weights[i]
+    return (
+        max(0, int(bottom)),
+        min(n_rows, int(top) + 1),
+        max(0, int(left)),
+        min(n_columns, int(right) + 1),
+    )
+
+
+@compiled
+def vote_planes(
+    places: NDArray[np.float32],
+    weights: NDArray[np.int32],
+    angles: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    image: NDArray[np.int32],
+    bin_m: float,
+    votes: NDArray[np.int32],
+) -> None:
+    """Let places vote for all planes through them, in two stages.
+
+    For each direction in plan the places are counted in an upright image (distance along that
+    direction, height). For each phi the rows of the image are shifted and added up, or its columns
+    for planes that are more level than upright: a hundred times faster than voting one by one.
+
+    Args:
+        places: (3, m) e1, e2 and height, metres from the middle of the box.
+        weights: (m,) votes of each; negative ones take votes back.
+        angles: (d, 2) omega and phi of each direction, those with one omega together; radians.
+        starts: (o + 1,) where the directions of each omega start.
+        image: (rows, columns) scratch, zeros; its middle is the middle of the box.
+        bin_m: side of a cell of the image, width of a bin.
+        votes: (d, bins) added to, VOTE_SHARES per vote; the middle edge is distance zero.
+    """
+    n_rows, n_columns = image.shape
+    turned = np.empty((n_columns, n_rows), dtype=np.int32)
+    cells = np.empty(places.shape[1], dtype=np.int32)
+    spans = np.empty((n_rows, 2), dtype=np.int32)
+    turned_spans = np.empty((n_columns, 2), dtype=np.int32)
+    line = np.zeros(n_rows + n_columns + 4, dtype=np.int32)
+    for turn in range(starts.size - 1):
+        if starts[turn] == starts[turn + 1]:
+            continue
+        window = _count_upright(places, weights, angles[starts[turn], 0], bin_m, cells, image)
+        turn_image(image, window, turned)
+        span_rows(image, window, spans)
+        span_rows(turned, (window[2], window[3], window[0], window[1]), turned_spans)
+        for d in range(starts[turn], starts[turn + 1]):
+            level, rise = math.cos(angles[d, 1]), math.sin(angles[d, 1])
+            if level >= abs(rise):
+                piece = add_sheared(image, spans, rise / level, line)
+                share_out(line, piece, (n_rows, n_columns), level, votes[d])
+            else:
+                piece = add_sheared(turned, turned_spans, level / rise, line)
+                share_out(line, piece, (n_columns, n_rows), rise, votes[d])
+        image[window[0] : window[1], window[2] : window[3]] = 0
+
+
+@compiled
+def best_bins(
+    votes: NDArray[np.int32],
+    rows: NDArray[np.int64],
+    half: int,
+    barred: NDArray[np.uint8],
+    scores: NDArray[np.int64],
+    places: NDArray[np.int64],
+) -> None:
+    """Find in each row the window whose votes stand out most from the emptier window beside it.
+
+    Args:
+        votes: (d, bins).
+        rows: (m,) which of them are asked about.
+        half: a window has 2 half + 1 bins; the windows beside begin one bin further off.
+        barred: (d, bins) 1 where no window may have its middle.
+        scores: (d,) set where asked.
+        places: (d,) set to the middle bin.
+    """
+    n_bins = votes.shape[1]
+    width = 2 * half + 1
+    gap = width + 1
+    running = np.zeros(n_bins + 2 * (half + gap) + 1, dtype=np.int64)
+    windows = np.empty(n_bins + 2 * gap, dtype=np.int64)
+    line = np.empty(n_bins, dtype=np.int64)
+    before, middle, after = windows[:n_bins], windows[gap:], windows[2 * gap :]
+    # Loops of one step each, so that the processor takes several bins at once.
+    for d in rows:
+        row, is_barred = votes[d], barred[d]
+        total = np.int64(0)
+        for k in range(n_bins):
+            total += row[k]
+            running[half + gap + 1 + k] = total
+        running[half + gap + 1 + n_bins :] = total
+        low, high = running[: windows.size], running[width:]
+        for k in range(windows.size):
+            windows[k] = high[k] - low[k]
+        best = np.int64(-1)
+        for k in range(n_bins):
+            score = middle[k] - min(before[k], after[k])
+            line[k] = np.int64(-1) if is_barred[k] != 0 else score
+        for k in range(n_bins):
+            best = max(best, line[k])
+        scores[d], places[d] = best, 0
+        for k in range(n_bins):
+            if best >= 0 and line[k] == best:
+                places[d] = k
+                break
+
+
+@compiled
+def vote_tilts(
+    places: NDArray[np.float32],
+    weights: NDArray[np.int32],
+    slopes: NDArray[np.float64],
+    low_m: float,
+    bin_m: float,
+    votes: NDArray[np.int64],
+) -> None:
+    """Let places near a plane vote for planes that lean a little from it.
+
+    Args:
+        places: (3, m) u and v on the plane and the distance from it, metres.
+        weights: (m,) votes of each.
+        slopes: (t, 2) rise per metre along u and v.
+        low_m: lower edge of the first bin.
+        bin_m: width of a bin.
+        votes: (t, bins) added to.
+    """
+    n_bins = votes.shape[1]
+    bins = np.empty(places.shape[1], dtype=np.int32)
+    us, vs, heights = places[0], places[1], places[2]
+    zero, none, top = np.float32(0.0), np.int32(-1), np.float32(n_bins)
+    for t in range(slopes.shape[0]):
+        a, b = np.float32(-slopes[t, 0] / bin_m), np.float32(-slopes[t, 1] / bin_m)
+        c, d = np.float32(1.0 / bin_m), np.float32(-low_m / bin_m)
+        for i in range(bins.size):
+            place = c * heights[i] + a * us[i] + b * vs[i] + d
+            within = (place >= zero) & (place < top)
+            bins[i] = np.int32(place if within else zero) if within else none
+        for i in range(bins.size):
+            if bins[i] >= 0:
+                votes[t, bins[i]] += weights[i]
+
+
+@kernel_part
+def add_sheared(
+    image: NDArray[np.int32],
+    spans: NDArray[np.int32],
+    shear: float,
+    line: NDArray[np.int32],
+) -> tuple[int, int]:
+    """Add the rows of an image to a line, each shifted by its height over the middle times a shear.
+
+    A row's first column lands at half its number of rows, and one more, with no shift. The line is
+    zero before; gives the piece of it that no longer is.
+    """
+    n_rows = image.shape[0]
+    low, high = line.size, 0
+    for row in range(n_rows):
+        first, last = spans[row, 0], spans[row, 1]
+        if first >= last:
+            continue
+        shift = math.floor((row + 0.5 - 0.5 * n_rows) * shear + 0.5) + n_rows // 2 + 1
+        target = line[shift + first : shift + last]
+        source = image[row, first:last]
+        for i in range(source.size):
+            target[i] += source[i]
+        low, high = min(low, shift + first), max(high, shift + last)
+    return low, high
+
+
+@kernel_part
+def share_out(
+    line: NDArray[np.int32],
+    piece: tuple[int, int],
+    shape: tuple[int, int],
+    scale: float,
+    votes: NDArray[np.int32],
+) -> None:
+    """Add a piece of a line to a row of votes whose bins are narrower, in quarters; clears it.
+
+    Args:
+        line: see `add_sheared`.
+        piece: what of it is not zero.
+        shape: rows and columns of the image that was added up.
+        scale: width of a cell of the line, in bins; negative when it runs the other way.
+        votes: (bins,) added to.
+    """
+    middle = 0.5 * votes.size
+    for i in range(piece[0], piece[1]):
+        if line[i] == 0:
+            continue
+        left = scale * (i - (shape[0] // 2 + 1) - 0.5 * shape[1]) + middle
+        low = min(left, left + scale)
+        first = math.floor(low)
+        share = min(VOTE_SHARES, int(VOTE_SHARES * (first + 1 - low) / abs(scale) + 0.5))
+        if 0 <= first < votes.size:
+            votes[first] += share * line[i]
+        if 0 <= first + 1 < votes.size:
+            votes[first + 1] += (VOTE_SHARES - share) * line[i]
+        line[i] = 0
+
+
+@kernel_part
+def span_rows(
+    image: NDArray[np.int32], window: tuple[int, int, int, int], spans: NDArray[np.int32]
+) -> None:
+    """Set (rows, 2) spans to the first column with votes and the one behind the last.
+
+    All votes lie in the window: first row, row behind the last, and the same for the columns.
+    """
+    spans[:] = 0
+    for row in range(window[0], window[1]):
+        first, last = window[2], window[3]
+        while first < last and image[row, first] == 0:
+            first += 1
+        while last > first and image[row, last - 1] == 0:
+            last -= 1
+        spans[row, 0], spans[row, 1] = first, last
+
+
+@kernel_part
+def turn_image(
+    image: NDArray[np.int32], window: tuple[int, int, int, int], turned: NDArray[np.int32]
+) -> None:
+    """Set turned to the image with rows and columns exchanged, tile by tile for the cache."""
+    for top in range(window[0], window[1], _TILE):
+        for left in range(window[2], window[3], _TILE):
+            for column in range(left, min(left + _TILE, window[3])):
+                for row in range(top, min(top + _TILE, window[1])):
+                    turned[column, row] = image[row, column]

@@ -1,0 +1,125 @@
+"""`Planes`: what was stated in the details of version 1, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import ProductError
+from orthoflow.products import (
+    JsonValue,
+    Payload,
+    Planes,
+    ScanRow,
+    Spread,
+    Thickness,
+)
+
+
+def two_planes() -> Planes:
+    return Planes(
+        normal=np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]),
+        offset=np.array([-2.0, 0.0]),
+        corners=np.zeros((2, 4, 3)),
+        covariance=np.zeros((2, 4, 4)),
+        n_points=np.array([1200, 800]),
+        rms_m=np.array([0.002, 0.003]),
+        up=np.array([0.0, 0.0, 1.0]),
+        names=("wall 0", "floor"),
+    )
+
+
+def of_version_1(details: dict[str, JsonValue]) -> Payload:
+    """What version 1 wrote: facts that others read stood in the details."""
+    payload = two_planes().to_payload()
+    metadata = {
+        name: value
+        for name, value in payload.metadata.items()
+        if name not in {"tolerance_m", "thickness", "scan_row"}
+    }
+    return replace(payload, encoding_version=1, metadata={**metadata, "details": details})
+
+
+def test_planes_of_version_1_say_in_fields_what_stood_in_their_details() -> None:
+    fabric: dict[str, JsonValue] = {
+        "name": "fabric", "low": 0.0, "high": 0.3, "n_points": 70, "sigma_m": 0.004,
+    }  # fmt: skip
+    by_angle: dict[str, JsonValue] = {"low": 10.0, "high": 20.0, "n_points": 90, "sigma_m": 0.002}
+    planes = Planes.from_payload(
+        of_version_1(
+            {
+                "find_tolerance_m": 0.03,
+                "fit_tolerance_m": 0.01,
+                "thickness": [
+                    {
+                        "sigma_m": 0.002,
+                        "width_95_m": 0.008,
+                        "scan_step_m": 0.005,
+                        "incidence_deg": [by_angle],
+                        "material": [fabric],
+                    },
+                    None,
+                ],
+                "scan_row": {"row": 7, "scan": 1, "n_points": 40, "sigma_m": None},
+            }
+        )
+    )
+    assert planes.tolerance_m == 0.03
+    assert planes.thickness == (
+        Thickness(
+            sigma_m=0.002,
+            width_95_m=0.008,
+            scan_step_m=0.005,
+            incidence_deg=(Spread(low=10.0, high=20.0, n_points=90, sigma_m=0.002),),
+            material=(Spread(low=0.0, high=0.3, n_points=70, sigma_m=0.004, name="fabric"),),
+        ),
+        None,
+    )
+    assert planes.scan_row == ScanRow(row=7, scan=1, n_points=40)
+    assert planes.details == {"fit_tolerance_m": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("details", "tolerance_m"),
+    [
+        ({}, 0.05),
+        ({"tolerance_m": 0.02}, 0.02),
+        ({"tolerance_m": 0.02, "find_tolerance_m": 0.04}, 0.04),
+        ({"tolerance_m": -1.0}, 0.05),
+        ({"tolerance_m": "wide"}, 0.05),
+        ({"thickness": None, "scan_row": None}, 0.05),
+    ],
+)
+def test_the_tolerance_of_version_1_is_that_of_the_paper_unless_it_was_stated(
+    details: dict[str, JsonValue], tolerance_m: float
+) -> None:
+    planes = Planes.from_payload(of_version_1(details))
+    assert planes.tolerance_m == tolerance_m
+    assert planes.thickness == ()
+    assert planes.scan_row is None
+    assert planes.details == {}
+
+
+def test_what_was_measured_on_planes_comes_back_as_it_was() -> None:
+    spread = Spread(low=0.0, high=1.0, n_points=60, sigma_m=0.001, name="plaster")
+    thickness = Thickness(
+        sigma_m=0.001, width_95_m=0.004, scan_step_m=0.003, range_m=(spread,), intensity=(spread,)
+    )
+    row = ScanRow(row=3, scan=0, n_points=50, sigma_m=0.001, material=(spread,))
+    planes = replace(two_planes(), tolerance_m=0.02, thickness=(None, thickness), scan_row=row)
+    payload = planes.to_payload()
+    assert payload.encoding_version == 2
+    again = Planes.from_payload(payload)
+    assert (again.tolerance_m, again.thickness, again.scan_row) == (0.02, (None, thickness), row)
+
+
+def test_a_tolerance_must_be_positive() -> None:
+    with pytest.raises(ProductError, match=r"planes\.tolerance_m must be positive, got 0"):
+        replace(two_planes(), tolerance_m=0.0)
+
+
+def test_a_thickness_belongs_to_each_plane() -> None:
+    with pytest.raises(ProductError, match="must be empty or one per plane, got 1 for 2"):
+        replace(two_planes(), thickness=(None,))

@@ -1,0 +1,67 @@
+"""The tables of planes: size, exactness and thickness of each, and materials by place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from orthoflow.products import Planes, ScanRow, Spread, Thickness
+from orthoflow.report.plane_tables import MaterialRow, PlaneTable, plane_tables
+from tests.report_runs import HeldRun, cell, given, record
+
+PLACE = ("plane@plane=toy", "planes")
+FABRIC = Spread(low=0.0, high=0.3, n_points=70, sigma_m=0.004, name="fabric")
+PLASTER = Spread(low=0.3, high=1.0, n_points=90, sigma_m=0.001, name="plaster")
+
+
+def wall_and_floor() -> Planes:
+    wall = np.array([[0, 2, 3], [0, 2, 0], [4, 2, 0], [4, 2, 3]], dtype=np.float64)
+    covariance = np.zeros((2, 4, 4))
+    covariance[0, 3, 3] = 0.0005**2
+    return Planes(
+        normal=np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]),
+        offset=np.array([-2.0, 0.0]),
+        corners=np.array([wall, wall[:, [0, 2, 1]]]),
+        covariance=covariance,
+        n_points=np.array([1200, 800]),
+        rms_m=np.array([0.002, 0.003]),
+        up=np.array([0.0, 0.0, 1.0]),
+        names=("wall 0", "floor"),
+        viewpoint="stations",
+    )
+
+
+def table(planes: Planes) -> PlaneTable:
+    outputs = {PLACE[1]: given("", "a", "planes")}
+    cells = [cell(PLACE[0], outputs=outputs)]
+    run = HeldRun(path=Path("run.h5"), record=record(cells), products={PLACE: planes})
+    (found,) = plane_tables(run)
+    return found
+
+
+def test_planes_without_thickness_have_rows_without_it() -> None:
+    found = table(wall_and_floor())
+    assert (found.cell, found.viewpoint, found.materials) == (PLACE[0], "stations", ())
+    wall, floor = found.rows
+    assert (wall.name, wall.size, wall.n_points) == ("wall 0", "4.00 x 3.00 m", 1200)
+    assert (round(wall.sigma_mm, 9), wall.rms_mm) == (0.5, 2.0)
+    assert (wall.thickness_mm, floor.scan_step_mm) == (None, None)
+
+
+def test_thickness_and_materials_stand_in_the_tables() -> None:
+    thickness = Thickness(
+        sigma_m=0.002, width_95_m=0.008, scan_step_m=0.005, material=(FABRIC, PLASTER)
+    )
+    row = ScanRow(row=7, scan=1, n_points=40, sigma_m=0.001, material=(PLASTER,))
+    found = table(replace(wall_and_floor(), thickness=(thickness, None), scan_row=row))
+    assert (found.rows[0].thickness_mm, found.rows[0].scan_step_mm) == (2.0, 5.0)
+    assert (found.rows[1].thickness_mm, found.rows[1].scan_step_mm) == (None, None)
+    assert found.materials == (
+        MaterialRow(place="wall 0", material="fabric", n_points=70, thickness_mm=4.0),
+        MaterialRow(place="wall 0", material="plaster", n_points=90, thickness_mm=1.0),
+        MaterialRow(
+            place="row 7 of scan 1, wall 0", material="plaster", n_points=90, thickness_mm=1.0
+        ),
+    )
