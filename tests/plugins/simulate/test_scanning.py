@@ -1,13 +1,14 @@
-"""How wrong the simulated scanner measures: noise by incidence, range and material, by algebra."""
+"""How wrong the simulated scanner measures: noise, outliers and mixed distances, by algebra."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.simulate.scanning import Errors, Scanned, Scanner, Sweep
+from orthoflow_plugins.simulate.scanning import SPOILT, Errors, Scanned, Scanner, Sweep
 
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 
@@ -17,7 +18,9 @@ SIDE = 200
 STEP = 1e-6
 
 
-def surface(distance_m: float, incidence_deg: float, kind: TextureKind) -> Scene:
+def surface(
+    distance_m: float, incidence_deg: float = 0.0, kind: TextureKind = TextureKind.PLAIN
+) -> Scene:
     """A rectangle met by the x axis at a distance, turned about the vertical by an angle."""
     turn = math.radians(incidence_deg)
     return Scene(
@@ -35,22 +38,35 @@ def surface(distance_m: float, incidence_deg: float, kind: TextureKind) -> Scene
     )
 
 
-def deviations_m(
-    distance_m: float, incidence_deg: float, kind: TextureKind = TextureKind.PLAIN
-) -> NDArray[np.float64]:
-    """Measured less true distances of rays about the x axis."""
+def step_in_depth(near_m: float, far_m: float) -> Scene:
+    """Two surfaces across the x axis; the near one ends at it, on the side of negative y."""
+    near, far = surface(near_m), surface(far_m)
+    joined = {
+        name: np.concatenate([getattr(near, name), getattr(far, name)])
+        for name in ("centre", "axis_a", "axis_b", "plane_index", "role", "texture")
+    }
+    return replace(
+        near,
+        **joined,
+        extent=np.array([[-1.0, 0.0, -1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]]),
+        texture_params=np.vstack([near.texture_params, far.texture_params]),
+    )
+
+
+def scanned(scene: Scene, step: float = STEP, **errors: float) -> Scanned:
+    """Scan a scene by rays about the x axis, with no errors but the given ones."""
     sweep = Sweep(
         station=np.zeros(3),
-        azimuth=-0.5 * SIDE * STEP,
-        elevation=-0.5 * SIDE * STEP,
-        step=STEP,
+        azimuth=-0.5 * SIDE * step,
+        elevation=-0.5 * SIDE * step,
+        step=step,
         n_columns=SIDE,
         n_rows=SIDE,
         seed=5,
     )
     n = SIDE * SIDE
     x, y, z, intensity = np.zeros((4, n), dtype=np.float32)
-    scanned = Scanned(
+    filled = Scanned(
         x=x,
         y=y,
         z=z,
@@ -58,15 +74,28 @@ def deviations_m(
         rgb=np.zeros((n, 3), dtype=np.uint8),
         rectangle=np.zeros(n, dtype=np.int32),
     )
-    errors = Errors(noise_m=NOISE_M, outlier_share=0.0, beam_m=0.0, colour_noise=0.0)
-    Scanner(surface(distance_m, incidence_deg, kind), errors).sweep(sweep, 0, SIDE, scanned)
-    assert (scanned.rectangle == 0).all()
-    points = np.stack([scanned.x, scanned.y, scanned.z]).astype(np.float64)
-    azimuth = (np.arange(SIDE)[:, None] - 0.5 * SIDE) * STEP + np.zeros(SIDE)
-    turn = math.radians(incidence_deg)
+    none = {"noise_m": 0.0, "outlier_share": 0.0, "beam_m": 0.0, "colour_noise": 0.0}
+    Scanner(scene, Errors(**(none | errors))).sweep(sweep, 0, SIDE, filled)
+    return filled
+
+
+def distances_m(points: Scanned) -> NDArray[np.float64]:
+    axes = np.stack([points.x, points.y, points.z]).astype(np.float64)
+    return np.asarray(np.linalg.norm(axes, axis=0))
+
+
+def azimuths(step: float = STEP) -> NDArray[np.float64]:
+    """Azimuth of each ray, column by column."""
+    return np.repeat((np.arange(SIDE) - 0.5 * SIDE) * step, SIDE)
+
+
+def deviations_m(distance_m: float, incidence_deg: float, kind: TextureKind) -> NDArray[np.float64]:
+    """Measured less true distances of rays about the x axis."""
+    points = scanned(surface(distance_m, incidence_deg, kind), noise_m=NOISE_M)
+    assert (points.rectangle == 0).all()
     # The surface lies where x cos(turn) - y sin(turn) = distance cos(turn); all rays are near x.
-    true = distance_m / (1.0 - np.tan(azimuth.ravel()) * math.tan(turn))
-    return np.asarray(np.linalg.norm(points, axis=0) - true)
+    turned = np.tan(azimuths()) * math.tan(math.radians(incidence_deg))
+    return np.asarray(distances_m(points) - distance_m / (1.0 - turned))
 
 
 # Standard deviations in units of what is asked for, which holds at 3 m, square onto plaster. By
@@ -95,3 +124,66 @@ def test_noise_grows_with_slope_range_and_on_cloth(
     # Five standard deviations of a mean and of a standard deviation.
     assert errors.mean() == pytest.approx(0.0, abs=5.0 * sigma / math.sqrt(errors.size))
     assert errors.std() == pytest.approx(sigma, rel=5.0 / math.sqrt(2.0 * errors.size))
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "incidence_deg", "expected"),
+    [
+        pytest.param(2.0, 60.0, 0.5**0.7, id="askew"),
+        pytest.param(8.0, 0.0, 0.5, id="four times as far"),
+        pytest.param(0.5, 0.0, math.sqrt(2.0), id="nearer than a metre"),
+    ],
+)
+def test_the_laser_comes_back_fainter_from_slopes_and_from_far(
+    distance_m: float, incidence_deg: float, expected: float
+) -> None:
+    # The same spot of the texture each time; square on at 2 m its reflectance comes back.
+    here, there = (
+        scanned(surface(*place)).intensity.astype(np.float64)
+        for place in ((2.0, 0.0), (distance_m, incidence_deg))
+    )
+    assert there.mean() / here.mean() == pytest.approx(expected, rel=2e-3)
+    # Speckle: 3 %, to five standard deviations of a standard deviation.
+    assert here.std() / here.mean() == pytest.approx(0.03, rel=5.0 / math.sqrt(2.0 * here.size))
+
+
+def test_gross_outliers_fall_short_four_times_in_five() -> None:
+    points = scanned(surface(3.0), outlier_share=1.0)
+    distance = distances_m(points)
+    assert (points.rectangle == SPOILT).all()
+    short = distance < 3.0
+    # Five standard deviations of a binomial share, and of means of uniform distributions.
+    n = distance.size
+    assert short.mean() == pytest.approx(0.8, abs=5.0 * math.sqrt(0.16 / n))
+    assert 0.9 - 1e-5 < distance[short].min() < 0.91
+    assert 2.93 < distance[short].max() < 2.94 + 1e-5
+    assert distance[short].mean() == pytest.approx(1.92, abs=5.0 * 2.04 / math.sqrt(12.0 * 0.8 * n))
+    assert distance[~short].mean() == pytest.approx(4.0, abs=5.0 * 2.0 / math.sqrt(12.0 * 0.2 * n))
+    assert distance[~short].max() < 5.0 + 1e-5
+
+
+def test_distances_mix_where_the_spot_falls_on_two_surfaces() -> None:
+    step, beam_m = 2e-5, 0.006
+    points = scanned(step_in_depth(3.0, 3.5), step, beam_m=beam_m)
+    distance, azimuth = distances_m(points), azimuths(step)
+    for side, own_m, other_m in ((azimuth < 0.0, 3.0, 3.5), (azimuth > 0.0, 3.5, 3.0)):
+        mixed = side & (points.rectangle == SPOILT)
+        # A point of the spot's rim lies beyond the edge for those angles whose cosine says so.
+        away = np.abs(azimuth[side]) / (0.5 * beam_m / own_m)
+        chance = np.arccos(np.minimum(away, 1.0)) / math.pi
+        limit = 5.0 * math.sqrt(float(np.sum(chance * (1.0 - chance))))
+        assert np.count_nonzero(mixed) == pytest.approx(float(chance.sum()), abs=limit)
+        # Between none and half of the other surface, evenly; rays are longer by 4.1e-6 at most.
+        share = (distance[mixed] - own_m) / (other_m - own_m)
+        assert share.min() > -1e-4
+        assert share.max() < 0.5 + 1e-4
+        spread = 5.0 * 0.5 / math.sqrt(12.0 * len(share))
+        assert share.mean() == pytest.approx(0.25, abs=spread)
+        np.testing.assert_allclose(distance[side & ~mixed], own_m, rtol=5e-6)
+
+
+def test_depths_that_differ_little_do_not_mix() -> None:
+    # Less than 2 cm and 2 % of the distance: 8 cm at 3 m.
+    for far_m, mixes in ((3.07, False), (3.09, True)):
+        points = scanned(step_in_depth(3.0, far_m), 2e-5, beam_m=0.006)
+        assert bool((points.rectangle == SPOILT).any()) is mixes
