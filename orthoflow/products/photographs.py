@@ -155,6 +155,14 @@ class TieWall:
     normal_world: tuple[float, ...]
     gsd_m: float | None = None
 
+    def __post_init__(self) -> None:
+        shapes = np.shape(self.corners_world), np.shape(self.normal_world)
+        if shapes != ((4, 3), (3,)):
+            raise ProductError(
+                f"a wall of ties must have 4 corners and a normal of 3 numbers each, got shapes "
+                f"{shapes[0]} and {shapes[1]}"
+            )
+
     @classmethod
     def of(cls, wall: Wall) -> Self:
         """Give what ties say of a rastered wall."""
@@ -214,6 +222,13 @@ class Ties(Product):
     walls: tuple[TieWall, ...] = ()
     search_radius_px: tuple[float | None, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.search_radius_px and len(self.search_radius_px) != len(self.photo_names):
+            raise ProductError(
+                f"ties of {len(self.photo_names)} photos have {len(self.search_radius_px)} search "
+                "radii, one per photo is expected, or none"
+            )
 
     @classmethod
     def upgraded(cls, payload: Payload) -> Payload:
@@ -345,7 +360,7 @@ class Cameras(Product):
 
 def _ties_of_version_2(metadata: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
     """Metadata of ties whose details had `walls`, and `search_radius_px` of each photo."""
-    found, details = dict(metadata), _mapping(metadata.get("details"))
+    found, details = dict(metadata), dict(_mapping(metadata.get("details")))
     walls, needed = details.get("walls"), {"corners_world", "normal"}
     if isinstance(walls, list) and all(needed <= _mapping(wall).keys() for wall in walls):
         found["walls"] = [_wall_of_version_2(_mapping(wall)) for wall in walls]

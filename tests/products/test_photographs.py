@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
+from orthoflow.errors import ProductError
 from orthoflow.geometry import WallFrame
 from orthoflow.products import (
     Camera,
@@ -185,3 +187,23 @@ def test_what_ties_say_of_a_wall_is_what_its_raster_says() -> None:
     found = TieWall.of(wall)
     assert (found.name, found.gsd_m, found.normal_world) == ("north", 0.01, (0.0, -1.0, 0.0))
     np.testing.assert_array_equal(found.corners_world, frame.corners_world())
+
+
+def test_upgrading_leaves_the_older_payload_as_it_was() -> None:
+    metadata = old_tie_metadata({"photos": {"a.jpg": {"search_radius_px": 22.0}}})
+    before = json.dumps(metadata)
+    payload = Payload(
+        type_name="ties",
+        encoding_version=1,
+        metadata=metadata,
+        arrays=ties().to_payload().arrays,
+    )
+    assert Ties.from_payload(payload).search_radius_px == (22.0, None)
+    assert json.dumps(metadata) == before
+
+
+def test_walls_and_radii_of_another_shape_are_refused() -> None:
+    with pytest.raises(ProductError, match=r"4 corners and a normal .* got shapes \(1, 3\)"):
+        TieWall(corners_world=((0.0, 0.0, 0.0),), normal_world=(0.0, -1.0, 0.0))
+    with pytest.raises(ProductError, match="ties of 2 photos have 1 search radii"):
+        ties(search_radius_px=(22.0,))

@@ -12,8 +12,8 @@ from orthoflow.products import Camera, Cameras, JsonValue, Photos, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
-from orthoflow_plugins.match.pictures import photo_grey, require_intensity
-from orthoflow_plugins.match.tie_pieces import TiePiece, require_photos, ties_of
+from orthoflow_plugins.match.pictures import photo_grey, require_intensity, require_photos
+from orthoflow_plugins.match.tie_pieces import TiePiece, ties_of
 
 if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace, TracingRule

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.files.images import decode_image
 from orthoflow.geometry.opencv_border import HALF_PIXEL
-from orthoflow.products import Photo, Wall, Walls
+from orthoflow.products import Photo, Photos, Wall, Walls
 
 _TILES: Final = 8
 _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
@@ -49,6 +49,16 @@ class WallPoints:
     points_world: NDArray[np.float64]
     sigma_m: NDArray[np.float64]
     known: NDArray[np.bool_]
+
+
+def require_photos(photos: Photos) -> None:
+    """Refuse an empty set of photos.
+
+    Raises:
+        MethodError: there are no photos.
+    """
+    if not photos.photos:
+        raise MethodError("there are no photos to match with the walls: give at least one photo")
 
 
 def require_intensity(walls: Walls) -> None:

@@ -14,14 +14,8 @@ from orthoflow_plugins.match.features import FeatureRule, Features
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features
-from orthoflow_plugins.match.pictures import photo_grey, require_intensity
-from orthoflow_plugins.match.tie_pieces import (
-    TiePiece,
-    key_point_ties,
-    require_photos,
-    ties_of,
-    without_twins,
-)
+from orthoflow_plugins.match.pictures import photo_grey, require_intensity, require_photos
+from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
 
 class MatchSift(Method):

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import MethodError
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pictures import points_on_wall
@@ -90,16 +89,6 @@ def key_point_ties(
         role=role,
     )
     return piece.take(points.known & (piece.sigma_m < _SIGMA_MOST_CELLS * wall.frame.gsd_m))
-
-
-def require_photos(photos: Photos) -> None:
-    """Refuse an empty set of photos.
-
-    Raises:
-        MethodError: there are no photos.
-    """
-    if not photos.photos:
-        raise MethodError("there are no photos to match with the walls: give at least one photo")
 
 
 def ties_of(

@@ -1,4 +1,4 @@
-"""Which ties control an orientation and which only check it, and how they lie in the photo."""
+"""How ties lie over a photo: cells, quarters, hull, and a share of them withheld evenly."""
 
 from __future__ import annotations
 
