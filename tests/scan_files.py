@@ -11,6 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.points import PointBlock, open_scan
+from orthoflow.files.points.columns import Columns
+
+
+def read_all(path: Path, columns: Columns | None = None) -> list[PointBlock]:
+    """All blocks of a point file."""
+    return list(open_scan(path, columns).read())
+
+
+def read_points(path: Path, columns: Columns | None = None) -> NDArray[np.float64]:
+    """All points of a point file."""
+    return np.concatenate([block.points for block in read_all(path, columns)])
+
 
 def write_las(
     path: Path,

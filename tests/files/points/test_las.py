@@ -1,0 +1,201 @@
+"""LAS, LAZ and COPC: every digit and every block, and damage found before a library meets it."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.points import las, open_scan
+from tests import scan_files
+from tests.scan_files import read_all
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_gives_survey_coordinates_to_the_last_digit(
+    tmp_path: Path, points: NDArray[np.float64], suffix: str
+) -> None:
+    shifted = points + np.array([634512.0, 5486215.0, 112.0])
+    intensity = np.arange(40) * 100
+    rgb = np.arange(120).reshape(40, 3) * 257
+    path = scan_files.write_las(tmp_path / f"a{suffix}", shifted, intensity=intensity, rgb=rgb)
+    scan = open_scan(path)
+    (block,) = scan.read()
+    np.testing.assert_allclose(block.points, shifted, atol=1e-9)
+    np.testing.assert_array_equal(block.intensity, intensity)
+    np.testing.assert_array_equal(block.rgb, rgb)
+    assert scan.fields == {"intensity", "rgb"}
+    assert scan.n_most == 40
+
+
+def test_las_leaves_out_points_marked_as_deleted(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    withheld = np.arange(40) % 4 == 0
+    path = scan_files.write_las(tmp_path / "a.laz", points, withheld=withheld)
+    (block,) = read_all(path)
+    np.testing.assert_allclose(block.points, points[~withheld], atol=1e-9)
+    assert (block.n_read, block.n_withheld) == (40, 10)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("cores", [1, 3])
+def test_las_blocks_keep_the_order_of_the_file_for_any_number_of_processes(
+    suffix: str, cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Four chunks of 50 000 points, the last one not full; one to a block.
+    many = np.random.default_rng(0).uniform(0, 5, (170_000, 3))
+    path = scan_files.write_las(tmp_path / f"a{suffix}", many, withheld=np.arange(170_000) == 9)
+    monkeypatch.setattr(las, "BLOCK_POINTS", 50_000)
+    monkeypatch.setattr(las, "_BLOCKS_LEAST", 1)
+    blocks = list(open_scan(path, cores=cores).read())
+    assert [block.n_read for block in blocks] == [50_000, 50_000, 50_000, 20_000]
+    found = np.concatenate([block.points for block in blocks])
+    np.testing.assert_allclose(found, np.delete(many, 9, axis=0), atol=6e-5)
+    for block in blocks:
+        assert block.bounds is not None
+        np.testing.assert_array_equal(block.bounds[0], block.points.min(axis=0))
+        np.testing.assert_array_equal(block.bounds[1], block.points.max(axis=0))
+
+
+@pytest.mark.parametrize(
+    ("worker", "reason"),
+    [
+        ("raise SystemExit(3)", "its decoder ended with 3"),
+        ("print('a chunk makes no sense')", "a chunk makes no sense"),
+    ],
+)
+def test_a_decoder_that_fails_ends_in_one_sentence(
+    worker: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many = np.random.default_rng(0).uniform(0, 5, (5000, 3))
+    path = scan_files.write_las(tmp_path / "a.laz", many)
+    monkeypatch.setattr(las, "_BLOCKS_LEAST", 0)
+    monkeypatch.setattr(las, "_WORKER", tmp_path / "worker.py")
+    (tmp_path / "worker.py").write_text(worker)
+    with pytest.raises(InputError, match=f"a.laz cannot be read as LAS/LAZ: {reason};"):
+        list(open_scan(path, cores=2).read())
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.95])
+def test_a_las_file_that_is_cut_off_is_refused(tmp_path: Path, suffix: str, share: float) -> None:
+    many = np.random.default_rng(0).uniform(0, 5, (5000, 3))
+    path = scan_files.write_las(tmp_path / f"a{suffix}", many)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(InputError, match=rf"a\{suffix} (cannot be read|is cut off)"):
+        read_all(path)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_changed_bytes_in_a_laz_file_end_in_one_sentence_or_in_points(
+    tmp_path: Path, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    path = scan_files.write_las(tmp_path / "a.laz", rng.uniform(0, 5, (3000, 3)))
+    content = bytearray(path.read_bytes())
+    start = [0, 400][seed % 2]
+    for position in rng.integers(start, len(content), 20):
+        content[position] ^= int(rng.integers(1, 256))
+    path.write_bytes(bytes(content))
+    message = "a.laz"
+    try:
+        read_all(path)
+    except InputError as error:
+        message = str(error)
+    assert "a.laz" in message
+    assert "\n" not in message
+
+
+def test_a_laz_file_whose_bytes_decode_far_outside_its_bounds_is_refused(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.las", points)
+    content = bytearray(path.read_bytes())
+    content[-40 * 30 + 2] = 0x7F  # the high bytes of the first point's x
+    content[-40 * 30 + 3] = 0x7F
+    path.write_bytes(bytes(content))
+    with pytest.raises(InputError, match=r"a\.las is damaged: points lie \d+ units outside"):
+        read_all(path)
+
+
+def test_las_points_a_little_outside_the_stated_bounds_are_kept_with_a_note(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    import laspy
+
+    path = scan_files.write_las(tmp_path / "a.las", points)
+    with path.open("r+b") as file:
+        file.seek(179)  # max x of the header
+        file.write(np.float64(points[:, 0].max() - 0.5).tobytes())
+    with laspy.open(path) as reader:
+        assert reader.header.maxs[0] == points[:, 0].max() - 0.5
+    scan = open_scan(path)
+    assert sum(len(block.points) for block in scan.read()) == 40
+    assert "outside the bounds its header states" in scan.notes[0]
+
+
+def change(path: Path, position: int, content: bytes) -> Path:
+    changed = bytearray(path.read_bytes())
+    changed[position : position + len(content)] = content
+    path.write_bytes(bytes(changed))
+    return path
+
+
+def chunk_table(path: Path) -> int:
+    content = path.read_bytes()
+    (start,) = struct.unpack_from("<I", content, 96)
+    (table,) = struct.unpack_from("<q", content, start)
+    return int(table)
+
+
+@pytest.mark.parametrize(
+    ("position", "content", "message"),
+    [
+        (96, b"\xff\xff\xff\x00", "its points begin outside the file, which is cut off"),
+        (100, b"\xff\xff\xff\x7f", "its header states 2147483647 records that have no room"),
+        (243, b"\x05\x00\x00\x00", "records at its end are missing"),
+    ],
+    ids=["offset", "records", "extended-records"],
+)
+def test_a_damaged_las_header_is_found_before_a_library_believes_it(
+    tmp_path: Path, points: NDArray[np.float64], position: int, content: bytes, message: str
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.laz", points)
+    if position == 243:
+        change(path, 235, struct.pack("<Q", path.stat().st_size))
+    with pytest.raises(InputError, match=rf"a\.laz cannot be read as LAS/LAZ: {message}"):
+        open_scan(change(path, position, content))
+
+
+def test_a_las_file_that_ends_within_its_header_is_refused(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.las", points)
+    path.write_bytes(path.read_bytes()[:150])
+    with pytest.raises(InputError, match="it ends within its header"):
+        open_scan(path)
+
+
+def test_a_damaged_chunk_table_is_found_before_the_decompressor_believes_it(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.laz", points)
+    table = chunk_table(path)
+    # 3 thousand million chunks of 16 bytes each would end the process.
+    change(path, table + 4, b"\xff\xff\xff\xbf")
+    with pytest.raises(InputError, match="its chunk table states 3221225471 chunks"):
+        open_scan(path)
+
+
+def test_a_number_of_points_that_the_chunks_do_not_hold_is_found(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    path = scan_files.write_las(tmp_path / "a.laz", points)
+    change(path, 247, struct.pack("<Q", 400_000))
+    with pytest.raises(InputError, match="its chunks hold 50000 points, its header states 400000"):
+        open_scan(path)

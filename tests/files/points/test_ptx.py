@@ -1,0 +1,62 @@
+"""PTX: scans on grids, each where its scanner stood."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.points import open_scan
+from tests import scan_files
+from tests.scan_files import read_all
+
+
+def test_ptx_scans_are_placed_and_their_grid_is_known(
+    tmp_path: Path, points: NDArray[np.float64]
+) -> None:
+    table = np.column_stack([points, np.linspace(0, 1, 40), np.tile([10, 20, 30], (40, 1))])
+    table[5, :3] = 0.0
+    matrix = np.eye(4)
+    matrix[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    matrix[:3, 3] = [634512.347, 486215.781, 112.193]
+    path = scan_files.write_ptx(tmp_path / "a.ptx", [(table, 8, np.eye(4)), (table, 5, matrix)])
+    scan = open_scan(path)
+    first, second = scan.read()
+    seen = np.arange(40) != 5
+    np.testing.assert_allclose(first.points, points[seen], atol=1e-9)
+    turned = np.column_stack([-points[:, 1], points[:, 0], points[:, 2]])[seen]
+    np.testing.assert_allclose(second.points, turned + matrix[:3, 3], atol=1e-9)
+    np.testing.assert_array_equal(second.station, matrix[:3, 3])
+    np.testing.assert_array_equal(first.row, (np.arange(40) % 8)[seen])
+    np.testing.assert_array_equal(first.column, (np.arange(40) // 8)[seen])
+    np.testing.assert_array_equal(second.row, (np.arange(40) % 5)[seen])
+    assert (first.n_read, first.n_invalid) == (40, 1)
+    assert scan.fields == {"intensity", "rgb", "grid"}
+
+
+@pytest.mark.parametrize(
+    ("cut", "message"),
+    [
+        (-20, r"a\.ptx is cut off: its scan 0 holds \d+ points, its header states 40"),
+        (30, r"a\.ptx, line 1: expected the ten header lines of a PTX scan"),
+    ],
+    ids=["points", "header"],
+)
+def test_a_ptx_file_that_is_cut_off_is_refused(
+    tmp_path: Path, points: NDArray[np.float64], cut: int, message: str
+) -> None:
+    path = scan_files.write_ptx(tmp_path / "a.ptx", [(points, 8, np.eye(4))])
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:-3] if cut < 0 else lines[:5]))
+    with pytest.raises(InputError, match=message):
+        read_all(path)
+
+
+def test_a_ptx_line_with_an_odd_number_of_columns_is_refused(tmp_path: Path) -> None:
+    table = np.ones((4, 5))
+    path = scan_files.write_ptx(tmp_path / "a.ptx", [(table, 2, np.eye(4))])
+    with pytest.raises(InputError, match=r"a\.ptx, line 11: expected x y z, with intensity"):
+        open_scan(path)

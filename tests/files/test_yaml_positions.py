@@ -1,0 +1,184 @@
+"""YAML with positions: every value knows its place, and what is odd is a problem with its own."""
+
+from __future__ import annotations
+
+import pytest
+
+from orthoflow.files.yaml_positions import (
+    Dialect,
+    Listing,
+    Position,
+    Table,
+    Text,
+    Value,
+    describe,
+    join,
+    plain,
+    read_yaml,
+)
+
+TOLERANT = Dialect(is_strict=False)
+
+
+class Problems:
+    def __init__(self) -> None:
+        self.found: list[tuple[int, int, str, str]] = []
+
+    def add(self, position: Position, path: str, message: str) -> None:
+        self.found.append((position.line, position.column, path, message))
+
+
+def read(text: str, dialect: Dialect = TOLERANT) -> Value:
+    problems = Problems()
+    value = read_yaml(text, problems, dialect)
+    assert not problems.found
+    assert value is not None
+    return value
+
+
+def problems_of(text: str, dialect: Dialect | None = None) -> list[tuple[int, int, str, str]]:
+    problems = Problems()
+    if dialect is None:
+        read_yaml(text, problems)
+    else:
+        read_yaml(text, problems, dialect)
+    return problems.found
+
+
+def test_every_value_knows_its_line_and_column() -> None:
+    document = read("a: 1\nlist:\n  - x\n  - {deep: 2.5}\n")
+    assert isinstance(document, Table)
+    entry = document.get("list")
+    assert entry is not None
+    assert entry.position == Position(line=2, column=1)
+    assert isinstance(entry.value, Listing)
+    assert entry.value.position == Position(line=3, column=3)
+    first, second = entry.value.items
+    assert first == Text(position=Position(line=3, column=5), value="x")
+    assert isinstance(second, Table)
+    (deep,) = second
+    assert (deep.key, deep.position) == ("deep", Position(line=4, column=6))
+    assert deep.value == Text(position=Position(line=4, column=12), value=2.5)
+    assert document.get("b") is None
+    assert plain(document) == {"a": 1, "list": ["x", {"deep": 2.5}]}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("12", 12),
+        ("-0x1F", -31),
+        ("0o17", 15),
+        ("1_000", 1000),
+        ("1e3", 1000.0),
+        ("-.inf", float("-inf")),
+        ("true", True),
+        ("False", False),
+        ("~", None),
+        ("'12'", "12"),
+        ("yes", "yes"),
+        ("2001-01-01", "2001-01-01"),
+        ("!!float 3", 3.0),
+        ("!!str 3", "3"),
+    ],
+)
+def test_plain_values_are_those_of_yaml_1_2(text: str, value: object) -> None:
+    found = read(f"a: {text}", Dialect())
+    assert isinstance(found, Table)
+    (entry,) = found
+    assert isinstance(entry.value, Text)
+    assert entry.value.value == value
+    assert type(entry.value.value) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", (1, 1, "", "the document is empty")),
+        (
+            "a: 1\nb: 2\na: 3",
+            (3, 1, "a", "the key is there already, in line 1; remove one of them"),
+        ),
+        ("a: {3: x}", (1, 5, "a", "a key must be text, got 3")),
+        ("a: {~: x}", (1, 5, "a", "a key must be text, got ~")),
+        ("a:\n  ? [x]\n  : 1", (2, 5, "a", "a key must be text, got a list or mapping")),
+        ("a: [x, !foo y]", (1, 8, "a[1]", "tags are not allowed in a workflow, got !foo")),
+        ("a: !!int x", (1, 4, "a", "'x' is no int")),
+        ("a: &b {c: *b}", (1, 4, "", "the value contains itself through its anchor")),
+        (
+            "%YAML 1.1\n---\na: 1",
+            (1, 1, "", "expected YAML 1.2, got a %YAML line that asks for another version"),
+        ),
+        ("a: 1\n b: 2", (2, 3, "", "this is not YAML: mapping values are not allowed here")),
+        ("a: \x01", (1, 4, "", "this is not YAML: unacceptable character #x0001")),
+    ],
+    ids=lambda value: None if isinstance(value, tuple) else repr(value)[:20],
+)
+def test_what_is_odd_is_told_with_its_place(text: str, problem: tuple[int, int, str, str]) -> None:
+    (found,) = problems_of(text)
+    assert found[:3] == problem[:3]
+    assert found[3].startswith(problem[3])
+
+
+def test_a_tolerant_dialect_reads_over_versions_and_tags_and_tells_what_keys_are() -> None:
+    document = read("%YAML 1.1\n---\na: !foo {3: !bar x}\n")
+    assert plain(document) == {"a": {"3": "x"}}
+    assert isinstance(document, Table)
+    inner = document.entries[0].value
+    assert isinstance(inner, Table)
+    assert [entry.is_text for entry in inner] == [False]
+    assert document.entries[0].is_text
+
+
+def test_merged_entries_stand_behind_own_ones_at_the_place_of_their_table() -> None:
+    document = read("a: &a {x: 1, y: 2}\nb: &b {y: 3, z: 4}\nc:\n  <<: [*a, *b]\n  z: 5\n")
+    assert isinstance(document, Table)
+    merged = document.entries[2].value
+    assert isinstance(merged, Table)
+    assert [(entry.key, plain(entry.value)) for entry in merged] == [("z", 5), ("x", 1), ("y", 2)]
+    assert [entry.position.line for entry in merged] == [5, 4, 4]
+    assert problems_of("a:\n  <<: [3]", TOLERANT) == [
+        (2, 3, "a.<<", "expected a mapping or a list of mappings to merge, got 3")
+    ]
+    # Elsewhere it is a key as any other.
+    assert plain(read("a: {<<: {x: 1}}", Dialect())) == {"a": {"<<": {"x": 1}}}
+    assert plain(read('a: {"<<": {x: 1}}')) == {"a": {"<<": {"x": 1}}}
+
+
+def test_a_dialect_bounds_its_documents_and_words_their_mistakes() -> None:
+    small = Dialect(most_values=7, empty="nothing here", duplicate="{key} again, as in line {line}")
+    assert plain(read("[1, 2, 3, 4, 5, 6]", small)) == [1, 2, 3, 4, 5, 6]
+    assert problems_of("[1, 2, 3, 4, 5, 6, 7]", small)[0][3] == (
+        "the document has more than 7 values"
+    )
+    assert problems_of("[&a [1, 2], *a, *a]", small)[0][3] == (
+        "the document has more than 7 values once aliases are expanded"
+    )
+    assert problems_of("# nothing", small) == [(1, 1, "", "nothing here")]
+    assert problems_of("a: 1\na: 2", small) == [(2, 1, "a", "a again, as in line 1")]
+
+
+def test_documents_are_at_most_sixty_levels_deep() -> None:
+    assert isinstance(read("[" * 60 + "]" * 60), Listing)
+    assert problems_of("[" * 61 + "]" * 61) == [
+        (1, 61, "", "the document is nested deeper than 60 levels")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[1]", "a list"),
+        ("{a: 1}", "a mapping"),
+        ("a", 'the text "a"'),
+        ("true", "true"),
+        ("5", "5"),
+    ],
+)
+def test_values_are_described_for_messages(text: str, words: str) -> None:
+    assert describe(read(text)) == words
+
+
+def test_paths_are_keys_joined_by_dots() -> None:
+    assert join("", "a") == "a"
+    assert join("a.b", "c") == "a.b.c"
