@@ -127,3 +127,62 @@ def test_no_module_carries_doubts_or_leftovers(folder: str) -> None:
         if word in path.read_text()
     ]
     assert found == []
+
+
+def test_nobody_reads_the_details_of_a_product() -> None:
+    """They are for people: what other code reads is a typed, documented field of the product."""
+    sources = [ROOT / module for module in MODULES]
+    found = [
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in sources
+        for line in _readings_of_details(ast.parse(path.read_text()))
+    ]
+    templates = [path for package in PACKAGES for path in (ROOT / package).rglob("*.j2")]
+    found += [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in templates
+        for number, line in enumerate(path.read_text().splitlines(), start=1)
+        if ".details" in line
+    ]
+    assert not found, "\n".join(found)
+
+
+def _readings_of_details(tree: ast.Module) -> list[int]:
+    """Lines that take an entry out of an attribute named `details`, ask for one, or walk it.
+
+    Handing all of it on (`{**product.details, ...}`, `dict(count.details)`) reads nothing.
+    """
+    readers = {"get", "items", "keys", "pop", "setdefault", "values"}
+    read: list[ast.AST] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Subscript | ast.Attribute) and (
+            isinstance(node, ast.Subscript) or node.attr in readers
+        ):
+            read.append(node.value)
+        elif isinstance(node, ast.Compare):
+            read.extend(node.comparators)
+        elif isinstance(node, ast.For | ast.comprehension):
+            read.append(node.iter)
+        elif isinstance(node, ast.Assign | ast.AnnAssign | ast.NamedExpr) and node.value:
+            # Under another name it would be read unseen.
+            read.append(node.value)
+    return sorted(
+        item.lineno for item in read if isinstance(item, ast.Attribute) and item.attr == "details"
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "is_reading"),
+    [
+        ('ties.details["walls"]', True),
+        ('ties.details.get("walls")', True),
+        ('"walls" in ties.details', True),
+        ("[name for name in ties.details]", True),
+        ("told = ties.details", True),
+        ('{**ties.details, "photos": 2}', False),
+        ("header = dict(count.details)", False),
+        ('metadata["details"]', False),
+    ],
+)
+def test_readings_of_details_are_seen(line: str, is_reading: bool) -> None:
+    assert bool(_readings_of_details(ast.parse(line))) == is_reading

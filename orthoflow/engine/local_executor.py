@@ -179,7 +179,7 @@ class LocalExecutor:
             stdout=log,
             stderr=log,
             cwd=task.scratch,
-            env=child_environment(task),
+            env=_child_environment(task),
             pass_fds=(pipe,),
             start_new_session=True,
         )
@@ -315,7 +315,7 @@ def _read_log(path: Path) -> str:
     return text if size <= _LOG_BYTES else f"... ({size - _LOG_BYTES} bytes before)\n{text}"
 
 
-def child_environment(task: Task) -> dict[str, str]:
+def _child_environment(task: Task) -> dict[str, str]:
     """Environment variables for the process of a task."""
     variables = dict(os.environ)
     variables |= dict.fromkeys(_THREAD_VARIABLES, str(task.cores))

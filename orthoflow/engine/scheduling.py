@@ -135,8 +135,8 @@ def execute(
                 run_id=journal.run_id, n_cells=len(plan.cells), is_resumed=journal.is_resumed
             )
         )
-        with _scratch(store, journal.run_id) as scratch, watching_interruptions() as interruption:
-            tasks = TaskMaker(
+        with _scratch(store, journal.run_id) as scratch, _watching_interruptions() as interruption:
+            tasks = _TaskMaker(
                 plan=plan,
                 store=store,
                 scratch=scratch,
@@ -163,7 +163,7 @@ class _Ready:
 class _Run:
     """The state of one run; used from one thread."""
 
-    def __init__(self, tasks: TaskMaker, journal: Journal, listen: RunListener) -> None:
+    def __init__(self, tasks: _TaskMaker, journal: Journal, listen: RunListener) -> None:
         self._tasks = tasks
         self._plan = tasks.plan
         self._store = tasks.store
@@ -177,7 +177,7 @@ class _Run:
         self._ready: dict[str, _Ready] = {}
         self._running: dict[str, Task] = {}
 
-    def go(self, executor: Executor, interruption: Interruption) -> None:
+    def go(self, executor: Executor, interruption: _Interruption) -> None:
         """Run until every cell has a result.
 
         Raises:
@@ -331,7 +331,7 @@ class _Run:
         self._listen(CellFinished(address=cell.address, result=result, cached=is_cached))
 
 
-def _executor(name: ExecutorName, tell: Tell, interruption: Interruption) -> Executor:
+def _executor(name: ExecutorName, tell: Tell, interruption: _Interruption) -> Executor:
     if name == "inline":
         return InlineExecutor(tell, lambda: interruption.is_asked)
     return LocalExecutor(tell)
@@ -374,7 +374,7 @@ def _lock_of(folder: Path) -> Path:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskMaker:
+class _TaskMaker:
     """Makes the tasks of one run.
 
     Attributes:
@@ -447,7 +447,7 @@ def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
     )
 
 
-class Interruption:
+class _Interruption:
     """Whether the run was asked to stop.
 
     Attributes:
@@ -469,9 +469,9 @@ class Interruption:
 
 
 @contextmanager
-def watching_interruptions() -> Iterator[Interruption]:
+def _watching_interruptions() -> Iterator[_Interruption]:
     """Catch SIGINT and SIGTERM inside the block; only the main thread can, others never see any."""
-    interruption = Interruption()
+    interruption = _Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield interruption
         return
