@@ -94,7 +94,7 @@ def detect(
             return ConsensusProposer(unassigned, search, rng)
 
     elif method == "region":
-        wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, cell_m=0.1 / 3.0)
+        wanted = Neighbourhood(shape="cube", size_m=0.1, n_points=30, voxel_m=0.1 / 3.0)
         growth = Growth(angle_deg=10.0, distance_m=0.015, least_points=0.2 * SHARE * len(cloud))
 
         def proposer_of(cloud: PreparedCloud, unassigned: Unassigned, _: Rules) -> Proposer:
