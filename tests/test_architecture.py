@@ -48,17 +48,35 @@ def test_every_module_has_a_noun_for_a_name(module: Path) -> None:
 
 
 def test_imports_run_in_no_circle() -> None:
-    names = {name_of(module): module for module in MODULES}
-    imports = {
-        name: imported_modules(ast.parse((ROOT / module).read_text()), names.keys()) - {name}
-        for name, module in names.items()
-    }
     circles = [
-        circle
-        for circle in nx.strongly_connected_components(nx.DiGraph(imports))
-        if len(circle) > 1
+        circle for circle in nx.strongly_connected_components(import_graph()) if len(circle) > 1
     ]
     assert circles == []
+
+
+def test_geometry_keeps_only_what_two_kinds_or_the_framework_share() -> None:
+    geometry, graph = "orthoflow.geometry", import_graph()
+    for module in [name for name in graph if name.startswith(f"{geometry}.")]:
+        # Who reaches it through geometry alone.
+        users, todo = set[str](), [module]
+        while todo:
+            for user in graph.predecessors(todo.pop()):
+                if user.startswith(geometry):
+                    todo.append(user)
+                else:
+                    users.add(".".join(user.split(".")[:2]))
+        kinds = {user for user in users if user.startswith("orthoflow_plugins")}
+        assert len(kinds) >= 2 or users > kinds, f"{module} belongs to {kinds}"
+
+
+def import_graph() -> nx.DiGraph[str]:
+    """Modules and packages by name, an edge to each one that they import."""
+    names = {name_of(module): module for module in MODULES}
+    graph: nx.DiGraph[str] = nx.DiGraph()
+    for name, module in names.items():
+        imported = imported_modules(ast.parse((ROOT / module).read_text()), names.keys())
+        graph.add_edges_from((name, other) for other in imported - {name})
+    return graph
 
 
 def name_of(module: Path) -> str:
