@@ -24,6 +24,7 @@ from orthoflow_plugins.plane.block_kernels import (
     box_blocks,
     count_over_plan,
 )
+from orthoflow_plugins.plane.slab_kernels import claim_slab
 
 SAMPLE_POINTS: Final = 200_000
 # More cells than this cost more than they show; the cell grows instead.
@@ -36,8 +37,6 @@ _GOLDEN: Final = 0.6180339887498949
 _PARTS_MOST: Final = 8
 # Clouds thinner than this in two directions are a line or a point.
 _THINNEST_M: Final = 1e-4
-# Points so much beyond a tolerance are asked exactly whether they are within.
-_ROUNDING_M: Final = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,18 +105,6 @@ class Claim:
     slab: NDArray[np.float64]
     bounds_m: NDArray[np.float64]
 
-    def holds(self, offsets_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(m,) whether points (m, 3) lie in the slab and project into the rectangle."""
-        find_m, left, right, top, bottom = self.bounds_m
-        u, v = _along(offsets_m, self.slab[4:8]), _along(offsets_m, self.slab[8:])
-        inside: NDArray[np.bool_] = (left <= u) & (u <= right) & (top <= v) & (v <= bottom)
-        inside &= self.distances_m(offsets_m) <= find_m
-        return inside
-
-    def distances_m(self, offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(m,) distances of points (m, 3) from the plane, never negative."""
-        return np.abs(_along(offsets_m, self.slab[:4]))
-
 
 @dataclass(frozen=True, kw_only=True)
 class FreePoints:
@@ -175,20 +162,9 @@ class Unassigned:
 
     def claim(self, claim: Claim) -> None:
         """Give a plane its points, but for those that an earlier one has and is nearer to."""
-        offsets_m = self.sample.offsets_m
-        # The product is quick and off by rounding, so what it leaves is asked exactly.
-        rough_m = np.abs(offsets_m @ claim.slab[:3] - claim.slab[3])
-        near = np.flatnonzero(rough_m <= claim.bounds_m[0] + _ROUNDING_M)
-        near = near[claim.holds(offsets_m.take(near, axis=0))]
-        owners = self.claims[near]
-        wins = owners < 0
-        self.n_points -= int(np.count_nonzero(wins))
-        for owner in np.unique(owners[~wins]):
-            owned = np.flatnonzero(owners == owner)
-            asked_m = offsets_m.take(near[owned], axis=0)
-            wins[owned] = claim.distances_m(asked_m) < self.taken[owner].distances_m(asked_m)
-        self.claims[near[wins]] = len(self.taken)
         self.taken.append(claim)
+        slabs = np.array([item.slab for item in self.taken])
+        self.n_points -= claim_slab(self.sample.points, self.claims, slabs, claim.bounds_m)
         self._free = None
 
 
@@ -332,10 +308,3 @@ def plan_grid(
         cell_m=cell_m,
         shape=(int(cells[0]), int(cells[1]), int(cells[2])),
     )
-
-
-def _along(offsets_m: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(m,) places of points (m, 3) along an axis of a slab, as the compiled passes have them."""
-    x, y, z = offsets_m.T
-    along: NDArray[np.float64] = row[0] * x + row[1] * y + row[2] * z - row[3]
-    return along

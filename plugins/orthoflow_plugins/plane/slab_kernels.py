@@ -5,11 +5,11 @@ the in-plane axes u (3) with its origin and v (3) with its origin. Passes skip b
 whose box lies outside, and sum integers only (distances as multiples of a fixed step), so that
 neither the number of threads nor the order of blocks shows in the result.
 
-`sum_cells` asks about one plane, mostly in a sample, whose blocks reach through the scene. The
-passes over a cloud ask about all planes at once: blocks are tried only against the slabs that their
-box meets, mostly one or two, so that sixteen planes cost little more than one. Within a block
-places are counted from the middle of its box: float32 then is exact to nanometres wherever the
-block lies, and the processor takes twice as many points at once as with float64.
+`sum_cells` and `claim_slab` ask about one plane, mostly in a sample, whose blocks reach through the
+scene. The passes over a cloud ask about all planes at once: blocks are tried only against the slabs
+that their box meets, mostly one or two, so that sixteen planes cost little more than one. Within a
+block places are counted from the middle of its box: float32 then is exact to nanometres wherever
+the block lies, and the processor takes twice as many points at once as with float64.
 """
 
 from __future__ import annotations
@@ -92,6 +92,54 @@ def sum_cells(
                 counts[row, column, 2] += 1
                 sums[row, column, 0] += steps
                 sums[row, column, 1] += steps * steps
+
+
+@compiled
+def claim_slab(
+    points: BlockedPoints,
+    claims: NDArray[np.int8],
+    slabs: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+) -> int:
+    """Give the points of the last slab to it, unless an earlier slab that has them is nearer.
+
+    As `assign_points` with all slabs would, but for a sample and in float64, like `sum_cells`.
+
+    Args:
+        points: (n,) offsets in blocks.
+        claims: (n,) slab of each point, negative for none; changed.
+        slabs: (k, 12) all slabs so far, the new one last.
+        bounds: (5,) of the new slab: find tolerance, then smallest and largest u and v, metres.
+
+    Returns:
+        How many points were unclaimed and no longer are.
+    """
+    index, n_taken = slabs.shape[0] - 1, 0
+    slab, find_m = slabs[index], bounds[0]
+    distances = np.empty(BLOCK_POINTS)
+    for block in range(points.boxes.shape[0]):
+        if _misses(points.boxes[block], slab, find_m):
+            continue
+        start = block * BLOCK_POINTS
+        _measure(points, start, slab, distances)
+        for i in range(start, min(start + BLOCK_POINTS, claims.size)):
+            size = abs(distances[i - start])
+            if size > find_m:
+                continue
+            x, y, z = np.float64(points.x[i]), np.float64(points.y[i]), np.float64(points.z[i])
+            u = slab[4] * x + slab[5] * y + slab[6] * z - slab[7]
+            v = slab[8] * x + slab[9] * y + slab[10] * z - slab[11]
+            if not (bounds[1] <= u <= bounds[2] and bounds[3] <= v <= bounds[4]):
+                continue
+            owner = claims[i]
+            if owner < 0:
+                claims[i] = index
+                n_taken += 1
+                continue
+            a, b, c = slabs[owner, 0], slabs[owner, 1], slabs[owner, 2]
+            if size < abs(a * x + b * y + c * z - slabs[owner, 3]):
+                claims[i] = index
+    return n_taken
 
 
 @compiled
