@@ -98,14 +98,9 @@ def _verified(
 def label(found: list[FoundPlane], cloud: PreparedCloud, find_m: float) -> None:
     """Claim all points for the nearest plane in whose rectangle they lie."""
     slabs, bounds = _slabs(found, find_m)
-    assign(cloud, slabs, bounds)
-
-
-def assign(cloud: PreparedCloud, slabs: NDArray[np.float64], bounds_m: NDArray[np.float64]) -> None:
-    """Claim all points for the nearest of slabs (k, 12) in whose bounds (k, 5) they lie."""
 
     def give(_part: int, piece: slice) -> None:
-        assign_points(piece_of(cloud.points, piece), cloud.claims[piece], slabs, bounds_m)
+        assign_points(piece_of(cloud.points, piece), cloud.claims[piece], slabs, bounds)
 
     each_part(len(cloud.claims), cloud.parts, give)
 

@@ -20,9 +20,8 @@ from orthoflow_plugins.plane.assembling import (
     side_of_stations,
     warn_of_guesses,
 )
-from orthoflow_plugins.plane.final_fit import assign
 from orthoflow_plugins.plane.measuring import Deviations, measure_planes
-from orthoflow_plugins.plane.sample import PreparedCloud, prepare
+from orthoflow_plugins.plane.sample import Claim, PreparedCloud, prepare
 from orthoflow_plugins.plane.support import (
     Support,
     SurfaceRaster,
@@ -135,12 +134,13 @@ def lay_reference(
     """
     plane, prepared = reference.plane, reference.prepared
     axes = wall_axes(plane.normal, cloud.up)
-    slabs = np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])[None]
+    slab = np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])
     everywhere = _EVERYWHERE_M * np.array([-1.0, 1.0, -1.0, 1.0])
-    assign(prepared, slabs, np.concatenate([[tolerance_m], everywhere])[None])
+    bounds_m = np.concatenate([[tolerance_m], everywhere])
+    prepared.claim_alone(Claim(slab=slab, bounds_m=bounds_m))
     labels[:] = prepared.claims
     deviations = measure_planes(
-        prepared, slabs, everywhere[None], find_m=tolerance_m, fit_m=tolerance_m
+        prepared, slab[None], everywhere[None], find_m=tolerance_m, fit_m=tolerance_m
     )
     height_m = reference.corners_m.mean(axis=0) @ cloud.up
     planes = Planes(
@@ -190,10 +190,11 @@ def _extent(
 ) -> NDArray[np.float64]:
     """(4,) smallest and largest u and v of the points near a plane in its cells' rectangle."""
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
-    slabs = raster.slab()[None]
-    assign(prepared, slabs, np.concatenate([[reach_m], place.bounds_m])[None])
+    slab = raster.slab()
+    bounds_m = np.concatenate([[reach_m], place.bounds_m])
+    prepared.claim_alone(Claim(slab=slab, bounds_m=bounds_m))
     deviations = measure_planes(
-        prepared, slabs, place.bounds_m[None], find_m=reach_m, fit_m=reach_m
+        prepared, slab[None], place.bounds_m[None], find_m=reach_m, fit_m=reach_m
     )
     extent_m: NDArray[np.float64] = deviations.extents_m[0]
     return extent_m

@@ -23,6 +23,8 @@ from orthoflow_plugins.plane.block_kernels import (
     blocked,
     box_blocks,
     count_over_plan,
+    each_part,
+    piece_of,
 )
 from orthoflow_plugins.plane.slab_kernels import claim_slab
 
@@ -57,6 +59,19 @@ class Sample:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Claim:
+    """A plane that took points.
+
+    Attributes:
+        slab: (12,) the plane, see `slab_kernels`.
+        bounds_m: (5,) find tolerance, then smallest and largest u and v of its rectangle.
+    """
+
+    slab: NDArray[np.float64]
+    bounds_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
 class PreparedCloud:
     """A cloud as the passes take it, and the plane of each of its points.
 
@@ -66,7 +81,8 @@ class PreparedCloud:
         grid: plan cells and storeys.
         up: (3,) unit vector.
         parts: parts of parallel passes.
-        claims: (n,) int8, plane of each point, -1 for none yet; filled by `final_fit.label`.
+        claims: (n,) int8, plane of each point, -1 for none yet; `final_fit.label` and `claim_alone`
+            fill them.
         plan: all points per plan cell and per storey, where they were counted.
     """
 
@@ -92,18 +108,15 @@ class PreparedCloud:
         corners: NDArray[np.float64] = (self.grid.low_m + steps * extent) @ self.grid.basis
         return corners
 
+    def claim_alone(self, claim: Claim) -> None:
+        """Give one plane all points that it holds, and leave the others unclaimed."""
+        self.claims.fill(-1)
 
-@dataclass(frozen=True, kw_only=True)
-class Claim:
-    """A plane that took points.
+        def take(_part: int, piece: slice) -> None:
+            points = piece_of(self.points, piece)
+            claim_slab(points, self.claims[piece], claim.slab[None], claim.bounds_m)
 
-    Attributes:
-        slab: (12,) the plane, see `slab_kernels`.
-        bounds_m: (5,) find tolerance, then smallest and largest u and v of its rectangle.
-    """
-
-    slab: NDArray[np.float64]
-    bounds_m: NDArray[np.float64]
+        each_part(len(self.claims), self.parts, take)
 
 
 @dataclass(frozen=True, kw_only=True)

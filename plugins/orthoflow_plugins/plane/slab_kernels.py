@@ -103,7 +103,7 @@ def claim_slab(
 ) -> int:
     """Give the points of the last slab to it, unless an earlier slab that has them is nearer.
 
-    As `assign_points` with all slabs would, but for a sample and in float64, like `sum_cells`.
+    As `assign_points` with all slabs would, but in float64, like `sum_cells`.
 
     Args:
         points: (n,) offsets in blocks.

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.plane.block_kernels import each_part, piece_of
-from orthoflow_plugins.plane.final_fit import assign
 from orthoflow_plugins.plane.sample import Claim, PreparedCloud, Unassigned, prepare
-from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE, sum_assigned
+from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE, assign_points, sum_assigned
 from orthoflow_plugins.plane.support import INNER_SHARE, SurfaceRaster, measure_cells
 
 from orthoflow.geometry import Plane, wall_axes
@@ -76,7 +75,8 @@ def test_one_pass_for_all_planes_assigns_as_one_plane_after_the_other(seed: int)
     cloud = prepared_cloud(seed)
     claims = [claim_of(raster) for raster in rasters]
     slabs = np.array([claim.slab for claim in claims])
-    assign(cloud, slabs, np.array([claim.bounds_m for claim in claims]))
+    bounds_m = np.array([claim.bounds_m for claim in claims])
+    assign_points(cloud.points, cloud.claims, slabs, bounds_m)
     np.testing.assert_array_equal(cloud.claims, nearest_holder(cloud.sample.offsets_m, rasters))
 
 
