@@ -8,13 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow_plugins.plane.assignment_kernels import ALONG_NORMAL, centre_block, place_along
 from orthoflow_plugins.plane.block_kernels import BLOCK_POINTS, BlockedPoints
-from orthoflow_plugins.plane.slab_kernels import (
-    ALONG_NORMAL,
-    STEPS_PER_TOLERANCE,
-    centre_block,
-    place_along,
-)
+from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
 
 # Bins that the deviations of a plane's points are counted in.
 HISTOGRAM_BINS: Final = 200

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.threads import in_threads
+from orthoflow_plugins.plane.assignment_kernels import assign_points, name_labels, sum_assigned
 from orthoflow_plugins.plane.block_kernels import BLOCK_POINTS, each_part, piece_of
 from orthoflow_plugins.plane.candidates import (
     FoundPlane,
@@ -24,7 +25,6 @@ from orthoflow_plugins.plane.candidates import (
     verification,
 )
 from orthoflow_plugins.plane.sample import PreparedCloud
-from orthoflow_plugins.plane.slab_kernels import assign_points, name_labels, sum_assigned
 from orthoflow_plugins.plane.support import INNER_SHARE, CellSums, SurfaceRaster, cell_for
 
 _PASSES_MOST: Final = 3

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.plane.assignment_kernels import assign_points, sum_assigned
 from orthoflow_plugins.plane.block_kernels import each_part, piece_of
 from orthoflow_plugins.plane.sample import Claim, PreparedCloud, Unassigned, prepare
-from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE, assign_points, sum_assigned
+from orthoflow_plugins.plane.slab_kernels import STEPS_PER_TOLERANCE
 from orthoflow_plugins.plane.support import INNER_SHARE, SurfaceRaster, measure_cells
 
 from orthoflow.geometry import Plane, wall_axes
