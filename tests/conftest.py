@@ -18,15 +18,20 @@ from orthoflow.sdk.context import Drawing
 _ROOT = Path(__file__).resolve().parents[1]
 
 
-def _sources_digest() -> str:
-    sources = sorted(_ROOT.glob("*/**/*_kernels.py"))
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+def _kernels_digest() -> str:
+    """Digest of all modules that compile something, wherever they stand."""
+    packages = [_ROOT / "orthoflow", _ROOT / "plugins" / "orthoflow_plugins"]
+    texts = [path.read_bytes() for package in packages for path in sorted(package.rglob("*.py"))]
+    kernels = [text for text in texts if b"geometry.compiling" in text]
+    return hashlib.sha256(b"".join(kernels)).hexdigest()[:16]
 
 
 # Numba's own cache does not notice edits of kernels that a kernel calls: a folder per state of all
-# of them does. Set before anything imports numba.
+# of them does. One per user as well, since nobody can write into another's. Set before anything
+# imports numba.
 os.environ.setdefault(
-    "NUMBA_CACHE_DIR", str(Path(tempfile.gettempdir()) / f"orthoflow-kernels-{_sources_digest()}")
+    "NUMBA_CACHE_DIR",
+    str(Path(tempfile.gettempdir()) / f"orthoflow-kernels-{os.getuid()}-{_kernels_digest()}"),
 )
 
 # A PNG of one pixel.

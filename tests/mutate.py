@@ -20,11 +20,11 @@ assertions of what cannot happen, version numbers of results, and what changes s
 (threads, sizes of parts, arguments of drawings, floats below a millionth that guard a division).
 
 The tests of `orthoflow/engine/x.py` are those in `tests/engine`, of a plugin's module those of its
-kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it; the module's
-doctests and a file of its own name go first, then those that name the module, and the first failure ends a run.
-The conformance suite takes part for modules of kinds, without the golden results: these would
-notice everything, but know yesterday's numbers only. A run that takes far longer than without a
-mutation is stopped, which kills the mutation as well.
+kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it. Doctests
+and a file of the module's own name go first, then those that name the module; the first failure
+ends a run. The conformance suite takes part for modules of kinds, without the golden results:
+these would notice everything, but know yesterday's numbers only. A run that takes far longer than
+without a mutation is stopped, which kills the mutation as well.
 
 All this happens in copies of the tree, kept in the temporary folder (`--work`) between runs for the
 sake of compiled kernels. Numba's cache does not notice that a kernel which another one calls has
