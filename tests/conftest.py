@@ -21,8 +21,13 @@ _ROOT = Path(__file__).resolve().parents[1]
 def _kernels_digest() -> str:
     """Digest of all modules that compile something, wherever they stand."""
     packages = [_ROOT / "orthoflow", _ROOT / "plugins" / "orthoflow_plugins"]
-    texts = [path.read_bytes() for package in packages for path in sorted(package.rglob("*.py"))]
-    kernels = [text for text in texts if b"geometry.compiling" in text]
+    paths = [path for package in packages for path in sorted(package.rglob("*.py"))]
+    texts = {path: path.read_bytes() for path in paths}
+    kernels = [
+        text
+        for path, text in texts.items()
+        if path.name == "compiling.py" or b"geometry.compiling" in text
+    ]
     return hashlib.sha256(b"".join(kernels)).hexdigest()[:16]
 
 
