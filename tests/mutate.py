@@ -70,6 +70,9 @@ COPIED: Final = (
     *("benchmarks", "pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE"),
 )
 KILLED_SHARE: Final = 0.9
+# Exit codes of pytest.
+_MISUSED: Final = 4
+_NOTHING_FOUND: Final = 5
 
 
 # --- which tests ---
@@ -250,7 +253,7 @@ class Worker:
             report = self.folder / "report.xml"
             done = self._pytest([folder, f"--junitxml={report}"], self._kernels, 3600.0)
             self._usual_s[folder] = time.monotonic() - began
-            if done is None or done.returncode not in (0, 1, 5):
+            if done is None or done.returncode not in (0, 1, _NOTHING_FOUND):
                 return f"{folder} does not run: {'' if done is None else done.stdout[-2000:]}"
             if done.returncode == 1:
                 failed = _failed(report)
@@ -290,7 +293,9 @@ class Worker:
             done = self._pytest(arguments, kernels, timeout_s)
             if done is None:
                 return f"timeout of {timeout_s:.0f} s"
-            if done.returncode not in (0, 5):
+            if done.returncode == _MISUSED:
+                raise RuntimeError(f"pytest does not take its arguments: {done.stdout[-500:]}")
+            if done.returncode not in (0, _NOTHING_FOUND):
                 return _named_failure(done.stdout)
         return ""
 
@@ -418,12 +423,18 @@ def run(
     def work_off(number: int, share: Sequence[Mutation]) -> None:
         worker = Worker(folder=work / f"worker-{number}", least_timeout_s=timeout_s)
         worker.prepare(ROOT)
+        # Which tests there are is asked of the copy: the checkout may go on.
+        tree = Tree.of(worker.tree)
         for mutation in share:
             folders = folders_of(tree, mutation.path) if is_checked else []
             if problem := worker.first_problem(folders):
                 problems.append(problem)
                 return
-            verdict = worker.verdict(mutation, tree)
+            try:
+                verdict = worker.verdict(mutation, tree)
+            except RuntimeError as error:
+                problems.append(str(error))
+                return
             with lock:
                 verdicts.append(verdict)
                 tell(verdict)
