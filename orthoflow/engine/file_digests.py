@@ -7,7 +7,6 @@ import json
 import os
 import time
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -15,6 +14,7 @@ from typing import Final
 from orthoflow.engine.durability import write_whole
 from orthoflow.engine.results import RecordedFile
 from orthoflow.errors import InputError
+from orthoflow.geometry.threads import in_order
 
 # A file changed this shortly before hashing may change again within the same time stamp.
 _SETTLED_NS: Final = 2_000_000_000
@@ -45,8 +45,7 @@ class FileDigests:
         Raises:
             InputError: a file cannot be read.
         """
-        with ThreadPoolExecutor(max_workers=4) as pool:
-            return tuple(pool.map(self.digest, paths))
+        return tuple(in_order(self.digest, paths, threads=4))
 
     def digest(self, path: Path) -> FileRef:
         """Give the digest of one file.

@@ -7,6 +7,7 @@ results have the same bits for any number of them. Compiled kernels let other th
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -32,10 +33,10 @@ def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = Non
 
 
 def in_order(
-    function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int
+    function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int | None = None
 ) -> Iterator[_Result]:
-    """Give a function's results item by item, so many computed at once."""
-    with ThreadPoolExecutor(max(1, threads)) as pool:
+    """Give a function's results item by item, so many computed at once; None: one per processor."""
+    with ThreadPoolExecutor(os.cpu_count() if threads is None else max(1, threads)) as pool:
         yield from pool.map(function, items)
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +13,7 @@ from orthoflow_provenance.model import PublishedFile, RecordedCell
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.geometry.threads import in_order
 from orthoflow.records.metrics import cell_metrics, write_metrics_csv
 
 PRODUCTS_FOLDER: Final = "products"
@@ -54,8 +53,7 @@ def publish_products(
 
 def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
     paths = sorted(path for path in target.rglob("*") if path.is_file())
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        digests = list(pool.map(file_sha256, paths))
+    digests = list(in_order(file_sha256, paths))
     return tuple(
         PublishedFile(
             path=path.relative_to(run_folder).as_posix(),

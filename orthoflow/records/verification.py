@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -13,6 +11,7 @@ from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.verify import verify_record
 
 from orthoflow.engine.file_digests import file_sha256
+from orthoflow.geometry.threads import in_order
 from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.runs import find_record, record_errors
 
@@ -81,8 +80,7 @@ class _PublishedCheck:
 
 
 def _check_published(folder: Path, record: RunRecord) -> _PublishedCheck:
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        states = list(pool.map(lambda file: _state(folder, file), record.published))
+    states = list(in_order(lambda file: _state(folder, file), record.published))
     checked = list(zip(record.published, states, strict=True))
     missing = [file.path for file, state in checked if state == "missing"]
     changed = tuple(

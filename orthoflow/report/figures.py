@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.files.images import decode_image, encode_png, shrunk_webp
+from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure, Run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.diagrams import run_diagram
@@ -99,9 +99,8 @@ def write_figures(run: Run, folder: Path, addresses: Iterable[str]) -> int:
         if figures:
             inside.mkdir(exist_ok=True)
         waiting.extend((inside / figure.name, figure) for figure in figures)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        # Drained, so that an error in a thread is not lost.
-        list(pool.map(lambda item: _write_figure(*item), waiting))
+    # Drained, so that an error in a thread is not lost.
+    list(in_order(lambda item: _write_figure(*item), waiting))
     return len(waiting)
 
 
@@ -125,8 +124,7 @@ def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[
         side for side in _SIDES_PX if (side / 1000) ** 2 <= 2 * bytes_most / n_bytes
     ] or _SIDES_PX[-1:]
     for side_px in sides:
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            fitted = tuple(pool.map(lambda figure, side=side_px: _smaller(figure, side), figures))
+        fitted = tuple(in_order(partial(_smaller, side_px=side_px), figures))
         if sum(len(figure.data) for figure in fitted) <= bytes_most:
             break
     return fitted

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.files.images import Part, cells_webp, grey_cells, sampled_rows
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import count_cells
+from orthoflow.geometry.threads import in_order
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
 from orthoflow.records import Run
 
@@ -130,18 +129,17 @@ class _Drawing:
 def _drawn(drawings: Sequence[_Drawing], *, n_products: float) -> Iterator[Picture]:
     """Draw pictures side by side; encoding takes most of a report's time."""
     longest_side_px = side_px(n_products * len(drawings))
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        contents = pool.map(lambda drawing: drawing.draw(longest_side_px), drawings)
-        for drawing, content in zip(drawings, contents, strict=True):
-            yield Picture(
-                uri=data_uri(content, "image/webp"),
-                title=drawing.title,
-                caption=drawing.caption,
-                file=drawing.file,
-                cell=drawing.cell,
-                wall=drawing.wall,
-                frame=drawing.frame,
-            )
+    contents = in_order(lambda drawing: drawing.draw(longest_side_px), drawings)
+    for drawing, content in zip(drawings, contents, strict=True):
+        yield Picture(
+            uri=data_uri(content, "image/webp"),
+            title=drawing.title,
+            caption=drawing.caption,
+            file=drawing.file,
+            cell=drawing.cell,
+            wall=drawing.wall,
+            frame=drawing.frame,
+        )
 
 
 def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawing:
