@@ -172,7 +172,7 @@ class Planes(Product):
             if value is not None:
                 moved[name] = value
         metadata = {**payload.metadata, **moved, "details": details}
-        return replace(payload, encoding_version=cls.encoding_version, metadata=metadata)
+        return super().upgraded(replace(payload, metadata=metadata))
 
     def __len__(self) -> int:
         return len(self.offset)
