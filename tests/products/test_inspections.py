@@ -86,3 +86,14 @@ def test_a_truth_of_encoding_1_without_photos_sees_all_round_unless_it_says_more
     truth = Truth.from_payload(truth_of_encoding_1({"parameters": {}}))
     assert (truth.lowest_elevation_deg, truth.highest_elevation_deg) == (-90.0, 90.0)
     assert (truth.n_spoilt, truth.photos, truth.cameras) == (0, (), None)
+
+
+@pytest.mark.parametrize(
+    "photos",
+    ["none", [3], [{"name": "a.jpg"}], [{"name": "a.jpg", "wall": "w", "gsd_mm": "4"}]],
+    ids=["no list", "no mapping", "incomplete", "no number"],
+)
+def test_photos_that_version_1_did_not_write_stay_where_people_read_them(photos: JsonValue) -> None:
+    truth = Truth.from_payload(truth_of_encoding_1({"photos": photos}))
+    assert truth.photos == ()
+    assert truth.details == {"photos": photos}
