@@ -70,6 +70,10 @@ class StoreError(OrthoflowError, OSError):
     """The store or a run folder cannot be read or written: full disk, no permission, damage."""
 
 
+class DamageError(StoreError):
+    """The store does not hold any more what was put into it; what is computed again heals it."""
+
+
 class RecordError(OrthoflowError, ValueError):
     """A record is damaged, differs from its seal, or has a format this version cannot read."""
 

@@ -101,3 +101,16 @@ def _undrawn_charts() -> Iterator[None]:
 def charts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw charts in this test all the same."""
     monkeypatch.setattr(StepContext, "figure", _FIGURE)
+
+
+@pytest.fixture
+def drawings(monkeypatch: pytest.MonkeyPatch) -> dict[str, Drawing]:
+    """Keep the charts of this test by their names, undrawn."""
+    kept: dict[str, Drawing] = {}
+
+    def figure(_: StepContext, name: str, content: Drawing, caption: str = "") -> None:
+        assert caption
+        kept[name] = content
+
+    monkeypatch.setattr(StepContext, "figure", figure)
+    return kept

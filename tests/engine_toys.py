@@ -4,6 +4,7 @@ from __future__ import annotations
 
 HOOKS = """
 from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec, hookimpl
+from toy_plugin.mischief_names import MISCHIEF
 
 WORKS = ["add", "noise", "sign", "slow", "segfault", "abort", "eat", "hang", "stubborn", "quit",
          "leave", "raises", "refuses", "unreadable", "needs_library", "no_memory", "full_disk",
@@ -16,20 +17,26 @@ def orthoflow_kinds():
         KindSpec(name="make", summary="makes numbers", is_source=True),
         KindSpec(name="work", summary="works on numbers", inputs={"numbers": "numbers"},
                  outputs={"numbers": "numbers"}),
+        KindSpec(name="thin", summary="makes few of many", inputs={"scan": "scan"},
+                 outputs={"numbers": "numbers"}),
     ]
 
 @hookimpl
 def orthoflow_products():
     return [ProductSpec(type_name="numbers", target="toy_plugin.products:Numbers",
-                        summary="numbers", publisher="toy_plugin.products:publish")]
+                        summary="numbers", publisher="toy_plugin.products:publish"),
+            ProductSpec(type_name="scan", target="toy_plugin.products:Scan", summary="many")]
 
 @hookimpl
 def orthoflow_methods():
     makes = [MethodSpec(id=f"make.{name}", target=f"toy_plugin.makes:{name.title()}", summary="")
-             for name in ("range", "file")]
+             for name in ("range", "file", "scan")]
     works = [MethodSpec(id=f"work.{name}", target=f"toy_plugin.works:{name}", summary="")
              for name in WORKS]
-    return makes + works
+    means = MethodSpec(id="thin.means", target="toy_plugin.works:Means", summary="")
+    mischief = [MethodSpec(id=f"work.{name}", target=f"toy_plugin.mischief:{name}", summary="")
+                for name in MISCHIEF]
+    return [*makes, *works, means, *mischief]
 """
 
 PRODUCTS = """
@@ -50,6 +57,13 @@ class Numbers(Product):
     note: str = ""
 
 @dataclass(frozen=True, kw_only=True)
+class Scan(Product):
+    type_name: ClassVar[str] = "scan"
+    mapped: ClassVar[bool] = True
+    embedded: ClassVar[bool] = False
+    values: NDArray[np.float64]
+
+@dataclass(frozen=True, kw_only=True)
 class Strangers(Product):
     type_name: ClassVar[str] = "strangers"
 
@@ -64,6 +78,7 @@ from pydantic import Field
 from orthoflow.errors import InputError
 from orthoflow.products import InputFiles
 from orthoflow.sdk import Method, MethodParams, Ports
+from toy_plugin import products
 from toy_plugin.products import Numbers
 
 class Range(Method):
@@ -81,6 +96,22 @@ class Range(Method):
     def run(self, inputs, params, ctx):
         ctx.metric("count", params.count, "1")
         return self.Out(numbers=Numbers(values=np.arange(float(params.count))))
+
+class Scan(Method):
+    id = "make.scan"
+
+    class Params(MethodParams):
+        count: int = Field(8000, ge=1, description="How many.")
+
+    class In(Ports):
+        pass
+
+    class Out(Ports):
+        scan: products.Scan
+
+    def run(self, inputs, params, ctx):
+        values = np.sqrt(np.arange(float(params.count)))
+        return self.Out(scan=products.Scan(values=values))
 
 class File(Method):
     id = "make.file"
@@ -117,7 +148,7 @@ from pydantic import Field
 
 from orthoflow.errors import InputError, MethodError
 from orthoflow.sdk import Method, MethodParams, Ports
-from toy_plugin.products import Numbers, Strangers
+from toy_plugin.products import Numbers, Scan, Strangers
 
 class Work(Method):
     class Params(MethodParams):
@@ -253,7 +284,8 @@ def spawns(values, params, ctx):
 
 @work("exact")
 def spawns_and_waits(values, params, ctx):
-    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    sleeper = [sys.executable, "-c", "import time; time.sleep(600)"]
+    child = subprocess.Popen(sleeper, start_new_session=True)
     ctx.log(f"started {child.pid}")
     child.wait()
 
@@ -269,6 +301,22 @@ def fills_mapped(values, params, ctx):
     array = ctx.allocate("numbers", "values", (8 << 20,), np.float64)
     array[:] = 1.0
     return array
+
+class Means(Method):
+    id = "thin.means"
+    determinism = "exact"
+
+    class Params(MethodParams):
+        pass
+
+    class In(Ports):
+        scan: Scan
+
+    class Out(Ports):
+        numbers: Numbers
+
+    def run(self, inputs, params, ctx):
+        return self.Out(numbers=Numbers(values=inputs.scan.values.reshape(-1, 1000).mean(axis=1)))
 
 class wrong_type(Work):
     id = "work.wrong_type"

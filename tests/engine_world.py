@@ -6,6 +6,7 @@ import importlib
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from orthoflow.engine import RunOptions, RunOutcome, RunPlan, Store, execute, pl
 from orthoflow.engine.events import RunEvent
 from orthoflow.errors import OrthoflowError
 from orthoflow.workflow import expand_cells, load_workflow
+from tests.engine_mischief import MISCHIEF, NAMES
 from tests.engine_toys import HOOKS, MAKES, PRODUCTS, WORKS
 
 
@@ -106,6 +108,7 @@ def install_toys(site: Path) -> None:
     package = site / "toy_plugin"
     package.mkdir(parents=True)
     files = {"hooks": HOOKS, "products": PRODUCTS, "makes": MAKES, "works": WORKS, "__init__": ""}
+    files |= {"mischief": MISCHIEF, "mischief_names": f"MISCHIEF = {NAMES}"}
     for name, text in files.items():
         (package / f"{name}.py").write_text(text)
     info = site / "toy_plugin-1.0.dist-info"
@@ -118,6 +121,19 @@ def forget_toys() -> None:
     """Let the next import see the plugin as it lies on the disk."""
     for name in [name for name in sys.modules if name.partition(".")[0] == "toy_plugin"]:
         del sys.modules[name]
+
+
+def has_ended(process_id: int) -> bool:
+    """Whether a process ends within a while."""
+    for _ in range(100):
+        try:
+            state = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0]
+        except FileNotFoundError:
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
 
 
 def _main(folder: Path, into: str) -> None:

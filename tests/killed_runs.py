@@ -1,11 +1,13 @@
-"""Runs that are killed: one process that has loaded everything and forks a run for each order.
+"""Runs that come to harm: one process that has loaded everything and forks a run for each order.
 
-    python tests/killed_runs.py FOLDER
+    python -m tests.killed_runs FOLDER
 
 Reads orders from stdin, a JSON object per line, and answers each with one: `arguments` of the
 command line; `event`, the number of the audit event (opening, renaming, removing a file ...) at
-which the run kills itself, or `seconds`, after which it is killed. The answer has `code`, negative
-for a signal, and `events`, how many there were before the run ended by itself.
+which the run kills itself, or `seconds`, after which it is killed; or `fault`, one of
+`faulty_files.FAULTS`, and `operation`, the number of the file operation that it befalls. The answer
+has `code`, negative for a signal, `events`, how many events or operations there were before the run
+ended by itself, and `said`, what it wrote to standard error.
 """
 
 from __future__ import annotations
@@ -13,22 +15,84 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
-def run_forked(arguments: Sequence[str], *, event: int | None, seconds: float | None) -> int:
-    """Run the command line in a fork of this process, killed or not; give its exit code."""
+@dataclass(frozen=True)
+class Answer:
+    """How a run ended: exit code, events or operations in it, and what it said."""
+
+    code: int
+    events: int
+    said: str
+
+
+@dataclass(frozen=True)
+class RunServer:
+    """The process that forks runs, from outside."""
+
+    folder: Path
+    process: subprocess.Popen[str]
+
+    def __call__(self, *arguments: str, **order: object) -> Answer:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps({"arguments": arguments, **order}) + "\n")
+        self.process.stdin.flush()
+        return Answer(**json.loads(self.process.stdout.readline()))
+
+
+@contextmanager
+def run_server(folder: Path, environment: Mapping[str, str]) -> Iterator[RunServer]:
+    """Start the process; `environment` says which plugins are installed."""
+    paths = [str(ROOT / part) for part in ("", "plugins", "provenance")]
+    python_path = ":".join([*paths, environment["PYTHONPATH"]])
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.killed_runs", str(folder)],
+        env={**environment, "PYTHONPATH": python_path},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with process:
+        yield RunServer(folder, process)
+        assert process.stdin is not None
+        process.stdin.close()
+        assert process.wait() == 0
+
+
+# Any: an order is JSON that this module wrote itself.
+def run_forked(order: Mapping[str, Any]) -> int:
+    """Run the command line in a fork of this process, harmed or not; give its exit code."""
     process = os.fork()
     if process == 0:
         signal.alarm(300)  # a run that hangs ends the test, not the patience of whoever waits
-        _be_the_run(arguments, event)
-    if seconds is not None:
-        time.sleep(seconds)
+        if "fault" in order:
+            _be_the_faulty_run(order)
+        _be_the_run(order["arguments"], order.get("event"))
+    if "seconds" in order:
+        time.sleep(order["seconds"])
         os.kill(process, signal.SIGKILL)
     return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+def _be_the_faulty_run(order: Mapping[str, Any]) -> None:
+    from tests.faulty_files import FaultyFiles
+
+    files = FaultyFiles(Path.cwd(), order["fault"], order["operation"], order.get("seed", 0))
+    with files.in_place():
+        code = run_here(order["arguments"])
+    Path("events").write_text(str(files.count))
+    os._exit(code)
 
 
 def _be_the_run(arguments: Sequence[str], event: int | None) -> None:
@@ -60,21 +124,18 @@ def run_here(arguments: Sequence[str]) -> int:
 def _main() -> None:
     os.chdir(sys.argv[1])
     answers = os.fdopen(os.dup(1), "w")
-    # What runs print goes nowhere: they share this process's output.
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
+    # What runs print on standard output goes nowhere: they share this process's.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    said = os.open("said.txt", os.O_RDWR | os.O_CREAT | os.O_APPEND)
+    os.dup2(said, 2)
     for line in sys.stdin:
         order = json.loads(line)
         Path("events").write_text("0")
-        if order.get("here"):
-            code = run_here(order["arguments"])
-        else:
-            code = run_forked(
-                order["arguments"], event=order.get("event"), seconds=order.get("seconds")
-            )
+        os.ftruncate(said, 0)
+        code = run_here(order["arguments"]) if order.get("here") else run_forked(order)
         events = int(Path("events").read_text() or "0")  # empty: killed while it was written
-        answers.write(json.dumps({"code": code, "events": events}) + "\n")
+        text = Path("said.txt").read_text(errors="replace")
+        answers.write(json.dumps({"code": code, "events": events, "said": text}) + "\n")
         answers.flush()
 
 

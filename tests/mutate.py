@@ -10,21 +10,23 @@ A place is a line with something to mutate. What is done to it:
 - comparison: turned round (`<` to `>=`, `==` to `!=`, `in` to `not in`), or its bound moved (`<` to
   `<=`) where both sides may be whole numbers: floats hardly ever meet their bound;
 - boolean: `and` for `or`, `not` left out, `True` for `False`;
-- constant: a whole number one more, a float doubled (0.0 to 1.0); likewise defaults of arguments;
+- constant: a whole number one more, from 100 on doubled, as is a float (0.0 to 1.0); likewise
+  defaults of arguments;
 - return: the value dropped;
 - branch: always taken, never taken.
 
 Left alone is what no test should hold: docstrings, annotations, decorators, what only type checkers
 read, messages and whatever else an exception is raised with, log and progress lines, `__repr__`,
-assertions of what cannot happen, version numbers of results, and what changes speed or looks alone
-(threads, sizes of parts, arguments of drawings, floats below a millionth that guard a division).
+assertions of what cannot happen, version numbers of results, what changes speed or looks alone
+(threads, sizes of parts and caches, arguments of drawings, floats below a millionth that guard a
+division) and how often a search goes on at most: one that has converged moves no more.
 
 The tests of `orthoflow/engine/x.py` are those in `tests/engine`, of a plugin's module those of its
 kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it. Doctests
 and a file of the module's own name go first, then those that name the module; the first failure
-ends a run. The conformance suite takes part for modules of kinds, without the golden results:
-these would notice everything, but know yesterday's numbers only. A run that takes far longer than
-without a mutation is stopped, which kills the mutation as well.
+ends a run. The conformance suite takes part for modules of kinds, its golden results last: they
+hold what a method gives, too, but a killer that knows why a number is right says more. A run that
+takes far longer than without a mutation is stopped, which kills the mutation as well.
 
 All this happens in copies of the tree, kept in the temporary folder (`--work`) between runs for the
 sake of compiled kernels. Numba's cache does not notice that a kernel which another one calls has
@@ -287,8 +289,10 @@ class Worker:
         runs = [["-x", *files_of(tree, mutation.path)]]
         if kinds := kinds_of(tree, mutation.path):
             named = " or ".join(f"{kind}." for kind in kinds)
-            rules = f"({named}) and not golden"
-            runs.append(["-x", "tests/testing/test_conformance.py", "-k", rules])
+            runs += [
+                ["-x", "tests/testing/test_conformance.py", "-k", f"({named}) and {which}"]
+                for which in ("not golden", "golden")
+            ]
         for arguments in runs:
             done = self._pytest(arguments, kernels, timeout_s)
             if done is None:

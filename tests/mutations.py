@@ -66,12 +66,14 @@ _UNSEEN_KEYWORDS: Final = re.compile(
     r"^(strict|copy|cores|(n_)?threads|n_per_run|max_workers|maxsize|stacklevel|daemon|flush"
     r"|figsize|dpi|alpha|linewidths?|lw|fontsize|labelsize|(face|edge)?color|cmap|markersize|zorder"
     r"|pad|rotation_mode|interpolation|frameon|loc|ncols|capsize|hspace|wspace|description|examples"
-    r"|title|help|compresslevel|quality)$"
+    r"|title|help|compresslevel|quality|indent)$"
 )
 _UNSEEN_NAMES: Final = re.compile(
-    r"AT_ONCE|PER_RUN|CHUNK|_POLL|^(result_version|citations|cores|threads)$"
+    r"AT_ONCE|PER_RUN|CHUNK|BLOCK_(POINTS|BYTES)|PART_POINTS|(SCAN|CACHE)_BYTES|IN_MEMORY|_POLL"
+    r"|ITERATIONS|ROUNDS|(STEPS|PASSES|SWEEPS|PROCESSES)_MOST|^(result_version|citations|cores|threads)$"
 )
 _GUARD: Final = 1e-6
+_LARGE: Final = 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +246,7 @@ class _Finder(ast.NodeVisitor):
         if isinstance(value, bool):
             other: object = not value
         elif isinstance(value, int):
-            other = value + 1
+            other = 2 * value if value >= _LARGE else value + 1
         elif isinstance(value, float) and not 0.0 < abs(value) < _GUARD:
             other = 2.0 * value if value else 1.0
         else:

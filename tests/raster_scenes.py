@@ -105,3 +105,55 @@ def checker(columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[
     odd = (columns.astype(int) + rows.astype(int)) % 2
     red, green = columns.astype(int) * 3 % 251, rows.astype(int) * 5 % 251
     return np.column_stack([odd * red, odd * green, odd * 90]).astype(np.uint8)
+
+
+def waves(columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A texture 0..1 without edges, with detail of six to thirty cells in all directions."""
+    rng = np.random.default_rng(17)
+    total = np.zeros(np.shape(columns))
+    for cells in np.geomspace(6.0, 30.0, 12):
+        direction, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+        along = np.cos(direction) * columns + np.sin(direction) * rows
+        total += np.sin(2.0 * np.pi * along / cells + phase)
+    return 0.5 + total / 24.0
+
+
+def shift_of_waves(values: NDArray[np.floating], *, rim_cells: int = 5) -> NDArray[np.float64]:
+    """How far a raster that should show `waves` shows them to the right and down, in cells."""
+    columns, rows = (
+        grid.reshape(values.shape)[rim_cells:-rim_cells, rim_cells:-rim_cells].ravel()
+        for grid in cell_centres(values.shape)
+    )
+    seen = values[rim_cells:-rim_cells, rim_cells:-rim_cells].ravel().astype(np.float64)
+    known = np.isfinite(seen)
+    step = 1e-3
+    slopes = np.column_stack(
+        [
+            waves(columns + step, rows) - waves(columns - step, rows),
+            waves(columns, rows + step) - waves(columns, rows - step),
+        ]
+    ) / (2.0 * step)
+    off = seen - waves(columns, rows)
+    moved: NDArray[np.float64] = np.linalg.lstsq(slopes[known], -off[known], rcond=None)[0]
+    return moved
+
+
+def points_apart(
+    shape: tuple[int, int], cells: float, *, seed: int, in_rows: bool
+) -> NDArray[np.float64]:
+    """Places (n, 2) = (column, row) so many cells apart, in a scan's turned rows or anywhere."""
+    rng = np.random.default_rng(seed)
+    if not in_rows:
+        count = round(shape[0] * shape[1] / cells**2)
+        return rng.uniform((0, 0), shape[::-1], (count, 2))
+    most = 2 * max(shape)
+    across, down = (grid.ravel() for grid in np.mgrid[:most, :most] * cells - most / 2)
+    angle = np.radians(rng.uniform(2.0, 8.0))
+    places = np.column_stack(
+        [
+            np.cos(angle) * across - np.sin(angle) * down,
+            np.sin(angle) * across + np.cos(angle) * down,
+        ]
+    )
+    places = places[((places > 0.0) & (places < shape[::-1])).all(axis=1)]
+    return rng.permutation(places)

@@ -32,6 +32,7 @@ def write_las(
     intensity: NDArray[np.int64] | None = None,
     rgb: NDArray[np.int64] | None = None,
     withheld: NDArray[np.bool_] | None = None,
+    classes: NDArray[np.int64] | None = None,
     scale: float = 0.0001,
 ) -> Path:
     import laspy
@@ -47,14 +48,19 @@ def write_las(
         las.red, las.green, las.blue = rgb.astype(np.uint16).T
     if withheld is not None:
         las.withheld = withheld
+    if classes is not None:
+        las.classification = classes.astype(np.uint8)
     las.write(path)
     return path
 
 
-def write_e57(path: Path, scans: Sequence[Mapping[str, Any]]) -> Path:
+def write_e57(
+    path: Path, scans: Sequence[Mapping[str, Any]], images: Sequence[Mapping[str, Any]] = ()
+) -> Path:
     """Write scans, each with `fields` (name -> values) and optional `rotation` and `translation`.
 
-    Optional `intensity_limits` and `rgb_limit` go into the header.
+    Optional `intensity_limits` and `rgb_limit` go into the header. Images have a `kind`, a
+    `content`, optional `numbers` of their representation, a `name` and a pose as scans have it.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -69,7 +75,33 @@ def write_e57(path: Path, scans: Sequence[Mapping[str, Any]]) -> Path:
             _set_pose(libe57, image, node, scan)
             _set_limits(libe57, image, node, scan)
             _set_points(libe57, file, node, scan["fields"])
+        for picture in images:
+            _add_image(libe57, image, picture)
     return path
+
+
+def _add_image(libe57: Any, image: Any, picture: Mapping[str, Any]) -> None:
+    root = image.root()
+    if not root.isDefined("images2D"):
+        root.set("images2D", libe57.VectorNode(image, True))
+    node, shown = libe57.StructureNode(image), libe57.StructureNode(image)
+    root["images2D"].append(node)
+    if "name" in picture:
+        node.set("name", libe57.StringNode(image, picture["name"]))
+    _set_pose(libe57, image, node, picture)
+    node.set(f"{picture['kind']}Representation", shown)
+    for name, value in picture.get("numbers", {}).items():
+        is_count = name in ("imageWidth", "imageHeight")
+        shown.set(
+            name,
+            libe57.IntegerNode(image, int(value))
+            if is_count
+            else libe57.FloatNode(image, float(value)),
+        )
+    content = picture["content"]
+    blob = libe57.BlobNode(image, len(content))
+    shown.set("jpegImage" if content.startswith(b"\xff\xd8") else "pngImage", blob)
+    blob.write(bytearray(content), 0, len(content))
 
 
 def _set_pose(libe57: Any, image: Any, node: Any, scan: Mapping[str, Any]) -> None:

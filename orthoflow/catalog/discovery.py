@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.metadata import EntryPoint
@@ -21,6 +22,7 @@ from orthoflow.catalog.catalog import (
     ProductEntry,
 )
 from orthoflow.catalog.distributions import DistributionInfo, describe_distribution
+from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import (
@@ -32,7 +34,10 @@ from orthoflow.sdk.hooks import (
     ProductSpec,
 )
 
-NAME_PATTERN: Final = r"[a-z][a-z0-9_-]{0,31}"
+# Windows takes the first ones for devices; addresses and files are named after names.
+NAME_PATTERN: Final = (
+    r"(?!(?:con|prn|aux|nul|com[0-9]|lpt[0-9])(?![a-z0-9_-]))[a-z][a-z0-9_-]{0,31}"
+)
 _METHOD_ID: Final = re.compile(rf"{NAME_PATTERN}\.{NAME_PATTERN}")
 _KIND: Final = re.compile(NAME_PATTERN)
 _TARGET: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -64,7 +69,7 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
     Args:
         entry_points: plugins to look at; None for all installed ones.
     """
-    found = metadata.entry_points(group=ENTRY_POINT_GROUP) if entry_points is None else entry_points
+    found = _installed_entry_points() if entry_points is None else entry_points
     announcements: list[_Announcement] = []
     broken: list[BrokenPlugin] = []
     described = [(entry, describe_distribution(entry)) for entry in found]
@@ -72,7 +77,8 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
         described, key=lambda item: (item[1].name, item[0].name, item[0].value)
     ):
         try:
-            announcements.append(_announce(entry, distribution))
+            with foreign_code(f"plugin {entry.name} of {distribution}"):
+                announcements.append(_announce(entry, distribution))
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001 - foreign code may raise anything, even SystemExit
@@ -81,6 +87,26 @@ def discover_catalog(entry_points: Iterable[EntryPoint] | None = None) -> Catalo
     kinds = _collect_kinds(announcements, frozenset(products))
     methods = _collect_methods(announcements, kinds, frozenset(products))
     return Catalog(methods=methods, kinds=kinds, products=products, broken=tuple(broken))
+
+
+def _installed_entry_points() -> Iterable[EntryPoint]:
+    try:
+        return metadata.entry_points(group=ENTRY_POINT_GROUP)
+    except ValueError:
+        # One unreadable file spoils that for all. A distribution may be found twice; the first
+        # counts, as on import.
+        return _readable_entry_points()
+
+
+def _readable_entry_points() -> tuple[EntryPoint, ...]:
+    found: dict[str, list[EntryPoint]] = {}
+    for distribution in metadata.distributions():
+        try:
+            entries = distribution.entry_points.select(group=ENTRY_POINT_GROUP)
+            found.setdefault(distribution.name, list(entries))
+        except ValueError:
+            continue
+    return tuple(entry for entries in found.values() for entry in entries)
 
 
 def _announce(entry: EntryPoint, distribution: DistributionInfo) -> _Announcement:
@@ -111,8 +137,23 @@ def _specs(answers: Iterable[object], spec_class: type[_Spec]) -> tuple[_Spec, .
         for item in answer:
             if not isinstance(item, spec_class):
                 raise PluginError(f"expected a {spec_class.__name__}, got {item!r}")
+            _check_fields(item)
             specs.append(item)
     return tuple(specs)
+
+
+def _check_fields(spec: MethodSpec | KindSpec | ProductSpec) -> None:
+    """Check the types of a spec's fields, which a dataclass takes as they come."""
+    for item in dataclasses.fields(spec):
+        value: object = getattr(spec, item.name)
+        texts = (*value, *value.values()) if isinstance(value, Mapping) else (value,)
+        is_fine = all(isinstance(text, str) for text in texts)
+        if item.name == "is_source":
+            is_fine = isinstance(value, bool)
+        if item.name in ("inputs", "outputs"):
+            is_fine = is_fine and isinstance(value, Mapping)
+        if not is_fine:
+            raise PluginError(f"{item.name} of a {type(spec).__name__} cannot be {value!r}")
 
 
 def _check_spelling(announcement: _Announcement) -> None:

@@ -40,12 +40,22 @@ def describe_distribution(entry_point: EntryPoint) -> DistributionInfo:
         return DistributionInfo(
             name=entry_point.name, version="0", is_released=False, source_folder=folder
         )
+    name, version = _name_and_version(distribution)
     return DistributionInfo(
-        name=distribution.name,
-        version=distribution.version,
+        name=name or entry_point.name,
+        version=version or "0",
         is_released=_is_released(distribution, code),
         source_folder=folder,
     )
+
+
+def _name_and_version(distribution: Distribution) -> tuple[str, str]:
+    """What the metadata say; nothing where they are missing or cannot be read."""
+    try:
+        stated = distribution.metadata
+    except ValueError:
+        return "", ""
+    return str(stated["Name"] or ""), str(stated["Version"] or "")
 
 
 def _is_released(distribution: Distribution, code: Path | None) -> bool:

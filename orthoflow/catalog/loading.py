@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
+from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import KindSpec, MethodSpec
@@ -35,7 +36,8 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
     """
     module_name, _, name = target.partition(":")
     try:
-        return typing.cast("object", getattr(import_module(module_name), name))
+        with foreign_code(f"{what} of {distribution}"):
+            return typing.cast("object", getattr(import_module(module_name), name))
     except KeyboardInterrupt:
         raise
     except BaseException as error:

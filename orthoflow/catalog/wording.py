@@ -4,6 +4,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Final
+
+from orthoflow.sdk.lines import one_line
+
+_LONGEST: Final = 500
+# Comparing takes some microseconds for each, for every name that is misspelt.
+_MOST_CANDIDATES: Final = 1000
+_LONGEST_NAME: Final = 200
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -12,7 +20,10 @@ def nearest(name: str, known: Iterable[str]) -> str:
     >>> nearest("hugh2d", ["hough2d", "ransac"])
     'hough2d'
     """
-    matches = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.6)
+    candidates = sorted(known)
+    if len(candidates) > _MOST_CANDIDATES or len(name) > _LONGEST_NAME:
+        return ""
+    matches = difflib.get_close_matches(name, candidates, n=1, cutoff=0.6)
     return matches[0] if matches else ""
 
 
@@ -34,5 +45,5 @@ def describe_error(error: BaseException) -> str:
     >>> describe_error(ValueError("no such\n  plane"))
     'ValueError: no such plane'
     """
-    text = " ".join(str(error).split())
+    text = one_line(error, _LONGEST)
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

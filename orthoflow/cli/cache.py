@@ -1,27 +1,31 @@
-"""`orthoflow cache`: list or clean the store of results."""
+"""`orthoflow cache`: list, check or clean the store of results."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from orthoflow.cli.commands import Command, LazyCommand, LazyGroup
-from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import json_option, store_option
-from orthoflow.cli.tables import counted, echo_json, echo_table, size
+from orthoflow.cli.tables import counted, echo, echo_json, echo_table, size
+
+if TYPE_CHECKING:
+    from orthoflow.engine.soundness import Aside
 
 _SUMMARIES: Final = {
     "list": "List the stored results with their size and age.",
     "gc": "Remove what no stored result needs any more.",
+    "verify": "Check every byte of the store, and set aside what is damaged.",
 }
 
 
 cache: Final[click.Command] = LazyGroup(
     name="cache",
-    help="List or clean the store of results.",
+    help="List, check or clean the store of results.",
     lazy={
         name: LazyCommand(target=f"orthoflow.cli.cache:cache_{name}", summary=summary)
         for name, summary in _SUMMARIES.items()
@@ -38,8 +42,10 @@ def cache_list(store: Path, *, as_json: bool) -> int:
     Equal products of several results are stored once, but count for each.
     """
     from orthoflow.engine import Store, list_results
+    from orthoflow.engine.soundness import lying_aside
 
-    results = list_results(Store(store))
+    opened = Store(store)
+    results = list_results(opened)
     if as_json:
         echo_json([asdict(result) for result in results])
         return EXIT_GOOD
@@ -57,7 +63,8 @@ def cache_list(store: Path, *, as_json: bool) -> int:
             for result in results
         ],
     )
-    click.echo(f"{counted(len(results), 'result')} in {store}")
+    echo(f"{counted(len(results), 'result')} in {store}")
+    _say_what_lies_aside(lying_aside(opened))
     return EXIT_GOOD
 
 
@@ -80,9 +87,49 @@ def cache_gc(store: Path, older_than: float | None, *, dry_run: bool, as_json: b
         echo_json({"dry_run": dry_run, **asdict(found)})
         return EXIT_GOOD
     verb = "would remove" if dry_run else "removed"
-    click.echo(
+    echo(
         f"{verb} {counted(found.n_results, 'result')} and "
         f"{counted(found.n_objects, 'object')}, "
         f"{size(found.freed_bytes)}"
     )
     return EXIT_GOOD
+
+
+@click.command("verify", cls=Command)
+@store_option
+@json_option
+def cache_verify(store: Path, *, as_json: bool) -> int:
+    """Check every byte of the stored results, products, published files and figures.
+
+    What is damaged is set aside: the next run that needs it computes it again. Ends with 3 when
+    something was damaged. Runs may use the store meanwhile.
+    """
+    from orthoflow.engine import Store, check_store
+
+    found = check_store(Store(store))
+    code = EXIT_RECORD_DIFFERS if found.damaged else EXIT_GOOD
+    if as_json:
+        echo_json({"store": str(store), "ok": not found.damaged, **asdict(found)})
+        return code
+    for item in found.damaged:
+        echo(f"{item.name}: {item.what}")
+    echo(
+        f"{counted(found.n_results, 'result')} and {counted(found.n_objects, 'object')} in {store} "
+        "are as they were stored"
+    )
+    _say_what_lies_aside(found.aside)
+    if found.damaged:
+        say_error(
+            f"error: {counted(len(found.damaged), 'part')} of {store} were damaged and set aside, "
+            "see above; the next run computes what it needs of them again"
+        )
+    return code
+
+
+def _say_what_lies_aside(aside: Aside) -> None:
+    """Say how much was set aside, if anything was."""
+    if aside.count:
+        echo(
+            f"set aside because damaged: {aside.count}, {size(aside.size_bytes)}; "
+            "`orthoflow cache gc` removes them"
+        )

@@ -10,7 +10,7 @@ import click
 from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option, workflow_arguments
-from orthoflow.cli.tables import counted, echo_json
+from orthoflow.cli.tables import counted, echo, echo_json
 from orthoflow.errors import OrthoflowError
 
 
@@ -24,7 +24,7 @@ def check(workflow: str, sets: Sequence[str], inputs: Sequence[str], *, as_json:
     for as well. Ends with 2 when something is wrong, with 4 when a plugin is missing.
     """
     if not as_json:
-        click.echo(_check(workflow, sets, inputs))
+        echo(_check(workflow, sets, inputs))
         return EXIT_GOOD
     try:
         summary = _check(workflow, sets, inputs)

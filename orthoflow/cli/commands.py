@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Final
 
 import click
+
+from orthoflow.errors import OrthoflowError, RecordError
 
 DEBUG_HELP: Final = "Show tracebacks of errors."
 
@@ -46,6 +49,33 @@ class Command(click.Command):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.params.append(debug_parameter())
+
+
+class RecordCommand(Command):
+    """A command whose arguments are runs: what fails on a damaged record is said to be its fault.
+
+    Reading checks the form of a record, not what one part of it says of another; verifying does.
+    """
+
+    def invoke(self, ctx: click.Context) -> object:
+        """Run the command; where it fails on what a record holds, say what is wrong with that."""
+        try:
+            return super().invoke(ctx)
+        except (OrthoflowError, OSError, click.ClickException, click.Abort, click.exceptions.Exit):
+            raise
+        except Exception as error:
+            from orthoflow.records import verify_run
+
+            for path in self._runs(ctx):
+                if findings := verify_run(path, also_published=False).findings:
+                    raise RecordError(f"{path} is not as it was written: {findings[0]}") from error
+            raise
+
+    def _runs(self, ctx: click.Context) -> Iterator[str | Path]:
+        for item in self.params:
+            if isinstance(item, click.Argument):
+                given = ctx.params[str(item.name)]
+                yield from given if isinstance(given, tuple) else (given,)
 
 
 @dataclass(frozen=True, kw_only=True)

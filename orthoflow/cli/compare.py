@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from orthoflow.cli.commands import Command
+from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option, store_option
-from orthoflow.cli.tables import counted, echo_distances, echo_json, echo_table, number
+from orthoflow.cli.tables import counted, echo, echo_distances, echo_json, echo_table, number
 
 if TYPE_CHECKING:
     from orthoflow.records import (
@@ -30,7 +30,7 @@ Value = TypeVar("Value")
 _NOTHING: Final = "-"
 
 
-@click.command(cls=Command)
+@click.command(cls=RecordCommand)
 @click.argument("first", metavar="A", type=click.Path(path_type=Path))
 @click.argument("second", metavar="B", type=click.Path(path_type=Path))
 @store_option
@@ -86,23 +86,23 @@ def _row_json(row: Pair[Any]) -> dict[str, object]:
 
 def _print(comparison: RunComparison) -> None:
     for mark, record in (("A", comparison.left), ("B", comparison.right)):
-        click.echo(
+        echo(
             f"{mark}: {record.name}, run {record.run_id}, {record.created_by}, {record.started}, "
             f"seed {record.seed}, {counted(len(record.cells), 'cell')}"
         )
     _print_pairs("inputs", comparison.inputs, _files_text)
     if comparison.workflow:
-        click.echo("\nworkflow, A (-) against B (+)")
+        echo("", "workflow, A (-) against B (+)")
         for line in comparison.workflow[2:]:
-            click.echo(line)
+            echo(line)
     else:
-        click.echo("\nworkflow: same text")
+        echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join)
     _print_pairs("cells", comparison.cells, _facts_text)
     _print_pairs("parameters (* set, others are defaults)", comparison.parameters, _parameter_text)
     _print_pairs("environment", comparison.environment, str)
     _print_metrics(comparison.metrics)
-    click.echo("\nproducts")
+    echo("", "products")
     echo_distances(comparison.products)
 
 
@@ -110,9 +110,9 @@ def _print_pairs(title: str, rows: Sequence[Pair[Value]], text: Callable[[Value]
     """Print the rows that differ under a title, or that none does."""
     different = [row for row in rows if not row.is_same]
     if not different:
-        click.echo(f"\n{title}: same")
+        echo("", f"{title}: same")
         return
-    click.echo(f"\n{title}: {len(different)} of {len(rows)} differ")
+    echo("", f"{title}: {len(different)} of {len(rows)} differ")
     echo_table(
         ("", "A", "B"),
         [
@@ -157,7 +157,7 @@ def _print_metrics(rows: Sequence[Pair[ComparedMetric]]) -> None:
     is_measured = [not _side(row).is_cost for row in rows]
     is_different = [_value(row.left) != _value(row.right) for row in rows]
     n_different = sum(a and b for a, b in zip(is_measured, is_different, strict=True))
-    click.echo(f"\nmetrics: {n_different} of {sum(is_measured)} differ, time and memory left aside")
+    echo("", f"metrics: {n_different} of {sum(is_measured)} differ, time and memory left aside")
     echo_table(
         ("metric", "A", "B", "B - A", "unit"),
         [

@@ -11,7 +11,7 @@ from orthoflow.cli.commands import Command
 from orthoflow.cli.diagnosis import Diagnosis, diagnose_libraries, diagnose_machine
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_PLUGIN_MISSING
 from orthoflow.cli.options import json_option, store_option
-from orthoflow.cli.tables import counted, echo_json, echo_table
+from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 
 
 @click.command(cls=Command)
@@ -47,22 +47,22 @@ def doctor(store: Path, *, as_json: bool) -> int:
 
 
 def _print(findings: list[Diagnosis], *, broken_core: bool) -> None:
-    click.echo(f"orthoflow {__version__}\n")
+    echo(f"orthoflow {__version__}", "")
     echo_table(
         ("what", "verdict", "found"),
         [(item.name, item.verdict, item.found) for item in findings],
     )
     costs = [item for item in findings if item.cost]
     if costs:
-        click.echo("\nWhat that costs:")
+        echo("", "What that costs:")
     for item in costs:
-        click.echo(f"- {item.name}: {item.cost}")
+        echo(f"- {item.name}: {item.cost}")
     if broken_core:
-        click.echo("\nsomething that everything needs is missing")
+        echo("", "something that everything needs is missing")
     elif costs:
-        click.echo(f"\northoflow works, with {counted(len(costs), 'restriction')}")
+        echo("", f"orthoflow works, with {counted(len(costs), 'restriction')}")
     else:
-        click.echo("\neverything works")
+        echo("", "everything works")
 
 
 def _diagnose_plugins() -> list[Diagnosis]:

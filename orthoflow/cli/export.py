@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
-from orthoflow.cli.commands import Command
+from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import input_option, store_option
-from orthoflow.cli.tables import counted
+from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import ArgumentError, StoreError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ _SAID: Final = {
 }
 
 
-@click.command(cls=Command)
+@click.command(cls=RecordCommand)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @click.option(
     "--to",
@@ -76,6 +76,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     lacks so far comes from the store and from the input files, looked for by content or given with
     --input.
     """
+    from orthoflow.engine.durability import whole_folder
     from orthoflow.records import open_run
 
     chosen = _Choices(**choices)
@@ -83,21 +84,27 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     opened = open_run(run)
     name = target or "embedded"
     # figures/ has those of the baseline already.
-    folder = output or opened.folder / ("all-figures" if target == "figures" else name)
-    if target == "colmap":
-        said = _export_colmap(opened, folder, chosen.cell)
-    elif target == "csv":
-        said = _export_csv(opened, folder)
-    elif target == "figures":
-        said = _export_figures(opened, folder, chosen.cell)
-    elif target == "laz":
-        said = _export_laz(opened, folder, chosen)
-    elif target == "ro-crate":
-        said = _export_crate(opened, folder, chosen)
-    else:
-        said = _export_embedded(opened, folder, chosen)
-    click.echo(f"{name}: {folder}: {said}")
+    folder = output or _folder_inside(opened, "all-figures" if target == "figures" else name)
+    _refuse_filled(folder)
+    with whole_folder(folder) as aside:
+        said = _exported(target, opened, aside, chosen)
+    echo(f"{name}: {folder}: {said}")
     return EXIT_GOOD
+
+
+def _exported(target: str | None, run: Run, folder: Path, chosen: _Choices) -> str:
+    """Write a format into a folder and say what was written."""
+    if target == "colmap":
+        return _export_colmap(run, folder, chosen.cell)
+    if target == "csv":
+        return _export_csv(run, folder)
+    if target == "figures":
+        return _export_figures(run, folder, chosen.cell)
+    if target == "laz":
+        return _export_laz(run, folder, chosen)
+    if target == "ro-crate":
+        return _export_crate(run, folder, chosen)
+    return _export_embedded(run, folder, chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,9 +156,12 @@ def _export_csv(run: Run, folder: Path) -> str:
 
 
 def _export_figures(run: Run, folder: Path, cell: str | None) -> str:
+    from orthoflow.records import figure_files
     from orthoflow.report import write_figures
 
     addresses = run.cells if cell is None else (run.cell(cell).address,)
+    # Refused before a folder is made for them.
+    figure_files(run, addresses)
     _make_empty(folder)
     return f"{counted(write_figures(run, folder, addresses), 'figure')} and the graph"
 
@@ -188,6 +198,7 @@ def _embedded(run: Run, folder: Path, chosen: _Choices) -> Run:
 def _export_laz(run: Run, folder: Path, chosen: _Choices) -> str:
     from orthoflow.files.points.plane_clouds import write_plane_cloud
     from orthoflow.products import PointCloud, PointLabels
+    from orthoflow.records.run_files import path_inside
 
     address, port = _output_of(run, "labels", chosen.cell)
     recorded = run.cell(address)
@@ -198,8 +209,8 @@ def _export_laz(run: Run, folder: Path, chosen: _Choices) -> str:
         )
     cloud = _product(run, clouds[0], PointCloud, chosen.store)
     labels = _product(run, recorded.outputs[port].digest, PointLabels, chosen.store)
+    path = path_inside(folder, f"{recorded.step}.laz")
     _make_empty(folder)
-    path = folder / f"{recorded.step}.laz"
     write_plane_cloud(path, cloud, labels)
     n_planes = int(labels.plane_index.max(initial=-1)) + 1
     return (
@@ -246,11 +257,22 @@ def _output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
     return last, found[last]
 
 
-def _make_empty(folder: Path) -> None:
+def _folder_inside(run: Run, name: str) -> Path:
+    """A folder of the run that nobody named; a link there would lead to where nobody wants it."""
+    folder = run.folder / name
+    if folder.is_symlink():
+        raise ArgumentError(f"{folder} is a link: choose a folder with -o, or remove it")
+    return folder
+
+
+def _refuse_filled(folder: Path) -> None:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ArgumentError(
             f"{folder} exists already and is not empty: choose another folder with -o, or remove it"
         )
+
+
+def _make_empty(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -10,7 +10,7 @@ from typing import Final
 import click
 
 from orthoflow.cli.commands import Session
-from orthoflow.cli.tables import counted
+from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import OrthoflowError
 
 EXIT_GOOD: Final = 0
@@ -27,21 +27,34 @@ def explain(error: Exception, session: Session) -> int:
     Returns:
         The exit code of the process.
     """
+    from orthoflow.engine.memory import is_for_want_of_memory
+    from orthoflow.sdk.lines import one_line
+
     if session.debug:
         import traceback
 
-        traceback.print_exception(error)
+        say_error(*"".join(traceback.format_exception(error)).rstrip("\n").split("\n"))
     if isinstance(error, click.Abort | KeyboardInterrupt):
         say_error(session.resume_hint or "interrupted")
         return EXIT_INTERRUPTED
     if isinstance(error, OrthoflowError):
         interrupted = error.exit_code == EXIT_INTERRUPTED
-        say_error((session.resume_hint if interrupted else "") or _sentence(error))
+        hint = session.resume_hint if interrupted else ""
+        say_error(*([hint] if hint else _sentences(error)))
         return error.exit_code
+    if is_for_want_of_memory(error):
+        say_error("error: not enough memory to go on; free some, or raise the limit on memory")
+        return EXIT_CELL_FAILED
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename}: " if error.filename else ""
         say_error(f"error: {where}{error.strerror.lower()}")
         return EXIT_CELL_FAILED
+    if isinstance(error, ImportError):
+        say_error(
+            f"error: a library fails to import: {one_line(error)}; `orthoflow doctor` says what is "
+            f"missing"
+        )
+        return EXIT_PLUGIN_MISSING
     say_error(
         f"error: orthoflow itself failed ({type(error).__name__}: {_first_line(str(error))}); "
         "repeat the command with --debug and report what it prints"
@@ -49,12 +62,12 @@ def explain(error: Exception, session: Session) -> int:
     return EXIT_CELL_FAILED
 
 
-def _sentence(error: OrthoflowError) -> str:
+def _sentences(error: OrthoflowError) -> list[str]:
     n_problems = len(getattr(error, "problems", ()))
     if not n_problems:
-        return f"error: {error_text(error)}"
+        return [f"error: {error_text(error)}"]
     # Lines that begin with file:line:column, as editors and other tools expect them.
-    return f"{error}\nerror: {counted(n_problems, 'problem')}"
+    return [*str(error).split("\n"), f"error: {counted(n_problems, 'problem')}"]
 
 
 def error_text(error: Exception) -> str:
@@ -62,10 +75,10 @@ def error_text(error: Exception) -> str:
     return str(error) or type(error).__name__
 
 
-def say_error(text: str) -> None:
-    """Write to standard error; a closed one is no reason to fail."""
+def say_error(*lines: str) -> None:
+    """Write lines to standard error; a closed one is no reason to fail."""
     with contextlib.suppress(BrokenPipeError):
-        click.echo(text, err=True)
+        echo(*lines, err=True)
 
 
 def silence_stdout() -> None:

@@ -9,6 +9,7 @@ import click
 from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import workflow_arguments
+from orthoflow.cli.tables import echo
 
 
 @click.command(cls=Command)
@@ -21,5 +22,5 @@ def graph(workflow: str, sets: Sequence[str], inputs: Sequence[str]) -> int:
 
     catalog = discover_catalog()
     loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
-    click.echo(mermaid(loaded, catalog).rstrip("\n"))
+    echo(*mermaid(loaded, catalog).rstrip("\n").split("\n"))
     return EXIT_GOOD

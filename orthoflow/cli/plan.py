@@ -16,7 +16,7 @@ from orthoflow.cli.options import (
     store_option,
     workflow_arguments,
 )
-from orthoflow.cli.tables import counted, echo_json, echo_table
+from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 
 if TYPE_CHECKING:
     from orthoflow.engine import PlannedCell
@@ -56,7 +56,7 @@ def plan(
         ("cell", "method", "status", "reason"),
         [(item.cell.address, item.cell.method, item.status, item.reason) for item in planned],
     )
-    click.echo(f"\n{_summary(planned)}")
+    echo("", _summary(planned))
     return EXIT_GOOD
 
 

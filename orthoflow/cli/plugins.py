@@ -15,7 +15,7 @@ from orthoflow.catalog import Catalog, DistributionInfo, MethodEntry, discover_c
 from orthoflow.cli.commands import Command, LazyCommand, LazyGroup
 from orthoflow.cli.failures import EXIT_CELL_FAILED, EXIT_GOOD, EXIT_PLUGIN_MISSING
 from orthoflow.cli.options import json_option
-from orthoflow.cli.tables import counted, echo_json, echo_table
+from orthoflow.cli.tables import counted, echo, echo_json, echo_table
 from orthoflow.errors import PluginError
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def plugins_list(*, as_json: bool) -> int:
             for entry in catalog.methods.values()
         ],
     )
-    click.echo()
+    echo()
     echo_table(
         ("kind", "takes", "gives", "distribution", "summary"),
         [
@@ -88,7 +88,7 @@ def plugins_list(*, as_json: bool) -> int:
             for name, kind in catalog.kinds.items()
         ],
     )
-    click.echo()
+    echo()
     echo_table(
         ("product", "distribution", "summary"),
         [
@@ -103,11 +103,11 @@ def plugins_list(*, as_json: bool) -> int:
         *(str(broken) for broken in catalog.broken),
     ]
     if problems:
-        click.echo("\nwhat is wrong:")
+        echo("", "what is wrong:")
     for problem in problems:
-        click.echo(f"- {problem}")
+        echo(f"- {problem}")
     for broken in catalog.broken:
-        click.echo(f"`orthoflow plugins show {broken.entry_point}` prints its traceback")
+        echo(f"`orthoflow plugins show {broken.entry_point}` prints its traceback")
     return EXIT_GOOD
 
 
@@ -270,25 +270,25 @@ def _print_failure(failure: _Failure, *, as_json: bool) -> None:
             }
         )
         return
-    click.echo(f"{failure.problem}\n")
-    click.echo(f"distribution  {failure.distribution}")
-    click.echo("state         broken")
-    click.echo(f"from          {failure.target}")
+    echo(failure.problem, "")
+    echo(f"distribution  {failure.distribution}")
+    echo("state         broken")
+    echo(f"from          {failure.target}")
     if failure.traceback:
-        click.echo(f"\n{failure.traceback.rstrip()}")
+        echo("", *failure.traceback.rstrip().split("\n"))
 
 
 def _print_method(entry: MethodEntry, method: type[Method]) -> None:
-    click.echo(f"{entry.spec.id}: {entry.spec.summary}\n")
+    echo(f"{entry.spec.id}: {entry.spec.summary}", "")
     if text := _docstring(method):
-        click.echo(f"{text}\n")
-    click.echo(f"distribution  {entry.distribution.name} {entry.distribution.version}")
-    click.echo(f"state         {entry.state}")
-    click.echo(f"class         {entry.spec.target}")
-    click.echo(f"determinism   {method.determinism}, result version {method.result_version}")
+        echo(*text.split("\n"), "")
+    echo(f"distribution  {entry.distribution.name} {entry.distribution.version}")
+    echo(f"state         {entry.state}")
+    echo(f"class         {entry.spec.target}")
+    echo(f"determinism   {method.determinism}, result version {method.result_version}")
     for citation in method.citations:
-        click.echo(f"citation      {citation}")
-    click.echo()
+        echo(f"citation      {citation}")
+    echo()
     ports = [
         *(
             ("in", port, type_name, "" if required else "optional")
@@ -298,7 +298,7 @@ def _print_method(entry: MethodEntry, method: type[Method]) -> None:
     ]
     echo_table(("port", "name", "product", ""), ports)
     parameters = _parameters(method.Params)
-    click.echo("" if parameters else "\nno parameters")
+    echo(*([""] if parameters else ["", "no parameters"]))
     echo_table(
         ("parameter", "type", "default", "unit", "description"),
         [
@@ -393,10 +393,11 @@ def plugins_new(name: str, *, as_json: bool, folder: Path, **said: str) -> int:
         echo_json({"method": project.method_id, "files": [str(path) for path in written]})
         return EXIT_GOOD
     for path in written:
-        click.echo(f"wrote {path}")
-    click.echo(
-        f"\nnext: cd {name}, python -m pip install -e '.[test]', python -m pytest; "
-        f"then write {project.package}/method.py"
+        echo(f"wrote {path}")
+    echo(
+        "",
+        f"next: cd {name}, python -m pip install -e '.[test]', python -m pytest; "
+        f"then write {project.package}/method.py",
     )
     return EXIT_GOOD
 
@@ -424,11 +425,11 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None) -> int:
             {"check": case.check.name, "state": state, "rule": case.check.rule, "problem": problem}
         )
         if not as_json:
-            click.echo(f"{state:7} {case.check.name}: {problem or case.check.rule}")
+            echo(f"{state:7} {case.check.name}: {problem or case.check.rule}")
     n_broken = sum(result["state"] == "broken" for result in results)
     if as_json:
         echo_json({"method": method_id, "checks": results})
     else:
         kept = f"{method_id} keeps {counted(len(results) - n_broken, 'rule')}"
-        click.echo(f"\n{kept}, breaks {n_broken}" if n_broken else f"\n{kept}")
+        echo("", f"{kept}, breaks {n_broken}" if n_broken else kept)
     return EXIT_CELL_FAILED if n_broken else EXIT_GOOD

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import io
+import os
 import sys
+import threading
 from typing import Any, Final, NoReturn
 
 import click
 
 from orthoflow import __version__
 from orthoflow.cli.commands import LazyCommand, LazyGroup, Session, debug_parameter
-from orthoflow.cli.failures import explain, silence_stdout
+from orthoflow.cli.failures import explain, say_error, silence_stdout
+from orthoflow.cli.tables import echo
 
 _SUMMARIES: Final = {
     "check": "Say everything that is wrong with a workflow file.",
@@ -21,11 +26,12 @@ _SUMMARIES: Final = {
     "compare": "Lay two runs side by side: what differs, and how far.",
     "report": "Write the HTML report of one or more runs.",
     "verify": "Check that a record is whole and unchanged.",
+    "sign": "Sign a record with your key, for those who verify it.",
     "replay": "Make a run again from its record and say what came out differently.",
     "export": "Write a run's results for other programs.",
     "plugins": "List, show and check methods, and write a plugin of your own.",
     "schema": "Print the JSON Schema of workflow files.",
-    "cache": "List or clean the store of results.",
+    "cache": "List, check or clean the store of results.",
     "doctor": "Say what is installed, what is missing, and what that costs.",
 }
 
@@ -55,7 +61,9 @@ class Program(LazyGroup):
             silence_stdout()
             code = 0
         except click.ClickException as error:
-            error.show()
+            said = io.StringIO()
+            error.show(said)
+            say_error(*said.getvalue().rstrip("\n").split("\n"))
             code = error.exit_code
         except Exception as error:  # noqa: BLE001 - the last stop before the user
             code = explain(error, session)
@@ -73,7 +81,7 @@ class Program(LazyGroup):
 
 def _print_version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:  # noqa: FBT001
     if value:
-        click.echo(f"orthoflow {__version__}")
+        echo(f"orthoflow {__version__}")
         ctx.exit()
 
 
@@ -103,4 +111,19 @@ def main() -> NoReturn:
     """Run the `orthoflow` command."""
     # Loading makes much that stays and little garbage: looking for it took a tenth of a `plan`.
     gc.set_threshold(50_000, *gc.get_threshold()[1:])
-    program.main(prog_name="orthoflow")
+    try:
+        program.main(prog_name="orthoflow")
+    except SystemExit as end:
+        _leave_foreign_threads(end.code)
+        raise
+
+
+def _leave_foreign_threads(code: object) -> None:
+    """Leave at once where a plugin left threads behind, for which Python would wait for ever."""
+    main_thread = threading.main_thread()
+    if all(thread.daemon or thread is main_thread for thread in threading.enumerate()):
+        return
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code if isinstance(code, int) else 0)

@@ -21,6 +21,7 @@ from orthoflow.engine.events import (
     RunEvent,
     RunStarted,
 )
+from orthoflow.foreign_text import shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -146,14 +147,13 @@ class LiveProgress:
         """Change the table; what must stay readable is printed above it."""
         match event:
             case RunStarted():
-                self._live.console.print(start_text(event), markup=False, highlight=False)
+                self._print(start_text(event))
             case CellStarted():
                 self._change(event.address, ProgressRow(state="running", started=time.monotonic()))
             case CellProgress():
                 self._advance(event)
             case CellWarned():
-                text = f"{event.address}: warning: {event.text}"
-                self._live.console.print(text, style="yellow", markup=False, highlight=False)
+                self._print(f"{event.address}: warning: {event.text}", style="yellow")
             case CellFinished():
                 result = event.result
                 self._change(
@@ -166,6 +166,9 @@ class LiveProgress:
                 )
             case _:
                 return
+
+    def _print(self, text: str, style: str | None = None) -> None:
+        self._live.console.print(shown(text), style=style, markup=False, highlight=False)
 
     def _advance(self, event: CellProgress) -> None:
         with self._lock:
@@ -186,18 +189,18 @@ class LiveProgress:
             table.add_column(title, no_wrap=True, overflow="ellipsis")
         with self._lock:
             rows = dict(self._rows)
-        shown = visible_rows(rows, self._console.height - 3)
-        for address, row in shown.items():
+        visible = visible_rows(rows, self._console.height - 3)
+        for address, row in visible.items():
             running = row.state == "running"
             state = f"{100 * row.fraction:3.0f} %" if running else row.state
             seconds = time.monotonic() - row.started if running else row.wall_s
             table.add_row(
-                Text(address),
+                Text(shown(address)),
                 Text(state, style=_STYLES.get(row.state, "dim")),
                 Text(duration(seconds) if seconds else ""),
-                Text(row.text),
+                Text(shown(row.text)),
             )
-        if len(shown) < len(rows):
+        if len(visible) < len(rows):
             n_ended = sum(row.state not in ("waiting", "running") for row in rows.values())
             table.add_row(Text(f"{n_ended} of {len(rows)} ended", style="dim"))
         return table

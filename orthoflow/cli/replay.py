@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from orthoflow.cli.commands import Command, current_session
+from orthoflow.cli.commands import RecordCommand, current_session
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import (
     DEFAULT_STORE,
@@ -21,16 +21,16 @@ from orthoflow.cli.options import (
     json_option,
     output_option,
 )
-from orthoflow.cli.tables import echo_distances, echo_json
+from orthoflow.cli.tables import echo, echo_distances, echo_json
 from orthoflow.errors import CancelledStepError
 
 if TYPE_CHECKING:
-    from orthoflow.engine import Store
+    from orthoflow.engine import RunOutcome, Store
     from orthoflow.records import ProductDistance, Run
     from orthoflow.records.replaying import Replay
 
 
-@click.command(cls=Command)
+@click.command(cls=RecordCommand)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @input_option
 @output_option("<name>-replay-<run id>")
@@ -62,7 +62,7 @@ def replay(
     """
     from orthoflow.catalog import discover_catalog
     from orthoflow.engine import RunOptions, Store
-    from orthoflow.engine.run_folder import new_run_id
+    from orthoflow.engine.run_folder import new_run_folder, new_run_id
     from orthoflow.records import open_run
     from orthoflow.records.input_files import embedded_inputs
     from orthoflow.records.replaying import plan_replay
@@ -70,7 +70,7 @@ def replay(
     options = RunOptions(jobs=jobs, executor=executor)
     original = open_run(run)
     run_id = new_run_id()
-    folder = output or Path("runs") / f"{original.record.name}-replay-{run_id}"
+    folder = output or new_run_folder(f"{original.record.name}-replay", run_id)
     with (
         _store_folder(store, folder) as store_folder,
         embedded_inputs(original, folder.parent) as extracted,
@@ -129,7 +129,7 @@ class _Call:
             f"-o {self.folder} goes on from there"
         )
         for note in self.replay.notes:
-            click.echo(f"note: {note}", err=self.as_json)
+            echo(f"note: {note}", err=self.as_json)
         made = self._make()
         distances = self._distances(made)
         differs = any(item.verdict == "different" for item in distances)
@@ -143,9 +143,9 @@ class _Call:
         if self.as_json:
             echo_json(content)
         else:
-            click.echo()
+            echo()
             echo_distances(distances)
-            click.echo(f"record of the replay: {made.path}")
+            echo(f"record of the replay: {made.path}")
         if differs:
             say_error(f"error: the replay of {self.original.path} differs, see above")
         return EXIT_RECORD_DIFFERS if differs else EXIT_GOOD
@@ -153,21 +153,27 @@ class _Call:
     def _make(self) -> Run:
         from orthoflow.cli.progress import make_progress
         from orthoflow.engine import execute
-        from orthoflow.records import REPORT_FILE, write_run
+        from orthoflow.records import REPORT_FILE, executed_and_written, write_run
         from orthoflow.report import write_report
 
         plan = self.replay.plan
-        with make_progress(tuple(item.cell.address for item in plan.cells)) as progress:
-            outcome = execute(plan, self.folder, self.store, progress.tell, run_id=self.run_id)
-        return write_run(
-            outcome,
-            plan,
-            self.replay.workflow,
-            self.folder,
-            self.store,
-            embed=self.replay.is_embedded,
-            before_finish=lambda run: write_report([run], self.folder / REPORT_FILE),
-        )
+
+        def run() -> RunOutcome:
+            with make_progress(tuple(item.cell.address for item in plan.cells)) as progress:
+                return execute(plan, self.folder, self.store, progress.tell, run_id=self.run_id)
+
+        def write(outcome: RunOutcome) -> Run:
+            return write_run(
+                outcome,
+                plan,
+                self.replay.workflow,
+                self.folder,
+                self.store,
+                embed=self.replay.is_embedded,
+                before_finish=lambda made: write_report([made], self.folder / REPORT_FILE),
+            )
+
+        return executed_and_written(run, write).run
 
     def _distances(self, made: Run) -> tuple[ProductDistance, ...]:
         from orthoflow.catalog import discover_catalog

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
-from orthoflow.cli.commands import Command
+from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.tables import echo
 from orthoflow.errors import ArgumentError
 
 
-@click.command(cls=Command)
+@click.command(cls=RecordCommand)
 @click.argument("runs", metavar="RUN [RUN ...]", nargs=-1, required=True, type=click.Path())
 @click.option(
     "-o",
@@ -41,5 +42,5 @@ def report(runs: tuple[str, ...], output: Path | None) -> int:
         write_page(opened[0], target)
     else:
         write_report(opened, target)
-    click.echo(f"report: {target}")
+    echo(f"report: {target}")
     return EXIT_GOOD

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +18,11 @@ from orthoflow.cli.options import (
     store_option,
     workflow_arguments,
 )
-from orthoflow.cli.tables import counted, duration, echo_table
+from orthoflow.cli.tables import counted, duration, echo, echo_table
 
 if TYPE_CHECKING:
     from orthoflow.engine import RunOutcome, RunPlan, Store
-    from orthoflow.records import RecordedCell, Run
+    from orthoflow.records import RecordedCell, Run, WrittenRun
     from orthoflow.workflow import Workflow
 
 
@@ -81,34 +81,37 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report and say what came out."""
-        from orthoflow.engine.run_folder import new_run_id
-        from orthoflow.records import REPORT_FILE, write_run
+        from orthoflow.engine.run_folder import new_run_folder, new_run_id
+        from orthoflow.records import REPORT_FILE, executed_and_written, write_run
         from orthoflow.report import write_page
 
         run_id = new_run_id()
-        folder = self.folder or Path("runs") / f"{self.workflow.name}-{run_id}"
+        folder = self.folder or new_run_folder(self.workflow.name, run_id)
         current_session().resume_hint = (
             "interrupted; what is finished is kept, and the same command with "
             f"-o {folder} goes on from there"
         )
-        outcome = self._execute(folder, run_id)
         report = folder / REPORT_FILE
-        finished = write_run(
-            outcome,
-            self.plan,
-            self.workflow,
-            folder,
-            self.store,
-            embed=self.embed,
-            before_finish=lambda run: write_page(run, report),
-        )
-        _print_failures(finished.record.cells)
+
+        def write(outcome: RunOutcome) -> Run:
+            return write_run(
+                outcome,
+                self.plan,
+                self.workflow,
+                folder,
+                self.store,
+                embed=self.embed,
+                before_finish=lambda run: write_page(run, report),
+            )
+
+        made = executed_and_written(lambda: self._execute(folder, run_id), write)
+        _print_failures(made.run.record.cells)
         try:
-            _print_summary(finished, report)
+            _print_summary(made, report)
         except BrokenPipeError:
             # Nobody reads the summary any more; the exit code still says how the run went.
             silence_stdout()
-        return outcome.exit_code
+        return made.outcome.exit_code
 
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:
         from orthoflow.cli.progress import make_progress
@@ -126,25 +129,27 @@ def _print_failures(cells: Iterable[RecordedCell]) -> None:
             say_error(f"{cell.address} failed: {cell.error_message}")
 
 
-def _print_summary(run: Run, report: Path) -> None:
+def _print_summary(made: WrittenRun, report: Path) -> None:
     """Write the table of cells, the warnings, and last the report, the record and the images."""
-    cells = run.record.cells
-    click.echo()
+    run, cells = made.run, made.run.record.cells
+    echo()
     echo_table(
         ("cell", "method", "status", "time", "remark"),
         [(cell.address, cell.method, _status(cell), _time(cell), _remark(cell)) for cell in cells],
     )
     warnings = [f"warning, {cell.address}: {text}" for cell in cells for text in cell.warnings]
     if warnings:
-        click.echo()
+        echo()
     for warning in warnings:
-        click.echo(warning)
-    click.echo(f"\n{_cached_text(cells)}")
-    click.echo(f"products: {run.products_folder}")
-    click.echo(f"report: {report}")
-    click.echo(f"record: {run.path}")
+        echo(warning)
+    echo("", _cached_text(cells))
+    if made.outcome.damaged:
+        echo(_damaged_text(made.outcome.damaged))
+    echo(f"products: {run.products_folder}")
+    echo(f"report: {report}")
+    echo(f"record: {run.path}")
     for image in run.orthoimages:
-        click.echo(f"orthoimage: {image}")
+        echo(f"orthoimage: {image}")
 
 
 def _cached_text(cells: Iterable[RecordedCell]) -> str:
@@ -159,6 +164,14 @@ def _cached_text(cells: Iterable[RecordedCell]) -> str:
             else ("the only step was cached")
         )
     return f"{n_cached} of {counted(n_cells, 'step')} cached"
+
+
+def _damaged_text(damaged: Mapping[str, str]) -> str:
+    """Say which cells' results were damaged in the store."""
+    were = "were" if len(damaged) > 1 else "was"
+    named = ", ".join(f"{address} ({what})" for address, what in damaged.items())
+    count = counted(len(damaged), "result")
+    return f"{count} of the store {were} damaged and computed again: {named}"
 
 
 def _status(cell: RecordedCell) -> str:

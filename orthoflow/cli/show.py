@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.cli.commands import Command
+from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.diagnosis import LIBRARIES
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option
-from orthoflow.cli.tables import counted, duration, echo_json, echo_table, number, size
+from orthoflow.cli.tables import counted, duration, echo, echo_json, echo_table, number, size
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell, Run
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 
 
-@click.command(cls=Command)
+@click.command(cls=RecordCommand)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @json_option
 def show(run: Path, *, as_json: bool) -> int:
@@ -41,15 +41,15 @@ def show(run: Path, *, as_json: bool) -> int:
 
 def _print_head(run: Run) -> None:
     record = run.record
-    click.echo(f"{record.name}, run {record.run_id}: {_status_text(run)}")
-    click.echo(f"{record.started} to {record.ended}, {record.created_by}, seed {record.seed}")
+    echo(f"{record.name}, run {record.run_id}: {_status_text(run)}")
+    echo(f"{record.started} to {record.ended}, {record.created_by}, seed {record.seed}")
     if record.overrides:
-        click.echo(f"overrides: {' '.join(record.overrides)}")
+        echo(f"overrides: {' '.join(record.overrides)}")
     for entry in record.inputs:
         if not entry.files:
-            click.echo(f"input {entry.name}: not given")
+            echo(f"input {entry.name}: not given")
         for file in entry.files:
-            click.echo(
+            echo(
                 f"input {entry.name}: {file.name}, {size(file.size_bytes)}, "
                 f"sha256 {file.sha256[:12]}{', in the record' if entry.embedded else ''}"
             )
@@ -65,7 +65,7 @@ def _status_text(run: Run) -> str:
 
 
 def _print_cells(run: Run) -> None:
-    click.echo()
+    echo()
     echo_table(
         ("cell", "method", "status", "time", "memory"),
         [
@@ -81,10 +81,10 @@ def _print_cells(run: Run) -> None:
     )
     for cell in run.record.cells:
         if cell.error_message:
-            click.echo(f"{cell.address} {cell.status}: {cell.error_message}")
+            echo(f"{cell.address} {cell.status}: {cell.error_message}")
     for cell in run.record.cells:
         for warning in cell.warnings:
-            click.echo(f"warning, {cell.address}: {warning}")
+            echo(f"warning, {cell.address}: {warning}")
 
 
 def _cell_status(cell: RecordedCell) -> str:
@@ -98,7 +98,7 @@ def _print_metrics(run: Run) -> None:
         for metric in cell.metrics
     ]
     if rows:
-        click.echo()
+        echo()
         echo_table(("cell", "metric", "value", "unit"), rows)
 
 
@@ -106,21 +106,22 @@ def _print_environments(run: Run) -> None:
     for environment in run.record.environments:
         commit = f", commit {environment.git_commit}" if environment.git_commit else ""
         packages = environment.packages
-        click.echo(
-            f"\nenvironment: Python {environment.python}, {environment.os}, {environment.cpu}, "
+        echo(
+            "",
+            f"environment: Python {environment.python}, {environment.os}, {environment.cpu}, "
             f"{counted(environment.cores, 'core')}, {counted(environment.threads, 'thread')}"
-            f"{commit}"
+            f"{commit}",
         )
         used = [name for name in packages if name.lower() in _OWN_LIBRARIES]
         others = f" and {len(packages) - len(used)} others (--json names them)"
-        click.echo(", ".join(f"{name} {packages[name]}" for name in used) + others)
+        echo(", ".join(f"{name} {packages[name]}" for name in used) + others)
 
 
 def _print_files(run: Run) -> None:
     n_files = sum(len(files) for files in run.files.values())
-    click.echo(f"\nproducts: {run.products_folder}, {counted(n_files, 'file')}")
+    echo("", f"products: {run.products_folder}, {counted(n_files, 'file')}")
     for image in run.orthoimages:
-        click.echo(f"orthoimage: {image}")
+        echo(f"orthoimage: {image}")
 
 
 def _as_json(run: Run) -> dict[str, object]:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from orthoflow.foreign_text import shown, shown_json
+
 if TYPE_CHECKING:
     from orthoflow.records import Distance, ProductDistance
 
@@ -16,11 +18,20 @@ _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured"
 _UNITS: Final = {"grey": " grey levels", "1": ""}
 
 
+def echo(*lines: str, err: bool = False) -> None:
+    """Print lines, on standard error if asked to; what a terminal would obey is written out.
+
+    All that a command says goes through here: names, messages and logs come from strangers.
+    """
+    for line in lines or ("",):
+        click.echo(shown(line), err=err)  # noqa: TID251 - the one place
+
+
 def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under a header, columns aligned; nothing when there are no rows."""
     if rows:
         for line in table_lines(header, rows):
-            click.echo(line)
+            echo(line)
 
 
 def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -29,16 +40,19 @@ def table_lines(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[st
     >>> table_lines(("cell", "time"), [("cloud", "1.0 s")])
     ['cell   time', 'cloud  1.0 s']
     """
-    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+    # Escaped first: what is written out is longer.
+    laid = [[shown(text) for text in row] for row in (header, *rows)]
+    widths = [max(len(row[i]) for row in laid) for i in range(len(header))]
     return [
         "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        for row in (header, *rows)
+        for row in laid
     ]
 
 
 def echo_json(value: object) -> None:
     """Print a value as JSON, readable and stable."""
-    click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+    text = shown_json(json.dumps(value, indent=2, ensure_ascii=False))
+    click.echo(text)  # noqa: TID251 - what could be obeyed is written as JSON has it
 
 
 def echo_distances(distances: Sequence[ProductDistance]) -> None:
@@ -57,8 +71,8 @@ def echo_distances(distances: Sequence[ProductDistance]) -> None:
     )
     for item in distances:
         if item.reason:
-            click.echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
-    click.echo(verdict_counts(distances))
+            echo(f"{item.cell}.{item.port} {item.verdict}: {item.reason}")
+    echo(verdict_counts(distances))
 
 
 def verdict_counts(distances: Sequence[ProductDistance]) -> str:

@@ -10,7 +10,7 @@ import click
 from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_RECORD_DIFFERS, say_error
 from orthoflow.cli.options import json_option
-from orthoflow.cli.tables import counted, echo_json
+from orthoflow.cli.tables import counted, echo, echo_json
 
 if TYPE_CHECKING:
     from orthoflow.records import Verification
@@ -18,17 +18,24 @@ if TYPE_CHECKING:
 
 @click.command(cls=Command)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.option(
+    "--signer",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="The public key, OpenSSH or PEM, that the record must be signed with.",
+)
 @json_option
-def verify(run: Path, *, as_json: bool) -> int:
+def verify(run: Path, signer: Path | None, *, as_json: bool) -> int:
     """Check that the record of RUN, a run folder or its run.h5, is whole and unchanged.
 
     Recomputes the seal, the digest of every product and input file in the record, every cache
     key and the digest of the workflow, and compares the published files beside the record with
-    theirs; one that is not there is noted. Ends with 3 when something differs.
+    theirs; one that is not there is noted. With --signer the record must be signed with that key.
+    Ends with 3 when something differs.
     """
     from orthoflow.records import verify_run
 
-    verification = verify_run(run)
+    verification = verify_run(run, signer=signer)
     findings = verification.findings
     if as_json:
         echo_json(
@@ -38,18 +45,19 @@ def verify(run: Path, *, as_json: bool) -> int:
                 "products": verification.n_products,
                 "inputs": verification.n_inputs,
                 "published": verification.n_published,
+                "signed_with": verification.signed_with,
                 "findings": list(findings),
                 "notes": list(verification.notes),
             }
         )
         return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
     for note in verification.notes:
-        click.echo(f"note: {note}")
+        echo(f"note: {note}")
     if not findings:
-        click.echo(_summary(verification))
+        echo(_summary(verification))
     else:
         for finding in findings:
-            click.echo(finding)
+            echo(finding)
         say_error(f"error: {verification.path} is not as it was written, see above")
     return EXIT_RECORD_DIFFERS if findings else EXIT_GOOD
 
@@ -61,4 +69,6 @@ def _summary(verification: Verification) -> str:
     parts.append("seal ok")
     if verification.n_published:
         parts.append(f"{counted(verification.n_published, 'published file')} unchanged")
+    if verification.signed_with:
+        parts.append(f"signed with {verification.signed_with}")
     return f"verified: {', '.join(parts)}"

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from orthoflow.engine.plan import PlannedCell, PlannedInput, RunOptions, RunPlan, plan_run
     from orthoflow.engine.results import CellResult, ProductRef
     from orthoflow.engine.scheduling import RunOutcome, execute
+    from orthoflow.engine.soundness import Soundness, check_store
     from orthoflow.engine.store import Store, StoredResult, list_results
 
 __all__ = [
@@ -39,8 +40,10 @@ __all__ = [
     "RunOutcome",
     "RunPlan",
     "RunStarted",
+    "Soundness",
     "Store",
     "StoredResult",
+    "check_store",
     "collect_garbage",
     "execute",
     "list_results",
@@ -66,8 +69,10 @@ _HOMES = {
     "RunOutcome": "scheduling",
     "RunPlan": "plan",
     "RunStarted": "events",
+    "Soundness": "soundness",
     "Store": "store",
     "StoredResult": "store",
+    "check_store": "soundness",
     "collect_garbage": "garbage",
     "execute": "scheduling",
     "list_results": "store",

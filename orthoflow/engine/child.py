@@ -5,7 +5,6 @@ Light imports on top: it must tie its life to the coordinator's before anything 
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import json
 import os
@@ -18,12 +17,14 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Final
 
+from orthoflow.engine.keeper import fork_kept
+from orthoflow.foreign_text import shown
+
 if TYPE_CHECKING:
     from orthoflow.engine.results import CellResult
     from orthoflow.engine.tasks import Task
     from orthoflow.sdk.context import StepEvent
 
-_PR_SET_PDEATHSIG: Final = 1
 _OOM_SCORE: Final = "900"
 _PROGRESS_EVERY_S: Final = 0.1
 
@@ -44,7 +45,9 @@ class ProgressPipe:
                 return
             self._last = time.monotonic()
         else:
-            sys.stderr.write(f"{event.text}\n")
+            # The method may have closed it, or put something else into its place.
+            with suppress(AttributeError, OSError, ValueError):
+                sys.stderr.write(shown(event.text, keep="\n") + "\n")
         self.send({"kind": event.kind, "text": event.text, "fraction": event.fraction})
 
     def send(self, content: dict[str, object]) -> None:
@@ -56,6 +59,9 @@ class ProgressPipe:
                     line = line[os.write(self._descriptor, line) :]
         except BrokenPipeError:
             os._exit(1)
+        except OSError:
+            # The method closed it: it works on unheard.
+            return
 
 
 class StopRequest:
@@ -69,14 +75,6 @@ class StopRequest:
         self.is_set = True
 
 
-def die_with(parent: int) -> None:
-    """Let the kernel kill this process when the coordinator's spawning thread dies."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        # It died before the line above.
-        os._exit(1)
-
-
 def volunteer_for_oom_killer() -> None:
     """Be the first that the kernel kills when memory runs out, instead of the coordinator."""
     with suppress(OSError):
@@ -85,24 +83,29 @@ def volunteer_for_oom_killer() -> None:
 
 def main(arguments: list[str]) -> None:
     """Run one task and leave its result beside it."""
-    task_file, descriptor, parent = Path(arguments[0]), int(arguments[1]), int(arguments[2])
-    die_with(parent)
+    task_file, descriptor, coordinator = Path(arguments[0]), int(arguments[1]), int(arguments[2])
+    fork_kept(coordinator)
     volunteer_for_oom_killer()
     os.set_inheritable(descriptor, False)  # noqa: FBT003
     stop = StopRequest()
     signal.signal(signal.SIGTERM, stop)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable()
     pipe = ProgressPipe(descriptor)
 
     from orthoflow.engine.running import run_task  # noqa: PLC0415 - after the ties above
     from orthoflow.engine.tasks import read_task  # noqa: PLC0415
+    from orthoflow.errors import StoreError  # noqa: PLC0415
 
-    task = read_task(task_file)
+    try:
+        task = read_task(task_file)
+    except StoreError as error:
+        pipe.send({"kind": "failed", "text": str(error)})
+        os._exit(1)
     result = run_task(task, pipe.listen, lambda: stop.is_set)
     _leave(task, result, pipe)
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):
+            stream.flush()
     # Without the interpreter's tear-down: libraries crash there, and threads may never end.
     os._exit(0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import subprocess
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -64,6 +65,18 @@ def sync_file(path: Path) -> None:
         os.close(descriptor)
 
 
+def sync_tree(folder: Path) -> None:
+    """Make everything below a folder survive a power cut, its name in its own folder left aside."""
+    folders = [folder]
+    for path in folder.rglob("*"):
+        if path.is_dir():
+            folders.append(path)
+        else:
+            sync_file(path)
+    for path in folders:
+        sync_folder(path)
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file aside and rename it into place; readers see the old one or the new one.
 
@@ -107,11 +120,42 @@ def place_folder(aside: Path, final: Path) -> bool:
     return True
 
 
+@contextmanager
+def whole_folder(final: Path) -> Iterator[Path]:
+    """Give the name of a folder to make and fill; it gets its final name when the block ends well.
+
+    Raises:
+        StoreError: the disk refuses.
+    """
+    aside = final.with_name(f".{final.name}.unfinished")
+    remove_tree(aside)
+    try:
+        with writing_to(final):
+            yield aside
+            sync_tree(aside)
+            if final.is_dir():
+                final.rmdir()
+        place_folder(aside, final)
+    finally:
+        remove_tree(aside)
+
+
 def remove_tree(folder: Path) -> None:
     """Remove a folder that may be gone already or be removed by somebody else meanwhile."""
-    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    except RecursionError:
+        # Before Python 3.13 it calls itself for every level, and there may be thousands.
+        subprocess.run(["rm", "-rf", "--", folder], stderr=subprocess.DEVNULL, check=False)
 
 
 def folder_size(folder: Path) -> int:
     """Bytes of all files below a folder, 0 when it is not there."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of all files below a folder; a link counts for itself."""
+    if path.is_dir() and not path.is_symlink():
+        return folder_size(path)
+    return path.lstat().st_size

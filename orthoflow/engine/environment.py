@@ -44,9 +44,14 @@ def packages() -> dict[str, str]:
     """Installed distributions with their versions, the first of a name winning as on import."""
     found: dict[str, str] = {}
     for distribution in metadata.distributions():
-        name = distribution.metadata["Name"]
-        if name and name not in found:
-            found[name] = distribution.version
+        try:
+            stated = distribution.metadata
+        except ValueError:
+            # Not even text: nobody can say what it is.
+            continue
+        name, version = stated["Name"], stated["Version"]
+        if name and version and name not in found:
+            found[name] = version
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
 
 

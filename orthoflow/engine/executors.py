@@ -17,11 +17,14 @@ from orthoflow.engine.results import CellResult
 from orthoflow.engine.running import failed_result, run_task
 from orthoflow.engine.tasks import Task
 from orthoflow.errors import CancelledStepError
+from orthoflow.foreign_text import shown
 from orthoflow.sdk.context import StepEvent
 
 Tell = Callable[[str, StepEvent], None]
 # Names the folder for what numba compiles.
 COMPILED_CODE: Final = "NUMBA_CACHE_DIR"
+# Of a long log the end is kept.
+_MOST_LINES: Final = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,11 +94,11 @@ class InlineExecutor:
         if self._is_cancelled:
             reason = CancelledStepError(f"step {task.address} was interrupted")
             return (TaskEnd(address=task.address, result=failed_result(task, reason)),)
-        log: list[str] = []
+        log: deque[str] = deque(maxlen=_MOST_LINES)
 
         def listen(event: StepEvent) -> None:
             if event.kind != "progress":
-                log.append(event.text)
+                log.append(shown(event.text, keep="\n"))
             self._tell(task.address, event)
 
         with compiled_code_in(task.numba_folder):

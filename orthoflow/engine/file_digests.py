@@ -5,16 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import stat
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from orthoflow.engine.checked_json import is_checked, with_digest
 from orthoflow.engine.durability import write_whole
-from orthoflow.engine.results import RecordedFile
+from orthoflow.engine.results import RecordedFile, name_problem
 from orthoflow.errors import InputError
+from orthoflow.files.json_texts import parse_json
 from orthoflow.geometry.threads import in_order
+from orthoflow.sdk.lines import one_line, text_of_path
 
 # A file changed this shortly before hashing may change again within the same time stamp.
 _SETTLED_NS: Final = 2_000_000_000
@@ -25,10 +29,10 @@ class FileRef(RecordedFile):
     """An input file by name and content, where it lies.
 
     Attributes:
-        mtime_ns: when it was last changed; only to notice a change while a step reads it.
+        identity: what the file system says of it; only to notice a change while a step reads it.
     """
 
-    mtime_ns: int
+    identity: str
 
 
 class FileDigests:
@@ -51,17 +55,30 @@ class FileDigests:
         """Give the digest of one file.
 
         Raises:
-            InputError: the file cannot be read.
+            InputError: the file cannot be read, or has a name that a record cannot take.
         """
+        if problem := name_problem(path.name):
+            raise InputError(
+                f"the input file {path} has a name that {problem}, which other systems refuse: "
+                "rename it"
+            )
+        if text_of_path(path) is None:
+            raise InputError(
+                f"the input file {one_line(path)} has a path that is no UTF-8: rename it"
+            )
         try:
-            before = path.stat()
-            identity = _identity(before)
+            if not stat.S_ISREG(path.stat().st_mode):
+                raise InputError(
+                    f"the input {path} is no file: expected one that can be read again"
+                )
+            identity = file_identity(path)
             known = self._known.get(identity)
             sha256 = known or file_sha256(path)
             after = path.stat()
+            is_same = _identity(after) == identity
         except OSError as error:
             raise InputError(f"cannot read the input file {path}: {error.strerror}") from error
-        if _identity(after) != identity:
+        if not is_same:
             raise InputError(f"the input file {path} changed while it was read; run again")
         if known is None and time.time_ns() - after.st_mtime_ns > _SETTLED_NS:
             self._known[identity] = sha256
@@ -70,7 +87,7 @@ class FileDigests:
             name=path.name,
             size_bytes=after.st_size,
             sha256=sha256,
-            mtime_ns=after.st_mtime_ns,
+            identity=identity,
         )
 
     def save(self) -> None:
@@ -80,12 +97,23 @@ class FileDigests:
             StoreError: the disk refuses.
         """
         if self._is_dirty:
-            write_whole(self._memo, json.dumps(self._known, sort_keys=True).encode())
+            text = json.dumps({"files": self._known}, sort_keys=True)
+            write_whole(self._memo, with_digest(text).encode())
             self._is_dirty = False
 
 
-def _identity(stat: os.stat_result) -> str:
-    return f"{stat.st_dev}:{stat.st_ino}:{stat.st_size}:{stat.st_mtime_ns}:{stat.st_ctime_ns}"
+def file_identity(path: Path) -> str:
+    """What the file system says of a file as long as it stays as it is.
+
+    Raises:
+        OSError: the file cannot be reached.
+    """
+    return _identity(path.stat())
+
+
+def _identity(state: os.stat_result) -> str:
+    times = f"{state.st_mtime_ns}:{state.st_ctime_ns}"
+    return f"{state.st_dev}:{state.st_ino}:{state.st_size}:{times}"
 
 
 def file_sha256(path: Path) -> str:
@@ -100,7 +128,9 @@ def file_sha256(path: Path) -> str:
 
 def _read_memo(memo: Path) -> dict[str, str]:
     try:
-        content = json.loads(memo.read_text(encoding="utf-8"))
+        text = memo.read_text(encoding="utf-8")
+        content = parse_json(text) if is_checked(text) else None
     except (OSError, ValueError):
         return {}
-    return {str(k): str(v) for k, v in content.items()} if isinstance(content, dict) else {}
+    files = content.get("files") if isinstance(content, dict) else None
+    return dict(files) if isinstance(files, dict) else {}

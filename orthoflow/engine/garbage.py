@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from orthoflow.engine.durability import folder_size
+from orthoflow.engine.durability import size_of
 from orthoflow.engine.locks import exclusive_lock
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError
@@ -27,18 +27,20 @@ class GarbageReport:
     Attributes:
         n_results: results.
         n_objects: products and figures.
+        n_damaged: what had been set aside because it was damaged.
         freed_bytes: bytes of everything removed.
     """
 
     n_results: int
     n_objects: int
+    n_damaged: int
     freed_bytes: int
 
 
 def collect_garbage(
     store: Store, *, older_than_days: float | None = None, dry_run: bool = False
 ) -> GarbageReport:
-    """Remove incomplete results, products without results, and left-overs of killed runs.
+    """Remove incomplete results, products without results, what is damaged or left by killed runs.
 
     Args:
         store: the store; no run may use it meanwhile.
@@ -52,7 +54,7 @@ def collect_garbage(
     if older_than_days is not None and older_than_days < 0:
         raise ArgumentError(f"days must be 0 or more, got {older_than_days:g}")
     if not store.folder.is_dir():
-        return GarbageReport(n_results=0, n_objects=0, freed_bytes=0)
+        return GarbageReport(n_results=0, n_objects=0, n_damaged=0, freed_bytes=0)
     busy = f"the store {store.folder} is in use by a run; wait until it has ended"
     with exclusive_lock(store.lock_file, busy):
         return _collect(store, older_than_days, is_dry=dry_run)
@@ -68,18 +70,24 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
         for path in store.preimages.glob("*/*.json")
         if path.stem in gone or not (store.results / path.name).exists()
     )
-    rest = (*_children(store.scratch), *_stale_kernels(store), *_half_written(store))
-    freed = sum(_size(path) for path in (*results, *objects, *preimages, *rest))
+    damaged = _children(store.damaged)
+    rest = (*damaged, *_children(store.scratch), *_stale_kernels(store), *_half_written(store))
+    freed = sum(size_of(path) for path in (*results, *objects, *preimages, *rest))
     if not is_dry:
         # Results first: killed in between, no result is left whose objects are gone.
         for path in (*results, *preimages, *objects, *rest):
             _remove(path)
-    return GarbageReport(n_results=len(results), n_objects=len(objects), freed_bytes=freed)
+    return GarbageReport(
+        n_results=len(results),
+        n_objects=len(objects),
+        n_damaged=len(damaged),
+        freed_bytes=freed,
+    )
 
 
 def _useless_results(store: Store, older_than_days: float | None) -> Iterator[Path]:
     for path in sorted(store.results.glob("*.json")):
-        age_days = (time.time() - path.stat().st_mtime) / _DAY_S
+        age_days = (time.time() - path.lstat().st_mtime) / _DAY_S
         is_old = older_than_days is not None and age_days >= older_than_days
         if is_old or store.result(path.stem) is None:
             yield path
@@ -110,12 +118,8 @@ def _children(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted(folder.iterdir())) if folder.is_dir() else ()
 
 
-def _size(path: Path) -> int:
-    return folder_size(path) if path.is_dir() else path.stat().st_size
-
-
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
         with contextlib.suppress(FileNotFoundError):

@@ -7,7 +7,6 @@ of source code stand for a version wherever code is not a released install.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,9 +16,12 @@ from pathlib import Path
 from typing import Final, cast
 
 from orthoflow.catalog import Catalog, MethodEntry
+from orthoflow.catalog.foreign_code import foreign_code
+from orthoflow.catalog.wording import describe_error
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile
 from orthoflow.engine.store import canonical_json
 from orthoflow.errors import PluginError
+from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.sdk.methods import Method, port_specs
 from orthoflow.workflow.cells import Cell
@@ -136,7 +138,7 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
 def read_preimage(text: str) -> Mapping[str, JsonValue]:
     """Read a preimage's text; an empty mapping when it is not one."""
     try:
-        content = json.loads(text)
+        content = parse_json(text)
     except ValueError:
         return {}
     return cast("dict[str, JsonValue]", content) if isinstance(content, dict) else {}
@@ -144,10 +146,13 @@ def read_preimage(text: str) -> Mapping[str, JsonValue]:
 
 def _tools(cls: type[Method]) -> dict[str, str]:
     try:
-        return {str(name): str(version) for name, version in cls.tools().items()}
-    except Exception as error:
+        with foreign_code(f"method {cls.id}"):
+            return {str(name): str(version) for name, version in cls.tools().items()}
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise PluginError(
-            f"method {cls.id} cannot tell the versions of its libraries: {error}"
+            f"method {cls.id} cannot tell the versions of its libraries: {describe_error(error)}"
         ) from error
 
 

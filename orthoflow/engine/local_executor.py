@@ -7,6 +7,7 @@ import dataclasses
 import os
 import selectors
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -20,13 +21,16 @@ from pydantic import TypeAdapter
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.executors import COMPILED_CODE, TaskEnd, Tell
-from orthoflow.engine.group_guard import GroupGuard
+from orthoflow.engine.keeper import END_ALL
 from orthoflow.engine.memory import GIB, MemoryGuard, oom_kills, process_memory
+from orthoflow.engine.process_trees import descendants
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.running import failed_result
+from orthoflow.engine.step_logs import StepLog
 from orthoflow.engine.tasks import Task, write_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
 from orthoflow.sdk.context import StepEvent
+from orthoflow.sdk.lines import one_line
 
 _THREAD_VARIABLES: Final = (
     "BLIS_NUM_THREADS",
@@ -42,8 +46,12 @@ _THREAD_VARIABLES: Final = (
     "VECLIB_MAXIMUM_THREADS",
 )
 _GRACE_S: Final = 5.0
-_LOG_BYTES: Final = 256 << 10
 _READ_BYTES: Final = 1 << 16
+# So much is heard at once: a step that never stops talking must not keep us from its timeout.
+_READS_AT_ONCE: Final = 16
+_LONGEST_LINE: Final = 1 << 20
+_LARGEST_RESULT: Final = 64 << 20
+_LONGEST_LAST_LINE: Final = 300
 _CRASHES: Final = {
     signal.SIGSEGV: "segmentation fault",
     signal.SIGBUS: "bus error, as when the disk is full under a memory-mapped file",
@@ -67,7 +75,8 @@ class _Running:
 
     Attributes:
         task: the task.
-        process: its leader.
+        process: its keeper, which ends as the step has ended.
+        log: what it prints.
         pipe: reading end of the progress pipe.
         process_descriptor: becomes readable when the process ends.
         started: ISO 8601 UTC.
@@ -75,7 +84,9 @@ class _Running:
         oom_kills: the kernel's counter at the start.
         reason: why we stopped it; None as long as we did not.
         is_victim: stopped for want of memory.
-        kill_at: when SIGTERM has had its time, monotonic seconds.
+        kill_at: when it has had its time to end by itself, monotonic seconds.
+        is_killed: the keeper was asked to end the step, and had no time before.
+        step: process id of the step itself, None before it is known.
         peak_bytes: largest own memory seen from outside.
         said: what is unread of its last line.
         last_words: a failure it could not write to the disk.
@@ -83,6 +94,7 @@ class _Running:
 
     task: Task
     process: subprocess.Popen[bytes]
+    log: StepLog
     pipe: int
     process_descriptor: int
     started: str
@@ -91,6 +103,8 @@ class _Running:
     reason: OrthoflowError | None = None
     is_victim: bool = False
     kill_at: float | None = None
+    is_killed: bool = False
+    step: int | None = None
     peak_bytes: int = 0
     said: bytes = b""
     last_words: str = ""
@@ -107,7 +121,6 @@ class LocalExecutor:
     _running: dict[str, _Running] = field(default_factory=dict)
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
     _guard: MemoryGuard = field(default_factory=MemoryGuard)
-    _group_guard: GroupGuard = field(default_factory=GroupGuard)
 
     def start(self, task: Task) -> None:
         """Spawn the process of a task.
@@ -118,18 +131,17 @@ class LocalExecutor:
         with writing_to(Path(task.folder).parent):
             task.scratch.mkdir(parents=True, exist_ok=True)
         write_task(task)
-        with writing_to(Path(task.log).parent):
-            log = os.open(task.log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
+        log = StepLog(Path(task.log))
         reading, writing = os.pipe()
         os.set_blocking(reading, False)
         try:
-            process = self._spawn(task, writing, log)
+            process = self._spawn(task, writing, log.descriptor)
         finally:
             os.close(writing)
-            os.close(log)
         run = _Running(
             task=task,
             process=process,
+            log=log,
             pipe=reading,
             process_descriptor=os.pidfd_open(process.pid),
             started=now(),
@@ -137,7 +149,6 @@ class LocalExecutor:
             oom_kills=oom_kills(),
         )
         self._running[task.address] = run
-        self._group_guard.watch(process.pid)
         self._selector.register(run.pipe, selectors.EVENT_READ, run)
         self._selector.register(run.process_descriptor, selectors.EVENT_READ, run)
 
@@ -158,11 +169,15 @@ class LocalExecutor:
 
     def close(self) -> None:
         """Kill whatever still runs."""
+        for run in self._running.values():
+            _end_all(run)
         for run in list(self._running.values()):
-            _signal_group(run, signal.SIGKILL)
+            try:
+                run.process.wait(_GRACE_S)
+            except subprocess.TimeoutExpired:
+                _kill_group(run)
             self._forget(run)
         self._selector.close()
-        self._group_guard.close()
 
     def _spawn(self, task: Task, pipe: int, log: int) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
@@ -185,7 +200,7 @@ class LocalExecutor:
         )
 
     def _hear(self, run: _Running) -> None:
-        while True:
+        for _ in range(_READS_AT_ONCE):
             try:
                 block = os.read(run.pipe, _READ_BYTES)
             except BlockingIOError:
@@ -197,6 +212,9 @@ class LocalExecutor:
             *lines, run.said = (run.said + block).split(b"\n")
             for line in lines:
                 self._pass_on(run, line)
+            # No event is that long.
+            if len(run.said) > _LONGEST_LINE:
+                run.said = b""
 
     def _pass_on(self, run: _Running, line: bytes) -> None:
         # A method may write into the pipe by mistake: what is not an event is not passed on.
@@ -210,18 +228,18 @@ class LocalExecutor:
     def _watch(self) -> None:
         time_now = time.monotonic()
         for run in self._running.values():
-            memory = process_memory(run.process.pid)
-            run.peak_bytes = max(run.peak_bytes, memory.anonymous if memory else 0)
+            run.peak_bytes = max(run.peak_bytes, _memory_of_step(run))
+            run.log.shorten()
             limit = run.task.timeout_s
             if run.kill_at is not None and time_now > run.kill_at:
-                _signal_group(run, signal.SIGKILL)
+                self._kill(run)
             elif limit is not None and run.reason is None and time_now - run.clock > limit:
                 self._stop(run, describe_timeout(run.task.who, limit))
         self._guard_memory()
 
     def _guard_memory(self) -> None:
-        groups = {run.task.address: run.process.pid for run in self._running.values()}
-        victim = self._guard.check(groups)
+        keepers = {run.task.address: run.process.pid for run in self._running.values()}
+        victim = self._guard.check(keepers)
         # One at a time: the memory of a dying process is not free at once.
         if victim is None or any(run.is_victim for run in self._running.values()):
             return
@@ -229,7 +247,16 @@ class LocalExecutor:
         run.is_victim = True
         run.reason = describe_memory(run.task.who, victim.n_bytes)
         run.peak_bytes = max(run.peak_bytes, victim.n_bytes)
-        _signal_group(run, signal.SIGKILL)
+        self._kill(run)
+
+    def _kill(self, run: _Running) -> None:
+        """Let the keeper end all that the step started; one that cannot any more goes with it."""
+        if run.is_killed:
+            _kill_group(run)
+        else:
+            _end_all(run)
+        run.is_killed = True
+        run.kill_at = time.monotonic() + _GRACE_S
 
     def _stop(self, run: _Running, reason: OrthoflowError) -> None:
         if run.reason is None:
@@ -239,18 +266,18 @@ class LocalExecutor:
 
     def _end(self, run: _Running) -> TaskEnd:
         self._hear(run)
-        # Before the leader is reaped, so that its number cannot belong to strangers already.
-        _signal_group(run, signal.SIGKILL)
+        # Somebody may have killed the keeper. Before it is reaped, so that its number cannot belong
+        # to strangers already.
+        _kill_group(run)
+        run.process.wait()
+        run.log.shorten()
+        result = dataclasses.replace(self._result(run), log=run.log.text())
         self._forget(run)
-        result = self._result(run)
-        return TaskEnd(
-            address=run.task.address,
-            result=dataclasses.replace(result, log=_read_log(Path(run.task.log))),
-        )
+        return TaskEnd(address=run.task.address, result=result)
 
     def _forget(self, run: _Running) -> None:
-        self._group_guard.forget(run.process.pid)
         run.process.wait()
+        run.log.close()
         for descriptor in (run.pipe, run.process_descriptor):
             with contextlib.suppress(KeyError):
                 self._selector.unregister(descriptor)
@@ -262,11 +289,12 @@ class LocalExecutor:
         error = run.reason
         if error is None:
             try:
-                text = task.result_file.read_text(encoding="utf-8")
-                result = result_from_json(text, task.result_file.name)
+                result = result_from_json(_read_result(task.result_file), task.result_file.name)
+                if result.key != task.key:
+                    raise StoreError(f"{task.result_file.name} is not the result of this task")
                 peak = max(result.peak_rss_mib, round(run.peak_bytes / (1 << 20), 1))
                 return dataclasses.replace(result, peak_rss_mib=peak)
-            except (OSError, StoreError):
+            except (OSError, RecursionError, UnicodeDecodeError):
                 error = _reason_of_silence(run)
         return dataclasses.replace(
             failed_result(task, error),
@@ -285,11 +313,11 @@ def _messages() -> TypeAdapter[StepEvent | _LastWords]:
 
 def _reason_of_silence(run: _Running) -> OrthoflowError:
     if run.last_words:
-        return StoreError(run.last_words)
+        return StoreError(one_line(run.last_words))
     code = run.process.returncode
     if code == -signal.SIGKILL and oom_kills() > run.oom_kills:
         return describe_memory(run.task.who, run.peak_bytes)
-    tail = _read_log(Path(run.task.log)).strip().rpartition("\n")[2]
+    tail = one_line(run.log.text().strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
     return StepFailedError(describe_exit(run.task.who, code, run.peak_bytes, tail))
 
 
@@ -298,21 +326,41 @@ def _has_ended(run: _Running) -> bool:
     return info is not None
 
 
+def _memory_of_step(run: _Running) -> int:
+    """Anonymous bytes of the step itself, the one process that its keeper forks."""
+    if run.step is None:
+        run.step = next(iter(descendants(run.process.pid)), None)
+    memory = process_memory(run.step) if run.step is not None else None
+    return memory.anonymous if memory else 0
+
+
+def _end_all(run: _Running) -> None:
+    for number in (END_ALL, signal.SIGCONT):
+        with contextlib.suppress(ProcessLookupError):
+            run.process.send_signal(number)
+
+
+def _kill_group(run: _Running) -> None:
+    _signal_group(run, signal.SIGKILL)
+
+
 def _signal_group(run: _Running, number: signal.Signals) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(run.process.pid, number)
 
 
-def _read_log(path: Path) -> str:
-    """The end of a log, without the NUL characters that no text in a record may have."""
-    try:
-        with path.open("rb") as stream:
-            size = os.fstat(stream.fileno()).st_size
-            stream.seek(max(0, size - _LOG_BYTES))
-            text = stream.read().decode("utf-8", errors="replace").replace("\0", "")
-    except OSError:
-        return ""
-    return text if size <= _LOG_BYTES else f"... ({size - _LOG_BYTES} bytes before)\n{text}"
+def _read_result(path: Path) -> str:
+    """Read what a step left; it may have left anything.
+
+    Raises:
+        OSError: there is no file, or one that no step of ours writes.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    with os.fdopen(descriptor, "rb") as stream:
+        state = os.fstat(descriptor)
+        if not stat.S_ISREG(state.st_mode) or state.st_size > _LARGEST_RESULT:
+            raise OSError(f"{path.name} is not a result")
+        return stream.read().decode("utf-8")
 
 
 def _child_environment(task: Task) -> dict[str, str]:

@@ -20,12 +20,19 @@ def shared_lock(path: Path) -> Iterator[None]:
     Raises:
         StoreError: the lock file cannot be made, or the file system has no locks.
     """
-    descriptor = _open(path)
-    try:
-        _lock(descriptor, fcntl.LOCK_SH, path)
+    with _waited_for(path, fcntl.LOCK_SH):
         yield
-    finally:
-        os.close(descriptor)
+
+
+@contextmanager
+def taking_turns(path: Path) -> Iterator[None]:
+    """Hold a lock alone; waits while somebody else holds it.
+
+    Raises:
+        StoreError: the lock file cannot be made, or the file system has no locks.
+    """
+    with _waited_for(path, fcntl.LOCK_EX):
+        yield
 
 
 @contextmanager
@@ -56,6 +63,16 @@ def is_locked(path: Path) -> bool:
         return False
     try:
         return not _lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, path)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _waited_for(path: Path, operation: int) -> Iterator[None]:
+    descriptor = _open(path)
+    try:
+        _lock(descriptor, operation, path)
+        yield
     finally:
         os.close(descriptor)
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import os
+import errno
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
+
+from orthoflow.engine.process_trees import descendants
 
 MIB: Final = 1 << 20
 GIB: Final = 1 << 30
@@ -51,14 +53,10 @@ def process_memory(process_id: int | str = "self") -> ProcessMemory | None:
     )
 
 
-def group_memory(group_id: int) -> int:
-    """Anonymous memory of all processes of a group, in bytes."""
-    total = 0
-    for entry in os.scandir("/proc"):
-        if entry.name.isdigit() and _group_of(int(entry.name)) == group_id:
-            memory = process_memory(entry.name)
-            total += memory.anonymous if memory else 0
-    return total
+def tree_memory(root: int) -> int:
+    """Anonymous memory of a process and of all that it started, in bytes."""
+    memories = (process_memory(process) for process in (root, *descendants(root)))
+    return sum(memory.anonymous for memory in memories if memory)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,13 +144,6 @@ def _fields(text: str) -> dict[str, int]:
     return fields
 
 
-def _group_of(process_id: int) -> int:
-    try:
-        return os.getpgid(process_id)
-    except ProcessLookupError:
-        return -1
-
-
 def _group_limits() -> list[tuple[int, int]]:
     """(limit, used) of this process's memory control groups and their parents, in bytes."""
     try:
@@ -224,18 +215,18 @@ class MemoryGuard:
     def __init__(self) -> None:
         self.interval_s = _LONGEST_S
 
-    def check(self, groups: Mapping[str, int]) -> Victim | None:
+    def check(self, roots: Mapping[str, int]) -> Victim | None:
         """Choose a step to stop when too little memory is left.
 
         Args:
-            groups: address -> process group of every running step.
+            roots: address -> process above all others of every running step.
         """
         memory = available_memory()
         margin = memory.available - memory.floor
         self.interval_s = min(max(margin / _FASTEST_BYTES_PER_S, _SHORTEST_S), _LONGEST_S)
-        if margin > 0 or not groups:
+        if margin > 0 or not roots:
             return None
-        held = {address: group_memory(group) for address, group in groups.items()}
+        held = {address: tree_memory(root) for address, root in roots.items()}
         largest = max(held, key=lambda address: held[address])
         # Somebody else may be eating: a small step would be killed for nothing.
         if held[largest] < memory.floor:
@@ -250,3 +241,13 @@ def oom_kills() -> int:
     except OSError:
         return 0
     return sum(int(line.split()[1]) for line in lines if line.startswith("oom_kill "))
+
+
+def is_for_want_of_memory(error: BaseException) -> bool:
+    """Whether an error says that memory ran out, also while a library was loaded.
+
+    The loader tells that in words only.
+    """
+    if isinstance(error, ImportError):
+        return "failed to map segment" in str(error) or "allocate memory" in str(error)
+    return isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Final
 
+from orthoflow_provenance.inner_files import name_problem
 from orthoflow_provenance.model import (
     CellOutcome,
     CellStatus,
@@ -22,7 +23,9 @@ from orthoflow_provenance.model import (
 )
 from pydantic import TypeAdapter, ValidationError
 
+from orthoflow.engine.checked_json import is_checked, with_digest
 from orthoflow.errors import StoreError
+from orthoflow.files.json_texts import parse_json
 
 # The words of a record, for the rest of the engine.
 __all__ = [
@@ -37,12 +40,15 @@ __all__ = [
     "ProductRef",
     "RecordedEnvironment",
     "RecordedFile",
+    "name_problem",
     "result_from_json",
     "result_to_json",
     "shared_fields",
 ]
 
-FORMAT: Final = "orthoflow/result/1"
+FORMAT: Final = "orthoflow/result/2"
+# Without the digest of its own text.
+_EARLIER_FORMAT: Final = "orthoflow/result/1"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +94,8 @@ class CellResult(CellOutcome):
 def result_to_json(result: CellResult) -> str:
     """Give a result as JSON text."""
     content = _codec().dump_python(result, mode="json")
-    return json.dumps({"format": FORMAT, **content}, allow_nan=False, ensure_ascii=False)
+    text = json.dumps({"format": FORMAT, **content}, allow_nan=False, ensure_ascii=False)
+    return with_digest(text)
 
 
 def result_from_json(text: str, where: str) -> CellResult:
@@ -102,9 +109,12 @@ def result_from_json(text: str, where: str) -> CellResult:
         StoreError: the text is damaged or of another format.
     """
     try:
-        content = json.loads(text)
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
+        content = parse_json(text)
+        form = content.get("format") if isinstance(content, dict) else None
+        if not isinstance(content, dict) or form not in (FORMAT, _EARLIER_FORMAT):
             raise StoreError(f"{where} has a result format that this orthoflow cannot read")
+        if not is_checked(text) and (form == FORMAT or "sha256" in content):
+            raise StoreError(f"{where} is damaged: it does not have the digest that it states")
         return _codec().validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors()[0]

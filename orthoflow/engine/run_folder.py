@@ -13,12 +13,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Literal, Self, TypeAlias
 
+from orthoflow_provenance.errors import UnsafeFileError
+from orthoflow_provenance.inner_files import path_below
 from pydantic import TypeAdapter
 
 from orthoflow.engine.clock import now, time_in_a_name
 from orthoflow.engine.durability import sync_folder, writing_to
 from orthoflow.engine.results import CellStatus
-from orthoflow.errors import ArgumentError, StoreError
+from orthoflow.errors import ArgumentError, RecordError, StoreError
 
 JOURNAL: Final = "journal.jsonl"
 RECORD_FILE: Final = "run.h5"
@@ -76,7 +78,18 @@ class CellEnded:
     error: str
 
 
-JournalLine: TypeAlias = RunBegan | RunWent | CellBegan | CellEnded
+@dataclass(frozen=True, kw_only=True)
+class CellDamaged:
+    """The stored result of a cell was damaged; `what` says in which parts."""
+
+    event: Literal["damaged"] = "damaged"
+    time: str
+    address: str
+    key: str
+    what: str
+
+
+JournalLine: TypeAlias = RunBegan | RunWent | CellBegan | CellEnded | CellDamaged
 
 
 class Journal:
@@ -87,6 +100,7 @@ class Journal:
         is_resumed: the folder held an unfinished run.
         started: ISO 8601 UTC, of the first attempt.
         finished_keys: keys of the cells that this run has computed before it was interrupted.
+        damaged: address -> what of its stored result was found damaged in this run.
     """
 
     def __init__(self, folder: Path, name: str, *, run_id: str = "") -> None:
@@ -130,6 +144,8 @@ class Journal:
         Raises:
             StoreError: the disk refuses.
         """
+        if isinstance(line, CellDamaged):
+            self.damaged[line.address] = line.what
         content = _codec().dump_python(line, mode="json")
         text = json.dumps(content, ensure_ascii=False, allow_nan=False).encode() + b"\n"
         with writing_to(self._folder):
@@ -157,6 +173,7 @@ class Journal:
                 f"{name}; choose another folder with -o"
             )
         self.run_id = first.run_id
+        self.damaged = {line.address: line.what for line in lines if isinstance(line, CellDamaged)}
         self.started = first.time
         self.finished_keys = frozenset(
             line.key
@@ -198,7 +215,14 @@ def _check_folder(folder: Path) -> None:
         raise ArgumentError(
             f"{folder} holds a finished run ({RECORD_FILE}); choose another folder with -o"
         )
-    if folder.is_dir() and not (folder / JOURNAL).exists() and any(folder.iterdir()):
+    if not folder.is_dir():
+        return
+    if link := next((path for path in folder.iterdir() if path.is_symlink()), None):
+        raise ArgumentError(
+            f"{folder} holds a link, {link.name}, as no run makes them; choose another folder with "
+            "-o"
+        )
+    if not (folder / JOURNAL).exists() and any(folder.iterdir()):
         raise ArgumentError(
             f"{folder} is not empty and holds no unfinished run; choose another folder with -o"
         )
@@ -207,6 +231,20 @@ def _check_folder(folder: Path) -> None:
 def new_run_id() -> str:
     """Make up the id of a run: its time in UTC, and something random."""
     return f"{time_in_a_name()}-{uuid.uuid4().hex[:6]}"
+
+
+def new_run_folder(name: str, run_id: str) -> Path:
+    """Where a run goes that nobody gave a folder: `runs/<name>-<run id>`.
+
+    Raises:
+        RecordError: the name, which a record may have given, cannot be that of a folder.
+    """
+    try:
+        return path_below(Path("runs"), f"{name}-{run_id}")
+    except UnsafeFileError as error:
+        raise RecordError(
+            f"the run cannot lie below runs/: {error}; name its folder with -o"
+        ) from error
 
 
 def cell_file_name(address: str) -> str:

@@ -7,6 +7,8 @@ import errno
 import json
 import os
 import resource
+import signal
+import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -19,7 +21,8 @@ from pydantic import ValidationError
 
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import store_error, writing_to
-from orthoflow.engine.memory import MIB, MemorySampler
+from orthoflow.engine.file_digests import file_identity, file_sha256
+from orthoflow.engine.memory import MIB, MemorySampler, is_for_want_of_memory
 from orthoflow.engine.results import (
     CellResult,
     Costs,
@@ -30,15 +33,21 @@ from orthoflow.engine.results import (
     shared_fields,
 )
 from orthoflow.engine.store import Publisher, Store, digest_of
-from orthoflow.engine.tasks import Task, TaskInput
+from orthoflow.engine.tasks import Task, TaskFile, TaskInput
 from orthoflow.errors import InputError, MethodError, OrthoflowError, PluginError, StepFailedError
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import StepContext, StepEvent
+from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method
 
 # Inputs up to this size are digested again after the run: they must not have changed.
 _CHECKED_BYTES: Final = 16 << 20
+# The main one and the sampler of memory.
+_OWN_THREADS: Final = 2
+# With room for what a method raised, which is cut shorter, and the words around it.
+_LONGEST_ERROR: Final = 4000
+_LONGEST_TRACE: Final = 64 << 10
 
 Listener = Callable[[StepEvent], None]
 
@@ -57,11 +66,12 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
     try:
         with sampler:
             result = call.run()
-    except Exception as error:  # noqa: BLE001 - a foreign method may raise anything
+    except BaseException as error:
+        # Where Ctrl-C is ignored, nobody but the method can have raised it.
+        is_users = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
+        if isinstance(error, KeyboardInterrupt) and is_users:
+            raise
         result = failed_result(task, explain_failure(task, error), _trace(error))
-    except SystemExit as error:
-        reason = MethodError(f"{task.who} tried to end the program ({error.code})")
-        result = failed_result(task, reason, _trace(error))
     return dataclasses.replace(
         result,
         started=started,
@@ -77,7 +87,7 @@ def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellRes
         blank_result(task),
         status="failed",
         error_type=type(error).__name__,
-        error_message=str(error),
+        error_message=one_line(error, _LONGEST_ERROR) or f"{task.who} failed without a word",
         traceback=trace,
         exit_code=error.exit_code,
     )
@@ -97,28 +107,32 @@ def blank_result(task: Task) -> CellResult:
     )
 
 
-def explain_failure(task: Task, error: Exception) -> OrthoflowError:
+def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
     """Turn whatever a method raised into one of our errors with one sentence."""
     if isinstance(error, OrthoflowError):
         return error
-    if isinstance(error, MemoryError):
+    if is_for_want_of_memory(error):
         return StepFailedError(
             f"{task.who} needed more memory than it could get: "
-            f"{str(error) or 'an allocation failed'}"
+            f"{one_line(error) or 'an allocation failed'}"
         )
     if isinstance(error, ImportError):
         missing = error.name or "a library"
         return PluginError(
-            f"{task.who} needs {missing}, which is missing or fails to import: {error}"
+            f"{task.who} needs {missing}, which is missing or fails to import: {one_line(error)}"
         )
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return store_error(error, Path(task.store))
-    if isinstance(error, ValueError) and "read-only" in str(error):
+        # No StoreError: the method wanted more than there is, and stands failed in the record.
+        return StepFailedError(str(store_error(error, Path(task.store))))
+    if isinstance(error, ValueError) and "read-only" in one_line(error):
         return MethodError(
             f"{task.who} writes to an array that is read-only, as all its inputs are ({error}); it "
             f"must work on a copy"
         )
-    return MethodError(f"{task.who} failed unexpectedly: {type(error).__name__}: {error}")
+    said = f"failed unexpectedly: {type(error).__name__}: {one_line(error)}".removesuffix(": ")
+    if isinstance(error, SystemExit):
+        said = f"tried to end the program ({one_line(error.code)})"
+    return MethodError(f"{task.who} {said}")
 
 
 class _Call:
@@ -157,10 +171,13 @@ class _Call:
         cls = cast("type[Method]", load_target(self.task.target))
         inputs = {port: self._read(given) for port, given in self.task.inputs.items()}
         params = self._params(cls)
-        wall, cpu = time.perf_counter(), _cpu_s()
+        wall, cpu, process = time.perf_counter(), _cpu_s(), os.getpid()
         try:
             outputs = cls().run(cls.In(**inputs), params, self._context)
         finally:
+            if os.getpid() != process:
+                # The method forked, and this is not the process whose result counts.
+                os._exit(1)
             self._wall_s = round(time.perf_counter() - wall, 4)
             self._cpu_s = round(_cpu_s() - cpu, 4)
         self._check_inputs(inputs)
@@ -178,7 +195,7 @@ class _Call:
             paths = tuple(Path(file.path) for file in given.files)
             return InputFiles(name=given.input_name, paths=paths)
         cls = cast("type[Product]", load_target(given.target))
-        return self._store.get_product(given.ref.digest, cls)
+        return self._store.get_product(given.ref.digest, cls, is_checked=True)
 
     def _params(self, cls: type[Method]) -> object:
         try:
@@ -189,7 +206,7 @@ class _Call:
     def _check_inputs(self, inputs: Mapping[str, Product | InputFiles]) -> None:
         for port, given in self.task.inputs.items():
             for file in given.files:
-                _check_file(file.path, file.size_bytes, file.mtime_ns)
+                _check_file(file)
             product = inputs[port]
             is_checked = isinstance(product, Product) and _n_bytes(product) <= _CHECKED_BYTES
             if is_checked and digest_of(cast("Product", product)) != given.ref.digest:
@@ -220,7 +237,17 @@ class _Call:
             refs[port] = self._store.put_product(
                 product, publisher, publisher_tag=self.task.publisher_tag
             )
+            self._check_output(port, product, refs[port])
         return refs
+
+    def _check_output(self, port: str, product: Product, ref: ProductRef) -> None:
+        # Only who still runs can change what was returned; a thread can be seen.
+        is_checked = _n_bytes(product) <= _CHECKED_BYTES or threading.active_count() > _OWN_THREADS
+        if is_checked and digest_of(product) != ref.digest:
+            raise MethodError(
+                f"{self.task.who} changed its output {port} after it had returned it; it must wait "
+                f"for its threads"
+            )
 
     def _keep_figures(self) -> tuple[FigureRef, ...]:
         return tuple(
@@ -243,19 +270,21 @@ def load_target(target: str) -> object:
         return cast("object", getattr(import_module(module), name))
     except Exception as error:
         raise PluginError(
-            f"{target} cannot be loaded: {type(error).__name__}: {error}; "
+            f"{target} cannot be loaded: {type(error).__name__}: {one_line(error)}; "
             f"`orthoflow doctor` says what is missing"
         ) from error
 
 
-def _check_file(path: str, size_bytes: int, mtime_ns: int) -> None:
+def _check_file(file: TaskFile) -> None:
+    path = Path(file.path)
     try:
-        stat = os.stat(path)  # noqa: PTH116
+        # Who only touched it, or gave it another name, has changed nothing.
+        is_same = file_identity(path) == file.identity or file_sha256(path) == file.sha256
     except OSError as error:
         raise InputError(
             f"the input file {path} cannot be read any more: {error.strerror}"
         ) from error
-    if (stat.st_size, stat.st_mtime_ns) != (size_bytes, mtime_ns):
+    if not is_same:
         raise InputError(f"the input file {path} changed while it was read; run again")
 
 
@@ -269,4 +298,9 @@ def _cpu_s() -> float:
 
 
 def _trace(error: BaseException) -> str:
-    return "".join(traceback.format_exception(error))
+    try:
+        text = "".join(traceback.format_exception(error))
+    except Exception:  # noqa: BLE001 - as above, it may fail at being told of
+        text = ""
+    # The end says what happened.
+    return text[-_LONGEST_TRACE:].encode(errors="backslashreplace").decode()

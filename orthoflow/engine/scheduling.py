@@ -41,6 +41,7 @@ from orthoflow.engine.results import CellResult, MethodIdentity, ProductRef, sha
 from orthoflow.engine.run_folder import (
     LOGS,
     CellBegan,
+    CellDamaged,
     CellEnded,
     Journal,
     RunWent,
@@ -48,14 +49,17 @@ from orthoflow.engine.run_folder import (
 )
 from orthoflow.engine.store import Store
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput
-from orthoflow.errors import CancelledStepError
+from orthoflow.errors import ArgumentError, CancelledStepError, DamageError
 from orthoflow.sdk.context import StepEvent
-from orthoflow.workflow.cells import Cell, WorkflowInput
+from orthoflow.sdk.lines import one_line, text_of_path
+from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
 
 _POLL_S: Final = 0.25
 _CODE_CHANGED: Final = (
     "the code of the method changed during the run: the result is not kept for other runs"
 )
+# So often a failed cell is given another chance whose inputs were damaged when it failed.
+_MOST_REPEATS: Final = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +73,7 @@ class RunOutcome:
         results: address -> result, in the order of the plan.
         cached: address -> id of the run that computed it, for results of other runs.
         resumed: addresses that this run had computed before it was interrupted.
+        damaged: address -> what of its stored result was damaged, for what was computed again.
         inputs: workflow input -> files; None when it is optional and absent.
     """
 
@@ -78,6 +83,7 @@ class RunOutcome:
     results: Mapping[str, CellResult]
     cached: Mapping[str, str] = field(default_factory=dict)
     resumed: frozenset[str] = frozenset()
+    damaged: Mapping[str, str] = field(default_factory=dict)
     inputs: Mapping[str, PlannedInput | None] = field(default_factory=dict)
 
     @property
@@ -122,11 +128,16 @@ def execute(
         run_id: id of a new run, made up when empty; a resumed run keeps its own.
 
     Raises:
-        ArgumentError: the run folder holds a finished run or other files.
+        ArgumentError: the run folder holds a finished run or other files, or a path is no text.
         StoreError: the disk refuses, or the run folder is in use.
         CancelledStepError: interrupted by Ctrl-C or SIGTERM.
     """
     folder = Path(run_folder).absolute()
+    for what, path in (("run folder", folder), ("store", store.folder)):
+        if text_of_path(path) is None:
+            raise ArgumentError(
+                f"the {what} {one_line(path)} has a path that is no UTF-8: rename it"
+            )
     with store.in_use(), Journal(folder, plan.name, run_id=run_id) as journal:
         with writing_to(folder):
             (folder / LOGS).mkdir(exist_ok=True)
@@ -173,6 +184,7 @@ class _Run:
         self._cached: dict[str, str] = {}
         self._resumed: set[str] = set()
         self._made: set[str] = set()
+        self._repeats: dict[str, int] = {}
         self._waiting = {item.cell.address: item for item in self._plan.cells}
         self._ready: dict[str, _Ready] = {}
         self._running: dict[str, Task] = {}
@@ -201,6 +213,7 @@ class _Run:
             results={address: self._results[address] for address in order},
             cached={a: self._cached[a] for a in order if a in self._cached},
             resumed=frozenset(self._resumed),
+            damaged={a: self._journal.damaged[a] for a in order if a in self._journal.damaged},
             inputs=self._plan.inputs,
         )
 
@@ -224,10 +237,10 @@ class _Run:
             if ready is None or self._is_under_way(ready.key):
                 continue
             # An equal cell of this run may have ended meanwhile.
-            known = self._store.result(ready.key.key) if ready.key.key in self._made else None
+            known = self._known(planned.cell, ready.key) if ready.key.key in self._made else None
             if known is not None:
                 self._settle(planned.cell, known, is_cached=True)
-            elif self._has_room(planned.cell):
+            elif self._has_room(planned.cell) and not self._is_held_up(planned.cell, ready.refs):
                 self._start(planned.cell, ready, executor)
 
     def _prepare(self, cell: Cell) -> None:
@@ -268,10 +281,41 @@ class _Run:
         is_done = key.key in self._journal.finished_keys or key.key in self._made
         if cell.step in self._plan.options.force and not is_done:
             return None
-        result = self._store.result(key.key)
-        if result is not None:
-            self._store.touch(key.key)
-        return result
+        taken = self._store.take(key.key)
+        if taken.damage:
+            text = f"the stored result was damaged ({taken.damage}) and is computed again"
+            self._listen(CellWarned(address=cell.address, text=text))
+            self._journal.write(
+                CellDamaged(time=now(), address=cell.address, key=key.key, what=taken.damage)
+            )
+        return taken.result
+
+    def _is_held_up(
+        self, cell: Cell, refs: Mapping[str, ProductRef], *, again: bool = False
+    ) -> bool:
+        """Whether a cell must wait because stored products that it takes turn out to be damaged.
+
+        The cells that gave them, and all behind these, are then settled anew.
+        """
+        givers = {
+            source.address
+            for port, ref in refs.items()
+            if isinstance(source := cell.inputs[port], CellOutput)
+            and not self._store.is_sound(ref.digest, again=again)
+        }
+        affected = set(givers)
+        for item in self._plan.cells if givers else ():
+            address = item.cell.address
+            if affected.intersection(needed_addresses(item.cell)):
+                affected.add(address)
+            if address in affected and address in self._results:
+                del self._results[address]
+                self._waiting[address] = item
+            if address in affected:
+                self._ready.pop(address, None)
+                self._cached.pop(address, None)
+                self._resumed.discard(address)
+        return bool(givers)
 
     def _is_under_way(self, key: CellKey) -> bool:
         """Whether an equal cell runs already; its result will then serve both."""
@@ -299,20 +343,50 @@ class _Run:
 
     def _take(self, end: TaskEnd) -> None:
         task = self._running.pop(end.address)
-        cell = next(item.cell for item in self._plan.cells if item.cell.address == end.address)
-        result = end.result
+        planned = next(item for item in self._plan.cells if item.cell.address == end.address)
+        cell, result = planned.cell, end.result
+        remove_tree(Path(task.folder))
+        if self._is_to_repeat(cell, task, result):
+            self._waiting[cell.address] = planned
+            return
         if result.status == "ok" and self._plan.methods[cell.method].is_code_unchanged():
             self._made.add(task.key)
             self._store.put_result(task.key, result, cell.step)
+            self._store.trust(result)
         elif result.status == "ok":
             # Kept under its key it would pass for what the code of that key computes.
             self._listen(CellWarned(address=cell.address, text=_CODE_CHANGED))
-            result = dataclasses.replace(result, warnings=(*result.warnings, _CODE_CHANGED))
-        remove_tree(Path(task.folder))
+            result = _with_warning(result, _CODE_CHANGED)
+        if self._has_other_inputs_now(cell, task):
+            # What it took was damaged and came out differently when it was computed again.
+            self._waiting[cell.address] = planned
+            return
         self._settle(cell, result)
+
+    def _is_to_repeat(self, cell: Cell, task: Task, result: CellResult) -> bool:
+        """Whether a cell failed because of what the store gave it, not because of its method."""
+        repeats = self._repeats.get(cell.address, 0)
+        if result.status == "ok" or result.exit_code == CancelledStepError.exit_code:
+            return False
+        refs = {port: given.ref for port, given in task.inputs.items()}
+        is_fault_of_store = self._is_held_up(cell, refs, again=True)
+        # Another run may have set aside what this one was about to read, and mended it since.
+        is_fault_of_store |= result.error_type == DamageError.__name__
+        self._repeats[cell.address] = repeats + 1
+        return is_fault_of_store and repeats < _MOST_REPEATS
+
+    def _has_other_inputs_now(self, cell: Cell, task: Task) -> bool:
+        if not all(address in self._results for address in needed_addresses(cell)):
+            return True
+        refs = known_inputs(cell, self._plan.inputs, self._results)
+        return refs != {port: given.ref for port, given in task.inputs.items()}
 
     def _settle(self, cell: Cell, result: CellResult, *, is_cached: bool = False) -> None:
         self._waiting.pop(cell.address, None)
+        damage = self._journal.damaged.get(cell.address)
+        if damage and result.status == "ok":
+            text = f"the stored result was damaged ({damage}) and was computed again"
+            result = _with_warning(result, text)
         self._results[cell.address] = result
         if is_cached and result.run_id == self._journal.run_id:
             self._resumed.add(cell.address)
@@ -329,6 +403,10 @@ class _Run:
             )
         )
         self._listen(CellFinished(address=cell.address, result=result, cached=is_cached))
+
+
+def _with_warning(result: CellResult, text: str) -> CellResult:
+    return dataclasses.replace(result, warnings=(*result.warnings, text))
 
 
 def _executor(name: ExecutorName, tell: Tell, interruption: _Interruption) -> Executor:
@@ -442,7 +520,7 @@ class _TaskMaker:
 
 def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
     return tuple(
-        TaskFile(path=str(path.absolute()), size_bytes=file.size_bytes, mtime_ns=file.mtime_ns)
+        TaskFile(path=str(path.absolute()), identity=file.identity, sha256=file.sha256)
         for path, file in zip(given.paths, given.files, strict=True)
     )
 

@@ -5,28 +5,34 @@ Layout below the store's folder:
     objects/<digest>/product.h5     a product, `object.json` beside it, `files/` what it publishes
     objects/<digest>/blob           a figure
     results/<key>.json              what a cell gave, naming objects
+    damaged/                        what was set aside; garbage
     preimages/<method>/<key>.json   small copies of the keys' preimages, for explanations
     digests.json                    memory of input files' digests; disposable
     numba/<source digest>/          compiled kernels; disposable
     scratch/<run id>/               work in progress; removed with its run
     lock                            shared by runs, exclusive for garbage collection
+    damaged.lock                    held by who sets something aside
+
+Everything has the digest of its bytes (`objects`, `checked_json`) and is checked when a run, or an
+export, takes it. What is damaged is set aside, never removed: another run may have it open.
 """
 
 from __future__ import annotations
 
 import contextlib
-import filecmp
+import errno
 import hashlib
 import json
 import os
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
-from orthoflow_provenance.digests import canonical_json, payload_digest
+from orthoflow_provenance.digests import canonical_json, payload_digest, sha256_text
 from orthoflow_provenance.errors import RecordFormatError
 
 from orthoflow.engine.clock import time_of_file
@@ -34,20 +40,31 @@ from orthoflow.engine.durability import (
     folder_size,
     place_folder,
     remove_tree,
-    sync_file,
-    sync_folder,
+    sync_tree,
     write_whole,
     writing_to,
 )
 from orthoflow.engine.file_digests import FileDigests
-from orthoflow.engine.locks import shared_lock
-from orthoflow.engine.results import (
-    CellResult,
-    ProductRef,
-    result_from_json,
-    result_to_json,
+from orthoflow.engine.locks import shared_lock, taking_turns
+from orthoflow.engine.objects import (
+    BLOB,
+    PRODUCT,
+    PUBLISHED,
+    SHORTAGES,
+    WHOLE,
+    CheckedFiles,
+    EarlierProduct,
+    StoredProduct,
+    describe_product,
+    files_of,
+    missing_part,
+    part_name,
+    read_description,
+    require_plain_files,
 )
-from orthoflow.errors import ProductError, StoreError
+from orthoflow.engine.results import CellResult, ProductRef, result_from_json, result_to_json
+from orthoflow.errors import DamageError, ProductError, StoreError
+from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import Payload, Product
 
 if TYPE_CHECKING:
@@ -58,12 +75,12 @@ __all__ = [
     "Publisher",
     "Store",
     "StoredResult",
+    "TakenResult",
     "canonical_json",
     "digest_of",
     "list_results",
 ]
 
-_HDF5_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _READ_RETRY_S: Final = 0.05
 
 ProductT = TypeVar("ProductT", bound=Product)
@@ -102,6 +119,19 @@ class StoredResult:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TakenResult:
+    """What a run gets for a key.
+
+    Attributes:
+        result: None when there is none, or none that is whole.
+        damage: which parts of it were damaged, empty when there is nothing to say.
+    """
+
+    result: CellResult | None
+    damage: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Preimage:
     """Key preimage of an earlier result, with the name of its step."""
 
@@ -130,8 +160,11 @@ class Store:
         self.results = self.folder / "results"
         self.objects = self.folder / "objects"
         self.preimages = self.folder / "preimages"
+        self.damaged = self.folder / "damaged"
         self.lock_file = self.folder / "lock"
         self._workspace = workspace or self.scratch / "loose"
+        self._checked = CheckedFiles()
+        self._found_damaged: dict[str, str] = {}
 
     def file_digests(self) -> FileDigests:
         """Give the memory of input files' digests; call its `save` when done."""
@@ -179,11 +212,12 @@ class Store:
         aside = self._new_folder()
         try:
             with writing_to(self.folder):
-                digest = write_product_file(aside / "product.h5", product.to_payload())
+                digest = write_product_file(aside / PRODUCT, product.to_payload())
                 final = self._object(digest)
-                if not _is_same_object(aside, final, publisher_tag if publisher else ""):
+                tag = publisher_tag if publisher else ""
+                if not self._is_there(final, tag):
                     self._finish_object(aside, product, publisher, digest)
-                    _describe(aside, type(product).type_name, publisher_tag if publisher else "")
+                    describe_product(aside, final.name, type(product).type_name, tag)
                     self._place(aside, final)
         except RecordFormatError as error:
             raise ProductError(f"a {product.type_name} cannot be stored: {error}") from error
@@ -193,42 +227,64 @@ class Store:
             type_name=product.type_name, encoding_version=product.encoding_version, digest=digest
         )
 
-    def get_product(self, digest: str, cls: type[ProductT]) -> ProductT:
+    def get_product(
+        self, digest: str, cls: type[ProductT], *, is_checked: bool = False
+    ) -> ProductT:
         """Read a product; arrays are read-only, those of scan size memory-mapped.
 
+        Args:
+            digest: of the product.
+            cls: its type.
+            is_checked: somebody has looked at its bytes already, as the coordinator does for steps.
+
         Raises:
-            StoreError: it is not there, or was damaged; a damaged one is removed.
+            DamageError: it is not there, or is damaged.
             ProductError: it is of another type.
         """
         from orthoflow_provenance.payloads import read_product_file  # noqa: PLC0415 - as above
 
-        path = self._object(digest) / "product.h5"
+        path = self._object(digest) / PRODUCT
         if not path.is_file():
             # Another run may be exchanging the folder for an equal one this very moment.
             time.sleep(_READ_RETRY_S)
+        if not path.exists():
+            raise DamageError(f"the store {self.folder} has no product {digest}")
+        what = f"the stored product {digest[:19]} in {self.folder}"
+        damaged = f"{what} was damaged; run again and it is computed anew"
+        if not is_checked and not self.is_sound(digest):
+            raise DamageError(damaged)
         try:
             stored = read_product_file(path, map_arrays=True)
-        except FileNotFoundError as error:
-            raise StoreError(f"the store {self.folder} has no product {digest}") from error
         except (OSError, ValueError, KeyError, RuntimeError) as error:
-            if isinstance(error, OSError) and error.errno:
+            if isinstance(error, OSError) and error.errno in SHORTAGES:
                 raise StoreError(f"cannot read {path}: {error.strerror}") from error
-            self._discard(digest)
-            raise StoreError(
-                f"the stored product {digest[:19]} in {self.folder} was damaged ({error}) and has "
-                f"been removed; run again and it is computed anew"
-            ) from error
+            raise DamageError(f"{damaged} ({error})") from error
         return cls.from_payload(_as_payload(stored))
 
     def product_file(self, digest: str) -> Path | None:
-        """The HDF5 file of a product, None when it is not there or visibly damaged."""
-        path = self._object(digest) / "product.h5"
-        return path if _looks_whole(path) else None
+        """The HDF5 file of a product, None when it is not there or is damaged."""
+        return self._object(digest) / PRODUCT if self.is_sound(digest) else None
 
-    def published_files(self, digest: str) -> tuple[Path, ...]:
-        """The files that a product published, sorted by name."""
-        folder = self._object(digest) / "files"
-        return tuple(sorted(path for path in folder.rglob("*") if path.is_file()))
+    def published_files(self, digest: str) -> Mapping[Path, str]:
+        """The files that a product published, sorted by name, and the SHA-256 that each must have.
+
+        They are not read here: who copies them computes the digests on the way.
+
+        Raises:
+            DamageError: the product is not there, or nobody knows what it published.
+        """
+        folder = self._object(digest)
+        found = read_description(folder)
+        if isinstance(found, EarlierProduct) and self.is_sound(digest):
+            found = read_description(folder)
+        if not isinstance(found, StoredProduct):
+            raise DamageError(f"the store {self.folder} has no sound product {digest}")
+        prefix = f"{PUBLISHED}/"
+        return {
+            folder / name: file.sha256
+            for name, file in sorted(found.files.items())
+            if name.startswith(prefix)
+        }
 
     # Figures ------------------------------------------------------------------------------------
 
@@ -239,49 +295,124 @@ class Store:
             StoreError: the disk refuses.
         """
         sha256 = hashlib.sha256(content).hexdigest()
-        if self.blob_path(sha256) is None:
+        folder = self.objects / sha256
+        if self._damaged_part(folder):
             aside = self._new_folder()
             try:
-                write_whole(aside / "blob", content)
-                place_folder(aside, self.objects / sha256)
+                write_whole(aside / BLOB, content)
+                self._place(aside, folder)
             finally:
                 remove_tree(aside)
         return sha256
 
-    def blob_path(self, sha256: str) -> Path | None:
-        """The file with these bytes, None when it is not there."""
-        path = self.objects / sha256 / "blob"
-        return path if path.is_file() else None
+    def blob(self, sha256: str) -> bytes:
+        """The bytes of a figure.
+
+        Raises:
+            DamageError: they are not there, or are damaged.
+        """
+        with contextlib.suppress(OSError):
+            content = (self._object(sha256) / BLOB).read_bytes()
+            if hashlib.sha256(content).hexdigest() == sha256:
+                return content
+        self.is_sound(sha256)
+        raise DamageError(f"the figure {sha256[:12]} in the store {self.folder} is damaged")
+
+    # Damage -------------------------------------------------------------------------------------
+
+    def is_sound(self, name: str, *, again: bool = False) -> bool:
+        """Whether a product or a figure has the bytes that were put there; see `damage`."""
+        return not self.damage(name, again=again)
+
+    def damage(self, name: str, *, with_published: bool = False, again: bool = False) -> str:
+        """Say which part of an object is damaged, and set it aside; empty when it is sound.
+
+        Args:
+            name: of the object: digest of a product, or SHA-256 of a figure.
+            with_published: look at the published files too.
+            again: look at files, too, that this process has found sound and nobody changed since.
+
+        Raises:
+            StoreError: it cannot be set aside.
+            OSError: the machine lacks memory or open files.
+        """
+        folder = self._object(name)
+
+        def damaged_part() -> str:
+            return self._damaged_part(folder, with_published=with_published, again=again)
+
+        part = damaged_part()
+        if part and not self._set_aside(folder, damaged_part):
+            # It is gone, or another run has mended it, or it could not be read just once.
+            part = damaged_part()
+        if part and part != WHOLE:
+            self._found_damaged[folder.name] = part
+        return part
+
+    def damaged_objects(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Look at every byte of objects, set damaged ones aside and name them."""
+        wanted = dict.fromkeys(names)
+        return tuple(name for name in wanted if self.damage(name, with_published=True, again=True))
+
+    def trust(self, result: CellResult) -> None:
+        """Take the objects of a result for sound that has only just been computed."""
+        for name in result.objects:
+            folder = self.objects / name
+            with contextlib.suppress(OSError):
+                for path in files_of(folder):
+                    self._checked.trust(folder / path)
 
     # Results ------------------------------------------------------------------------------------
 
     def result(self, key: str) -> CellResult | None:
-        """The result of a key; None when there is none, or some of its objects are missing."""
-        path = self.results / f"{key}.json"
-        try:
-            result = result_from_json(path.read_text(encoding="utf-8"), path.name)
-        except (FileNotFoundError, UnicodeDecodeError):
+        """The result of a key; None when there is none, or objects of it are visibly not whole."""
+        result = self._read_result(key)
+        if result is None or any(missing_part(self.objects / name) for name in result.objects):
             return None
-        except StoreError:
-            return None
-        except OSError as error:
-            raise StoreError(f"cannot read {path}: {error.strerror}") from error
-        is_complete = (
-            result.key == key
-            and result.status == "ok"
-            and all(self.product_file(ref.digest) for ref in result.outputs.values())
-            and all(self.blob_path(figure.sha256) for figure in result.figures)
-        )
-        return result if is_complete else None
+        return result
+
+    def take(self, key: str) -> TakenResult:
+        """Take the result of a key into a run: what is visibly damaged is set aside and named.
+
+        Raises:
+            StoreError: the store cannot be read.
+        """
+        result = self._read_result(key)
+        if result is None:
+            path = self.results / f"{key}.json"
+            is_damaged = self._set_aside(path, lambda: self._read_result(key) is None)
+            return TakenResult(result=None, damage="result file" if is_damaged else "")
+        damage: dict[str, None] = {}
+        for name in sorted(result.objects):
+            folder = self.objects / name
+            if part := missing_part(folder):
+                self._set_aside(folder, partial(missing_part, folder))
+                damage[self._found_damaged.get(name, part)] = None
+        if damage:
+            return TakenResult(result=None, damage=", ".join(damage))
+        with contextlib.suppress(OSError):
+            os.utime(self.results / f"{key}.json")
+        return TakenResult(result=result)
+
+    def damage_of_result(self, key: str) -> str:
+        """Say what makes a result useless, and set it aside; empty when all of it is there.
+
+        Raises:
+            StoreError: it cannot be set aside.
+        """
+        result = self._read_result(key)
+        reason = "result file" if result is None else ""
+        for name in sorted(result.objects) if result is not None else ():
+            if part := missing_part(self.objects / name):
+                part = self._found_damaged.get(name, part)
+                reason = f"needs objects/{name[:12]}, which is damaged ({part})"
+        if reason:
+            self._set_aside(self.results / f"{key}.json", lambda: self.result(key) is None)
+        return reason
 
     def size_bytes(self, result: CellResult) -> int:
         """What a result's products, their published files and its figures take here."""
         return sum(folder_size(self.objects / name) for name in result.objects)
-
-    def touch(self, key: str) -> None:
-        """Note that a result was used now; garbage collection keeps what is used."""
-        with contextlib.suppress(OSError):
-            os.utime(self.results / f"{key}.json")
 
     def put_result(self, key: str, result: CellResult, step: str) -> None:
         """Keep the result of a cell; its objects must be in the store already.
@@ -332,27 +463,89 @@ class Store:
         files = aside / "files"
         files.mkdir()
         publisher(product, files, digest)
-        for path in files.rglob("*"):
-            if path.is_file():
-                sync_file(path)
-            else:
-                sync_folder(path)
-        sync_folder(files)
+        require_plain_files(files, f"a {product.type_name}")
+        sync_tree(files)
 
     def _place(self, aside: Path, final: Path) -> None:
-        if final.exists():
+        if os.path.lexists(final):
             old = self._workspace / f"replaced-{uuid.uuid4().hex}"
             with contextlib.suppress(FileNotFoundError):
                 final.rename(old)
             remove_tree(old)
         place_folder(aside, final)
 
-    def _discard(self, digest: str) -> None:
-        aside = self._workspace / f"damaged-{uuid.uuid4().hex}"
-        with contextlib.suppress(OSError):
-            aside.parent.mkdir(parents=True, exist_ok=True)
-            self._object(digest).rename(aside)
-            remove_tree(aside)
+    def _read_result(self, key: str) -> CellResult | None:
+        path = self.results / f"{key}.json"
+        try:
+            result = result_from_json(path.read_text(encoding="utf-8"), path.name)
+        except (OSError, UnicodeDecodeError) as error:
+            if isinstance(error, OSError) and error.errno in SHORTAGES:
+                raise
+            return None
+        return result if result.key == key and result.status == "ok" else None
+
+    def _is_there(self, folder: Path, publisher_tag: str) -> bool:
+        """Whether an equal object is there, sound, and needs no newer published files."""
+        found = read_description(folder)
+        is_current = isinstance(found, StoredProduct) and found.publisher == publisher_tag
+        return is_current and not self._damaged_part(folder, with_published=True, again=True)
+
+    def _damaged_part(
+        self, folder: Path, *, with_published: bool = False, again: bool = False
+    ) -> str:
+        found = read_description(folder)
+        if isinstance(found, EarlierProduct):
+            return "" if self._adopt(folder, found) else part_name(PRODUCT)
+        files = files_of(folder)
+        if not files:
+            return missing_part(folder)
+        for name, expected in files.items():
+            if name.startswith(f"{PUBLISHED}/") and not with_published:
+                continue
+            if again:
+                self._checked.forget(folder / name)
+            if not self._checked.is_sound(folder / name, expected):
+                return part_name(name)
+        return ""
+
+    def _adopt(self, folder: Path, earlier: EarlierProduct) -> bool:
+        """Give a product of an earlier version its digests, if its content is what its name says.
+
+        Nobody knows any more what its published files were: they are taken as they are, once.
+        """
+        from orthoflow_provenance.payloads import read_product_file  # noqa: PLC0415 - as above
+
+        try:
+            stored = read_product_file(folder / PRODUCT, map_arrays=True)
+            if payload_digest(stored) != f"sha256:{folder.name}":
+                return False
+        except (OSError, ValueError, KeyError, RuntimeError):
+            return False
+        with contextlib.suppress(StoreError):
+            describe_product(folder, folder.name, earlier.type, earlier.publisher)
+        return True
+
+    def _set_aside(self, path: Path, is_damaged: Callable[[], object]) -> bool:
+        """Move a file or folder out of the way, if it is there and still damaged.
+
+        Raises:
+            StoreError: it cannot be moved.
+        """
+        try:
+            with writing_to(self.folder), taking_turns(self.folder / "damaged.lock"):
+                # Another run may have been quicker, and may have put a sound one there.
+                if not os.path.lexists(path) or not is_damaged():
+                    return False
+                self.damaged.mkdir(exist_ok=True)
+                path.rename(self.damaged / f"{path.name}-{uuid.uuid4().hex[:8]}")
+        except StoreError as error:
+            if error.errno == errno.ENOENT:
+                return False
+            raise StoreError(
+                f"{path.parent.name}/{path.name[:12]} in the store {self.folder} is damaged, but "
+                f"cannot be set aside: {error}"
+            ) from error
+        return True
 
 
 def list_results(store: Store) -> tuple[StoredResult, ...]:
@@ -383,40 +576,6 @@ def digest_of(product: Product) -> str:
     return payload_digest(product.to_payload())
 
 
-def _describe(folder: Path, type_name: str, publisher_tag: str) -> None:
-    size = (folder / "product.h5").stat().st_size
-    description = {"type": type_name, "size_bytes": size, "publisher": publisher_tag}
-    write_whole(folder / "object.json", json.dumps(description).encode())
-
-
-def _description(folder: Path) -> dict[str, object]:
-    try:
-        content = json.loads((folder / "object.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def _is_same_object(new: Path, old: Path, publisher_tag: str) -> bool:
-    """Whether the old object is whole and needs no newer published files.
-
-    Bytes are compared: the file of an equal product is equal, so a difference means damage.
-    """
-    if not _looks_whole(old / "product.h5") or _description(old)["publisher"] != publisher_tag:
-        return False
-    return filecmp.cmp(new / "product.h5", old / "product.h5", shallow=False)
-
-
-def _looks_whole(path: Path) -> bool:
-    try:
-        with path.open("rb") as stream:
-            signature = stream.read(len(_HDF5_SIGNATURE))
-            size = os.fstat(stream.fileno()).st_size
-    except OSError:
-        return False
-    return signature == _HDF5_SIGNATURE and _description(path.parent).get("size_bytes") == size
-
-
 def _as_payload(stored: StoredPayload) -> Payload:
     return Payload(
         type_name=stored.type_name,
@@ -429,7 +588,10 @@ def _as_payload(stored: StoredPayload) -> Payload:
 
 def _read_preimage(path: Path) -> Preimage | None:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return Preimage(key=path.stem, step=content["step"], text=content["preimage"])
+        content = parse_json(path.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            return None
+        found = Preimage(key=path.stem, step=content["step"], text=content["preimage"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+    return found if sha256_text(found.text) == found.key else None

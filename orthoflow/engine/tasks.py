@@ -8,19 +8,26 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from pydantic import JsonValue, TypeAdapter
+from pydantic import JsonValue, TypeAdapter, ValidationError
 
 from orthoflow.engine.durability import write_whole
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedEnvironment
+from orthoflow.errors import StoreError
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskFile:
-    """An input file of a task; size and time tell whether it changed meanwhile."""
+    """An input file of a task.
+
+    Attributes:
+        path: where it lies.
+        identity: what the file system says of it as long as it stays as it is.
+        sha256: digest of its content, hexadecimal.
+    """
 
     path: str
-    size_bytes: int
-    mtime_ns: int
+    identity: str
+    sha256: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,8 +133,21 @@ def write_task(task: Task) -> None:
 
 
 def read_task(path: Path) -> Task:
-    """Read a task back."""
-    return _codec().validate_json(path.read_bytes(), strict=True)
+    """Read a task back.
+
+    Raises:
+        StoreError: the file cannot be read, or is damaged.
+    """
+    try:
+        return _codec().validate_json(path.read_bytes(), strict=True)
+    except OSError as error:
+        raise StoreError(f"cannot read the task {path}: {error.strerror}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise StoreError(
+            f"the task {path} is damaged: {place or 'the text'}: {first['msg']}; run again"
+        ) from error
 
 
 @cache

@@ -40,7 +40,10 @@ from orthoflow.files.yaml_positions import (
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Calibration, Intrinsics
 
-_MAX_BYTES: Final = 1_000_000
+# Some seconds of parsing; a calibration of a thousand cameras has about 150 kB.
+MOST_BYTES: Final = 400_000
+MOST_CAMERAS: Final = 1000
+MOST_VALUES: Final = 20_000
 _SIZES: Final = ("width", "height")
 _FOCALS: Final = ("fx", "fy")
 _CENTRES: Final = ("cx", "cy")
@@ -50,7 +53,7 @@ _N_DISTORTION: Final = 5
 _START: Final = Position(line=1, column=1)
 _DIALECT: Final = Dialect(
     is_strict=False,
-    most_values=200_000,
+    most_values=MOST_VALUES,
     empty="the calibration file is empty",
     duplicate='found duplicate key "{key}"; remove one of them',
 )
@@ -145,9 +148,10 @@ def intrinsics_for(
 
 def _text_of(path: Path) -> str:
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        if path.stat().st_size > MOST_BYTES:
             raise InputError(
-                f"{path.name} has {path.stat().st_size} bytes: a calibration file is a short text"
+                f"{path.name} has {path.stat().st_size} bytes, a calibration file at most "
+                f"{MOST_BYTES}: give photos of one camera one entry, by a pattern"
             )
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -179,6 +183,14 @@ class _Reader:
         self._refuse_unknown(document, ("cameras",), "")
         if not isinstance(section.value, Table) or not section.value.entries:
             self._add(section.position, "cameras: expected one entry per photo name or pattern")
+            return None
+        n_cameras = len(section.value.entries)
+        if n_cameras > MOST_CAMERAS:
+            self._add(
+                section.position,
+                f"cameras: expected at most {MOST_CAMERAS} entries, got {n_cameras}; give photos "
+                "of one camera one entry, by a pattern",
+            )
             return None
         cameras: dict[str, Intrinsics] = {}
         for entry in section.value:

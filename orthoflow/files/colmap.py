@@ -1,22 +1,64 @@
-"""Orientations as a COLMAP text model: `cameras.txt`, `images.txt`, `points3D.txt`.
+"""Orientations as a COLMAP model: `cameras.txt`, `images.txt`, `points3D.txt`, read also as `.bin`.
 
 COLMAP counts pixels as orthoflow does, the centre of the first one at (0.5, 0.5), and has the same
-camera axes, so nothing is converted. The points are the ties that the orientation kept.
+camera axes, so nothing is converted. The points written are the ties that the orientation kept.
 """
 
 from __future__ import annotations
 
+import math
+import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import ArgumentError
+from orthoflow.errors import ArgumentError, InputError
+from orthoflow.files.given_cameras import (
+    GivenCamera,
+    bare_name,
+    checked_lens,
+    damaged,
+    numbers_of,
+    text_of,
+)
 from orthoflow.files.sidecars import write_text
-from orthoflow.geometry.rotations import quaternion_from_rotation
+from orthoflow.geometry.rotations import quaternion_from_rotation, rotation_from_quaternion
 from orthoflow.products import Camera, Cameras, Intrinsics, TieRole, Ties
+
+# COLMAP's numbers of its models, with how many parameters each has.
+_MODELS: Final = (
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+)
+# Parameters of those that OpenCV's model holds, in COLMAP's order.
+_COLUMNS: Final = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": (
+        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+        *("k3", "k4", "k5", "k6"),
+    ),
+}
+# u, v and the number of the point.
+_OBSERVATION_BYTES: Final = 24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +174,160 @@ def _points_text(seen: _KeptTies) -> str:
         place = _words(seen.points_world[index])
         lines.append(f"{index + 1} {place} 128 128 128 {error!r} {track}")
     return "\n".join(lines) + "\n"
+
+
+def read_colmap_model(cameras: Path, images: Path) -> tuple[GivenCamera, ...]:
+    """Read the orientations of a model, as text or binary.
+
+    Args:
+        cameras: `cameras.txt` or `cameras.bin`.
+        images: `images.txt` or `images.bin`.
+
+    Raises:
+        InputError: the model is damaged.
+    """
+    is_binary = images.suffix.lower() == ".bin"
+    lenses = (_binary_lenses if is_binary else _text_lenses)(cameras)
+    found = []
+    for name, camera_id, pose in (_binary_images if is_binary else _text_images)(images):
+        if camera_id not in lenses:
+            raise damaged(images, f"{name} has camera {camera_id}, which {cameras.name} has not")
+        lens, length = lenses[camera_id], float(np.linalg.norm(pose[:4]))
+        if not (math.isfinite(length) and length > 0.0 and all(map(math.isfinite, pose))):
+            raise damaged(images, f"the pose of {name} must be finite numbers")
+        if isinstance(lens, str):
+            found.append(GivenCamera(name=bare_name(name), reason=lens))
+            continue
+        found.append(
+            GivenCamera(
+                name=bare_name(name),
+                lens=lens,
+                rotation=rotation_from_quaternion(np.array(pose[:4]) / length),
+                translation=np.array(pose[4:]),
+            )
+        )
+    if not found:
+        raise damaged(images, "the model has no images")
+    return tuple(found)
+
+
+def _text_lenses(path: Path) -> dict[int, Intrinsics | str]:
+    lenses: dict[int, Intrinsics | str] = {}
+    for number, line in enumerate(text_of(path).splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) < 5:
+            raise damaged(path, "expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", number)
+        camera_id, width, height, *params = numbers_of(
+            [words[0], *words[2:]], path, "a camera's parameters", number
+        )
+        lenses[int(camera_id)] = _lens_of(words[1], (int(width), int(height)), params, path)
+    return lenses
+
+
+def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
+    lines = iter(enumerate(text_of(path).splitlines(), start=1))
+    for number, line in lines:
+        words = line.split(maxsplit=9)
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) < 10:
+            raise damaged(
+                path, "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", number
+            )
+        pose = numbers_of(words[1:8], path, "a pose", number)
+        yield words[9].strip(), int(numbers_of([words[8]], path, "CAMERA_ID", number)[0]), pose
+        # The points of the image stand in a line of their own, which may be empty.
+        next(lines, None)
+
+
+def _binary_lenses(path: Path) -> dict[int, Intrinsics | str]:
+    data = _Bytes(path)
+    lenses: dict[int, Intrinsics | str] = {}
+    for _ in range(data.count()):
+        camera_id, model, width, height = data.values("<IiQQ")
+        if not 0 <= model < len(_MODELS):
+            raise damaged(path, f"camera {camera_id} is of the unknown model {model}")
+        name, n_params = _MODELS[model]
+        params = list(data.values(f"<{n_params}d"))
+        lenses[camera_id] = _lens_of(name, (width, height), params, path)
+    return lenses
+
+
+def _binary_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
+    data = _Bytes(path)
+    for _ in range(data.count()):
+        _image_id, *pose, camera_id = data.values("<I7dI")
+        name = data.text()
+        data.skip(_OBSERVATION_BYTES * data.count())
+        yield name, camera_id, pose
+
+
+class _Bytes:
+    """A binary file of COLMAP's, read from the front."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._at = path, 0
+        try:
+            self._content = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
+
+    def values(self, form: str) -> tuple[Any, ...]:
+        """The next values."""
+        start = self._at
+        self.skip(struct.calcsize(form))
+        return struct.unpack_from(form, self._content, start)
+
+    def count(self) -> int:
+        """How many items follow; each has at least one byte."""
+        (count,) = self.values("<Q")
+        if count > len(self._content):
+            raise damaged(self._path, f"it states {count} items, more than it has bytes")
+        return int(count)
+
+    def text(self) -> str:
+        """The text up to the next zero."""
+        end = self._content.find(b"\0", self._at)
+        text = self._content[self._at : end].decode("utf-8", errors="replace")
+        self.skip(max(end, len(self._content)) + 1 - self._at if end < 0 else end + 1 - self._at)
+        return text
+
+    def skip(self, count: int) -> None:
+        """Go on by so many bytes."""
+        self._at += count
+        if self._at > len(self._content):
+            raise damaged(self._path, "it ends too early, it is cut off")
+
+
+def _lens_of(
+    model: str, size: tuple[int, int], params: list[float], path: Path
+) -> Intrinsics | str:
+    """A camera's lens, or why there is none."""
+    columns = _COLUMNS.get(model)
+    if columns is None:
+        return (
+            f"its camera is of the model {model}, which OpenCV's has not: undistort the model "
+            "with COLMAP (image_undistorter), or refine it as OPENCV"
+        )
+    if len(params) != len(columns):
+        raise damaged(path, f"a camera {model} has {len(columns)} parameters, got {len(params)}")
+    values = dict(zip(columns, params, strict=True))
+    if any(values.get(name, 0.0) for name in ("k4", "k5", "k6")):
+        return "its camera has k4, k5 or k6, which orthoflow does not take: refine it as OPENCV"
+    focal = values.get("f", 0.0)
+    lens = Intrinsics(
+        width=size[0],
+        height=size[1],
+        fx=values.get("fx", focal),
+        fy=values.get("fy", focal),
+        cx=values["cx"],
+        cy=values["cy"],
+        distortion=tuple(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3")),
+        source="given",
+    )
+    return checked_lens(lens, path, f"a camera {model}")
 
 
 def _words(values: list[float] | NDArray[np.float64]) -> str:

@@ -21,6 +21,10 @@ _SCAN: Final = 0xDA
 _APP1: Final = 0xE1
 _APP2: Final = 0xE2
 _ICC_MAGIC: Final = b"ICC_PROFILE\x00"
+# Start of frame, all kinds; between them lie tables.
+_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_WIDTH_TAG: Final = 0x100
+_HEIGHT_TAG: Final = 0x101
 _ICC_TAG: Final = 34675
 # Profiles of cameras take some kilobytes; a packed one that grows beyond this is none.
 _ICC_MOST: Final = 1 << 24
@@ -48,6 +52,31 @@ def image_format(encoded: bytes) -> ImageFormat | None:
         return "PNG"
     if encoded[:4] in (b"II*\x00", b"MM\x00*"):
         return "TIFF"
+    return None
+
+
+def is_webp(encoded: bytes) -> bool:
+    """Whether a file begins as WebP, which figures are kept in; it has at most 16383 x 16383 px."""
+    return encoded[:4] == b"RIFF" and encoded[8:12] == b"WEBP"
+
+
+def stated_size(encoded: bytes) -> tuple[int, int] | None:
+    """Width and height as a JPEG, PNG or TIFF file states them; None where it does not."""
+    match image_format(encoded):
+        case "PNG":
+            chunk = next(_png_chunks(encoded), None)
+            if chunk is not None and chunk.kind == b"IHDR" and chunk.end - chunk.start >= 8:
+                return _two_numbers(encoded[chunk.start : chunk.start + 8])
+        case "JPEG":
+            for segment in _jpeg_segments(encoded):
+                if segment.kind in _FRAMES and segment.end - segment.start >= 5:
+                    height, width = _two_numbers(encoded[segment.start + 1 : segment.start + 5])
+                    return width, height
+        case "TIFF":
+            main = read_directory(encoded, most_bytes=len(encoded))
+            width_px, height_px = main.number(_WIDTH_TAG), main.number(_HEIGHT_TAG)
+            if width_px is not None and height_px is not None:
+                return int(width_px), int(height_px)
     return None
 
 
@@ -123,6 +152,11 @@ def _unpacked(content: bytes) -> bytes | None:
     except zlib.error:
         return None
     return profile if profile and unpacking.eof else None
+
+
+def _two_numbers(content: bytes) -> tuple[int, int]:
+    half = len(content) // 2
+    return int.from_bytes(content[:half], "big"), int.from_bytes(content[half:], "big")
 
 
 def _jpeg_segments(encoded: bytes) -> Iterator[_Segment]:

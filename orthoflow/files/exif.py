@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -40,6 +40,9 @@ _UNIT_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH: Final = 2
 # Longest side of sensors, from the smallest phone to large format scanning backs.
 _SENSOR_MM: Final = (1.5, 130.0)
+# From fisheyes to telescopes, in front of any sensor; cameras that do not know write 0, 1 or 65535.
+_FOCAL_MM: Final = (0.5, 3000.0)
+_EQUIVALENT_MM: Final = (4.0, 3000.0)
 _CROPPED: Final = 0.02
 _CONTRADICTION: Final = 1.15
 
@@ -85,10 +88,12 @@ class FocalLength:
     Attributes:
         value_px: pixels of the stored array, or None when EXIF does not tell it.
         reason: what it was taken from, or why there is none.
+        doubt: what EXIF says that cannot be and was not used; empty without such.
     """
 
     value_px: float | None
     reason: str
+    doubt: str = ""
 
 
 def read_exif(encoded: bytes) -> Exif:
@@ -120,13 +125,37 @@ def focal_length(exif: Exif, width: int, height: int) -> FocalLength:
     The pixel pitch of the focal plane comes first, as it is exact where it is right; it follows
     the picture when that was made smaller or turned since. It is left when it contradicts the
     35 mm equivalent, which does not depend on the size of the picture. That one is taken over the
-    diagonal, see `FULL_FRAME_DIAGONAL_MM`.
+    diagonal, see `FULL_FRAME_DIAGONAL_MM`. What no lens has is told and not used.
 
     Args:
         exif: what EXIF says.
         width: pixels of the stored array.
         height: pixels.
     """
+    of_length = _doubt("focal length", exif.focal_mm, _FOCAL_MM)
+    of_equivalent = _doubt("35 mm equivalent", exif.focal_35mm, _EQUIVALENT_MM)
+    doubt = "; ".join(filter(None, (of_length, of_equivalent)))
+    believed = replace(
+        exif,
+        focal_mm=None if of_length else exif.focal_mm,
+        focal_35mm=None if of_equivalent else exif.focal_35mm,
+    )
+    found = _believed_focal_length(believed, width, height)
+    reason = doubt if found.value_px is None and doubt else found.reason
+    return FocalLength(value_px=found.value_px, reason=reason, doubt=doubt)
+
+
+def _doubt(what: str, value_mm: float | None, possible_mm: tuple[float, float]) -> str:
+    """Say that a value cannot be; empty when it can, or is absent."""
+    shortest, longest = possible_mm
+    if value_mm is None or shortest <= value_mm <= longest:
+        return ""
+    return (
+        f"EXIF says a {what} of {value_mm:g} mm, which no lens has ({shortest:g} to {longest:g} mm)"
+    )
+
+
+def _believed_focal_length(exif: Exif, width: int, height: int) -> FocalLength:
     if exif.focal_mm is None and exif.focal_35mm is None:
         return FocalLength(value_px=None, reason="no EXIF focal length")
     if _is_cropped(exif, width, height):
@@ -197,7 +226,7 @@ def _contradict(one: float, other: float | None) -> bool:
 
 
 def _whole(value: float | None) -> int | None:
-    return None if value is None else int(value)
+    return int(value) if value is not None and value >= 1.0 else None
 
 
 def _resolution(directory: Directory) -> float | None:

@@ -21,13 +21,16 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError, ProductError, StoreError
 
 if TYPE_CHECKING:
-    from rasterio.io import DatasetWriter
+    from rasterio.io import DatasetReader, DatasetWriter
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
 LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["plane of the wall, metres",UNIT["metre",1.0],AXIS["X",EAST],AXIS["Y",NORTH]]'
 )
+# What is read is held as a whole, beside copies of it.
+MOST_CELLS: Final = 1 << 28
+MOST_BANDS: Final = 4
 TILE_PX: Final = 512
 # Larger images are not laid out in memory, but in a file beside the one to write.
 _IN_MEMORY_CELLS: Final = 1 << 26
@@ -250,7 +253,8 @@ def read_raster(path: Path) -> RasterFile:
     from rasterio.errors import RasterioError
 
     try:
-        with _quiet(), rasterio.open(path) as dataset:
+        with _quiet(), rasterio.open(path, driver="GTiff") as dataset:
+            _check_size(path, dataset)
             values = dataset.read()
             return RasterFile(
                 values=values[0] if len(values) == 1 else np.moveaxis(values, 0, 2),
@@ -263,10 +267,22 @@ def read_raster(path: Path) -> RasterFile:
                 overviews=tuple(dataset.overviews(1)),
                 layout=dataset.tags(ns="IMAGE_STRUCTURE").get("LAYOUT", ""),
             )
-    except (RasterioError, OSError) as error:
+    except (RasterioError, OSError, UnicodeDecodeError) as error:
+        # UnicodeDecodeError: GDAL's messages and tags hold bytes of the file.
         raise InputError(
             f"{path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
         ) from error
+
+
+def _check_size(path: Path, dataset: DatasetReader) -> None:
+    """Refuse what a small file may state and no orthoimage has, before there is room for it."""
+    cells = dataset.width * dataset.height
+    if cells > MOST_CELLS or dataset.count > MOST_BANDS:
+        raise InputError(
+            f"{path.name} is too large: {dataset.width} x {dataset.height} cells in "
+            f"{dataset.count} bands, at most {MOST_CELLS} cells and {MOST_BANDS} bands are read; "
+            "export it with larger cells or in parts"
+        )
 
 
 def _gsd_m(path: Path, transform: Affine) -> float:

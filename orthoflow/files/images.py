@@ -14,9 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError
+from orthoflow.files.containers import image_format, is_webp, stated_size
 from orthoflow.files.exif import without_orientation
 
 PREVIEW_SIDE_PX: Final = 1600
+# 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
+MOST_PIXELS: Final = 1 << 28
 # Larger images are averaged before they are shrunk, so many rows of the result at a time.
 _WHOLE_PX: Final = 1 << 26
 _BAND_PX: Final = 64
@@ -30,26 +33,34 @@ Cells = Callable[[Part], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 
 
 def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
-    """Decode a JPEG, PNG, TIFF ... file into (rows, cols, 3) RGB.
+    """Decode a JPEG, PNG, TIFF or WebP file into (rows, cols, 3) RGB.
 
     Args:
         encoded: the file's bytes.
         name: what to call it in an error.
 
     Raises:
-        InputError: the bytes are no image that OpenCV knows, or it is cut off.
+        InputError: the bytes are no JPEG, PNG, TIFF or WebP, or cut off, or too many pixels.
     """
     import cv2
 
+    if image_format(encoded) is None and not is_webp(encoded):
+        raise InputError(_not_an_image(encoded, name))
+    size = stated_size(encoded)
+    if size is not None and size[0] * size[1] > MOST_PIXELS:
+        raise InputError(
+            f"{name} is too large: {size[0]} x {size[1]} pixels, at most {MOST_PIXELS} are "
+            "decoded; make it smaller or cut it into parts"
+        )
     try:
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
         data = np.frombuffer(without_orientation(encoded), dtype=np.uint8)
         image = cv2.imdecode(data, flags)
     except cv2.error as error:
         raise InputError(_not_an_image(encoded, name)) from error
     if image is None:
         raise InputError(_not_an_image(encoded, name))
-    return np.ascontiguousarray(image[:, :, ::-1]).astype(np.uint8, copy=False)
+    return np.ascontiguousarray(image).astype(np.uint8, copy=False)
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:

@@ -6,11 +6,10 @@ for the same product. The `k` in file names is the wall's position in `Walls`.
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, fields
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -32,6 +31,7 @@ from orthoflow.files.sidecars import (
     write_json,
     write_text,
 )
+from orthoflow.foreign_text import Value, csv_text
 from orthoflow.geometry import WallFrame, omega_phi_deg
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
@@ -86,6 +86,7 @@ def publish_planes(product: Planes, folder: Path, digest: str) -> None:
             "omega_deg": omega,
             "phi_deg": phi,
             "viewpoint": product.viewpoint,
+            "side_from": product.side_source(index),
         }
         if product.part_corners is not None and product.part_plane is not None:
             entry["part_corners_world"] = numbers(product.part_corners[product.part_plane == index])
@@ -158,24 +159,21 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
 def publish_ties(product: Ties, folder: Path, digest: str) -> None:
     """Write `ties.csv`: pixels in OpenCV's convention, residuals observed - computed."""
     del digest  # A table of numbers has no place for it; the record names it.
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(TIE_COLUMNS)
     pixels = to_opencv(product.pixels_photo)
-    for index in range(len(product.photo)):
-        table.writerow(
-            [
-                product.photo_names[int(product.photo[index])],
-                int(product.wall[index]),
-                *(_cell(value) for value in pixels[index]),
-                *(_cell(value) for value in product.points_world[index]),
-                TieRole(int(product.role[index])).name.lower(),
-                *(_cell(value) for value in product.residual_px[index]),
-                _cell(product.sigma_px[index]),
-                "first pixel centre at 0 0",
-            ]
+    rows: Iterator[Sequence[Value]] = (
+        (
+            product.photo_names[int(product.photo[index])],
+            int(product.wall[index]),
+            *(_cell(value) for value in pixels[index]),
+            *(_cell(value) for value in product.points_world[index]),
+            TieRole(int(product.role[index])).name.lower(),
+            *(_cell(value) for value in product.residual_px[index]),
+            _cell(product.sigma_px[index]),
+            "first pixel centre at 0 0",
         )
-    write_text(folder / "ties.csv", text.getvalue())
+        for index in range(len(product.photo))
+    )
+    write_text(folder / "ties.csv", csv_text(chain((TIE_COLUMNS,), rows)))
 
 
 def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
@@ -209,12 +207,8 @@ def publish_cameras(product: Cameras, folder: Path, digest: str) -> None:
 
 def _table_text(rows: Sequence[ResidualRow]) -> str:
     """Rows as CSV; what is absent stays empty."""
-    text = io.StringIO()
     columns = [column.name for column in fields(ResidualRow)]
-    writer = csv.DictWriter(text, fieldnames=columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    return text.getvalue()
+    return csv_text([columns, *(astuple(row) for row in rows)])
 
 
 def _publish_raster(

@@ -12,8 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, InputError, StoreError
+from orthoflow.files.json_texts import parse_json
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import JsonValue, OrthoMask, SurfaceMask
+
+MOST_SIDECAR_BYTES: Final = 1 << 20
+# Numbers of walls are kept in 16 bits.
+MOST_WALLS: Final = 32_000
+_LONGEST_SHOWN: Final = 100
 
 SURFACE_MASK_MEANINGS: Final[dict[SurfaceMask, str]] = {
     SurfaceMask.VOID: "void: no point of the scan fell here",
@@ -50,6 +57,45 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
     }
 
 
+def read_sidecar(path: Path) -> dict[str, object]:
+    """Read the JSON object beside a raster.
+
+    Raises:
+        InputError: the file cannot be read, is too large, or holds something else.
+    """
+    try:
+        if path.stat().st_size > MOST_SIDECAR_BYTES:
+            raise InputError(
+                f"{path.name} has {path.stat().st_size} bytes, more than {MOST_SIDECAR_BYTES}: "
+                "expected a JSON object with origin_world, u_world ..."
+            )
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path.name} cannot be read: {error}") from error
+    return sidecar_of(text, path.name)
+
+
+def sidecar_of(text: str, name: str) -> dict[str, object]:
+    """Read the text of a JSON object that says where a raster lies.
+
+    Raises:
+        InputError: it is something else, nested too deeply, or has numbers of too many digits.
+    """
+    try:
+        content = parse_json(text)
+    except ValueError as error:
+        raise InputError(f"{name}: no JSON, {error}") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{name}: expected a JSON object with origin_world, u_world ...")
+    return content
+
+
+def shown_value(value: object) -> str:
+    """Give what a sidecar holds for a message, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]} ..."
+
+
 def frame_of_raster(
     content: Mapping[str, object],
     *,
@@ -73,12 +119,12 @@ def frame_of_raster(
     """
     vectors = {}
     for key in ("origin_world", "u_world", "v_world", "normal_world"):
-        try:
-            vectors[key] = np.array(content.get(key), dtype=np.float64)
-        except (TypeError, ValueError):
-            vectors[key] = np.zeros(0)
-        if vectors[key].shape != (3,) or not np.isfinite(vectors[key]).all():
-            raise InputError(f"{name}: {key} must be three numbers, got {content.get(key)!r}")
+        vectors[key] = _vector(content.get(key))
+        if vectors[key].shape != (3,) or not (np.abs(vectors[key]) < FARTHEST_M).all():
+            raise InputError(
+                f"{name}: {key} must be three numbers below {FARTHEST_M:g}, got "
+                f"{shown_value(content.get(key))}"
+            )
     u, v = vectors["u_world"], vectors["v_world"]
     try:
         return WallFrame(
@@ -92,6 +138,16 @@ def frame_of_raster(
         )
     except GeometryError as error:
         raise InputError(f"{name}: {error}") from error
+
+
+def _vector(value: object) -> NDArray[np.float64]:
+    """Numbers of a list, compared as they are; an empty array where it holds something else."""
+    if not isinstance(value, list) or any(isinstance(item, bool) for item in value):
+        return np.zeros(0)
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)
 
 
 def raster_tags(

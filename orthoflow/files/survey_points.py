@@ -1,25 +1,24 @@
-"""Named points from text files, as surveyors export them: a header, one point per line."""
+"""Tables of points, as surveyors export and people write them: a header, one point per line."""
 
 from __future__ import annotations
 
 import csv
 import difflib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final, TypeVar
 
 from orthoflow.errors import InputError
+from orthoflow.files.sidecars import MOST_WALLS
 
-_REQUIRED: Final = ("name", "x", "y", "z")
 _MEASURED: Final = ("wall", "u_px", "v_px")
-_COLUMNS: Final = (*_REQUIRED, "class", *_MEASURED)
 _SEPARATORS: Final = (";", "\t", ",")
-_MAX_BYTES: Final = 100_000_000
+MOST_BYTES: Final = 20_000_000
+MOST_POINTS: Final = 100_000
 _MAX_PROBLEMS: Final = 20
-_MAX_WALL: Final = 32_000
-_MAX_LINE: Final = 10_000
+MOST_LINE: Final = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +40,35 @@ class SurveyPoint:
     pixel_wall: tuple[float, float] | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class MeasuredTie:
+    """A point of a photo that somebody measured.
+
+    Attributes:
+        where: file and line, for messages.
+        photo: name of the photo.
+        pixel: column and row as they stand in the file.
+        position: x, y, z as they stand in the file.
+        sigma_px: standard deviation of each pixel coordinate, or None.
+    """
+
+    where: str
+    photo: str
+    pixel: tuple[float, float]
+    position: tuple[float, float, float]
+    sigma_px: float | None = None
+
+
+def read_measured_ties(path: Path) -> tuple[MeasuredTie, ...]:
+    """Read a file of ties: `photo,u_px,v_px,x,y,z[,sigma_px]`, otherwise as `read_survey_points`.
+
+    Raises:
+        InputError: the file cannot be used; one line per problem, `file:line: ...`.
+    """
+    reader = _TieReader(path.name)
+    return reader.checked(reader.ties(_text_of(path, reader.form)))
+
+
 def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
     """Read a file of points.
 
@@ -51,24 +79,55 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
     Raises:
         InputError: the file cannot be used; one line per problem, `file:line: ...`.
     """
-    reader = _Reader(path.name)
-    points = reader.read(_text_of(path))
-    if reader.problems:
-        left_out = len(reader.problems) - _MAX_PROBLEMS
-        more = [f"... and {left_out} more problems"] if left_out > 0 else []
-        raise InputError("\n".join(reader.problems[:_MAX_PROBLEMS] + more))
-    return points
+    reader = _PointReader(path.name)
+    return reader.checked(reader.points(_text_of(path, reader.form)))
 
 
-def _text_of(path: Path) -> str:
+@dataclass(frozen=True, kw_only=True)
+class _Form:
+    """Columns of a table.
+
+    Attributes:
+        content: what its lines are.
+        required: columns that are always there.
+        known: all columns, in the order of a table whose first line does not name them.
+        bare: how many such a table may have.
+        together: columns of which all are there or none.
+    """
+
+    content: str
+    required: tuple[str, ...]
+    known: tuple[str, ...]
+    bare: tuple[int, ...]
+    together: tuple[str, ...] = ()
+
+
+_POINTS: Final = _Form(
+    content="points",
+    required=("name", "x", "y", "z"),
+    known=("name", "x", "y", "z", "class", *_MEASURED),
+    bare=(4, 5),
+    together=_MEASURED,
+)
+_TIES: Final = _Form(
+    content="ties",
+    required=("photo", "u_px", "v_px", "x", "y", "z"),
+    known=("photo", "u_px", "v_px", "x", "y", "z", "sigma_px"),
+    bare=(6, 7),
+)
+
+
+def _text_of(path: Path, form: _Form) -> str:
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise InputError(f"{path.name} is too large for a list of points: expected a CSV file")
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(
+                f"{path.name} is too large for a list of {form.content}: expected a CSV file"
+            )
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path.name} is no UTF-8 text: expected a CSV file with the columns "
-            f"{','.join(_REQUIRED)}; save it as UTF-8"
+            f"{','.join(form.required)}; save it as UTF-8"
         ) from error
     except OSError as error:
         raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
@@ -80,30 +139,110 @@ class _Row:
     cells: tuple[str, ...]
 
 
-class _Reader:
-    """Turns lines into points and collects everything that is wrong with them."""
+_Item = TypeVar("_Item")
+
+
+class _TableReader:
+    """Turns lines into rows of a table and collects everything that is wrong with them."""
+
+    form: ClassVar[_Form]
 
     def __init__(self, file_name: str) -> None:
         self.file_name = file_name
         self.problems: list[str] = []
 
-    def read(self, text: str) -> tuple[SurveyPoint, ...]:
-        rows = list(_rows(text))
+    def checked(self, items: tuple[_Item, ...]) -> tuple[_Item, ...]:
+        """Give what was read, or say what is wrong with it."""
+        if self.problems:
+            left_out = len(self.problems) - _MAX_PROBLEMS
+            more = [f"... and {left_out} more problems"] if left_out > 0 else []
+            raise InputError("\n".join(self.problems[:_MAX_PROBLEMS] + more))
+        return items
+
+    def _table(self, text: str) -> Iterator[tuple[_Row, dict[str, str]]]:
+        """Give the rows that have a cell for every column."""
+        form, rows = self.form, list(_rows(text))
         if rows and len(rows[-1].cells) == 0:
-            self._add(rows[-1], f"the line is longer than {_MAX_LINE} letters: this is no list")
-            return ()
+            self._add(
+                rows[-1],
+                f"the line is longer than {MOST_LINE} letters: this is no list"
+                if len(rows) <= MOST_POINTS
+                else f"the file holds more than {MOST_POINTS} {form.content}: split it",
+            )
+            return
         if not rows:
             self.problems.append(
-                f"{self.file_name} holds no points: expected {','.join(_REQUIRED)} per line"
+                f"{self.file_name} holds no {form.content}: expected {','.join(form.required)} "
+                "per line"
             )
-            return ()
+            return
         columns = self._columns(rows[0])
         if columns is None:
-            return ()
+            return
+        body = rows[1:] if _is_header(rows[0]) else rows
+        if not body:
+            self._add(rows[0], f"only the names of the columns, no {form.content}")
+        for row in body:
+            if len(row.cells) == len(columns):
+                yield row, dict(zip(columns, row.cells, strict=True))
+                continue
+            hint = "; write decimal points, not commas" if len(row.cells) > len(columns) else ""
+            self._add(row, f"expected {len(columns)} columns, got {len(row.cells)}{hint}")
+
+    def _columns(self, first: _Row) -> tuple[str, ...] | None:
+        form = self.form
+        if not _is_header(first):
+            if len(first.cells) in form.bare:
+                return form.known[: len(first.cells)]
+            single = [
+                name for name in form.known[len(form.required) :] if name not in form.together
+            ]
+            optional = [f"[,{name}]" for name in single]
+            optional += [f"[,{','.join(form.together)}]"] if form.together else []
+            self._add(
+                first,
+                f"expected the names of the columns, {','.join(form.required)}"
+                f"{''.join(optional)}, got {len(first.cells)} values without names",
+            )
+            return None
+        names = tuple(cell.lower() for cell in first.cells)
+        n_before = len(self.problems)
+        for name in names:
+            if name not in form.known:
+                near = difflib.get_close_matches(name, form.known, n=1)
+                hint = f" (did you mean {near[0]}?)" if near else ""
+                self._add(first, f"unknown column {name}{hint}; known are {', '.join(form.known)}")
+            elif names.count(name) > 1:
+                self._add(first, f"the column {name} is there {names.count(name)} times")
+        missing = [name for name in form.required if name not in names]
+        if missing:
+            self._add(first, f"the column {', '.join(missing)} is missing")
+        given = [name for name in form.together if name in names]
+        if given and len(given) < len(form.together):
+            self._add(first, f"{', '.join(form.together)} belong together, got only {given[0]}")
+        return names if len(self.problems) == n_before else None
+
+    def _number(self, row: _Row, key: str, cell: str) -> float:
+        number = _as_number(cell)
+        if number is None or not math.isfinite(number):
+            has_decimal_comma = "," in cell and _as_number(cell.replace(",", ".")) is not None
+            hint = "; write a decimal point" if has_decimal_comma else ""
+            self._add(row, f"{key} must be a number, got {cell or 'nothing'}{hint}")
+            return math.nan
+        return number
+
+    def _add(self, row: _Row, message: str) -> None:
+        self.problems.append(f"{self.file_name}:{row.line}: {message}")
+
+
+class _PointReader(_TableReader):
+    form = _POINTS
+
+    def points(self, text: str) -> tuple[SurveyPoint, ...]:
         points = []
         lines: dict[str, int] = {}
-        for row in rows[1:] if _is_header(rows[0]) else rows:
-            point = self._point(row, columns)
+        for row, cells in self._table(text):
+            point = self._point(row, cells)
             if point is None:
                 continue
             if point.name in lines:
@@ -112,43 +251,9 @@ class _Reader:
                 )
             lines.setdefault(point.name, row.line)
             points.append(point)
-        if not points and not self.problems:
-            self._add(rows[0], "only the names of the columns, no points")
         return tuple(points)
 
-    def _columns(self, first: _Row) -> tuple[str, ...] | None:
-        if not _is_header(first):
-            if len(first.cells) in (4, 5):
-                return _COLUMNS[: len(first.cells)]
-            self._add(
-                first,
-                f"expected the names of the columns, {','.join(_REQUIRED)}[,class]"
-                f"[,{','.join(_MEASURED)}], got {len(first.cells)} values without names",
-            )
-            return None
-        names = tuple(cell.lower() for cell in first.cells)
-        n_before = len(self.problems)
-        for name in names:
-            if name not in _COLUMNS:
-                near = difflib.get_close_matches(name, _COLUMNS, n=1)
-                hint = f" (did you mean {near[0]}?)" if near else ""
-                self._add(first, f"unknown column {name}{hint}; known are {', '.join(_COLUMNS)}")
-            elif names.count(name) > 1:
-                self._add(first, f"the column {name} is there {names.count(name)} times")
-        missing = [name for name in _REQUIRED if name not in names]
-        if missing:
-            self._add(first, f"the column {', '.join(missing)} is missing")
-        measured = [name for name in _MEASURED if name in names]
-        if measured and len(measured) < len(_MEASURED):
-            self._add(first, f"{', '.join(_MEASURED)} belong together, got only {measured[0]}")
-        return names if len(self.problems) == n_before else None
-
-    def _point(self, row: _Row, columns: Sequence[str]) -> SurveyPoint | None:
-        if len(row.cells) != len(columns):
-            hint = "; write decimal points, not commas" if len(row.cells) > len(columns) else ""
-            self._add(row, f"expected {len(columns)} columns, got {len(row.cells)}{hint}")
-            return None
-        cells = dict(zip(columns, row.cells, strict=True))
+    def _point(self, row: _Row, cells: dict[str, str]) -> SurveyPoint | None:
         n_before = len(self.problems)
         if not cells["name"]:
             self._add(row, "the name is missing")
@@ -174,23 +279,39 @@ class _Reader:
             self._add(row, f"{', '.join(_MEASURED)} belong together, got only {', '.join(given)}")
             return None, None
         wall = self._number(row, "wall", cells["wall"])
-        if math.isfinite(wall) and not (wall.is_integer() and 0 <= wall <= _MAX_WALL):
+        if math.isfinite(wall) and not (wall.is_integer() and 0 <= wall <= MOST_WALLS):
             self._add(row, f"wall must be the number of a wall, from 0, got {cells['wall']}")
             return None, None
         pixel = (self._number(row, "u_px", cells["u_px"]), self._number(row, "v_px", cells["v_px"]))
         return (int(wall) if math.isfinite(wall) else None), pixel
 
-    def _number(self, row: _Row, key: str, cell: str) -> float:
-        number = _as_number(cell)
-        if number is None or not math.isfinite(number):
-            has_decimal_comma = "," in cell and _as_number(cell.replace(",", ".")) is not None
-            hint = "; write a decimal point" if has_decimal_comma else ""
-            self._add(row, f"{key} must be a number, got {cell or 'nothing'}{hint}")
-            return math.nan
-        return number
 
-    def _add(self, row: _Row, message: str) -> None:
-        self.problems.append(f"{self.file_name}:{row.line}: {message}")
+class _TieReader(_TableReader):
+    form = _TIES
+
+    def ties(self, text: str) -> tuple[MeasuredTie, ...]:
+        ties = (self._tie(row, cells) for row, cells in self._table(text))
+        return tuple(tie for tie in ties if tie is not None)
+
+    def _tie(self, row: _Row, cells: dict[str, str]) -> MeasuredTie | None:
+        n_before = len(self.problems)
+        if not cells["photo"]:
+            self._add(row, "the name of the photo is missing")
+        u, v, x, y, z = (self._number(row, key, cells[key]) for key in self.form.required[1:])
+        sigma_px = (
+            self._number(row, "sigma_px", cells["sigma_px"]) if cells.get("sigma_px") else None
+        )
+        if sigma_px is not None and sigma_px <= 0.0:
+            self._add(row, f"sigma_px must be positive, got {cells['sigma_px']}")
+        if len(self.problems) > n_before:
+            return None
+        return MeasuredTie(
+            where=f"{self.file_name}:{row.line}",
+            photo=cells["photo"],
+            pixel=(u, v),
+            position=(x, y, z),
+            sigma_px=sigma_px,
+        )
 
 
 def _rows(text: str) -> Iterator[_Row]:
@@ -198,10 +319,12 @@ def _rows(text: str) -> Iterator[_Row]:
     first = next((line for line in lines if line.strip() and line.strip()[0] != "#"), "")
     # A comma may be part of a number; the others may not.
     separator = next((mark for mark in _SEPARATORS if mark in first), ",")
+    n_rows = 0
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.strip()[0] == "#":
             continue
-        if len(line) > _MAX_LINE:
+        n_rows += 1
+        if len(line) > MOST_LINE or n_rows > MOST_POINTS:
             yield _Row(line=number, cells=())
             return
         cells = next(csv.reader([line], delimiter=separator))

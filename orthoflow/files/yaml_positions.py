@@ -24,7 +24,10 @@ from ruamel.yaml.nodes import Node, ScalarNode, SequenceNode
 
 from orthoflow.products.product import JsonValue
 
-MAX_DEPTH: Final = 60
+DEEPEST: Final = 60
+MOST_DIGITS: Final = 1000
+MOST_VALUES: Final = 10_000
+_LONGEST_SHOWN: Final = 100
 _TAG: Final = "tag:yaml.org,2002:"
 _MERGE: Final = "<<"
 
@@ -101,7 +104,7 @@ class Dialect:
     """
 
     is_strict: bool = True
-    most_values: int = 10_000
+    most_values: int = MOST_VALUES
     empty: str = "the document is empty"
     duplicate: str = "the key is there already, in line {line}; remove one of them"
 
@@ -145,8 +148,12 @@ def describe_scalar(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        return f'the text "{value}"'
+        return f'the text "{_cut(value)}"'
     return str(value)
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
 
 
 def read_yaml(text: str, log: Problems, dialect: Dialect = STRICT) -> Value | None:
@@ -196,11 +203,11 @@ def _check_size(text: str, dialect: Dialect) -> None:
             continue
         n_nodes += isinstance(event, NodeEvent)
         depth += isinstance(event, CollectionStartEvent)
-        if depth > MAX_DEPTH or n_nodes > dialect.most_values:
+        if depth > DEEPEST or n_nodes > dialect.most_values:
             raise _UnreadableError(
                 _mark_position(event.start_mark),
-                f"the document is nested deeper than {MAX_DEPTH} levels"
-                if depth > MAX_DEPTH
+                f"the document is nested deeper than {DEEPEST} levels"
+                if depth > DEEPEST
                 else f"the document has more than {dialect.most_values} values",
             )
 
@@ -244,10 +251,8 @@ class _Converter:
             )
         if id(node) in self.open_nodes:
             raise _UnreadableError(position, "the value contains itself through its anchor")
-        if depth > MAX_DEPTH:
-            raise _UnreadableError(
-                position, f"the document is nested deeper than {MAX_DEPTH} levels"
-            )
+        if depth > DEEPEST:
+            raise _UnreadableError(position, f"the document is nested deeper than {DEEPEST} levels")
         if isinstance(node, ScalarNode):
             return Text(position=position, value=self._scalar(node, position, path))
         self.open_nodes.add(id(node))
@@ -317,7 +322,7 @@ class _Converter:
         except KeyError:
             self._refuse_tag(node, position, path)
         except ValueError:
-            self.log.add(position, path, f"{text!r} is no {tag.removeprefix(_TAG)}")
+            self.log.add(position, path, f"{_cut(text)!r} is no {tag.removeprefix(_TAG)}")
         return text
 
     def _refuse_tag(self, node: Node, position: Position, path: str) -> None:
@@ -339,6 +344,9 @@ def _parse_scalar(kind: str, text: str) -> Scalar:
         case "bool":
             return {"true": True, "false": False}[text.lower()]
         case "int":
+            if len(text) > MOST_DIGITS:
+                # Decimal ones Python refuses by itself, others it could not put into words.
+                raise ValueError(f"more than {MOST_DIGITS} digits")
             digits = text.replace("_", "").lower()
             base = next((base for mark, base in _BASES.items() if mark in digits), 10)
             return int(digits, base)

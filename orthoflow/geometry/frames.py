@@ -16,6 +16,8 @@ from orthoflow.geometry.planes import Plane
 # Below this angle between normal and up a plane counts as a floor or ceiling: "right for the
 # viewer" would then hang on a nearly vertical normal's noise.
 LEVEL_LIMIT_DEG: Final = 10.0
+# Beyond any survey frame on Earth; what lies farther comes from damaged numbers.
+FARTHEST_M: Final = 1e9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +95,13 @@ class WallFrame:
                 relative @ self.normal_world,
             ]
         )
+
+    def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance (n,) of world points (n, 3) from the raster's rectangle, on either side."""
+        on_wall = self.wall_from_world(points_world)
+        beside_px = on_wall[:, :2] - np.clip(on_wall[:, :2], 0.0, [self.width, self.height])
+        beside_m = self.gsd_m * np.linalg.norm(beside_px, axis=1)
+        return np.asarray(np.hypot(beside_m, on_wall[:, 2]))
 
     def corners_world(self) -> NDArray[np.float64]:
         """Outer corners (4, 3) of the raster on the plane: top-left, then counter-clockwise."""

@@ -1,4 +1,4 @@
-"""The narrow gaps of a raster, told from windows, and which cells lend them values.
+"""The narrow gaps of a raster, told from windows.
 
 A disc holds a cell of a set where, in some column that it crosses, the cell of the set nearest to
 its middle row is within it. So distances down columns are found first; then each row asks the
@@ -18,14 +18,14 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.threads import in_parts
 
 
-def lenders_in_gaps(
+def narrow_gaps(
     is_measured: NDArray[np.bool_], radius_cells: int, *, threads: int
 ) -> NDArray[np.int64]:
-    """For each void cell of a narrow gap the measured cell nearest to it.
+    """Find the void cells of narrow gaps.
 
     A gap is narrow where no disc of the radius fits into it: what stays void is the morphological
     opening of the void cells, so that windows and outlines keep their shape to the cell. Cells
-    outside the raster count as void. Of cells equally near, the upper and then the left one lends.
+    outside the raster count as void. A measured cell lies within the radius of each cell found.
 
     Args:
         is_measured: (rows, cols).
@@ -33,34 +33,17 @@ def lenders_in_gaps(
         threads: how many threads work.
 
     Returns:
-        (k, 2) flat indices: the void cell, and the measured cell that lends its values.
+        (k,) flat indices, ascending.
     """
     if radius_cells == 0:
-        return np.empty((0, 2), dtype=np.int64)
+        return np.empty(0, dtype=np.int64)
     rows, columns = is_measured.shape
     # Framed with void, so that discs may lie half outside the raster.
     framed: NDArray[np.bool_] = np.pad(is_measured, radius_cells)
     is_touched = _met_by_discs(framed, radius_cells, threads=threads)
     is_open = _met_by_discs(~is_touched, radius_cells, threads=threads)
     inner = np.s_[radius_cells : radius_cells + rows, radius_cells : radius_cells + columns]
-    is_narrow = np.logical_not(is_open[inner] | is_measured)
-    void = np.flatnonzero(is_narrow)
-    lent = np.column_stack([void, void])
-    del void, framed, is_touched, is_open, is_narrow  # Of sparse rasters as large as what is given.
-    measured = np.ascontiguousarray(is_measured)
-    task = partial(nearest_within, measured, disc_offsets(radius_cells), lent)
-    in_parts(task, len(lent), threads=threads)
-    return lent
-
-
-def disc_offsets(radius_cells: int) -> NDArray[np.int64]:
-    """Cells (k, 2) = (row, column) within a radius of a centre cell, nearest first, without it."""
-    steps = np.arange(-radius_cells, radius_cells + 1, dtype=np.int64)
-    rows, columns = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
-    squares = rows * rows + columns * columns
-    order = np.argsort(squares, kind="stable")
-    order = order[(squares[order] > 0) & (squares[order] <= radius_cells * radius_cells)]
-    return np.column_stack([rows[order], columns[order]])
+    return np.flatnonzero(np.logical_not(is_open[inner] | is_measured))
 
 
 def _met_by_discs(
@@ -136,31 +119,3 @@ def find_discs(
             beside, height = distances[row, k : k + columns], heights[k]
             for j in range(columns):
                 into[j] |= beside[j] <= height
-
-
-@compiled
-def nearest_within(
-    is_measured: NDArray[np.bool_],
-    offsets: NDArray[np.int64],
-    lent: NDArray[np.int64],
-    first: int,
-    end: int,
-) -> None:
-    """Find the measured cell nearest to each of some void cells.
-
-    Args:
-        is_measured: (rows, cols).
-        offsets: (k, 2) rows and columns of a disc without its centre, nearest first; a measured
-            cell lies within it.
-        lent: (n, 2) flat indices of the void cell, and of the measured one, which is set.
-        first: first void cell.
-        end: the void cell after the last one.
-    """
-    rows, columns = is_measured.shape
-    for i in range(first, end):
-        row, column = lent[i, 0] // columns, lent[i, 0] % columns
-        for k in range(offsets.shape[0]):
-            r, c = row + offsets[k, 0], column + offsets[k, 1]
-            if 0 <= r < rows and 0 <= c < columns and is_measured[r, c]:
-                lent[i, 1] = r * columns + c
-                break

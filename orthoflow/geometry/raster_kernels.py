@@ -222,6 +222,41 @@ def take_values(
                 goal[k] = source[winner.point] if winner.n_points > 0 else nothing
 
 
+@compiled
+def find_places(
+    cells: NDArray[np.int64],
+    winners: NDArray[np.void],
+    offsets: Offsets,
+    wall_from_offset: NDArray[np.float64],
+    places: NDArray[np.float32],
+    first: int,
+    end: int,
+) -> None:
+    """Find where the points that won some cells lie.
+
+    Args:
+        cells: (n,) flat indices.
+        winners: (cells,) of `WINNER`.
+        offsets: of the cloud.
+        wall_from_offset: (3, 4) as in `Target`.
+        places: (rows, cols, 2) to the right of and below the centre, overwritten at the cells.
+        first: first of `cells` to visit.
+        end: the one after the last.
+    """
+    m = wall_from_offset
+    for cell in cells[first:end]:
+        row, column = cell // places.shape[1], cell % places.shape[1]
+        winner = winners[cell]
+        if winner.n_points == 0:
+            places[row, column] = np.nan
+            continue
+        x, y, z = offsets.x[winner.point], offsets.y[winner.point], offsets.z[winner.point]
+        u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+        v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+        places[row, column, 0] = u - column - 0.5
+        places[row, column, 1] = v - row - 0.5
+
+
 @inlined
 def _rank(depth_bits, square_bits):  # type: ignore[no-untyped-def]  # numba infers the types
     """Order of points as whole numbers: larger depths first, then smaller squares.

@@ -23,6 +23,9 @@ from orthoflow.geometry.threads import in_parts, in_threads
 # wait for each other seldom.
 _CHUNK: Final = 1 << 20
 
+# Who lends to a gap is among the cells nearest to it, or a cell farther.
+_BESIDE_GAPS_CELLS: Final = 2
+
 _Value = TypeVar("_Value", bound=np.generic)
 
 
@@ -117,6 +120,31 @@ def values_of_winners(
     task = partial(kernels.take_values, winners, seen, void, taken)
     in_parts(task, winners.size, threads=threads)
     return taken
+
+
+def places_of_winners(
+    points: OffsetPoints, slab: Slab, winners: NDArray[np.void], *, threads: int
+) -> NDArray[np.float32]:
+    """Where the points lie that won the cells beside gaps, between which these are filled.
+
+    Returns:
+        (cells, 2) to the right of and below the centre, in cells; 0 in cells that no void one lies
+        near, NaN in cells without a point of their own.
+    """
+    is_beside = (winners["n_points"] == 0).reshape(slab.frame.shape)
+    for axis in (0, 1):
+        grown = np.moveaxis(is_beside, axis, 0)
+        for _ in range(_BESIDE_GAPS_CELLS):
+            before = grown.copy()
+            grown[1:] |= before[:-1]
+            grown[:-1] |= before[1:]
+    places = np.zeros((*slab.frame.shape, 2), dtype=np.float32)
+    offsets = read_only(points.x, points.y, points.z)
+    matrix = wall_from_offset(slab.frame, points.origin)
+    cells = np.flatnonzero(is_beside)
+    task = partial(kernels.find_places, cells, winners, offsets, matrix, places)
+    in_parts(task, len(cells), threads=threads)
+    return places.reshape(-1, 2)
 
 
 def _empty_entries(n_points: int) -> Entries:

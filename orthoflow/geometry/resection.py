@@ -354,9 +354,11 @@ def _problem(
     Survey coordinates would cost digits.
     """
     freedom = LensFreedom() if lens is None else lens
-    n_free = POSE_PARAMETERS + freedom.sigmas.size
-    if 2 * len(seen) < n_free + 2:
-        raise GeometryError(f"a resection with {n_free} unknowns got only {len(seen)} points")
+    # What is known of the lens beforehand determines it as far as the points do not.
+    if 2 * len(seen) < POSE_PARAMETERS + 2:
+        raise GeometryError(
+            f"a resection with {POSE_PARAMETERS} unknowns got only {len(seen)} points"
+        )
     middle = seen.points_world.mean(axis=0)
     local = replace(seen, points_world=seen.points_world - middle)
     return middle, _Problem(local, freedom, prior, soft_limit)

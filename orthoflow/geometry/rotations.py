@@ -51,3 +51,11 @@ def quaternion_from_rotation(rotation: NDArray[np.float64]) -> NDArray[np.float6
     )
     quaternion: NDArray[np.float64] = np.linalg.eigh(matrix)[1][:, -1]
     return -quaternion if quaternion[0] < 0.0 else quaternion
+
+
+def rotation_from_quaternion(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrix (3, 3) of a unit quaternion (4,) = (w, x, y, z)."""
+    w, vector = quaternion[0], quaternion[1:]
+    cross = cross_matrix(vector)
+    rotation: NDArray[np.float64] = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+    return rotation

@@ -15,7 +15,14 @@ from orthoflow.products.photographs import (
     Ties,
     TieWall,
 )
-from orthoflow.products.planes import Planes, PointLabels, ScanRow, Spread, Thickness
+from orthoflow.products.planes import (
+    Planes,
+    PointLabels,
+    ScanRow,
+    SideSource,
+    Spread,
+    Thickness,
+)
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 from orthoflow.products.walls import (
     IntensitySource,
@@ -57,6 +64,7 @@ __all__ = [
     "Product",
     "ResidualRow",
     "ScanRow",
+    "SideSource",
     "Spread",
     "SurfaceMask",
     "TakenPhoto",

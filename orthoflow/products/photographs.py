@@ -186,7 +186,7 @@ class Ties(Product):
     Attributes:
         photo_names: names the column `photo` refers to.
         photo: (n,) int32 index into `photo_names`.
-        wall: (n,) int32 index of the wall.
+        wall: (n,) int32 index of the wall, -1 where nobody said.
         pixels_photo: (n, 2) float64 (u, v), first pixel centre at (0.5, 0.5).
         points_world: (n, 3) float64 metres.
         sigma_px: (n,) float64.
@@ -194,6 +194,8 @@ class Ties(Product):
         role: (n,) uint8 `TieRole`.
         residual_px: (n, 2) float64 observed - computed, NaN before an orientation.
         walls: the walls that the column `wall` refers to; empty when the matcher does not say.
+        by_hand: (n,) uint8, 1 for ties that a person measured; None where nobody did. These are
+            never withheld, and their sigmas are believed.
         search_radius_px: one per photo name: the photo was searched no farther than this from
             where a tie was expected, so that wrong ties lie within it, too; None where all of the
             photo was searched, and empty when all of every photo was.
@@ -219,6 +221,7 @@ class Ties(Product):
     sigma_m: NDArray[np.float64]
     role: NDArray[np.uint8]
     residual_px: NDArray[np.float64]
+    by_hand: NDArray[np.uint8] | None = None
     walls: tuple[TieWall, ...] = ()
     search_radius_px: tuple[float | None, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)

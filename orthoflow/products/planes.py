@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,14 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry import Plane
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 
+SideSource = Literal["stations", "photos", "guess", "given"]
+
+_SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
+    "stations": "stations",
+    "view_from": "given",
+    "given": "given",
+    "guess": "guess",
+}
 # That of markiewicz2015.
 _USUAL_TOLERANCE_M: Final = 0.05
 
@@ -97,6 +105,7 @@ class Planes(Product):
         part_corners: (p, 4, 3) float64 rectangles of connected parts, or None.
         part_plane: (p,) int32 index of the plane a part lies on, or None.
         viewpoint: how the normals' side was chosen: `stations`, `view_from`, `given` or `guess`.
+        side_from: the same per plane, where planes differ; empty where all are as `viewpoint` says.
         tolerance_m: distance within which points counted when the planes were found; a method that
             does not say is taken to have used that of markiewicz2015.
         thickness: of the cloud on each plane, None where too few points show it; empty where
@@ -128,6 +137,7 @@ class Planes(Product):
     part_corners: NDArray[np.float64] | None = None
     part_plane: NDArray[np.int32] | None = None
     viewpoint: str = "guess"
+    side_from: tuple[SideSource, ...] = ()
     tolerance_m: float = _USUAL_TOLERANCE_M
     thickness: tuple[Thickness | None, ...] = ()
     scan_row: ScanRow | None = None
@@ -151,6 +161,11 @@ class Planes(Product):
             raise ProductError(f"planes.normal must be unit vectors, got lengths {lengths}")
         if not self.tolerance_m > 0.0:
             raise ProductError(f"planes.tolerance_m must be positive, got {self.tolerance_m}")
+        if self.side_from and len(self.side_from) != count:
+            raise ProductError(
+                f"planes.side_from must be empty or one per plane, got {len(self.side_from)} for "
+                f"{count}"
+            )
         if self.thickness and len(self.thickness) != count:
             raise ProductError(
                 f"planes.thickness must be empty or one per plane, got {len(self.thickness)} for "
@@ -174,8 +189,41 @@ class Planes(Product):
         metadata = {**payload.metadata, **moved, "details": details}
         return super().upgraded(replace(payload, metadata=metadata))
 
+    def to_payload(self) -> Payload:
+        """Give the planes as arrays and JSON; what all planes share is said once."""
+        payload = super().to_payload()
+        if self.side_from:
+            return payload
+        metadata = {name: value for name, value in payload.metadata.items() if name != "side_from"}
+        return replace(payload, metadata=metadata)
+
     def __len__(self) -> int:
         return len(self.offset)
+
+    def side_source(self, index: int) -> SideSource:
+        """How it is known from which side a plane is seen."""
+        return (
+            self.side_from[index] if self.side_from else _SIDE_SOURCES.get(self.viewpoint, "guess")
+        )
+
+    def turned(self, index: int) -> Planes:
+        """Give the planes with one seen from its other side."""
+        corners, parts = self.corners.copy(), self.part_corners
+        # From behind, right is left: the top-left corner of one side is the other's top-right.
+        corners[index] = corners[index, ::-1]
+        if parts is not None and self.part_plane is not None:
+            parts = parts.copy()
+            own = self.part_plane == index
+            parts[own] = parts[own, ::-1]
+        sign = np.ones(len(self))
+        sign[index] = -1.0
+        return replace(
+            self,
+            normal=self.normal * sign[:, None],
+            offset=self.offset * sign,
+            corners=corners,
+            part_corners=parts,
+        )
 
     def plane(self, index: int) -> Plane:
         """Give one of the planes, 0 the one with the largest support."""

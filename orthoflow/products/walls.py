@@ -139,6 +139,13 @@ class Walls(Product):
                     f"have {len(self.percentiles)} percentiles"
                 )
 
+    def nearest(self, points_world: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Index (n,) of the wall whose rectangle is nearest to each point (n, 3); -1 for none."""
+        if not self.walls:
+            return np.full(len(points_world), -1, dtype=np.int32)
+        distances_m = [wall.frame.distances_m(points_world) for wall in self.walls]
+        return np.asarray(np.argmin(distances_m, axis=0), dtype=np.int32)
+
     @classmethod
     def upgraded(cls, payload: Payload) -> Payload:
         """Move the percentiles, which stood in the details before version 2."""

@@ -29,9 +29,10 @@ from orthoflow.records.comparison import (
     product_distances,
 )
 from orthoflow.records.metrics import MetricRow, cell_metrics
+from orthoflow.records.run_files import figure_files, write_files
 from orthoflow.records.runs import REPORT_FILE, Run, open_run
 from orthoflow.records.verification import Verification, verify_run
-from orthoflow.records.writing import write_run
+from orthoflow.records.writing import WrittenRun, executed_and_written, write_run
 
 __all__ = [
     "COSTS",
@@ -57,10 +58,14 @@ __all__ = [
     "RunRecord",
     "Verdict",
     "Verification",
+    "WrittenRun",
     "cell_metrics",
     "compare_runs",
+    "executed_and_written",
+    "figure_files",
     "open_run",
     "product_distances",
     "verify_run",
+    "write_files",
     "write_run",
 ]

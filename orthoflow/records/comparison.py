@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +12,7 @@ from orthoflow_provenance.compare import ArrayDifference, measure_payloads
 from orthoflow_provenance.digests import payload_digest
 from orthoflow_provenance.model import COSTS, RecordedCell, RecordedFile, RunRecord
 
+from orthoflow.engine.keys import read_preimage
 from orthoflow.errors import OrthoflowError
 from orthoflow.products.product import JsonValue, Payload, Product
 from orthoflow.records.metrics import cell_metrics
@@ -199,7 +199,7 @@ def _text_differences(left: RunRecord, right: RunRecord) -> tuple[str, ...]:
 
 
 def _facts(cell: RecordedCell) -> CellFacts:
-    preimage = json.loads(cell.key_preimage) if cell.key_preimage else {}
+    preimage = read_preimage(cell.key_preimage)
     return CellFacts(
         status=cell.status,
         method=cell.method,
@@ -207,10 +207,15 @@ def _facts(cell: RecordedCell) -> CellFacts:
         result_version=cell.result_version,
         determinism=cell.determinism,
         seed=cell.seed,
-        code=preimage.get("code") or {},
-        tools=preimage.get("tools") or {},
+        code=_texts(preimage.get("code")),
+        tools=_texts(preimage.get("tools")),
         error=cell.error_message,
     )
+
+
+def _texts(value: JsonValue) -> dict[str, str]:
+    """A mapping of texts as a preimage has it; what a damaged one has in its place is left out."""
+    return {k: str(v) for k, v in value.items()} if isinstance(value, dict) else {}
 
 
 def _parameters(cell: RecordedCell) -> dict[str, ParameterValue]:

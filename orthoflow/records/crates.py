@@ -13,7 +13,7 @@ from typing import Final
 from orthoflow_provenance.model import RecordedCell, RunRecord
 
 from orthoflow.engine.durability import writing_to
-from orthoflow.engine.run_folder import RECORD_FILE
+from orthoflow.engine.run_folder import RECORD_FILE, cell_file_name
 from orthoflow.products.product import JsonValue
 from orthoflow.records import crate_entities as entities
 from orthoflow.records.crate_entities import (
@@ -25,7 +25,9 @@ from orthoflow.records.crate_entities import (
     refs,
 )
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
+from orthoflow.records.run_files import copy_files, creating, path_inside
 from orthoflow.records.runs import REPORT_FILE, Run
+from orthoflow.records.signatures import SIGNATURE_SUFFIX
 
 NO_LICENSE: Final = "not stated: ask who made these results"
 METADATA_FILE: Final = "ro-crate-metadata.json"
@@ -69,43 +71,48 @@ def write_crate(
 
     Raises:
         StoreError: the disk refuses.
+        RecordError: a name in the record cannot be that of a file, or a link stands in the place
+            of a file.
     """
-    with writing_to(folder):
-        texts = {
-            WORKFLOW_FILE: run.record.workflow_source,
-            RESOLVED_FILE: run.record.workflow_resolved,
-            **{
-                environment_file(environment): "".join(
-                    f"{name}=={version}\n" for name, version in environment.packages.items()
-                )
-                for environment in run.record.environments
-            },
-        }
-        for name, text in texts.items():
-            (folder / name).write_text(text, encoding="utf-8", newline="")
-        names = [*texts, *_copy_files(run, folder, record or run)]
-        crate = crate_metadata((record or run).record, names, license_text=license_text)
-        path = folder / METADATA_FILE
-        path.write_text(json.dumps(crate, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    return (path, *(folder / name for name in names))
+    texts = {
+        WORKFLOW_FILE: run.record.workflow_source,
+        RESOLVED_FILE: run.record.workflow_resolved,
+        **{
+            environment_file(environment): "".join(
+                f"{name}=={version}\n" for name, version in environment.packages.items()
+            )
+            for environment in run.record.environments
+        },
+    }
+    for name, text in texts.items():
+        _write(folder, name, text)
+    names = [*texts, *_copy_files(run, folder, record or run)]
+    crate = crate_metadata((record or run).record, names, license_text=license_text)
+    _write(folder, METADATA_FILE, json.dumps(crate, indent=1, ensure_ascii=False) + "\n")
+    return (folder / METADATA_FILE, *(path_inside(folder, name) for name in names))
+
+
+def _write(folder: Path, name: str, text: str) -> None:
+    with creating(folder, name) as stream:
+        stream.write(text.encode("utf-8"))
 
 
 def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
     """Copy record, report and published files; give their paths in the crate."""
-    sources = {RECORD_FILE: record.path}
-    report = run.folder / REPORT_FILE
-    if report.is_file():
-        sources[REPORT_FILE] = report
-    metrics = run.products_folder / METRICS_FILE
-    published = [file for files in run.files.values() for file in files]
-    for file in (*published, *([metrics] if metrics.is_file() else [])):
-        sources[f"{PRODUCTS_FOLDER}/{file.relative_to(run.products_folder).as_posix()}"] = file
-    for name, source in sources.items():
-        target = folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if source != target:
-            shutil.copyfile(source, target)
-    return list(sources)
+    if record.path != folder / RECORD_FILE:
+        with writing_to(folder):
+            shutil.copyfile(record.path, folder / RECORD_FILE)
+    wanted = [REPORT_FILE]
+    if record is run and run.path.name == RECORD_FILE:
+        wanted.append(f"{RECORD_FILE}{SIGNATURE_SUFFIX}")
+    wanted += [
+        f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/{file.name}"
+        for address, files in run.files.items()
+        for file in files
+    ]
+    wanted.append(f"{PRODUCTS_FOLDER}/{METRICS_FILE}")
+    sizes = {file.path: file.size_bytes for file in run.record.published}
+    return [RECORD_FILE, *copy_files(run.folder, folder, wanted, sizes)]
 
 
 def crate_metadata(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from orthoflow_provenance.inner_files import name_problem
 from orthoflow_provenance.input_files import extract_files
 from orthoflow_provenance.model import RecordedFile, RecordedInput
 
@@ -133,6 +134,8 @@ class _Places:
 
     def candidates(self, name: str) -> Iterator[Path]:
         """Paths at which a file of that name may be, the likeliest first."""
+        if name_problem(name):
+            return
         yield from (path for path in self.files if path.name == name)
         yield from (folder / name for folder in self.folders)
 

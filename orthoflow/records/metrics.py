@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 from orthoflow_provenance.model import RecordedCell, cost_metrics
+
+from orthoflow.foreign_text import csv_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +54,6 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
 
 def write_metrics_csv(path: Path, rows: Iterable[MetricRow]) -> None:
     """Write rows with a header; numbers with every digit that they have."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([field.name for field in fields(MetricRow)])
-        writer.writerows(astuple(row) for row in rows)
+    header = [field.name for field in fields(MetricRow)]
+    text = csv_text([header, *(astuple(row) for row in rows)])
+    path.write_text(text, encoding="utf-8", newline="")

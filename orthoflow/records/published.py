@@ -5,14 +5,17 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterable, Mapping
+from itertools import chain, count
 from pathlib import Path
 from typing import Final
 
+from orthoflow_provenance.inner_files import colliding, files_below, path_below
 from orthoflow_provenance.model import PublishedFile, RecordedCell
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.errors import StoreError
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.metrics import cell_metrics, write_metrics_csv
 
@@ -23,32 +26,42 @@ METRICS_FILE: Final = "metrics.csv"
 def publish_products(
     run_folder: Path,
     cells: Iterable[RecordedCell],
-    files_of: Mapping[str, Mapping[str, tuple[Path, ...]]],
+    files_of: Mapping[str, Mapping[str, Mapping[Path, str]]],
 ) -> tuple[PublishedFile, ...]:
     """Fill `products/` of a run folder; an older one, left by an interrupted run, is replaced.
 
     Args:
         run_folder: existing folder.
         cells: all cells of the run.
-        files_of: address -> output port -> files in the store.
+        files_of: address -> output port -> files in the store, and the SHA-256 that each must have.
 
     Returns:
         What is there now, sorted by path.
 
     Raises:
-        StoreError: a file cannot be copied, e.g. because the disk is full.
+        StoreError: a file cannot be copied, e.g. because the disk is full, or is not what it must
+            be.
     """
     target = run_folder / PRODUCTS_FOLDER
     cells = tuple(cells)
+    expected: dict[Path, str] = {}
     with writing_to(target):
+        if target.is_symlink():
+            target.unlink()
         shutil.rmtree(target, ignore_errors=True)
         target.mkdir(parents=True, exist_ok=True)
         for cell in cells:
             if cell.status == "ok":
-                _publish_cell(target / cell_file_name(cell.address), cell, files_of)
+                folder = path_below(target, cell_file_name(cell.address))
+                expected |= _publish_cell(folder, cell, files_of)
         rows = [row for cell in cells for row in cell_metrics(cell)]
         write_metrics_csv(target / METRICS_FILE, rows)
-        return _digested(run_folder, target)
+        published = _digested(run_folder, target)
+    for file in published:
+        wanted = expected.get(run_folder / file.path, file.sha256)
+        if file.sha256 != wanted:
+            raise StoreError(f"{file.path} must have the digest {wanted}, got {file.sha256}")
+    return published
 
 
 def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
@@ -65,25 +78,35 @@ def _digested(run_folder: Path, target: Path) -> tuple[PublishedFile, ...]:
 
 
 def _publish_cell(
-    folder: Path, cell: RecordedCell, files_of: Mapping[str, Mapping[str, tuple[Path, ...]]]
-) -> None:
+    folder: Path, cell: RecordedCell, files_of: Mapping[str, Mapping[str, Mapping[Path, str]]]
+) -> dict[Path, str]:
+    """Copy the files of a cell; give the SHA-256 that each copy must have."""
     folder.mkdir()
+    expected: dict[Path, str] = {}
+    taken = [METRICS_FILE]
     for port, files in files_of.get(cell.address, {}).items():
-        for file in files:
+        for file, sha256 in files.items():
             # Two outputs of one type publish equal names: the port tells them apart.
-            name = file.name if not (folder / file.name).exists() else f"{port}_{file.name}"
+            marks = chain(("", f"{port}_"), (f"{port}_{number}_" for number in count(2)))
+            names = (f"{mark}{file.name}" for mark in marks)
+            name = next(name for name in names if not colliding([*taken, name]))
+            taken.append(name)
             # A copy, not a hard link: who edits a product must not change the store.
-            shutil.copyfile(file, folder / name)
+            copy = path_below(folder, name)
+            shutil.copyfile(file, copy)
+            expected[copy] = sha256
     write_metrics_csv(folder / METRICS_FILE, cell_metrics(cell))
+    return expected
 
 
 def published_files(run_folder: Path, address: str) -> tuple[Path, ...]:
-    """Files of one cell below `products/`, wall 2 before wall 10; empty when there are none."""
-    folder = run_folder / PRODUCTS_FOLDER / cell_file_name(address)
-    if not folder.is_dir():
-        return ()
-    files = (path for path in folder.iterdir() if path.is_file())
-    return tuple(sorted(files, key=lambda path: _by_number(path.name)))
+    """Files of one cell below `products/`, wall 2 before wall 10; empty when there are none.
+
+    Links are left out, whatever they lead to.
+    """
+    inside = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}"
+    names = sorted(files_below(run_folder, inside), key=_by_number)
+    return tuple(path_below(run_folder, f"{inside}/{name}") for name in names)
 
 
 def _by_number(name: str) -> tuple[tuple[str, int], ...]:

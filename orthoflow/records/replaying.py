@@ -16,6 +16,7 @@ from orthoflow.engine.environment import environment
 from orthoflow.engine.keys import input_digest
 from orthoflow.engine.plan import RunPlan, plan_run
 from orthoflow.errors import PluginError, RecordError, WorkflowError
+from orthoflow.files.json_texts import parse_json
 from orthoflow.records.input_files import find_inputs
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
@@ -187,7 +188,7 @@ def _inconsistencies(run: Run) -> Iterator[str]:
 # Any: JSON, compared and never trusted.
 def _preimage(cell: RecordedCell) -> Mapping[str, Any]:
     try:
-        content = json.loads(cell.key_preimage)
+        content = parse_json(cell.key_preimage)
     except ValueError:
         content = None
     return content if isinstance(content, dict) else {}
@@ -203,6 +204,8 @@ class _MethodCheck:
 
     def add(self, cell: RecordedCell) -> None:
         """Check the method of one more cell."""
+        if cell.seed is not None and cell.seed < 0:
+            _add(self.others, f"cell {cell.address}: a seed is not negative, got {cell.seed}")
         try:
             cls = self.catalog.method(cell.method).load()
             for product in cell.outputs.values():

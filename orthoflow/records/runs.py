@@ -184,6 +184,10 @@ def find_record(path: str | Path) -> Path:
         )
     if not given.exists():
         raise ArgumentError(f"{given} does not exist; give a run folder or its {RECORD_FILE}")
+    if not given.is_file():
+        raise ArgumentError(
+            f"{given} is a device or a pipe; give a run folder or its {RECORD_FILE}"
+        )
     return given
 
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
 from orthoflow_provenance.model import COSTS, RunRecord
 
+from orthoflow.foreign_text import Value, csv_text
 from orthoflow.records.metrics import write_metrics_csv
 from orthoflow.records.published import METRICS_FILE
 from orthoflow.records.runs import Run
 
-Row: TypeAlias = Sequence[str | int | float | None]
+Row: TypeAlias = Sequence[Value]
 
 
 def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
@@ -36,13 +36,8 @@ def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
     }
     write_metrics_csv(folder / METRICS_FILE, run.metrics())
     for name, rows in tables.items():
-        _write(folder / name, rows)
+        (folder / name).write_text(csv_text(rows), encoding="utf-8", newline="")
     return tuple(folder / name for name in (METRICS_FILE, *tables))
-
-
-def _write(path: Path, rows: Iterable[Row]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def _cells(record: RunRecord) -> Iterator[Row]:

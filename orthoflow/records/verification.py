@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
+from orthoflow_provenance.errors import UnsafeFileError
+from orthoflow_provenance.inner_files import open_below
 from orthoflow_provenance.model import PublishedFile, RunRecord
 from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.verify import verify_record
 
-from orthoflow.engine.file_digests import file_sha256
+from orthoflow.errors import RecordError
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.runs import find_record, record_errors
+from orthoflow.records.signatures import check_signature, read_signature
 
 _FILES_NAMED: Final = 3
+_State: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
+_WRONG: Final[dict[_State, str]] = {
+    "changed": "changed since it was published",
+    "unreadable": "unreadable since it was published",
+    "no file": "a link, a folder or a device stands where a file was published; it was not read",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +40,8 @@ class Verification:
         n_products: products whose arrays lie in the record and were compared with their digest.
         n_inputs: input files that lie in the record and were compared with their digest.
         n_published: files beside the record that are as they were published.
+        signed_with: fingerprint of the key that the record is signed with, empty unless that was
+            asked for and is so.
     """
 
     path: Path
@@ -37,9 +50,12 @@ class Verification:
     n_products: int = 0
     n_inputs: int = 0
     n_published: int = 0
+    signed_with: str = ""
 
 
-def verify_run(path: str | Path, *, also_published: bool = True) -> Verification:
+def verify_run(
+    path: str | Path, *, also_published: bool = True, signer: Path | None = None
+) -> Verification:
     """Check seal, digests, cache keys and required fields of a record, and the published files.
 
     Published files that are not beside the record are a note: a record may travel alone.
@@ -47,9 +63,12 @@ def verify_run(path: str | Path, *, also_published: bool = True) -> Verification
     Args:
         path: a run folder, or the `run.h5` in it.
         also_published: check the files beside the record too.
+        signer: public key that the record must be signed with.
 
     Raises:
         ArgumentError: nothing is there, or the folder holds no finished run.
+        InputError: `signer` is no public key.
+        PluginError: `signer` is given, and the library cryptography is missing.
     """
     record_path = find_record(path)
     findings = tuple(
@@ -60,16 +79,39 @@ def verify_run(path: str | Path, *, also_published: bool = True) -> Verification
     with record_errors(record_path):
         record = read_record(record_path)
     check = _check_published(record_path.parent, record) if also_published else _PublishedCheck()
+    signature = _check_signature(record_path, signer)
     return Verification(
         path=record_path,
-        findings=check.changed,
-        notes=check.notes,
+        findings=(*signature.findings, *check.changed),
+        notes=(*signature.notes, *check.notes),
+        signed_with=signature.signed_with,
         n_products=sum(
             product.embedded for cell in record.cells for product in cell.outputs.values()
         ),
         n_inputs=sum(len(entry.files) for entry in record.inputs if entry.embedded),
         n_published=check.n_same,
     )
+
+
+def _check_signature(record: Path, signer: Path | None) -> Verification:
+    """What is to be said of the signature alone."""
+    try:
+        if signer is not None:
+            found = check_signature(record, signer)
+            return Verification(path=record, findings=(), signed_with=found.fingerprint)
+        if (unchecked := read_signature(record)) is None:
+            return Verification(path=record, findings=())
+    except RecordError as error:
+        said = (str(error),)
+        is_asked = signer is not None
+        return Verification(
+            path=record, findings=said if is_asked else (), notes=() if is_asked else said
+        )
+    note = (
+        f"there is a signature, said to be of the key {unchecked.fingerprint}, that was not "
+        "checked: name the signer's public key with --signer"
+    )
+    return Verification(path=record, findings=(), notes=(note,))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,27 +125,25 @@ def _check_published(folder: Path, record: RunRecord) -> _PublishedCheck:
     states = list(in_order(lambda file: _state(folder, file), record.published))
     checked = list(zip(record.published, states, strict=True))
     missing = [file.path for file, state in checked if state == "missing"]
-    changed = tuple(
-        f"{file.path}: {state} since it was published"
-        for file, state in checked
-        if state in {"changed", "unreadable"}
-    )
+    changed = tuple(f"{file.path}: {_WRONG[state]}" for file, state in checked if state in _WRONG)
     notes = (_missing_note(missing, len(checked)),) if missing else ()
     return _PublishedCheck(changed=changed, notes=notes, n_same=states.count("same"))
 
 
-def _state(
-    folder: Path, file: PublishedFile
-) -> Literal["same", "changed", "missing", "unreadable"]:
-    path = folder / file.path
+def _state(folder: Path, file: PublishedFile) -> _State:
     try:
-        if path.stat().st_size != file.size_bytes:
-            return "changed"
-        return "same" if file_sha256(path) == file.sha256 else "changed"
+        with open_below(folder, file.path) as stream:
+            # A sparse file of a terabyte is told by its size.
+            if os.fstat(stream.fileno()).st_size != file.size_bytes:
+                return "changed"
+            digest = hashlib.file_digest(stream, "sha256").hexdigest()
     except (FileNotFoundError, NotADirectoryError):
         return "missing"
+    except UnsafeFileError:
+        return "no file"
     except OSError:
         return "unreadable"
+    return "same" if digest == file.sha256 else "changed"
 
 
 def _missing_note(missing: list[str], n_published: int) -> str:

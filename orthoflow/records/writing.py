@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
@@ -26,10 +27,10 @@ from orthoflow_provenance.model import (
 from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.writer import write_record
 
-from orthoflow.engine.durability import sync_folder, writing_to
+from orthoflow.engine.durability import sync_folder, sync_tree, writing_to
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.run_folder import RECORD_FILE
-from orthoflow.errors import InputError, StoreError
+from orthoflow.errors import DamageError, InputError, StoreError
 from orthoflow.records.input_files import embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
@@ -44,6 +45,15 @@ if TYPE_CHECKING:
     from orthoflow.workflow.cells import Cell
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
+_MOST_ATTEMPTS: Final = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrittenRun:
+    """A run that was executed, and its record."""
+
+    run: Run
+    outcome: RunOutcome
 
 
 def write_run(
@@ -74,9 +84,47 @@ def write_run(
         The finished run.
 
     Raises:
-        StoreError: the disk refuses, or the store lost a product of the run.
+        DamageError: something that the record needs was damaged in the store; it has been set
+            aside, and the same run, gone on with, computes it again.
+        StoreError: the disk refuses, or refused a step what it wanted to read or write.
         InputError: an input file to embed was changed during the run.
     """
+    _check_failures(outcome, run_folder)
+    try:
+        return _write_run(
+            outcome, plan, workflow, run_folder, store, embed=embed, before_finish=before_finish
+        )
+    except StoreError as error:
+        needed = [name for result in outcome.results.values() for name in result.objects]
+        damaged = store.damaged_objects(needed)
+        if not damaged and not isinstance(error, DamageError):
+            raise
+        raise DamageError(
+            f"the store {store.folder} does not hold any more what the record needs ({error}); the "
+            f"same command with -o {run_folder} computes it again"
+        ) from error
+
+
+def _check_failures(outcome: RunOutcome, run_folder: Path) -> None:
+    """Refuse to finish a run in which a step failed for the disk's sake, not for its method's."""
+    for address, result in outcome.failed.items():
+        if result.error_type in (StoreError.__name__, DamageError.__name__):
+            raise StoreError(
+                f"{address} failed: {result.error_message}; what is finished is kept, and the same "
+                f"command with -o {run_folder} goes on from there"
+            )
+
+
+def _write_run(
+    outcome: RunOutcome,
+    plan: RunPlan,
+    workflow: Workflow,
+    run_folder: Path,
+    store: Store,
+    *,
+    embed: bool,
+    before_finish: Callable[[Run], None] | None,
+) -> Run:
     record = build_record(outcome, plan, workflow, store, embed=embed)
     with writing_to(run_folder):
         run_folder.mkdir(parents=True, exist_ok=True)
@@ -89,9 +137,31 @@ def write_run(
         _write_record(unfinished, record, store, plan, embed=embed)
         if before_finish is not None:
             before_finish(Run(path=unfinished, record=read_record(unfinished)))
+        # All that the record names, before its own name says that it is there.
+        sync_tree(run_folder)
         finished = unfinished.replace(run_folder / RECORD_FILE)
         sync_folder(run_folder)
     return Run(path=finished, record=record)
+
+
+def executed_and_written(
+    execute: Callable[[], RunOutcome], write: Callable[[RunOutcome], Run]
+) -> WrittenRun:
+    """Execute a run and write it; what the store turns out to have lost is computed again.
+
+    Args:
+        execute: goes on with the run each time it is called, as `engine.execute` does.
+        write: calls `write_run`.
+
+    Raises:
+        DamageError: the store loses things faster than they can be computed.
+    """
+    for _ in range(_MOST_ATTEMPTS - 1):
+        outcome = execute()
+        with suppress(DamageError):
+            return WrittenRun(run=write(outcome), outcome=outcome)
+    outcome = execute()
+    return WrittenRun(run=write(outcome), outcome=outcome)
 
 
 def _write_record(
@@ -109,8 +179,7 @@ def _write_record(
         raise InputError(f"{error}: run again") from error
     except RecordFormatError as error:
         raise StoreError(
-            f"the record cannot be assembled from the store {store.folder}: {error}; run again "
-            "with --force STEP for the step that made it"
+            f"the record cannot be assembled from the store {store.folder}: {error}"
         ) from error
 
 
@@ -125,7 +194,7 @@ def build_record(
     """Turn what the engine gave into what a record says.
 
     Raises:
-        StoreError: the store lost a picture of the run.
+        DamageError: the store lost a picture of the run.
     """
     results = outcome.results
     recorder = _CellRecorder(outcome=outcome, plan=plan, store=store, embed=embed)
@@ -240,13 +309,11 @@ class _CellRecorder:
 
 
 def _recorded_figure(figure: FigureRef, store: Store) -> RecordedFigure:
-    path = store.blob_path(figure.sha256)
-    if path is None:
-        raise StoreError(
-            f"the store {store.folder} lost the figure {figure.name}; run again and it is drawn "
-            "anew"
-        )
-    return RecordedFigure(data=path.read_bytes(), **shared_fields(figure, Figure))
+    try:
+        data = store.blob(figure.sha256)
+    except DamageError as error:
+        raise DamageError(f"the figure {figure.name} is damaged") from error
+    return RecordedFigure(data=data, **shared_fields(figure, Figure))
 
 
 def _recorded_inputs(plan: RunPlan, *, embed: bool) -> tuple[RecordedInput, ...]:
@@ -268,7 +335,7 @@ def _recorded_environments(results: Mapping[str, CellResult]) -> tuple[RecordedE
     return tuple({found.id: found for found in given if found is not None}.values())
 
 
-def _published(outcome: RunOutcome, store: Store) -> dict[str, dict[str, tuple[Path, ...]]]:
+def _published(outcome: RunOutcome, store: Store) -> dict[str, dict[str, Mapping[Path, str]]]:
     return {
         address: {port: store.published_files(ref.digest) for port, ref in result.outputs.items()}
         for address, result in outcome.results.items()

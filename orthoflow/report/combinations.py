@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from orthoflow.files.json_texts import parse_json
 from orthoflow.records import RecordedCell, Run, cell_metrics
 
 
@@ -142,8 +142,8 @@ def wanted_metrics(run: Run) -> tuple[str, ...]:
 
 def _comparison(run: Run) -> Mapping[str, object]:
     try:
-        document = json.loads(run.record.workflow_resolved)
-    except json.JSONDecodeError:
+        document = parse_json(run.record.workflow_resolved)
+    except ValueError:
         return {}
     found = document.get("compare") if isinstance(document, dict) else None
     return found if isinstance(found, dict) else {}

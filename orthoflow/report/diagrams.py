@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Final
 
+from orthoflow.foreign_text import shown
 from orthoflow.records import RecordedCell, Run
 from orthoflow.report.numbers import seconds_in_words
 
@@ -142,12 +143,14 @@ def _arrow(start: _Place, end: _Place) -> str:
 
 def _draw(box: _Box, place: _Place) -> str:
     return (
-        f'<g class="cell {box.state}"><title>{escape(box.title)}: {escape(box.below)}</title>'
+        f'<g class="cell {box.state}">'
+        f"<title>{escape(shown(box.title))}: {escape(shown(box.below))}</title>"
         f'<rect x="{place.x:.0f}" y="{place.y:.0f}" width="{_BOX_WIDTH}" '
         f'height="{_BOX_HEIGHT}" rx="6"/>'
-        f'<text x="{place.x + 10:.0f}" y="{place.y + 19:.0f}">{escape(_short(box.title))}</text>'
+        f'<text x="{place.x + 10:.0f}" y="{place.y + 19:.0f}">'
+        f"{escape(_short(shown(box.title)))}</text>"
         f'<text class="small" x="{place.x + 10:.0f}" y="{place.y + 36:.0f}">'
-        f"{escape(_short(box.below))}</text></g>"
+        f"{escape(_short(shown(box.below)))}</text></g>"
     )
 
 

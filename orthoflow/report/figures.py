@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 
-from orthoflow.engine.run_folder import cell_file_name
+from orthoflow.errors import InputError
 from orthoflow.files.images import decode_image, encode_png, shrunk_webp
 from orthoflow.geometry.threads import in_order
-from orthoflow.records import RecordedFigure, Run
+from orthoflow.records import RecordedFigure, Run, figure_files, write_files
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.pictures import Picture, data_uri
@@ -20,12 +20,6 @@ FIGURES_FOLDER: Final = "figures"
 _BYTES_MOST: Final = 10_500_000  # of all figures on a page; a third more in base64
 _SIDES_PX: Final = (700, 480, 340, 240)
 _SMALL_BYTES: Final = 20_000  # not worth drawing anew
-_SUFFIXES: Final[Mapping[str, str]] = {
-    "image/png": ".png",
-    "image/svg+xml": ".svg",
-    "image/webp": ".webp",
-    "image/jpeg": ".jpg",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,36 +75,43 @@ def baseline_addresses(run: Run) -> tuple[str, ...]:
     )
 
 
-def write_figures(run: Run, folder: Path, addresses: Iterable[str]) -> int:
+def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: str = "") -> int:
     """Write the figures of cells as PNG or SVG files below `folder/<cell>/`, and the run's graph.
+
+    A picture that is damaged has no file.
+
+    Args:
+        run: the run.
+        folder: made when missing.
+        addresses: of the cells.
+        inside: a folder in it that takes the place of `folder`; it must be no link.
 
     Returns:
         How many figures.
 
     Raises:
-        OSError: the folder cannot be written.
+        RecordError: a figure has a name or a type that no file can have; nothing is written.
+        StoreError: the folder cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "graph.svg").write_text(run_diagram(run, stands_alone=True), encoding="utf-8")
-    waiting: list[tuple[Path, RecordedFigure]] = []
-    for address in addresses:
-        inside = folder / cell_file_name(address)
-        figures = run.cells[address].figures
-        if figures:
-            inside.mkdir(exist_ok=True)
-        waiting.extend((inside / figure.name, figure) for figure in figures)
-    # Drained, so that an error in a thread is not lost.
-    list(in_order(lambda item: _write_figure(*item), waiting))
-    return len(waiting)
+    named = figure_files(run, addresses)
+    contents: dict[str, Callable[[], bytes | None]] = {
+        "graph.svg": lambda: run_diagram(run, stands_alone=True).encode("utf-8")
+    }
+    contents |= {path: partial(_content, figure) for path, figure in named.items()}
+    way = f"{inside}/" if inside else ""
+    write_files(folder, {f"{way}{path}": content for path, content in contents.items()})
+    return len(named)
 
 
-def _write_figure(stem: Path, figure: RecordedFigure) -> None:
-    suffix = _SUFFIXES.get(figure.media_type, "")
-    content = figure.data
+def _content(figure: RecordedFigure) -> bytes | None:
+    """The bytes of a figure's file; None for a picture that is damaged."""
     if figure.media_type == "image/webp":
         # What papers and word processors take.
-        suffix, content = ".png", encode_png(decode_image(figure.data, figure.name))
-    stem.with_name(stem.name + suffix).write_bytes(content)
+        try:
+            return encode_png(decode_image(figure.data, figure.name))
+        except InputError:
+            return None
+    return figure.data
 
 
 def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[RecordedFigure]:
@@ -133,7 +134,11 @@ def _fitted(figures: tuple[RecordedFigure, ...], bytes_most: float) -> Iterable[
 def _smaller(figure: RecordedFigure, side_px: int) -> RecordedFigure:
     if figure.media_type == "image/svg+xml" or len(figure.data) <= _SMALL_BYTES:
         return figure
-    data = shrunk_webp(figure.data, figure.name, longest_side_px=side_px)
+    try:
+        data = shrunk_webp(figure.data, figure.name, longest_side_px=side_px)
+    except InputError:
+        # A picture that cannot be decoded costs its place on the page, not the page.
+        return replace(figure, data=b"", caption=f"{figure.caption} (the picture is damaged)")
     if len(data) >= len(figure.data):
         return figure
     return RecordedFigure(

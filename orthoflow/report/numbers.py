@@ -18,7 +18,11 @@ def number(value: float, *, significant: int = 4) -> str:
     if value == int(value) and abs(value) < 1e15:
         return str(int(value))
     digits = max(0, significant - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:.{digits}f}".rstrip("0").rstrip(".") if digits < 10 else f"{value:.3g}"
+    if digits >= 10:
+        return f"{value:.3g}"
+    printed = f"{value:.{digits}f}"
+    # Zeros before the point count.
+    return printed.rstrip("0").rstrip(".") if digits else printed
 
 
 def number_with_unit(value: float, unit: str, *, significant: int = 4) -> str:

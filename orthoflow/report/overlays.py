@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Inspection, TieRole, Ties
 from orthoflow.records import Run
@@ -130,7 +131,8 @@ def draw_vectors(frame: WallFrame, vectors: Vectors, *, label: str, magnificatio
     ]
     return (
         f'<svg class="over" viewBox="0 0 {frame.width} {frame.height}" role="img" '
-        f'aria-label="{escape(label)}" stroke-width="{radius / 2:.3g}">{"".join(marks)}</svg>'
+        f'aria-label="{escape(shown(label))}" stroke-width="{radius / 2:.3g}">'
+        f"{''.join(marks)}</svg>"
     )
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import os
 import re
+import secrets
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,9 +20,12 @@ from markupsafe import Markup, escape
 
 from orthoflow import __version__
 from orthoflow.errors import StoreError
-from orthoflow.records import COSTS, Run, compare_runs
+from orthoflow.foreign_text import shown
+from orthoflow.products import Cameras
+from orthoflow.records import COSTS, Run, compare_runs, figure_files
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table, environment_words
+from orthoflow.report.cursors import cursor_places
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import differences
 from orthoflow.report.figures import (
@@ -31,7 +37,13 @@ from orthoflow.report.figures import (
 )
 from orthoflow.report.numbers import number_with_unit
 from orthoflow.report.overlays import overlays
-from orthoflow.report.pictures import Picture, orthoimage_pictures, sliders, wall_pictures
+from orthoflow.report.pictures import (
+    Picture,
+    embedded_products,
+    orthoimage_pictures,
+    sliders,
+    wall_pictures,
+)
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
 from orthoflow.report.summaries import Answer, Limit, answers, citations, limits
 
@@ -61,6 +73,8 @@ class _Section:
     orthoimages: tuple[Picture, ...]
     walls: tuple[Picture, ...]
     sliders: list[dict[str, object]]
+    places: list[dict[str, object]]
+    photos: tuple[str, ...]
     overlays: tuple[_Ground, ...]
     planes: tuple[PlaneTable, ...]
     figures: tuple[FigureGroup, ...]
@@ -75,14 +89,13 @@ def write_page(run: Run, path: Path) -> None:
 
     Raises:
         StoreError: a file cannot be written.
-        RecordError: the record is damaged.
+        RecordError: the record is damaged, or a figure has a name that no file can have.
     """
+    addresses = baseline_addresses(run)
+    # Before the page is written: a record with such names gets none.
+    figure_files(run, addresses)
     write_report([run], path)
-    folder = path.parent / FIGURES_FOLDER
-    try:
-        write_figures(run, folder, baseline_addresses(run))
-    except OSError as error:
-        raise StoreError(f"figures cannot be written to {folder}: {error.strerror}") from error
+    write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
 
 def write_report(runs: Sequence[Run], path: Path) -> None:
@@ -106,9 +119,11 @@ def write_report(runs: Sequence[Run], path: Path) -> None:
         title=", ".join(dict.fromkeys(run.record.name for run in runs)),
         version=__version__,
     )
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    aside = path.with_name(f".report-{secrets.token_hex(8)}")
     try:
-        aside.write_text(text, encoding="utf-8")
+        # A new file: through a link that lies there it would be another's.
+        with aside.open("x", encoding="utf-8") as stream:
+            stream.write(text)
         aside.replace(path)
     except OSError as error:
         with suppress(OSError):
@@ -124,6 +139,7 @@ def _template() -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
+        finalize=_shown,
         loader=jinja2.PackageLoader("orthoflow.report"),
     )
     environment.filters["with_unit"] = number_with_unit
@@ -131,11 +147,29 @@ def _template() -> jinja2.Template:
     environment.filters["cited"] = cited
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote
-    # Ours, and no template: braces in them mean nothing.
     environment.globals["costs"] = COSTS
-    environment.globals["css"] = Markup(_packaged("page.css"))
-    environment.globals["script"] = Markup(_packaged("page.js"))
+    # Ours, and no template: braces in them mean nothing.
+    css, script = _packaged("page.css"), _packaged("page.js")
+    environment.globals["css"] = Markup(css)
+    environment.globals["script"] = Markup(script)
+    environment.globals["policy"] = (
+        "default-src 'none'; img-src data:; "
+        f"style-src {_hash_source(css)}; script-src {_hash_source(script)}; "
+        "base-uri 'none'; form-action 'none'"
+    )
     return environment.get_template("page.html.j2")
+
+
+def _shown(value: object) -> object:
+    """Write out what turns reading round; what is markup already was made of escaped parts."""
+    is_text = isinstance(value, str) and not isinstance(value, Markup)
+    return shown(str(value), keep="\n\t") if is_text else value
+
+
+def _hash_source(text: str) -> str:
+    """Name a style or a script for the policy of the page, by its content."""
+    digest = hashlib.sha256(text.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
 def _packaged(name: str) -> str:
@@ -149,14 +183,14 @@ def cited(citation: str) -> Markup:
             lambda found: (
                 f'<a href="https://doi.org/{quote(found[1], safe="/.()-;")}">doi:{found[1]}</a>'
             ),
-            str(escape(citation)),
+            str(escape(shown(citation))),
         )
     )
 
 
 def _breakable(name: str) -> Markup:
     """Let a long name or address be broken behind its underscores, and before its variants."""
-    return Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(name))))
+    return Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(shown(name)))))
 
 
 def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
@@ -189,6 +223,8 @@ def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
         orthoimages=tuple(orthoimages),
         walls=tuple(walls),
         sliders=_slider_data(numbered, len(orthoimages)),
+        places=cursor_places(orthoimages, walls),
+        photos=_photo_names(run),
         overlays=tuple(
             _Ground(
                 svg=Markup(overlay.svg),
@@ -206,16 +242,23 @@ def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
     )
 
 
+def _photo_names(run: Run) -> tuple[str, ...]:
+    """Names of the photos that were oriented, or were to be."""
+    places = embedded_products(run, "cameras")
+    found = [Cameras.from_payload(payload) for payload in run.payloads(places)]
+    return tuple(sorted({camera.photo for cameras in found for camera in cameras.cameras}))
+
+
 def _slider_data(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[str, object]]:
     """What the page's script needs to know of pictures that show the same place."""
     return [
         {
-            "name": slider.name,
+            "name": shown(slider.name),
             "ratio": slider.ratio,
             "pictures": [
                 {
                     "id": pictures[laid.picture].id,
-                    "title": laid.title,
+                    "title": shown(laid.title),
                     "left": laid.left,
                     "top": laid.top,
                     "width": laid.width,

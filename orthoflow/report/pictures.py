@@ -17,6 +17,7 @@ from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
 from orthoflow.records import Run
+from orthoflow.report.cursors import CoarseDepths, coarse_depths
 
 LONGEST_SIDE_PX: Final = 1000
 SHORTEST_SIDE_PX: Final = 320
@@ -54,6 +55,7 @@ class Picture:
         wall: index of the wall it shows, -1 for what is no raster of a wall.
         frame: where it lies in the world, None for what is no raster of a wall.
         id: name of its place on the page; empty where nothing refers to it.
+        depths: of the wall, where it shows its depth.
     """
 
     uri: str
@@ -64,6 +66,7 @@ class Picture:
     wall: int = -1
     frame: WallFrame | None = None
     id: str = ""
+    depths: CoarseDepths | None = None
 
 
 def data_uri(content: bytes, media_type: str) -> str:
@@ -124,6 +127,7 @@ class _Drawing:
     cell: str
     wall: int
     frame: WallFrame
+    depths: CoarseDepths | None = None
 
 
 def _drawn(drawings: Sequence[_Drawing], *, n_products: float) -> Iterator[Picture]:
@@ -139,6 +143,7 @@ def _drawn(drawings: Sequence[_Drawing], *, n_products: float) -> Iterator[Pictu
             cell=drawing.cell,
             wall=drawing.wall,
             frame=drawing.frame,
+            depths=drawing.depths,
         )
 
 
@@ -184,6 +189,7 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
         cell=address,
         wall=index,
         frame=wall.frame,
+        depths=coarse_depths(wall.depth_m),
     )
 
 

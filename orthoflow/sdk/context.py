@@ -11,13 +11,21 @@ from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+from orthoflow_provenance.errors import UnsafeFileError
+from orthoflow_provenance.inner_files import colliding, path_below
 from orthoflow_provenance.model import Figure, Metric
 
 from orthoflow.errors import CancelledStepError, ProductError
+from orthoflow.sdk.lines import is_name, one_line
 
 __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
 
 _MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp", ".svg": "image/svg+xml"}
+# Far above what a step can have to say; far below what a record or a terminal suffers from.
+_MOST_METRICS: Final = 20_000
+_MOST_FIGURES: Final = 2_000
+_MOST_WARNINGS: Final = 200
+_LARGEST_FIGURE: Final = 64 << 20
 
 
 class Drawing(Protocol):
@@ -82,6 +90,8 @@ class StepContext:
     figures: list[DrawnFigure] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     _fraction: float = 0.0
+    _named: set[str] = field(default_factory=set)
+    _n_warnings: int = 0
 
     def metric(self, name: str, value: float, unit: str) -> None:
         """Report a number about the result.
@@ -92,13 +102,21 @@ class StepContext:
             unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
 
         Raises:
-            ProductError: the value is not finite, or the name was reported before.
+            ProductError: the value is not finite, the name is none or was reported before, or
+                there are too many.
         """
-        number = float(value)
+        self._take_name(name)
+        if not is_name(unit, also_of_file=False):
+            raise ProductError(
+                f"the unit of metric {name} must be a word, 1 for counts and shares, "
+                f"got {one_line(ascii(unit), 80)}"
+            )
+        try:
+            number = float(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ProductError(f"metric {name} must be a number: {one_line(error)}") from error
         if not math.isfinite(number):
             raise ProductError(f"metric {name} must be finite, got {number}")
-        if any(metric.name == name for metric in self.metrics):
-            raise ProductError(f"metric {name} was reported twice")
         self.metrics.append(Metric(name=name, value=number, unit=unit))
 
     def figure(self, name: str, content: bytes | Drawing, caption: str = "") -> None:
@@ -109,18 +127,29 @@ class StepContext:
             content: the bytes of a PNG, WebP or SVG file, or a matplotlib figure. Charts are PNG or
                 SVG; what looks like a photo is WebP, which takes a tenth of the bytes.
             caption: one sentence on what it shows.
+
+        Raises:
+            ProductError: no file can have the name, or a figure was drawn under it before, there
+                are too many figures, or one is no picture or larger than 64 MiB.
         """
-        folder = self.scratch / "figures"
-        folder.mkdir(exist_ok=True)
+        _require_room("figure", len(self.figures), _MOST_FIGURES)
+        suffix = _suffix(content) if isinstance(content, bytes) else ".png"
+        path = _path_below(self.scratch / "figures", name)
+        path = _path_below(path.parent, f"{name}{suffix}")
+        if colliding([*(figure.name for figure in self.figures), name]):
+            raise ProductError(f"figure {name} was drawn twice")
+        path.parent.mkdir(exist_ok=True)
         if isinstance(content, bytes):
-            path = folder / f"{name}{_suffix(content)}"
             path.write_bytes(content)
         else:
-            path = folder / f"{name}.png"
             content.savefig(path)
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > _LARGEST_FIGURE:
+            raise ProductError(
+                f"figure {name} must be a file of at most {_LARGEST_FIGURE >> 20} MiB"
+            )
         media_type = _MEDIA_TYPES[path.suffix]
         self.figures.append(
-            DrawnFigure(name=name, caption=caption, media_type=media_type, path=path)
+            DrawnFigure(name=name, caption=one_line(caption), media_type=media_type, path=path)
         )
 
     def progress(self, fraction: float, text: str = "") -> None:
@@ -132,16 +161,25 @@ class StepContext:
         if self.is_cancelled():
             raise CancelledStepError("the step was cancelled")
         self._fraction = min(1.0, max(self._fraction, float(fraction)))
-        self.listen(StepEvent(kind="progress", text=text, fraction=self._fraction))
+        self.listen(StepEvent(kind="progress", text=one_line(text), fraction=self._fraction))
 
     def log(self, text: str) -> None:
         """Write one line to the step's log."""
-        self.listen(StepEvent(kind="log", text=text))
+        self.listen(StepEvent(kind="log", text=one_line(text)))
 
     def warn(self, text: str) -> None:
-        """Tell the user something that limits the result; shown in terminal, record and report."""
-        self.warnings.append(text)
-        self.listen(StepEvent(kind="warning", text=text))
+        """Tell the user something that limits the result; shown in terminal, record and report.
+
+        One line each; after the two hundredth, only their number is kept.
+        """
+        self._n_warnings += 1
+        line = one_line(text)
+        if self._n_warnings <= _MOST_WARNINGS:
+            self.warnings.append(line)
+            self.listen(StepEvent(kind="warning", text=line))
+        else:
+            more = f"{self._n_warnings - _MOST_WARNINGS} more warnings, which are not kept"
+            self.warnings[_MOST_WARNINGS:] = [more]
 
     def cancelled(self) -> bool:
         """Whether the step was asked to stop."""
@@ -163,17 +201,45 @@ class StepContext:
 
         Raises:
             OSError: the disk has no room for it.
+            ProductError: no file can have the name.
         """
+        file_name = f"{port}.{name.replace('/', '.')}"
         size_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+        if np.dtype(dtype).hasobject or min(shape, default=0) < 0:
+            raise ProductError(f"an array cannot be of type {np.dtype(dtype)} and shape {shape}")
         if size_bytes == 0:
             return np.zeros(shape, dtype=dtype)
-        folder = self.scratch / "allocated"
-        folder.mkdir(exist_ok=True)
-        path = folder / f"{port}.{name.replace('/', '.')}"
+        path = _path_below(self.scratch / "allocated", file_name)
+        path.parent.mkdir(exist_ok=True)
         with path.open("wb") as file:
             # Writing into the hole of a sparse file on a full disk would kill the process.
             os.posix_fallocate(file.fileno(), 0, size_bytes)
         return np.memmap(path, dtype=np.dtype(dtype), mode="r+", shape=shape)
+
+    def _take_name(self, name: object) -> None:
+        if not is_name(name):
+            raise ProductError(
+                f"a metric must have a name of one printable line, without `/` and of at most 200 "
+                f"bytes, got {one_line(ascii(name), 80)}"
+            )
+        if name in self._named:
+            raise ProductError(f"metric {name} was reported twice")
+        _require_room("metric", len(self.metrics), _MOST_METRICS)
+        self._named.add(str(name))
+
+
+def _require_room(what: str, n_before: int, most: int) -> None:
+    if n_before >= most:
+        raise ProductError(f"a step may report {most} {what}s, not more")
+
+
+def _path_below(folder: Path, name: object) -> Path:
+    if not isinstance(name, str):
+        raise ProductError(f"the name of a file must be a text, got {one_line(ascii(name), 80)}")
+    try:
+        return path_below(folder, name)
+    except UnsafeFileError as error:
+        raise ProductError(str(error)) from error
 
 
 def _suffix(picture: bytes) -> str:

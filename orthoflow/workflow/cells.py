@@ -16,7 +16,12 @@ import networkx as nx
 from orthoflow.catalog import Catalog, did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.comparison import Assignment, combinations, is_excluded
+from orthoflow.workflow.comparison import (
+    Assignment,
+    check_cell_count,
+    combinations,
+    is_excluded,
+)
 from orthoflow.workflow.format import StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.inputs import present_inputs
 from orthoflow.workflow.methods import MethodInfo, describe_method
@@ -213,11 +218,11 @@ class _Expansion:
     def expand(self) -> tuple[Cell, ...]:
         """Give all cells in topological order, the first of each repeat in front of the others."""
         graph = step_graph(self.workflow.steps)
+        steps_of = {name: self._relevant(graph, name) for name in self.rank}
+        check_cell_count(self.workflow, steps_of)
         cells: dict[str, Cell] = {}
-        for name in self.rank:
+        for name, relevant in steps_of.items():
             step = self.workflow.steps[name]
-            before = nx.ancestors(graph, name)
-            relevant = [other for other in self.rank if other in before or other == name]
             made: dict[frozenset[tuple[str, str]], _Node] = {}
             self.nodes[name] = made
             for assignment in combinations(self.workflow, relevant):
@@ -229,6 +234,11 @@ class _Expansion:
                 if node.cell.address not in cells:
                     cells.update({cell.address: cell for cell in self._repeats(step, node.cell)})
         return tuple(cells.values())
+
+    def _relevant(self, graph: nx.DiGraph[str], name: str) -> list[str]:
+        """The steps that lie before a step and itself, in graph order."""
+        before = nx.ancestors(graph, name) | {name}
+        return sorted(before, key=self.rank.__getitem__)
 
     def _repeats(self, step: WorkflowStep, cell: Cell) -> list[Cell]:
         count = 1 if cell.skip_reason else step.variant(_variant_name(step, cell)).repeat

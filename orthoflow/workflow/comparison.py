@@ -25,7 +25,8 @@ from orthoflow.workflow.shapes import TEXT
 from orthoflow.workflow.steps import DraftStep
 
 Assignment: TypeAlias = dict[str, str]
-MAX_COMBINATIONS: Final = 20_000
+MOST_CELLS: Final = 20_000
+MOST_EXCLUDED: Final = 500
 
 
 def read_compare(
@@ -39,6 +40,13 @@ def read_compare(
     design = DESIGN.read(table, path, log) or "product"
     baseline = BASELINE.read(table, path, log)
     excluded = EXCLUDE.read(table, path, log) or ()
+    if len(excluded) > MOST_EXCLUDED:
+        log.add(
+            value.position,
+            join(path, EXCLUDE.name),
+            f"expected at most {MOST_EXCLUDED} combinations to leave out, got {len(excluded)}",
+        )
+        excluded = ()
     combinations = [_read_assignment(item, here, steps, log) for here, item in excluded]
     return Comparison(
         design=design,
@@ -64,6 +72,40 @@ def check_baseline(comparison: Comparison, position: Position, log: ProblemLog) 
             )
 
 
+def check_cell_count(workflow: Workflow, steps_of: Mapping[str, Sequence[str]]) -> None:
+    """Count the cells of a workflow before there are any, those that are left out included.
+
+    Args:
+        workflow: the workflow.
+        steps_of: per step the steps that matter to it, in graph order, itself last.
+
+    Raises:
+        WorkflowError: there are more than anybody can run.
+    """
+    count = sum(_count_cells(workflow, steps) for steps in steps_of.values())
+    if count > MOST_CELLS:
+        raise WorkflowError(
+            f"the comparison of {workflow.name} has {count} cells (combinations of variants, and "
+            f"repeats), more than {MOST_CELLS}; use design: one-at-a-time, fewer variants or a "
+            "smaller repeat"
+        )
+
+
+def _count_cells(workflow: Workflow, steps: Sequence[str]) -> int:
+    *before, name = steps
+    step = workflow.steps[name]
+    repeats = {variant.name: variant.repeat for variant in step.variants}
+    first = repeats[workflow.baseline[name] if step.is_varied else step.variants[0].name]
+    if workflow.compare is None:
+        return first
+    others = [
+        len(workflow.steps[other].variants) for other in before if workflow.steps[other].is_varied
+    ]
+    if workflow.compare.design == "product":
+        return math.prod(others) * sum(repeats.values())
+    return sum(count - 1 for count in others) * first + sum(repeats.values())
+
+
 def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignment]:
     """Give the combinations of variants that reach a step, each once, the last step fastest.
 
@@ -71,8 +113,6 @@ def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignmen
         workflow: the workflow.
         steps: the steps that matter, in graph order: the step itself and what lies before it.
 
-    Raises:
-        WorkflowError: there are more combinations than anybody can run.
     """
     varied = {
         name: tuple(variant.name for variant in workflow.steps[name].variants)
@@ -83,12 +123,6 @@ def combinations(workflow: Workflow, steps: Sequence[str]) -> Iterator[Assignmen
     if workflow.compare is None:
         yield baseline
     elif workflow.compare.design == "product":
-        count = math.prod(len(names) for names in varied.values())
-        if count > MAX_COMBINATIONS:
-            raise WorkflowError(
-                f"the comparison of {workflow.name} has {count} combinations of variants, more "
-                f"than {MAX_COMBINATIONS}; use design: one-at-a-time, or fewer variants"
-            )
         for names in itertools.product(*varied.values()):
             yield dict(zip(varied, names, strict=True))
     else:

@@ -31,7 +31,7 @@ from orthoflow.workflow.shapes import check_name
 from orthoflow.workflow.steps import DraftStep, read_steps
 from orthoflow.workflow.wiring import check_wiring
 
-MAX_BYTES: Final = 1 << 20
+MOST_BYTES: Final = 400_000
 
 
 def load_workflow(
@@ -74,9 +74,9 @@ def _read_text(path: Path) -> str:
         content = path.read_bytes()
     except OSError as error:
         raise WorkflowError(f"{path} cannot be read: {error.strerror}") from error
-    if len(content) > MAX_BYTES:
+    if len(content) > MOST_BYTES:
         raise WorkflowError(
-            f"{path} has {len(content)} bytes; a workflow file has at most {MAX_BYTES}"
+            f"{path} has {len(content)} bytes; a workflow file has at most {MOST_BYTES}"
         )
     try:
         return content.decode("utf-8-sig")

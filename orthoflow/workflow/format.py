@@ -37,6 +37,7 @@ from orthoflow.workflow.shapes import (
 )
 
 FORMAT: Final = 1
+MOST_REPEATS: Final = 10_000
 Design = Literal["product", "one-at-a-time"]
 
 
@@ -109,7 +110,7 @@ PARAMS: Final = Key(
 )
 REPEAT: Final = Key(
     name="repeat",
-    shape=whole_number(minimum=1),
+    shape=whole_number(minimum=1, maximum=MOST_REPEATS),
     meaning="How many runs with seeds of their own; what follows takes the first.",
     example="10",
     default="1",

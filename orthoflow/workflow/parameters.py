@@ -10,6 +10,8 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from orthoflow.catalog import did_you_mean
+from orthoflow.catalog.foreign_code import foreign_code
+from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import ArgumentError
 from orthoflow.files.yaml_positions import (
     Listing,
@@ -90,19 +92,22 @@ def resolve_params(
     if info is None:
         return ResolvedParams(as_set=as_set)
     try:
-        params = info.method.Params.model_validate_json(json.dumps(as_set), strict=True)
-        resolved = params.model_dump(mode="json")
+        with foreign_code(f"checking the parameters of {info.id}"):
+            params = info.method.Params.model_validate_json(json.dumps(as_set), strict=True)
+            resolved = params.model_dump(mode="json")
     except ValidationError as error:
         options = {override.keys[0]: override.option for override in overrides}
         reporter = _Reporter(variant=variant, info=info, options=options, log=log)
         for details in error.errors(include_url=False):
             reporter.report(details)
         return ResolvedParams(as_set=as_set)
-    except Exception as error:  # noqa: BLE001 - a stranger's validator may raise anything
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # noqa: BLE001 - a stranger's validator may raise anything
         log.add_plugin(
             variant.position,
             f"{variant.path}.params",
-            f"checking the parameters of {info.id} failed: {type(error).__name__}: {error}",
+            f"checking the parameters of {info.id} failed: {describe_error(error)}",
         )
         return ResolvedParams(as_set=as_set)
     return ResolvedParams(resolved=resolved, as_set=as_set)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from orthoflow.files.yaml_positions import Position
 
 
+MOST_PROBLEMS: Final = 100
 _SNIPPET_WIDTH: Final = 120
 
 
@@ -93,7 +94,15 @@ class ProblemLog:
     _in_options: list[Problem] = field(default_factory=list)
 
     def add(self, position: Position, path: str, message: str) -> None:
-        """Keep a problem of the file."""
+        """Keep a problem of the file.
+
+        Raises:
+            InvalidWorkflowError: there are so many that the file must be something else.
+        """
+        if len(self._in_file) == MOST_PROBLEMS:
+            message = f"more than {MOST_PROBLEMS} problems; correct those above and try again"
+            self._in_file.append(self._at(position, path, message))
+            self._raise()
         self._in_file.append(self._at(position, path, message))
 
     def add_plugin(self, position: Position, path: str, message: str) -> None:

@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
+import networkx as nx
+from pydantic import BaseModel, Field, ValidationError
+
+from orthoflow.catalog import NAME_PATTERN
 from orthoflow.errors import WorkflowError
+from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.format import (
     FORMAT,
+    MOST_REPEATS,
     Comparison,
+    Design,
     StepVariant,
     Workflow,
     WorkflowInputSpec,
     WorkflowStep,
 )
-from orthoflow.workflow.shapes import Reference
+from orthoflow.workflow.shapes import Reference, seconds_in
+from orthoflow.workflow.wiring import step_graph
 
 _PLACE: Final = "the resolved workflow"
 # What every record says of a method call; a key that came later may be missing in older ones.
@@ -64,27 +73,39 @@ def workflow_from_resolved(resolved: str, source: str) -> Workflow:
         WorkflowError: the text is no resolved workflow, or one of a newer format.
     """
     try:
-        document = json.loads(resolved)
-        _check_format(document["orthoflow"])
-        return Workflow(
-            name=document["name"],
-            path=Path(f"{document['name']}.yaml"),
-            source=source,
-            seed=document["seed"],
-            inputs={
-                name: WorkflowInputSpec(
-                    name=name, files=tuple(entry["files"]), optional=entry["optional"]
-                )
-                for name, entry in document["inputs"].items()
-            },
-            steps={name: _step(name, entry) for name, entry in document["steps"].items()},
-            compare=_comparison(document["compare"]),
-            overrides=tuple(document["overrides"]),
-        )
+        document = parse_json(resolved)
+        workflow = _workflow(document, source)
+        _check(workflow)
     except WorkflowError:
         raise
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise WorkflowError(f"{_PLACE} cannot be read: {place}: {first['msg']}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise WorkflowError(f"{_PLACE} cannot be read: {type(error).__name__} {error}") from error
+    return workflow
+
+
+# Any: JSON whose form `_check` and the caller's `except` look at.
+def _workflow(document: Any, source: str) -> Workflow:
+    _check_format(document["orthoflow"])
+    _check_types(document)
+    return Workflow(
+        name=document["name"],
+        path=Path(f"{document['name']}.yaml"),
+        source=source,
+        seed=document["seed"],
+        inputs={
+            name: WorkflowInputSpec(
+                name=name, files=tuple(entry["files"]), optional=entry["optional"]
+            )
+            for name, entry in document["inputs"].items()
+        },
+        steps={name: _step(name, entry) for name, entry in document["steps"].items()},
+        compare=_comparison(document["compare"]),
+        overrides=tuple(document["overrides"]),
+    )
 
 
 def _step_json(step: WorkflowStep) -> dict[str, object]:
@@ -117,7 +138,53 @@ def _check_format(version: object) -> None:
         raise WorkflowError(f"{_PLACE} has format {version}, this orthoflow reads {FORMAT}")
 
 
-# Any: JSON whose form the caller's `except` checks.
+class _VariantDocument(BaseModel):
+    """What a run takes from a recorded method call; the rest is only handed on."""
+
+    name: str
+    use: str
+    params: dict[str, object]
+    params_set: dict[str, object]
+    repeat: int = Field(ge=1)
+    cores: int | None = Field(ge=1)
+    timeout_s: float | None = Field(gt=0, allow_inf_nan=False)
+
+
+class _StepDocument(BaseModel):
+    inputs: dict[str, list[str]] = Field(alias="in")
+    unless: str
+    is_varied: bool
+    variants: list[_VariantDocument]
+
+
+class _InputDocument(BaseModel):
+    files: list[str]
+    optional: bool
+
+
+class _ComparisonDocument(BaseModel):
+    design: Design
+    baseline: dict[str, str]
+    exclude: list[dict[str, str]]
+    metrics: list[str]
+
+
+class _Document(BaseModel):
+    """The form of a resolved workflow: whoever wrote the record may have written anything."""
+
+    name: str
+    seed: int
+    inputs: dict[str, _InputDocument]
+    steps: dict[str, _StepDocument]
+    compare: _ComparisonDocument | None
+    overrides: list[str]
+
+
+def _check_types(document: object) -> None:
+    _Document.model_validate(document, strict=True)
+
+
+# Any: JSON whose form `_check_types` and the caller's `except` look at.
 def _step(name: str, entry: Mapping[str, Any]) -> WorkflowStep:
     return WorkflowStep(
         name=name,
@@ -151,3 +218,52 @@ def _comparison(entry: Mapping[str, Any] | None) -> Comparison | None:
         exclude=tuple(entry["exclude"]),
         metrics=tuple(entry["metrics"]),
     )
+
+
+def _check(workflow: Workflow) -> None:
+    """Look at what the file's checks had looked at, since a record may have been changed.
+
+    Raises:
+        ValueError: a value is out of range, or names what is not there.
+    """
+    names = [workflow.name, *workflow.inputs, *workflow.steps]
+    for step in workflow.steps.values():
+        names += [variant.name for variant in step.variants if step.is_varied]
+    for name in names:
+        if not re.fullmatch(NAME_PATTERN, name):
+            raise ValueError(f"{name[:60]!r} cannot be a name")
+    for step in workflow.steps.values():
+        _check_step(workflow, step)
+    if not nx.is_directed_acyclic_graph(step_graph(workflow.steps)):
+        raise ValueError("its steps need each other in a circle")
+    if workflow.compare is not None:
+        _check_comparison(workflow, workflow.compare)
+
+
+def _check_step(workflow: Workflow, step: WorkflowStep) -> None:
+    if not step.variants or not (step.is_varied or len(step.variants) == 1):
+        raise ValueError(f"step {step.name} has {len(step.variants)} variants")
+    for variant in step.variants:
+        _check_variant(variant)
+    if len({variant.name for variant in step.variants}) != len(step.variants):
+        raise ValueError(f"step {step.name} has two variants of one name")
+    if step.unless and step.unless not in workflow.inputs:
+        raise ValueError(f"step {step.name} hangs on an unknown input")
+    for reference in (item for references in step.inputs.values() for item in references):
+        known = workflow.inputs if reference.is_input else workflow.steps
+        if (reference.name if reference.is_input else reference.source) not in known:
+            raise ValueError(f"step {step.name} takes {reference}, which is not there")
+
+
+def _check_variant(variant: StepVariant) -> None:
+    if variant.repeat > MOST_REPEATS:
+        raise ValueError(f"{variant.method} is repeated {variant.repeat} times")
+    if variant.timeout_s is not None and seconds_in(variant.timeout_s) is None:
+        raise ValueError(f"{variant.method} has no usable time limit")
+
+
+def _check_comparison(workflow: Workflow, comparison: Comparison) -> None:
+    for assignment in (comparison.baseline, *comparison.exclude):
+        for step, variant in assignment.items():
+            if variant not in [item.name for item in workflow.steps[step].variants]:
+                raise ValueError(f"step {step} has no variant of the comparison")

@@ -29,11 +29,14 @@ from orthoflow.workflow.problems import ProblemLog
 
 INPUTS_NAME: Final = "inputs"
 _NAME_RULE: Final = (
-    "a name starts with a lower-case letter and has at most 32 lower-case letters, digits, - or _"
+    "a name starts with a lower-case letter, has at most 32 lower-case letters, digits, - or _, "
+    "and is not that of a device (con, prn, aux, nul, com1, lpt1 ...)"
 )
 _REFERENCE: Final = re.compile(rf"({NAME_PATTERN})\.({NAME_PATTERN})")
 _TIME: Final = re.compile(r"(\d+(?:\.\d+)?) *(s|min|h)")
 _METRIC: Final = re.compile(r"[^.]+\..+", re.DOTALL)
+# Records keep numbers of fewer than a hundred digits.
+_MOST_OF_A_NUMBER: Final = 10**80
 _SECONDS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 Schema: TypeAlias = dict[str, JsonValue]
@@ -133,12 +136,17 @@ FLAG: Final[Single[bool]] = Single(
 )
 
 
-def whole_number(*, minimum: int) -> Single[int]:
-    """A whole number from `minimum` on; `true` is none."""
+def whole_number(*, minimum: int, maximum: int | None = None) -> Single[int]:
+    """A whole number from `minimum` on, up to `maximum` if there is one; `true` is none."""
+    upper = _MOST_OF_A_NUMBER if maximum is None else maximum
     return Single(
-        words=f"a whole number from {minimum} on",
-        says={"type": "integer", "minimum": minimum},
-        take=lambda raw: raw if type(raw) is int and raw >= minimum else None,
+        words=f"a whole number from {minimum} {'on' if maximum is None else f'to {maximum}'}",
+        says={
+            "type": "integer",
+            "minimum": minimum,
+            **({} if maximum is None else {"maximum": maximum}),
+        },
+        take=lambda raw: raw if type(raw) is int and minimum <= raw <= upper else None,
     )
 
 

@@ -24,6 +24,12 @@ def orthoflow_kinds() -> list[KindSpec]:
             outputs={"planes": "planes", "labels": "labels"},
         ),
         KindSpec(
+            name="face",
+            summary="turn planes to the side from which they are seen",
+            inputs={"planes": "planes", "cloud": "cloud", "photos": "photos"},
+            outputs={"planes": "planes"},
+        ),
+        KindSpec(
             name="raster",
             summary="lay the cloud into a raster on each plane",
             inputs={"cloud": "cloud", "planes": "planes"},
@@ -32,13 +38,13 @@ def orthoflow_kinds() -> list[KindSpec]:
         KindSpec(
             name="match",
             summary="find points of the photos on the walls",
-            inputs={"photos": "photos", "walls": "walls", "cameras": "cameras"},
+            inputs={"photos": "photos", "walls": "walls", "cameras": "cameras", "hand": "ties"},
             outputs={"ties": "ties"},
         ),
         KindSpec(
             name="orient",
             summary="orient the photos to the scan",
-            inputs={"ties": "ties", "photos": "photos"},
+            inputs={"ties": "ties", "photos": "photos", "cameras": "cameras", "walls": "walls"},
             outputs={"cameras": "cameras"},
         ),
         KindSpec(
@@ -175,6 +181,16 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="surveyed points from CSV files",
         ),
         MethodSpec(
+            id="read.ties",
+            target="orthoflow_plugins.read.ties:ReadTies",
+            summary="points of photos that a person measured, from CSV files",
+        ),
+        MethodSpec(
+            id="read.cameras",
+            target="orthoflow_plugins.read.cameras:ReadCameras",
+            summary="orientations that other programs found, in the frame of the scan",
+        ),
+        MethodSpec(
             id="read.orthoimage",
             target="orthoflow_plugins.read.orthoimage:ReadOrthoimage",
             summary="GeoTIFF orthoimages of other programs, with the frame of their wall",
@@ -235,6 +251,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             summary="key points of the photos and of the walls, RootSIFT, mutual and distinct",
         ),
         MethodSpec(
+            id="face.photos",
+            target="orthoflow_plugins.match.sides:FaceByPhotos",
+            summary="planes whose side was guessed, turned to the side that the photos show",
+        ),
+        MethodSpec(
             id="match.guided",
             target="orthoflow_plugins.match.guided:MatchGuided",
             summary="photos laid into the walls by a first pose and measured there",
@@ -253,6 +274,11 @@ def orthoflow_methods() -> list[MethodSpec]:
             id="orient.colmap-bundle",
             target="orthoflow_plugins.orient.bundle:OrientColmapBundle",
             summary="all photos at once, tied to the walls and to each other, lenses refined",
+        ),
+        MethodSpec(
+            id="orient.given",
+            target="orthoflow_plugins.orient.given:OrientGiven",
+            summary="poses from elsewhere, as they are or corrected by ties measured by hand",
         ),
         MethodSpec(
             id="colour.photos",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Final, TypeAlias
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.inner_files import holds_control
 from orthoflow_provenance.model import JsonValue
 
 # Everything that h5py raises for damaged files; which one depends on where the damage is.
@@ -29,6 +29,9 @@ HDF5_ERRORS: Final = (
     MemoryError,
     SystemError,
 )
+
+# Nobody packs what is this small and read at once; more would be a flood from a few bytes.
+_PACKED_BYTES_MOST: Final = 4 << 20
 
 AttributeValue = str | int | float
 Cell: TypeAlias = str | int | float
@@ -58,11 +61,7 @@ def check_name(name: str, what: str) -> str:
     Raises:
         RecordFormatError: the name is empty, `.` or `..`, or holds `/` or a control character.
     """
-    if (
-        name in {"", ".", ".."}
-        or "/" in name
-        or any(unicodedata.category(letter) in {"Cc", "Cs", "Zl", "Zp"} for letter in name)
-    ):
+    if name in {"", ".", ".."} or "/" in name or holds_control(name):
         raise RecordFormatError(
             f"{what} {name!r} cannot be a name in a record: names are not empty, not `.` or `..`, "
             "and hold neither `/` nor control characters"
@@ -144,8 +143,7 @@ def read_text(group: h5py.Group, name: str) -> str:
         RecordFormatError: the dataset is missing, damaged or not text.
     """
     dataset = dataset_of(group, name)
-    with reading(f"{group.name}/{name}"):
-        value = dataset[()]
+    value = read_whole(dataset)
     if not isinstance(value, bytes):
         raise RecordFormatError(f"{group.name}/{name} must be one text, got {dataset.dtype}")
     return decoded(bytes(value), f"{group.name}/{name}")
@@ -222,8 +220,7 @@ def read_table(group: h5py.Group, name: str, columns: Columns) -> list[tuple[Cel
     """
     dataset = dataset_of(group, name)
     place = f"{group.name}/{name}"
-    with reading(place):
-        table: object = dataset[()]
+    table = read_whole(dataset)
     titles = table.dtype.names if isinstance(table, np.ndarray) else None
     if not isinstance(table, np.ndarray) or titles is None or table.ndim != 1:
         raise RecordFormatError(f"{place} must be a table with one row per entry")
@@ -246,6 +243,22 @@ def dataset_of(group: h5py.Group, name: str) -> h5py.Dataset:
     if not isinstance(found, h5py.Dataset):
         raise RecordFormatError(f"{group.name} lacks the dataset {name}")
     return found
+
+
+def read_whole(dataset: h5py.Dataset) -> object:
+    """Read a text, a table or a figure at once.
+
+    Raises:
+        RecordFormatError: it is damaged, or unpacks to much more than the file holds for it.
+    """
+    with reading(dataset.name):
+        if dataset.nbytes > max(_PACKED_BYTES_MOST, dataset.id.get_storage_size()):
+            raise RecordFormatError(
+                f"{dataset.name} unpacks to {dataset.nbytes} bytes: texts, tables and figures of "
+                f"more than {_PACKED_BYTES_MOST} bytes must not be packed"
+            )
+        value: object = dataset[()]
+    return value
 
 
 def decoded(data: bytes, place: str) -> str:

@@ -13,3 +13,7 @@ class RecordFormatError(ValueError):
 
 class InputFileError(RecordFormatError):
     """An input file that is to be embedded is missing, or not the one that was digested."""
+
+
+class UnsafeFileError(RecordFormatError):
+    """A name leads elsewhere than to a file in its folder, or no regular file stands there."""

@@ -5,14 +5,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import BinaryIO, Final, TypeAlias
 
 import h5py
 import numpy as np
 
 from orthoflow_provenance import layout
-from orthoflow_provenance.encoding import check_name, dataset_of, reading
+from orthoflow_provenance.encoding import dataset_of, reading
 from orthoflow_provenance.errors import InputFileError, RecordFormatError
+from orthoflow_provenance.inner_files import create_below, path_below
 from orthoflow_provenance.model import RecordedFile, RecordedInput
 from orthoflow_provenance.payloads import open_group
 from orthoflow_provenance.safe import safe_open
@@ -50,6 +51,9 @@ def _embed_file(contents: h5py.Group, name: str, path: Path, file: RecordedFile)
     dataset = contents.create_dataset(name, shape=(file.size_bytes,), dtype=np.uint8)
     digest = hashlib.sha256()
     n_bytes = 0
+    if not path.is_file():
+        # A pipe in its place would be waited for.
+        raise _is_another(path, file)
     with path.open("rb") as stream:
         while block := stream.read(_BLOCK_BYTES):
             if n_bytes + len(block) > file.size_bytes:
@@ -77,15 +81,6 @@ def content_name(index: int) -> str:
     return f"{index:04}"
 
 
-def is_file_name(name: str) -> bool:
-    """Say whether a name stands for a file in a folder, and leads nowhere else.
-
-    >>> is_file_name("hall.e57"), is_file_name("../hall.e57"), is_file_name("..")
-    (True, False, False)
-    """
-    return name not in {"", ".", ".."} and "/" not in name and "\0" not in name
-
-
 def has_contents(group: h5py.Group) -> bool:
     """Say whether the group of an input holds the bytes of its files."""
     with reading(group.name):
@@ -107,9 +102,10 @@ def extract_files(
 
     Raises:
         RecordFormatError: a file is damaged, is not the one that the record describes, or has a
-            name that leads elsewhere.
+            name that cannot be that of a file.
         OSError: a file cannot be written.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     with safe_open(path) as opened:
         return {
             entry.name: tuple(_extracted(opened, entry, folder))
@@ -119,30 +115,31 @@ def extract_files(
 
 
 def _extracted(opened: h5py.File, entry: RecordedInput, folder: Path) -> Iterator[Path]:
-    check_name(entry.name, "the input")
     contents = open_group(opened, f"{layout.INPUTS}/{entry.name}/{layout.INPUT_CONTENTS}")
     for index, file in enumerate(entry.files):
         name = content_name(index)
-        if not is_file_name(file.name):
+        dataset = dataset_of(contents, name)
+        # Before anything is written: the record says how much room it takes.
+        if dataset.dtype != np.uint8 or dataset.shape != (file.size_bytes,):
             raise RecordFormatError(
-                f"the input {entry.name} names the file {file.name!r}, which is no name of a file"
+                f"{dataset.name} must be the {file.size_bytes} bytes of {file.name!r}, got "
+                f"{dataset.dtype} {dataset.shape}"
             )
-        target = folder / entry.name / name / file.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _extract(dataset_of(contents, name), file, target)
-        yield target
+        inside = f"{entry.name}/{name}/{file.name}"
+        with create_below(folder, inside) as stream:
+            _extract(dataset, file, stream)
+        yield path_below(folder, inside)
 
 
-def _extract(dataset: h5py.Dataset, file: RecordedFile, target: Path) -> None:
+def _extract(dataset: h5py.Dataset, file: RecordedFile, stream: BinaryIO) -> None:
     digest = hashlib.sha256()
-    with target.open("wb") as stream:
-        for start in range(0, dataset.size, _BLOCK_BYTES):
-            with reading(dataset.name):
-                block = dataset[start : start + _BLOCK_BYTES].tobytes()
-            digest.update(block)
-            stream.write(block)
+    for start in range(0, dataset.size, _BLOCK_BYTES):
+        with reading(dataset.name):
+            block = dataset[start : start + _BLOCK_BYTES].tobytes()
+        digest.update(block)
+        stream.write(block)
     if digest.hexdigest() != file.sha256:
         raise RecordFormatError(
             f"{dataset.name} has the SHA-256 {digest.hexdigest()}, the record says {file.sha256} "
-            f"of {file.name}"
+            f"of {file.name!r}"
         )

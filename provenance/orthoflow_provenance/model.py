@@ -20,6 +20,14 @@ RUN_FORMAT: Final = "orthoflow-run"
 # Of the record; the minor number rises with every field that is added below (SPEC, 1.2).
 RUN_FORMAT_VERSION: Final = "1.2"
 
+# What a figure may be, and what its file is called.
+FIGURE_SUFFIXES: Final[Mapping[str, str]] = {
+    "image/png": ".png",
+    "image/svg+xml": ".svg",
+    "image/webp": ".webp",
+    "image/jpeg": ".jpg",
+}
+
 JsonValue: TypeAlias = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
 CellStatus = Literal["ok", "failed", "skipped"]
 

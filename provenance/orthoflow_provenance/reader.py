@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import h5py
+import numpy as np
 
 from orthoflow_provenance import layout
 from orthoflow_provenance.encoding import (
@@ -16,6 +17,7 @@ from orthoflow_provenance.encoding import (
     int_attribute,
     read_text,
     read_texts,
+    read_whole,
     reading,
     text_attribute,
 )
@@ -183,9 +185,9 @@ def _figures(group: h5py.Group) -> tuple[RecordedFigure, ...]:
 
 
 def _figure(dataset: h5py.Dataset) -> RecordedFigure:
-    with reading(dataset.name):
-        data = dataset[()].tobytes()
-    return RecordedFigure(data=data, **layout.read_fields(dataset, Figure))
+    return RecordedFigure(
+        data=np.asarray(read_whole(dataset)).tobytes(), **layout.read_fields(dataset, Figure)
+    )
 
 
 def _products(group: h5py.Group, name: str) -> dict[str, RecordedProduct]:

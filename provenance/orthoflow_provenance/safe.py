@@ -10,7 +10,7 @@ from typing import Final
 
 import h5py
 
-from orthoflow_provenance.encoding import reading
+from orthoflow_provenance.encoding import check_name, reading
 from orthoflow_provenance.errors import RecordFormatError
 
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
@@ -20,6 +20,8 @@ _LARGEST_RATIO: Final = 1100
 _ALWAYS_ALLOWED_BYTES: Final = 64 << 20
 _LARGEST_CHUNK_BYTES: Final = 64 << 20
 _LARGEST_ATTRIBUTE_BYTES: Final = 1 << 20
+# Groups, datasets and attributes; a cell with its products has some fifty.
+MOST_OBJECTS: Final = 1_000_000
 _FILTERS: Final = {
     h5py.h5z.FILTER_SHUFFLE: "shuffle",
     h5py.h5z.FILTER_DEFLATE: "gzip",
@@ -34,9 +36,9 @@ def safe_open(path: Path) -> Iterator[h5py.File]:
 
     Raises:
         RecordFormatError: the file is no HDF5 file or damaged, or holds links other than hard
-            links, an object that is reached twice, external or virtual storage, filters other than
-            shuffle, gzip and fletcher32, types outside the format, or datasets that unpack to far
-            more than the file could hold.
+            links, an object that is reached twice or has an impossible name, external or virtual
+            storage, filters other than shuffle, gzip and fletcher32, types outside the format, or
+            datasets that unpack to far more than the file could hold.
         OSError: the file cannot be opened.
     """
     _check_signature(path)
@@ -64,6 +66,8 @@ class _Inspection:
         self._name = path.name
         self._size_bytes = path.stat().st_size
         self._stored_bytes = 0
+        self._n_objects = 0
+        self._unfounded_bytes = 0
         self._seen: set[tuple[int, int]] = set()
 
     def run(self) -> None:
@@ -85,6 +89,7 @@ class _Inspection:
             for name in names:
                 place = f"{path.rstrip('/')}/{name.decode('utf-8', 'backslashreplace')}"
                 with reading(f"{self._name}:{place}"):
+                    self._check_name(name, place)
                     child = self._open(group, name, place)
                     if isinstance(child, h5py.h5g.GroupID):
                         pending.append((child, place, depth + 1))
@@ -106,6 +111,14 @@ class _Inspection:
         self._visit_once(child, place)
         return child
 
+    def _check_name(self, name: bytes, place: str) -> None:
+        # A way down is asked for with `/` between names: `..` would be one up for other programs.
+        if not _is_note(place):
+            try:
+                check_name(name.decode("utf-8"), "the object")
+            except RecordFormatError as error:
+                raise self._refusal(place, f"is no place in a record: {error}") from error
+
     def _visit_once(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
         # Two ways to one object make loops, and trees that grow without end from a few bytes.
         info = h5py.h5o.get_info(item)
@@ -113,6 +126,14 @@ class _Inspection:
         if identity in self._seen:
             raise self._refusal(place, "leads to an object that has another place as well")
         self._seen.add(identity)
+        self._count(1, place)
+
+    def _count(self, n_objects: int, place: str) -> None:
+        self._n_objects += n_objects
+        if self._n_objects > MOST_OBJECTS:
+            raise self._refusal(
+                place, f"and what lies before it are more than {MOST_OBJECTS} groups and attributes"
+            )
 
     def _check_dataset(self, dataset: h5py.h5d.DatasetID, place: str) -> None:
         properties = dataset.get_create_plist()
@@ -142,12 +163,21 @@ class _Inspection:
             raise self._refusal(
                 place, f"says it has {declared} bytes, but the file holds {stored} for it"
             )
+        # Many that each stay below what is always allowed would be a flood together.
+        self._unfounded_bytes += max(0, declared - _LARGEST_RATIO * stored)
+        if self._unfounded_bytes > _ALWAYS_ALLOWED_BYTES:
+            raise self._refusal(
+                place,
+                "and those before it say they have more than 64 MiB that the file cannot hold",
+            )
         self._stored_bytes += stored
         if self._stored_bytes > self._size_bytes:
             raise self._refusal(place, "and the datasets before it say more than the file can hold")
 
     def _check_attributes(self, item: h5py.h5g.GroupID | h5py.h5d.DatasetID, place: str) -> None:
-        for index in range(h5py.h5a.get_num_attrs(item)):
+        n_attributes = h5py.h5a.get_num_attrs(item)
+        self._count(n_attributes, place)
+        for index in range(n_attributes):
             attribute = h5py.h5a.open(item, index=index)
             kind = attribute.get_type()
             problem = ""

@@ -32,7 +32,9 @@ class FileSink:
     """
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        # Through a link it would be another's file that is emptied.
+        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+        self._descriptor = os.open(path, flags, 0o666)
         self._position = 0
         self._kept: list[tuple[int, bytes]] = []
         self._kept_end = 0

@@ -21,8 +21,10 @@ from orthoflow_provenance.encoding import (
     text_attribute,
 )
 from orthoflow_provenance.errors import RecordFormatError
-from orthoflow_provenance.input_files import content_name, is_file_name
+from orthoflow_provenance.inner_files import colliding, name_problem, path_problem
+from orthoflow_provenance.input_files import content_name
 from orthoflow_provenance.model import (
+    FIGURE_SUFFIXES,
     RUN_FORMAT,
     RUN_FORMAT_VERSION,
     RecordedCell,
@@ -42,6 +44,7 @@ from orthoflow_provenance.seal import (
     read_seal,
 )
 
+_LETTERS_MOST: Final = 60
 _HEX_DIGITS: Final = frozenset("0123456789abcdef")
 
 
@@ -96,6 +99,7 @@ def _findings(file: h5py.File) -> Iterator[Finding]:
         for cell in record.cells
         for port, product in cell.outputs.items()
     }
+    yield from _name_findings(record)
     for cell in record.cells:
         yield from _cell_findings(cell, environments)
         yield from _reference_findings(cell, outputs)
@@ -155,11 +159,10 @@ def _run_findings(record: RunRecord) -> Iterator[Finding]:
 def _input_findings(entry: RecordedInput, contents: ContentDigests) -> Iterator[Finding]:
     place = f"/{layout.INPUTS}/{entry.name}"
     for index, file in enumerate(entry.files):
-        if not (is_file_name(file.name) and _is_sha256(file.sha256) and file.size_bytes >= 0):
-            yield Finding(
-                place=place,
-                problem=f"the file {file.name!r} needs a name without folder, a size and a SHA-256",
-            )
+        if problem := name_problem(file.name):
+            yield Finding(place=place, problem=f"the name of the file {file.name!r} {problem}")
+        if not (_is_sha256(file.sha256) and file.size_bytes >= 0):
+            yield Finding(place=place, problem=f"the file {file.name!r} needs a size and a SHA-256")
         if not entry.embedded:
             continue
         inside = f"{place}/{layout.INPUT_CONTENTS}/{content_name(index)}"
@@ -169,14 +172,52 @@ def _input_findings(entry: RecordedInput, contents: ContentDigests) -> Iterator[
 
 
 def _published_findings(record: RunRecord) -> Iterator[Finding]:
+    place = f"/{layout.PUBLISHED}"
     for file in record.published:
-        is_inside = all(map(is_file_name, file.path.split("/")))
-        if not (is_inside and _is_sha256(file.sha256) and file.size_bytes >= 0):
+        if problem := path_problem(file.path):
             yield Finding(
-                place=f"/{layout.PUBLISHED}",
-                problem=f"the file {file.path!r} needs a path from the folder of the record, a "
-                "size and a SHA-256",
+                place=place,
+                problem=f"{file.path!r} {problem}: it must be a path from the folder of the record",
             )
+        if not (_is_sha256(file.sha256) and file.size_bytes >= 0):
+            yield Finding(place=place, problem=f"the file {file.path!r} needs a size and a SHA-256")
+    paths = [file.path for file in record.published]
+    if twice := colliding(paths):
+        yield Finding(place=place, problem=f"{twice!r} is named twice, as some systems see it")
+
+
+def _name_findings(record: RunRecord) -> Iterator[Finding]:
+    """Check what folders and files of other programs are called after."""
+    named = [("/@name", record.name), ("/@run_id", record.run_id)]
+    named += [(f"/{layout.INPUTS}/{entry.name}", entry.name) for entry in record.inputs]
+    for cell in record.cells:
+        place = f"/{layout.CELLS}/{cell.address}"
+        named += [(place, _shortened(cell.address)), (f"{place}@step", cell.step)]
+        named += [(f"{place}/{layout.CELL_OUTPUTS}/{port}", port) for port in cell.outputs]
+        yield from _figure_findings(cell)
+    for place, name in named:
+        # What must not be empty is said elsewhere.
+        if name and (problem := name_problem(name)):
+            yield Finding(place=place, problem=f"{name!r} {problem}, so no file can be named so")
+
+
+def _shortened(address: str) -> str:
+    """An address as the names of files have it: they cut the longest ones, and add a digest."""
+    return address if len(address) <= _LETTERS_MOST else f"{address[:_LETTERS_MOST]}-"
+
+
+def _figure_findings(cell: RecordedCell) -> Iterator[Finding]:
+    place = f"/{layout.CELLS}/{cell.address}/{layout.FIGURES}"
+    for figure in cell.figures:
+        suffix = FIGURE_SUFFIXES.get(figure.media_type, "")
+        if not suffix:
+            problem = f"the figure {figure.name!r} has the media type {figure.media_type!r}"
+            yield Finding(place=place, problem=f"{problem}, not that of a PNG, WebP or SVG file")
+        if problem := name_problem(figure.name) or name_problem(f"{figure.name}{suffix}"):
+            yield Finding(place=place, problem=f"the name of the figure {figure.name!r} {problem}")
+    if twice := colliding(figure.name for figure in cell.figures):
+        problem = f"two figures are named {twice!r}, as some systems see it"
+        yield Finding(place=place, problem=problem)
 
 
 def _cell_findings(cell: RecordedCell, environments: Set[str]) -> Iterator[Finding]:

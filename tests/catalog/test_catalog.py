@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import textwrap
@@ -13,6 +14,7 @@ from click.testing import CliRunner
 
 from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.cli import program
+from orthoflow.engine.environment import packages
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.products.planes import Planes
 from tests.laboratories import (
@@ -38,6 +40,15 @@ def orthoflow_kinds():
 @hookimpl
 def orthoflow_products():
     return [{products}]
+"""
+
+
+SPEECHLESS = """\
+class Speechless(Exception):
+    def __str__(self):
+        raise RuntimeError
+
+raise Speechless
 """
 
 
@@ -100,6 +111,12 @@ def test_listing_plugins_loads_no_heavy_library() -> None:
         ("mute", "x = 1", "PluginError: mute_hooks announces nothing"),
         ("listless", hooks().replace("return []", "return 3", 1), "expected a list of MethodSpec"),
         ("mixed", hooks(methods="'plane.mine'"), "expected a MethodSpec, got 'plane.mine'"),
+        ("speechless", SPEECHLESS, "Speechless: a Speechless without words"),
+        ("long", "raise ValueError('x' * 10**6)", "... (1000000 characters)"),
+        ("leaving_at_once", "import os; os._exit(3)", "SystemExit: 3"),
+        ("numbered", hooks(methods="MethodSpec(id=5, target='a:B', summary='-')"), "id of a Meth"),
+        ("portless", hooks(kinds="KindSpec(name='a', summary='-', inputs=None)"), "inputs of a K"),
+        ("unsure", hooks(kinds="KindSpec(name='a', summary='-', is_source=1)"), "is_source of a"),
         ("badid", hooks(methods=method("Mine", "a:B")), "method id must be kind.method in lower"),
         ("badkind", hooks(kinds="KindSpec(name='A b', summary='-')"), "must match"),
         ("badtarget", hooks(methods=method("plane.x", "a.B")), "target must be package.module"),
@@ -121,6 +138,69 @@ def test_a_plugin_that_fails_is_listed_and_harms_nobody(
     assert "Traceback" in broken.traceback
     assert str(broken).startswith(f"plugin {name} of {name} 1.0 fails to load: ")
     assert len(catalog.methods) == 14
+
+
+def test_a_plugin_that_loads_has_no_say_in_the_rest_of_the_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = "import os; os.chdir('/'); print('hello')\n" + hooks(methods=method("plane.mine", "a:B"))
+    before, leave = Path.cwd(), os._exit
+    catalog = with_plugin("talkative", text, tmp_path, monkeypatch)
+    assert "plane.mine" in catalog.methods
+    assert Path.cwd() == before
+    assert os._exit is leave
+    assert capsys.readouterr() == ("", "hello\n")
+
+
+def test_a_plugin_that_is_slow_to_load_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("orthoflow.catalog.foreign_code._SLOW_S", 0.05)
+    wait = "import time; time.sleep(0.3)\n"
+    text = wait + hooks(methods=method("plane.slow", "slow:B"))
+    catalog = with_plugin("slowly", text, tmp_path, monkeypatch, slow=wait)
+    assert "plugin slowly of slowly 1.0 is slow to load: waiting for it\n" in (
+        capsys.readouterr().err
+    )
+    with pytest.raises(PluginError):
+        catalog.methods["plane.slow"].load()
+    assert capsys.readouterr().err == (
+        "method plane.slow of slowly 1.0 is slow to load: waiting for it\n"
+    )
+
+
+def test_a_thread_that_a_plugin_left_does_not_keep_the_program(tmp_path: Path) -> None:
+    text = "import threading, time\nthreading.Thread(target=time.sleep, args=[600]).start()\n"
+    sources = {"threaded_hooks.py": text + hooks(methods=method("plane.mine", "a:B"))}
+    folder = write_distribution(tmp_path / "site", "threaded", sources)
+    done = subprocess.run(
+        [sys.executable, "-m", "orthoflow", "plugins", "list"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([*sys.path, str(folder)])},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "plane.mine" in done.stdout
+
+
+@pytest.mark.parametrize("file", ["METADATA", "entry_points.txt"])
+def test_a_distribution_that_nobody_can_read_harms_nobody(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = {"garbled_hooks.py": hooks(methods=method("plane.mine", "a:B"))}
+    folder = write_distribution(tmp_path / "site", "garbled", sources)
+    (folder / "garbled-1.0.dist-info" / file).write_bytes(bytes(range(128, 256)))
+    monkeypatch.syspath_prepend(LABORATORY)
+    monkeypatch.syspath_prepend(folder)
+    catalog = discover_catalog()
+    assert "simulate.room" in catalog.methods
+    if file == "METADATA":
+        assert str(catalog.method("plane.mine").distribution) == "garbled 0"
+    packages.cache_clear()
+    assert "laboratory" in packages()
+    packages.cache_clear()
 
 
 def test_ctrl_c_is_not_taken_for_a_broken_plugin(

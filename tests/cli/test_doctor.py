@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,9 @@ from click.testing import CliRunner
 
 from orthoflow.cli import diagnosis, program
 from orthoflow.cli.diagnosis import Library, diagnose_library, diagnose_machine
+from orthoflow.engine import memory
 
+GIB = 1 << 30
 CLICK = Library(distribution="click", module="click", loss="nothing works", is_core=True)
 
 
@@ -99,3 +102,84 @@ def test_a_store_where_nothing_can_be_written_is_named() -> None:
     assert (store.verdict, store.is_core) == ("missing", True)
     assert store.found.startswith("/proc cannot be written: ")
     assert store.cost == "no run can start here (choose another folder with --store DIR)"
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "verdict", "found"),
+    [
+        (2 * GIB, "ok", "2.0 GiB available"),
+        (2 * GIB - 1, "limited", "2.0 GiB available"),
+        (GIB // 2, "limited", "0.5 GiB available"),
+    ],
+)
+def test_little_memory_is_told(
+    monkeypatch: pytest.MonkeyPatch, n_bytes: int, verdict: str, found: str
+) -> None:
+    here = memory.AvailableMemory(available=n_bytes, total=n_bytes)
+    monkeypatch.setattr(memory, "available_memory", lambda: here)
+    told = diagnosis._diagnose_memory()
+    assert (told.verdict, told.found, bool(told.cost)) == (verdict, found, verdict != "ok")
+
+    def fail() -> None:
+        raise KeyError("MemTotal")
+
+    monkeypatch.setattr(memory, "available_memory", fail)
+    unknown = diagnosis._diagnose_memory()
+    assert (unknown.verdict, unknown.found, unknown.cost) == (
+        "limited",
+        "unknown",
+        "cannot be told",
+    )
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "verdict"),
+    [
+        ("Linux", "x86_64", "ok"),
+        ("Linux", "aarch64", "limited"),
+        ("Darwin", "x86_64", "limited"),
+    ],
+)
+def test_other_platforms_are_untested(
+    monkeypatch: pytest.MonkeyPatch, system: str, machine: str, verdict: str
+) -> None:
+    monkeypatch.setattr(platform, "system", lambda: system)
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    told = diagnosis._diagnose_platform()
+    assert told.verdict == verdict
+    assert told.found.endswith(f", {system} {machine}")
+    assert told.cost == ("" if verdict == "ok" else "only Linux on x86-64 is tested")
+
+
+@pytest.mark.parametrize(
+    ("problem", "way_out"),
+    [
+        ("libGL.so.1: cannot open", "libgl1"),
+        ("libX11.so.6: cannot open", "libx11-6"),
+        ("libusb-1.0.so.0: no", "libusb-1.0-0"),
+        ("libgomp.so.1: no", "libgomp1"),
+    ],
+)
+def test_a_missing_system_library_is_named_by_its_package(problem: str, way_out: str) -> None:
+    assert diagnosis._way_out(problem) == (
+        f"install the system package {way_out}, e.g. apt-get install {way_out}"
+    )
+    assert diagnosis._way_out("no module named x") == "reinstall it"
+
+
+def test_a_library_that_crashes_or_says_nothing_is_told() -> None:
+    crash = "os as _o; _o.kill(_o.getpid(), 11)"
+    assert diagnosis._import_problem(crash) == "its import crashes (signal 11)"
+    assert diagnosis._import_problem("os as _o; _o._exit(3)") == "its import fails: no message"
+    assert diagnosis._import_problem("json") == ""
+    assert diagnosis._import_problem("no_such_thing") == (
+        "its import fails: ModuleNotFoundError: No module named 'no_such_thing'"
+    )
+
+
+def test_every_library_of_the_core_is_one() -> None:
+    core = {library.distribution for library in diagnosis.LIBRARIES if library.is_core}
+    assert core == {
+        *("click", "h5py", "jinja2", "networkx", "numpy", "pluggy", "pydantic", "rich"),
+        "ruamel.yaml",
+    }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -14,7 +15,8 @@ from click.testing import CliRunner, Result
 
 from orthoflow import __version__
 from orthoflow.cli import program
-from orthoflow.cli.commands import LazyCommand, current_session
+from orthoflow.cli.commands import LazyCommand, Session, current_session
+from orthoflow.cli.failures import explain
 from orthoflow.cli.program import Program
 from orthoflow.errors import (
     ArgumentError,
@@ -36,6 +38,7 @@ COMMANDS = [
     "compare",
     "report",
     "verify",
+    "sign",
     "replay",
     "export",
     "plugins",
@@ -130,6 +133,7 @@ def test_every_command_loads_and_takes_debug(name: str) -> None:
         "plugins show",
         "cache list",
         "cache gc",
+        "cache verify",
     ],
 )
 def test_every_listing_verb_has_json(command: str) -> None:
@@ -216,10 +220,36 @@ def test_only_the_standard_library_click_and_pluggy_load_for_help(tmp_path: Path
     code = (
         "import sys\n"
         "import orthoflow.cli\n"
+        "floors = ('cli', 'errors', 'foreign_text', 'version')\n"
         "print([m for m in sys.modules if m.startswith('orthoflow.') "
-        "and not m.startswith(('orthoflow.cli', 'orthoflow.errors', 'orthoflow.version'))])"
+        "and m.split('.')[1] not in floors])"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
     )
     assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "sentence"),
+    [
+        (MemoryError(), 1, "error: not enough memory to go on"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), 1, "error: not enough memory to go on"),
+        (
+            ImportError("libhdf5.so: failed to map segment from shared object"),
+            1,
+            "error: not enough memory to go on",
+        ),
+        (
+            ImportError("libGL.so.1: cannot open shared object file"),
+            4,
+            "error: a library fails to import: libGL.so.1: cannot open shared object file",
+        ),
+    ],
+    ids=["allocation", "system", "loader", "missing"],
+)
+def test_want_of_memory_and_broken_libraries_are_a_sentence(
+    error: Exception, code: int, sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert explain(error, Session()) == code
+    assert capsys.readouterr().err.startswith(sentence)

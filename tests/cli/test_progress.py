@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+
 import pytest
+from rich.console import Console
 
 from orthoflow.cli.progress import LiveProgress, PlainProgress, ProgressRow, visible_rows
 from orthoflow.engine import (
@@ -79,3 +82,30 @@ def test_what_does_not_fit_is_what_matters_least() -> None:
     assert list(visible_rows(rows, 6)) == list(rows)
     assert list(visible_rows(rows, 3)) == ["step2", "step3", "step4"]
     assert list(visible_rows(rows, 0)) == ["step2"]
+
+
+def test_what_steps_say_is_shown_and_not_obeyed(capsys: pytest.CaptureFixture[str]) -> None:
+    evil = "\x1b[2J\u202e[bold red]x[/]\nplane: ok"
+    result = CellResult(status="failed", started="now", wall_s=1.0, error_message=evil)
+    events: list[RunEvent] = [
+        RunStarted(run_id=evil, n_cells=1, is_resumed=False),
+        CellStarted(address=f"a {evil}"),
+        CellProgress(address=f"a {evil}", fraction=0.5, text=evil),
+        CellWarned(address=f"a {evil}", text=evil),
+        CellFinished(address=f"b {evil}", result=result, cached=False),
+    ]
+    live = LiveProgress(())
+    live._console = Console(file=io.StringIO(), width=200, height=40)
+    live._live.console = live._console
+    for event in events:
+        live.tell(event)
+    live._console.print(live.table())
+    drawn = live._console.file.getvalue()  # type: ignore[attr-defined]
+    with PlainProgress() as progress:
+        for event in events:
+            progress.tell(event)
+    for said in (drawn, capsys.readouterr().err):
+        assert "\x1b" not in said
+        assert "\u202e" not in said
+        assert "\\x1b[2J\\u202e[bold red]x[/]\\nplane: ok" in said
+        assert not [line for line in said.splitlines() if line.startswith("plane: ok")]

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import signal
+from pathlib import Path
 
 import pytest
 
-from orthoflow.engine.local_executor import describe_exit
+from orthoflow.engine import step_logs
+from orthoflow.engine.local_executor import (
+    describe_exit,
+    describe_memory,
+    describe_timeout,
+    duration,
+)
+from orthoflow.engine.step_logs import StepLog
 
 WHO = "method plane.mine of mine 1.0"
 
@@ -38,3 +47,48 @@ def test_a_crash_is_named_by_its_signal(number: signal.Signals) -> None:
     told = describe_exit(WHO, -number, 0, "")
     assert told.startswith(f"{WHO} crashed (")
     assert told.endswith(f", {number.name})")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (0.5, "0.5 s"),
+        (59.0, "59 s"),
+        (60.0, "1 min"),
+        (90.0, "90 s"),
+        (3540.0, "59 min"),
+        (3600.0, "1 h"),
+        (5400.0, "90 min"),
+        (7200.0, "2 h"),
+        (7201.0, "7201 s"),
+    ],
+)
+def test_a_timeout_is_told_in_the_largest_whole_unit(seconds: float, said: str) -> None:
+    assert duration(seconds) == said
+    sentence = f"{WHO} ran past its timeout of {said} and was stopped"
+    assert str(describe_timeout(WHO, seconds)) == sentence
+
+
+def test_want_of_memory_and_unknown_signals_are_told() -> None:
+    assert str(describe_memory(WHO, 5 << 29)) == (
+        f"{WHO} needed more memory than the machine has (2.5 GiB when stopped); give it less data "
+        "or coarser parameters"
+    )
+    assert "(signal 99)" in describe_exit(WHO, -99, 0, "")
+
+
+@pytest.mark.parametrize("n_bytes", [0, 9, 10, 11, 25])
+def test_of_a_long_log_the_end_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_bytes: int
+) -> None:
+    monkeypatch.setattr(step_logs, "_KEPT_BYTES", 10)
+    log = StepLog(tmp_path / "log")
+    text = "".join(chr(ord("a") + k) for k in range(n_bytes))
+    os.write(log.descriptor, text.encode())
+    kept = text if n_bytes <= 10 else f"... ({n_bytes - 10} bytes before)\n{text[-10:]}"
+    assert log.text() == kept
+    log.close()
+    log = StepLog(tmp_path / "log")
+    os.write(log.descriptor, b"a\0b\xff")
+    assert log.text() == "ab\ufffd"
+    log.close()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,12 +20,12 @@ from orthoflow.engine.memory import (
     MemoryGuard,
     Victim,
     available_memory,
-    group_memory,
     process_memory,
+    tree_memory,
 )
 from orthoflow.engine.results import CellResult
 from orthoflow.errors import StoreError
-from tests.engine_world import World, toy_world
+from tests.engine_world import World, has_ended, toy_world
 
 MIB = 1 << 20
 
@@ -138,7 +138,7 @@ def test_running_out_of_memory_in_an_allocation_is_a_sentence(world: World) -> N
 
 def test_a_full_disk_in_a_method_names_the_store(world: World) -> None:
     result = bad_result(world, "full_disk", executor="inline")
-    assert result.error_type == "StoreError"
+    assert result.error_type == "StepFailedError"
     assert result.error_message.startswith(
         f"cannot write to {world.store.folder}: No space left on the disk"
     )
@@ -190,25 +190,13 @@ def test_processes_that_a_method_leaves_behind_are_killed(world: World) -> None:
     assert has_ended(int(process_id))
 
 
-def has_ended(process_id: int) -> bool:
-    for _ in range(100):
-        try:
-            state = Path(f"/proc/{process_id}/stat").read_text().rpartition(")")[2].split()[0]
-        except FileNotFoundError:
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.05)
-    return False
-
-
 def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A machine of 8 GiB with 1.5 GiB left, less what the steps take.
     def little_memory() -> AvailableMemory:
         taken = sum(
-            group_memory(int(entry.name)) for entry in Path("/proc").iterdir() if _is_child(entry)
+            tree_memory(int(entry.name)) for entry in Path("/proc").iterdir() if _is_child(entry)
         )
         return AvailableMemory(available=1536 * MIB - taken, total=8192 * MIB)
 
@@ -253,7 +241,7 @@ def test_the_guard_stops_the_largest_step_when_memory_is_short(
     sizes = {index: held[address] * MIB for address, index in groups.items()}
     memory = AvailableMemory(available=available * MIB, total=8192 * MIB)
     monkeypatch.setattr(machine_memory, "available_memory", lambda: memory)
-    monkeypatch.setattr(machine_memory, "group_memory", lambda group: sizes[group])
+    monkeypatch.setattr(machine_memory, "tree_memory", lambda group: sizes[group])
     guard = MemoryGuard()
     assert guard.check(groups) == expected
     assert (guard.interval_s == 0.25) == (available > 2500)
@@ -379,3 +367,23 @@ def test_files_larger_than_allowed_fail_the_cell(world: World) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert outcome.results["a"].error_type == "StoreError"
     assert "the file would be larger than allowed" in outcome.results["a"].error_message
+
+
+def test_a_damaged_task_is_told_in_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "task.json").write_text('{"address": 5}')
+    reading, writing = os.pipe()
+    child = [sys.executable, "-m", "orthoflow.engine.child", str(tmp_path / "task.json")]
+    done = subprocess.run(
+        [*child, str(writing), str(os.getpid())],
+        pass_fds=(writing,),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    os.close(writing)
+    with os.fdopen(reading) as said:
+        message = json.loads(said.read())
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert message["kind"] == "failed"
+    assert "task.json is damaged" in message["text"]

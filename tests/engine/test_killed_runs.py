@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import random
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,30 +12,27 @@ import pytest
 
 from orthoflow.engine import Store
 from orthoflow.records import open_run, verify_run
+from tests.killed_runs import Answer, RunServer, run_server
 from tests.long_loops import IS_LONG
 from tests.workshop_runs import workshop_environment, write_studio
 
-ROOT = Path(__file__).resolve().parents[2]
 KILLS = 100 if IS_LONG else 10
 
 
 @dataclass(frozen=True)
 class Killer:
-    """The process that runs and kills, and a run that nobody disturbed."""
+    """The server of runs, and a run that nobody disturbed."""
 
-    folder: Path
-    process: subprocess.Popen[str]
+    server: RunServer
 
-    def __call__(self, name: str, **order: object) -> dict[str, int]:
+    @property
+    def folder(self) -> Path:
+        return self.server.folder
+
+    def __call__(self, name: str, **order: object) -> Answer:
         """Run the workflow into a folder of that name, with a store of its own."""
         arguments = ["run", "studio.yaml", "-o", name, "--executor", "inline"]
-        order = {"arguments": [*arguments, "--store", f"{name}.store"], **order}
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps(order) + "\n")
-        self.process.stdin.flush()
-        answer: dict[str, int] = json.loads(self.process.stdout.readline())
-        return answer
+        return self.server(*arguments, "--store", f"{name}.store", **order)
 
     def digests(self, name: str) -> dict[str, str]:
         run = open_run(self.folder / name)
@@ -53,24 +47,11 @@ class Killer:
 def killer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Killer]:
     folder = tmp_path_factory.mktemp("killed")
     write_studio(folder)
-    paths = [str(ROOT / part) for part in ("", "plugins", "provenance")]
-    environment = dict(workshop_environment())
-    environment["PYTHONPATH"] = ":".join([*paths, environment["PYTHONPATH"]])
-    process = subprocess.Popen(
-        [sys.executable, str(ROOT / "tests" / "killed_runs.py"), str(folder)],
-        env=environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
-        found = Killer(folder, process)
+    with run_server(folder, workshop_environment()) as server:
+        found = Killer(server)
         # The first run loads what runs need, so that forks begin with it.
-        assert found("quiet", here=True)["code"] == 0
+        assert found("quiet", here=True).code == 0
         yield found
-        assert process.stdin is not None
-        process.stdin.close()
-        assert process.wait() == 0
 
 
 @pytest.mark.long  # ten in a normal run
@@ -78,8 +59,8 @@ def test_killed_runs_go_on_and_end_with_the_same_digests(killer: Killer) -> None
     started = time.monotonic()
     watched = killer("watched")
     duration_s = time.monotonic() - started
-    assert watched["code"] == 0
-    assert watched["events"] > 500
+    assert watched.code == 0
+    assert watched.events > 500
     rng = random.Random(20150807)
     kills = resumed = 0
     while kills < KILLS:
@@ -88,16 +69,16 @@ def test_killed_runs_go_on_and_end_with_the_same_digests(killer: Killer) -> None
         # Some runs are killed again while they go on.
         for _ in range(rng.choice((1, 1, 2, 3))):
             # At file operations, where it hurts, and at any time, also within HDF5's own writing.
-            at_event = {"event": rng.randint(1, watched["events"])}
+            at_event = {"event": rng.randint(1, watched.events)}
             at_time = {"seconds": rng.uniform(0.0, duration_s)}
-            code = killer(name, **(at_event if rng.random() < 0.6 else at_time))["code"]
+            code = killer(name, **(at_event if rng.random() < 0.6 else at_time)).code
             kills += 1
             assert code in (-9, 0, 2)  # 2: it had finished before
             if (folder / "run.h5").exists():
                 assert verify_run(folder).findings == ()
                 break
         was_finished = (folder / "run.h5").exists()
-        assert killer(name)["code"] == (2 if was_finished else 0)
+        assert killer(name).code == (2 if was_finished else 0)
         resumed += not was_finished
         assert verify_run(folder).findings == ()
         assert killer.digests(name) == killer.digests("quiet")

@@ -135,9 +135,7 @@ def test_figures_metrics_and_warnings_are_kept(world: World) -> None:
     result = outcome.results["b"]
     (figure,) = result.figures
     assert (figure.name, figure.caption, figure.media_type) == ("dot", "a dot", "image/png")
-    path = world.store.blob_path(figure.sha256)
-    assert path is not None
-    assert path.read_bytes() == b"\x89PNG\r\n\x1a\n0123"
+    assert world.store.blob(figure.sha256) == b"\x89PNG\r\n\x1a\n0123"
     assert [(m.name, m.value, m.unit) for m in result.metrics] == [("dots", 1.0, "1")]
     assert result.warnings == ("the dot is small",)
     assert CellWarned(address="b", text="the dot is small") in world.events

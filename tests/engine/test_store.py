@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import os
 import resource
 import shutil
@@ -26,11 +27,12 @@ from orthoflow.engine.results import (
     result_from_json,
     result_to_json,
 )
-from orthoflow.engine.store import digest_of
-from orthoflow.errors import ArgumentError, InputError, ProductError, StoreError
+from orthoflow.engine.store import Publisher, digest_of
+from orthoflow.errors import ArgumentError, DamageError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
 
-KEY = "ab" * 32
+PREIMAGE = '{"v":1}'
+KEY = hashlib.sha256(PREIMAGE.encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +66,7 @@ def store(tmp_path: Path) -> Store:
 def ok_result(store: Store, *products: Product, key: str = KEY) -> CellResult:
     refs = {f"p{index}": store.put_product(item) for index, item in enumerate(products)}
     return CellResult(
-        status="ok", key=key, key_preimage='{"v":1}', method="toy.make", run_id="r1", outputs=refs
+        status="ok", key=key, key_preimage=PREIMAGE, method="toy.make", run_id="r1", outputs=refs
     )
 
 
@@ -109,6 +111,34 @@ def test_published_files_lie_beside_the_product(store: Store) -> None:
     assert file.read_text() == f"{ref.digest} seen"
 
 
+def publish_link(product: Product, folder: Path, digest: str, /) -> None:
+    (folder / "link.txt").symlink_to("/etc/hostname")
+
+
+def publish_pipe(product: Product, folder: Path, digest: str, /) -> None:
+    os.mkfifo(folder / "pipe")
+
+
+def publish_control(product: Product, folder: Path, digest: str, /) -> None:
+    (folder / "a\x1b[2J.txt").write_text(digest)
+
+
+@pytest.mark.parametrize(
+    ("publisher", "sentence"),
+    [
+        (publish_link, "a heights publishes 'link.txt', which is a link or a device"),
+        (publish_pipe, "a heights publishes 'pipe', which is a link or a device"),
+        (publish_control, r"publishes 'a\\x1b\[2J.txt', which holds a control character"),
+    ],
+)
+def test_what_cannot_be_published_everywhere_is_refused(
+    store: Store, publisher: Publisher, sentence: str
+) -> None:
+    with pytest.raises(ProductError, match=sentence):
+        store.put_product(heights(), publisher)
+    assert not list(store.objects.glob("*"))
+
+
 def test_an_equal_product_is_kept_once(store: Store) -> None:
     first = store.put_product(heights(), publish)
     written = object_folder(store, first).stat().st_ino
@@ -120,11 +150,16 @@ def test_an_equal_product_is_kept_once(store: Store) -> None:
 
 def test_another_version_of_the_publisher_makes_its_files_anew(store: Store) -> None:
     ref = store.put_product(heights("x"), publish, publisher_tag="1")
-    object_folder(store, ref).joinpath("files", "heights.txt").write_text("old")
+    written = object_folder(store, ref).stat().st_ino
     store.put_product(heights("x"), publish, publisher_tag="1")
-    assert store.published_files(ref.digest)[0].read_text() == "old"
-    store.put_product(heights("x"), publish, publisher_tag="2")
-    assert store.published_files(ref.digest)[0].read_text() == f"{ref.digest} x"
+    assert object_folder(store, ref).stat().st_ino == written
+
+    def publish_more(product: Product, folder: Path, digest: str, /) -> None:
+        (folder / "more.txt").write_text("more")
+
+    store.put_product(heights("x"), publish_more, publisher_tag="2")
+    (file,) = store.published_files(ref.digest)
+    assert file.read_text() == "more"
 
 
 @pytest.mark.parametrize("damage", [flip_middle, truncate, Path.unlink], ids=lambda f: f.__name__)
@@ -137,12 +172,13 @@ def test_a_damaged_product_is_replaced_when_it_is_computed_again(
     np.testing.assert_array_equal(store.get_product(ref.digest, Heights).values, heights().values)
 
 
-def test_reading_a_damaged_product_says_so_and_removes_it(store: Store) -> None:
+def test_reading_a_damaged_product_says_so_and_sets_it_aside(store: Store) -> None:
     ref = store.put_product(heights())
-    truncate(object_folder(store, ref) / "product.h5")
-    with pytest.raises(StoreError, match=r"was damaged .* run again and it is computed anew"):
+    flip_middle(object_folder(store, ref) / "product.h5")
+    with pytest.raises(DamageError, match=r"was damaged; run again and it is computed anew"):
         store.get_product(ref.digest, Heights)
-    with pytest.raises(StoreError, match="has no product sha256:"):
+    assert [path.name[:64] for path in store.damaged.iterdir()] == [ref.digest[7:]]
+    with pytest.raises(DamageError, match="has no product sha256:"):
         store.get_product(ref.digest, Heights)
 
 
@@ -167,10 +203,9 @@ def test_only_digests_name_objects(store: Store, digest: str) -> None:
 def test_figures_are_kept_by_their_bytes(store: Store) -> None:
     sha256 = store.put_blob(b"\x89PNG...")
     assert store.put_blob(b"\x89PNG...") == sha256
-    path = store.blob_path(sha256)
-    assert path is not None
-    assert path.read_bytes() == b"\x89PNG..."
-    assert store.blob_path("00" * 32) is None
+    assert store.blob(sha256) == b"\x89PNG..."
+    with pytest.raises(DamageError, match=r"the figure 000000000000 in the store .* is damaged"):
+        store.blob("00" * 32)
 
 
 def test_a_result_comes_back_equal(store: Store) -> None:
@@ -376,7 +411,7 @@ def test_a_used_result_counts_as_new(store: Store) -> None:
     store.put_result(KEY, ok_result(store, heights()), "step")
     old = time.time() - 10 * 86400
     os.utime(store.results / f"{KEY}.json", (old, old))
-    store.touch(KEY)
+    assert store.take(KEY).result is not None
     assert collect_garbage(store, older_than_days=5).n_results == 0
 
 
@@ -450,6 +485,13 @@ def test_a_damaged_memory_of_digests_is_ignored(tmp_path: Path) -> None:
     (tmp_path / "digests.json").write_text("{")
     file = settled_file(tmp_path / "scan.xyz", b"1 2 3\n")
     assert len(FileDigests(tmp_path / "digests.json").digest(file).sha256) == 64
+
+
+@pytest.mark.parametrize("name", ["aux.laz", "a\nb.laz", "hall.", "c:hall.laz"], ids=ascii)
+def test_an_input_file_that_no_record_can_name_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("points")
+    with pytest.raises(InputError, match=r"which other systems refuse: rename it"):
+        FileDigests(tmp_path / "memo").digest(tmp_path / name)
 
 
 def test_a_missing_input_file_is_named(tmp_path: Path) -> None:

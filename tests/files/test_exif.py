@@ -247,6 +247,40 @@ def test_the_unit_of_the_focal_plane_counts(unit: int | None, per_unit: int) -> 
     assert focal_length(exif, 6000, 4000).value_px == pytest.approx(8000.0, rel=1e-12)
 
 
+@pytest.mark.parametrize("said_mm", [1, 65535])
+def test_a_35_mm_equivalent_that_no_lens_has_is_told_and_not_used(said_mm: int) -> None:
+    focal = focal_length(exif_of(focal_mm=4.5, focal_35mm=said_mm), 4000, 3000)
+    assert focal.value_px is None
+    assert focal.doubt == (
+        f"EXIF says a 35 mm equivalent of {said_mm} mm, which no lens has (4 to 3000 mm)"
+    )
+    assert focal.doubt in focal.reason
+
+
+@pytest.mark.parametrize("said_mm", [1, 65535])
+def test_an_impossible_equivalent_does_not_contradict_the_pixel_pitch(said_mm: int) -> None:
+    exif = exif_of(focal_mm=50, focal_35mm=said_mm, resolution_px_per_mm=160)
+    focal = focal_length(exif, 6000, 4000)
+    assert focal.value_px == pytest.approx(8000.0, rel=1e-12)
+    assert f"{said_mm} mm, which no lens has" in focal.doubt
+
+
+@pytest.mark.parametrize("said_mm", [0.01, 65535])
+def test_a_focal_length_that_no_lens_has_is_not_multiplied_by_the_pitch(said_mm: float) -> None:
+    focal = focal_length(exif_of(focal_mm=said_mm, resolution_px_per_mm=160), 6000, 4000)
+    assert focal.value_px is None
+    assert f"EXIF says a focal length of {said_mm:g} mm, which no lens has" in focal.doubt
+    both = exif_of(focal_mm=said_mm, focal_35mm=28, resolution_px_per_mm=160)
+    assert focal_length(both, 1500, 1000).value_px == pytest.approx(28 / 36 * 1500, rel=1e-12)
+
+
+@pytest.mark.parametrize("equivalent_mm", [4, 3000])
+def test_the_shortest_and_longest_lenses_that_there_are_are_believed(equivalent_mm: int) -> None:
+    focal = focal_length(exif_of(focal_35mm=equivalent_mm), 1500, 1000)
+    assert focal.value_px == pytest.approx(equivalent_mm / 36 * 1500, rel=1e-12)
+    assert focal.doubt == ""
+
+
 def test_a_photo_that_was_cut_has_no_focal_length_from_exif() -> None:
     exif = exif_of(focal_mm=28, focal_35mm=28, width=6000, height=4000)
     focal = focal_length(exif, 3000, 3000)
@@ -331,3 +365,10 @@ def test_only_the_orientation_of_a_tiff_is_taken_out() -> None:
     assert without_orientation(made.tiff(image, 6)) == made.tiff(image, 1)
     turned = made.jpeg(image, made.exif_block({made.ORIENTATION: 6}))
     assert without_orientation(turned) is turned
+
+
+def test_a_picture_that_was_taken_less_than_a_pixel_wide_says_nothing_of_its_size() -> None:
+    block = made.exif_block({}, {made.FOCAL_35MM: 36, made.WIDTH: (1, 3), made.HEIGHT: 48})
+    exif = read_exif(made.jpeg(made.picture(), block))
+    assert (exif.width, exif.height) == (None, 48)
+    assert focal_length(exif, 64, 48).value_px == pytest.approx(36 / math.hypot(36, 24) * 80)

@@ -182,3 +182,55 @@ def test_values_are_described_for_messages(text: str, words: str) -> None:
 def test_paths_are_keys_joined_by_dots() -> None:
     assert join("", "a") == "a"
     assert join("a.b", "c") == "a.b.c"
+
+
+@pytest.mark.parametrize("marks", ["[]", "{}"], ids=["lists", "mappings"])
+@pytest.mark.parametrize(("depth", "is_read"), [(60, True), (61, False)])
+def test_sixty_levels_are_the_most(marks: str, depth: int, is_read: bool) -> None:
+    one = marks[0] if marks == "[]" else "{a: "
+    text = one * depth + "1" + marks[1] * depth
+    if is_read:
+        read(text)
+        # Beside each other they are no deeper.
+        read("\n".join(f"- {text.replace(one, '', 1)[:-1]}" for _ in range(5)))
+        return
+    (problem,) = problems_of(text, TOLERANT)
+    assert problem[3] == "the document is nested deeper than 60 levels"
+
+
+@pytest.mark.parametrize(
+    ("text", "n_values"),
+    [("a", 1), ("[a, b]", 3), ("a: b", 3), ("{a: [b, c], d: {}}", 7)],
+)
+def test_keys_and_values_are_counted(text: str, n_values: int) -> None:
+    read(text, Dialect(is_strict=False, most_values=n_values))
+    dialect = Dialect(is_strict=False, most_values=n_values - 1)
+    (problem,) = problems_of(text, dialect)
+    assert problem[3] == f"the document has more than {n_values - 1} values"
+
+
+def test_expanded_aliases_are_counted_without_keys() -> None:
+    text = "[&a [x, y], *a, *a]"
+    # The list, three lists in it, and two values in each.
+    read(text, Dialect(is_strict=False, most_values=10))
+    (problem,) = problems_of(text, Dialect(is_strict=False, most_values=9))
+    assert problem[3] == "the document has more than 9 values once aliases are expanded"
+    (problem,) = problems_of("a: &a [*a]", TOLERANT)
+    assert problem[3] == "the value contains itself through its anchor"
+
+
+def test_merged_entries_stand_behind_those_of_the_table() -> None:
+    document = read("base: &b {x: 1, y: 2}\nmore: &m {y: 3, z: 4}\nall: {<<: [*b, *m], x: 9}\n")
+    assert plain(document)["all"] == {"x": 9, "y": 2, "z": 4}  # type: ignore[call-overload, index]
+    assert plain(read('{"<<": {x: 1}}')) == {"<<": {"x": 1}}
+    assert plain(read("a: &b {x: 1}\nc: {<<: *b}"))["c"] == {"x": 1}  # type: ignore[call-overload, index]
+    (problem,) = problems_of("a: {<<: [3], x: 1}", TOLERANT)
+    assert problem[2:] == (
+        "a.<<",
+        "expected a mapping or a list of mappings to merge, got 3",
+    )
+
+
+def test_the_place_of_what_the_reader_refuses_is_told() -> None:
+    ((line, column, _, _),) = problems_of("a: 1\nbc: \x01", TOLERANT)
+    assert (line, column) == (2, 5)

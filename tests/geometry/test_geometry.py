@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError
 from orthoflow.geometry import (
     Plane,
+    WallFrame,
     angle_between_deg,
     basis_from_up,
     frame_over,
@@ -131,3 +134,59 @@ def test_the_corners_of_a_frame_are_those_of_its_rectangle() -> None:
 def test_a_rectangle_without_area_is_refused() -> None:
     with pytest.raises(GeometryError, match="needs an area"):
         frame_over(np.zeros((4, 3)), Z_UP, gsd_m=0.1)
+
+
+# --- limits ---
+
+
+@pytest.mark.parametrize(("tilt_deg", "is_level"), [(9.9, True), (10.1, False)])
+def test_planes_within_ten_degrees_of_level_read_like_a_map(
+    tilt_deg: float, is_level: bool
+) -> None:
+    lean = np.radians(tilt_deg)
+    for side in (1.0, -1.0):
+        normal = side * np.array([0.0, np.sin(lean), np.cos(lean)])
+        u, _ = wall_axes(normal, np.array([0.0, 0.0, 1.0]))
+        # For a viewer on the side that it leans to, right is west.
+        np.testing.assert_allclose(u, [1.0 if is_level else -side, 0.0, 0.0], atol=1e-12)
+
+
+def framed(width_m: float, height_m: float, gsd_m: float) -> WallFrame:
+    corners = np.array(
+        [[0, 0, height_m], [0, 0, 0], [width_m, 0, 0], [width_m, 0, height_m]], dtype=np.float64
+    )
+    return frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=gsd_m)
+
+
+def test_grids_cover_their_rectangle_but_for_a_millionth_of_a_cell() -> None:
+    assert framed(3.0, 1.5, 0.003).shape == (500, 1000)
+    assert framed(3.0 + 2e-9, 1.5, 0.003).shape == (500, 1000)
+    assert framed(3.0 + 2e-8, 1.5, 0.003).shape == (500, 1001)
+    assert framed(3.0, 1.5 + 2e-8, 0.003).shape == (501, 1000)
+    assert framed(0.001, 0.002, 1.0).shape == (1, 1)
+
+
+def test_frames_have_the_same_cells_to_a_thousandth() -> None:
+    frame = framed(1.0, 0.5, 0.01)
+    for shift_m, is_same in ((0.9e-5, True), (1.1e-5, False), (-1.1e-5, False)):
+        moved = replace(frame, origin_world=frame.origin_world + np.array([shift_m, 0.0, 0.0]))
+        assert frame.has_cells_of(moved) is is_same
+    assert not frame.has_cells_of(replace(frame, width=frame.width - 1))
+
+
+@pytest.mark.parametrize("change", [{"gsd_m": 0.0}, {"gsd_m": -1.0}, {"width": 0}, {"height": 0}])
+def test_a_frame_without_cells_is_refused(change: dict[str, float]) -> None:
+    frame = framed(1.0, 0.5, 0.01)
+    with pytest.raises(GeometryError, match="positive cell size and at least one cell"):
+        replace(frame, **change)
+    with pytest.raises(GeometryError, match="mirror the image"):
+        replace(frame, u_world=-frame.u_world)
+
+
+def test_the_plane_of_a_frame_holds_its_corners() -> None:
+    frame = replace(framed(1.0, 0.5, 0.01), origin_world=np.array([3.0, 4.0, 5.0]))
+    np.testing.assert_allclose(frame.plane.distances_m(frame.corners_world()), 0.0, atol=1e-12)
+    assert frame.plane.flipped().offset_m == -frame.plane.offset_m == 4.0
+    # On the plane, either side is as good: it stays.
+    plane = frame.plane
+    assert plane.towards(frame.origin_world) is plane

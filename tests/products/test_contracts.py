@@ -6,10 +6,11 @@ comparison pass that it should stop.
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from orthoflow import products
-from orthoflow.products import Product
+from orthoflow.products import Product, product
 
 MAPPED = {"cloud", "labels"}
 # Named by their digest in a record; `--embed` adds them.
@@ -81,3 +82,28 @@ def test_a_type_is_stored_and_compared_as_ever(name: str) -> None:
         field: f"{float(text.split()[0]):g} {text.split()[1]}"
         for field, text in TOLERANCES[name].items()
     }
+
+
+# Raised when the fields of a type change, so that older and newer ones are told apart.
+SECOND = {"planes", "walls", "ties", "cameras", "truth"}
+
+
+@pytest.mark.parametrize("name", TOLERANCES)
+def test_a_type_has_the_encoding_of_today(name: str) -> None:
+    assert TYPES[name].encoding_version == (2 if name in SECOND else 1)
+
+
+def test_large_products_are_mapped_whatever_their_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    labels = products.PointLabels(plane_index=np.zeros(4, np.int16))
+    points = products.CheckPoints(
+        names=("a",),
+        points_world=np.zeros((1, 3)),
+        classes=("",),
+        wall=np.zeros(1, np.int32),
+        pixels_wall=np.zeros((1, 2)),
+    )
+    n_bytes = sum(array.nbytes for array in points.to_payload().arrays.values())
+    for limit, is_mapped in ((n_bytes, False), (n_bytes - 1, True)):
+        monkeypatch.setattr(product, "_LARGE_BYTES", limit)
+        assert points.to_payload().mapped == is_mapped
+        assert labels.to_payload().mapped

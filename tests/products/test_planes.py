@@ -123,3 +123,32 @@ def test_a_tolerance_must_be_positive() -> None:
 def test_a_thickness_belongs_to_each_plane() -> None:
     with pytest.raises(ProductError, match="must be empty or one per plane, got 1 for 2"):
         replace(two_planes(), thickness=(None,))
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "source"),
+    [
+        ("stations", "stations"),
+        ("view_from", "given"),
+        ("given", "given"),
+        ("guess", "guess"),
+        ("a stranger's word", "guess"),
+    ],
+)
+def test_the_side_of_a_plane_is_known_as_all_are_or_by_itself(viewpoint: str, source: str) -> None:
+    planes = replace(two_planes(), viewpoint=viewpoint)
+    assert [planes.side_source(index) for index in range(2)] == [source, source]
+    own = replace(planes, side_from=("photos", "given"))
+    assert [own.side_source(index) for index in range(2)] == ["photos", "given"]
+
+
+def test_sides_of_their_own_are_kept_and_no_sides_leave_the_encoding_as_it_was() -> None:
+    own = replace(two_planes(), side_from=("photos", "guess"))
+    assert Planes.from_payload(own.to_payload()).side_from == ("photos", "guess")
+    assert "side_from" not in two_planes().to_payload().metadata
+    assert Planes.from_payload(two_planes().to_payload()).side_from == ()
+
+
+def test_sides_are_none_or_one_per_plane() -> None:
+    with pytest.raises(ProductError, match="side_from must be empty or one per plane, got 1 for 2"):
+        replace(two_planes(), side_from=("photos",))

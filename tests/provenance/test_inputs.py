@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 from pathlib import Path
 
 import h5py
@@ -76,12 +77,13 @@ def test_a_changed_byte_is_named_and_not_taken_out(tmp_path: Path) -> None:
         extract_files(path, read_record(path).inputs, tmp_path / "out")
 
 
-@pytest.mark.parametrize("name", ["../out.txt", "..", "/etc/passwd"])
+@pytest.mark.parametrize("name", ["../out.txt", "..", "/etc/passwd", "nul", "a\x1b[2Jb", "x" * 256])
 def test_a_name_that_leads_elsewhere_is_refused(tmp_path: Path, name: str) -> None:
     path = write_embedded(tmp_path, CONTENTS[:1])
     inputs = (RecordedInput(name="photos", files=(recorded(name, CONTENTS[0]),), embedded=True),)
-    with pytest.raises(RecordFormatError, match="which is no name of a file"):
+    with pytest.raises(RecordFormatError, match="so it cannot be the name of a file"):
         extract_files(path, inputs, tmp_path / "out")
+    assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
     assert not list(tmp_path.glob("**/out.txt"))
 
 
@@ -92,7 +94,11 @@ def test_a_file_that_changed_or_is_gone_is_not_embedded(tmp_path: Path) -> None:
         name="photos", files=(recorded("photo.jpg", b"older photo"),), embedded=True
     )
     record = record_with((entry,))
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
     for find, sentence in (
+        (lambda _: pipe, "but it was changed since it was digested"),
+        (lambda _: tmp_path / "gone", "but it was changed since it was digested"),
         (lambda _: changed, "but it was changed since it was digested"),
         (lambda _: None, "is to be embedded, but there is none with its SHA-256"),
     ):

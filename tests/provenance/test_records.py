@@ -631,7 +631,7 @@ SEALED_CHANGES = {
             ),
         ),
         "/inputs/scan",
-        "'/home/a.laz' needs a name without folder",
+        "'/home/a.laz' holds / or a backslash",
     ),
 }
 

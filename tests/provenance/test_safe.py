@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from orthoflow_provenance.encoding import read_texts
 from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.reader import open_record
 from orthoflow_provenance.safe import safe_open
 from orthoflow_provenance.verify import verify_record
 
@@ -119,6 +122,25 @@ def deep_nesting(file: h5py.File) -> None:
     file.create_group("/".join("g" * 40))
 
 
+def way_up(file: h5py.File) -> None:
+    file.create_group("a")
+    file.id.links.move(b"a", file.id, b"..")
+
+
+def name_with_escape(file: h5py.File) -> None:
+    file.create_group("a\x1b[2J")
+
+
+def name_in_no_encoding(file: h5py.File) -> None:
+    file.create_group("a")
+    file.id.links.move(b"a", file.id, b"\xff\xfe")
+
+
+def flood_of_small_datasets(file: h5py.File) -> None:
+    for name in "abc":
+        file.create_dataset(name, (30 << 20,), "u1", chunks=(1 << 20,), compression="gzip")
+
+
 FORBIDDEN: list[tuple[Callable[[h5py.File], None], str]] = [
     (external_link, ":/a is a link into another file: the file is not opened"),
     (external_link_in_a_group, ":/b/c/a is a link into another file"),
@@ -142,6 +164,10 @@ FORBIDDEN: list[tuple[Callable[[h5py.File], None], str]] = [
     (reference_in_an_attribute, ":/@a has a type outside the format"),
     (text_of_variable_length_in_an_attribute, ":/b@a has a type outside the format"),
     (large_attribute, ":/@a is larger than 1 MiB"),
+    (way_up, ":/.. is no place in a record: the object '..' cannot be a name"),
+    (name_with_escape, "is no place in a record: the object 'a\\x1b[2J' cannot be a name"),
+    (name_in_no_encoding, ":/\\xff\\xfe cannot be read, the file is damaged"),
+    (flood_of_small_datasets, ":/c and those before it say they have more than 64 MiB"),
     (deep_nesting, "is nested more than 32 groups deep"),
 ]
 
@@ -226,3 +252,49 @@ def test_well_packed_data_of_any_size_is_allowed(tmp_path: Path) -> None:
         assert file["a"].nbytes > 500 * file["a"].id.get_storage_size()
     with safe_open(path) as file:
         assert file["a"].shape == (80 << 20,)
+
+
+def test_sixty_thousand_groups_are_looked_at_at_once(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w", libver="v110") as file:
+        cells = file.create_group("cells")
+        for index in range(60_000):
+            h5py.h5g.create(cells.id, str(index).encode())
+    began = time.process_time()
+    with pytest.raises(RecordFormatError), open_record(tmp_path / "a.h5"):
+        pass
+    assert time.process_time() - began < 5.0
+
+
+def test_more_objects_than_any_record_has_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for index in range(10):
+            file.create_group(str(index)).attrs["a"] = index
+    monkeypatch.setattr("orthoflow_provenance.safe.MOST_OBJECTS", 21)
+    with safe_open(tmp_path / "a.h5"):
+        pass
+    monkeypatch.setattr("orthoflow_provenance.safe.MOST_OBJECTS", 20)
+    refused = pytest.raises(RecordFormatError, match="more than 20 groups and attributes")
+    with refused, safe_open(tmp_path / "a.h5"):
+        pass
+
+
+def test_tables_and_texts_that_unpack_to_much_are_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    rows = np.zeros(5 << 20, dtype=[("text", "S1")])
+    with h5py.File(path, "w") as file:
+        file.create_dataset("packed", data=rows, chunks=(1 << 20,), compression=9)
+        file.create_dataset("plain", data=rows[:1000], chunks=(1000,), compression=9)
+    with safe_open(path) as file:
+        with pytest.raises(RecordFormatError, match=r"/packed unpacks to 5242880 bytes: texts, ta"):
+            read_texts(file, "packed")
+        assert read_texts(file, "plain") == ("",) * 1000
+
+
+def test_names_in_notes_are_nobodys_business(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group("notes/a\x1b")
+    with safe_open(path) as file:
+        assert list(file["notes"]) == ["a\x1b"]

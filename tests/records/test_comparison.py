@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -131,3 +132,13 @@ def test_arrays_beside_the_record_are_found_in_a_store_or_not_measured(studio: S
     assert {item.verdict for item in compare_runs(left, right).products} == {"not measured"}
     measured = compare_runs(left, right, stores=[Store(studio.folder / ".orthoflow")]).products
     assert {item.verdict for item in measured} == {"within tolerance"}
+
+
+@pytest.mark.parametrize("preimage", ["", "[1]", "{", "[" * 50_000, '{"code": 5, "tools": [1]}'])
+def test_a_preimage_that_says_nothing_costs_nothing(studio: Studio, preimage: str) -> None:
+    first, second = (open_run(studio.folder / name) for name in ("first", "first"))
+    for address, cell in second.cells.items():
+        second.cells[address] = replace(cell, key_preimage=preimage)  # type: ignore[index]
+    (pair, *_) = compare_runs(first, second).cells
+    assert pair.right is not None
+    assert (pair.right.code, pair.right.tools) == ({}, {})

@@ -152,6 +152,11 @@ def a_record(digest: str) -> RunRecord:
     )
 
 
+def as_stored(*paths: Path) -> dict[Path, str]:
+    """Files of the store with the digests that they have."""
+    return {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+
+
 @pytest.fixture
 def run_folder(tmp_path: Path) -> Path:
     """A finished run folder with one embedded product and one that is only named."""
@@ -163,7 +168,7 @@ def run_folder(tmp_path: Path) -> Path:
     write_record(folder / "run.h5", record, lambda asked: product if asked == digest else None)
     published = tmp_path / "planes.json"
     published.write_text('{"planes": []}', encoding="utf-8")
-    publish_products(folder, record.cells, {"plane@plane=given": {"planes": (published,)}})
+    publish_products(folder, record.cells, {"plane@plane=given": {"planes": as_stored(published)}})
     return folder
 
 
@@ -232,11 +237,44 @@ def test_two_outputs_that_publish_the_same_name_both_stay(tmp_path: Path) -> Non
     for port in ("a", "b"):
         (tmp_path / port).mkdir()
         (tmp_path / port / "planes.json").write_text(port, encoding="utf-8")
-    files = {port: (tmp_path / port / "planes.json",) for port in ("a", "b")}
+    files = {port: as_stored(tmp_path / port / "planes.json") for port in ("a", "b")}
     publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files})
     cell = tmp_path / "run" / "products" / "cloud"
     assert (cell / "planes.json").read_text(encoding="utf-8") == "a"
     assert (cell / "b_planes.json").read_text(encoding="utf-8") == "b"
+
+
+def test_no_published_file_takes_the_place_of_another_or_of_the_metrics(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    names = {"a": ("b_x.csv", "Metrics.CSV"), "b": ("x.csv", "X.csv", "metrics.csv")}
+    files = {}
+    for port, mine in names.items():
+        (tmp_path / port).mkdir()
+        paths = [tmp_path / port / name for name in mine]
+        for path in paths:
+            path.write_text(f"{port} {path.name}", encoding="utf-8")
+        files[port] = as_stored(*paths)
+    published = publish_products(tmp_path / "run", [cloud_cell()], {"cloud": files})
+    cell = tmp_path / "run" / "products" / "cloud"
+    assert {path.name: path.read_text(encoding="utf-8")[:20] for path in cell.iterdir()} == {
+        "b_x.csv": "a b_x.csv",
+        "a_Metrics.CSV": "a Metrics.CSV",
+        "x.csv": "b x.csv",
+        "b_2_X.csv": "b X.csv",
+        "b_metrics.csv": "b metrics.csv",
+        "metrics.csv": "cell,step,method,met",
+    }
+    assert len(published) == 7
+
+
+def test_products_are_not_published_through_a_link(tmp_path: Path) -> None:
+    for name in ("run", "outside"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "outside" / "precious.txt").write_text("precious")
+    (tmp_path / "run" / "products").symlink_to(tmp_path / "outside")
+    publish_products(tmp_path / "run", [cloud_cell()], {})
+    assert [path.name for path in (tmp_path / "outside").iterdir()] == ["precious.txt"]
+    assert not (tmp_path / "run" / "products").is_symlink()
 
 
 def test_orthoimages_come_in_the_order_of_the_walls(run: Run) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from orthoflow.engine import RunOptions, RunOutcome, Store, execute, plan_run
 from orthoflow.records import Run, write_run
-from orthoflow.records.replaying import plan_replay
+from orthoflow.records.replaying import UnreplayableRunError, plan_replay
 from orthoflow.workflow import cells, expand_cells, load_workflow
 from tests.engine_world import World, toy_world
 
@@ -81,3 +82,33 @@ def test_another_code_of_a_method_is_noted_and_not_refused(world: World) -> None
     assert "work.noise: its code is not that of the record, though both say result version 1" in (
         replay.notes
     )
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"),
+    [
+        ("cores", -5, "greater than or equal to 1"),
+        ("cores", "many", "valid integer"),
+        ("timeout_s", "soon", "valid number"),
+        ("timeout_s", [1], "valid number"),
+        ("timeout_s", -1.0, "greater than 0"),
+        ("repeat", 0, "greater than or equal to 1"),
+    ],
+)
+def test_a_record_whose_workflow_asks_for_the_impossible_is_refused(
+    world: World, field: str, value: object, reason: str
+) -> None:
+    path = world.folder / "toy.yaml"
+    path.write_text(WORKFLOW)
+    catalog = world.catalog()
+    workflow = load_workflow(path, catalog)
+    plan = plan_run(expand_cells(workflow, catalog), workflow, catalog, world.store, INLINE)
+    outcome = execute(plan, world.folder / "run", world.store)
+    last = workflow.steps["last"]
+    asking = dataclasses.replace(last.variants[0], **{field: value})  # type: ignore[arg-type]
+    steps = {**workflow.steps, "last": dataclasses.replace(last, variants=(asking,))}
+    hostile = dataclasses.replace(workflow, steps=steps)
+    run = write_run(outcome, plan, hostile, world.folder / "run", world.store)
+    said = rf"the resolved workflow cannot be read: steps\.last\.variants\.0\.{field}: .*{reason}"
+    with pytest.raises(UnreplayableRunError, match=said):
+        plan_replay(run, catalog, Store(world.folder / "fresh"), INLINE)

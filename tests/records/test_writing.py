@@ -5,8 +5,12 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from dataclasses import dataclass
+from datetime import datetime, timedelta, tzinfo
 from pathlib import Path
+from typing import Self
 
+import h5py
+import numpy as np
 import pytest
 
 from orthoflow.catalog import discover_catalog
@@ -15,6 +19,9 @@ from orthoflow.engine.results import FigureRef
 from orthoflow.errors import StoreError
 from orthoflow.records import Run, open_run, verify_run, write_run
 from orthoflow.workflow import Workflow, expand_cells, load_workflow
+from tests import photo_files
+from tests.engine_world import toy_world
+from tests.studios import open_studio
 from tests.workshop_runs import WORKSHOP, write_studio
 
 
@@ -102,15 +109,31 @@ def test_copies_do_not_share_their_bytes_with_the_store(executed: Executed) -> N
     run = executed.write()
     [planes] = [path for path in run.files["survey"] if path.name == "planes.json"]
     digest = run.cells["survey"].outputs["planes"].digest
-    before = executed.store.published_files(digest)[0].read_bytes()
+    [stored, *_] = executed.store.published_files(digest)
+    before = stored.read_bytes()
     planes.write_text("edited", encoding="utf-8")
-    assert executed.store.published_files(digest)[0].read_bytes() == before
+    assert stored.read_bytes() == before
 
 
 def test_a_product_that_the_store_lost_is_named(executed: Executed) -> None:
     shutil.rmtree(executed.store.objects)
-    with pytest.raises(StoreError, match="the record cannot be assembled from the store"):
+    with pytest.raises(StoreError, match="has no sound product sha256:"):
         executed.write()
+    assert not (executed.folder / "run.h5").exists()
+
+
+def test_a_run_is_not_finished_in_which_the_disk_refused_a_step(executed: Executed) -> None:
+    refused = dataclasses.replace(
+        executed.outcome.results["paint"],
+        status="failed",
+        error_type="StoreError",
+        error_message="cannot write to the store: Input/output error",
+        exit_code=1,
+    )
+    results = {**executed.outcome.results, "paint": refused}
+    outcome = dataclasses.replace(executed.outcome, results=results)
+    with pytest.raises(StoreError, match=r"paint failed: .* the same command with -o .* goes on"):
+        dataclasses.replace(executed, outcome=outcome).write()
     assert not (executed.folder / "run.h5").exists()
 
 
@@ -120,5 +143,83 @@ def test_a_figure_that_the_store_lost_is_named(executed: Executed) -> None:
     results["paint"] = dataclasses.replace(results["paint"], figures=(figure,))
     outcome = dataclasses.replace(executed.outcome, results=results)
     broken = dataclasses.replace(executed, outcome=outcome)
-    with pytest.raises(StoreError, match="lost the figure plan; run again and it is drawn anew"):
+    with pytest.raises(StoreError, match=r"needs \(the figure plan is damaged\)"):
         broken.write()
+
+
+def test_what_a_photo_says_of_people_and_places_stays_in_the_photo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    studio = open_studio(tmp_path, monkeypatch)
+    secrets = {0x013B: "Jane Doe", 0x8298: "Doe Studios", 0x010E: "at 50.0412N 21.9991E"}
+    serial = {0xA431: "SN-4711-0815", 0xA430: "Owner Doe", 0xA435: "LENS-0042"}
+    maker = {photo_files.MAKE: "Maker", photo_files.MODEL: "Model"}
+    block = photo_files.exif_block({**maker, **secrets}, {photo_files.FOCAL_35MM: 36, **serial})
+    photo_files.write(tmp_path, {"a.jpg": photo_files.jpeg(photo_files.picture(), block)})
+    steps = "orthoflow: 1\ninputs: {photos: {files: a.jpg}}\nsteps:\n"
+    (tmp_path / "p.yaml").write_text(
+        steps + "  shots: {use: read.photos, in: {files: inputs.photos}}\n"
+    )
+    assert studio("run", "p.yaml", "-o", "run").exit_code == 0
+    assert studio("export", "run", "--to", "ro-crate", "-o", "crate").exit_code == 0
+    said = {"run.h5": _everything_in(tmp_path / "run" / "run.h5")}
+    for folder in ("run", "crate"):
+        for path in (tmp_path / folder).rglob("*"):
+            if path.is_file():
+                said[str(path)] = path.read_bytes()
+    assert b"Maker Model" in said["run.h5"]  # the log says which camera it was
+    for text in (*secrets.values(), *serial.values()):
+        assert not [name for name, content in said.items() if text.encode() in content], text
+    # Who asks for everything gets everything.
+    assert studio("run", "p.yaml", "-o", "whole", "--embed").exit_code == 0
+    assert b"SN-4711-0815" in _everything_in(tmp_path / "whole" / "run.h5")
+
+
+def _everything_in(path: Path) -> bytes:
+    """All values of a record, unpacked."""
+    found: list[bytes] = []
+
+    def add(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        found.extend(str(value).encode() for value in item.attrs.values())
+        if isinstance(item, h5py.Dataset):
+            found.append(np.asarray(item[()]).tobytes())
+
+    with h5py.File(path) as file:
+        file.visititems(add)
+    return b"\n".join(found)
+
+
+def test_a_clock_that_goes_back_by_a_year_spoils_no_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Back(datetime):
+        n_asked = 0
+
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> Self:  # type: ignore[override]
+            cls.n_asked += 1
+            time = super().now(tz)
+            return time if cls.n_asked < 4 else time - timedelta(days=365)
+
+    with toy_world(tmp_path) as world:
+        path = tmp_path / "toy.yaml"
+        path.write_text(
+            "orthoflow: 1\nname: toy\nsteps:\n  first: {use: make.range}\n"
+            "  last: {use: work.add, in: {numbers: first.numbers}}\n"
+        )
+        catalog = world.catalog()
+        workflow = load_workflow(path, catalog)
+        plan = plan_run(
+            expand_cells(workflow, catalog),
+            workflow,
+            catalog,
+            world.store,
+            RunOptions(executor="inline"),
+        )
+        monkeypatch.setattr("orthoflow.engine.clock.datetime", Back)
+        outcome = execute(plan, tmp_path / "run", world.store)
+        run = write_run(outcome, plan, workflow, tmp_path / "run", world.store)
+        monkeypatch.undo()
+    assert run.record.started > run.record.ended
+    assert all(cell.wall_s >= 0.0 for cell in run.record.cells)
+    assert verify_run(run.path).findings == ()

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from orthoflow_provenance.model import Metric, RecordedCell, RecordedFigure
 
 from orthoflow.report import write_report
 from tests.browser import PROGRAM, BrowserError, Page, browser
-from tests.report_runs import compared_run
+from tests.report_runs import HeldRun, compared_run
 
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no chromium is installed")
 ROWS = "[...document.querySelectorAll('#r1-comparison ~ .scroll tbody tr')]"
@@ -91,6 +94,68 @@ def test_the_slider_shows_what_was_chosen(page: Page) -> None:
     assert "intensity" in chosen[0]
 
 
+FIGURE = "document.querySelector('.first figure')"
+POINTER = (
+    f"(kind, x, y) => {{ const image = {FIGURE}.querySelector('img');"
+    " const box = image.getBoundingClientRect();"
+    " image.dispatchEvent(new PointerEvent(kind, { bubbles: true,"
+    " clientX: box.left + image.clientLeft + x * image.clientWidth,"
+    " clientY: box.top + image.clientTop + y * image.clientHeight })); }"
+)
+
+
+def test_the_world_under_the_cursor_of_an_orthoimage_is_told(page: Page) -> None:
+    page.evaluate(f"({POINTER})('pointermove', 0.25, 0.5)")
+    told = page.evaluate(f"{FIGURE}.querySelector('.readout').innerText")
+    # 120 x 80 cells of 0.01 m from (4e5, 5e6, 3), u along x, v down, n along -y.
+    u, v = (float(text) for text in re.findall(r"[uv] ([0-9.]+) px", told))
+    assert (u, v) == pytest.approx((30.0, 40.0), abs=0.6)
+    x, y, z = (float(text) for text in re.findall(r"x (.*) m$", told)[0].split(", "))
+    depth = re.findall(r"depth (-?[0-9.]+) m", told)
+    assert x == pytest.approx(4.0e5 + 0.01 * u, abs=2e-3)
+    assert z == pytest.approx(3.0 - 0.01 * v, abs=2e-3)
+    assert y == pytest.approx(5.0e6 - (float(depth[0]) if depth else 0.0), abs=2e-3)
+
+
+def test_clicks_are_saved_as_check_points_and_as_ties(page: Page) -> None:
+    page.evaluate(
+        "(() => { window.saved = []; URL.createObjectURL = blob => {"
+        " blob.text().then(text => window.saved.push(text)); return '#'; };"
+        " HTMLAnchorElement.prototype.click = function () { window.file = this.download; }; })()"
+    )
+    points = "document.querySelector('.points')"
+    assert page.evaluate(f"{points}.querySelector('[data-part=ties]').disabled") is True
+    for x in (0.25, 0.75, 0.5):
+        page.evaluate(f"({POINTER})('click', {x}, 0.5)")
+    page.evaluate(f"{points}.querySelectorAll('[aria-label=\"remove point 2\"]')[0].click()")
+    page.evaluate(f"{points}.querySelector('[data-part=checkpoints]').click()")
+    assert page.evaluate("window.file") == "checkpoints.csv"
+    saved = page.evaluate("new Promise(done => setTimeout(() => done(window.saved.pop()), 50))")
+    header, first, second = csv.reader(saved.splitlines())
+    assert header == ["name", "x", "y", "z", "wall", "u_px", "v_px"]
+    assert (first[0], second[0]) == ("P1", "P3")
+    assert float(first[1]) == pytest.approx(4.0e5 + 0.01 * float(first[5]), abs=1e-3)
+    assert float(second[5]) == pytest.approx(60.0, abs=0.6)
+    page.evaluate(f"{points}.querySelector('[data-part=ties]').click()")
+    told = f"{points}.querySelector('[data-part=told]').innerText"
+    assert page.evaluate(told).startswith("0 ties; 2 points lack a photo")
+    page.evaluate(
+        f"(() => {{ const row = {points}.querySelector('[data-part=list] > div');"
+        " const [, photo, u, v] = row.querySelectorAll('input');"
+        " photo.value = 'a, b.jpg'; u.value = '12.5'; v.value = '7'; })()"
+    )
+    page.evaluate(f"{points}.querySelector('[data-part=ties]').click()")
+    saved = page.evaluate("new Promise(done => setTimeout(() => done(window.saved.pop()), 50))")
+    header, tie = csv.reader(saved.splitlines())
+    assert header == ["photo", "u_px", "v_px", "x", "y", "z"]
+    assert tie == ["a, b.jpg", "12.5", "7", *first[1:4]]
+    assert (
+        page.evaluate(told)
+        == "1 ties; 1 points lack a photo or where it shows them, and are left out"
+    )
+    assert page.complaints == []
+
+
 def test_vectors_lie_over_the_intensity_of_their_wall(page: Page) -> None:
     grounds = page.evaluate(
         "[...document.querySelectorAll('.stack')]"
@@ -153,3 +218,92 @@ def test_two_environments_on_a_page_fit_a_phone(page: Page, tmp_path: Path) -> N
     assert len(page.evaluate("document.querySelector('.legend').innerText").splitlines()) == 2
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     assert page.complaints == []
+
+
+SCRIPT = "document.title = 'injected'; console.error('injected')"
+INJECTED = (
+    f"<script>{SCRIPT}</script>",
+    f'<img src="data:," onerror="{SCRIPT}">',
+    f'"><script>{SCRIPT}</script>',
+    "</style></script><svg onload=\"document.title = 'injected'\">",
+)
+HOSTILE_SVG = f"""<svg xmlns="http://www.w3.org/2000/svg" width="40" height="30" onload="{SCRIPT}">
+<script>{SCRIPT}</script><style>rect {{ fill: green }}</style><rect width="40" height="30"/>
+<foreignObject width="9" height="9"><img xmlns="http://www.w3.org/1999/xhtml" src="x"
+onerror="{SCRIPT}"/></foreignObject></svg>"""
+
+
+def hostile(run: HeldRun) -> HeldRun:
+    """The run with scripts in whatever a stranger may write."""
+    text = "".join(INJECTED)
+
+    def spoilt(cell: RecordedCell) -> RecordedCell:
+        figures = tuple(
+            replace(figure, name=text, caption=text, media_type=f"image/png{text}")
+            for figure in cell.figures
+        )
+        drawn = RecordedFigure(
+            name="drawn", caption=text, media_type="image/svg+xml", data=HOSTILE_SVG.encode()
+        )
+        metrics = tuple(replace(metric, unit=text) for metric in cell.metrics)
+        return replace(
+            cell,
+            metrics=(*metrics, Metric(name=text, value=1.0, unit=text)) if metrics else (),
+            figures=(*figures[:1], drawn) if figures else (),
+            warnings=(text, "turned \u202eround"),
+            citations=(f"{text} doi:10.1/{text}",),
+            log=text,
+            params={text: text},
+            method=text,
+        )
+
+    cells = tuple(map(spoilt, run.record.cells))
+    record = replace(
+        run.record, cells=cells, name=text, run_id=text, workflow_source=text, overrides=(text,)
+    )
+    return replace(run, record=record)
+
+
+def test_what_strangers_write_is_no_script_and_the_page_still_works(
+    page: Page, tmp_path: Path
+) -> None:
+    write_report([hostile(compared_run(tmp_path))], tmp_path / "hostile.html")
+    page.complaints.clear()
+    page.show_as(1440)
+    page.open(tmp_path / "hostile.html")
+    # Time for the scripts that shall not run: handlers of images come after they have loaded.
+    page.evaluate("new Promise(done => setTimeout(done, 200))")
+    assert page.evaluate("document.title").startswith("<script>")
+    assert page.complaints == []
+    # The page's own one, and blocks of data, which nobody runs.
+    kinds = page.evaluate("[...document.scripts].map(script => script.type)")
+    assert sorted(kinds) == ["", "application/json", "application/json"]
+    assert page.evaluate("document.querySelectorAll('[onerror], [onload]').length") == 0
+    assert "turned \\u202eround" in page.evaluate("document.body.innerText")
+    # The picture with a script in it is shown as a picture.
+    drawn = "[...document.images].filter(image => image.src.startsWith('data:image/svg'))"
+    assert page.evaluate(f"{drawn}.map(image => image.naturalWidth)")[0] == 40
+    page.evaluate("document.querySelector('[data-part=position]').focus()")
+    page.press("ArrowRight")
+    cut = page.evaluate("document.querySelectorAll('.stage .layer')[1].style.clipPath")
+    assert cut == "inset(0px 49.5% 0px 0px)"
+    page.evaluate("document.querySelector('th[data-sort] button').click()")
+    assert page.evaluate("document.querySelectorAll('[aria-sort=ascending]').length") == 1
+    assert page.complaints == []
+
+
+def test_the_policy_of_the_page_stops_what_would_get_onto_it(page: Page, tmp_path: Path) -> None:
+    write_report([compared_run(tmp_path)], tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    # As if an escape had been forgotten.
+    (tmp_path / "leaky.html").write_text(
+        text.replace("</main>", f"{''.join(INJECTED[:2])}<p style='color: red'>red</p></main>")
+    )
+    page.complaints.clear()
+    page.open(tmp_path / "leaky.html")
+    assert page.evaluate("document.title") != "injected"
+    assert page.evaluate("getComputedStyle(document.querySelector('main > p')).color") != (
+        "rgb(255, 0, 0)"
+    )
+    assert len(page.complaints) >= 3
+    assert all("Content Security Policy" in complaint for complaint in page.complaints)

@@ -122,6 +122,26 @@ def test_figures_beyond_the_budget_are_drawn_smaller(
     assert sum(len(picture.uri) for group in groups for picture in group.pictures) < before / 2
 
 
+def test_a_picture_that_cannot_be_decoded_costs_its_place_not_the_page(
+    compared: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = compared.cells["check@plane=fine"]
+    spoilt = tuple(
+        replace(figure, data=figure.data[:100]) if figure.name == "error_map" else figure
+        for figure in cell.figures
+    )
+    monkeypatch.setitem(compared.cells, cell.address, replace(cell, figures=spoilt))  # type: ignore[arg-type]
+    assert write_figures(compared, tmp_path, [cell.address]) == 2
+    assert not list((tmp_path / cell.address).glob("error_map*"))
+    monkeypatch.setattr("orthoflow.report.figures._BYTES_MOST", 100)
+    monkeypatch.setattr("orthoflow.report.figures._SMALL_BYTES", 0)
+    (group,) = [group for group in figure_groups(compared) if group.cell == cell.address]
+    assert [picture.caption for picture in group.pictures] == [
+        "how far (the picture is damaged)",
+        "a chart",
+    ]
+
+
 def test_many_pictures_are_small_ones() -> None:
     assert side_px(1) == 1000
     # Their bytes go with their area: 400 together are not more than 60 large ones.

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from orthoflow.errors import ProductError
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext, StepEvent
+from orthoflow.sdk.context import Drawing
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(20)
@@ -38,6 +41,26 @@ def test_a_picture_is_kept_by_its_kind(
     assert (figure.name, figure.caption, figure.media_type) == ("wall_0", "A wall.", media_type)
     assert figure.path == tmp_path / "figures" / f"wall_0{suffix}"
     assert figure.path.read_bytes() == content
+
+
+@pytest.mark.parametrize("name", ["../x", "/tmp/x", "..", "", "nul", "a\nb", "x" * 253, "x" * 300])
+def test_a_picture_that_no_file_can_be_called_after_is_refused(tmp_path: Path, name: str) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    with pytest.raises(ProductError, match="so it cannot be the name of a file here"):
+        context(scratch).figure(name, PNG)
+    with pytest.raises(ProductError, match="so it cannot be the name of a file here"):
+        context(scratch).allocate("walls", f"{name}/\0", (3,), np.uint8)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_two_pictures_have_names_that_differ_everywhere(tmp_path: Path) -> None:
+    ctx = context(tmp_path)
+    ctx.figure("depth", PNG)
+    for name, content in (("Depth", PNG), ("depth", SVG)):
+        with pytest.raises(ProductError, match=f"figure {name} was drawn twice"):
+            ctx.figure(name, content)
+    assert [figure.path.name for figure in ctx.figures] == ["depth.png"]
 
 
 @pytest.mark.usefixtures("charts")
@@ -106,3 +129,102 @@ def test_a_method_that_does_nothing_says_what_it_lacks(tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="Idle must implement run"):
         Idle().run(Ports(), MethodParams(), context(tmp_path))
     assert Idle.tools() == {}
+
+
+NOT_NAMES = ["", "..", "../up", "/abs", "two\nlines", "red \x1b[31m", "half \udcff", "n" * 300, 5]
+
+
+@pytest.mark.parametrize("name", NOT_NAMES, ids=ascii)
+def test_what_cannot_be_a_name_names_no_metric_and_no_figure(tmp_path: Path, name: str) -> None:
+    ctx = context(tmp_path)
+    with pytest.raises(ProductError, match=r"^a metric must have a name of one printable line"):
+        ctx.metric(name, 1.0, "mm")
+    refused = r"cannot be the name of a file here$|^the name of a file must be a text, got 5$"
+    with pytest.raises(ProductError, match=refused):
+        ctx.figure(name, PNG)
+    assert (ctx.metrics, ctx.figures, list(tmp_path.iterdir())) == ([], [], [])
+
+
+@pytest.mark.parametrize("unit", ["", "m\nm", None, 1.0, "\x1b"], ids=ascii)
+def test_a_unit_is_a_word(tmp_path: Path, unit: str) -> None:
+    ctx = context(tmp_path)
+    with pytest.raises(ProductError, match="the unit of metric length must be a word"):
+        ctx.metric("length", 1.0, unit)
+
+
+@pytest.mark.parametrize(
+    "value", ["three", None, 10**400, [1.0]], ids=["text", "None", "huge", "list"]
+)
+def test_a_metric_is_a_number(tmp_path: Path, value: float) -> None:
+    with pytest.raises(ProductError, match=r"^metric length must be a number: "):
+        context(tmp_path).metric("length", value, "m")
+
+
+def test_a_name_serves_once_and_there_are_only_so_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.sdk.context._MOST_METRICS", 2)
+    monkeypatch.setattr("orthoflow.sdk.context._MOST_FIGURES", 1)
+    ctx = context(tmp_path)
+    ctx.metric("a", 1.0, "m/s")
+    ctx.figure("a", PNG)
+    with pytest.raises(ProductError, match="metric a was reported twice"):
+        ctx.metric("a", 2.0, "m")
+    ctx.metric("b", 2.0, "m")
+    with pytest.raises(ProductError, match="a step may report 2 metrics, not more"):
+        ctx.metric("c", 3.0, "m")
+    with pytest.raises(ProductError, match="a step may report 1 figures, not more"):
+        ctx.figure("b", PNG)
+    assert [metric.name for metric in ctx.metrics] == ["a", "b"]
+
+
+class LeadsElsewhere:
+    def savefig(self, path: Path) -> None:
+        path.symlink_to(__file__)
+
+
+class Pipe:
+    def savefig(self, path: Path) -> None:
+        os.mkfifo(path)
+
+
+class Giant:
+    def savefig(self, path: Path) -> None:
+        with path.open("wb") as file:
+            file.truncate(1 << 40)
+
+
+class Nothing:
+    def savefig(self, path: Path) -> None:
+        """Write nothing."""
+
+
+@pytest.mark.parametrize(
+    "drawing",
+    [LeadsElsewhere(), Pipe(), Giant(), Nothing()],
+    ids=lambda drawing: type(drawing).__name__,
+)
+@pytest.mark.usefixtures("charts")
+def test_a_figure_is_a_file_of_its_own(tmp_path: Path, drawing: Drawing) -> None:
+    ctx = context(tmp_path)
+    with pytest.raises(ProductError, match="figure chart must be a file of at most 64 MiB"):
+        ctx.figure("chart", drawing)
+    assert ctx.figures == []
+
+
+def test_an_array_that_no_file_can_hold_is_refused(tmp_path: Path) -> None:
+    ctx = context(tmp_path)
+    for shape, dtype in [((4,), object), ((-4,), float)]:
+        with pytest.raises(ProductError, match=r"^an array cannot be of type .* and shape "):
+            ctx.allocate("numbers", "values", shape, dtype)
+
+
+def test_what_a_step_says_is_heard_line_by_line(tmp_path: Path) -> None:
+    heard: list[StepEvent] = []
+    ctx = context(tmp_path, heard)
+    ctx.log("one\ntwo")
+    ctx.warn(None)  # type: ignore[arg-type]
+    ctx.progress(float("nan"), "p" * (1 << 20))
+    assert [event.text for event in heard[:2]] == ["one two", "None"]
+    assert heard[2].fraction == 0.0
+    assert heard[2].text.endswith("p... (1048576 characters)")

@@ -11,8 +11,10 @@ import pytest
 
 from orthoflow.catalog import discover_catalog
 from orthoflow.files.images import encode_jpeg
+from orthoflow.files.publishing import publish_cameras
 from orthoflow.products import Cameras, InputFiles, Product
 from orthoflow.testing import ConformanceCase, conformance_cases
+from orthoflow.testing.examples import example
 from orthoflow.testing.photographed import settled_camera
 from tests import inspect_scenes, ortho_scenes, photo_files
 
@@ -47,6 +49,8 @@ FILES: dict[str, str] = {
     "read.photos": "photo.jpg",
     "read.checkpoints": "points.csv",
     "read.orthoimage": "wall.tif",
+    "read.ties": "ties.csv",
+    "read.cameras": "cameras.json",
 }
 
 
@@ -63,10 +67,20 @@ def example_files(name: str) -> InputFiles:
         "photo.jpg": encode_jpeg(photo_files.picture()),
         "points.csv": b"name,x,y,z\nA,1,2,3\nB,4,5,6\n",
         "wall.tif": inspect_scenes.orthoimage_file(),
+        "ties.csv": b"photo,u_px,v_px,x,y,z\na.png,1,2,3,4,5\n",
+        "cameras.json": camera_file(),
     }
     folder = Path(mkdtemp(prefix="orthoflow-conformance-"))
     paths = photo_files.write(folder, {name: contents[name]})
     return InputFiles(name="files", paths=paths)
+
+
+def camera_file() -> bytes:
+    folder = Path(mkdtemp(prefix="orthoflow-conformance-"))
+    cameras = example("cameras")
+    assert isinstance(cameras, Cameras)
+    publish_cameras(cameras, folder, "sha256:0")
+    return (folder / "cameras.json").read_bytes()
 
 
 def coloured_wall() -> Mapping[str, Product | InputFiles]:

@@ -97,7 +97,7 @@ CHEATS: dict[str, tuple[str, str, str]] = {
     ),
     "unmeasured": (
         "outputs-are-valid",
-        "metric height has no unit",
+        "the unit of metric height must be a word",
         """
         def lift_m(self, cloud, ctx):
             ctx.metric("height", 1.0, "")

@@ -298,7 +298,7 @@ steps:
           variants: {{{variants.replace("plane.ransac", "raster.grid")}}}}}
 compare: {{}}
 """
-    with pytest.raises(WorkflowError, match=r"flow has 40000 combinations .*one-at-a-time"):
+    with pytest.raises(WorkflowError, match=r"flow has 40201 cells .*one-at-a-time"):
         cells_of(text, write, catalog)
 
 
@@ -353,3 +353,20 @@ def test_a_selection_that_leaves_nothing_is_refused(catalog: Catalog, write: Pat
     message = "no step of workflow palace-room is left by --from ortho --until wall together"
     with pytest.raises(ArgumentError, match=message):
         expand_cells(workflow, catalog, selection=Selection(from_=("ortho",), until=("wall",)))
+
+
+@pytest.mark.parametrize("inputs", ["{scan: {optional: true}}", "{scan: {files: a.e57}}"])
+def test_a_skipped_step_is_not_repeated(catalog: Catalog, write: Path, inputs: str) -> None:
+    text = f"""\
+orthoflow: 1
+inputs: {inputs}
+steps:
+  cloud: {{use: read.scan, in: {{files: inputs.scan}}}}
+  plane: {{use: plane.ransac, in: {{cloud: cloud.cloud}}, repeat: 3}}
+"""
+    is_skipped = "optional" in inputs
+    planes = [cell for cell in cells_of(text, write, catalog).values() if cell.step == "plane"]
+    assert [cell.address for cell in planes] == [
+        *("plane", "plane#1", "plane#2")[: 1 if is_skipped else 3]
+    ]
+    assert [bool(cell.skip_reason) for cell in planes] == [is_skipped] * len(planes)

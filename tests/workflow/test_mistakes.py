@@ -89,7 +89,7 @@ CASES = {
     "repeat is no number": (
         STEP % ", repeat: often",
         "steps.x.repeat",
-        'expected a whole number from 1 on, got the text "often"',
+        'expected a whole number from 1 to 10000, got the text "often"',
     ),
     "timeout without unit": (
         STEP % ', timeout: "30"',
@@ -125,6 +125,7 @@ CASES = {
         "steps.inputs",
         "a step cannot be called inputs",
     ),
+    "name of a device": ("nul: {use: simulate.room}", "steps.nul", "'nul' cannot be a name"),
     "name in capitals": ("X: {use: simulate.room}", "steps.X", "'X' cannot be a name"),
     "unknown port": (
         "x: {use: plane.hough2d, in: {cloud: cloud.cloud, clouds: cloud.cloud}}",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -66,11 +67,11 @@ def changed(change: Callable[[dict[str, object]], object]) -> str:
         ),
         (
             changed(lambda document: document.pop("seed")),
-            r"the resolved workflow cannot be read: KeyError 'seed'",
+            r"the resolved workflow cannot be read: seed: Field required",
         ),
         (
             changed(lambda document: document.update(steps=[])),
-            r"the resolved workflow cannot be read: AttributeError",
+            r"the resolved workflow cannot be read: steps: Input should be a valid dictionary",
         ),
         (
             changed(
@@ -78,7 +79,7 @@ def changed(change: Callable[[dict[str, object]], object]) -> str:
                     step["variants"][0].pop("repeat") for step in document["steps"].values()
                 ]
             ),
-            r"the resolved workflow cannot be read: KeyError 'repeat'",
+            r"the resolved workflow cannot be read: steps\..*\.repeat: Field required",
         ),
     ],
     ids=["text", "list", "empty", "newer", "no seed", "steps are a list", "no repeat"],
@@ -92,3 +93,72 @@ def test_paths_of_the_command_line_are_not_recorded(tmp_path: Path) -> None:
     document = json.loads(resolved_json(loaded(RECIPES[0])))
     assert document["orthoflow"] == 1
     assert str(tmp_path.anchor + "home") not in json.dumps(document)
+
+
+def _first(document: Any, key: str) -> Any:
+    return next(iter(document[key].values()))
+
+
+CHANGES: dict[str, tuple[Callable[[Any], object], str]] = {
+    "a step that leaves its folder": (
+        lambda d: d["steps"].update({"../x": _first(d, "steps")}),
+        "'../x' cannot be a name",
+    ),
+    "a repeat that is text": (
+        lambda d: _first(d, "steps")["variants"][0].update(repeat="2"),
+        r"variants\.0\.repeat: Input should be a valid integer",
+    ),
+    "a billion repeats": (
+        lambda d: _first(d, "steps")["variants"][0].update(repeat=10**9),
+        "is repeated 1000000000 times",
+    ),
+    "no variants": (lambda d: _first(d, "steps").update(variants=[]), "has 0 variants"),
+    "a method that is a list": (
+        lambda d: _first(d, "steps")["variants"][0].update(use=["a"]),
+        r"variants\.0\.use: Input should be a valid string",
+    ),
+    "a reference to nothing": (
+        lambda d: _first(d, "steps")["in"].update(cloud=["nowhere.cloud"]),
+        "takes nowhere.cloud, which is not there",
+    ),
+    "a circle": (
+        lambda d: _first(d, "steps")["in"].update(cloud=[f"{next(iter(d['steps']))}.cloud"]),
+        "need each other in a circle",
+    ),
+    "an endless time limit": (
+        lambda d: _first(d, "steps")["variants"][0].update(timeout_s=-1.0),
+        r"timeout_s: Input should be greater than 0",
+    ),
+    "an unknown input": (lambda d: _first(d, "steps").update(unless="no"), "an unknown input"),
+    "a flag that is a number": (
+        lambda d: _first(d, "inputs").update(optional=1),
+        "optional: Input should be a valid bool",
+    ),
+    "a seed that is true": (lambda d: d.update(seed=True), "seed: Input should be a valid integer"),
+    "files that are numbers": (
+        lambda d: _first(d, "inputs").update(files=[1]),
+        r"files\.0: Input should be a valid string",
+    ),
+    "an unknown design": (
+        lambda d: d.update(compare={"design": "all", "baseline": {}, "exclude": [], "metrics": []}),
+        r"compare\.design: Input should be",
+    ),
+    "a baseline of nothing": (
+        lambda d: d.update(
+            compare={
+                "design": "product",
+                "baseline": {next(iter(d["steps"])): "no"},
+                "exclude": [],
+                "metrics": [],
+            }
+        ),
+        "has no variant of the comparison",
+    ),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_the_checks_of_a_file_would_refuse_is_refused(change: str) -> None:
+    act, words = CHANGES[change]
+    with pytest.raises(WorkflowError, match=words):
+        workflow_from_resolved(changed(act), "")

@@ -16,6 +16,13 @@ from orthoflow.errors import InputError
 BLOCK_POINTS: Final = 500_000
 # Positions are counted in 32 bits by half the programs that will read our products.
 MOST_POINTS: Final = 2**32
+# What packs points best takes a byte for each and more; a small file that states many is refused
+# before there is room made for them.
+MOST_POINTS_PER_BYTE: Final = 8
+# Honest lines of text scans and headers are much shorter.
+MOST_LINE_BYTES: Final = 10_000
+# Fields of a point, known or not.
+MOST_FIELDS: Final = 1000
 
 PointField = Literal["intensity", "rgb", "grid"]
 
@@ -30,6 +37,7 @@ class PointBlock:
         n_read: points of the file that this block accounts for, those left out included.
         n_invalid: points left out because the file calls them invalid (no return, 0 0 0).
         n_withheld: points left out because the file calls them deleted.
+        n_unwanted: points left out because nobody asked for their class.
         intensity: (n,) float32 in the file's own scale, or None.
         rgb: (n, 3) in the file's own scale and type, or None.
         row: (n,) int64 position in the scan's grid, or None; column alike.
@@ -44,6 +52,7 @@ class PointBlock:
     n_read: int
     n_invalid: int = 0
     n_withheld: int = 0
+    n_unwanted: int = 0
     intensity: NDArray[np.float32] | None = None
     rgb: NDArray[np.generic] | None = None
     row: NDArray[np.int64] | None = None

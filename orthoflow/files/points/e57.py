@@ -19,6 +19,7 @@ from orthoflow.files.points.blocks import (
     point_fields,
     short_file_error,
 )
+from orthoflow.files.points.e57_xml import check_xml
 from orthoflow.files.points.libraries import load_library, reading
 
 FORMAT: Final = "E57"
@@ -66,6 +67,7 @@ class ScanHeader:
 
 def open_e57(path: Path) -> ScanFile:
     """Open an E57 file; every scan with points is read, in the order of the file."""
+    check_xml(path)
     pye57 = load_library("pye57", path)
     with reading(path, FORMAT), pye57.E57(str(path)) as file:
         headers = [
@@ -106,7 +108,7 @@ def _read_header(path: Path, file: Any, index: int) -> ScanHeader:
             f"{path.name}: scan {index} has the fields {', '.join(sorted(names))}, expected "
             "cartesianX, Y, Z or sphericalRange, Azimuth, Elevation"
         )
-    rotation, translation = _pose(node)
+    rotation, translation = pose_of(node)
     is_posed = not (np.allclose(rotation, np.eye(3), atol=1e-12) and not translation.any())
     return ScanHeader(
         index=index,
@@ -120,8 +122,8 @@ def _read_header(path: Path, file: Any, index: int) -> ScanHeader:
     )
 
 
-def _pose(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """World-from-scan rotation and translation; the identity where the file states none."""
+def pose_of(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation and translation to the file's world; the identity where the file states none."""
     rotation = np.eye(3)
     translation = np.zeros(3)
     if not node.isDefined("pose"):
@@ -129,9 +131,9 @@ def _pose(node: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     pose = node["pose"]
     if pose.isDefined("rotation"):
         # By name: files may store the four numbers in any order.
-        rotation = _rotation([_value(pose["rotation"][name]) for name in "wxyz"])
+        rotation = _rotation([number_of(pose["rotation"][name]) for name in "wxyz"])
     if pose.isDefined("translation"):
-        translation = np.array([_value(pose["translation"][name]) for name in "xyz"])
+        translation = np.array([number_of(pose["translation"][name]) for name in "xyz"])
     return rotation, translation
 
 
@@ -147,7 +149,8 @@ def _rotation(quaternion: list[float]) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_quat(unit, scalar_first=True).as_matrix(), dtype=np.float64)
 
 
-def _value(node: Any) -> float:
+def number_of(node: Any) -> float:
+    """Give the value of a number's node, whatever its type."""
     scaled = getattr(node, "scaledValue", None)
     return float(node.value() if scaled is None else scaled())
 
@@ -158,7 +161,7 @@ def _limits(node: Any, group: str, low: str, high: str) -> tuple[float, float] |
     limits = node[group]
     if not (limits.isDefined(low) and limits.isDefined(high)):
         return None
-    smallest, largest = _value(limits[low]), _value(limits[high])
+    smallest, largest = number_of(limits[low]), number_of(limits[high])
     is_usable = math.isfinite(smallest) and math.isfinite(largest) and largest > smallest
     return (smallest, largest) if is_usable else None
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import ScanFile
+from orthoflow.files.points.blocks import MOST_POINTS_PER_BYTE, ScanFile
 from orthoflow.files.points.columns import Columns
 
 
@@ -71,18 +71,38 @@ def find_format(path: Path) -> Format:
     return named
 
 
-def open_scan(path: Path, columns: Columns | None = None, *, cores: int = 1) -> ScanFile:
+def open_scan(
+    path: Path,
+    columns: Columns | None = None,
+    *,
+    classes: Collection[int] = (),
+    cores: int = 1,
+) -> ScanFile:
     """Open a point file as far as its header.
 
     Args:
         path: the file.
         columns: what the columns of a text file are, if the user says so.
+        classes: of a LAS or LAZ file only points of these classes are given; all when empty.
         cores: processes that may decode points; only large LAZ files use more than one.
 
     Raises:
         InputError: the file cannot be read, says what and why in one sentence.
         PluginError: the library for this format is missing.
     """
+    scan = _opened(path, columns, classes=classes, cores=cores)
+    n_bytes = path.stat().st_size
+    if scan.n_most > MOST_POINTS_PER_BYTE * n_bytes:
+        raise InputError(
+            f"{path.name} states {scan.n_most} points but has {n_bytes} bytes, which cannot hold "
+            "them: the file is damaged or cut off, copy or export it again"
+        )
+    return scan
+
+
+def _opened(
+    path: Path, columns: Columns | None, *, classes: Collection[int], cores: int
+) -> ScanFile:
     found = find_format(path)
     if found is TEXT:
         from orthoflow.files.points.text import open_text
@@ -91,7 +111,7 @@ def open_scan(path: Path, columns: Columns | None = None, *, cores: int = 1) -> 
     if found is LAS:
         from orthoflow.files.points.las import open_las
 
-        return open_las(path, cores=cores)
+        return open_las(path, classes=classes, cores=cores)
     return _openers()[found.name](path)
 
 

@@ -20,7 +20,7 @@ import os
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -46,6 +46,12 @@ _VLR_BYTES: Final = 54
 _EVLR_BYTES: Final = 60
 _OFFSET_BYTES: Final = 8
 _CHUNKED: Final = (2, 3)
+# Of the compression's record: which compressor, where its items are listed, and of their types how
+# many layers each takes (point, colours, colours with infrared, wave packets).
+_LAYERED: Final = 3
+_ITEMS_AT: Final = 32
+_LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
+_EXTRA_BYTES: Final = 14
 _MOST_FIXED_CHUNK: Final = 50_000_000
 _WORKER: Final = Path(__file__).with_name("las_worker.py")
 # Blocks that a process may be ahead.
@@ -57,11 +63,18 @@ _LARGEST_CHUNK: Final = 2 * BLOCK_POINTS
 _PROCESSES_MOST: Final = 16
 
 
-def open_las(path: Path, *, cores: int = 1) -> ScanFile:
-    """Open a LAS, LAZ or COPC file; so many processes may decode its points."""
+def open_las(path: Path, *, classes: Collection[int] = (), cores: int = 1) -> ScanFile:
+    """Open a LAS, LAZ or COPC file.
+
+    Args:
+        path: the file.
+        classes: only points of these classes are given; all when empty.
+        cores: processes that may decode its points.
+    """
     laspy = load_library("laspy", path)
     _check_header(path)
-    with reading(path, FORMAT), laspy.open(path) as reader:
+    # Records behind the points are of no use here, and may claim any size.
+    with reading(path, FORMAT), laspy.open(path, read_evlrs=False) as reader:
         header = reader.header
         names = set(header.point_format.dimension_names)
         bounds = np.vstack([header.mins, header.maxs]).astype(np.float64)
@@ -74,6 +87,7 @@ def open_las(path: Path, *, cores: int = 1) -> ScanFile:
         if n_points > 0:
             _check_chunks(path, header)
     notes: list[str] = []
+    wanted = _Wanted(n_points=n_points, classes=frozenset(classes), cores=cores)
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
@@ -81,31 +95,40 @@ def open_las(path: Path, *, cores: int = 1) -> ScanFile:
         fields=point_fields(
             has_intensity="intensity" in names, has_rgb={"red", "green", "blue"} <= names
         ),
-        read=lambda: _blocks(path, laspy, n_points, bounds, notes, cores=cores),
+        read=lambda: _blocks(path, laspy, bounds, notes, wanted),
         details=details,
         notes=notes,
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Wanted:
+    """What is read of a file.
+
+    Attributes:
+        n_points: that its header states.
+        classes: of the points; empty for all.
+        cores: processes that may decode at the same time.
+    """
+
+    n_points: int
+    classes: frozenset[int]
+    cores: int
+
+
 def _blocks(
-    path: Path,
-    laspy: Any,
-    n_points: int,
-    bounds: NDArray[np.float64],
-    notes: list[str],
-    *,
-    cores: int,
+    path: Path, laspy: Any, bounds: NDArray[np.float64], notes: list[str], wanted: _Wanted
 ) -> Iterator[PointBlock]:
     n_read = 0
     n_outside = 0
-    for chunk in guarded(_records(path, laspy, cores=cores), path, FORMAT):
+    for chunk in guarded(_records(path, laspy, wanted), path, FORMAT):
         with reading(path, FORMAT):
-            block = _block(chunk)
+            block = _block(chunk, wanted.classes)
         n_read += block.n_read
         n_outside += _outside(path, block, bounds)
         yield block
-    if n_read != n_points:
-        raise short_file_error(path, "data", f"{n_read} points", f"{n_points}")
+    if n_read != wanted.n_points:
+        raise short_file_error(path, "data", f"{n_read} points", f"{wanted.n_points}")
     if n_outside:
         notes.append(
             f"{path.name}: {n_outside} points lie outside the bounds its header states; they are "
@@ -113,7 +136,7 @@ def _blocks(
         )
 
 
-def _block(chunk: Any) -> PointBlock:
+def _block(chunk: Any, classes: frozenset[int]) -> PointBlock:
     axes = _coordinates(chunk)
     points = axes.T
     names = set(chunk.point_format.dimension_names)
@@ -130,16 +153,19 @@ def _block(chunk: Any) -> PointBlock:
         bounds=_bounds(axes),
     )
     flags = chunk.withheld
-    if not np.bitwise_or.reduce(flags.array) & flags.bit_mask:
+    if not (classes or np.bitwise_or.reduce(flags.array) & flags.bit_mask):
         return block
     withheld = np.asarray(flags, dtype=np.bool_)
     kept = ~withheld
+    if classes:
+        kept &= np.isin(np.asarray(chunk.classification), list(classes))
     axes = axes[:, kept]
     return PointBlock(
         points=axes.T,
         scan=0,
         n_read=len(points),
         n_withheld=int(withheld.sum()),
+        n_unwanted=int((~kept & ~withheld).sum()),
         intensity=None if intensity is None else intensity[kept],
         rgb=None if rgb is None else rgb[kept],
         bounds=_bounds(axes),
@@ -249,10 +275,38 @@ def _check_chunks(path: Path, header: Any) -> None:
     ):
         raise _damaged(path, f"its chunks are said to hold {compression.chunk_size()} points each")
     n_points = sum(count for count, _ in table)
+    if _is_layered(record):
+        _check_layers(path, record, start + _OFFSET_BYTES, [size for _, size in table])
     if n_points < header.point_count or (is_variable and n_points != header.point_count):
         raise _damaged(
             path, f"its chunks hold {n_points} points, its header states {header.point_count}"
         )
+
+
+def _is_layered(record: bytes) -> bool:
+    return bool(struct.unpack_from("<H", record)[0] == _LAYERED)
+
+
+def _check_layers(path: Path, record: bytes, start: int, chunks: list[int]) -> None:
+    """Compare the layers of each chunk with its size: the decompressor makes room for them first.
+
+    A chunk of point formats 6 and up is its first point, the number of its points, the size of
+    each layer, and the layers.
+    """
+    (n_items,) = struct.unpack_from("<H", record, _ITEMS_AT)
+    items = [struct.unpack_from("<HH", record, _ITEMS_AT + 2 + 6 * k) for k in range(n_items)]
+    if not all(kind in _LAYERS or kind == _EXTRA_BYTES for kind, _ in items):
+        raise _damaged(path, "its compression is none of point formats 6 and up")
+    n_layers = sum(size if kind == _EXTRA_BYTES else _LAYERS[kind] for kind, size in items)
+    sizes = struct.Struct(f"<I{n_layers}I")
+    n_head = sum(size for _, size in items) + sizes.size
+    with path.open("rb") as file:
+        for n_bytes in chunks:
+            file.seek(start + n_head - sizes.size)
+            raw = file.read(sizes.size)
+            if len(raw) < sizes.size or n_head + sum(sizes.unpack(raw)[1:]) != n_bytes:
+                raise _damaged(path, "the layers of its chunks are not as large as they are said")
+            start += n_bytes
 
 
 def _check_size(path: Path, file: Any, start: int, n_points: int) -> int:
@@ -292,17 +346,19 @@ class _Layout:
     Attributes:
         step: points of a block; whole chunks.
         start: of the compressed points in the file, bytes.
+        has_classes: whether the classes of the points are decoded, too.
         record: description of the compression, as the file has it.
         point_bytes: of a point that is not compressed.
     """
 
     step: int
     start: int
+    has_classes: bool
     record: bytes
     point_bytes: int
 
 
-def _records(path: Path, laspy: Any, *, cores: int) -> Iterator[Any]:
+def _records(path: Path, laspy: Any, wanted: _Wanted) -> Iterator[Any]:
     """Give laspy's records of up to `BLOCK_POINTS` points each, in the order of the file.
 
     A record is to be done with before the next one is asked for.
@@ -310,26 +366,27 @@ def _records(path: Path, laspy: Any, *, cores: int) -> Iterator[Any]:
     Args:
         path: the file; its header and chunk table have been checked.
         laspy: the library.
-        cores: processes that may decode at the same time.
+        wanted: what is read of it.
 
     Raises:
         BaseException: whatever the library throws at a damaged file.
     """
-    fields = laspy.DecompressionSelection
-    wanted = fields.base().decompress_z().decompress_flags()
-    wanted = wanted.decompress_intensity().decompress_rgb()
-    with laspy.open(path, decompression_selection=wanted) as reader:
+    fields = laspy.DecompressionSelection.base().decompress_z().decompress_flags()
+    fields = fields.decompress_intensity().decompress_rgb()
+    if wanted.classes:
+        fields = fields.decompress_classification()
+    with laspy.open(path, decompression_selection=fields, read_evlrs=False) as reader:
         # Where memory cannot be shared without a name, this process decodes all by itself.
-        is_shared_out = cores > 1 and hasattr(os, "memfd_create")
-        layout = _layout(path, reader.header) if is_shared_out else None
+        is_shared_out = wanted.cores > 1 and hasattr(os, "memfd_create")
+        layout = _layout(path, reader.header, wanted) if is_shared_out else None
         if layout is None:
             yield from reader.chunk_iterator(BLOCK_POINTS)
         else:
-            n_processes = min(cores, _PROCESSES_MOST)
+            n_processes = min(wanted.cores, _PROCESSES_MOST)
             yield from _decoded_elsewhere(path, laspy, reader.header, layout, n_processes)
 
 
-def _layout(path: Path, header: Any) -> _Layout | None:
+def _layout(path: Path, header: Any, wanted: _Wanted) -> _Layout | None:
     """How to share a file out; None for small files, and where blocks cannot begin at a chunk."""
     if not header.are_points_compressed or header.point_count < _BLOCKS_LEAST * BLOCK_POINTS:
         return None
@@ -341,6 +398,7 @@ def _layout(path: Path, header: Any) -> _Layout | None:
     return _Layout(
         step=size * max(1, BLOCK_POINTS // size),
         start=int(header.offset_to_point_data),
+        has_classes=bool(wanted.classes),
         record=record,
         point_bytes=int(header.point_format.size),
     )
@@ -360,7 +418,7 @@ class _Decoder:
             self._process = subprocess.Popen(
                 [
                     *(sys.executable, "-P", str(_WORKER), str(path), str(shared)),
-                    *(str(layout.start), layout.record.hex()),
+                    *(str(layout.start), str(int(layout.has_classes)), layout.record.hex()),
                     *(str(slot_bytes), str(layout.step), str(layout.point_bytes)),
                     *(str(first), str(stride), str(n_points)),
                 ],

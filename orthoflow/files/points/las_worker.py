@@ -13,7 +13,7 @@ import sys
 
 def main() -> None:
     """Decode until there are no more blocks, or nobody asks for them."""
-    path, shared, start, record, *numbers = sys.argv[1:]
+    path, shared, start, has_classes, record, *numbers = sys.argv[1:]
     slot_bytes, step, point_bytes, first, stride, n_points = (int(text) for text in numbers)
     try:
         lazrs = importlib.import_module("lazrs")
@@ -24,6 +24,7 @@ def main() -> None:
             | lazrs.SELECTIVE_DECOMPRESS_FLAGS
             | lazrs.SELECTIVE_DECOMPRESS_INTENSITY
             | lazrs.SELECTIVE_DECOMPRESS_RGB
+            | int(has_classes) * lazrs.SELECTIVE_DECOMPRESS_CLASSIFICATION
         )
         with open(path, "rb") as source:  # noqa: PTH123 - pathlib would take longer than the rest
             source.seek(int(start))

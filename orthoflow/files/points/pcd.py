@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import (
     BLOCK_POINTS,
+    MOST_FIELDS,
     PointBlock,
     ScanFile,
     point_fields,
@@ -227,6 +228,8 @@ def _read_header(path: Path) -> PcdHeader:
 def _parse_header(entries: Mapping[str, list[str]], n_bytes: int) -> PcdHeader:
     fields = entries["FIELDS"]
     counts = [int(item) for item in entries.get("COUNT", ["1"] * len(fields))]
+    if sum(max(count, 1) for count in counts) > MOST_FIELDS:
+        raise ValueError(f"a point has more than {MOST_FIELDS} fields")
     kinds = [
         "<" + _KINDS[kind.upper()] + str(int(size))
         for kind, size in zip(entries["TYPE"], entries["SIZE"], strict=True)

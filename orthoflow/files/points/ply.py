@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -13,13 +12,15 @@ import numpy as np
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import (
     BLOCK_POINTS,
+    MOST_FIELDS,
+    MOST_POINTS,
     PointBlock,
     ScanFile,
     point_fields,
     short_file_error,
 )
 from orthoflow.files.points.columns import Columns, columns_of_header, point_block
-from orthoflow.files.points.tables import Layout, read_table
+from orthoflow.files.points.tables import Layout, read_table, take_lines
 
 FORMAT: Final = "PLY"
 _TYPES: Final = {
@@ -137,8 +138,10 @@ def _text_blocks(
     n_skipped = sum(element.count for element in header.elements[: header.vertex_position])
     with path.open("rb") as file:
         line = file.read(header.n_bytes).count(b"\n") + n_skipped + 1
-        for _ in islice(file, n_skipped):
-            pass
+        for start in range(0, n_skipped, BLOCK_POINTS):
+            count = min(BLOCK_POINTS, n_skipped - start)
+            if len(take_lines(file, count, first_line=line - n_skipped + start)) != count:
+                raise short_file_error(path, "elements", "fewer lines", str(n_skipped))
         for start in range(0, vertex.count, BLOCK_POINTS):
             count = min(BLOCK_POINTS, vertex.count - start)
             table = read_table(
@@ -167,7 +170,14 @@ def _skip_binary(path: Path, file: BinaryIO, element: Element, byte_order: str) 
                 raise short_file_error(
                     path, f"element {element.name}", "fewer entries", str(element.count)
                 )
-            file.seek(int(np.frombuffer(raw, length)[0]) * np.dtype(kind[1]).itemsize, 1)
+            n_items = int(np.frombuffer(raw, length)[0])
+            if n_items < 0:
+                # Back and forth in a file of a hundred bytes, as often as the header likes.
+                raise InputError(
+                    f"{path.name} is damaged: element {element.name} has a list of {n_items} "
+                    "entries; export it again"
+                )
+            file.seek(n_items * np.dtype(kind[1]).itemsize, 1)
 
 
 def _read_header(path: Path) -> PlyHeader:
@@ -196,9 +206,14 @@ def _parse_header(lines: list[list[str]]) -> tuple[str, tuple[Element, ...]]:
         if words[0] == "format":
             byte_order = _BYTE_ORDERS[words[1]]
         elif words[0] == "element":
-            elements.append(Element(name=words[1], count=int(words[2]), properties=(), types=()))
+            count = int(words[2])
+            if not 0 <= count < MOST_POINTS:
+                raise ValueError(f"element {words[1]} has {count} entries")
+            elements.append(Element(name=words[1], count=count, properties=(), types=()))
         elif words[0] == "property":
             element = elements[-1]
+            if len(element.properties) == MOST_FIELDS:
+                raise ValueError(f"element {element.name} has more than {MOST_FIELDS} properties")
             kind: str | tuple[str, str] = (
                 (_TYPES[words[2]], _TYPES[words[3]]) if words[1] == "list" else _TYPES[words[1]]
             )

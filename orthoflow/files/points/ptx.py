@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -20,7 +19,7 @@ from orthoflow.files.points.blocks import (
     short_file_error,
 )
 from orthoflow.files.points.columns import Columns, point_block
-from orthoflow.files.points.tables import Layout, count_lines, find_layout, read_table
+from orthoflow.files.points.tables import Layout, count_lines, find_layout, read_table, take_lines
 
 FORMAT: Final = "PTX"
 HEADER_LINES: Final = 10
@@ -53,7 +52,8 @@ def open_ptx(path: Path) -> ScanFile:
     """Open a PTX file."""
     with path.open("rb") as file:
         _read_header(path, file, 1)
-        layout = _layout(path, file.readline())
+        (points,) = take_lines(file, 1, first_line=HEADER_LINES + 1) or (b"",)
+        layout = _layout(path, points)
     columns = Columns(names=tuple(_COLUMNS[layout.n_columns].split()), rule="format")
     return ScanFile(
         name=path.name,
@@ -120,7 +120,8 @@ def _placed(
 
 def _read_header(path: Path, file: BinaryIO, line: int) -> ScanHeader | None:
     """Header of the next scan, or None at the end of the file."""
-    lines = [item.decode("ascii", "replace") for item in islice(file, HEADER_LINES)]
+    raw = take_lines(file, HEADER_LINES, first_line=line)
+    lines = [item.decode("ascii", "replace") for item in raw]
     if line > 1 and not "".join(lines).strip():
         return None
     try:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -15,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
+from orthoflow.files.points.blocks import MOST_LINE_BYTES
 
 _NUMBER: Final = re.compile(
     r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE
 )
 _COMMENTS: Final = (b"#", b"//")
 _SCAN_BYTES: Final = 1 << 24
+_LINES_AT_ONCE: Final = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +68,7 @@ def find_layout(line: str) -> Layout | None:
 def numbers_of(line: str, layout: Layout) -> list[float]:
     """Numbers of a line; NaN for a field that is none."""
     return [
-        float(field.replace(layout.decimal, ".")) if _NUMBER.fullmatch(field) else float("nan")
+        _number(field.replace(layout.decimal, ".")) if _NUMBER.fullmatch(field) else math.nan
         for field in _fields(line, layout)
     ]
 
@@ -78,6 +82,27 @@ def count_lines(path: Path) -> int:
             lines += block.count(b"\n")
             last = block[-1:]
     return lines + (last != b"\n")
+
+
+def take_lines(file: BinaryIO, n_lines: int, *, first_line: int) -> list[bytes]:
+    """Read the next lines of a file, at most so many; never more of a line than it may have.
+
+    Raises:
+        InputError: a line is longer than `MOST_LINE_BYTES`.
+    """
+    lines: list[bytes] = []
+    pieces = iter(partial(file.readline, MOST_LINE_BYTES + 1), b"")
+    # Some at a time: what is one line of gigabytes is noticed before it is all in memory.
+    while part := list(islice(pieces, min(_LINES_AT_ONCE, n_lines - len(lines)))):
+        if max(map(len, part)) > MOST_LINE_BYTES:
+            place = next(place for place, line in enumerate(part) if len(line) > MOST_LINE_BYTES)
+            raise InputError(
+                f"{Path(file.name).name}, line {first_line + len(lines) + place}: the line has "
+                f"more than {MOST_LINE_BYTES} bytes, so this is no list of points; export the "
+                "file again"
+            )
+        lines += part
+    return lines
 
 
 def read_table(
@@ -99,7 +124,7 @@ def read_table(
     Raises:
         InputError: a line holds something else than numbers.
     """
-    lines = list(islice(file, n_lines))
+    lines = take_lines(file, n_lines, first_line=first_line)
     try:
         return _parse(lines, layout, columns)
     except ValueError as error:
@@ -171,6 +196,11 @@ def _fits(text: str, layout: Layout, columns: Sequence[int]) -> bool:
     fields = _fields(text, layout)
     wanted = [fields[column] for column in columns if column < len(fields)]
     return len(fields) <= layout.n_columns and _are_numbers([item for item in wanted if item])
+
+
+def _number(text: str) -> float:
+    """Number of a text; NaN where it has a decimal comma that the first lines do not have."""
+    return math.nan if "," in text else float(text)
 
 
 def _fields(line: str, layout: Layout) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -30,6 +29,7 @@ from orthoflow.files.points.tables import (
     numbers_of,
     read_tables,
     split_fields,
+    take_lines,
 )
 
 FORMAT: Final = "text"
@@ -80,8 +80,7 @@ def open_text(path: Path, columns: Columns | None = None) -> ScanFile:
 def _blocks(path: Path, head: TextHead) -> Iterator[PointBlock]:
     n_read = 0
     with path.open("rb") as file:
-        for _ in islice(file, head.n_header_lines):
-            pass
+        take_lines(file, head.n_header_lines, first_line=1)
         tables = read_tables(
             file,
             head.layout,
@@ -123,7 +122,7 @@ def _read_head(path: Path, columns: Columns | None) -> TextHead:
 
 def _first_lines(path: Path) -> list[str]:
     with path.open("rb") as file:
-        raw = list(islice(file, HEADER_LINES + SAMPLE_LINES))
+        raw = take_lines(file, HEADER_LINES + SAMPLE_LINES, first_line=1)
     if raw and raw[0].startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError(f"{path.name} is UTF-16 text: save it as UTF-8 or plain ASCII")
     if any(b"\0" in line for line in raw):

@@ -123,6 +123,109 @@
     choose();
   }
 
+  // Orthoimages tell what lies under the cursor, and clicks are collected as check points or ties.
+  for (const panel of document.querySelectorAll("[data-points]")) {
+    const places = JSON.parse(document.getElementById(panel.dataset.points).textContent);
+    const photos = panel.querySelector("datalist").id;
+    const part = Object.fromEntries(
+      [...panel.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
+    const points = [];
+    const under = (place, image, event) => {
+      const box = image.getBoundingClientRect();
+      const x = (event.clientX - box.left - image.clientLeft) / image.clientWidth;
+      const y = (event.clientY - box.top - image.clientTop) / image.clientHeight;
+      if (!(x >= 0 && x < 1 && y >= 0 && y < 1)) return null;
+      const u = x * place.width, v = y * place.height;
+      const known = place.mm.length > 0
+        ? place.mm[Math.floor(y * place.rows) * place.columns + Math.floor(x * place.columns)] : null;
+      const depth = known === null ? NaN : known / 1000;
+      const world = [0, 1, 2].map((axis) => place.origin[axis]
+        + place.gsd * (u * place.u[axis] + v * place.v[axis]) + (known === null ? 0 : depth) * place.n[axis]);
+      return { wall: place.wall, u, v, depth, world };
+    };
+    const words = (point) => `u ${point.u.toFixed(1)} px, v ${point.v.toFixed(1)} px, depth ${
+      Number.isNaN(point.depth) ? "unknown (the plane is taken)" : `${point.depth.toFixed(3)} m`}, x ${
+      point.world.map((value) => value.toFixed(3)).join(", ")} m`;
+    const field = (label, size, list) => {
+      const input = document.createElement("input");
+      input.setAttribute("aria-label", label);
+      input.placeholder = label;
+      input.size = size;
+      if (list) input.setAttribute("list", list);
+      return input;
+    };
+    const update = () => {
+      part.checkpoints.disabled = part.ties.disabled = points.length === 0;
+      part.told.textContent = "";
+    };
+    const collect = (point) => {
+      const row = document.createElement("div");
+      const number = 1 + Math.max(0, ...points.map((other) => other.number));
+      const name = field(`name of point ${number}`, 8);
+      name.value = `P${number}`;
+      const entry = { ...point, number, name, photo: field(`photo of point ${number}`, 12, photos),
+        photoU: field("u in the photo", 8), photoV: field("v in the photo", 8) };
+      const remove = document.createElement("button");
+      remove.type = "button";
+      remove.textContent = "remove";
+      remove.setAttribute("aria-label", `remove point ${number}`);
+      remove.addEventListener("click", () => {
+        points.splice(points.indexOf(entry), 1);
+        row.remove();
+        update();
+      });
+      const told = document.createElement("span");
+      told.textContent = `wall ${point.wall}, ${words(point)}`;
+      row.append(name, told, entry.photo, entry.photoU, entry.photoV, remove);
+      part.list.append(row);
+      points.push(entry);
+      update();
+    };
+    const cell = (value) => {
+      const text = typeof value === "number" ? String(Number(value.toFixed(4))) : value.trim();
+      return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+    };
+    const save = (file, header, rows) => {
+      const lines = [header, ...rows.map((row) => row.map(cell))].map((row) => row.join(","));
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(new Blob([`${lines.join("\n")}\n`], { type: "text/csv" }));
+      link.download = file;
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+    };
+    part.checkpoints.addEventListener("click", () => {
+      save("checkpoints.csv", ["name", "x", "y", "z", "wall", "u_px", "v_px"],
+        points.map((point) => [point.name.value, ...point.world, point.wall, point.u, point.v]));
+      part.told.textContent = `${points.length} check points`;
+    });
+    part.ties.addEventListener("click", () => {
+      const isNumber = (input) => input.value.trim() !== "" && Number.isFinite(Number(input.value));
+      const whole = points.filter((point) =>
+        point.photo.value.trim() && isNumber(point.photoU) && isNumber(point.photoV));
+      const left = points.length - whole.length;
+      const lacking = left ? `; ${left} points lack a photo or where it shows them, and are left out` : "";
+      part.told.textContent = `${whole.length} ties${lacking}`;
+      if (whole.length) save("ties.csv", ["photo", "u_px", "v_px", "x", "y", "z"], whole.map((point) =>
+        [point.photo.value, Number(point.photoU.value), Number(point.photoV.value), ...point.world]));
+    });
+    for (const place of places) {
+      const figure = document.getElementById(place.id);
+      const image = figure.querySelector("img");
+      const readout = document.createElement("output");
+      readout.className = "readout";
+      readout.textContent = "move over the picture for coordinates";
+      figure.querySelector("figcaption").append(readout);
+      image.addEventListener("pointermove", (event) => {
+        const point = under(place, image, event);
+        if (point) readout.textContent = words(point);
+      });
+      image.addEventListener("click", (event) => {
+        const point = under(place, image, event);
+        if (point) collect(point);
+      });
+    }
+  }
+
   // On paper nothing can be unfolded.
   let folded = [];
   addEventListener("beforeprint", () => {

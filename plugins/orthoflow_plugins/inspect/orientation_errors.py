@@ -199,7 +199,8 @@ def tie_errors_cells(ties: Ties, walls: Walls, truth: Truth) -> NDArray[np.float
             axes = np.vstack([frame.u_world, frame.v_world])
             off_px = ties.pixels_photo[mine] - camera.project(points)[:, :2]
             pixels_by_plane = pixels_by_point(camera, points) @ axes.T
-            seen = np.isfinite(off_px).all(axis=1) & (np.linalg.det(pixels_by_plane) != 0.0)
+            seen = np.asarray(np.isfinite(off_px).all(axis=1), dtype=np.bool_)
+            seen[seen] = np.linalg.det(pixels_by_plane[seen]) != 0.0
             off_m = np.linalg.solve(pixels_by_plane[seen], off_px[seen, :, None])[:, :, 0]
             errors[mine[seen]] = np.linalg.norm(off_m, axis=1) / frame.gsd_m
     return errors

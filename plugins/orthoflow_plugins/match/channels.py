@@ -95,12 +95,14 @@ class WallTarget:
         grey: its intensity, NaN where it has no depth; None where it shows nothing.
         channels: of its intensity, by content, as far as they were needed.
         textures: of these channels, likewise.
+        grains: as `grain_of` gives them, by half the width of a patch.
     """
 
     wall: Wall
     grey: NDArray[np.float32] | None
     channels: dict[str, Channels] = field(default_factory=dict)
     textures: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    grains: dict[int, NDArray[np.float32]] = field(default_factory=dict)
     lock: Lock = field(default_factory=Lock)
 
     def prepare(self, content: str, half_patch_cells: int) -> None:
@@ -111,6 +113,8 @@ class WallTarget:
             channels = CHANNELS[content](self.grey)
             self.textures[content] = texture(channels, half_patch_cells=half_patch_cells)
             self.channels[content] = channels
+            if half_patch_cells not in self.grains:
+                self.grains[half_patch_cells] = grain_of(self.wall, half_patch_cells)
 
 
 def target_of(wall: Wall) -> WallTarget:
@@ -119,6 +123,20 @@ def target_of(wall: Wall) -> WallTarget:
         return WallTarget(wall=wall, grey=None)
     grey = np.where(np.isfinite(wall.depth_m), wall.intensity, np.nan).astype(np.float32)
     return WallTarget(wall=wall, grey=grey)
+
+
+def grain_of(wall: Wall, half_patch_cells: int) -> NDArray[np.float32]:
+    """How many cells share one measured cell around each cell (rows, cols), at least 1.
+
+    What fills a gap follows from the cells about it and errs with them: a patch tells no more than
+    its measured cells do.
+    """
+    import cv2
+
+    side = (2 * half_patch_cells + 1,) * 2
+    known = cv2.blur(np.isfinite(wall.depth_m).astype(np.float32), side)
+    measured = cv2.blur((wall.count > 0).astype(np.float32), side)
+    return np.asarray(np.maximum(1.0, known / np.maximum(measured, 1e-3)), dtype=np.float32)
 
 
 def texture(channels: Channels, *, half_patch_cells: int) -> NDArray[np.float32]:

@@ -11,8 +11,9 @@ from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
-from orthoflow_plugins.match.pictures import photo_grey, require_intensity, require_photos
+from orthoflow_plugins.match.pictures import photo_grey, require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, ties_of
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ class MatchGuided(Method):
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.3",
@@ -85,11 +86,12 @@ class MatchGuided(Method):
         )
 
     class In(Ports):
-        """Photos, the rastered walls, and where the photos were taken, roughly."""
+        """Photos, the walls, where the photos were taken, roughly, and ties measured by hand."""
 
         photos: Photos
         walls: Walls
         cameras: Cameras
+        hand: Ties | None = None
 
     class Out(Ports):
         """Points of the photos known on the walls."""
@@ -104,10 +106,13 @@ class MatchGuided(Method):
 
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
-        require_intensity(walls)
+        alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
+        if alone is not None:
+            return self.Out(ties=alone)
         oriented = _oriented(inputs.cameras)
         if params.preset == "paper":
-            return self.Out(ties=_masked(photos, walls, oriented, ctx))
+            ties = _masked(photos, walls, oriented, ctx)
+            return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
         ctx.progress(0.0, "walls")
         targets = [target_of(wall) for wall in walls.walls]
         indices = [k for k, photo in enumerate(photos.photos) if photo.name in oriented]
@@ -145,7 +150,7 @@ class MatchGuided(Method):
             },
         )
         _report(ctx, ties, traces)
-        return self.Out(ties=ties)
+        return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
 
     @classmethod
     def tools(cls) -> dict[str, str]:

@@ -57,6 +57,16 @@ class PairingRule:
     is_exact: bool = True
 
 
+USUAL_RULE: Final = PairingRule(
+    features=FeatureRule(n_most=8000, contrast_threshold=0.02, edge_threshold=10.0),
+    ratio_most=0.85,
+    n_verified_least=8,
+    longest_side_px=4000,
+    clip_limit=3.0,
+)
+"""As `match.sift` has them, for methods that look for photos on walls besides."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pair:
     """Matches of a photo with one wall.
@@ -136,6 +146,36 @@ def pair_photo(
     second = seeker.pairs(key_points, _shown(first, walls))
     best = second if second.n_verified > first.n_verified else first
     return _completed(best, walls, rule)
+
+
+def side_matches(
+    grey: NDArray[np.uint8], walls: Sequence[Features | None], rule: PairingRule
+) -> NDArray[np.intp]:
+    """Count the matches that agree when walls are seen from the front, and from behind.
+
+    A wall whose normal points away from the viewer is a mirror image of what the photo shows.
+
+    Args:
+        grey: (height, width) of the photo.
+        walls: key points per wall, None where it shows nothing or is not asked about.
+        rule: how.
+
+    Returns:
+        (walls, 2): front, behind; 0 where fewer than the rule's least agree.
+    """
+    seeker = _Seeker(grey=grey, rule=rule)
+    counts = np.zeros((len(walls), 2), dtype=np.intp)
+    scale = min(seeker.finest, _FIRST_SIDE_PX / max(grey.shape))
+    while True:
+        # All key points: a wall that was laid on cells roughly shares few of the strongest.
+        features = seeker.key_points(scale).features
+        for side, seen in enumerate((features, features.mirrored(grey.shape[1]))):
+            for pair in seeker.pairs(_KeyPoints(features=seen, scale=scale), walls).pairs:
+                if pair.is_shown:
+                    counts[pair.wall, side] = max(counts[pair.wall, side], pair.agreeing.sum())
+        if counts.any() or scale >= seeker.finest:
+            return counts
+        scale = min(seeker.finest, 2.0 * scale)
 
 
 @dataclass(frozen=True, kw_only=True)

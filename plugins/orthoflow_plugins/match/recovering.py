@@ -19,8 +19,8 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.products import Camera, Photo, Photos, Wall
 from orthoflow_plugins.match.channels import WallTarget
-from orthoflow_plugins.match.features import FeatureRule, Features
-from orthoflow_plugins.match.pairing import PairingRule, PhotoPairs, pair_photo, wall_features
+from orthoflow_plugins.match.features import Features
+from orthoflow_plugins.match.pairing import USUAL_RULE, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.pictures import photo_grey
 from orthoflow_plugins.match.tie_pieces import key_point_ties
 from orthoflow_plugins.match.tracing import Trace, TracingRule, trace_photo
@@ -30,14 +30,6 @@ _AGREEING_LEAST: Final = 24
 _POSE_LIMIT_SHARE: Final = 0.002
 _POSE_TRIALS: Final = 2000
 _SEED: Final = 1
-# As `match.sift` has them.
-_SEEKING: Final = PairingRule(
-    features=FeatureRule(n_most=8000, contrast_threshold=0.02, edge_threshold=10.0),
-    ratio_most=0.85,
-    n_verified_least=8,
-    longest_side_px=4000,
-    clip_limit=3.0,
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +111,7 @@ def painted_walls(traces: Sequence[Trace], walls: Sequence[Wall]) -> list[Painte
             part = grey[projection.part]
             part[np.isfinite(shown)] = shown[np.isfinite(shown)]
         as_shown = replace(wall, intensity=grey / np.float32(255.0))
-        features = wall_features(as_shown, _SEEKING) if np.isfinite(grey).any() else None
+        features = wall_features(as_shown, USUAL_RULE) if np.isfinite(grey).any() else None
         painted.append(PaintedWall(wall=as_shown, features=features))
     return painted
 
@@ -136,7 +128,7 @@ def recovered_pose(
         painted: the walls.
         lens: its interior orientation, roughly; the pose is ignored.
     """
-    pairs = pair_photo(grey, [each.features for each in painted], _SEEKING)
+    pairs = pair_photo(grey, [each.features for each in painted], USUAL_RULE)
     if pairs.n_verified < _AGREEING_LEAST:
         return None
     pixels, points = _agreeing(pairs, painted)

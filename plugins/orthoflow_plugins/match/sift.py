@@ -11,10 +11,11 @@ from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import FeatureRule, Features
+from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features
-from orthoflow_plugins.match.pictures import photo_grey, require_intensity, require_photos
+from orthoflow_plugins.match.pictures import photo_grey, require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
 
@@ -87,10 +88,11 @@ class MatchSift(Method):
         )
 
     class In(Ports):
-        """The photos and the rastered walls."""
+        """The photos, the rastered walls, and ties measured by hand."""
 
         photos: Photos
         walls: Walls
+        hand: Ties | None = None
 
     class Out(Ports):
         """Points of the photos known on the walls."""
@@ -101,9 +103,12 @@ class MatchSift(Method):
         """Match every photo with every wall."""
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
-        require_intensity(walls)
+        alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
+        if alone is not None:
+            return self.Out(ties=alone)
         if params.preset == "paper":
-            return self.Out(ties=_paper(photos, walls, ctx))
+            ties = _paper(photos, walls, ctx)
+            return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
         rule = _rule(params)
         ctx.progress(0.0, "key points of the walls")
         on_walls = list(one_by_one(lambda wall: wall_features(wall, rule), walls.walls, ctx.cores))
@@ -126,7 +131,7 @@ class MatchSift(Method):
             search_radius_px=tuple(radii_px),
         )
         _report(ctx, ties, on_walls)
-        return self.Out(ties=ties)
+        return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
 
     @classmethod
     def tools(cls) -> dict[str, str]:

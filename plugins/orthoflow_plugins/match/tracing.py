@@ -214,7 +214,8 @@ def _measured(
         moved = measure(channels, CHANNELS[content](grey), places, search)
         n_measured += len(moved.places)
         moved = moved.take(_agrees_around(moved))
-        pieces.append(_piece(view.photo, index, target.wall, (moved, projection)))
+        grain = target.grains[rule.half_patch_cells][projection.part]
+        pieces.append(_piece(view.photo, index, target.wall, (moved, projection), grain))
     pieces.sort(key=lambda piece: piece.wall)
     return _Round(
         pieces=pieces,
@@ -223,12 +224,20 @@ def _measured(
     )
 
 
-def _piece(photo: int, index: int, wall: Wall, found: tuple[Displacements, Projection]) -> TiePiece:
+def _piece(
+    photo: int,
+    index: int,
+    wall: Wall,
+    found: tuple[Displacements, Projection],
+    grain: NDArray[np.float32],
+) -> TiePiece:
+    """Ties of one photo with one wall; residuals agree over the cells of a grain."""
     moved, projection = found
     at = moved.places + moved.shift_cells
     pixels = np.column_stack([_between(projection.u, at), _between(projection.v, at)])
     points = points_on_wall(wall, moved.places + projection.corner + np.float64(0.5))
-    sigma_cells = np.hypot(moved.sigma_cells, _SIGMA_FLOOR_CELLS)
+    per_independent = np.sqrt(grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64))
+    sigma_cells = np.hypot(moved.sigma_cells * per_independent, _SIGMA_FLOOR_CELLS)
     piece = TiePiece(
         photo=photo,
         wall=index,

@@ -41,24 +41,51 @@ class _Scene:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Blocks:
+    """Blocks of about as many cells each, laid out the same from either end of each side.
+
+    Attributes:
+        rows: first row of each block, and the row after the last one.
+        columns: the same of columns.
+    """
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+
+    @classmethod
+    def over(cls, shape: tuple[int, int], side_cells: int) -> Blocks:
+        """Cut a raster into blocks with sides of about so many cells, at most."""
+        rows, columns = (_symmetric_edges(length, side_cells) for length in shape)
+        return cls(rows=rows, columns=columns)
+
+
+def _symmetric_edges(length: int, part: int) -> NDArray[np.int64]:
+    n_parts = -(-length // part)
+    # A middle of one cell belongs to neither half: it takes a part of its own in their middle.
+    n_parts += length % 2 * (1 - n_parts % 2)
+    half = np.arange(n_parts // 2 + 1) * length // n_parts
+    return np.concatenate([half, (length - half[::-1])[1 - n_parts % 2 :]])
+
+
+@dataclass(frozen=True, kw_only=True)
 class CutLabels:
     """Which layer a cut gives each cell.
 
     Attributes:
-        small: (rows, cols) int16 at the reduced scale, -1 where no layer paints.
-        factor: side of its squares in cells.
-        shape: rows and columns of the wall.
+        small: (rows, cols) int16 of the blocks, -1 where no layer paints.
+        blocks: which cells they are made of.
     """
 
     small: NDArray[np.int16]
-    factor: int
-    shape: tuple[int, int]
+    blocks: Blocks
 
     def in_rows(self, rows: slice) -> NDArray[np.int16]:
         """Layer (rows, cols) of the cells in some rows of the wall."""
-        squares = np.arange(*rows.indices(self.shape[0])) // self.factor
-        wide: NDArray[np.int16] = np.repeat(self.small[squares], self.factor, axis=1)
-        return wide[:, : self.shape[1]]
+        first_rows, first_columns = self.blocks.rows, self.blocks.columns
+        wanted = np.arange(*rows.indices(int(first_rows[-1])))
+        blocks = np.searchsorted(first_rows, wanted, side="right") - 1
+        wide: NDArray[np.int16] = np.repeat(self.small[blocks], np.diff(first_columns), axis=1)
+        return wide
 
 
 def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> CutLabels:
@@ -74,7 +101,8 @@ def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> CutLabels:
     """
     shape = layers[0].frame.shape
     factor = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS_MOST)))
-    scene = _reduced(layers, wall, factor)
+    blocks = Blocks.over((shape[0], shape[1]), factor)
+    scene = _reduced(layers, wall, blocks)
     labels = np.argmin(scene.views, axis=0)
     for _ in range(_SWEEPS):
         before = labels
@@ -83,27 +111,24 @@ def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> CutLabels:
         if np.array_equal(labels, before):
             break
     labels = np.where(scene.views.min(axis=0) < _FORBIDDEN, labels, -1)
-    return CutLabels(small=labels.astype(np.int16), factor=factor, shape=shape)
+    return CutLabels(small=labels.astype(np.int16), blocks=blocks)
 
 
-def _reduced(layers: Sequence[Layer], wall: Wall | None, factor: int) -> _Scene:
-    shape = layers[0].frame.shape
-    painted = np.stack(
-        [_means(partial(_painted_in, layer.mask), shape, factor) for layer in layers]
-    )
+def _reduced(layers: Sequence[Layer], wall: Wall | None, blocks: Blocks) -> _Scene:
+    painted = np.stack([_means(partial(_painted_in, layer.mask), blocks) for layer in layers])
     colours = np.stack(
         [
-            np.stack([_raster_means(layer.rgb[..., band], factor) for band in range(3)], axis=-1)
+            np.stack([_raster_means(layer.rgb[..., band], blocks) for band in range(3)], axis=-1)
             / np.maximum(share, 1e-3)[..., None]
             for layer, share in zip(layers, painted, strict=True)
         ]
     )
-    quality = np.stack([_raster_means(layer.quality, factor) for layer in layers])
+    quality = np.stack([_raster_means(layer.quality, blocks) for layer in layers])
     best = np.maximum(quality.max(axis=0), 1e-12)
     views = np.where(painted > 0.5, _VIEW_WEIGHT * (1.0 - quality / best), _FORBIDDEN)
     edges = np.zeros(views.shape[1:])
     if wall is not None:
-        steps = _means(partial(_depth_edges_in, wall.depth_m), shape, factor)
+        steps = _means(partial(_depth_edges_in, wall.depth_m), blocks)
         edges = np.where(steps > 0.0, _DEPTH_EDGE_COST, 0.0)
     return _Scene(colours=(colours / 255.0).astype(np.float32), views=views, edges=edges)
 
@@ -121,71 +146,69 @@ def _painted_in(mask: NDArray[np.uint8], rows: slice) -> NDArray[np.bool_]:
 
 
 def _depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool_]:
-    """The depth edges of some rows; the row below tells of the last one."""
-    edges = depth_edges(depth_m[rows.start : rows.stop + 1])
-    return edges[: rows.stop - rows.start]
+    """Cells of some rows on either side of a depth edge; the rows beside them tell of the rim."""
+    first = max(0, rows.start - 1)
+    around = depth_m[first : rows.stop + 1]
+    beside = depth_edges(around) | depth_edges(around[::-1, ::-1])[::-1, ::-1]
+    return beside[rows.start - first :][: rows.stop - rows.start]
 
 
 def _raster_means(
-    raster: NDArray[np.uint8] | NDArray[np.float32], factor: int
+    raster: NDArray[np.uint8] | NDArray[np.float32], blocks: Blocks
 ) -> NDArray[np.float64]:
-    return _means(lambda rows: raster[rows], (raster.shape[0], raster.shape[1]), factor)
+    return _means(lambda rows: raster[rows], blocks)
 
 
-def _means(
-    values: Callable[[slice], NDArray[np.generic]], shape: tuple[int, int], factor: int
-) -> NDArray[np.float64]:
-    """Means of squares of cells; those at the rim are of what is there.
-
-    Args:
-        values: gives those of some rows.
-        shape: rows and columns of the wall.
-        factor: side of a square.
-    """
-    parts: list[NDArray[np.float64]] = []
-    for part in row_bands(shape, multiple=factor):
-        known = values(part).astype(np.float64)
-        rows, columns = (-(-side // factor) * factor for side in known.shape)
-        padded = np.pad(
-            known, ((0, rows - known.shape[0]), (0, columns - known.shape[1])), mode="edge"
-        )
-        blocks = padded.reshape(rows // factor, factor, columns // factor, factor)
-        parts.append(blocks.mean(axis=(1, 3)))
-    return np.concatenate(parts)
+def _means(values: Callable[[slice], NDArray[np.generic]], blocks: Blocks) -> NDArray[np.float64]:
+    """Means (rows, cols) of the cells of each block; `values` gives those of some rows."""
+    rows, columns = blocks.rows, blocks.columns
+    means = np.empty((len(rows) - 1, len(columns) - 1))
+    # So many rows of blocks at once as make about a band.
+    for some in row_bands((len(means), int(columns[-1] * np.diff(rows).max()))):
+        first, last = rows[some.start], rows[some.stop]
+        known = values(slice(int(first), int(last))).astype(np.float64)
+        sums = np.add.reduceat(known, rows[some] - first, axis=0)
+        means[some] = np.add.reduceat(sums, columns[:-1], axis=1)
+    means /= np.outer(np.diff(rows), np.diff(columns))
+    return means
 
 
 def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:
     """Let one layer take over cells: the best of all such moves, by a minimum cut."""
-    from scipy.sparse import coo_array
+    from scipy.sparse import coo_array, csr_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
     count = labels.size
     source, sink = count, count + 1
     flat = labels.ravel()
     cells = np.arange(count)
-    # Unary costs of keeping (0) and of taking alpha (1).
-    keep = scene.views.reshape(len(scene.views), -1)[flat, cells].copy()
-    take = scene.views[alpha].ravel().copy()
+    # Unary costs of keeping (0) and of taking alpha (1). Whole numbers: none is lost in sums, so
+    # that it does not matter which of two neighbours is p.
+    views = np.rint(_UNITS * scene.views)
+    keep = views.reshape(len(views), -1)[flat, cells]
+    take = views[alpha].ravel().copy()
     starts, ends, between = [], [], []
     grid = cells.reshape(labels.shape)
     for one, other in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
         p, q = one.ravel(), other.ravel()
-        kept = _seam_cost(scene, p, q, flat[p], flat[q])
         right = _seam_cost(scene, p, q, flat[p], np.full(len(p), alpha))
         left = _seam_cost(scene, p, q, np.full(len(p), alpha), flat[q])
+        # Where a step over alpha costs less than the seam, a cut cannot tell, and the seam counts
+        # as much as the step.
+        kept = np.minimum(_seam_cost(scene, p, q, flat[p], flat[q]), right + left)
         # Kolmogorov and Zabih 2004: A + (C - A) p - C q + (B + C - A) (1 - p) q.
         np.add.at(take, p, left - kept)
         np.add.at(take, q, -left)
         starts.append(p)
         ends.append(q)
-        between.append(np.maximum(right + left - kept, 0.0))
+        between.append(right + left - kept)
     low = np.minimum(keep, take)
     starts += [np.full(count, source), cells]
     ends += [cells, np.full(count, sink)]
     # A cell on the sink's side takes alpha and cuts its link from the source.
     between += [take - low, keep - low]
     # Edges from p to q are cut where p keeps and q takes: p on the source's side.
-    capacity = np.minimum(np.concatenate(between), 4.0 * _FORBIDDEN) * _UNITS
+    capacity = np.minimum(np.concatenate(between), 4.0 * _FORBIDDEN * _UNITS)
     graph = coo_array(
         (
             np.rint(capacity).astype(np.int32),
@@ -194,7 +217,7 @@ def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[n
         shape=(count + 2, count + 2),
     ).tocsr()
     flow = maximum_flow(graph, source, sink).flow
-    rest = graph - flow
+    rest = csr_array(graph - flow)
     rest.data = np.maximum(rest.data, 0)
     rest.eliminate_zeros()
     reached = breadth_first_order(rest, source, return_predecessors=False)
@@ -211,7 +234,7 @@ def _seam_cost(
     label_p: NDArray[np.int64],
     label_q: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Cost (n,) of neighbours with these labels: 0 for equal ones."""
+    """Cost (n,) of neighbours with these labels, whole units: 0 for equal ones."""
     colours = scene.colours.reshape(len(scene.colours), -1, 3)
     views = scene.views.reshape(len(scene.views), -1)
     edges = scene.edges.ravel()
@@ -221,4 +244,4 @@ def _seam_cost(
         # Where only one of them paints there is nothing to compare, and no step to be seen.
         both = (views[label_p, cell] < _FORBIDDEN) & (views[label_q, cell] < _FORBIDDEN)
         cost = cost + np.where(both, apart, 0.0)
-    return np.where(label_p == label_q, 0.0, cost)
+    return np.where(label_p == label_q, 0.0, np.rint(_UNITS * cost))

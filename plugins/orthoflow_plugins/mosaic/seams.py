@@ -77,7 +77,7 @@ class MosaicSeams(Method):
     """
 
     id: ClassVar[str] = "mosaic.seams"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.4",

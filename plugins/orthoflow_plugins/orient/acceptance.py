@@ -10,11 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo
 from orthoflow_plugins.orient.estimation import Estimate
 from orthoflow_plugins.orient.layout import hull_area, image_cells, quadrant_counts
-from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
+from orthoflow_plugins.orient.wall_errors import KnownWall, WallError, wall_error
 
 _TIES_LEAST: Final = 8
 _SIDE_CHECK_LEAST: Final = 4
@@ -133,7 +134,7 @@ def too_few(n_ties: int) -> str:
 
 def reason_against(candidate: Candidate) -> str:
     """Say why an orientation is not `ok`; empty when it is."""
-    for gate in _GATES:
+    for gate in _GATES_BY_HAND if candidate.estimate.without_one else _GATES:
         reason = gate(candidate)
         if reason:
             return reason
@@ -264,9 +265,13 @@ def _in_front(candidate: Candidate) -> str:
     return ""
 
 
-def _covered(candidate: Candidate) -> str:
+def _shows_a_wall(candidate: Candidate) -> str:
     if candidate.error is None:
         return "with this pose the photo would show no wall that its ties lie on"
+    return ""
+
+
+def _covered(candidate: Candidate) -> str:
     if candidate.hull_ratio < candidate.rule.hull_ratio_least:
         return (
             f"the control covers {candidate.hull_ratio:.1%} of the part of the photo that shows "
@@ -301,8 +306,39 @@ _GATES: Final[tuple[Callable[[Candidate], str], ...]] = (
     _check_agrees,
     _spread,
     _in_front,
+    _shows_a_wall,
     _covered,
     _accurate,
+)
+
+
+def _checked_by_each_other(candidate: Candidate) -> str:
+    """Hold a pose from few ties to what it would be worth without any of them.
+
+    A wrong tie that the others cannot tell does no more harm than the pose without it is uncertain.
+    """
+    if candidate.gsd_m is None:
+        return ""
+    most_m = candidate.rule.sigma_corner_most_gsd * candidate.gsd_m
+    pixels = candidate.seen.pixels_photo[candidate.estimate.agreeing]
+    errors = [
+        wall_error(resection, candidate.known) for resection in candidate.estimate.without_one
+    ]
+    for (u, v), error in zip(to_opencv(pixels), errors, strict=True):
+        if error is not None and not error.rms_m <= most_m:
+            return (
+                f"without the tie at (u {u:.0f}, v {v:.0f}) its predicted error on the wall would "
+                f"be {1000 * error.rms_m:.1f} mm, at most {1000 * most_m:.1f} mm is allowed: were "
+                "that tie wrong, the others could not tell; measure more of them, farther apart"
+            )
+    return ""
+
+
+_GATES_BY_HAND: Final[tuple[Callable[[Candidate], str], ...]] = (
+    _in_front,
+    _shows_a_wall,
+    _accurate,
+    _checked_by_each_other,
 )
 
 

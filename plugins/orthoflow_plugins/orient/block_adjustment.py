@@ -30,7 +30,7 @@ from orthoflow_plugins.orient.estimation import (
 )
 from orthoflow_plugins.orient.lenses import LensGroups, intrinsics_of
 from orthoflow_plugins.orient.photo_ties import PhotoTies
-from orthoflow_plugins.orient.single_photo import TiedPhoto
+from orthoflow_plugins.orient.single_photo import ByHand, TiedPhoto
 
 _ROUNDS: Final = 5
 _TIE_SIGMA_START_PX: Final = 0.5
@@ -46,10 +46,12 @@ class Trusted:
     Attributes:
         tied: its ties.
         estimate: its orientation by itself.
+        hand: what the ties that a person measured make of it.
     """
 
     tied: TiedPhoto
     estimate: Estimate
+    hand: ByHand
 
 
 @dataclass(frozen=True, kw_only=True)

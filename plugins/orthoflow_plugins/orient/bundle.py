@@ -14,7 +14,7 @@ from orthoflow.errors import GeometryError
 from orthoflow.products import Cameras, JsonValue, Photo, Photos, Ties
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.orient.acceptance import reason_to_leave_out, too_few
+from orthoflow_plugins.orient.acceptance import reason_to_leave_out
 from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, lenses_json
 from orthoflow_plugins.orient.block_adjustment import Adjusted, Trusted, adjust_block
 from orthoflow_plugins.orient.estimation import estimate_pose
@@ -34,6 +34,8 @@ from orthoflow_plugins.orient.single_photo import (
     TiedPhoto,
     candidate_of,
     judged,
+    oriented_by_hand,
+    reason_not_to_try,
     refused,
     require,
     tied_photo,
@@ -126,7 +128,8 @@ class OrientColmapBundle(Method):
                 estimates = list(adjusted.estimates)
                 details = _report_block(ctx, adjusted, [item.tied.photo for item in block])
             for at, item, estimate in zip(trusted, block, estimates, strict=True):
-                found[at] = judged(item.tied, candidate_of(item.tied, ties, params, estimate))
+                candidate = candidate_of(item.tied, ties, params, estimate)
+                found[at] = item.hand.or_alone(judged(item.tied, candidate))
         every = [found[nth] for nth in range(len(photos))]
         return self.Out(cameras=hand_over(ctx, ties, photos, every, details))
 
@@ -141,15 +144,22 @@ def _by_itself(
     tied: TiedPhoto, ties: Ties, params: OrientColmapBundle.Params
 ) -> Trusted | Oriented:
     """Orient a photo by its own ties; refused where they agree by chance only."""
-    reason = too_few(len(tied.seen))
+    hand = oriented_by_hand(tied, ties, params)
+    if hand.joined is not None:
+        return Trusted(tied=tied, estimate=hand.joined, hand=hand)
+    if hand.is_enough:
+        return hand.alone
+    reason = reason_not_to_try(tied, hand)
     if reason:
         return refused(tied, reason)
     estimate = estimate_pose(tied.photo, tied.seen, tied.is_check, tied.rule)
     if isinstance(estimate, str):
-        return refused(tied, estimate)
+        return refused(tied, hand.reason or estimate)
     # A wrong pose would pull at the photos that are tied to it.
     reason = reason_to_leave_out(candidate_of(tied, ties, params, estimate))
-    return refused(tied, reason) if reason else Trusted(tied=tied, estimate=estimate)
+    if reason:
+        return refused(tied, hand.reason or reason)
+    return Trusted(tied=tied, estimate=estimate, hand=hand)
 
 
 def _adjusted(

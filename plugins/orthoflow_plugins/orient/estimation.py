@@ -84,6 +84,8 @@ class Estimate:
         limit: in standard deviations, as `fit.normalised`.
         notes: what its method has to say of it.
         numbers: what its method alone measures, by name, for the record.
+        without_one: of a pose from ties that a person measured, how exact it is without each of
+            them in turn; empty for others.
     """
 
     resection: Resection
@@ -94,6 +96,7 @@ class Estimate:
     limit: float
     notes: tuple[str, ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
+    without_one: tuple[Resection, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,6 +254,23 @@ def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
     return replace(lens, rotation=pose.rotation, translation=pose.translation)
 
 
+def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDArray[np.float64]:
+    """Pixels (n, 2) as without distortion; NaN where the lens model cannot be undone."""
+    if not lens.distortion.any():
+        return pixels
+    try:
+        rays = lens.rays_camera(pixels)
+    except GeometryError:
+        rays = np.full((len(pixels), 3), np.nan)
+        for index in range(len(pixels)):
+            try:
+                rays[index] = lens.rays_camera(pixels[index : index + 1])[0]
+            except GeometryError:
+                continue
+    straight: NDArray[np.float64] = rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
+    return straight
+
+
 @dataclass(frozen=True, kw_only=True)
 class _RobustPose:
     """A pose and the ties that agree with it.
@@ -304,7 +324,7 @@ def _robust_pose(seen: SeenPoints, lens: ViewingCamera, rule: EstimationRule) ->
     """
     import cv2
 
-    usable = _undistorted(seen.pixels_photo, lens)
+    usable = undistorted_pixels(seen.pixels_photo, lens)
     inside: NDArray[np.bool_] = np.asarray(np.isfinite(usable).all(axis=1))
     if inside.sum() < _LEAST_FOR_POSE:
         return None
@@ -350,20 +370,3 @@ def _usac(rule: EstimationRule) -> Any:
     # The adjustment that follows does what a local optimisation would do in thrice the time.
     params.loMethod = cv2.LOCAL_OPTIM_NULL
     return params
-
-
-def _undistorted(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDArray[np.float64]:
-    """Pixels of a camera without distortion; NaN where the lens model cannot be undone."""
-    if not lens.distortion.any():
-        return pixels
-    try:
-        rays = lens.rays_camera(pixels)
-    except GeometryError:
-        rays = np.full((len(pixels), 3), np.nan)
-        for index in range(len(pixels)):
-            try:
-                rays[index] = lens.rays_camera(pixels[index : index + 1])[0]
-            except GeometryError:
-                continue
-    straight: NDArray[np.float64] = rays[:, :2] * [lens.fx, lens.fy] + [lens.cx, lens.cy]
-    return straight

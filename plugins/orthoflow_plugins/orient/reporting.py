@@ -76,11 +76,12 @@ def _warn(ctx: StepContext, oriented: Oriented) -> None:
 
 
 def _measure(ctx: StepContext, found: Sequence[Oriented]) -> None:
-    numbers = [item.numbers for item in found if item.camera.status == "ok" and item.numbers]
+    oriented = [item for item in found if item.camera.status == "ok"]
+    numbers = [item.numbers for item in oriented if item.numbers]
     n_ties = sum(len(item.role) for item in found)
     ctx.metric("n_photos", len(found), "1")
-    ctx.metric("n_oriented", len(numbers), "1")
-    ctx.metric("n_refused", len(found) - len(numbers), "1")
+    ctx.metric("n_oriented", len(oriented), "1")
+    ctx.metric("n_refused", len(found) - len(oriented), "1")
     ctx.metric("n_ties", n_ties, "1")
     ctx.metric("n_control", sum(item.n_control for item in numbers), "1")
     ctx.metric("n_check", sum(item.n_check for item in numbers), "1")

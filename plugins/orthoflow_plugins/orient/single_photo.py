@@ -9,12 +9,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import MethodError
+from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Camera, JsonValue, Photo, Photos, ResidualRow, TieRole, Ties
 from orthoflow.sdk import StepContext
-from orthoflow_plugins.orient.acceptance import Candidate, reason_against, too_few, warnings_for
-from orthoflow_plugins.orient.estimation import Estimate, EstimationRule
+from orthoflow_plugins.orient.acceptance import (
+    Candidate,
+    reason_against,
+    reason_to_leave_out,
+    too_few,
+    warnings_for,
+)
+from orthoflow_plugins.orient.by_hand import TIES_LEAST, pose_by_hand
+from orthoflow_plugins.orient.estimation import Estimate, EstimationRule, adjusted
 from orthoflow_plugins.orient.layout import withheld
 from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.residuals import (
@@ -40,6 +47,7 @@ class TiedPhoto:
         chosen: (n,) index into all ties.
         seen: these ties as an adjustment takes them.
         is_check: (n,) withheld from every estimation.
+        by_hand: (n,) measured by a person.
         rule: how to estimate, with a seed of its own.
     """
 
@@ -47,6 +55,7 @@ class TiedPhoto:
     chosen: NDArray[np.intp]
     seen: SeenPoints
     is_check: NDArray[np.bool_]
+    by_hand: NDArray[np.bool_]
     rule: EstimationRule
 
 
@@ -75,6 +84,42 @@ class Oriented:
     table: tuple[ResidualRow, ...] = ()
     notes: tuple[str, ...] = ()
     candidate: Candidate | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByHand:
+    """What the ties that a person measured make of a photo.
+
+    Attributes:
+        alone: its orientation by them alone, or why there is none; without a reason where there
+            are too few of them to orient it.
+        kept: (n,) bool, ties of the photo that determine it.
+        joined: its orientation with the other ties that agree with these; None where they do not.
+    """
+
+    alone: Oriented
+    kept: NDArray[np.bool_]
+    joined: Estimate | None = None
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether they orient the photo alone."""
+        return self.alone.camera.status == "ok"
+
+    @property
+    def reason(self) -> str:
+        """Why they do not orient it; empty where they do, or are too few."""
+        return "" if self.is_enough else self.alone.camera.status
+
+    def agrees(self, agreeing: NDArray[np.bool_]) -> bool:
+        """Whether an orientation that these ties (n,) agree with has all that were kept."""
+        return bool(agreeing[self.kept].all())
+
+    def or_alone(self, oriented: Oriented) -> Oriented:
+        """Give an orientation by all ties if it is ok and not against those by hand."""
+        if oriented.camera.status == "ok" and self.agrees(oriented.role != TieRole.REJECTED):
+            return oriented
+        return self.alone if self.is_enough or self.reason else oriented
 
 
 def require(ties: Ties, photos: Photos) -> None:
@@ -121,11 +166,17 @@ def tied_photo(
         sigma_m=ties.sigma_m[chosen],
     )
     size_px = (photo.width, photo.height)
+    by_hand = np.zeros(len(chosen), dtype=np.bool_)
+    if ties.by_hand is not None:
+        by_hand = ties.by_hand[chosen] > 0
+    is_check = np.zeros(len(chosen), dtype=np.bool_)
+    is_check[~by_hand] = withheld(seen.pixels_photo[~by_hand], size_px, params.check_share, own)
     return TiedPhoto(
         photo=photo,
         chosen=chosen,
         seen=seen,
-        is_check=withheld(seen.pixels_photo, size_px, params.check_share, own),
+        is_check=is_check,
+        by_hand=by_hand,
         rule=params.estimation(int(own.integers(_SEED_LIMIT))),
     )
 
@@ -148,13 +199,45 @@ def each_by_itself(
 
 
 def _by_itself(tied: TiedPhoto, ties: Ties, params: OrientParams, estimator: Estimator) -> Oriented:
-    reason = too_few(len(tied.seen))
+    hand = oriented_by_hand(tied, ties, params)
+    if hand.joined is not None:
+        return hand.or_alone(judged(tied, candidate_of(tied, ties, params, hand.joined)))
+    if hand.is_enough:
+        return hand.alone
+    reason = reason_not_to_try(tied, hand)
     if reason:
         return refused(tied, reason)
     estimate = estimator(tied.photo, tied.seen, tied.is_check, tied.rule)
     if isinstance(estimate, str):
-        return refused(tied, estimate)
-    return judged(tied, candidate_of(tied, ties, params, estimate))
+        return refused(tied, hand.reason or estimate)
+    return hand.or_alone(judged(tied, candidate_of(tied, ties, params, estimate)))
+
+
+def reason_not_to_try(tied: TiedPhoto, hand: ByHand) -> str:
+    """Say why a photo that ties by hand do not orient cannot be either by all its ties."""
+    # What a person measured is never withheld, so that the others have to check the pose.
+    n_withheld_from = int((~tied.by_hand).sum())
+    return (hand.reason if too_few(n_withheld_from) else "") or too_few(len(tied.seen))
+
+
+def oriented_by_hand(tied: TiedPhoto, ties: Ties, params: OrientParams) -> ByHand:
+    """Orient a photo by the ties that a person measured, alone and with those that agree."""
+    nothing = ByHand(alone=refused(tied, ""), kept=np.zeros(len(tied.seen), dtype=np.bool_))
+    if tied.by_hand.sum() < TIES_LEAST:
+        return nothing
+    found = pose_by_hand(tied.photo, tied.seen, tied.by_hand)
+    if isinstance(found, str):
+        return replace(nothing, alone=refused(tied, found))
+    alone = judged(tied, candidate_of(tied, ties, params, found.estimate))
+    hand = ByHand(alone=alone, kept=found.estimate.agreeing)
+    if too_few(int((~tied.by_hand).sum())):
+        return hand
+    try:
+        joined = adjusted(tied.photo, tied.seen, tied.is_check, found.start, tied.rule)
+    except GeometryError:
+        return hand
+    is_trusted = not reason_to_leave_out(candidate_of(tied, ties, params, joined))
+    return replace(hand, joined=joined) if is_trusted and hand.agrees(joined.agreeing) else hand
 
 
 def candidate_of(
@@ -227,7 +310,10 @@ def _usable(ties: Ties, name: str, n_most: int) -> NDArray[np.intp]:
     if len(mine) <= n_most:
         return mine
     thinned = np.floor(np.arange(n_most) * len(mine) / n_most).astype(np.intp)
-    return np.asarray(mine[thinned], dtype=np.intp)
+    kept = np.asarray(mine[thinned], dtype=np.intp)
+    if ties.by_hand is not None:
+        kept = np.union1d(kept, mine[ties.by_hand[mine] > 0])
+    return kept
 
 
 def _search_radius_px(ties: Ties, name: str) -> float:

@@ -61,7 +61,7 @@ class WallError:
 def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
     """Describe the walls of some ties: from what their matcher says, else from the points."""
     walls = []
-    for index in np.unique(ties.wall[chosen]):
+    for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]):
         if int(index) < len(ties.walls):
             walls.append(_described(int(index), ties.walls[int(index)]))
         else:

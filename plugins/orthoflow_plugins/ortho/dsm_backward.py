@@ -45,7 +45,7 @@ class DsmBackward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-backward"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7, 4.4",

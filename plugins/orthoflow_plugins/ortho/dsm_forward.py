@@ -38,7 +38,7 @@ class DsmForward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-forward"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7",
@@ -100,7 +100,8 @@ def _layer(
     photo: OpenedPhoto, surface: Surface, wall: int, params: DsmForward.Params, *, threads: int
 ) -> Layer | None:
     """Throw a photo onto one wall; None where no pixel meets it."""
-    from orthoflow.geometry.narrow_gaps import lenders_in_gaps
+    from orthoflow.geometry.narrow_gaps import narrow_gaps
+    from orthoflow_plugins.ortho.filling import Painted, painted_between
     from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch, throw_pixels
     from orthoflow_plugins.ortho.surfaces import is_before, view_of
 
@@ -117,16 +118,26 @@ def _layer(
         return None
     is_painted = catch.pixel != NO_PIXEL
     seen, quality = _seen(photo.viewer, surface, border_px=view.border_px)
-    lent = lenders_in_gaps(is_painted, params.fill_gap_cells, threads=threads)
-    is_gap = ~np.isnan(relief.depth.ravel()[lent[:, 0]]) & seen.ravel()[lent[:, 0]]
-    gaps, lenders = lent[is_gap].T
-    taken = np.maximum(catch.pixel, 0).ravel()
-    taken[gaps] = taken[lenders]
-    filled = np.zeros(shape, dtype=np.uint8)
-    filled.ravel()[gaps] = 1
-    is_shown = is_painted | (filled > 0)
-    rgb = photo.pixels.reshape(-1, 3)[taken].reshape(*shape, 3)
-    rgb[~is_shown] = 0
+    gaps = narrow_gaps(is_painted, params.fill_gap_cells, threads=threads)
+    gaps = gaps[~np.isnan(relief.depth.ravel()[gaps]) & seen.ravel()[gaps]]
+    rgb = photo.pixels.reshape(-1, 3)[np.maximum(catch.pixel, 0).ravel()].reshape(*shape, 3)
+    rgb[~is_painted] = 0
+    is_filled = painted_between(
+        gaps,
+        rgb,
+        Painted(
+            places=np.where(is_painted.reshape(-1, 1), np.float32(0.0), np.float32(np.nan)).repeat(
+                2, axis=1
+            ),
+            depth_m=relief.depth.reshape(-1),
+            # A gap takes what is painted about it, whatever surface it is of.
+            layer_m=np.inf,
+        ),
+        reach_cells=params.fill_gap_cells,
+        threads=threads,
+    )
+    filled = is_filled.astype(np.uint8)
+    is_shown = is_painted | is_filled
     mask = np.where(seen, LayerMask.OCCLUDED, LayerMask.OUTSIDE)
     mask[np.isnan(relief.depth)] = LayerMask.NO_SURFACE
     mask[is_shown] = LayerMask.PAINTED

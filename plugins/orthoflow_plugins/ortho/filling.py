@@ -5,6 +5,7 @@ After skarlatos2012, section 3; the picture is the pair of its Figure 5.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.products import Layer, LayerMask
 
-Inpainting = Literal["telea", "navier-stokes", "none"]
+Inpainting = Literal["between", "telea", "navier-stokes", "none"]
 VoidLimits = tuple[int, int, int]
 
 _WINDOWS: Final = (3, 5, 7)
@@ -21,6 +22,22 @@ _SIDE_CELLS: Final = 240
 _ZOOM: Final = 3
 _GUTTER_PX: Final = 12
 _VOID_RGB: Final = (255, 0, 255)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Painted:
+    """Where a raster is painted, flat over its cells.
+
+    Attributes:
+        places: (cells, 2) float32, where what paints a cell lies to the right of and below its
+            centre, in cells; NaN where nothing does.
+        depth_m: (cells,) float32, of the surface; NaN where it is not known.
+        layer_m: depths that differ by more are of different surfaces.
+    """
+
+    places: NDArray[np.float32]
+    depth_m: NDArray[np.float32]
+    layer_m: float
 
 
 def fillable_gaps(is_void: NDArray[np.bool_], limits: VoidLimits) -> NDArray[np.bool_]:
@@ -66,20 +83,80 @@ def inpainted(
 ) -> NDArray[np.uint8]:
     """Paint the fillable cells with colours that come from painted cells only.
 
+    OpenCV's fronts run from the top and from the left first, which shifts what they paint. So the
+    raster is painted in all eight ways in which it may be turned and mirrored, and the mean taken.
+
     Args:
         rgb: (rows, cols, 3); values of void cells have no influence.
         is_void: (rows, cols) cells without a colour.
         is_fillable: (rows, cols) the void cells to paint.
-        method: of `cv2.inpaint`; `none` paints nothing.
+        method: of `cv2.inpaint`.
         radius_px: neighbourhood from which a cell takes its colour.
 
     Returns:
         (rows, cols, 3) colours, 0 in void cells that are not filled.
     """
+    painted = np.where(is_void[..., np.newaxis], np.uint8(0), rgb)
+    if is_void.all() or not is_fillable.any():
+        return painted
+    sums = np.zeros(rgb.shape, dtype=np.uint16)
+    for is_mirrored in (False, True):
+        for quarters in range(4):
+            side = np.s_[:, :: -1 if is_mirrored else 1]
+            found = _inpainted_once(
+                np.rot90(rgb[side], quarters),
+                np.rot90(is_void[side], quarters),
+                np.rot90(is_fillable[side], quarters),
+                method=method,
+                radius_px=radius_px,
+            )
+            sums += np.rot90(found, -quarters)[side]
+    painted[is_fillable] = (sums[is_fillable] + 4) // 8
+    return painted
+
+
+def painted_between(
+    gaps: NDArray[np.int64],
+    rgb: NDArray[np.uint8],
+    painted: Painted,
+    *,
+    reach_cells: float,
+    threads: int,
+) -> NDArray[np.bool_]:
+    """Paint gaps in place with what lies between the painted cells about them.
+
+    Args:
+        gaps: (n,) flat indices of cells that are not painted.
+        rgb: (rows, cols, 3) colours, written in the gaps.
+        painted: which cells are painted.
+        reach_cells: gaps without a painted cell so near stay as they are.
+        threads: how many threads work.
+
+    Returns:
+        (rows, cols) which gaps were painted.
+    """
+    from orthoflow.geometry.interpolation import Surroundings, cell_values, interpolate
+
+    is_filled = np.zeros(rgb.shape[:2], dtype=np.bool_)
+    around = Surroundings(painted.places, rgb.shape[1], painted.layer_m)
+    values = cell_values(painted.depth_m, rgb=rgb.reshape(-1, 3))
+    into = values._replace(depth_m=np.empty(0, dtype=np.float32))
+    found = interpolate(gaps, around, values, into, reach_cells=reach_cells, threads=threads)
+    is_filled.ravel()[gaps[found]] = True
+    return is_filled
+
+
+def _inpainted_once(
+    rgb: NDArray[np.uint8],
+    is_void: NDArray[np.bool_],
+    is_fillable: NDArray[np.bool_],
+    *,
+    method: Inpainting,
+    radius_px: float,
+) -> NDArray[np.uint8]:
+    """Colours (rows, cols, 3) as OpenCV fills them; those of other void cells mean nothing."""
     import cv2
 
-    if method == "none" or is_void.all() or not is_fillable.any():
-        return np.where(is_void[..., np.newaxis], np.uint8(0), rgb)
     # cv2.inpaint takes every cell outside its mask for known, so that the black of large voids
     # would creep into the gaps beside them. Void cells lend the colour of their nearest painted
     # cell while it runs.
@@ -91,9 +168,9 @@ def inpainted(
     painted_of_label[labels.ravel()[painted]] = painted
     lent = rgb.reshape(-1, 3)[painted_of_label[labels.ravel()]].reshape(rgb.shape)
     flag = cv2.INPAINT_TELEA if method == "telea" else cv2.INPAINT_NS
-    filled = cv2.inpaint(lent, is_fillable.astype(np.uint8), radius_px, flag)
-    is_shown = ~is_void | is_fillable
-    return np.where(is_shown[..., np.newaxis], filled, np.uint8(0))
+    return np.asarray(
+        cv2.inpaint(lent, is_fillable.astype(np.uint8), radius_px, flag), dtype=np.uint8
+    )
 
 
 def filling_preview(rgb_before: NDArray[np.uint8], layer: Layer) -> bytes:

@@ -54,11 +54,16 @@ class CellColours:
         has_point: (cells,).
         distance_cells: (cells,) from the centre to the point that stands for the cell: the
             coloured one, or the topmost one of those averaged; infinite where void.
+        places: (cells, 2) float32, where the coloured point lies to the right of and below the
+            centre, in cells, 0 where several are averaged; NaN where void.
+        depth_m: (cells,) float32, of the point that stands for the cell; NaN where void.
     """
 
     rgb: NDArray[np.uint8]
     has_point: NDArray[np.bool_]
     distance_cells: NDArray[np.float32]
+    places: NDArray[np.float32]
+    depth_m: NDArray[np.float32]
 
 
 def colours_of(
@@ -73,7 +78,11 @@ def colours_of(
         rule: how.
     """
     from orthoflow.geometry.raster_kernels import NO_POINT
-    from orthoflow.geometry.rastering import topmost_points, values_of_winners
+    from orthoflow.geometry.rastering import (
+        places_of_winners,
+        topmost_points,
+        values_of_winners,
+    )
 
     winners = topmost_points(cloud, slab, threads=rule.threads)
     has_point = winners["point"] != NO_POINT
@@ -87,7 +96,16 @@ def colours_of(
         _lay_medians(rgb, cloud, values, slab, floors_m, rule)
     else:
         rgb[:] = values_of_winners(winners, values, 0, threads=rule.threads)
-    return CellColours(rgb=rgb, has_point=has_point, distance_cells=np.sqrt(winners["square"]))
+    places = places_of_winners(cloud, slab, winners, threads=rule.threads)
+    if rule.colouring in {"gaussian", "median"}:
+        places[has_point] = 0.0
+    return CellColours(
+        rgb=rgb,
+        has_point=has_point,
+        distance_cells=np.sqrt(winners["square"]),
+        places=places,
+        depth_m=np.where(has_point, winners["depth_m"], np.float32(np.nan)),
+    )
 
 
 def _most_central(

@@ -17,20 +17,23 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.ortho.filling import (
     Inpainting,
+    Painted,
     fillable_gaps,
     filling_preview,
     inpainted,
+    painted_between,
 )
 from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, colours_of
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Projection:
-    """A wall before its gaps are filled: colours, and each winner's distance to its centre."""
+    """A wall before its gaps are filled: colours, and where each winner lies in its cell."""
 
     rgb: NDArray[np.uint8]
     is_void: NDArray[np.bool_]
     distance_cells: NDArray[np.float32]
+    painted: Painted
 
 
 class PointcloudDirect(Method):
@@ -42,7 +45,7 @@ class PointcloudDirect(Method):
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "skarlatos2012: Direct orthophoto generation from color point clouds of complex scenes, 3",
@@ -76,10 +79,17 @@ class PointcloudDirect(Method):
             default=5, ge=1, le=50, description="Points that the median takes at most."
         )
         inpaint: Inpainting = Field(
-            default="telea", description="How gaps are filled: telea, navier-stokes, none."
+            default="between",
+            description="How gaps are filled: between the painted cells about them, by where their "
+            "points lie; telea and navier-stokes of OpenCV, the mean of all eight ways in which "
+            "the raster may be turned and mirrored; none.",
         )
         inpaint_radius_px: float = Field(
-            default=3.0, gt=0, le=100, description="Reach from which a gap takes its colour."
+            default=3.0,
+            gt=0,
+            le=100,
+            description="Reach from which a gap takes its colour; with between, one without a "
+            "painted cell so near stays void.",
         )
 
     class In(Ports):
@@ -111,7 +121,7 @@ class PointcloudDirect(Method):
             started = time.perf_counter()
             projection = _project(inputs, colours, wall, rule)
             projected = time.perf_counter()
-            layers.append(_filled(projection, wall, k, params))
+            layers.append(_filled(projection, wall, k, params, threads=ctx.cores))
             seconds += (projected - started, time.perf_counter() - projected)
             n_filled = _n_filled(layers[-1])
             if best_preview is None or n_filled > best_preview[0]:
@@ -149,23 +159,38 @@ def _project(
         rgb=found.rgb.reshape(*shape, 3),
         is_void=~found.has_point.reshape(shape),
         distance_cells=found.distance_cells.reshape(shape),
+        painted=Painted(places=found.places, depth_m=found.depth_m, layer_m=rule.layer_m),
     )
 
 
 def _filled(
-    projection: _Projection, wall: Wall, index: int, params: PointcloudDirect.Params
+    projection: _Projection,
+    wall: Wall,
+    index: int,
+    params: PointcloudDirect.Params,
+    *,
+    threads: int,
 ) -> Layer:
     is_void = projection.is_void
-    is_filled = np.zeros_like(is_void)
+    rgb, is_filled = projection.rgb.copy(), np.zeros_like(is_void)
     if params.inpaint != "none" and not is_void.all():
         is_filled = fillable_gaps(is_void, params.void_limits)
-    rgb = inpainted(
-        projection.rgb,
-        is_void,
-        is_filled,
-        method=params.inpaint,
-        radius_px=params.inpaint_radius_px,
-    )
+    if params.inpaint == "between":
+        is_filled = painted_between(
+            np.flatnonzero(is_filled),
+            rgb,
+            projection.painted,
+            reach_cells=params.inpaint_radius_px,
+            threads=threads,
+        )
+    elif params.inpaint != "none":
+        rgb = inpainted(
+            projection.rgb,
+            is_void,
+            is_filled,
+            method=params.inpaint,
+            radius_px=params.inpaint_radius_px,
+        )
     shown = ~is_void | is_filled
     # 1 at the centre of the cell, 0.5 in its corner: how well the point stands for the cell. A
     # filled cell is worth less than any painted one.

@@ -318,10 +318,7 @@ class ResidualCounts:
         asked: NDArray[np.int64],
         claims: NDArray[np.int8],
     ) -> NDArray[np.int64]:
-        taken = np.flatnonzero(claims >= 0)
-        if len(taken) == 0:
-            return counts
-        left = asked - self._counted(place[taken], counts.shape)
+        left = asked - self._counted(place[claims >= 0], counts.shape)
         share = np.divide(left, asked, out=np.ones(counts.shape), where=asked > 0)
         remaining: NDArray[np.int64] = np.rint(counts * share).astype(np.int64)
         return remaining

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
-from orthoflow.products import JsonValue, Planes, PointCloud
+from orthoflow.products import JsonValue, Planes, PointCloud, SideSource
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.candidates import Candidate, FoundPlane
 from orthoflow_plugins.plane.covariance import Stated
@@ -106,7 +106,8 @@ def assemble(
     )
     raw = tuple(_raw(found[i].candidate, item, cloud) for i, item in zip(order, faced, strict=True))
     viewpoint: Viewpoint = known_viewpoint(cloud)
-    if all(item.is_guessed for item in faced):
+    is_guessed = [item.is_guessed for item in faced]
+    if all(is_guessed):
         viewpoint = "guess"
     planes = Planes(
         normal=np.array([item.plane.normal for item in faced]),
@@ -126,6 +127,7 @@ def assemble(
             np.arange(len(faced), dtype=np.int32), [len(item.part_corners_m) for item in faced]
         ),
         viewpoint=viewpoint,
+        side_from=_sides(viewpoint, is_guessed) if len(set(is_guessed)) > 1 else (),
         tolerance_m=ordered.find_m,
         details=_details(faced, ordered, normalities, raw),
     )
@@ -354,6 +356,11 @@ def _faced(
         part_corners_m=np.array([enclosing(part, plane, turned) for part in parts_m]),
         is_guessed=is_guessed,
     )
+
+
+def _sides(viewpoint: Viewpoint, is_guessed: list[bool]) -> tuple[SideSource, ...]:
+    known: SideSource = "given" if viewpoint == "view_from" else "stations"
+    return tuple("guess" if guessed else known for guessed in is_guessed)
 
 
 def _details(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Final, Self
+from typing import TYPE_CHECKING, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ from orthoflow.geometry import Plane, basis_from_up, plane_through
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 
+if TYPE_CHECKING:
+    from orthoflow_plugins.plane.reference import Reference
+    from orthoflow_plugins.plane.sample import PreparedCloud
+
 Vector = tuple[float, float, float]
 
 # The horizontal plane lies below this share of the points: below the scene, above stray echoes.
@@ -22,13 +26,60 @@ _GROUND_SHARE: Final = 0.01
 _BUFFER_TOLERANCES: Final = 3.0
 
 
-class GivenPlane(Method):
-    """Lay the reference plane where the user says.
+class StatedPlane(MethodParams):
+    """One plane, stated in exactly one of three ways."""
 
-    Exactly one of three ways: `normal` with `offset_m` (the side of the normal is the viewer's and
-    is never turned), three `points` (world metres; the normal is turned towards the viewer), or the
-    `horizontal` plane seen from above, which is also the default, as in skarlatos2012. Without
-    `height_m` it lies at the height that 1 % of the points are below.
+    normal: Vector | None = Field(
+        None, description="Direction towards the viewer, world axes; any length."
+    )
+    offset_m: float | None = Field(
+        None, description="Distance of the plane from the world origin along the unit normal."
+    )
+    points: tuple[Vector, Vector, Vector] | None = Field(
+        None, description="Three points on the plane, world metres."
+    )
+    horizontal: bool = Field(
+        default=False,
+        description="The plane across `up`, seen from above; also what holds by default.",
+    )
+    height_m: float | None = Field(
+        None,
+        description="Height of the horizontal plane along `up`, world metres; by default the "
+        "height that 1 % of the points are below.",
+    )
+
+    @property
+    def ways(self) -> tuple[str, ...]:
+        """In which of the three ways something is said."""
+        ways = {
+            "normal": self.normal is not None or self.offset_m is not None,
+            "points": self.points is not None,
+            "horizontal": self.horizontal or self.height_m is not None,
+        }
+        return tuple(way for way, is_used in ways.items() if is_used)
+
+    @model_validator(mode="after")
+    def _one_way_only(self) -> Self:
+        if len(self.ways) > 1:
+            raise ValueError(
+                f"plane.given takes one of normal with offset_m, points, or horizontal, got "
+                f"{' and '.join(self.ways)}"
+            )
+        if (self.normal is None) != (self.offset_m is None):
+            raise ValueError("plane.given needs normal and offset_m together, got only one")
+        if self.normal is not None and math.hypot(*self.normal) < 1e-9:
+            raise ValueError("normal must have a length, got (0, 0, 0)")
+        return self
+
+
+class GivenPlane(Method):
+    """Lay the reference plane, or several, where the user says.
+
+    Each in exactly one of three ways: `normal` with `offset_m` (the side of the normal is the
+    viewer's and is never turned), three `points` (world metres; the normal is turned towards the
+    viewer), or the `horizontal` plane seen from above, which is also the default, as in
+    skarlatos2012. Without `height_m` it lies at the height that 1 % of the points are below.
+    Several planes are listed in `planes`; a point near several belongs to the nearest.
 
     The rectangle spans the points within `buffer_m` of the plane (every point for the horizontal
     one), without parts too small to matter, such as stray echoes beside the scene.
@@ -44,26 +95,14 @@ class GivenPlane(Method):
         ),
     )
 
-    class Params(MethodParams):
-        """Where the plane is."""
+    class Params(StatedPlane):
+        """Where the plane is, or the planes are."""
 
-        normal: Vector | None = Field(
-            None, description="Direction towards the viewer, world axes; any length."
-        )
-        offset_m: float | None = Field(
-            None, description="Distance of the plane from the world origin along the unit normal."
-        )
-        points: tuple[Vector, Vector, Vector] | None = Field(
-            None, description="Three points on the plane, world metres."
-        )
-        horizontal: bool = Field(
-            default=False,
-            description="The plane across `up`, seen from above; also what holds by default.",
-        )
-        height_m: float | None = Field(
-            None,
-            description="Height of the horizontal plane along `up`, world metres; by default the "
-            "height that 1 % of the points are below.",
+        planes: tuple[StatedPlane, ...] = Field(
+            (),
+            max_length=100,
+            description="Several planes instead of one, each with its own normal and offset_m, "
+            "points, or horizontal and height_m.",
         )
         tolerance_m: float = Field(
             0.05, gt=0.0, description="Points this near to the plane are labelled with it."
@@ -76,22 +115,12 @@ class GivenPlane(Method):
         )
 
         @model_validator(mode="after")
-        def _one_way_only(self) -> Self:
-            ways = {
-                "normal": self.normal is not None or self.offset_m is not None,
-                "points": self.points is not None,
-                "horizontal": self.horizontal or self.height_m is not None,
-            }
-            named = [way for way, is_used in ways.items() if is_used]
-            if len(named) > 1:
+        def _one_or_several(self) -> Self:
+            if self.planes and self.ways:
                 raise ValueError(
-                    f"plane.given takes one of normal with offset_m, points, or horizontal, got "
-                    f"{' and '.join(named)}"
+                    f"plane.given takes one plane, or several in planes, got {self.ways[0]} beside "
+                    "planes: move it into the list"
                 )
-            if (self.normal is None) != (self.offset_m is None):
-                raise ValueError("plane.given needs normal and offset_m together, got only one")
-            if self.normal is not None and math.hypot(*self.normal) < 1e-9:
-                raise ValueError("normal must have a length, got (0, 0, 0)")
             return self
 
     class In(Ports):
@@ -106,38 +135,56 @@ class GivenPlane(Method):
         labels: PointLabels
 
     _too_far: ClassVar[str] = (
-        "no point of the cloud lies within {buffer:g} m of the given plane; along its normal the "
+        "no point of the cloud lies within {buffer:g} m of the plane; along its normal the "
         "points lie between {low:.3f} m and {high:.3f} m of it: check normal and offset_m, points "
         "or height_m, or raise buffer_m (plane.given)"
     )
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Lay the plane and find which points are on it."""
-        from orthoflow_plugins.plane.reference import lay_reference, place_reference
+        """Lay the planes and find which points are on them."""
+        from orthoflow_plugins.plane.reference import lay_references, prepare_for_references
 
         cloud = inputs.cloud
         if len(cloud) < 3:
             cloud.require_points(3)
         ctx.progress(0.0, "placing the plane")
-        plane, is_settled = self._stated(params, cloud)
+        prepared = prepare_for_references(cloud, parts=ctx.cores)
+        references = []
+        for nth, stated in enumerate(params.planes or (params,)):
+            which = f"planes[{nth}]" if params.planes else "the given plane"
+            try:
+                references.append(self._placed(stated, params, cloud, prepared))
+            except MethodError as error:
+                raise MethodError(f"{which}: {error}") from error
+        ctx.progress(0.4, "labelling points")
+        labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
+        planes = lay_references(
+            references, cloud, prepared, labels, tolerance_m=params.tolerance_m, ctx=ctx
+        )
+        return self.Out(planes=planes, labels=PointLabels(plane_index=labels))
+
+    @classmethod
+    def _placed(
+        cls, stated: StatedPlane, params: Params, cloud: PointCloud, prepared: PreparedCloud
+    ) -> Reference:
+        from orthoflow_plugins.plane.reference import place_reference
+
+        plane, is_settled = cls._stated(stated, cloud)
         buffer_m = params.buffer_m
-        if buffer_m is None and (params.normal is not None or params.points is not None):
+        if buffer_m is None and (stated.normal is not None or stated.points is not None):
             buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
         reference = place_reference(
-            plane, cloud, buffer_m=buffer_m, keeps_side=is_settled, parts=ctx.cores
+            plane, cloud, prepared, buffer_m=buffer_m, keeps_side=is_settled
         )
         if reference is None:
             low_m, high_m = _reach(plane, cloud)
             raise MethodError(
-                self._too_far.format(buffer=buffer_m or math.inf, low=low_m, high=high_m)
+                cls._too_far.format(buffer=buffer_m or math.inf, low=low_m, high=high_m)
             )
-        ctx.progress(0.4, "labelling points")
-        labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
-        planes = lay_reference(reference, cloud, labels, tolerance_m=params.tolerance_m, ctx=ctx)
-        return self.Out(planes=planes, labels=PointLabels(plane_index=labels))
+        return reference
 
     @staticmethod
-    def _stated(params: Params, cloud: PointCloud) -> tuple[Plane, bool]:
+    def _stated(params: StatedPlane, cloud: PointCloud) -> tuple[Plane, bool]:
         """The plane in the cloud's offsets, and whether its side is settled."""
         if params.normal is not None and params.offset_m is not None:
             normal = np.array(params.normal) / math.hypot(*params.normal)

@@ -1,7 +1,8 @@
-"""A stated plane laid over a cloud: its rectangle, its viewer's side, and the points on it."""
+"""Stated planes laid over a cloud: rectangles, the viewer's side of each, and the points on it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -46,41 +47,49 @@ class Reference:
         corners_m: (4, 3) offsets, top-left first, counter-clockwise for the viewer.
         part_corners_m: (p, 4, 3) the same of each connected part.
         viewpoint: how the side was chosen.
-        prepared: the cloud, nothing claimed.
     """
 
     plane: Plane
     corners_m: NDArray[np.float64]
     part_corners_m: NDArray[np.float64]
     viewpoint: str
-    prepared: PreparedCloud
 
 
-def place_reference(
-    plane: Plane, cloud: PointCloud, *, buffer_m: float | None, keeps_side: bool, parts: int
-) -> Reference | None:
-    """Put a rectangle about the points near a plane, and turn its normal to the viewer.
-
-    Args:
-        plane: the plane, in the cloud's offsets.
-        cloud: the cloud.
-        buffer_m: points this near span the rectangle; None for all points.
-        keeps_side: leave the normal as it is.
-        parts: threads.
-
-    Returns:
-        The plane with its rectangle, or None where no point is near.
+def prepare_for_references(cloud: PointCloud, *, parts: int) -> PreparedCloud:
+    """Prepare a cloud that planes are laid over.
 
     Raises:
         MethodError: the points of the cloud coincide or lie on one line.
     """
-    prepared = prepare(
+    return prepare(
         cloud,
         basis_from_up(cloud.up),
         cell_m=_PLAN_CELL_M,
         least_share=_STRAY_SHARE,
         parts=parts,
     )
+
+
+def place_reference(
+    plane: Plane,
+    cloud: PointCloud,
+    prepared: PreparedCloud,
+    *,
+    buffer_m: float | None,
+    keeps_side: bool,
+) -> Reference | None:
+    """Put a rectangle about the points near a plane, and turn its normal to the viewer.
+
+    Args:
+        plane: the plane, in the cloud's offsets.
+        cloud: the cloud.
+        prepared: the same; its claims are overwritten.
+        buffer_m: points this near span the rectangle; None for all points.
+        keeps_side: leave the normal as it is.
+
+    Returns:
+        The plane with its rectangle, or None where no point is near.
+    """
     raster, place = _rectangle(plane, prepared, buffer_m)
     if place is None:
         return None
@@ -111,54 +120,108 @@ def place_reference(
         corners_m=enclosing(corners_m, plane, axes),
         part_corners_m=np.array([enclosing(part, plane, axes) for part in parts_m]),
         viewpoint=viewpoint,
-        prepared=prepared,
     )
 
 
-def lay_reference(
-    reference: Reference,
+def lay_references(
+    references: Sequence[Reference],
     cloud: PointCloud,
+    prepared: PreparedCloud,
     labels: NDArray[np.int16],
     *,
     tolerance_m: float,
     ctx: StepContext,
 ) -> Planes:
-    """Label the points on a placed plane, and report how they lie about it.
+    """Label the points on placed planes, and report how they lie about them.
 
     Args:
-        reference: the plane.
+        references: the planes.
         cloud: the cloud.
-        labels: (n,) filled with 0 on the plane and -1 elsewhere.
+        prepared: the same; its claims are overwritten.
+        labels: (n,) filled with the place of a point's plane, the nearest of several, and -1 where
+            there is none.
         tolerance_m: how near a point must be.
         ctx: takes metrics and warnings.
+
+    Returns:
+        The planes, the one with the most points first.
     """
-    plane, prepared = reference.plane, reference.prepared
-    axes = wall_axes(plane.normal, cloud.up)
-    slab = np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])
+    slabs = np.array([_slab(reference, cloud) for reference in references])
     everywhere = _EVERYWHERE_M * np.array([-1.0, 1.0, -1.0, 1.0])
-    bounds_m = np.concatenate([[tolerance_m], everywhere])
-    prepared.claim_alone(Claim(slab=slab, bounds_m=bounds_m))
+    claims = _nearest_claims(references, prepared, slabs, np.append(tolerance_m, everywhere))
+    counts = np.bincount(claims[claims >= 0], minlength=len(references))
+    order = np.argsort(-counts, kind="stable")
+    place = np.append(np.argsort(order), -1).astype(np.int8)
+    prepared.claims[:] = place[claims]
     labels[:] = prepared.claims
     deviations = measure_planes(
-        prepared, slab[None], everywhere[None], find_m=tolerance_m, fit_m=tolerance_m
+        prepared,
+        slabs[order],
+        np.tile(everywhere, (len(references), 1)),
+        find_m=tolerance_m,
+        fit_m=tolerance_m,
     )
-    height_m = reference.corners_m.mean(axis=0) @ cloud.up
+    ordered = [references[at] for at in order.tolist()]
+    normals = np.array([reference.plane.normal for reference in ordered])
+    corners_m = np.array([reference.corners_m for reference in ordered])
+    n_parts = [len(reference.part_corners_m) for reference in ordered]
+    viewpoints = [reference.viewpoint for reference in ordered]
     planes = Planes(
-        normal=plane.normal[None].copy(),
-        offset=np.array([plane.offset_m + float(plane.normal @ cloud.origin)]),
-        corners=cloud.origin + reference.corners_m[None],
-        covariance=np.zeros((1, 4, 4)),
+        normal=normals,
+        offset=np.array(
+            [
+                reference.plane.offset_m + float(reference.plane.normal @ cloud.origin)
+                for reference in ordered
+            ]
+        ),
+        corners=cloud.origin + corners_m,
+        covariance=np.zeros((len(ordered), 4, 4)),
         n_points=deviations.n_find,
         rms_m=deviations.rms_find_m,
         up=cloud.up.copy(),
-        names=plane_names(plane.normal[None], np.array([height_m]), cloud.up),
-        part_corners=cloud.origin + reference.part_corners_m,
-        part_plane=np.zeros(len(reference.part_corners_m), dtype=np.int32),
-        viewpoint=reference.viewpoint,
+        names=plane_names(normals, corners_m.mean(axis=1) @ cloud.up, cloud.up),
+        part_corners=cloud.origin + np.concatenate([item.part_corners_m for item in ordered]),
+        part_plane=np.repeat(np.arange(len(ordered), dtype=np.int32), n_parts),
+        # One word for all of them: the least certain.
+        viewpoint="guess" if "guess" in viewpoints else viewpoints[0],
         tolerance_m=tolerance_m,
     )
-    _report(ctx, planes, deviations, n_points=len(cloud))
+    _report(ctx, planes, deviations, n_points=len(cloud), n_guessed=viewpoints.count("guess"))
     return planes
+
+
+def _slab(reference: Reference, cloud: PointCloud) -> NDArray[np.float64]:
+    """A plane as the passes over the points take it (12,)."""
+    plane = reference.plane
+    axes = wall_axes(plane.normal, cloud.up)
+    return np.concatenate([plane.normal, [plane.offset_m], axes[0], [0.0], axes[1], [0.0]])
+
+
+def _nearest_claims(
+    references: Sequence[Reference],
+    prepared: PreparedCloud,
+    slabs: NDArray[np.float64],
+    bounds_m: NDArray[np.float64],
+) -> NDArray[np.int8]:
+    """Index (n,) of the nearest plane of each point that one claims, else -1."""
+    claims = np.full(len(prepared.claims), -1, dtype=np.int8)
+    for index, reference in enumerate(references):
+        prepared.claim_alone(Claim(slab=slabs[index], bounds_m=bounds_m))
+        taken = prepared.claims == 0
+        disputed = np.flatnonzero(taken & (claims >= 0))
+        if len(disputed):
+            points = prepared.points
+            points_m = np.column_stack(
+                [axis[disputed].astype(np.float64) for axis in (points.x, points.y, points.z)]
+            )
+            own_m = np.abs(reference.plane.distances_m(points_m))
+            others_m = np.abs(
+                np.einsum("ni,ni->n", points_m, slabs[claims[disputed], :3])
+                - slabs[claims[disputed], 3]
+            )
+            taken[disputed[own_m >= others_m]] = False
+        claims[taken] = index
+    return claims
 
 
 def _rectangle(
@@ -200,13 +263,15 @@ def _extent(
     return extent_m
 
 
-def _report(ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int) -> None:
+def _report(
+    ctx: StepContext, planes: Planes, deviations: Deviations, *, n_points: int, n_guessed: int
+) -> None:
     omega_deg, phi_deg = omega_phi_deg(planes.normal[0], planes.up)
-    ctx.metric("n_planes", 1, "1")
-    ctx.metric("labelled_share", float(deviations.n_find[0]) / n_points, "1")
+    ctx.metric("n_planes", len(planes), "1")
+    ctx.metric("labelled_share", float(deviations.n_find.sum()) / n_points, "1")
     ctx.metric("rms_mm", 1000.0 * float(planes.rms_m[0]), "mm")
     ctx.metric("omega_deg", omega_deg, "deg")
     ctx.metric("phi_deg", phi_deg, "deg")
     ctx.metric("offset_m", float(planes.offset[0]), "m")
-    if planes.viewpoint == "guess":
-        warn_of_guesses(ctx, 1, 1)
+    if n_guessed:
+        warn_of_guesses(ctx, n_guessed, len(planes))

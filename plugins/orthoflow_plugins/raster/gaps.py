@@ -1,7 +1,7 @@
 """Where the cells of a surface come from: measured, recovered in narrow gaps, or void.
 
 A gap is recovered between points that lie side by side in a scan, where its rows and columns are
-known; else with the nearest measured cell.
+known; else between the measured cells about it.
 """
 
 from __future__ import annotations
@@ -12,15 +12,22 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.narrow_gaps import lenders_in_gaps
+from orthoflow.geometry.interpolation import CellValues, Surroundings, cell_values, interpolate
+from orthoflow.geometry.narrow_gaps import narrow_gaps
 from orthoflow.geometry.point_kernels import read_only
 from orthoflow.geometry.raster_kernels import BLOCK
 from orthoflow.geometry.rastering import entries_inside, wall_from_offset
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud, SurfaceMask
 from orthoflow_plugins.raster.rules import GapRule
-from orthoflow_plugins.raster.scan_grid_kernels import CellValues, Reach, ScanGrid, recover_between
-from orthoflow_plugins.raster.surfaces import CELLS_AT_ONCE, CellSurface
+from orthoflow_plugins.raster.scan_grid_kernels import (
+    Reach,
+    ScanGrid,
+    Sums,
+    recover_between,
+    take_means,
+)
+from orthoflow_plugins.raster.surfaces import CellSurface
 
 # A scan with more rows times columns than this has numbers that are no grid (2 GB of indices).
 _GRID_CELLS_MOST: Final = 1 << 28
@@ -41,16 +48,23 @@ def close_gaps(
     mask[surface.count > 0] = SurfaceMask.MEASURED
     mask[~is_known] = SurfaceMask.VOID
     mask[_recover_between_neighbours(cloud, slab, surface, rule)] = SurfaceMask.RECOVERED
-    lent = lenders_in_gaps(is_known.reshape(slab.frame.shape), rule.gap_cells, threads=rule.threads)
-    for first in range(0, len(lent), CELLS_AT_ONCE):
-        part = lent[first : first + CELLS_AT_ONCE]
-        # Lenders are never void, so that it does not matter which part comes first.
-        void, lender = part[mask[part[:, 0]] == SurfaceMask.VOID].T
-        mask[void] = SurfaceMask.RECOVERED
-        for values in (surface.depth_m, surface.intensity, surface.rgb):
-            if values is not None:
-                values[void] = values[lender]
+    narrow = narrow_gaps(is_known.reshape(slab.frame.shape), rule.gap_cells, threads=rule.threads)
+    narrow = narrow[mask[narrow] == SurfaceMask.VOID]
+    values = _values(surface)
+    is_found = interpolate(
+        narrow,
+        Surroundings(surface.places, slab.frame.width, rule.layer_m),
+        values,
+        values,
+        reach_cells=rule.gap_cells,
+        threads=rule.threads,
+    )
+    mask[narrow[is_found]] = SurfaceMask.RECOVERED
     return mask
+
+
+def _values(surface: CellSurface) -> CellValues:
+    return cell_values(surface.depth_m, intensity=surface.intensity, rgb=surface.rgb)
 
 
 def _recover_between_neighbours(
@@ -79,17 +93,22 @@ def _recover_between_neighbours(
     no_intensity, no_rgb = np.empty(0, dtype=np.float32), np.empty((0, 3), dtype=np.uint8)
     intensity = _unchanged(no_intensity if cloud.intensity is None else cloud.intensity)
     rgb = _unchanged(no_rgb if cloud.rgb is None else cloud.rgb)
-    values = CellValues(
-        surface.depth_m,
-        no_intensity.copy() if surface.intensity is None else surface.intensity,
-        no_rgb.copy() if surface.rgb is None else surface.rgb,
-    )
+    values = _values(surface)
     matrix = wall_from_offset(slab.frame, cloud.origin)
     offsets = read_only(cloud.x, cloud.y, cloud.z)
-    reach = Reach(rule.scan_steps, float(rule.span_cells), rule.layer_m)
-    near = _near(is_void, rule.span_cells)
-    for points in _grids(cloud, slab, surface, near, rule):
-        recover_between(ScanGrid(points, offsets, matrix), intensity, rgb, reach, is_void, values)
+    chosen = _points_beside_voids(cloud, slab, surface, _near(is_void, rule.span_cells), rule)
+    for step in range(1, rule.scan_steps + 1):
+        sums = Sums(
+            n=np.zeros(was_void.size, dtype=np.uint16),
+            depth_m=np.zeros(was_void.size, dtype=np.float32),
+            intensity=np.zeros(values.intensity.shape, dtype=np.float32),
+            rgb=np.zeros(values.rgb.shape, dtype=np.float32),
+        )
+        reach = Reach(step, float(rule.span_cells), rule.layer_m)
+        for points in _grids(cloud, chosen):
+            grid = ScanGrid(points, offsets, matrix)
+            recover_between(grid, intensity, rgb, reach, is_void, sums)
+        take_means(np.flatnonzero(is_void), sums, is_void.reshape(-1), values)
     return was_void & ~is_void.ravel()
 
 
@@ -108,15 +127,8 @@ def _near(is_void: NDArray[np.bool_], reach_cells: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(is_void.view(np.uint8), window), dtype=np.bool_).ravel()
 
 
-def _grids(
-    cloud: PointCloud,
-    slab: Slab,
-    surface: CellSurface,
-    near: NDArray[np.bool_],
-    rule: GapRule,
-) -> Iterator[NDArray[np.int64]]:
-    """For each scan the indices of its points beside void cells, by row and column."""
-    chosen = _points_beside_voids(cloud, slab, surface, near, rule)
+def _grids(cloud: PointCloud, chosen: NDArray[np.uint32]) -> Iterator[NDArray[np.int64]]:
+    """For each scan the indices of its chosen points by row and column."""
     if cloud.row is None or cloud.column is None:
         raise AssertionError("a grid was asked of a cloud without rows and columns")
     scans = np.zeros(len(chosen), dtype=np.uint16) if cloud.scan is None else cloud.scan[chosen]

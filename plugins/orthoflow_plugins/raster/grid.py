@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.slabs import Slab
@@ -15,21 +16,42 @@ from orthoflow.products import IntensitySource, Planes, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.raster.balancing import balanced
+from orthoflow_plugins.raster.crops import (
+    CroppedFrame,
+    Polygon,
+    Rectangle,
+    area_m2,
+    blank_outside,
+    cropped,
+)
 from orthoflow_plugins.raster.reporting import report, warn
 from orthoflow_plugins.raster.rules import GapRule, RasterRule, Surface, SurfaceRule
-from orthoflow_plugins.raster.selection import Constraint, WallChoice, chosen_planes, frame_of
+from orthoflow_plugins.raster.selection import (
+    Constraint,
+    Place,
+    WallChoice,
+    chosen_planes,
+    distance_m,
+    frame_of,
+    nearest_plane,
+)
 from orthoflow_plugins.raster.walls import WallRaster, rastered_wall, require_memory
+
+# A point that somebody took for one on a wall is farther from it than any relief.
+_FAR_M: Final = 1.0
 
 
 class RasterGrid(Method):
     """Lay the cloud into a raster on each wall: depth, spread, count, intensity, colour.
 
     Narrow gaps are closed: between neighbours of the scan's own rows and columns where these are
-    known, else with the nearest measured cell. Wider ones, such as windows, stay void.
+    known, else between the measured cells about them, by where their points lie. Wider ones, such
+    as windows, stay void. Where a cell has one or two points, the means of their intensities and
+    colours are carried along their slope from there to its centre.
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.4, 4.2",
@@ -111,6 +133,17 @@ class RasterGrid(Method):
             description="Raster exactly these planes, by their place in planes.json, where 0 has "
             "the most support; empty: as constraint, min_area_m2, n_walls_max, skip_covered say.",
         )
+        near: tuple[Place, ...] = Field(
+            default=(),
+            description="Raster the wall nearest to each of these points and no others, "
+            "[[x, y, z], ...] in world metres, among planes of the right direction (constraint).",
+        )
+        crop: Rectangle | Polygon | None = Field(
+            default=None,
+            description="Part of the wall to raster, metres to the right and down from the "
+            "top-left corner of its whole raster: a rectangle [left, top, right, bottom], or a "
+            "polygon [[right, down], ...] beyond which cells stay void.",
+        )
         skip_covered: bool = Field(
             default=True,
             description="Leave out a plane that lies within the buffer of a larger parallel wall, "
@@ -119,6 +152,22 @@ class RasterGrid(Method):
         margin_m: float = Field(
             default=0.0, ge=0, description="Widens the rectangle of a plane on all sides."
         )
+
+        @model_validator(mode="after")
+        def _one_choice_of_walls(self) -> Self:
+            if self.ranks and self.near:
+                raise ValueError("walls are chosen by ranks or by near, got both; leave one out")
+            return self
+
+        @field_validator("crop")
+        @classmethod
+        def _crop_has_an_area(cls, crop: Rectangle | Polygon | None) -> Rectangle | Polygon | None:
+            if crop is not None and not area_m2(crop) > 0.0:
+                raise ValueError(
+                    "crop must be [left, top, right, bottom] or at least three corners "
+                    f"[[right, down], ...] that span an area, in metres, got {list(crop)}"
+                )
+            return crop
 
     class In(Ports):
         """The cloud and the planes found in it."""
@@ -135,7 +184,8 @@ class RasterGrid(Method):
         """Raster the chosen planes, one pass over the cloud or a few for each."""
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
-        slabs = _slabs(planes, params)
+        crops = _crops(planes, params, ctx)
+        slabs = _slabs(planes, params, crops)
         rule = _raster_rule(params, threads=ctx.cores)
         rasters: list[WallRaster] = []
         source = _intensity_source(cloud)
@@ -153,6 +203,9 @@ class RasterGrid(Method):
                     allocate=partial(_allocated, ctx, k),
                 )
             )
+            outline_px = crops[index].outline_px
+            if outline_px is not None:
+                blank_outside(rasters[-1].wall, outline_px)
         walls = tuple(raster.wall for raster in rasters)
         _require_points_near(walls, next(iter(slabs.values())))
         warn(ctx, rasters, source)
@@ -174,15 +227,21 @@ class RasterGrid(Method):
         )
 
 
-def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
-    """Slab of each chosen plane by its index.
-
-    Raises:
-        MethodError: the rasters would not fit into memory.
-    """
+def _reach_m(planes: Planes, params: RasterGrid.Params) -> tuple[float, float]:
+    """Reach before and behind the planes."""
     both = 3.0 * planes.tolerance_m if params.buffer_m is None else params.buffer_m
     front = both if params.buffer_front_m is None else params.buffer_front_m
     behind = both if params.buffer_behind_m is None else params.buffer_behind_m
+    return front, behind
+
+
+def _crops(planes: Planes, params: RasterGrid.Params, ctx: StepContext) -> dict[int, CroppedFrame]:
+    """Grid of each chosen plane by its index, the whole or a part.
+
+    Raises:
+        MethodError: there is no such plane, or no wall has the part that is wanted.
+    """
+    front, behind = _reach_m(planes, params)
     choice = WallChoice(
         constraint=params.constraint,
         min_area_m2=params.min_area_m2,
@@ -191,14 +250,51 @@ def _slabs(planes: Planes, params: RasterGrid.Params) -> dict[int, Slab]:
         front_m=front,
         behind_m=behind,
         ranks=params.ranks,
+        near=params.near,
     )
-    slabs = {
-        index: Slab(
-            frame=frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m),
-            front_m=front,
-            behind_m=behind,
-        )
+    frames = {
+        index: frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m)
         for index in chosen_planes(planes, choice)
+    }
+    for place in params.near:
+        index = nearest_plane(planes, list(frames), np.array(place))
+        apart_m = distance_m(planes, index, np.array(place))
+        ctx.log(f"near {list(place)}: {planes.names[index]}, {apart_m:.3f} m away")
+        if apart_m > _FAR_M:
+            ctx.warn(
+                f"near {list(place)}: the nearest wall, {planes.names[index]}, is {apart_m:.2f} m "
+                "away: check the point, its unit and the planes"
+            )
+    if params.crop is None:
+        return {index: CroppedFrame(frame=frame) for index, frame in frames.items()}
+    parts = {index: cropped(frame, params.crop) for index, frame in frames.items()}
+    crops = {index: part for index, part in parts.items() if part is not None}
+    if not crops:
+        frame = next(iter(frames.values()))
+        raise MethodError(
+            f"crop {list(params.crop)} lies beside every wall: the raster of "
+            f"{planes.names[next(iter(frames))]} is {frame.width * frame.gsd_m:.3f} m wide and "
+            f"{frame.height * frame.gsd_m:.3f} m high"
+        )
+    if len(frames) > 1:
+        ctx.warn(
+            f"crop cuts the same part out of {len(frames)} walls; choose one with near or ranks"
+        )
+    return crops
+
+
+def _slabs(
+    planes: Planes, params: RasterGrid.Params, crops: Mapping[int, CroppedFrame]
+) -> dict[int, Slab]:
+    """Slab of each chosen plane by its index.
+
+    Raises:
+        MethodError: the rasters would not fit into memory.
+    """
+    front, behind = _reach_m(planes, params)
+    slabs = {
+        index: Slab(frame=crop.frame, front_m=front, behind_m=behind)
+        for index, crop in crops.items()
     }
     require_memory([slab.frame for slab in slabs.values()], params.surface)
     return slabs

@@ -31,6 +31,11 @@ class SurfaceRule:
     percentiles: tuple[float, ...]
     threads: int
 
+    @property
+    def is_of_one_point(self) -> bool:
+        """Whether a cell takes the values of one of its points, not the mean of several."""
+        return self.surface in {"nearest", "centre", "topmost", "tin"}
+
 
 @dataclass(frozen=True, kw_only=True)
 class GapRule:
@@ -69,6 +74,7 @@ class RasterRule:
     @property
     def reach_rows(self) -> int:
         """How many rows away a cell may lie that decides what becomes of another, at most."""
-        # Noise is taken out twice, and a gap is as wide as what spans it and a disc on either side.
-        gaps = self.gaps.span_cells + 2 * self.gaps.gap_cells
+        # Noise is taken out twice, and a gap is as wide as what spans it and a disc on either side,
+        # and a little more, between which it is interpolated.
+        gaps = self.gaps.span_cells + 2 * self.gaps.gap_cells + 2
         return _REACH_OF_OUTLIERS + 2 * self.surface.denoise_cells + gaps

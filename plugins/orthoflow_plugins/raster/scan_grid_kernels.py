@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled
+from orthoflow.geometry.interpolation import CellValues
 from orthoflow.geometry.point_kernels import Offsets
 
 # A hair outside of a triangle still counts: a centre on an edge belongs to one of two at least.
@@ -32,28 +33,30 @@ class Reach(NamedTuple):
     """What neighbours may stand for one surface.
 
     Attributes:
-        steps: rows and columns of the scan between them, at most.
+        step: rows and columns of the scan between them.
         side_cells: their distance on the wall along u and along v, at most.
         step_m: difference of their depths, at most.
     """
 
-    steps: int
+    step: int
     side_cells: float
     step_m: float
 
 
-class CellValues(NamedTuple):
-    """What is recovered, flat over cells; arrays without cells are left alone.
+class Sums(NamedTuple):
+    """What triangles lay into the cells that they cover, summed, flat over cells.
 
     Attributes:
+        n: uint16 triangles.
         depth_m: float32.
         intensity: float32.
-        rgb: (cells, 3) uint8.
+        rgb: (cells, 3) float32.
     """
 
+    n: NDArray[np.uint16]
     depth_m: NDArray[np.float32]
     intensity: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
+    rgb: NDArray[np.float32]
 
 
 @compiled
@@ -63,41 +66,70 @@ def recover_between(
     rgb: NDArray[np.uint8],
     reach: Reach,
     is_void: NDArray[np.bool_],
-    values: CellValues,
+    sums: Sums,
 ) -> None:
-    """Fill void cells in triangles of neighbours, linear between them, near neighbours first.
+    """Lay the triangles of neighbours into void cells, linear between them.
+
+    A square of four neighbours is cut along both of its diagonals, so that neither counts more.
 
     Args:
         grid: one scan.
         intensity: of the cloud, or without points.
         rgb: of the cloud, or without points.
         reach: what neighbours are.
-        is_void: (rows, cols) of the wall; made false where a cell is filled.
-        values: written where a cell is filled.
+        is_void: (rows, cols) of the wall.
+        sums: added to.
     """
     rows, columns = grid.points.shape
+    step = reach.step
     corners = np.empty((3, 3))
     chosen = np.empty(3, dtype=np.int64)
-    for step in range(1, reach.steps + 1):
-        for row in range(rows):
-            for column in range(columns):
-                chosen[0] = grid.points[row, column]
-                if chosen[0] < 0:
+    for row in range(rows):
+        for column in range(columns):
+            chosen[0] = grid.points[row, column]
+            if chosen[0] < 0:
+                continue
+            _place(grid, chosen[0], corners[0])
+            # The four squares about a point, of each the half with its right angle there.
+            for quarter in range(4):
+                across = column + (step if quarter % 2 else -step)
+                down = row + (step if quarter // 2 else -step)
+                if not (0 <= across < columns and 0 <= down < rows):
                     continue
-                _place(grid, chosen[0], corners[0])
-                # The two halves of a square of four neighbours, each seen from its right angle.
-                for side in (step, -step):
-                    across, down = column + side, row + side
-                    if across < 0 or across >= columns or down < 0 or down >= rows:
-                        continue
-                    chosen[1] = grid.points[row, across]
-                    chosen[2] = grid.points[down, column]
-                    if chosen[1] < 0 or chosen[2] < 0:
-                        continue
-                    _place(grid, chosen[1], corners[1])
-                    _place(grid, chosen[2], corners[2])
-                    if _is_one_surface(corners, reach):
-                        _fill(corners, chosen, intensity, rgb, is_void, values)
+                chosen[1] = grid.points[row, across]
+                chosen[2] = grid.points[down, column]
+                if chosen[1] < 0 or chosen[2] < 0:
+                    continue
+                _place(grid, chosen[1], corners[1])
+                _place(grid, chosen[2], corners[2])
+                if _is_one_surface(corners, reach):
+                    _fill(corners, chosen, intensity, rgb, is_void, sums)
+
+
+@compiled
+def take_means(
+    cells: NDArray[np.int64], sums: Sums, is_void: NDArray[np.bool_], values: CellValues
+) -> None:
+    """Give some void cells the mean of what triangles laid into them, if any did.
+
+    Args:
+        cells: flat indices.
+        sums: of the triangles.
+        is_void: (cells,), made false where a cell is filled.
+        values: written where a cell is filled.
+    """
+    for cell in cells:
+        n = sums.n[cell]
+        if n == 0:
+            continue
+        is_void[cell] = False
+        values.depth_m[cell] = sums.depth_m[cell] / n
+        if values.intensity.size:
+            values.intensity[cell] = sums.intensity[cell] / n
+        if values.rgb.size:
+            for band in range(3):
+                shade = sums.rgb[cell, band] / n
+                values.rgb[cell, band] = np.uint8(min(255.0, max(0.0, shade + 0.5)))
 
 
 @compiled
@@ -127,9 +159,9 @@ def _fill(
     intensity: NDArray[np.float32],
     rgb: NDArray[np.uint8],
     is_void: NDArray[np.bool_],
-    values: CellValues,
+    sums: Sums,
 ) -> None:
-    """Fill the void cells whose centres lie in a triangle."""
+    """Add a triangle to the void cells whose centres lie in it."""
     ax, ay, bx, by = corners[0, 0], corners[0, 1], corners[1, 0], corners[1, 1]
     cx, cy = corners[2, 0], corners[2, 1]
     area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
@@ -150,13 +182,12 @@ def _fill(
             a = 1.0 - b - c
             if a < -_ON_EDGE or b < -_ON_EDGE or c < -_ON_EDGE:
                 continue
-            is_void[row, column] = False
             cell = row * width + column
-            values.depth_m[cell] = a * corners[0, 2] + b * corners[1, 2] + c * corners[2, 2]
+            sums.n[cell] += np.uint16(1)
+            sums.depth_m[cell] += a * corners[0, 2] + b * corners[1, 2] + c * corners[2, 2]
             p, q, r = chosen
-            if values.intensity.size:
-                values.intensity[cell] = a * intensity[p] + b * intensity[q] + c * intensity[r]
-            if values.rgb.size:
+            if sums.intensity.size:
+                sums.intensity[cell] += a * intensity[p] + b * intensity[q] + c * intensity[r]
+            if sums.rgb.size:
                 for band in range(3):
-                    mixed = a * rgb[p, band] + b * rgb[q, band] + c * rgb[r, band]
-                    values.rgb[cell, band] = np.uint8(min(255.0, max(0.0, mixed + 0.5)))
+                    sums.rgb[cell, band] += a * rgb[p, band] + b * rgb[q, band] + c * rgb[r, band]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -14,6 +15,7 @@ from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.products import Planes
 
 Constraint = Literal["vertical", "horizontal", "any"]
+Place = tuple[float, float, float]
 
 # How far a plane may lean and still count as vertical or horizontal.
 _LEAN_DEG: Final = 10.0
@@ -34,6 +36,8 @@ class WallChoice:
         front_m: reach of a wall towards the viewer.
         behind_m: reach behind it.
         ranks: these planes and no others, whatever else is said; empty for no such choice.
+        near: (x, y, z) in metres: to each the plane of the right direction whose rectangle is
+            nearest, and no others; empty for no such choice.
     """
 
     constraint: Constraint
@@ -43,6 +47,7 @@ class WallChoice:
     front_m: float
     behind_m: float
     ranks: tuple[int, ...] = ()
+    near: tuple[Place, ...] = ()
 
 
 def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
@@ -67,6 +72,8 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
             f"none of the {len(planes)} planes is {choice.constraint} within {_LEAN_DEG:g} deg: "
             "set constraint to any, or look for other planes"
         )
+    if choice.near:
+        return sorted({nearest_plane(planes, fitting, np.array(place)) for place in choice.near})
     large = [k for k in fitting if area_m2(planes.corners[k]) >= choice.min_area_m2]
     # The best supported plane stays whatever its size: a scan of one small object has a wall too.
     chosen: list[int] = []
@@ -75,6 +82,23 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
             continue
         chosen.append(index)
     return chosen[: choice.n_walls_max]
+
+
+def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
+    """Index of the plane nearest to a point (3,), of equally near ones the better supported."""
+    return min(among, key=lambda index: (round(distance_m(planes, index, place), 6), index))
+
+
+def distance_m(planes: Planes, index: int, place: NDArray[np.float64]) -> float:
+    """Distance of a point (3,) from what is known of a plane's surface.
+
+    That is the nearest of its connected parts, or its rectangle where no parts are known.
+    """
+    rectangles = planes.corners[index][None]
+    if planes.part_corners is not None and planes.part_plane is not None:
+        own = planes.part_corners[planes.part_plane == index]
+        rectangles = own if len(own) else rectangles
+    return min(_distance_m(corners, place) for corners in rectangles)
 
 
 def area_m2(corners: NDArray[np.float64]) -> float:
@@ -91,6 +115,14 @@ def frame_of(planes: Planes, index: int, *, gsd_m: float, margin_m: float) -> Wa
     steps = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
     widened = corners + margin_m * (steps[:, :1] * right + steps[:, 1:] * down)
     return frame_over(widened, planes.normal[index], gsd_m=gsd_m)
+
+
+def _distance_m(corners: NDArray[np.float64], place: NDArray[np.float64]) -> float:
+    """Distance of a point (3,) from a rectangle (4, 3)."""
+    sides = np.array([corners[3] - corners[0], corners[1] - corners[0]])
+    shares = (place - corners[0]) @ sides.T / np.maximum((sides**2).sum(axis=1), 1e-12)
+    nearest = corners[0] + np.clip(shares, 0.0, 1.0) @ sides
+    return float(np.linalg.norm(place - nearest))
 
 
 def _covers(planes: Planes, wall: int, index: int, choice: WallChoice) -> bool:

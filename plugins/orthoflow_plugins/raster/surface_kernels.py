@@ -5,12 +5,36 @@ They run over the entries of `raster_kernels`, each thread on the cells it owns.
 
 from __future__ import annotations
 
+import math
+from typing import Final, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.point_kernels import Offsets
 from orthoflow.geometry.raster_kernels import BLOCK, Entries, is_own
+
+# The mean of more points lies so near the centre of their cell that nothing is left to carry.
+FEW_POINTS: Final = 2
+
+
+class FewPoints(NamedTuple):
+    """Where the points lie of cells with few of them, all flat over cells.
+
+    Attributes:
+        n_inside: points in each cell.
+        depths_m: the surface.
+        layer_m: a point farther than this from the surface belongs to another layer.
+        n_summed: uint8, points on the surface in cells with few points.
+        places: (cells, 2) float32, of these to the right of and below the centre, in cells.
+    """
+
+    n_inside: NDArray[np.uint32]
+    depths_m: NDArray[np.float32]
+    layer_m: float
+    n_summed: NDArray[np.uint8]
+    places: NDArray[np.float32]
 
 
 @compiled
@@ -208,3 +232,50 @@ def add_values(
             for channel in range(channels):
                 sums[cell, channel] += values[entries.points[k], channel]
             sums[cell, channels] += 1
+
+
+@compiled
+def add_places(
+    entries: Entries,
+    offsets: Offsets,
+    wall_from_offset: NDArray[np.float64],
+    few: FewPoints,
+    owners: int,
+    owner: int,
+) -> None:
+    """Sum the places of the points on the surface, of cells with few points.
+
+    Args:
+        entries: one chunk.
+        offsets: of the whole cloud.
+        wall_from_offset: (3, 4) as in `Target`.
+        few: added to.
+        owners: a power of two, how many threads share the cells.
+        owner: whose cells to visit.
+    """
+    m = wall_from_offset
+    for block in range(entries.n_inside.size):
+        first = block * BLOCK
+        for k in range(first, first + entries.n_inside[block]):
+            cell = entries.cells[k]
+            if not is_own(cell, owners, owner) or few.n_inside[cell] > FEW_POINTS:
+                continue
+            # Nothing lies on the surface of a void cell, whose depth is not a number.
+            if not abs(entries.depths_m[k] - few.depths_m[cell]) <= few.layer_m:
+                continue
+            point = entries.points[k]
+            x, y, z = float(offsets.x[point]), float(offsets.y[point]), float(offsets.z[point])
+            u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+            v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+            few.places[cell, 0] += u - math.floor(u) - 0.5
+            few.places[cell, 1] += v - math.floor(v) - 0.5
+            few.n_summed[cell] += np.uint8(1)
+
+
+@compiled
+def find_mean_places(few: FewPoints, first: int, end: int) -> None:
+    """Turn the sums of some cells into means: NaN without a point, 0 in cells with many."""
+    for cell in range(first, end):
+        if few.n_inside[cell] <= FEW_POINTS:
+            for axis in range(2):
+                few.places[cell, axis] /= np.float32(few.n_summed[cell])

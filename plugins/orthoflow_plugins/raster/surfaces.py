@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.interpolation import Surroundings, cell_values, interpolate
 from orthoflow.geometry.point_kernels import read_only
 from orthoflow.geometry.raster_kernels import Entries, keep_nearest, keep_topmost
 from orthoflow.geometry.rastering import (
     empty_winners,
     entries_inside,
+    places_of_winners,
     share_cells,
     values_of_winners,
     wall_from_offset,
@@ -45,6 +47,8 @@ class CellSurface:
         intensity: float32, NaN where void, or None.
         rgb: (cells, 3) uint8, 0 where void, or None.
         percentiles_m: (cells, k) float32, NaN in cells without points, or None.
+        places: (cells, 2) float32, where the points of a cell lie to the right of and below its
+            centre, in cells; (0, 0) where many do, NaN where none does.
     """
 
     depth_m: NDArray[np.float32]
@@ -52,18 +56,42 @@ class CellSurface:
     count: NDArray[np.uint32]
     intensity: NDArray[np.float32] | None
     rgb: NDArray[np.uint8] | None
+    places: NDArray[np.float32]
     percentiles_m: NDArray[np.float32] | None = None
 
 
 def surface_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
     """Lay a cloud into the raster of a wall."""
-    if rule.surface in {"nearest", "centre", "topmost", "tin"}:
+    if rule.is_of_one_point:
         surface = _surface_of_winners(cloud, slab, rule)
     else:
         surface = _surface_of_all(cloud, slab, rule)
     if not rule.percentiles:
         return surface
     return replace(surface, percentiles_m=_percentiles_m(cloud, slab, surface.count, rule))
+
+
+def carried_to_centres(surface: CellSurface, slab: Slab, rule: SurfaceRule) -> CellSurface:
+    """Carry intensity and colour of cells with few points from these to the centre of the cell.
+
+    Rules that take a single point take its values as they are.
+    """
+    if rule.is_of_one_point or (surface.intensity is None and surface.rgb is None):
+        return surface
+    few = np.flatnonzero(
+        (surface.count > 0) & (surface.count <= kernels.FEW_POINTS) & np.isfinite(surface.depth_m)
+    )
+    intensity = None if surface.intensity is None else surface.intensity.copy()
+    rgb = None if surface.rgb is None else surface.rgb.copy()
+    interpolate(
+        few,
+        Surroundings(surface.places, slab.frame.width, rule.layer_m),
+        cell_values(surface.depth_m, intensity=surface.intensity, rgb=surface.rgb),
+        cell_values(np.empty(0, dtype=np.float32), intensity=intensity, rgb=rgb),
+        reach_cells=0.0,
+        threads=rule.threads,
+    )
+    return replace(surface, intensity=intensity, rgb=rgb)
 
 
 def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
@@ -86,6 +114,7 @@ def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> Cel
         count=winners["n_points"].copy(),
         intensity=None if intensity is None else taken(intensity[:, np.newaxis], np.nan)[:, 0],
         rgb=None if rgb is None else taken(rgb, 0),
+        places=places_of_winners(cloud, slab, winners, threads=rule.threads),
     )
     points = winners["point"][has_point]
     return _triangulated(cloud, slab, points, surface) if rule.surface == "tin" else surface
@@ -127,6 +156,8 @@ def _triangulated(
         depth_m=np.ascontiguousarray(found[0][:, 0]),
         intensity=None if surface.intensity is None else np.ascontiguousarray(found[1][:, 0]),
         rgb=None if surface.rgb is None else np.rint(np.nan_to_num(found[-1])).astype(np.uint8),
+        # The net tells what is at the centres.
+        places=np.where(np.isfinite(found[0]), np.float32(0.0), np.float32(np.nan)).repeat(2, 1),
     )
 
 
@@ -206,13 +237,22 @@ def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSur
         if rule.surface == "denoised":
             raster_m = denoised(raster_m, rule.denoise_cells)
         depth_m = raster_m.ravel()
-    intensity, rgb = _averaged_values(cloud, slab, depth_m, layer_m=layer_m, threads=rule.threads)
+    few = kernels.FewPoints(
+        n_inside=count,
+        depths_m=depth_m,
+        layer_m=layer_m,
+        n_summed=np.zeros(slab.n_cells, dtype=np.uint8),
+        places=np.zeros((slab.n_cells, 2), dtype=np.float32),
+    )
+    intensity, rgb = _averaged_values(cloud, slab, few, threads=rule.threads)
+    in_parts(partial(kernels.find_mean_places, few), slab.n_cells, threads=rule.threads)
     return CellSurface(
         depth_m=depth_m,
         sigma_m=sigma_m,
         count=count,
         intensity=intensity,
         rgb=rgb,
+        places=few.places,
     )
 
 
@@ -290,7 +330,11 @@ def _percentiles_m(
 
 
 def _averaged_values(
-    cloud: PointCloud, slab: Slab, depth_m: NDArray[np.float32], *, layer_m: float, threads: int
+    cloud: PointCloud,
+    slab: Slab,
+    few: kernels.FewPoints,
+    *,
+    threads: int,
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint8] | None]:
     channels = _channels(cloud)
     # Whole numbers for colours: half the memory, and exact.
@@ -301,13 +345,17 @@ def _averaged_values(
         )
         for values in channels
     ]
-    if channels:
-        for entries in entries_inside(cloud, slab, threads=threads):
-            passes = [
-                partial(kernels.add_values, entries, values, depth_m, layer_m, sum_of_values)
-                for values, sum_of_values in zip(channels, sums, strict=True)
-            ]
-            share_cells(threads, *passes)
+    offsets, matrix = (
+        read_only(cloud.x, cloud.y, cloud.z),
+        wall_from_offset(slab.frame, cloud.origin),
+    )
+    for entries in entries_inside(cloud, slab, threads=threads):
+        passes = [
+            partial(kernels.add_values, entries, values, few.depths_m, few.layer_m, sum_of_values)
+            for values, sum_of_values in zip(channels, sums, strict=True)
+        ]
+        passes.append(partial(kernels.add_places, entries, offsets, matrix, few))
+        share_cells(threads, *passes)
     intensity: NDArray[np.float32] | None = None
     rgb: NDArray[np.uint8] | None = None
     for sum_of_values in sums:

@@ -160,10 +160,11 @@ def _is_banded(frame: WallFrame, surface: Surface) -> bool:
 
 def _rastered(cloud: PointCloud, slab: Slab, rule: RasterRule) -> _Raster:
     from orthoflow_plugins.raster.gaps import close_gaps
-    from orthoflow_plugins.raster.surfaces import surface_of
+    from orthoflow_plugins.raster.surfaces import carried_to_centres, surface_of
 
     surface = surface_of(cloud, slab, rule.surface)
     mask = close_gaps(cloud, slab, surface, rule.gaps)
+    surface = carried_to_centres(surface, slab, rule.surface)
     if surface.intensity is None:
         surface = replace(surface, intensity=_grey(surface.rgb, mask))
     return _Raster(surface=surface, mask=mask)
@@ -177,6 +178,7 @@ def _rastered_in_bands(
 
     whole: dict[str, NDArray[np.generic]] = {}
     frame, width = slab.frame, slab.frame.width
+    kept = [field.name for field in fields(CellSurface) if field.name != "places"]
     for band in bands_with_reach(frame.shape, cells_most=_BAND_CELLS, reach_rows=rule.reach_rows):
         corner = frame.origin_world + band.around.start * frame.gsd_m * frame.v_world
         height = band.around.stop - band.around.start
@@ -184,9 +186,7 @@ def _rastered_in_bands(
         raster = _rastered(cloud, replace(slab, frame=part), rule)
         cells = slice(band.rows.start * width, band.rows.stop * width)
         inner = slice(band.inner.start * width, band.inner.stop * width)
-        arrays = {"mask": raster.mask} | {
-            field.name: getattr(raster.surface, field.name) for field in fields(CellSurface)
-        }
+        arrays = {"mask": raster.mask} | {name: getattr(raster.surface, name) for name in kept}
         for name, values in arrays.items():
             if values is None:
                 continue
@@ -195,7 +195,7 @@ def _rastered_in_bands(
                 whole[name] = allocate(name, shape, values.dtype)
             whole[name][cells] = values[inner]
     mask = whole.pop("mask")
-    absent = dict.fromkeys(("intensity", "rgb", "percentiles_m"))
+    absent = dict.fromkeys(("intensity", "rgb", "percentiles_m", "places"))
     # The arrays have the types of the bands' own.
     surface = CellSurface(**cast("dict[str, Any]", absent | whole))
     return _Raster(surface=surface, mask=mask.astype(np.uint8, copy=False))

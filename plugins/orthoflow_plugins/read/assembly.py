@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, StoreError
 from orthoflow.files.points import PointBlock, ScanFile
+from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.read.scales import ColourScale
 from orthoflow_plugins.read.stations import ScanSummary
 
-# Beyond any survey frame on Earth; what lies farther comes from damaged numbers.
-FARTHEST_M: Final = 1e9
 # Coordinates rounded more coarsely than this limit what an orthoimage can show.
 COARSE_M: Final = 0.005
 # Offsets keep half a tenth of a millimetre; beyond, the user is told.
@@ -49,9 +48,13 @@ class FileCount:
         n_kept: those of them that are in the cloud.
         n_invalid: those marked as invalid.
         n_withheld: those marked as deleted.
+        n_unwanted: those of a class that nobody asked for.
+        n_outside: those outside the box that was asked for.
         n_not_finite: those whose coordinates are not finite, or beyond any survey frame.
         rounding_m: step to which coordinates are rounded, 0 where it is fine.
         rgb_scale: what the file's colours range to, or None without colours.
+        n_far: those of `n_not_finite` that are finite.
+        first_far_m: the first of them.
         header: what else the file says of itself, for people.
     """
 
@@ -61,10 +64,21 @@ class FileCount:
     n_kept: int = 0
     n_invalid: int = 0
     n_withheld: int = 0
+    n_unwanted: int = 0
+    n_outside: int = 0
     n_not_finite: int = 0
     rounding_m: float = 0.0
     rgb_scale: str | None = None
+    n_far: int = 0
+    first_far_m: tuple[float, ...] = ()
     header: Mapping[str, str | int | float] = field(default_factory=dict)
+
+    def note_far(self, lost: NDArray[np.float64]) -> None:
+        """Count points (n, 3), metres, that were left out though their coordinates are finite."""
+        far = lost[np.isfinite(lost).all(axis=1)]
+        if len(far) and not self.n_far:
+            self.first_far_m = tuple(far[0].tolist())
+        self.n_far += len(far)
 
 
 class CloudAssembly:
@@ -78,9 +92,24 @@ class CloudAssembly:
         n_intensity_lost: intensities that are not finite.
     """
 
-    def __init__(self, ctx: StepContext, files: list[ScanFile], unit_m: float) -> None:
-        """Allocate for the most points that may come; what is not filled is cut off later."""
+    def __init__(
+        self,
+        ctx: StepContext,
+        files: list[ScanFile],
+        unit_m: float,
+        box_m: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Allocate for the most points that may come; what is not filled is cut off later.
+
+        Args:
+            ctx: of the step.
+            files: what will be read.
+            unit_m: metres per unit of the files.
+            box_m: (2, 3) lowest and highest coordinates of the points to keep; None for all.
+        """
         self._ctx = ctx
+        self._box_m = box_m
+        self._reach_m = _bounds(np.empty((0, 3)))
         self._unit_m = unit_m
         self._capacity = sum(file.n_most for file in files)
         _require_space(ctx, self._capacity)
@@ -118,12 +147,36 @@ class CloudAssembly:
             self._ctx.progress(min(done, 1.0), f"{file.name}: {count.n_read} points")
         if colours is not None:
             count.rgb_scale = colours.scale
-        if count.n_kept == 0:
+        if count.n_far:
+            place = " ".join(f"{value:g}" for value in count.first_far_m)
+            self._ctx.warn(
+                f"{count.name}: {count.n_far} points lie farther than {FARTHEST_M:g} m from the "
+                f"origin, the first at {place}, and were left out: check the file and unit"
+            )
+        if count.n_kept + count.n_unwanted + count.n_outside == 0:
             raise InputError(
                 f"{file.name} holds no usable points: of {count.n_read}, {count.n_invalid} are "
                 f"marked as invalid, {count.n_withheld} as deleted and {count.n_not_finite} are "
                 "not finite; export it again"
             )
+
+    def require_points(self) -> None:
+        """Refuse a choice of points that leaves none of any file.
+
+        Raises:
+            InputError: all points are of other classes or outside the box.
+        """
+        if self.n_points:
+            return
+        n_unwanted, n_outside = (
+            sum(getattr(count, name) for count in self.files)
+            for name in ("n_unwanted", "n_outside")
+        )
+        text = f"no point is left: {n_unwanted} are of other classes than those asked for"
+        if n_outside:
+            low, high = (", ".join(f"{value:.2f}" for value in corner) for corner in self._reach_m)
+            text += f", {n_outside} lie outside the box: the points reach from ({low}) to ({high})"
+        raise InputError(f"{text}; change classes or box (read.scan)")
 
     @property
     def offsets(self) -> list[NDArray[Any]]:
@@ -152,19 +205,18 @@ class CloudAssembly:
         count.n_read += block.n_read
         count.n_invalid += block.n_invalid
         count.n_withheld += block.n_withheld
+        count.n_unwanted += block.n_unwanted
         points, bounds = block.points, block.bounds
         if self._unit_m != 1.0:
             points = points * self._unit_m
             bounds = None if bounds is None else bounds * self._unit_m
         if bounds is None:
             bounds = _bounds(points)
-        kept = _usable(points, bounds)
+        kept = self._kept(points, bounds, count)
         usable = points[kept]
         if not isinstance(kept, slice):
             bounds = _bounds(usable)
         n_kept = len(usable)
-        count.n_not_finite += len(points) - n_kept
-        count.n_kept += n_kept
         self._summarise(block, scan, bounds)
         if n_kept == 0:
             return
@@ -181,6 +233,36 @@ class CloudAssembly:
         if scan > 0:
             self._store_scan(scan, part)
         self.n_points = part.stop
+
+    def _kept(
+        self, points: NDArray[np.float64], bounds: NDArray[np.float64], count: FileCount
+    ) -> NDArray[np.bool_] | slice:
+        """Which points (n, 3) are usable and lie in the box, counted."""
+        usable = _usable(points, bounds)
+        if not isinstance(usable, slice):
+            count.note_far(points[~usable])
+        n_usable = len(points[usable])
+        count.n_not_finite += len(points) - n_usable
+        kept = self._in_box(points, usable)
+        n_kept = len(points[kept])
+        count.n_outside += n_usable - n_kept
+        count.n_kept += n_kept
+        return kept
+
+    def _in_box(
+        self, points: NDArray[np.float64], usable: NDArray[np.bool_] | slice
+    ) -> NDArray[np.bool_] | slice:
+        """Which usable points (n, 3) lie in the box, its faces included."""
+        if self._box_m is None:
+            return usable
+        low, high = _bounds(points[usable])
+        self._reach_m = np.stack(
+            [np.minimum(self._reach_m[0], low), np.maximum(self._reach_m[1], high)]
+        )
+        inside = np.zeros(len(points), dtype=np.bool_)
+        inside[usable] = True
+        inside &= ((points >= self._box_m[0]) & (points <= self._box_m[1])).all(axis=1)
+        return inside
 
     def _store_points(self, points: NDArray[np.float64], part: slice) -> None:
         if self.n_points == 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Final
@@ -13,7 +12,13 @@ from pydantic import Field
 
 from orthoflow.errors import InputError
 from orthoflow.files.geotiff import RasterFile, read_raster
-from orthoflow.files.sidecars import frame_of_raster
+from orthoflow.files.sidecars import (
+    MOST_WALLS,
+    frame_of_raster,
+    read_sidecar,
+    shown_value,
+    sidecar_of,
+)
 from orthoflow.products import InputFiles, Orthoimage, Orthoimages, OrthoMask
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 
@@ -87,8 +92,10 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
     raster = read_raster(path)
     place = _place(path, among, raster)
     said = place.get("wall", wall)
-    if not isinstance(said, int) or said < 0:
-        raise InputError(f"{path.stem}.json: wall must be the number of a wall, got {said!r}")
+    if isinstance(said, bool) or not isinstance(said, int) or not 0 <= said <= MOST_WALLS:
+        raise InputError(
+            f"{path.stem}.json: wall must be the number of a wall, from 0, got {shown_value(said)}"
+        )
     rgb = _rgb(path, raster)
     shown = raster.shown if raster.shown.ndim == 2 else raster.shown[..., 0]
     frame = frame_of_raster(
@@ -113,32 +120,15 @@ def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, o
     """What the JSON file beside an image says, or the tag that orthoflow writes."""
     for other in among:
         if other.stem == path.stem and other.suffix.lower() == ".json":
-            return _json(other.name, _text(other))
+            return read_sidecar(other)
     if "frame" in raster.tags:
         tags = {"name": raster.tags.get("name", path.stem)}
-        return _json(path.name, raster.tags["frame"]) | tags
+        return sidecar_of(raster.tags["frame"], path.name) | tags
     raise InputError(
         f"{path.name} does not say where it lies in the world: put {path.stem}.json with "
         "origin_world, u_world, v_world and normal_world among the files, e.g. a copy of the "
         "wall_<k>_intensity.json that orthoflow wrote"
     )
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name} cannot be read: {error}") from error
-
-
-def _json(name: str, text: str) -> dict[str, object]:
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{name}: no JSON, {error}") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{name}: expected a JSON object with origin_world, u_world ...")
-    return content
 
 
 def _rgb(path: Path, raster: RasterFile) -> NDArray[np.uint8]:

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import ClassVar, Final
+
+from pydantic import Field
 
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import intrinsics_for, matching_pattern, read_calibration
 from orthoflow.files.containers import image_format, is_cut_off
+from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
+from orthoflow.files.e57_images import E57Image, read_e57_images
 from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
 from orthoflow.files.images import decode_image
-from orthoflow.products import Calibration, InputFiles, Photo, Photos
+from orthoflow.files.panoramas import PanoramaFace, faces_of
+from orthoflow.products import Calibration, InputFiles, Intrinsics, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.figures import ContactSheet
 
@@ -22,7 +28,10 @@ _NAMED: Final = 3
 
 
 class ReadPhotos(Method):
-    """Read JPEG, PNG and TIFF photos as they are, ordered by name.
+    """Read JPEG, PNG and TIFF photos as they are, also from inside E57 files, ordered by name.
+
+    A panorama, in an E57 file or named in `panoramas`, becomes six photos, the faces of a cube, as
+    PNG; their lenses are exact.
 
     The files' bytes are kept and never encoded again. Pixels are those of the stored array: the
     EXIF orientation is written down, not applied. Every photo is decoded once, so that a damaged
@@ -30,7 +39,7 @@ class ReadPhotos(Method):
     """
 
     id = "read.photos"
-    result_version = 1
+    result_version = 2
     determinism = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "CIPA DC-008, Exchangeable image file format for digital still cameras (Exif)",
@@ -39,7 +48,14 @@ class ReadPhotos(Method):
     )
 
     class Params(MethodParams):
-        """Nothing to set: files and calibration say everything."""
+        """What files and calibration do not say."""
+
+        panoramas: tuple[str, ...] = Field(
+            (),
+            description="Names of photos, or patterns such as '360_*.jpg', that are panoramas over "
+            "the whole sphere (equirectangular, twice as wide as high): each becomes six photos, "
+            "NAME_front.png and so on.",
+        )
 
     class In(Ports):
         """The photos, and a calibration file if there is one."""
@@ -54,13 +70,14 @@ class ReadPhotos(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Read all photos; see the class."""
-        paths = _photo_paths(ctx, inputs.files)
+        ctx.progress(0.0, inputs.files.name)
+        sources = _sources(ctx, inputs.files, params.panoramas)
         calibration = _calibration(inputs.calibration)
-        sheet = ContactSheet(len(paths))
+        sheet = ContactSheet(len(sources))
         read = []
-        for index, path in enumerate(paths):
-            ctx.progress(index / len(paths), path.name)
-            read.append(_read_photo(path, calibration, sheet))
+        for index, source in enumerate(sources):
+            ctx.progress(index / len(sources), source.name)
+            read.append(_read_photo(source, calibration, sheet))
             ctx.log(_described(read[-1]))
         _warn(ctx, read, calibration)
         photos = Photos(photos=tuple(item.photo for item in read))
@@ -76,19 +93,82 @@ class _ReadPhoto:
     focal: FocalLength
 
 
-def _photo_paths(ctx: StepContext, files: InputFiles) -> list[Path]:
-    """Image files ordered by name; says which others there are."""
-    paths = [path for path in files.paths if path.suffix.lower() in _SUFFIXES]
-    others = [path.name for path in files.paths if path.suffix.lower() not in _SUFFIXES]
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    """Where a photo comes from.
+
+    Attributes:
+        name: of the photo.
+        content: a file of its own, or what makes one of an E57 file or a panorama.
+        lens: what that file says of its lens.
+    """
+
+    name: str
+    content: Path | E57Image | PanoramaFace
+    lens: Intrinsics | None = None
+
+    def encoded(self) -> bytes:
+        """The bytes of the photo as they are."""
+        if isinstance(self.content, Path):
+            return _bytes_of(self.content)
+        return self.content.encoded()
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"photo {path.name} cannot be read: {error.strerror}") from error
+
+
+def _of_panorama(path: Path) -> list[_Source]:
+    encoded = _bytes_of(path)
+    _require_whole(path.name, encoded)
+    height, width = decode_image(encoded, f"photo {path.name}").shape[:2]
+    if width != 2 * height:
+        raise InputError(
+            f"photo {path.name} is named in panoramas, but has {width} x {height} pixels: a "
+            "panorama over the whole sphere is twice as wide as high"
+        )
+    return [
+        _Source(name=face.name, content=face, lens=face.lens)
+        for face in faces_of(encoded, path.stem, width)
+    ]
+
+
+def _inside_e57(path: Path) -> list[_Source]:
+    return [
+        _Source(
+            name=image.name,
+            content=image,
+            lens=image.camera.lens if isinstance(image.camera.lens, Intrinsics) else None,
+        )
+        for image in read_e57_images(path)
+    ]
+
+
+def _sources(ctx: StepContext, files: InputFiles, panoramas: Sequence[str]) -> list[_Source]:
+    """Photos ordered by name; says which other files there are."""
     if not files.paths:
         raise InputError(f"the input {files.name} names no files: expected photos")
-    if not paths:
+    sources, others = [], []
+    for path in files.paths:
+        is_photo = path.suffix.lower() in _SUFFIXES
+        if is_photo and any(fnmatchcase(path.name, pattern) for pattern in panoramas):
+            sources += _of_panorama(path)
+        elif is_photo:
+            sources.append(_Source(name=path.name, content=path))
+        elif path.suffix.lower() == E57_SUFFIX:
+            sources += _inside_e57(path)
+        else:
+            others.append(path.name)
+    if not sources:
         raise InputError(
             f"the input {files.name} holds no photo, only {len(others)} other files: "
             f"{_names(others)}; expected JPEG, PNG or TIFF (.jpg, .png, .tif), so develop raw and "
             "HEIC photos first"
         )
-    counts = Counter(path.name for path in paths)
+    counts = Counter(source.name for source in sources)
     twice = sorted(name for name, count in counts.items() if count > 1)
     if twice:
         raise InputError(
@@ -100,7 +180,7 @@ def _photo_paths(ctx: StepContext, files: InputFiles) -> list[Path]:
             f"{len(others)} of {len(files.paths)} files of the input {files.name} are no JPEG, "
             f"PNG or TIFF and were left out: {_names(others)}"
         )
-    return sorted(paths, key=lambda path: path.name)
+    return sorted(sources, key=lambda source: source.name)
 
 
 def _calibration(files: InputFiles | None) -> Calibration | None:
@@ -114,12 +194,12 @@ def _calibration(files: InputFiles | None) -> Calibration | None:
     return read_calibration(files.paths[0])
 
 
-def _read_photo(path: Path, calibration: Calibration | None, sheet: ContactSheet) -> _ReadPhoto:
-    name = path.name
-    try:
-        encoded = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"photo {name} cannot be read: {error.strerror}") from error
+def _require_whole(name: str, encoded: bytes) -> None:
+    """Refuse what is no photo, or not all of one.
+
+    Raises:
+        InputError: it is not.
+    """
     if image_format(encoded) is None:
         raise InputError(
             f"photo {name} is no JPEG, PNG or TIFF file ({len(encoded)} bytes), whatever its name "
@@ -130,13 +210,25 @@ def _read_photo(path: Path, calibration: Calibration | None, sheet: ContactSheet
             f"photo {name} is cut off: its {len(encoded)} bytes end before the image does; copy "
             "it again from the camera, or take it out"
         )
+
+
+def _read_photo(
+    source: _Source, calibration: Calibration | None, sheet: ContactSheet
+) -> _ReadPhoto:
+    name, encoded = source.name, source.encoded()
+    _require_whole(name, encoded)
     image = decode_image(encoded, f"photo {name}")
     height, width = image.shape[:2]
     exif = read_exif(encoded)
     focal = focal_length(exif, width, height)
-    intrinsics = None
+    intrinsics = source.lens
     if calibration is not None:
-        intrinsics = intrinsics_for(calibration, name, width, height)
+        intrinsics = intrinsics_for(calibration, name, width, height) or intrinsics
+    if intrinsics is not None and (intrinsics.width, intrinsics.height) != (width, height):
+        raise InputError(
+            f"photo {name} has {width} x {height} pixels, but its file says "
+            f"{intrinsics.width} x {intrinsics.height}: export it again"
+        )
     photo = Photo(
         name=name,
         encoded=encoded,
@@ -170,6 +262,10 @@ def _warn(ctx: StepContext, read: Sequence[_ReadPhoto], calibration: Calibration
     damaged = [item.photo.name for item in read if item.exif.is_damaged]
     if damaged:
         ctx.warn(f"the EXIF data of {_counted(damaged)} are damaged; what is readable was taken")
+    doubts = dict.fromkeys(item.focal.doubt for item in read if item.focal.doubt)
+    for doubt in doubts:
+        doubted = [item.photo.name for item in read if item.focal.doubt == doubt]
+        ctx.warn(f"{_counted(doubted)}: {doubt}: it is not used")
     if calibration is not None:
         _warn_of_matches(ctx, read, calibration)
     unknown = [

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from importlib.metadata import version
-from typing import ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from orthoflow.errors import InputError
 from orthoflow.files.points import ScanFile, open_scan
 from orthoflow.files.points.columns import columns_of_text
+from orthoflow.files.points.formats import LAS
 from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.products import InputFiles, JsonValue, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
@@ -28,6 +29,7 @@ from orthoflow_plugins.read.scales import (
 from orthoflow_plugins.read.stations import Stations, choose_stations
 
 Unit = Literal["m", "mm", "ft", "us-ft"]
+Corner = tuple[float, float, float]
 
 UNITS_M: Final[dict[Unit, float]] = {
     "m": 1.0,
@@ -72,6 +74,28 @@ class ReadScan(Method):
             "limits the files state, else the range of the data.",
         )
 
+        box: tuple[Corner, Corner] | None = Field(
+            None,
+            description="Lowest and highest corner, [[x, y, z], [x, y, z]], world metres (after "
+            "unit was applied): points outside are left out, those on its faces are kept.",
+        )
+        classes: tuple[Annotated[int, Field(ge=0, le=255)], ...] = Field(
+            (),
+            description="Classes of LAS and LAZ points that are kept, e.g. [1, 6] (ASPRS: 6 is "
+            "building); empty for all.",
+        )
+
+        @model_validator(mode="after")
+        def _box_has_an_inside(self) -> Self:
+            if self.box is not None and not all(
+                low < high for low, high in zip(*self.box, strict=True)
+            ):
+                raise ValueError(
+                    "box must be [[x, y, z], [x, y, z]], the lowest corner and then the highest, "
+                    f"got {[list(corner) for corner in self.box]}"
+                )
+            return self
+
     class In(Ports):
         """The files."""
 
@@ -87,10 +111,18 @@ class ReadScan(Method):
         columns = None if params.columns is None else columns_of_text(params.columns)
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} names no files: expected a scan")
-        files = [open_scan(path, columns, cores=ctx.cores) for path in inputs.files.paths]
+        files = [
+            open_scan(path, columns, classes=params.classes, cores=ctx.cores)
+            for path in inputs.files.paths
+        ]
+        if params.classes and not any(file.format_name == LAS.name for file in files):
+            ctx.warn(
+                "classes only speaks of LAS and LAZ files, and none was read; it has no effect"
+            )
         if columns is not None and not any(file.format_name == "text" for file in files):
             ctx.warn("columns only speaks of text files, and none was read; it has no effect")
-        assembly = CloudAssembly(ctx, files, UNITS_M[params.unit])
+        box_m = None if params.box is None else np.array(params.box)
+        assembly = CloudAssembly(ctx, files, UNITS_M[params.unit], box_m)
         _warn_of_missing_fields(ctx, files, assembly)
         for file in files:
             # Damaged numbers overflow on their way; what is not finite is dropped and counted.
@@ -98,6 +130,7 @@ class ReadScan(Method):
                 assembly.add_file(file)
             for note in file.notes:
                 ctx.warn(note)
+        assembly.require_points()
         cloud = _finish(ctx, assembly, files, params)
         ctx.figure("plan", plan_view_png(cloud), "The cloud from above, brighter where denser.")
         polar = polar_view_png(cloud)
@@ -272,6 +305,9 @@ def _counts_json(assembly: CloudAssembly) -> dict[str, JsonValue]:
             "invalid": count.n_invalid,
             "withheld": count.n_withheld,
             "not_finite": count.n_not_finite,
+            # Of scans that were read as a whole, records do not change.
+            **({"unwanted": count.n_unwanted} if count.n_unwanted else {}),
+            **({"outside": count.n_outside} if count.n_outside else {}),
             "rounding_m": count.rounding_m,
             "rgb_scale": count.rgb_scale,
             "header": dict(count.header),

@@ -35,11 +35,16 @@ if TYPE_CHECKING:
     from orthoflow_plugins.simulate.deliverables import Delivery
     from orthoflow_plugins.simulate.scanning import Errors, Scan
 
-SpectralGap = Literal["none", "easy", "hard"]
+SpectralGap = Literal["none", "easy", "hard", "inverted"]
 
 _PANORAMA_FACTOR: Final = 3.0
 # How much of what the laser sees is a pattern of its own.
-_SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {"none": 0.0, "easy": 0.3, "hard": 0.7}
+_SPECTRAL_GAPS: Final[Mapping[SpectralGap, float]] = {
+    "none": 0.0,
+    "easy": 0.3,
+    "hard": 0.7,
+    "inverted": 0.3,
+}
 
 
 class SimulateRoom(Method):
@@ -109,7 +114,15 @@ class SimulateRoom(Method):
         )
         spectral_gap: SpectralGap = Field(
             "easy",
-            description="none: the laser sees the painted patterns; hard: mostly other ones.",
+            description="none: the laser sees the painted patterns; hard: mostly other ones; "
+            "inverted: it falls where red rises, with wet patches and retro-reflecting spots.",
+        )
+        spectral_inversion_share: float | None = Field(
+            None,
+            ge=0.0,
+            le=1.0,
+            description="Share of the inverted contrast in what the laser sees; by default 1 for "
+            "`inverted`, else 0. Gains, signs and powers are drawn per material.",
         )
         textile_share: float = Field(
             TEXTILE_BY_DESIGN,
@@ -233,7 +246,7 @@ def _scan(
     main_wall = room.planes[0]
     seeds = rng.integers(0, 2**62, size=2 * params.n_stations)
     sweeps = planned_sweeps(plan, main_wall.plane, main_wall.outline, seeds)
-    return scan_scene(room.scene, sweeps, _errors(params), ctx)
+    return scan_scene(room.scene, sweeps, _errors(params, int(seeds[0])), ctx)
 
 
 def _film(params: SimulateRoom.Params) -> Film:
@@ -255,7 +268,7 @@ def _check_points(delivery: Delivery, views: SceneCameras, n_most: int) -> Check
     )
 
 
-def _errors(params: SimulateRoom.Params) -> Errors:
+def _errors(params: SimulateRoom.Params, band_seed: int) -> Errors:
     from orthoflow_plugins.simulate.scanning import Errors
 
     return Errors(
@@ -263,4 +276,12 @@ def _errors(params: SimulateRoom.Params) -> Errors:
         outlier_share=params.outlier_share,
         beam_m=params.beam_m,
         colour_noise=params.colour_noise_grey,
+        inversion=_inversion(params),
+        band_seed=band_seed,
     )
+
+
+def _inversion(params: SimulateRoom.Params) -> float:
+    if params.spectral_inversion_share is None:
+        return float(params.spectral_gap == "inverted")
+    return params.spectral_inversion_share

@@ -19,6 +19,7 @@ from orthoflow.geometry.scene_rays import RAYS_AT_ONCE, Hits, SceneRays, points_
 from orthoflow.geometry.scenes import Scene, TextureKind
 from orthoflow.geometry.threads import in_runs
 from orthoflow.sdk import StepContext
+from orthoflow_plugins.simulate.laser_band import LaserBand
 from orthoflow_plugins.simulate.room_model import main_wall_axes
 
 # `Scanned.rectangle` of a ray that met nothing, and of a gross outlier or a mixed distance.
@@ -71,12 +72,16 @@ class Errors:
         outlier_share: share of points at a random distance.
         beam_m: diameter of the spot; where it falls on two surfaces the distance mixes.
         colour_noise: standard deviation of a colour, grey levels.
+        inversion: how far the laser sees contrast the other way round, as `LaserBand` has it.
+        band_seed: of the materials in the laser's band.
     """
 
     noise_m: float
     outlier_share: float
     beam_m: float
     colour_noise: float
+    inversion: float = 0.0
+    band_seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,6 +218,7 @@ class Scanner:
         self._normal = scene.normal
         self._is_cloth = scene.texture == TextureKind.TEXTILE
         self._errors = errors
+        self._band = LaserBand(scene=scene, inversion=errors.inversion, seed=errors.band_seed)
 
     def sweep(self, sweep: Sweep, first: int, last: int, scanned: Scanned) -> None:
         """Scan some columns; every ray's noise is a function of seed, column and row alone.
@@ -230,10 +236,10 @@ class Scanner:
         measured = self._measured(sweep, echoes, into.rectangle)
         for coordinate, along in zip((into.x, into.y, into.z), range(3), strict=True):
             coordinate[:] = sweep.station[along] + measured * echoes.ways[along]
-        colours = self._rays.colours(
-            echoes.hits.rectangle, points_on(start, echoes.ways, echoes.hits)
-        )
-        bright = colours[3] * echoes.cosine**0.7
+        points = points_on(start, echoes.ways, echoes.hits)
+        colours = self._rays.colours(echoes.hits.rectangle, points)
+        seen = self._band.reflectance(echoes.hits.rectangle, points, colours)
+        bright = seen * echoes.cosine**0.7
         bright *= np.sqrt(2.0 / np.maximum(1.0, echoes.distance))
         bright *= 1.0 + 0.03 * normals(echoes.states, 12)
         into.intensity[:] = np.clip(bright, 0.0, 1.0)

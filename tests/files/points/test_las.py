@@ -43,6 +43,26 @@ def test_las_leaves_out_points_marked_as_deleted(
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("cores", [1, 2])
+def test_only_the_classes_asked_for_are_given_and_the_rest_is_counted(
+    suffix: str, cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(1)
+    points, withheld = rng.uniform(0, 5, (60_000, 3)), np.arange(60_000) % 7 == 0
+    classes = rng.choice([2, 6, 40], 60_000)
+    path = scan_files.write_las(tmp_path / f"a{suffix}", points, withheld=withheld, classes=classes)
+    monkeypatch.setattr(las, "BLOCK_POINTS", 50_000)
+    monkeypatch.setattr(las, "_BLOCKS_LEAST", 1)
+    blocks = list(open_scan(path, classes=(6, 40), cores=cores).read())
+    wanted = np.isin(classes, [6, 40])
+    found = np.concatenate([block.points for block in blocks])
+    np.testing.assert_allclose(found, points[wanted & ~withheld], atol=6e-5)
+    assert sum(block.n_read for block in blocks) == 60_000
+    assert sum(block.n_withheld for block in blocks) == withheld.sum()
+    assert sum(block.n_unwanted for block in blocks) == (~wanted & ~withheld).sum()
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("cores", [1, 3])
 def test_las_blocks_keep_the_order_of_the_file_for_any_number_of_processes(
     suffix: str, cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

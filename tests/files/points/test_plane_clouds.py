@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import ArgumentError
+from orthoflow.files.points import plane_clouds
 from orthoflow.files.points.las import open_las
 from orthoflow.files.points.plane_clouds import plane_colour, write_plane_cloud
 from orthoflow.products import PointCloud, PointLabels
@@ -72,3 +73,103 @@ def test_labels_of_another_cloud_are_refused(tmp_path: Path) -> None:
     other = PointLabels(plane_index=np.zeros(7, dtype=np.int16))
     with pytest.raises(ArgumentError, match="labels are of 7 points, but the cloud has 5000"):
         write_plane_cloud(tmp_path / "planes.laz", cloud, other)
+
+
+def test_neighbouring_planes_have_hues_a_golden_section_apart() -> None:
+    # 0.618 of the circle lies 0.708 of the way from cyan to blue, the next one, 0.236, near green.
+    assert [plane_colour(k) for k in range(-1, 3)] == [
+        *((128, 128, 128), (255, 102, 102)),
+        *((102, 147, 255), (191, 255, 102)),
+    ]
+
+
+def small_cloud(**more: np.ndarray | None) -> PointCloud:
+    points = np.array([[10.5, 20.25, 30.0], [11.0, 21.0, 31.0], [12.0, 22.0, 32.0]])
+    return dataclasses.replace(scenes.cloud_of(points), **more)  # type: ignore[arg-type]
+
+
+SMALL_LABELS = PointLabels(plane_index=np.array([-1, 0, 0], np.int16))
+
+
+@pytest.mark.parametrize(
+    ("more", "shades"),
+    [
+        ({"intensity": None, "rgb": None}, (1.0, 1.0, 1.0)),
+        # Roots of the intensity, from the darkest (0.4) to the lightest; a scan goes from 0 to 1.
+        ({"intensity": np.array([0.0, 0.25, 1.0], np.float32), "rgb": None}, (0.4, 0.7, 1.0)),
+        ({"intensity": np.array([0.0, -4.0, 9.0], np.float32), "rgb": None}, (0.4, 0.4, 1.0)),
+        (
+            {
+                "intensity": None,
+                "rgb": np.array([[0, 0, 0], [90, 0, 60], [100, 100, 100]], np.uint8),
+            },
+            (0.4, 0.7, 1.0),
+        ),
+    ],
+    ids=["neither", "intensity", "odd intensity", "colours"],
+)
+def test_a_colour_is_its_planes_shaded(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    more: dict[str, np.ndarray | None],
+    shades: tuple[float, ...],
+) -> None:
+    monkeypatch.setattr(plane_clouds, "_CHUNK", 2)
+    monkeypatch.setattr(plane_clouds, "_grey_range", exact_range)
+    cloud = small_cloud(**more)
+    write_plane_cloud(tmp_path / "a.laz", cloud, SMALL_LABELS)
+    read = laspy.read(tmp_path / "a.laz")
+    colours = np.array([(128, 128, 128), (255, 102, 102), (255, 102, 102)])
+    expected = 257.0 * colours * np.array(shades)[:, None]
+    np.testing.assert_allclose(np.column_stack([read.red, read.green, read.blue]), expected, atol=1)
+    np.testing.assert_array_equal(read.xyz, cloud.points_world())
+    assert set(read.return_number) == set(read.number_of_returns) == {1}
+    header = read.header
+    assert (header.version.minor, header.point_format.id) == (4, 7)
+    assert header.generating_software.strip("\0") == "orthoflow"
+    np.testing.assert_array_equal(header.scales, [1e-4] * 3)
+    np.testing.assert_array_equal(header.offsets, np.floor(cloud.origin))
+    if cloud.intensity is not None:
+        np.testing.assert_array_equal(
+            read.intensity, np.rint(65535.0 * np.clip(cloud.intensity, 0.0, 1.0))
+        )
+
+
+def exact_range(cloud: PointCloud) -> tuple[float, float]:
+    grey = plane_clouds._grey(cloud, slice(0, len(cloud)))
+    is_plain = cloud.intensity is None and cloud.rgb is None
+    return (0.0, 1.0) if is_plain else (float(grey.min()), float(grey.max()))
+
+
+def test_shades_go_from_the_first_to_the_last_hundredth() -> None:
+    grey = np.tile(np.linspace(0.0, 1.0, 1001, dtype=np.float32), 20)
+    cloud = scenes.cloud_of(np.zeros((len(grey), 3)), intensity=grey**2)
+    low, high = plane_clouds._grey_range(cloud)
+    assert low == pytest.approx(0.01, abs=2e-3)
+    assert high == pytest.approx(0.99, abs=2e-3)
+    assert plane_clouds._grey_range(small_cloud(intensity=None)) == (0.0, 1.0)
+    nothing = np.zeros(0, np.float32)
+    none = PointCloud(
+        origin=np.zeros(3),
+        x=nothing,
+        y=nothing,
+        z=nothing,
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity=nothing,
+    )
+    assert plane_clouds._grey_range(none) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("far_m", "scale"), [(100_000.0, 1e-4), (107_374.0, 1e-4), (107_376.0, 1e-3), (2e6, 1e-2)]
+)
+def test_wide_clouds_are_kept_in_coarser_steps(tmp_path: Path, far_m: float, scale: float) -> None:
+    points = np.array([[0.0, 0.0, 0.0], [0.0, -far_m, 0.0]])
+    still = np.zeros(2, np.float32)
+    y = np.array([0.0, -far_m], np.float32)
+    cloud = PointCloud(origin=np.zeros(3), x=still, y=y, z=still, up=np.array([0.0, 0.0, 1.0]))
+    labels = PointLabels(plane_index=np.zeros(2, np.int16))
+    write_plane_cloud(tmp_path / "a.laz", cloud, labels)
+    read = laspy.read(tmp_path / "a.laz")
+    np.testing.assert_allclose(read.header.scales, [scale] * 3, rtol=1e-12)
+    np.testing.assert_allclose(read.xyz, points, atol=scale)

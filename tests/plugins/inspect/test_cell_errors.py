@@ -1,13 +1,26 @@
-"""A part of a large wall is compared: spread evenly, whole blocks, nothing where nothing shows."""
+"""Errors of cells; of large walls a part is compared, spread evenly, in whole blocks."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.cell_errors import BLOCK_CELLS, sampling, sampling_rule
+from orthoflow_plugins.inspect.cell_errors import (
+    BLOCK_CELLS,
+    Sampling,
+    WallSamples,
+    depth_step_band,
+    pooled,
+    sample_findings,
+    sampling,
+    sampling_rule,
+    wall_errors,
+)
 
 from orthoflow.geometry import frame_over
-from orthoflow.products import Orthoimage, OrthoMask
+from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask
 
 
 def image(mask: np.ndarray) -> Orthoimage:
@@ -58,3 +71,169 @@ def test_what_shows_nothing_has_no_colours_to_compare() -> None:
     rule = sampling_rule([wall], colour_cells_most=1_000_000, seen_cells_most=1_000_000)
     coloured = sampling(wall, rule).coloured[::BLOCK_CELLS, ::BLOCK_CELLS]
     np.testing.assert_array_equal(coloured, [[1, 0, 0], [0, 0, 1], [0, 0, 0]])
+
+
+# --- errors of cells ---
+
+SHAPE = (12, 20)
+
+
+def scene() -> tuple[Any, Any, Any]:
+    """An orthoimage, its wall and their truth: a step of two columns' depth at column 10.
+
+    Rows 0 and 1 of the image are right; row 5 is off by 10 grey, row 7 filled and off by 20; column
+    15 of row 3 has a colour that is nowhere near.
+    """
+    rgb = np.full((*SHAPE, 3), 100.0, dtype=np.float32)
+    depth = np.zeros(SHAPE, dtype=np.float32)
+    depth[:, 10:] = 0.1
+    rectangle = np.zeros(SHAPE, dtype=np.int32)
+    rectangle[11] = -1
+    rgb[11], depth[11] = np.nan, np.nan
+    behind = np.zeros(SHAPE, dtype=np.bool_)
+    behind[3] = True
+    seen = rectangle >= 0
+    seen[9] = False
+    frame = SimpleNamespace(gsd_m=0.01, shape=SHAPE)
+    true = SimpleNamespace(
+        rgb=rgb, depth_m=depth, rectangle=rectangle, behind_object=behind, seen=seen, frame=frame
+    )
+    shown = np.full((*SHAPE, 3), 100, dtype=np.uint8)
+    shown[5], shown[7, :, 1] = 110, 120
+    shown[3, 15] = (100, 100, 145)
+    shown[8, 15] = (100, 100, 139)
+    mask = np.full(SHAPE, OrthoMask.PAINTED, dtype=np.uint8)
+    mask[7], mask[10] = OrthoMask.FILLED, OrthoMask.NONE
+    measured = np.full(SHAPE, SurfaceMask.MEASURED, dtype=np.uint8)
+    measured[0] = SurfaceMask.VOID
+    wall = SimpleNamespace(
+        mask=measured,
+        depth_m=depth + np.float32(0.002),
+        sigma_m=np.full(SHAPE, 0.001, dtype=np.float32),
+    )
+    return SimpleNamespace(rgb=shown, mask=mask), wall, true
+
+
+def test_cells_are_compared_away_from_steps_and_by_what_they_are() -> None:
+    image_, wall, true = scene()
+    every = np.ones(SHAPE, dtype=np.bool_)
+    lattice = np.zeros(SHAPE, dtype=np.bool_)
+    lattice[1::2, 1::2] = True
+    steps = depth_step_band(true.depth_m)
+    # Two cells on either side of the step, and two rows at the rim of the surface.
+    expected = np.zeros(SHAPE, dtype=np.bool_)
+    expected[:, 8:12] = expected[9:] = True
+    np.testing.assert_array_equal(steps[:11], expected[:11])
+    errors = wall_errors(image_, wall, true, Sampling(coloured=every, lattice=lattice))
+    samples = errors.samples
+    away = ~steps & (true.rectangle >= 0)
+    n_away = np.count_nonzero(away[1:])
+    np.testing.assert_allclose(samples.depth_m, 0.002, atol=1e-7)
+    assert len(samples.depth_m) == len(samples.sigma_m) == n_away
+    assert len(samples.step_depth_m) == 10 * 20 - n_away
+    assert np.isnan(errors.depth_m[[0, 11]]).all()
+    # Per row of sixteen cells away from steps: six rows right, one off by 10.
+    assert np.count_nonzero(samples.colour == 100.0) == 16
+    np.testing.assert_allclose(samples.filled_colour, np.full(16, 400.0 / 3.0))
+    assert np.count_nonzero(samples.colour > 100.0) == 2
+    assert len(samples.colour) == 8 * 16
+    assert len(samples.step_colour) == 8 * 4 + 20
+    np.testing.assert_allclose(errors.grey[5, :8], 10.0)
+    assert np.isnan(errors.grey[10:]).all()
+    painted = (image_.mask == OrthoMask.PAINTED) & (true.rectangle >= 0)
+    assert samples.n_painted == np.count_nonzero(painted & lattice)
+    assert samples.n_seen == np.count_nonzero(true.seen & lattice)
+    assert samples.n_seen_painted == np.count_nonzero(true.seen & lattice & painted)
+    assert samples.n_seen_shown - samples.n_seen_painted == np.count_nonzero(lattice[7])
+    assert samples.n_unseen_painted == 0
+    assert samples.n_coloured == np.count_nonzero(painted)
+    # Forty grey is the limit.
+    assert (samples.n_gross, samples.n_ghost) == (1, 1)
+    some = wall_errors(image_, wall, true, Sampling(coloured=~every, lattice=every)).samples
+    assert (len(some.colour), some.n_coloured, some.n_gross) == (0, 0, 0)
+    assert len(some.depth_m) == n_away
+    true.seen[2, :8] = False
+    assert wall_errors(image_, wall, true, Sampling(coloured=every, lattice=every)
+                       ).samples.n_unseen_painted == 8  # fmt: skip
+
+
+def samples_of(**given: Any) -> WallSamples:
+    none = np.zeros(0)
+    usual = {
+        "depth_m": none, "sigma_m": none, "step_depth_m": none, "colour": none,
+        "filled_colour": none, "step_colour": none, "shift_m": np.zeros((0, 2)),
+        "shift_cells": np.zeros((0, 2)), "n_painted": 0, "n_seen": 0, "n_seen_painted": 0,
+        "n_seen_shown": 0, "n_unseen_painted": 0, "n_coloured": 0, "n_gross": 0, "n_ghost": 0,
+    }  # fmt: skip
+    return WallSamples(**{**usual, **given})
+
+
+def numbers_of(samples: WallSamples, **options: bool) -> dict[str, float]:
+    return {item.name: item.value for item in sample_findings(samples, 2, **options)}
+
+
+def test_numbers_follow_their_definitions() -> None:
+    shift_cells = np.array([[0.1, 0.2], [0.1, 0.1], [0.2, 0.1], [0.1, -0.1], [9.0, 0.0]])
+    samples = samples_of(
+        depth_m=np.array([0.001, -0.002, 0.003, 0.001]),
+        sigma_m=np.array([0.0004, 0.0005, 0.0011, np.nan]),
+        step_depth_m=np.array([0.01, 0.02]),
+        colour=np.array([4.0, 16.0]),
+        filled_colour=np.array([9.0]),
+        step_colour=np.array([25.0, 49.0]),
+        shift_m=0.01 * shift_cells,
+        shift_cells=shift_cells,
+        n_painted=10, n_seen=8, n_seen_painted=6, n_seen_shown=7, n_unseen_painted=3,
+        n_coloured=20, n_gross=4, n_ghost=1,
+    )  # fmt: skip
+    found = numbers_of(samples)
+    kept = 10.0 * shift_cells[:4]
+    expected = {
+        "depth_median_mm": 1.0,
+        "depth_nmad_mm": 1.4826 * 1.0,
+        "depth_rmse_mm": np.sqrt(15.0 / 4.0),
+        "depth_within_3sigma": 2.0 / 3.0,
+        "depth_step_rmse_mm": np.sqrt(250.0),
+        "colour_rmse_grey": np.sqrt(10.0),
+        "filled_colour_rmse_grey": 3.0,
+        "step_colour_rmse_grey": np.sqrt(37.0),
+        "n_patches": 5.0,
+        "rmse_u_mm": np.sqrt((kept[:, 0] ** 2).mean()),
+        "rmse_v_mm": np.sqrt((kept[:, 1] ** 2).mean()),
+        "mean_u_mm": kept[:, 0].mean(),
+        "mean_v_mm": kept[:, 1].mean(),
+        "displaced_share": 0.2,
+        "completeness": 0.75,
+        "completeness_filled": 0.875,
+        "unseen_painted_share": 0.3,
+        "gross_colour_share": 0.2,
+        "ghost_share": 0.05,
+    }
+    assert found == {name: pytest.approx(value, rel=1e-3) for name, value in expected.items()}
+    assert {item.wall for item in sample_findings(samples, 2)} == {2}
+    traced = numbers_of(samples, sources_are_traced=True)
+    assert traced["patch_rmse_u_mm"] == found["rmse_u_mm"]
+    assert traced["ghost_colour_share"] == 0.05
+    assert "rmse_u_mm" not in traced
+    assert numbers_of(samples_of()) == {"n_patches": 0.0}
+    twice = numbers_of(pooled([samples, samples]))
+    assert twice == {
+        name: pytest.approx(10.0 if name == "n_patches" else value, rel=1e-3)
+        for name, value in expected.items()
+    }
+
+
+def test_patches_further_off_than_the_rest_are_displaced() -> None:
+    """A quarter of a cell is always allowed, else four robust deviations."""
+    still = np.zeros((9, 2))
+    for far, share in ((0.24, 0.0), (0.26, 0.1)):
+        cells = np.vstack([still, [0.0, far]])
+        found = numbers_of(samples_of(shift_cells=cells, shift_m=0.01 * cells))
+        assert found["displaced_share"] == pytest.approx(share)
+    # Of these ten and one more the median is 1/45, the median distance from it 2/15.
+    spread = np.column_stack([np.linspace(-0.2, 0.2, 10), np.zeros(10)])
+    limit = 1.0 / 45.0 + 4.0 * 1.4826 * 2.0 / 15.0
+    for far, share in ((limit - 0.01, 0.0), (limit + 0.01, 1.0 / 11.0)):
+        cells = np.vstack([spread, [far, 0.0]])
+        found = numbers_of(samples_of(shift_cells=cells, shift_m=0.01 * cells))
+        assert found["displaced_share"] == pytest.approx(share, abs=1e-9), far

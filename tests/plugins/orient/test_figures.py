@@ -1,15 +1,26 @@
-"""Histograms of residuals: all photos together, and each with its own normal distribution."""
+"""Pictures of an orientation: ties on photos, predicted errors on walls, residuals of photos."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from orthoflow_plugins.orient.figures import PhotoResiduals, _normal, draw_residuals
+from numpy.typing import NDArray
+from orthoflow_plugins.orient import figures
+from orthoflow_plugins.orient.figures import (
+    PhotoResiduals,
+    _normal,
+    draw_residuals,
+    draw_ties,
+    draw_wall_errors,
+)
 
-from orthoflow.products import TieRole
+from orthoflow.files.images import encode_png
+from orthoflow.products import Photo, TieRole
 from orthoflow.sdk import StepContext
 
 
@@ -50,3 +61,169 @@ def test_without_residuals_nothing_is_drawn(tmp_path: Path) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     draw_residuals(context, [])
     assert context.figures == []
+
+
+# --- ties on photos ---
+
+
+@pytest.fixture
+def exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures as they are before WebP loses some of them."""
+    monkeypatch.setattr(figures, "encode_webp", np.array)
+
+
+def photo_of(image: NDArray[np.uint8], name: str = "west/a b.jpg") -> Photo:
+    return Photo(name=name, encoded=encode_png(image), width=image.shape[1], height=image.shape[0])
+
+
+@pytest.mark.usefixtures("exact")
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_ties_are_marked_on_a_dimmed_photo_in_the_colour_of_their_role(
+    scale: float, drawings: dict[str, Any], tmp_path: Path
+) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    image = np.full((round(300 / scale), round(900 / scale), 3), 200, dtype=np.uint8)
+    at = np.array([[100.5, 50.5], [400.5, 100.5], [700.5, 250.5]])
+    role = np.array([TieRole.CONTROL, TieRole.CHECK, TieRole.REJECTED], dtype=np.uint8)
+    draw_ties(context, photo_of(image), at / scale, role, "ok")
+    shown = np.array(drawings["ties_west-a-b"])
+    assert shown.shape == (300, 900, 3)
+    colours = [(40, 200, 60), (250, 220, 40), (220, 40, 40)]
+    expected = np.full((300, 900, 3), 140, dtype=np.uint8)
+    for (u, v), colour in zip(((100, 50), (400, 100), (700, 250)), colours, strict=True):
+        cv2.circle(expected, (u, v), 2, colour, -1, cv2.LINE_AA)
+        assert tuple(shown[v, u]) == colour
+        assert tuple(shown[v, u + 4]) == (140, 140, 140)
+    # Marks have sixteenths of a pixel, these stand on whole ones.
+    assert np.abs(shown.astype(int) - expected).max() <= 2
+
+
+def test_photos_of_one_stem_have_figures_of_their_own_and_no_more_than_enough(
+    tmp_path: Path,
+) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    image = np.zeros((4, 6, 3), dtype=np.uint8)
+    nothing = np.empty((0, 2)), np.empty(0, dtype=np.uint8)
+    for name in ("a.jpg", "a.tif", "noending"):
+        draw_ties(context, photo_of(image, name), *nothing, "ok")
+    assert [figure.name for figure in context.figures] == ["ties_a", "ties_a-1", "ties_noending"]
+    for k in range(30):
+        draw_ties(context, photo_of(image, f"{k}.jpg"), *nothing, "ok")
+    assert len(context.figures) == 24
+
+
+# --- predicted errors ---
+
+
+@pytest.mark.usefixtures("exact")
+def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
+    drawings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    corners = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [9.0, 0.0, 2.0]])
+    wall = SimpleNamespace(index=3, corners_world=corners)
+    hidden = SimpleNamespace(index=5, corners_world=corners)
+    shape = (20, 90)
+    rng = np.random.default_rng(0)
+    first, second = rng.uniform(0.001, 0.01, (2, *shape))
+    first[:5], second[3:, :4] = np.inf, np.nan
+    sigmas = {1: first, 2: second}
+
+    def sigmas_of(photo: int, on: Any, asked: tuple[int, int]) -> NDArray[np.float64]:
+        assert asked == shape
+        return sigmas[photo] if on is wall else np.full(shape, np.inf)
+
+    monkeypatch.setattr(figures, "sigmas_on_wall", sigmas_of)
+    candidates: Any = [
+        SimpleNamespace(known=(wall, hidden), estimate=SimpleNamespace(resection=k)) for k in (1, 2)
+    ]
+    draw_wall_errors(context, candidates)
+    # Nobody sees the other wall.
+    assert list(drawings) == ["wall_3_predicted_error"]
+    best = np.minimum(first, np.where(np.isnan(second), np.inf, second))
+    seen = np.isfinite(best)
+    assert not seen.all()
+    high = np.percentile(best[seen], 98.0)
+    grey = np.rint(255.0 * np.minimum(np.where(seen, best, 0.0) / high, 1.0)).astype(np.uint8)
+    rgb = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[:, :, ::-1].copy()
+    rgb[~seen] = (20, 40, 60)
+    shown = np.array(drawings["wall_3_predicted_error"])
+    np.testing.assert_array_equal(shown, rgb.repeat(8, axis=0).repeat(8, axis=1))
+
+
+# --- residuals ---
+
+
+def test_residuals_of_all_photos_are_counted_by_role_and_coordinate(
+    drawings: dict[str, Any], tmp_path: Path
+) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    photos = [residuals(f"{k}.jpg", 300, k, shift_px=k - 1.0) for k in range(3)]
+    # Unknown ones are left out.
+    photos[0].residuals_px[1] = np.nan
+    draw_residuals(context, photos)
+    pooled = drawings["residuals"]
+    np.testing.assert_allclose(pooled.get_size_inches(), [7.0, 5.2])
+    panels = np.array(pooled.axes).reshape(2, 2)
+    for row, kind in enumerate((TieRole.CONTROL, TieRole.CHECK)):
+        values = np.vstack([photo.of_kind(kind) for photo in photos])
+        assert len(values) == (3 * 239 - 1 if row == 0 else 180)
+        for column in range(2):
+            axes = panels[row, column]
+            counts, edges, _ = axes.patches[0].get_data()
+            expected = np.histogram(values[:, column], bins=40)
+            np.testing.assert_array_equal(counts, expected[0])
+            np.testing.assert_allclose(edges, expected[1])
+            x, curve = axes.lines[0].get_data()
+            assert (x[0], x[-1]) == (edges[0], edges[-1])
+            mean, deviation = values[:, column].mean(), values[:, column].std()
+            share = np.exp(-0.5 * ((x - mean) / deviation) ** 2)
+            peak = len(values) * (edges[1] - edges[0]) / (deviation * np.sqrt(2.0 * np.pi))
+            np.testing.assert_allclose(curve, peak * share)
+
+
+def test_rows_of_photos_reach_the_same_height_and_as_far_as_nearly_all_residuals(
+    drawings: dict[str, Any], tmp_path: Path
+) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    photos = [residuals(f"{k}.jpg", 200 + k, k) for k in range(32)]
+    # Two residuals of a photo are no distribution.
+    photos[4] = residuals("4.jpg", 3, 4)
+    draw_residuals(context, photos)
+    figure = drawings["residuals_by_photo"]
+    np.testing.assert_allclose(figure.get_size_inches(), [2.6 * 4, 1.0 + 0.45 * 30])
+    names = [text.get_text() for text in figure.axes[0].get_yticklabels()]
+    assert names == [f"{k}.jpg" for k in range(30)]
+    np.testing.assert_array_equal(figure.axes[0].get_yticks(), -np.arange(30.0))
+    columns = [(kind, axis) for kind in (TieRole.CONTROL, TieRole.CHECK) for axis in (0, 1)]
+    for (kind, axis), axes in zip(columns, figure.axes, strict=True):
+        pooled = np.vstack([photo.of_kind(kind) for photo in photos])[:, axis]
+        reach = np.percentile(np.abs(pooled), 99.5)
+        np.testing.assert_allclose(axes.get_xlim(), (-reach, 1.6 * reach))
+        np.testing.assert_allclose(axes.get_ylim(), (0.9 - 30, 1.0))
+        assert len(axes.patches) == 29
+        middle, *curves = [line.get_data() for line in sorted(axes.lines, key=_n_places)]
+        np.testing.assert_array_equal(middle[0], 0.0)
+        rows = [row for row in range(30) if row != 4]
+        for row, stairs, (x, curve) in zip(rows, axes.patches, curves, strict=True):
+            heights, edges, baseline = stairs.get_data()
+            assert baseline == -row
+            values = photos[row].of_kind(kind)[:, axis]
+            counts = np.histogram(values, 25, (-reach, reach))[0]
+            top = 0.8 / max(counts.max(), _normal(values, edges, x).max())
+            np.testing.assert_allclose(heights + row, top * counts, atol=1e-12)
+            np.testing.assert_allclose(curve + row, top * _normal(values, edges, x), atol=1e-12)
+            assert (edges[0], edges[-1]) == (x[0], x[-1]) == (-reach, reach)
+
+
+def _n_places(line: Any) -> int:
+    return len(line.get_xdata())
+
+
+def test_two_residuals_are_not_drawn(drawings: dict[str, Any], tmp_path: Path) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    role = np.array([TieRole.CONTROL] * 3 + [TieRole.CHECK] * 2, dtype=np.uint8)
+    values = np.arange(10.0).reshape(5, 2)
+    draw_residuals(context, [PhotoResiduals(name="a.jpg", residuals_px=values, role=role)])
+    assert len(drawings["residuals"].axes) == 2
+    assert len(drawings["residuals_by_photo"].axes) == 2

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from orthoflow.errors import MethodError, ProductError
 from orthoflow.products import PointCloud
-from tests.plane_scenes import ROOM, cloud_of, context, sampled
+from tests.plane_scenes import ROOM, Rectangle, cloud_of, context, sampled
 
 SURVEY = (634512.347, 486215.781, 112.193)
 
@@ -142,3 +142,77 @@ def test_a_plane_far_from_every_point_says_where_the_points_are(tmp_path: Path) 
 def test_an_empty_cloud_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ProductError, match="the cloud has 0 points"):
         lay(cloud_of(np.zeros((0, 3))), tmp_path)
+
+
+TRIPLES = (
+    {"points": ((-3.0, -2.0, -1.5), (3.0, -2.0, -1.5), (0.0, -2.0, 1.5))},
+    {"horizontal": True, "height_m": -1.5},
+)
+
+
+def test_several_planes_are_those_that_each_alone_would_be(tmp_path: Path) -> None:
+    cloud = cloud_of(sampled(), stations=np.array([[0.0, 1.0, 0.0]]))
+    both = lay(cloud, tmp_path / "both", planes=TRIPLES)
+    singles = [lay(cloud, tmp_path / str(k), **stated) for k, stated in enumerate(TRIPLES)]
+    # By the number of their points, as everywhere: the floor has more.
+    assert both.planes.n_points[0] > both.planes.n_points[1]
+    assert both.planes.names == ("floor", "wall 1")
+    for place, alone in zip((1, 0), singles, strict=True):
+        for name in ("normal", "offset", "corners"):
+            np.testing.assert_array_equal(
+                getattr(both.planes, name)[place], getattr(alone.planes, name)[0], err_msg=name
+            )
+    assert both.planes.part_plane is not None
+    assert set(both.planes.part_plane.tolist()) == {0, 1}
+
+
+def test_a_point_near_two_planes_belongs_to_the_nearer(tmp_path: Path) -> None:
+    points = sampled()
+    out = lay(cloud_of(points), tmp_path, planes=TRIPLES, tolerance_m=0.05)
+    to_wall, to_floor = np.abs(points[:, 1] + 2.0), np.abs(points[:, 2] + 1.5)
+    disputed = (to_wall < 0.049) & (to_floor < 0.049) & (np.abs(to_wall - to_floor) > 1e-5)
+    assert disputed.sum() > 10
+    wall = out.planes.names.index("wall 1")
+    labels = out.labels.plane_index
+    np.testing.assert_array_equal(labels[disputed] == wall, (to_wall < to_floor)[disputed])
+    assert out.planes.n_points.tolist() == [np.count_nonzero(labels == k) for k in (0, 1)]
+
+
+def test_the_one_of_several_planes_that_no_point_is_near_is_named(tmp_path: Path) -> None:
+    beside = {"normal": (0.0, 1.0, 0.0), "offset_m": 10.0}
+    with pytest.raises(MethodError, match=r"planes\[1\]: no point of the cloud lies within"):
+        lay(cloud_of(sampled()), tmp_path, planes=(TRIPLES[0], beside))
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"planes": TRIPLES, "height_m": 2.0}, "got horizontal beside planes: move it into"),
+        ({"planes": ({"normal": (0, 0, 1.0)},)}, "normal and offset_m together, got only one"),
+    ],
+    ids=["one and several", "half of one"],
+)
+def test_contradicting_lists_of_planes_are_refused(params: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        GivenPlane.Params(**params)
+
+
+def test_the_rectangle_spans_what_lies_within_the_buffer(tmp_path: Path) -> None:
+    wall = Rectangle("wall", (0, 2, 0), (1, 0, 0), (0, 0, 1), 20_000)
+    beside = Rectangle("beside", (1.5, 2.3, 0), (0.5, 0, 0), (0, 0, 1), 10_000)
+    cloud = cloud_of(sampled((wall, beside)))
+
+    def right_m(name: str, **params: object) -> float:
+        asked = {"normal": (0.0, -1.0, 0.0), "offset_m": -2.0, **params}
+        return float(lay(cloud, tmp_path / name, **asked).planes.corners[0, :, 0].max())
+
+    # By default three tolerances: 15 cm, 36 cm.
+    assert right_m("usual") == pytest.approx(1.0, abs=0.01)
+    assert right_m("tolerant", tolerance_m=0.12) == pytest.approx(2.0, abs=0.01)
+    assert right_m("wide", buffer_m=0.4) == pytest.approx(2.0, abs=0.01)
+    assert right_m("narrow", tolerance_m=0.12, buffer_m=0.2) == pytest.approx(1.0, abs=0.01)
+    points = ((0.0, 2.0, 0.0), (1.0, 2.0, 0.0), (0.0, 2.0, 1.0))
+    three = lay(cloud, tmp_path / "three", points=points, buffer_m=0.4).planes
+    assert three.corners[0, :, 0].max() == pytest.approx(2.0, abs=0.01)
+    three = lay(cloud, tmp_path / "usual three", points=points).planes
+    assert three.corners[0, :, 0].max() == pytest.approx(1.0, abs=0.01)

@@ -99,6 +99,47 @@ def test_a_plane_is_not_covered_by_one_that_was_left_out_itself() -> None:
     assert chosen_planes(three, CHOICE) == [0, 2]
 
 
+def test_the_wall_nearest_to_a_point_is_chosen() -> None:
+    # Facing -y: y = 3 from x = 0 to 5, y = 1 from 6 to 7, and one across at x = 5.
+    three = planes(MAIN, (2.0, 6.0, 1.0, 0.0), (0.0, 5.0, 2.0, -90.0))
+    cases = {
+        (2.0, 2.9, 1.0): 0,
+        (2.0, 3.4, 1.0): 0,  # behind it is as near as before it
+        (6.5, 1.2, 1.0): 1,
+        (5.1, 1.5, 1.0): 2,
+        (5.6, 1.1, 1.0): 1,  # on the extension of 1's plane, and nearer than 2
+    }
+    for place, expected in cases.items():
+        assert chosen_planes(three, replace(CHOICE, near=(place,))) == [expected], place
+    both = replace(CHOICE, near=((6.5, 1.2, 1.0), (2.0, 2.9, 1.0), (1.0, 2.9, 1.0)))
+    assert chosen_planes(three, both) == [0, 1]
+
+
+def test_a_covered_or_small_wall_is_chosen_when_a_point_is_near_it() -> None:
+    both = planes(MAIN, (0.08, 1.0, 0.2, 0.0))
+    assert chosen_planes(both, CHOICE) == [0]
+    assert chosen_planes(both, replace(CHOICE, near=((1.1, 2.9, 1.0),))) == [1]
+
+
+def test_only_planes_of_the_right_direction_are_near() -> None:
+    with pytest.raises(MethodError, match="none of the 1 planes is horizontal"):
+        chosen_planes(planes(MAIN), replace(CHOICE, constraint="horizontal", near=((1, 3, 1),)))
+
+
+def test_the_parts_of_a_plane_count_and_not_the_rectangle_about_them() -> None:
+    # Two ends of one wall, and a wall in the gap between them that stands 0.4 m behind.
+    ends = planes(MAIN, (-0.4, 2.0, 1.0, 0.0))
+    parts = planes((0.0, 0.0, 1.0, 0.0), (0.0, 4.0, 1.0, 0.0))
+    known = replace(
+        ends,
+        part_corners=np.concatenate([parts.corners, ends.corners[1:]]),
+        part_plane=np.array([0, 0, 1], dtype=np.int32),
+    )
+    place = replace(CHOICE, near=((2.5, 3.1, 1.0),))
+    assert chosen_planes(ends, place) == [0]
+    assert chosen_planes(known, place) == [1]
+
+
 def test_a_rank_that_no_plane_has_is_refused() -> None:
     two = planes(MAIN, (0.5, 0.0, 5.0, 0.0))
     assert chosen_planes(two, replace(CHOICE, ranks=(1,))) == [1]

@@ -25,7 +25,9 @@ class Reader:
         self.count = 0
         self.ctx: StepContext
 
-    def __call__(self, *paths: Path, calibration: str | None = None) -> tuple[Photo, ...]:
+    def __call__(
+        self, *paths: Path, calibration: str | None = None, **params: object
+    ) -> tuple[Photo, ...]:
         self.count += 1
         scratch = self.folder / f"scratch-{self.count}"
         scratch.mkdir()
@@ -33,7 +35,8 @@ class Reader:
         inputs = ReadPhotos.In(
             files=InputFiles(name="photos", paths=paths), calibration=self._calibration(calibration)
         )
-        return ReadPhotos().run(inputs, ReadPhotos.Params(), self.ctx).photos.photos
+        checked = ReadPhotos.Params.model_validate(params)
+        return ReadPhotos().run(inputs, checked, self.ctx).photos.photos
 
     def _calibration(self, text: str | None) -> InputFiles | None:
         if text is None:
@@ -113,6 +116,50 @@ def test_a_cut_photo_does_not_keep_the_focal_length_of_the_whole(
     (photo,) = read(*made.write(tmp_path, {"a.jpg": content}))
     assert photo.exif_focal_px is None
     assert "the focal length of photo a.jpg is unknown (the photo was cut" in read.warnings
+
+
+def test_a_focal_length_that_cannot_be_is_told_even_where_another_is_used(
+    tmp_path: Path, read: Reader
+) -> None:
+    pitch: dict[int, made.Value] = {
+        made.FOCAL: (50, 1), made.RESOLUTION_X: (10, 1), made.RESOLUTION_UNIT: 4,
+    }  # fmt: skip
+    files = {
+        "a.jpg": made.jpeg(made.picture(), made.exif_block({}, {made.FOCAL_35MM: 65535})),
+        "b.jpg": made.jpeg(made.picture(), made.exif_block({}, pitch | {made.FOCAL_35MM: 1})),
+    }
+    first, second = read(*made.write(tmp_path, files))
+    assert first.exif_focal_px is None
+    assert second.exif_focal_px == pytest.approx(500.0)
+    told = "EXIF says a 35 mm equivalent of {} mm, which no lens has (4 to 3000 mm)"
+    assert f"photo a.jpg: {told.format(65535)}: it is not used" in read.warnings
+    assert f"photo b.jpg: {told.format(1)}: it is not used" in read.warnings
+
+
+def test_a_panorama_becomes_six_photos_with_exact_lenses(tmp_path: Path, read: Reader) -> None:
+    files = {"360_a.jpg": encode_jpeg(made.picture(128, 64)), "b.jpg": encode_jpeg(made.picture())}
+    photos = read(*made.write(tmp_path, files), panoramas=("360_*",))
+    assert [photo.name for photo in photos] == [
+        *(f"360_a_{face}.png" for face in ("back", "down", "front", "left", "right", "up")),
+        "b.jpg",
+    ]
+    lens = photos[0].intrinsics
+    assert lens is not None
+    # A right angle: half the side is the focal length, and the side a quarter of the circle.
+    assert (photos[0].width, lens.fx, lens.cx) == (41, 20.5, 20.5)
+    assert photos[-1].intrinsics is None
+
+
+def test_a_panorama_of_another_shape_is_refused(tmp_path: Path, read: Reader) -> None:
+    files = {"a.jpg": encode_jpeg(made.picture(64, 48))}
+    with pytest.raises(InputError, match="has 64 x 48 pixels: a panorama over the whole sphere is"):
+        read(*made.write(tmp_path, files), panoramas=("a.jpg",))
+
+
+def test_a_panorama_that_is_cut_off_is_refused(tmp_path: Path, read: Reader) -> None:
+    files = {"a.jpg": encode_jpeg(made.picture(128, 64))[:-40]}
+    with pytest.raises(InputError, match=r"photo a\.jpg is cut off"):
+        read(*made.write(tmp_path, files), panoramas=("*",))
 
 
 def test_damaged_exif_data_are_said(tmp_path: Path, read: Reader) -> None:

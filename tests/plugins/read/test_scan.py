@@ -97,6 +97,67 @@ def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
     assert cloud.x.dtype == np.float32
 
 
+def test_a_box_keeps_the_points_in_it_and_on_its_faces(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    world_m = points + np.array([634512.347, 486215.781, 112.193])
+    # In feet: the box is in metres, as everything that follows.
+    corner = world_m[7]
+    box = [[*(corner - 4.0)], [*corner]]
+    cloud = read(write_text(tmp_path / "a.xyz", world_m / 0.3048), unit="ft", box=box)
+    inside = ((world_m >= corner - 4.0) & (world_m <= corner + 1e-9)).all(axis=1)
+    assert 3 < inside.sum() < 300
+    kept = cloud.points_world()
+    # 1e-9 m: the corner itself went through feet and back.
+    assert len(kept) in (inside.sum(), inside.sum() - 1)
+    assert (kept >= corner - 4.00001).all()
+    assert (kept <= corner + 1e-5).all()
+    (file,) = cloud.source["files"]  # type: ignore[misc]
+    assert file["outside"] == 400 - len(kept)  # type: ignore[index,call-overload]
+    assert cloud.source["counts"]["dropped"] == 400 - len(kept)  # type: ignore[index,call-overload]
+
+
+def test_points_on_the_faces_of_a_box_are_kept(tmp_path: Path, read: Reader) -> None:
+    steps = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3)
+    cloud = read(write_text(tmp_path / "a.xyz", steps), box=[[1, 1, 1], [3, 4, 2]])
+    assert len(cloud) == 3 * 4 * 2
+    np.testing.assert_array_equal(cloud.points_world().min(axis=0), [1, 1, 1])
+    np.testing.assert_array_equal(cloud.points_world().max(axis=0), [3, 4, 2])
+
+
+def test_a_box_beside_the_scan_says_where_the_scan_is(tmp_path: Path, read: Reader) -> None:
+    steps = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), axis=-1).reshape(-1, 3)
+    path = write_text(tmp_path / "a.xyz", steps)
+    with pytest.raises(InputError) as caught:
+        read(path, box=[[10, 10, 10], [11, 11, 11]])
+    beside = write_text(tmp_path / "b.xyz", steps + 8.0)
+    # Of several files, one may lie beside the box as a whole.
+    assert len(read(path, beside, box=[[10, 10, 10], [11, 11, 11]])) == 8
+    assert "125 lie outside the box: the points reach from (0.00, 0.00, 0.00) to (4.00, " in str(
+        caught.value
+    )
+
+
+def test_a_box_without_an_inside_is_refused() -> None:
+    with pytest.raises(ValueError, match="the lowest corner and then the highest"):
+        ReadScan.Params(box=((0.0, 0.0, 1.0), (1.0, 1.0, 1.0)))
+
+
+def test_classes_choose_points_of_las_files(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    classes = np.arange(400) % 3
+    path = scan_files.write_las(tmp_path / "a.laz", points, classes=classes)
+    cloud = read(path, classes=[0, 2])
+    np.testing.assert_allclose(cloud.points_world(), points[classes != 1], atol=6e-5)
+    (file,) = cloud.source["files"]  # type: ignore[misc]
+    assert file["unwanted"] == 133  # type: ignore[index,call-overload]
+    with pytest.raises(InputError, match="400 are of other classes than those asked for; change"):
+        read(path, classes=[9])
+    read(write_text(tmp_path / "a.xyz", points), classes=[2])
+    assert "classes only speaks of LAS and LAZ files" in read.warnings
+
+
 def test_a_shift_by_whole_metres_changes_the_origin_only(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
@@ -145,6 +206,21 @@ def test_points_that_are_not_finite_are_dropped_and_counted(
     assert read.metrics["n_not_finite"] == 4
     assert read.metrics["n_points"] == 396
     assert cloud.source["counts"] == {"read": 400, "kept": 396, "dropped": 4}
+    assert "1 points lie farther than 1e+09 m" in read.warnings
+
+
+def test_finite_points_beyond_any_survey_are_named(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    points[5] = (0.5, 1e30, -2.0)
+    points[9, 0] = -2e9
+    points[11, 0] = np.nan
+    cloud = read(write_text(tmp_path / "a.xyz", points))
+    assert len(cloud) == 397
+    assert (
+        "a.xyz: 2 points lie farther than 1e+09 m from the origin, the first at 0.5 1e+30 -2, and "
+        "were left out"
+    ) in read.warnings
 
 
 def test_one_point_is_a_cloud(tmp_path: Path, read: Reader) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.register.similarity import RegisterSimilarity, Similarity
+from orthoflow_plugins.register.similarity import RegisterSimilarity, Similarity, fit_similarity
 
-from orthoflow.errors import MethodError
+from orthoflow.errors import GeometryError, MethodError
+from orthoflow.geometry.rotations import rotation_from_vector
 from orthoflow.products import CheckPoints
 from tests import raster_scenes as scenes
 from tests.inspect_scenes import points_at
@@ -81,3 +83,107 @@ def test_too_few_pairs_and_lines_are_refused(tmp_path: Path) -> None:
     line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
     with pytest.raises(MethodError, match="lie on one line"):
         register(tmp_path, points_at(line), points_at(line))
+
+
+def test_residuals_and_what_they_add_up_to_are_told(tmp_path: Path) -> None:
+    source, off = places(4, 6), 0.001 * np.random.default_rng(9).normal(size=(6, 3))
+    true = turned(4)
+    control = replace(
+        points_at(true.apply(source) + off), names=("P5", "P4", "P3", "P2", "P1", "P0")
+    )
+    # Pairs go by names, in the order of the points.
+    points = replace(points_at(source), names=control.names)
+    out, metrics = register(tmp_path, points, replace(
+        control, names=control.names[::-1], points_world=control.points_world[::-1]
+    ))  # fmt: skip
+    inspection = out.inspection
+    details: Any = inspection.details
+    fitted = details["target_from_source"]
+    rotation, shift = np.array(fitted["rotation"]), np.array(fitted["translation_m"])
+    residual = fitted["scale"] * source @ rotation.T + shift - control.points_world
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(inspection.displacement_m, residual[:, :2], atol=1e-9)
+    np.testing.assert_array_equal(inspection.points_world, control.points_world)
+    for row, name, values in zip(details["residuals"], control.names, residual, strict=True):
+        assert row["name"] == name
+        found = [row["dx_mm"], row["dy_mm"], row["dz_mm"]]
+        np.testing.assert_allclose(found, 1e3 * values, atol=6e-5)
+    length = 1e3 * np.linalg.norm(residual, axis=1)
+    # 18 coordinates less seven parameters.
+    assert metrics["sigma0_mm"] == pytest.approx(1e3 * np.sqrt((residual**2).sum() / 11.0))
+    assert metrics["rms_mm"] == pytest.approx(np.sqrt((length**2).mean()))
+    assert metrics["max_mm"] == pytest.approx(length.max())
+    apart = []
+    for k in range(6):
+        others = np.arange(6) != k
+        fit = fit_similarity(source[others], control.points_world[others], with_scale=True)
+        apart.append(np.linalg.norm(fit.apply(source[[k]])[0] - control.points_world[k]))
+    assert metrics["left_out_rms_mm"] == pytest.approx(1e3 * np.sqrt(np.mean(np.square(apart))))
+
+
+def test_three_pairs_are_enough_and_leave_none_out(tmp_path: Path) -> None:
+    true, source = turned(7), places(7, 3)
+    out, metrics = register(tmp_path, points_at(source), points_at(true.apply(source)))
+    assert "left_out_rms_mm" not in metrics
+    assert metrics["n_pairs"] == 3
+    np.testing.assert_allclose(out.cloud.origin, true.apply(np.zeros((1, 3)))[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("with_scale", [True, False])
+def test_no_other_similarity_fits_better(with_scale: bool) -> None:
+    rng = np.random.default_rng(3)
+    source = places(8, 12)
+    target = turned(8).apply(source) + 0.2 * rng.normal(size=source.shape)
+    best = fit_similarity(source, target, with_scale=with_scale)
+    assert np.linalg.det(best.rotation) == pytest.approx(1.0)
+
+    def squares(fit: Similarity) -> float:
+        return float(((fit.apply(source) - target) ** 2).sum())
+
+    least = squares(best)
+    for axis in np.eye(3):
+        for step in (1e-4, -1e-4):
+            turn = rotation_from_vector(step * axis)
+            about = best.apply(source.mean(axis=0)[None])[0]
+            moved = replace(
+                best,
+                rotation=turn @ best.rotation,
+                translation=turn @ (best.translation - about) + about,
+            )
+            assert squares(moved) > least
+            assert squares(replace(best, translation=best.translation + step * axis)) > least
+    if with_scale:
+        for factor in (1.0001, 0.9999):
+            scaled = replace(
+                best,
+                scale=factor * best.scale,
+                translation=about - factor * best.scale * best.rotation @ source.mean(axis=0),
+            )
+            assert squares(scaled) > least
+    else:
+        assert best.scale == 1.0
+
+
+def test_stations_move_with_the_cloud(tmp_path: Path) -> None:
+    true, source = turned(6), places(6)
+    ctx = scenes.context(tmp_path)
+    cloud = scenes.cloud_of(np.zeros((5, 3)))
+    stations = np.array([[1.0, 2.0, 3.0], [-4.0, 0.0, 2.0]])
+    cloud = replace(cloud, stations=stations, stations_source="file")
+    inputs = RegisterSimilarity.In(
+        cloud=cloud, points=points_at(source), control=points_at(true.apply(source))
+    )
+    out = RegisterSimilarity().run(inputs, RegisterSimilarity.Params(), ctx)
+    assert out.cloud.stations is not None
+    np.testing.assert_allclose(out.cloud.stations, true.apply(stations), atol=1e-6)
+
+
+def test_mirrored_points_are_turned_as_well_as_may_be() -> None:
+    source = places(9)
+    fitted = fit_similarity(source, source * [1.0, 1.0, -1.0], with_scale=True)
+    assert np.linalg.det(fitted.rotation) == pytest.approx(1.0)
+    assert 0.0 < fitted.scale < 1.0
+    with pytest.raises(GeometryError, match="at least 3 pairs"):
+        fit_similarity(source[:2], source[:2], with_scale=True)
+    with pytest.raises(GeometryError, match="at least 3 pairs"):
+        fit_similarity(source, source[:5], with_scale=True)

@@ -1,0 +1,107 @@
+"""What it costs that a run checks what it takes from the store, as a share of the whole run.
+
+    python benchmarks/store_checking.py [WORKFLOW] [--set STEP.PARAM=VALUE ...] [--force STEP ...]
+
+Runs a workflow in this process, in a temporary folder of the working directory: computed, twice
+with everything cached, and with the steps of --force computed again from what is cached, so that
+their inputs are checked. Checking is looking at results and objects, reading their bytes, and
+noting the digests of what is stored; `synced` is bringing the run folder to the disk.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from orthoflow.catalog import discover_catalog
+from orthoflow.engine import RunOptions, RunOutcome, Store, execute, plan_run, store
+from orthoflow.engine.durability import folder_size
+from orthoflow.records import Run, executed_and_written, write_run, writing
+from orthoflow.report import write_page
+from orthoflow.workflow import Workflow, expand_cells, load_workflow
+
+CHECKING = ((Store, "damage"), (Store, "take"), (Store, "blob"), (store, "describe_product"))
+SYNCING = ((writing, "sync_tree"),)
+
+
+class Clock:
+    """Adds up what calls take, those within another not twice."""
+
+    def __init__(self, *places: tuple[Any, str]) -> None:
+        self.wall_s = self.cpu_s = 0.0
+        self._is_running = False
+        for owner, name in places:
+            setattr(owner, name, self._timed(getattr(owner, name)))
+
+    def _timed(self, call: Callable[..., object]) -> Callable[..., object]:
+        def timed(*arguments: object, **more: object) -> object:
+            if self._is_running:
+                return call(*arguments, **more)
+            self._is_running = True
+            wall, cpu = time.perf_counter(), time.process_time()
+            try:
+                return call(*arguments, **more)
+            finally:
+                self._is_running = False
+                self.wall_s += time.perf_counter() - wall
+                self.cpu_s += time.process_time() - cpu
+
+        return timed
+
+
+def run(workflow: Workflow, folder: Path, into: str, *, force: tuple[str, ...]) -> None:
+    """Plan, execute and record, as the command line does, but in this process."""
+    catalog = discover_catalog()
+    opened = Store(folder / "store")
+    options = RunOptions(executor="inline", force=force)
+    plan = plan_run(expand_cells(workflow, catalog), workflow, catalog, opened, options)
+
+    def write(outcome: RunOutcome) -> Run:
+        page = folder / into / "report.html"
+        return write_run(
+            outcome,
+            plan,
+            workflow,
+            folder / into,
+            opened,
+            before_finish=lambda made: write_page(made, page),
+        )
+
+    with opened.in_use():
+        made = executed_and_written(lambda: execute(plan, folder / into, opened), write)
+    for address, failed in made.outcome.failed.items():
+        print(f"{address} failed: {failed.error_message}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("workflow", nargs="?", default="quickstart.yaml")
+    parser.add_argument("--set", dest="sets", action="append", default=[])
+    parser.add_argument("--force", action="append", default=[])
+    given = parser.parse_args()
+    workflow = load_workflow(given.workflow, discover_catalog(), sets=given.sets)
+    checking, syncing = Clock(*CHECKING), Clock(*SYNCING)
+    with tempfile.TemporaryDirectory(dir=Path.cwd()) as name:
+        folder = Path(name)
+        forced = tuple(given.force)
+        runs = {"computed": (), "cached": (), "cached, again": ()}
+        for into, force in (runs | ({"forced": forced} if forced else {})).items():
+            checking.wall_s = checking.cpu_s = syncing.wall_s = syncing.cpu_s = 0.0
+            wall, cpu = time.perf_counter(), time.process_time()
+            run(workflow, folder, into, force=force)
+            wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+            print(
+                f"{into:14} {wall:7.2f} s, processor {cpu:7.2f} s; "
+                f"checking {checking.wall_s:.3f} s = {checking.wall_s / wall:.1%}, "
+                f"processor {checking.cpu_s:.3f} s = {checking.cpu_s / cpu:.1%}; "
+                f"synced in {syncing.wall_s:.3f} s"
+            )
+        print(f"store: {folder_size(folder / 'store' / 'objects') / 1e6:.0f} MB in objects")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""`orthoflow sign`: sign the seal of a record."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from orthoflow.cli.commands import Command
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.tables import echo
+from orthoflow.errors import ArgumentError, RecordError
+from orthoflow.foreign_text import shown
+
+
+@click.command(cls=Command)
+@click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+@click.option(
+    "--key",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Your private Ed25519 key, OpenSSH or PEM; its password is asked for.",
+)
+def sign(run: Path, key: Path) -> int:
+    """Sign the record of RUN, a run folder or its run.h5, with your key.
+
+    The signature lies beside the record as run.h5.sig and changes nothing in it. Only a record that
+    verifies is signed. `orthoflow verify RUN --signer FILE` checks it with your public key.
+    """
+    from orthoflow.records import verify_run
+    from orthoflow.records.signatures import SIGNATURE_SUFFIX, sign_record
+
+    verification = verify_run(run)
+    if verification.findings:
+        raise RecordError(
+            f"{verification.path} is not as it was written, so it is not signed: "
+            f"{verification.findings[0]}"
+        )
+    path = verification.path
+    made = sign_record(path, key, lambda: _password(key))
+    echo(f"signed: {path}{SIGNATURE_SUFFIX}, with the key {made.fingerprint}")
+    return EXIT_GOOD
+
+
+def _password(key: Path) -> str:
+    if not sys.stdin.isatty():
+        raise ArgumentError(
+            f"the key {key} is protected by a password, and there is no terminal to ask for it: "
+            "sign on a terminal, or with another key"
+        )
+    answer: str = click.prompt(shown(f"password of {key}"), hide_input=True, err=True)
+    return answer

@@ -1,0 +1,167 @@
+"""Photos inside E57 files (`images2D`), with their lenses and poses where the file states them.
+
+The camera of a pinhole image has x to the right, y up and z backwards (ASTM E2807), in a frame
+whose pose leads to the file's world. Principal points count from the outer corner of the first
+pixel, as ours do. A spherical image over the whole sphere becomes photos of a cube's six faces.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.given_cameras import GivenCamera
+from orthoflow.files.panoramas import FACES, PanoramaFace, faces_of
+from orthoflow.files.points.e57 import FORMAT, number_of, pose_of
+from orthoflow.files.points.libraries import load_library, reading
+from orthoflow.products import Intrinsics
+
+SUFFIX: Final = ".e57"
+_FROM_Y_UP: Final = np.diag([1.0, -1.0, -1.0])
+_REPRESENTATIONS: Final = ("pinhole", "spherical", "cylindrical", "visualReference")
+_CONTENTS: Final = {"jpegImage": ".jpg", "pngImage": ".png"}
+_UNUSUAL: Final = re.compile(r"[^\w.-]+")
+
+
+@dataclass(frozen=True, kw_only=True)
+class E57Image:
+    """A photo inside an E57 file.
+
+    Attributes:
+        name: of the photo: the file's, the image's, and the suffix of its content.
+        content: JPEG or PNG as it is in the file, or a face of the panorama that it is.
+        camera: its lens and pose, or why there is none.
+    """
+
+    name: str
+    content: bytes | PanoramaFace
+    camera: GivenCamera
+
+    def encoded(self) -> bytes:
+        """The photo as a file: of a face a PNG, of others the content."""
+        return self.content if isinstance(self.content, bytes) else self.content.encoded()
+
+
+def read_e57_images(path: Path) -> tuple[E57Image, ...]:
+    """Read the photos of an E57 file.
+
+    Raises:
+        InputError: the file is damaged, or holds no photos.
+        PluginError: the library for E57 is missing.
+    """
+    pye57 = load_library("pye57", path)
+    with reading(path, FORMAT), pye57.E57(str(path)) as file:
+        root = file.image_file.root()
+        has_images = root.isDefined("images2D")
+        nodes = list(_children(root["images2D"])) if has_images else []
+        images = tuple(
+            image
+            for index, node in enumerate(nodes)
+            for image in _images(path, index, pye57.libe57.StructureNode(node))
+        )
+    if not images:
+        raise InputError(f"{path.name} holds no photos (images2D as JPEG or PNG)")
+    return images
+
+
+def _children(vector: Any) -> Iterator[Any]:
+    return (vector.get(index) for index in range(vector.childCount()))
+
+
+def _images(path: Path, index: int, node: Any) -> Iterator[E57Image]:
+    """One photo, six of a panorama, or none where there is neither JPEG nor PNG."""
+    for kind in _REPRESENTATIONS:
+        field = f"{kind}Representation"
+        if not node.isDefined(field):
+            continue
+        shown = node[field]
+        for content, suffix in _CONTENTS.items():
+            if shown.isDefined(content):
+                name = _name(path, index, node, suffix)
+                encoded = _content(path, shown[content])
+                camera = _camera(path, name, node, kind, shown)
+                if kind == "spherical" and not camera.reason:
+                    yield from _faces(node, shown, encoded, name.removesuffix(suffix))
+                else:
+                    yield E57Image(name=name, content=encoded, camera=camera)
+                return
+
+
+def _faces(node: Any, shown: Any, content: bytes, stem: str) -> Iterator[E57Image]:
+    world_from_panorama, centre = pose_of(node)
+    for face in faces_of(content, stem, round(number_of(shown["imageWidth"]))):
+        rotation: NDArray[np.float64] = FACES[face.face] @ world_from_panorama.T
+        camera = GivenCamera(
+            name=face.name, lens=face.lens, rotation=rotation, translation=-rotation @ centre
+        )
+        yield E57Image(name=face.name, content=face, camera=camera)
+
+
+def _is_whole(shown: Any) -> bool:
+    """Whether a spherical image covers the sphere, to half a pixel."""
+    width, height, across, up = (
+        number_of(shown[name])
+        for name in ("imageWidth", "imageHeight", "pixelWidth", "pixelHeight")
+    )
+    return (
+        abs(width * across - 2.0 * math.pi) < 0.5 * across and abs(height * up - math.pi) < 0.5 * up
+    )
+
+
+def _name(path: Path, index: int, node: Any, suffix: str) -> str:
+    stated = str(node["name"].value()) if node.isDefined("name") else ""
+    bare = _UNUSUAL.sub("_", stated.removesuffix(suffix)).strip("_.")[:60]
+    return f"{path.stem}_{index:03d}{'_' if bare else ''}{bare}{suffix}"
+
+
+def _content(path: Path, blob: Any) -> bytes:
+    count = int(blob.byteCount())
+    if not 0 < count <= path.stat().st_size:
+        raise InputError(f"{path.name} is damaged: it states a photo of {count} bytes")
+    content = bytearray(count)
+    blob.read(content, 0, count)
+    return bytes(content)
+
+
+def _camera(path: Path, name: str, node: Any, kind: str, shown: Any) -> GivenCamera:
+    if kind == "visualReference":
+        return GivenCamera(name=name, reason="the E57 file shows it for reference only, unposed")
+    if kind == "cylindrical":
+        return GivenCamera(name=name, reason=f"it is a {kind} image, which cannot be painted from")
+    if not node.isDefined("pose"):
+        return GivenCamera(name=name, reason="the E57 file states no pose of it")
+    if kind == "spherical":
+        part = "" if _is_whole(shown) else "it is a part of a panorama, only whole ones are taken"
+        return GivenCamera(name=name, reason=part)
+    values = {
+        field: number_of(shown[field])
+        for field in ("imageWidth", "imageHeight", "focalLength", "pixelWidth", "pixelHeight")
+    } | {field: number_of(shown[field]) for field in ("principalPointX", "principalPointY")}
+    if not all(math.isfinite(value) for value in values.values()) or not all(
+        values[field] > 0.0 for field in ("focalLength", "pixelWidth", "pixelHeight")
+    ):
+        raise InputError(f"{path.name}: the lens of photo {name} is none: {values}")
+    world_from_camera, centre = pose_of(node)
+    rotation: NDArray[np.float64] = _FROM_Y_UP @ world_from_camera.T
+    return GivenCamera(
+        name=name,
+        lens=Intrinsics(
+            width=round(values["imageWidth"]),
+            height=round(values["imageHeight"]),
+            fx=values["focalLength"] / values["pixelWidth"],
+            fy=values["focalLength"] / values["pixelHeight"],
+            cx=values["principalPointX"],
+            cy=values["principalPointY"],
+            source="given",
+        ),
+        rotation=rotation,
+        translation=-rotation @ centre,
+    )

@@ -1,0 +1,309 @@
+"""Orientations of photos that other programs found, turned from the convention of each into ours.
+
+What comes out has our axes (x right, y down, z forward) and our pixels (first centre at 0.5, 0.5),
+in the world of the file. Read here are `cameras.json` of a run, Bundler's file and RealityCapture's
+list; `camera_formats` knows who reads the rest.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.products import Intrinsics
+
+_MOST_BYTES: Final = 500_000_000
+_FULL_FRAME_MM: Final = 36.0
+_ORTHONORMAL: Final = 1e-4
+# Axes of OpenGL, which Bundler and RealityCapture have: x right, y up, z backwards.
+_FROM_OPENGL: Final = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class CentredLens:
+    """A lens whose file says nothing of the photo's size, and counts from the photo's middle.
+
+    Attributes:
+        focal_px: focal length in pixels, or None where it is said by the photo's longer side.
+        focal_share: focal length as a share of the photo's longer side, or None.
+        off_middle: principal point from the middle, right and down, in shares of that side.
+        radial: k1, k2, k3.
+    """
+
+    focal_px: float | None = None
+    focal_share: float | None = None
+    off_middle: tuple[float, float] = (0.0, 0.0)
+    radial: tuple[float, float, float]
+
+    def of_size(self, width: int, height: int) -> Intrinsics:
+        """Give the lens of a photo of so many pixels."""
+        longest = max(width, height)
+        focal = self.focal_px or (self.focal_share or 0.0) * longest
+        k1, k2, k3 = self.radial
+        return Intrinsics(
+            width=width,
+            height=height,
+            fx=focal,
+            fy=focal,
+            cx=0.5 * width + self.off_middle[0] * longest,
+            cy=0.5 * height + self.off_middle[1] * longest,
+            distortion=(k1, k2, 0.0, 0.0, k3),
+            source="given",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivenCamera:
+    """The orientation of one photo as a file has it.
+
+    Attributes:
+        name: of the photo, without folders; some programs leave out its suffix.
+        lens: interior orientation, where the file says it.
+        rotation: (3, 3) camera_from_world; None where the file only says why there is none.
+        translation: (3,) camera_from_world, in the unit of the file.
+        sigma_wall_m: predicted error on the wall, where the file says it.
+        reason: why the photo has no orientation; empty where it has one.
+    """
+
+    name: str
+    lens: Intrinsics | CentredLens | None = None
+    rotation: NDArray[np.float64] | None = None
+    translation: NDArray[np.float64] | None = None
+    sigma_wall_m: float | None = None
+    reason: str = ""
+
+
+def text_of(path: Path) -> str:
+    """Text of a file of cameras.
+
+    Raises:
+        InputError: it cannot be read, is no text, or larger than any such file.
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path.name} is too large for a file of cameras")
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path.name} is no UTF-8 text: expected a file of cameras") from error
+    except OSError as error:
+        raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
+
+
+def bare_name(text: str) -> str:
+    """Name of a photo without folders, whichever way its program's slashes lean."""
+    return PureWindowsPath(text).name
+
+
+def damaged(path: Path, what: str, line: int | None = None) -> InputError:
+    """Build the error for a file of cameras that makes no sense."""
+    where = path.name if line is None else f"{path.name}:{line}"
+    return InputError(f"{where}: {what}; export the cameras again")
+
+
+def numbers_of(texts: Sequence[str], path: Path, what: str, line: int | None = None) -> list[float]:
+    """Turn words into finite numbers.
+
+    Raises:
+        InputError: one of them is none.
+    """
+    try:
+        values = [float(text) for text in texts]
+    except ValueError:
+        values = [math.nan]
+    if not all(math.isfinite(value) for value in values):
+        raise damaged(path, f"{what} must be numbers, got {' '.join(texts)[:60]!r}", line)
+    return values
+
+
+def rotation_of(values: Sequence[float], path: Path, whose: str) -> NDArray[np.float64]:
+    """Nine numbers as the nearest rotation matrix.
+
+    Raises:
+        InputError: they are far from one.
+    """
+    matrix = np.array(values, dtype=np.float64).reshape(3, 3)
+    left, _, right = np.linalg.svd(matrix)
+    rotation: NDArray[np.float64] = left @ right
+    if np.abs(rotation - matrix).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:
+        raise damaged(path, f"the rotation of {whose} is no rotation matrix")
+    return rotation
+
+
+def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
+    """Give a lens that can be one.
+
+    Raises:
+        InputError: it cannot.
+    """
+    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+    if not (all(map(math.isfinite, values)) and lens.fx > 0.0 and lens.fy > 0.0):
+        raise damaged(path, f"the lens of {whose} is none: focal length {lens.fx:g}, {lens.fy:g}")
+    if lens.width < 1 or lens.height < 1:
+        raise damaged(path, f"the photo {whose} is {lens.width} x {lens.height} pixels")
+    return lens
+
+
+def read_cameras_json(path: Path) -> tuple[GivenCamera, ...]:
+    """Read the `cameras.json` of a run: OpenCV's pixels, X_camera = R X_world + t.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    try:
+        content = json.loads(text_of(path))
+        entries: Mapping[str, Any] = dict(content["cameras"])
+        return tuple(_of_json(name, dict(entry), path) for name, entry in entries.items())
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise damaged(path, "it is no cameras.json of a run") from error
+
+
+def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
+    if entry["status"] != "ok":
+        return GivenCamera(name=name, reason=str(entry["status"]))
+    matrix = np.array(entry["K"], dtype=np.float64)
+    distortion = tuple(float(value) for value in entry["distortion"])
+    if matrix.shape != (3, 3) or len(distortion) != 5:
+        raise damaged(path, f"the lens of {name} must be K (3 x 3) and k1, k2, p1, p2, k3")
+    lens = Intrinsics(
+        width=int(entry["width"]),
+        height=int(entry["height"]),
+        fx=float(matrix[0, 0]),
+        fy=float(matrix[1, 1]),
+        cx=float(matrix[0, 2]) + HALF_PIXEL,
+        cy=float(matrix[1, 2]) + HALF_PIXEL,
+        distortion=distortion,
+        source="given",
+    )
+    lens = checked_lens(lens, path, name)
+    rotation = np.array(entry["R_camera_from_world"], dtype=np.float64).ravel().tolist()
+    sigma_mm = entry.get("sigma_wall_mm")
+    return GivenCamera(
+        name=name,
+        lens=lens,
+        rotation=rotation_of(rotation, path, name),
+        translation=np.array(
+            numbers_of([str(v) for v in entry["t_camera_from_world"]], path, f"t of {name}")
+        ).reshape(3),
+        sigma_wall_m=None if sigma_mm is None else float(sigma_mm) / 1000.0,
+    )
+
+
+def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
+    """Read Bundler's file: f, k1, k2, R and t of each camera, with the axes of OpenGL.
+
+    Its pixels count from the middle of the photo, y upwards.
+
+    Args:
+        path: the file.
+        names: of the photos, in its order.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    words = [
+        word
+        for line in text_of(path).splitlines()
+        if not line.lstrip().startswith("#")
+        for word in line.split()
+    ]
+    counts = numbers_of(words[:2], path, "the counts of cameras and points")
+    if len(counts) < 2 or counts[0] != len(names):
+        raise damaged(
+            path,
+            f"it states {counts[0]:.0f} cameras, but the list names {len(names)} photos"
+            if counts
+            else "it is empty",
+        )
+    found = []
+    for index, name in enumerate(names):
+        values = numbers_of(words[2 + 15 * index : 17 + 15 * index], path, f"camera {index}")
+        if len(values) < 15:
+            raise damaged(path, f"it ends within camera {index}")
+        focal, k1, k2 = values[:3]
+        if not focal > 0.0:
+            found.append(GivenCamera(name=name, reason="Bundler did not orient it"))
+            continue
+        found.append(
+            GivenCamera(
+                name=name,
+                lens=CentredLens(focal_px=focal, radial=(k1, k2, 0.0)),
+                rotation=_FROM_OPENGL @ rotation_of(values[3:12], path, name),
+                translation=_FROM_OPENGL @ np.array(values[12:15]),
+            )
+        )
+    return tuple(found)
+
+
+def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
+    """Read RealityCapture's "internal/external camera parameters" (CSV).
+
+    The focal length is the equivalent of a film 36 mm wide on the photo's longer side, the
+    principal point in shares of that side from the middle; heading is clockwise from north (y),
+    pitch 0 looks straight down.
+
+    Raises:
+        InputError: it is damaged, or has tangential distortion, whose sign it does not say.
+    """
+    lines = text_of(path).lstrip("# ").splitlines()
+    table = csv.DictReader(lines)
+    wanted = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3")
+    missing = [name for name in ("name", *wanted) if name not in (table.fieldnames or ())]
+    if missing:
+        raise damaged(
+            path,
+            f"the column {missing[0]} is missing: expected RealityCapture's internal/external "
+            "camera parameters, #name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
+        )
+    found = []
+    for row in table:
+        line, name = table.line_num, bare_name(row["name"] or "")
+        x, y, z, heading, pitch, roll, focal, px, py, k1, k2, k3 = numbers_of(
+            [row[key] or "" for key in wanted], path, "the parameters", line
+        )
+        if not focal > 0.0:
+            raise damaged(path, f"the focal length of {name} must be positive, got {focal:g}", line)
+        others = [float(row.get(key) or 0.0) for key in ("k4", "t1", "t2")]
+        if any(others):
+            raise damaged(
+                path,
+                f"{name} has k4 or tangential distortion, which orthoflow does not take from this "
+                "list: align with the model Brown3, or export a COLMAP model",
+                line,
+            )
+        rotation = _FROM_OPENGL @ _world_from_angles(heading, pitch, roll).T
+        found.append(
+            GivenCamera(
+                name=name,
+                lens=CentredLens(
+                    focal_share=focal / _FULL_FRAME_MM,
+                    off_middle=(px, py),
+                    radial=(k1, k2, k3),
+                ),
+                rotation=rotation,
+                translation=-rotation @ np.array([x, y, z]),
+            )
+        )
+    return tuple(found)
+
+
+def _world_from_angles(
+    heading_deg: float, pitch_deg: float, roll_deg: float
+) -> NDArray[np.float64]:
+    """World from the camera's OpenGL axes: about z by -heading, x by pitch, y by roll."""
+    h, p, r = (math.radians(value) for value in (-heading_deg, pitch_deg, roll_deg))
+    about_z = [[math.cos(h), -math.sin(h), 0.0], [math.sin(h), math.cos(h), 0.0], [0.0, 0.0, 1.0]]
+    about_x = [[1.0, 0.0, 0.0], [0.0, math.cos(p), -math.sin(p)], [0.0, math.sin(p), math.cos(p)]]
+    about_y = [[math.cos(r), 0.0, math.sin(r)], [0.0, 1.0, 0.0], [-math.sin(r), 0.0, math.cos(r)]]
+    return np.asarray(np.array(about_z) @ np.array(about_x) @ np.array(about_y))

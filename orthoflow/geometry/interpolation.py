@@ -1,0 +1,271 @@
+"""Cells of a raster between others: what they hold follows from the points around them.
+
+No direction is favoured: all cells about a cell take part, weighed by the distance of their points
+to its centre, and what they hold is carried there along its slope. So a raster that is turned or
+mirrored is interpolated to the turned or mirrored one, up to the order of sums.
+
+Loads numba: methods import it where they run.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.threads import in_parts
+
+# Cells take part that are so much farther than the nearest one, and all eight neighbours.
+_BEYOND_CELLS: Final = 1.0
+_NEIGHBOURS_SQUARE: Final = 2.0
+# Standard deviation of the weights, as a share of the distance to the nearest cell, at least 1.
+_SIGMA_SHARE: Final = 0.5
+# (1 - x / 8)^8 is nearly exp(-x), and takes a tenth of the time; nothing weighs less than the last.
+_WEIGHT_LEAST: Final = 1e-6
+# Slopes that hardly any spread of the points tells are taken as level.
+_RIDGE: Final = 0.005
+# Points are equally near whose squared distances differ by less.
+_AS_NEAR: Final = 1e-6
+
+
+class CellValues(NamedTuple):
+    """What cells hold, flat over a raster; arrays without cells are left alone.
+
+    Attributes:
+        depth_m: float32, NaN where void.
+        intensity: float32.
+        rgb: (cells, 3) uint8.
+    """
+
+    depth_m: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+
+
+def cell_values(
+    depth_m: NDArray[np.float32],
+    *,
+    intensity: NDArray[np.float32] | None = None,
+    rgb: NDArray[np.uint8] | None = None,
+) -> CellValues:
+    """Give values in the form that kernels are compiled for."""
+    return CellValues(
+        depth_m,
+        np.empty(0, dtype=np.float32) if intensity is None else intensity,
+        np.empty((0, 3), dtype=np.uint8) if rgb is None else rgb,
+    )
+
+
+class Surroundings(NamedTuple):
+    """The cells of a raster that lend what they hold to others.
+
+    Attributes:
+        places: (cells, 2) float32, where their points lie to the right of and below the centre of
+            the cell, in cells; NaN for cells that lend nothing.
+        width: columns of the raster.
+        layer_m: depths that differ by more are of different surfaces.
+    """
+
+    places: NDArray[np.float32]
+    width: int
+    layer_m: float
+
+
+def interpolate(
+    cells: NDArray[np.int64],
+    around: Surroundings,
+    values: CellValues,
+    into: CellValues,
+    *,
+    reach_cells: float,
+    threads: int,
+) -> NDArray[np.bool_]:
+    """Give cells what their surroundings hold, linear between them.
+
+    A cell that lends nothing takes what lies around it on one surface: its own where its depth is
+    known, else that of the nearest points, among equally near ones that of the point nearest the
+    viewer. A cell that lends keeps what it holds, carried from where its points lie to its centre.
+    Nothing leaves the range of what lies around.
+
+    Args:
+        cells: (n,) flat indices of the cells to interpolate.
+        around: who lends.
+        values: what the lenders hold, and the depths of the cells, as far as they are known.
+        into: written at the cells; may be `values` unless one of the cells lends.
+        reach_cells: how far away the nearest cell that lends may be.
+        threads: how many threads work.
+
+    Returns:
+        (n,) where there was anything to take; the other cells are left alone.
+    """
+    wanted = _Wanted(
+        cells=cells,
+        offsets=_offsets_within(max(math.sqrt(_NEIGHBOURS_SQUARE), reach_cells + _BEYOND_CELLS)),
+        is_found=np.zeros(len(cells), dtype=np.bool_),
+    )
+    task = partial(interpolate_cells, wanted, around, values, into)
+    in_parts(task, len(cells), threads=threads)
+    return wanted.is_found
+
+
+def _offsets_within(radius_cells: float) -> NDArray[np.int64]:
+    """Cells (k, 2) = (row, column) within a radius of a centre cell, itself first."""
+    most = math.floor(radius_cells)
+    steps = np.arange(-most, most + 1, dtype=np.int64)
+    rows, columns = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+    squares = rows * rows + columns * columns
+    order = np.argsort(squares, kind="stable")
+    order = order[squares[order] <= radius_cells * radius_cells + _AS_NEAR]
+    return np.column_stack([rows[order], columns[order]])
+
+
+class _Wanted(NamedTuple):
+    """The cells to interpolate, where to look about each, and for which anything was found."""
+
+    cells: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    is_found: NDArray[np.bool_]
+
+
+class _Lenders(NamedTuple):
+    """Room for the lenders of one cell: where they are, how far off, and how much they count."""
+
+    cells: NDArray[np.int64]
+    across: NDArray[np.float64]
+    down: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+
+@compiled
+def interpolate_cells(
+    wanted: _Wanted,
+    around: Surroundings,
+    values: CellValues,
+    into: CellValues,
+    first: int,
+    end: int,
+) -> None:
+    """Interpolate some of the cells; see `interpolate`."""
+    most = wanted.offsets.shape[0]
+    lenders = _Lenders(
+        np.empty(most, dtype=np.int64), np.empty(most), np.empty(most), np.empty(most)
+    )
+    for i in range(first, end):
+        cell = wanted.cells[i]
+        n, sigma = _find_lenders(cell, wanted.offsets, around, values.depth_m, lenders)
+        if n == 0:
+            continue
+        wanted.is_found[i] = True
+        _weigh(cell, n, sigma, around.places, lenders)
+        own = -1 if math.isnan(around.places[cell, 0]) else cell
+        if into.depth_m.size and math.isnan(values.depth_m[cell]):
+            into.depth_m[cell] = _mixed(values.depth_m, lenders, n, own)
+        if into.intensity.size:
+            into.intensity[cell] = _mixed(values.intensity, lenders, n, own)
+        if into.rgb.size:
+            for band in range(3):
+                shade = _mixed(values.rgb[:, band], lenders, n, own)
+                into.rgb[cell, band] = np.uint8(math.floor(shade + 0.5))
+
+
+@kernel_part
+def _find_lenders(
+    cell: int,
+    offsets: NDArray[np.int64],
+    around: Surroundings,
+    depth_m: NDArray[np.float32],
+    lenders: _Lenders,
+) -> tuple[int, float]:
+    """Find who lends to a cell; give how many, and how fast their weight falls off."""
+    places, width = around.places, around.width
+    height = places.shape[0] // width
+    row, column = cell // width, cell % width
+    surface_m = float(depth_m[cell])
+    n, farthest, sigma = 0, math.inf, _SIGMA_SHARE
+    nearest, nearest_m = math.inf, 0.0
+    for k in range(offsets.shape[0]):
+        r, c = row + offsets[k, 0], column + offsets[k, 1]
+        square = float(offsets[k, 0] ** 2 + offsets[k, 1] ** 2)
+        if square > farthest + _AS_NEAR:
+            break
+        if not (0 <= r < height and 0 <= c < width):
+            continue
+        other = r * width + c
+        if math.isnan(places[other, 0]) or abs(depth_m[other] - surface_m) > around.layer_m:
+            continue
+        if n == 0:
+            farthest = max(_NEIGHBOURS_SQUARE, (math.sqrt(square) + _BEYOND_CELLS) ** 2)
+            sigma = _SIGMA_SHARE * max(1.0, math.sqrt(square))
+        lenders.cells[n] = other
+        lenders.across[n] = offsets[k, 1] + float(places[other, 0])
+        lenders.down[n] = offsets[k, 0] + float(places[other, 1])
+        apart = lenders.across[n] ** 2 + lenders.down[n] ** 2
+        is_as_near = abs(apart - nearest) <= _AS_NEAR
+        if (is_as_near and depth_m[other] > nearest_m) or apart < nearest - _AS_NEAR:
+            nearest_m = float(depth_m[other])
+            nearest = min(apart, nearest)
+        n += 1
+    if math.isnan(surface_m):
+        n = _keep_layer(n, nearest_m, around.layer_m, depth_m, lenders)
+    return n, sigma
+
+
+@kernel_part
+def _keep_layer(
+    n: int, surface_m: float, layer_m: float, depth_m: NDArray[np.float32], lenders: _Lenders
+) -> int:
+    """Keep those of n lenders that lie on a surface; give how many."""
+    kept = 0
+    for k in range(n):
+        if abs(depth_m[lenders.cells[k]] - surface_m) <= layer_m:
+            lenders.cells[kept] = lenders.cells[k]
+            lenders.across[kept], lenders.down[kept] = lenders.across[k], lenders.down[k]
+            kept += 1
+    return kept
+
+
+@kernel_part
+def _weigh(cell: int, n: int, sigma: float, places: NDArray[np.float32], lenders: _Lenders) -> None:
+    """Set how much each of n lenders counts in a cell: linear regression, the nearer the more.
+
+    For a cell that lends itself, how much each counts in what carries its own to its centre.
+    """
+    per_square = 1.0 / (16.0 * sigma * sigma)
+    w, wx, wy, wxx, wxy, wyy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(n):
+        x, y = lenders.across[k], lenders.down[k]
+        weight = max(0.0, 1.0 - (x * x + y * y) * per_square) ** 2
+        weight *= weight
+        weight = max(_WEIGHT_LEAST, weight * weight)
+        lenders.weights[k] = weight
+        w, wx, wy = w + weight, wx + weight * x, wy + weight * y
+        wxx, wxy, wyy = wxx + weight * x * x, wxy + weight * x * y, wyy + weight * y * y
+    ridge = _RIDGE * sigma * sigma * w
+    wxx, wyy = wxx + ridge, wyy + ridge
+    # Rows of the inverse of ((w, wx, wy), (wx, wxx, wxy), (wy, wxy, wyy)), but for its determinant.
+    level, across, down = wxx * wyy - wxy * wxy, wxy * wy - wx * wyy, wx * wxy - wxx * wy
+    determinant = w * level + wx * across + wy * down
+    if not math.isnan(places[cell, 0]):
+        x, y = -float(places[cell, 0]), -float(places[cell, 1])
+        xx, xy, yy = w * wyy - wy * wy, wx * wy - w * wxy, w * wxx - wx * wx
+        level, across, down = x * across + y * down, x * xx + y * xy, x * xy + y * yy
+    for k in range(n):
+        share = level + across * lenders.across[k] + down * lenders.down[k]
+        lenders.weights[k] *= share / determinant
+
+
+@kernel_part
+def _mixed(values: NDArray[np.generic], lenders: _Lenders, n: int, own: int) -> float:
+    """What n lenders make of a cell, within their range; `own` is the cell if it lends, or -1."""
+    total, least, most = 0.0, math.inf, -math.inf
+    if own >= 0:
+        total = float(values[own])
+    for k in range(n):
+        value = float(values[lenders.cells[k]])
+        total += lenders.weights[k] * value
+        least, most = min(least, value), max(most, value)
+    return min(most, max(least, total))

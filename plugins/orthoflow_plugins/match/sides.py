@@ -1,0 +1,181 @@
+"""`face.photos`: from which side walls are seen, asked of the photos where no scanner says it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame, frame_over
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Photos, Planes, PointCloud, SideSource, SurfaceMask, Wall
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.match.features import Features
+from orthoflow_plugins.match.opencv import one_by_one, opencv_version
+from orthoflow_plugins.match.pairing import USUAL_RULE, side_matches, wall_features
+from orthoflow_plugins.match.pictures import filled_smoothly, photo_grey, require_photos
+
+# Key points need cells as fine as the points lie; what is between them is filled from around. A
+# wall is no larger than key points are found on at once.
+_SPACINGS_PER_CELL: Final = 0.6
+_FILLED_CELLS: Final = 2
+_CELLS_MOST: Final = 4_000_000
+_REC_601: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+_POINTS_LEAST: Final = 3
+
+
+class FaceByPhotos(Method):
+    """Turn planes whose side was guessed to the side from which the photos show them.
+
+    A wall seen from behind is a mirror image of what photos show. Where no scanner station says
+    from which side a plane was seen, the cloud is laid on it roughly, and photos are matched with
+    that picture as they are and mirrored; the side on which clearly more matches agree is taken.
+    Planes whose side is known are left as they are, and cost nothing; so are floors and ceilings.
+    """
+
+    id: ClassVar[str] = "face.photos"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "exact"
+    citations: ClassVar[tuple[str, ...]] = (
+        "lowe2004: Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",
+    )
+
+    class Params(MethodParams):
+        """What counts as evidence."""
+
+        n_agreeing_min: int = Field(
+            default=16,
+            ge=8,
+            description="Matches over all photos that must agree on a side of a wall.",
+        )
+        margin_min_ratio: float = Field(
+            default=2.0,
+            ge=1.0,
+            description="How many times as many they must be as those that agree on its other "
+            "side: a front that is symmetric agrees with its mirror image in part.",
+        )
+
+    class In(Ports):
+        """The planes, the cloud that they were found in, and the photos."""
+
+        planes: Planes
+        cloud: PointCloud
+        photos: Photos
+
+    class Out(Ports):
+        """The planes, some of them turned."""
+
+        planes: Planes
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Ask the photos about each plane whose side was guessed."""
+        planes, cloud = inputs.planes, inputs.cloud
+        require_photos(inputs.photos)
+        cloud.require_points(_POINTS_LEAST)
+        ctx.progress(0.0, "planes whose side was guessed")
+        asked = [index for index in range(len(planes)) if _is_asked(planes, index)]
+        ctx.metric("n_planes_guessed", len(asked), "1")
+        shown = cloud.intensity is not None or cloud.rgb is not None
+        if not asked or not shown:
+            ctx.metric("n_planes_turned", 0, "1")
+            return self.Out(planes=planes)
+        pictures = [_features(planes, index, cloud, ctx.cores) for index in asked]
+        counts = np.zeros((len(asked), 2), dtype=np.intp)
+        found = one_by_one(
+            lambda photo: side_matches(photo_grey(photo), pictures, USUAL_RULE),
+            inputs.photos.photos,
+            ctx.cores,
+        )
+        for nth, matches in enumerate(found):
+            ctx.progress((nth + 1) / (len(inputs.photos.photos) + 1), "photos on both sides")
+            counts += matches
+        sources: list[SideSource] = [planes.side_source(index) for index in range(len(planes))]
+        n_turned = 0
+        for index, (front, behind) in zip(asked, counts.tolist(), strict=True):
+            if max(front, behind) < max(
+                params.n_agreeing_min, params.margin_min_ratio * min(front, behind)
+            ):
+                continue
+            sources[index] = "photos"
+            if behind > front:
+                planes = planes.turned(index)
+                n_turned += 1
+                ctx.log(
+                    f"{planes.names[index]}: turned, {behind} matches of the photos agree on its "
+                    f"other side, {front} on the one that was guessed"
+                )
+        ctx.metric("n_planes_turned", n_turned, "1")
+        ctx.metric("n_planes_seen", sources.count("photos"), "1")
+        if "photos" not in sources:
+            return self.Out(planes=planes)
+        return self.Out(planes=replace(planes, side_from=tuple(sources)))
+
+    @classmethod
+    def tools(cls) -> dict[str, str]:
+        """OpenCV finds and describes the key points."""
+        return opencv_version()
+
+
+def _is_asked(planes: Planes, index: int) -> bool:
+    is_level = abs(float(planes.normal[index] @ planes.up)) > math.cos(
+        math.radians(LEVEL_LIMIT_DEG)
+    )
+    return planes.side_source(index) == "guess" and not is_level
+
+
+def _features(planes: Planes, index: int, cloud: PointCloud, cores: int) -> Features | None:
+    """Key points of the cloud laid on a plane; None where it shows nothing."""
+    corners = planes.corners[index]
+    area_m2 = float(
+        np.linalg.norm(corners[3] - corners[0]) * np.linalg.norm(corners[1] - corners[0])
+    )
+    spacing_m = math.sqrt(area_m2 / max(1, int(planes.n_points[index])))
+    cell_m = max(_SPACINGS_PER_CELL * spacing_m, math.sqrt(area_m2 / _CELLS_MOST))
+    frame = frame_over(corners, planes.normal[index], gsd_m=cell_m)
+    grey = _grey_on(frame, planes.tolerance_m, cloud, cores)
+    known = np.isfinite(grey)
+    wall = Wall(
+        frame=frame,
+        plane_index=index,
+        name=planes.names[index],
+        depth_m=np.where(known, np.float32(0.0), np.float32(np.nan)),
+        sigma_m=np.full(frame.shape, np.nan, dtype=np.float32),
+        count=known.astype(np.uint32),
+        mask=np.where(known, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
+        intensity=grey,
+    )
+    return wall_features(wall, USUAL_RULE)
+
+
+def _grey_on(
+    frame: WallFrame, tolerance_m: float, cloud: PointCloud, cores: int
+) -> NDArray[np.float32]:
+    """Grey 0..1 (rows, cols) of the cloud's topmost points; NaN where there is none."""
+    from orthoflow.geometry.rastering import topmost_points
+
+    slab = Slab(frame=frame, front_m=tolerance_m, behind_m=tolerance_m)
+    winners = topmost_points(cloud, slab, threads=cores)
+    has_point = winners["point"] < len(cloud)
+    points = winners["point"][has_point]
+    grey = np.full(len(winners), np.nan, dtype=np.float32)
+    if cloud.intensity is not None:
+        grey[has_point] = cloud.intensity[points]
+    elif cloud.rgb is not None:
+        grey[has_point] = cloud.rgb[points].astype(np.float32) @ _REC_601 / np.float32(255.0)
+    return _filled_between(grey.reshape(frame.shape))
+
+
+def _filled_between(grey: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Fill the cells between points; NaN stays where none is near."""
+    import cv2
+
+    side = 2 * _FILLED_CELLS + 1
+    near = cv2.dilate(np.isfinite(grey).astype(np.uint8), np.ones((side, side), np.uint8))
+    filled = filled_smoothly(grey)
+    filled[np.asarray(near) == 0] = np.nan
+    return filled

@@ -1,0 +1,174 @@
+"""`orient.given`: poses from elsewhere, as they are or corrected by ties that a person measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry.resection import SeenPoints, misfit
+from orthoflow.products import Camera, Cameras, JsonValue, Photo, Photos, Ties, TieWall, Walls
+from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow.sdk.methods import Determinism
+from orthoflow_plugins.orient.by_hand import TIES_LEAST
+from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.reporting import hand_over
+from orthoflow_plugins.orient.single_photo import Oriented, oriented_by_hand, tied_photo
+
+_SIDE: Final = 15
+# A tie farther off than that does not belong to the pose.
+_DISAGREEING: Final = 3.5
+
+
+class OrientGiven(Method):
+    """Take poses from elsewhere as they are.
+
+    Nothing proves them: their status is ok, their lens says `given`, and an error on the wall is
+    stated only where the files do. A photo with at least six ties measured by hand is oriented by
+    these, with the given lens, and judged by them; fewer only check the given pose. Poses in
+    another frame than the scan's are refused: none of them shows a wall then.
+    """
+
+    id: ClassVar[str] = "orient.given"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "seeded"
+    citations: ClassVar[tuple[str, ...]] = ()
+
+    class Params(OrientParams):
+        """The gates that a pose by ties measured by hand has to pass."""
+
+    class In(Ports):
+        """The poses, the photos, the walls they may show, and ties measured by hand."""
+
+        cameras: Cameras
+        photos: Photos
+        walls: Walls | None = None
+        ties: Ties | None = None
+
+    class Out(Ports):
+        """One orientation per photo."""
+
+        cameras: Cameras
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Take the poses, and check those that can be."""
+        given = {camera.photo: camera for camera in inputs.cameras.cameras}
+        if inputs.walls is not None:
+            _require_a_wall_in_view(list(given.values()), inputs.walls)
+        photos = inputs.photos.photos
+        taken = [
+            given.get(photo.name, Camera(photo=photo.name, status="no pose is given for it"))
+            for photo in photos
+        ]
+        if inputs.ties is None:
+            ctx.progress(1.0, "poses")
+            return self.Out(cameras=_as_they_are(ctx, taken))
+        ties = _on_walls(inputs.ties, inputs.walls)
+        found = []
+        for nth, (photo, camera) in enumerate(zip(photos, taken, strict=True)):
+            ctx.progress(nth / len(photos), photo.name)
+            known = replace(photo, intrinsics=camera.intrinsics or photo.intrinsics)
+            found.append(_oriented(known, camera, ties, params, ctx))
+        unchecked = [item.camera.photo for item in found if item.numbers is None]
+        return self.Out(cameras=hand_over(ctx, ties, photos, found, _said(unchecked)))
+
+
+def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:
+    n_oriented = sum(camera.status == "ok" for camera in cameras)
+    ctx.metric("n_photos", len(cameras), "1")
+    ctx.metric("n_oriented", n_oriented, "1")
+    ctx.metric("n_refused", len(cameras) - n_oriented, "1")
+    for camera in cameras:
+        if camera.status != "ok":
+            ctx.warn(f"photo {camera.photo} is not oriented: {camera.status}")
+    return Cameras(cameras=tuple(cameras), details=_said([camera.photo for camera in cameras]))
+
+
+def _said(unchecked: Sequence[str]) -> dict[str, JsonValue]:
+    return {
+        "given": list(unchecked),
+        "given_meaning": "photos whose poses were taken as they are; nothing has checked them",
+    }
+
+
+def _oriented(
+    photo: Photo, camera: Camera, ties: Ties, params: OrientGiven.Params, ctx: StepContext
+) -> Oriented:
+    tied = tied_photo(photo, ties, params, ctx.rng)
+    if tied.by_hand.sum() >= TIES_LEAST:
+        return oriented_by_hand(tied, ties, params).alone
+    residuals_px = np.full((len(tied.chosen), 2), np.nan)
+    notes: tuple[str, ...] = ()
+    if camera.status == "ok" and len(tied.seen):
+        fit = misfit(tied.seen, camera.viewing())
+        residuals_px = fit.residuals_px
+        notes = _disagreement(tied.seen, fit.normalised, residuals_px)
+    return Oriented(
+        camera=camera,
+        chosen=tied.chosen,
+        role=ties.role[tied.chosen],
+        residuals_px=residuals_px,
+        notes=notes,
+    )
+
+
+def _disagreement(
+    seen: SeenPoints, normalised: NDArray[np.float64], residuals_px: NDArray[np.float64]
+) -> tuple[str, ...]:
+    off = normalised > _DISAGREEING
+    if not off.any():
+        return ()
+    longest = float(np.nanmax(np.linalg.norm(residuals_px[off], axis=1), initial=0.0))
+    note = (
+        f"{int(off.sum())} of its {len(seen)} ties measured by hand disagree with the given pose, "
+        f"by up to {longest:.1f} px: measure at least {TIES_LEAST}, which then orient it, or "
+        "correct them"
+    )
+    return (note,)
+
+
+def _on_walls(ties: Ties, walls: Walls | None) -> Ties:
+    if walls is None:
+        return ties
+    return replace(
+        ties,
+        wall=walls.nearest(ties.points_world),
+        walls=tuple(TieWall.of(wall) for wall in walls.walls),
+    )
+
+
+def _require_a_wall_in_view(cameras: Sequence[Camera], walls: Walls) -> None:
+    """Refuse poses of which none shows a wall from before it.
+
+    Raises:
+        MethodError: there is none.
+    """
+    oriented = [camera.viewing() for camera in cameras if camera.status == "ok"]
+    for wall in walls.walls:
+        frame = wall.frame
+        steps = (np.arange(_SIDE) + 0.5) / _SIDE
+        places = np.stack(np.meshgrid(steps * frame.width, steps * frame.height), axis=-1)
+        points = frame.world_from_wall(places.reshape(-1, 2))
+        for camera in oriented:
+            is_before = (camera.centre_world - frame.origin_world) @ frame.normal_world > 0.0
+            if is_before and camera.sees(camera.project(points)[:, :2]).any():
+                return
+    if not oriented:
+        return
+    centres = np.array([camera.centre_world for camera in oriented])
+    corners = np.concatenate([wall.frame.corners_world() for wall in walls.walls])
+    raise MethodError(
+        f"none of the {len(oriented)} given poses shows a wall: they stand at {_extent(centres)}, "
+        f"the walls at {_extent(corners)} (x, y, z in metres). Cameras and scan must be in one "
+        "frame and unit: bring the model into that of the scan before it is exported, or match "
+        "the photos instead"
+    )
+
+
+def _extent(points: NDArray[np.float64]) -> str:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return ", ".join(f"{first:.1f} to {last:.1f}" for first, last in zip(low, high, strict=True))

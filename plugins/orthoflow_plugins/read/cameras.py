@@ -1,0 +1,122 @@
+"""`read.cameras`: orientations of the photos that another program found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import PurePath
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from orthoflow.errors import InputError
+from orthoflow.files.camera_formats import read_given_cameras
+from orthoflow.files.given_cameras import CentredLens, GivenCamera
+from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.read.scan import UNITS_M, Unit
+
+_NAMED = 3
+
+
+class ReadCameras(Method):
+    """Read poses and lenses: `cameras.json`, COLMAP, Metashape, Bundler, RealityCapture.
+
+    They must be in the frame of the scan; `orient.given` says when they show no wall. Photos are
+    found by their file names, with or without suffix. A photo that the files say nothing of, or
+    whose lens OpenCV's model has not, is not oriented, and the reason is said.
+    """
+
+    id = "read.cameras"
+    result_version = 1
+    determinism = "exact"
+    citations: ClassVar[tuple[str, ...]] = (
+        "schoenberger2016: Structure-from-motion revisited (COLMAP), doi:10.1109/CVPR.2016.445",
+        "snavely2006: Photo tourism (Bundler), doi:10.1145/1141911.1141964",
+        "Agisoft Metashape Professional user manual, camera models",
+    )
+
+    class Params(MethodParams):
+        """What the files do not say themselves."""
+
+        unit: Unit = Field(
+            "m", description="Unit of the files' coordinates; the poses are in metres."
+        )
+
+    class In(Ports):
+        """The files, and the photos that they speak of."""
+
+        files: InputFiles
+        photos: Photos
+
+    class Out(Ports):
+        """One orientation per photo."""
+
+        cameras: Cameras
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Read the files; see the class."""
+        ctx.progress(0.0, inputs.files.name)
+        given = read_given_cameras(inputs.files.paths)
+        photos = inputs.photos.photos
+        cameras = tuple(_camera(photo, given, UNITS_M[params.unit]) for photo in photos)
+        n_oriented = sum(camera.status == "ok" for camera in cameras)
+        if not n_oriented:
+            names = ", ".join(item.name for item in given[:_NAMED])
+            raise InputError(
+                f"the input {inputs.files.name} orients none of the {len(photos)} photos, such as "
+                f"{photos[0].name if photos else 'none'}: it speaks of {names}"
+                f"{' ...' if len(given) > _NAMED else ''}; {cameras[0].status if cameras else ''}"
+            )
+        for camera in cameras:
+            if camera.status != "ok":
+                ctx.warn(f"photo {camera.photo} is not oriented: {camera.status}")
+        ctx.metric("n_photos", len(photos), "1")
+        ctx.metric("n_oriented", n_oriented, "1")
+        ctx.metric("n_refused", len(photos) - n_oriented, "1")
+        ctx.log(f"{n_oriented} poses are taken as given; nothing here has checked them")
+        return self.Out(cameras=Cameras(cameras=cameras, details={"given": True}))
+
+
+def _camera(photo: Photo, given: Sequence[GivenCamera], unit_m: float) -> Camera:
+    found = _of_photo(photo.name, given)
+    if found is None:
+        return Camera(photo=photo.name, status="the files of given cameras say nothing of it")
+    if found.lens is None or found.rotation is None or found.translation is None:
+        return Camera(photo=photo.name, status=found.reason)
+    lens = found.lens
+    if isinstance(lens, CentredLens):
+        lens = lens.of_size(photo.width, photo.height)
+    if (lens.width, lens.height) != (photo.width, photo.height):
+        raise InputError(
+            f"photo {photo.name} has {photo.width} x {photo.height} pixels, but its given camera "
+            f"{lens.width} x {lens.height}: give the photos that were oriented, at the same size "
+            "and not turned"
+        )
+    return Camera(
+        photo=photo.name,
+        status="ok",
+        intrinsics=lens,
+        rotation_camera_from_world=found.rotation,
+        translation_camera_from_world=unit_m * np.asarray(found.translation, dtype=np.float64),
+        sigma_wall_m=found.sigma_wall_m,
+    )
+
+
+def _of_photo(name: str, given: Sequence[GivenCamera]) -> GivenCamera | None:
+    """The camera of a photo: of its name, or else of its name without suffix.
+
+    Raises:
+        InputError: several cameras have that name.
+    """
+    for wanted in (name, PurePath(name).stem):
+        found = [item for item in given if item.name == wanted]
+        found = found or [item for item in given if item.name.lower() == wanted.lower()]
+        if len(found) > 1:
+            raise InputError(
+                f"the files of given cameras have {len(found)} cameras {found[0].name}: photo "
+                f"{name} must have one"
+            )
+        if found:
+            return found[0]
+    return None

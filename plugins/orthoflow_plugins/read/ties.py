@@ -1,0 +1,114 @@
+"""`read.ties`: points of photos that a person measured."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from orthoflow.errors import InputError
+from orthoflow.files.survey_points import MeasuredTie, read_measured_ties
+from orthoflow.geometry.opencv_border import from_opencv
+from orthoflow.products import InputFiles, Photo, Photos, TieRole, Ties
+from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.read.scan import UNITS_M, Unit
+
+_MOST_PROBLEMS = 20
+
+
+class ReadTies(Method):
+    """Read ties that a person measured: `photo,u_px,v_px,x,y,z[,sigma_px]`.
+
+    World coordinates are those of the scan. Pixels are counted as in `ties.csv` and `cameras.json`
+    (OpenCV): the centre of the photo's first pixel is at (0, 0), and the EXIF orientation is not
+    applied.
+    """
+
+    id = "read.ties"
+    result_version = 1
+    determinism = "exact"
+    citations: ClassVar[tuple[str, ...]] = ()
+
+    class Params(MethodParams):
+        """What the files do not say themselves."""
+
+        unit: Unit = Field("m", description="Unit of x, y, z in the files; the ties are in metres.")
+        sigma_px: float = Field(
+            1.0,
+            gt=0,
+            description="Standard deviation of each pixel coordinate where the files say none.",
+        )
+        sigma_m: float = Field(
+            0.002,
+            ge=0,
+            description="Standard deviation of each world coordinate, metres: of the survey, or of "
+            "a place that was picked in the scan.",
+        )
+
+    class In(Ports):
+        """The files, and the photos that they speak of."""
+
+        files: InputFiles
+        photos: Photos
+
+    class Out(Ports):
+        """The ties of all files."""
+
+        ties: Ties
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Read all files; see the class."""
+        if not inputs.files.paths:
+            raise InputError(f"the input {inputs.files.name} names no files: expected ties")
+        ctx.progress(0.0, inputs.files.name)
+        found = [tie for path in inputs.files.paths for tie in read_measured_ties(path)]
+        photos = {photo.name: photo for photo in inputs.photos.photos}
+        problems = [text for tie in found if (text := _problem(tie, photos))]
+        if problems:
+            left_out = len(problems) - _MOST_PROBLEMS
+            more = [f"... and {left_out} more problems"] if left_out > 0 else []
+            raise InputError("\n".join(problems[:_MOST_PROBLEMS] + more))
+        ties = _ties(found, tuple(photos), params)
+        per_photo = np.bincount(ties.photo, minlength=len(photos))
+        ctx.metric("n_ties", len(found), "1")
+        ctx.metric("n_photos_tied", int((per_photo > 0).sum()), "1")
+        for name, count in zip(photos, per_photo.tolist(), strict=True):
+            if count:
+                ctx.log(f"{name}: {count} ties measured by hand")
+        return self.Out(ties=ties)
+
+
+def _problem(tie: MeasuredTie, photos: Mapping[str, Photo]) -> str:
+    """Say what is wrong with a tie; empty when nothing is."""
+    photo = photos.get(tie.photo)
+    if photo is None:
+        near = difflib.get_close_matches(tie.photo, photos, n=1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        return f"{tie.where}: there is no photo {tie.photo} among those given{hint}"
+    u, v = tie.pixel
+    if not (-0.5 <= u <= photo.width - 0.5 and -0.5 <= v <= photo.height - 0.5):
+        return (
+            f"{tie.where}: (u {u:g}, v {v:g}) lies outside photo {tie.photo}, which is "
+            f"{photo.width} x {photo.height} pixels as it is stored"
+        )
+    return ""
+
+
+def _ties(found: Sequence[MeasuredTie], names: tuple[str, ...], params: ReadTies.Params) -> Ties:
+    place = {name: index for index, name in enumerate(names)}
+    count, unit_m = len(found), UNITS_M[params.unit]
+    return Ties(
+        photo_names=names,
+        photo=np.array([place[tie.photo] for tie in found], dtype=np.int32),
+        wall=np.full(count, -1, dtype=np.int32),
+        pixels_photo=from_opencv(np.array([tie.pixel for tie in found], dtype=np.float64)),
+        points_world=unit_m * np.array([tie.position for tie in found], dtype=np.float64),
+        sigma_px=np.array([tie.sigma_px or params.sigma_px for tie in found], dtype=np.float64),
+        sigma_m=np.full(count, params.sigma_m),
+        role=np.full(count, TieRole.CONTROL, dtype=np.uint8),
+        residual_px=np.full((count, 2), np.nan),
+        by_hand=np.ones(count, dtype=np.uint8),
+    )

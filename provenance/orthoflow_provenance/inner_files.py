@@ -1,0 +1,218 @@
+"""Files below a folder whose names come from strangers: nothing leads out, only files are read.
+
+Every name that a record, a crate, an archive or a plugin gives becomes a path here and nowhere
+else. Reading and writing go down folder by folder through descriptors, so that nothing can be
+exchanged for a link between the look and the use.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import stat
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from io import BufferedReader
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from orthoflow_provenance.errors import UnsafeFileError
+
+LONGEST_NAME_BYTES: Final = 255
+LONGEST_PATH_BYTES: Final = 4095
+# Windows takes these for devices whatever stands behind a dot, on every drive and in every folder.
+_DEVICES: Final = re.compile(
+    r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])[ ]*(\..*)?", re.IGNORECASE | re.DOTALL
+)
+_DRIVE: Final = re.compile(r"[A-Za-z]:")
+_FOLDER_FLAGS: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_FILE_FLAGS: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_NEW_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+def holds_control(text: str) -> bool:
+    """Say whether a text has control characters, separators of lines, or halves of letters."""
+    return not text.isprintable() and any(
+        unicodedata.category(letter) in {"Cc", "Cs", "Zl", "Zp"} for letter in text
+    )
+
+
+_PROBLEMS: Final[tuple[tuple[str, Callable[[str], object]], ...]] = (
+    ("is empty", lambda name: not name),
+    ("is . or ..", lambda name: name in {".", ".."}),
+    ("holds / or a backslash", lambda name: "/" in name or "\\" in name),
+    ("holds a control character", holds_control),
+    (
+        f"is longer than {LONGEST_NAME_BYTES} bytes",
+        lambda name: len(name.encode("utf-8")) > LONGEST_NAME_BYTES,
+    ),
+    ("ends with a dot or a space", lambda name: name[-1] in ". "),
+    ("is reserved for a device", _DEVICES.fullmatch),
+    ("begins with the letter of a drive", _DRIVE.match),
+)
+
+
+def name_problem(name: str) -> str:
+    """Say why a name cannot be that of a file or folder on every system; empty when it can.
+
+    >>> name_problem("hall.e57"), name_problem(".."), name_problem("a/b")
+    ('', 'is . or ..', 'holds / or a backslash')
+    """
+    return next((problem for problem, is_found in _PROBLEMS if is_found(name)), "")
+
+
+def path_problem(path: str) -> str:
+    """Say why a relative path with `/` cannot be one below a folder; empty when it can.
+
+    >>> path_problem("products/wall/a.tif"), path_problem("/etc/x"), path_problem("a/../b")
+    ('', 'is absolute', 'has a part that is . or ..')
+    """
+    if not path:
+        return "is empty"
+    if path.startswith("/"):
+        return "is absolute"
+    if "/" not in path:
+        return name_problem(path)
+    for part in path.split("/"):
+        if problem := name_problem(part):
+            return f"has a part that {problem}"
+    if len(path.encode("utf-8")) > LONGEST_PATH_BYTES:
+        return f"is longer than {LONGEST_PATH_BYTES} bytes"
+    return ""
+
+
+def path_below(folder: Path, path: str) -> Path:
+    """Make the path of something below a folder of a name that came from elsewhere.
+
+    Raises:
+        UnsafeFileError: it would lead out of the folder, or cannot be a path everywhere: absolute,
+            `..`, empty, control characters, reserved names, too long.
+    """
+    return folder.joinpath(*_parts(path))
+
+
+def colliding(paths: Iterable[str]) -> str:
+    """Give the first path that some system takes for one before it; empty when there is none.
+
+    >>> colliding(["a.png", "b.png", "A.png"])
+    'A.png'
+    """
+    seen: set[str] = set()
+    for path in paths:
+        folded = unicodedata.normalize("NFC", unicodedata.normalize("NFC", path).casefold())
+        if folded in seen:
+            return path
+        seen.add(folded)
+    return ""
+
+
+def open_below(folder: Path, path: str) -> BufferedReader:
+    """Open a regular file below a folder for reading, through no link.
+
+    Raises:
+        UnsafeFileError: the path leads elsewhere, or a link, a folder or a device stands there.
+        OSError: there is no such file, or it cannot be read.
+    """
+    *folders, name = _parts(path)
+    with _folder_below(folder, folders) as parent:
+        _check_regular(os.stat(name, dir_fd=parent, follow_symlinks=False), path)
+        with _link_refused(parent, name, path):
+            descriptor = os.open(name, _FILE_FLAGS, dir_fd=parent)
+    try:
+        _check_regular(os.fstat(descriptor), path)
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+@contextmanager
+def create_below(folder: Path, path: str) -> Iterator[BinaryIO]:
+    """Write a file below a folder, through no link; it gets its name when it is complete.
+
+    Folders on the way are made. A file, or a link, of that name is replaced.
+
+    Raises:
+        UnsafeFileError: the path leads elsewhere, or a link stands in the place of a folder.
+        OSError: the file cannot be written.
+    """
+    *folders, name = _parts(path)
+    with _folder_below(folder, folders, is_made=True) as parent:
+        aside = f".{secrets.token_hex(8)}.part"
+        try:
+            with os.fdopen(os.open(aside, _NEW_FLAGS, 0o666, dir_fd=parent), "wb") as stream:
+                yield stream
+            os.replace(aside, name, src_dir_fd=parent, dst_dir_fd=parent)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(aside, dir_fd=parent)
+            raise
+
+
+def files_below(folder: Path, path: str) -> tuple[str, ...]:
+    """Name the regular files in a folder below another; none when there is no such folder.
+
+    Links, and files whose names could not be those of a record, are left out.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    try:
+        with _folder_below(folder, _parts(path)) as inside, os.scandir(inside) as entries:
+            return tuple(
+                entry.name
+                for entry in entries
+                if entry.is_file(follow_symlinks=False) and not name_problem(entry.name)
+            )
+    except (FileNotFoundError, NotADirectoryError, UnsafeFileError):
+        return ()
+
+
+def _parts(path: str) -> list[str]:
+    if problem := path_problem(path):
+        raise UnsafeFileError(f"{path!r} {problem}, so it cannot be the name of a file here")
+    return path.split("/")
+
+
+def _check_regular(found: os.stat_result, path: str) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        raise UnsafeFileError(f"{path!r} must be a file, but {_said(found)} stands there")
+
+
+def _said(found: os.stat_result) -> str:
+    if stat.S_ISLNK(found.st_mode):
+        return "a link"
+    return "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
+
+
+@contextmanager
+def _folder_below(folder: Path, names: list[str], *, is_made: bool = False) -> Iterator[int]:
+    """Go down folder by folder; the first one may be a link, it is what the user named."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        for depth, name in enumerate(names):
+            if is_made:
+                with suppress(FileExistsError):
+                    os.mkdir(name, dir_fd=descriptor)
+            with _link_refused(descriptor, name, "/".join(names[: depth + 1])):
+                inner = os.open(name, _FOLDER_FLAGS, dir_fd=descriptor)
+            os.close(descriptor)
+            descriptor = inner
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _link_refused(parent: int, name: str, path: str) -> Iterator[None]:
+    """Say that a link stands there; which error the system gives for one depends on the flags."""
+    try:
+        yield
+    except OSError as error:
+        with suppress(OSError):
+            found = os.stat(name, dir_fd=parent, follow_symlinks=False)
+            if stat.S_ISLNK(found.st_mode):
+                raise UnsafeFileError(f"{path!r} is a link, and links are not followed") from error
+        raise

@@ -1,0 +1,94 @@
+"""`orthoflow cache verify` and the summary of a run say what was damaged in the store."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.engine_world import toy_world
+from tests.killed_runs import run_here
+
+WORKFLOW = """
+orthoflow: 1
+name: toy
+seed: 7
+steps:
+  range: {use: make.range}
+  dots: {use: work.draws, in: {numbers: range.numbers}}
+"""
+RUN = ("run", "toy.yaml", "--executor", "inline", "-o")
+
+Said = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Iterator[Said]:
+    """Run a command in a folder with the toys; give its exit code and what it printed."""
+
+    def said(*arguments: str) -> tuple[int, str]:
+        capsys.readouterr()
+        code = run_here(arguments)
+        return code, capsys.readouterr().out
+
+    (tmp_path / "toy.yaml").write_text(WORKFLOW)
+    monkeypatch.chdir(tmp_path)
+    with toy_world(tmp_path):
+        yield said
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def test_a_run_says_what_it_found_damaged(say: Said, tmp_path: Path) -> None:
+    assert say(*RUN, "first")[0] == 0
+    [figure] = (tmp_path / ".orthoflow" / "objects").glob("*/blob")
+    flip(figure)
+    for published in (tmp_path / ".orthoflow" / "objects").glob("*/files/numbers.txt"):
+        flip(published)
+    code, text = say(*RUN, "again")
+    assert code == 0
+    assert (
+        "2 results of the store were damaged and computed again: "
+        "range (published file numbers.txt), dots (figure)\n"
+    ) in text
+    code, text = say("show", "again")
+    assert "the stored result was damaged (published file numbers.txt)" in text
+    code, text = say(*RUN, "third")
+    assert (code, "damaged" in text) == (0, False)
+
+
+def test_verify_names_what_is_damaged_and_sets_it_aside(say: Said, tmp_path: Path) -> None:
+    assert say("cache", "verify") == (
+        0,
+        "0 results and 0 objects in .orthoflow are as they were stored\n",
+    )
+    assert say(*RUN, "first")[0] == 0
+    assert say("cache", "verify") == (
+        0,
+        "2 results and 2 objects in .orthoflow are as they were stored\n",
+    )
+    [figure] = (tmp_path / ".orthoflow" / "objects").glob("*/blob")
+    name = figure.parent.name
+    flip(figure)
+    code, text = say("cache", "verify", "--json")
+    found = json.loads(text)
+    assert (code, found["ok"], found["n_results"], found["n_objects"]) == (3, False, 1, 1)
+    assert [item["what"] for item in found["damaged"]] == [
+        "figure",
+        f"needs objects/{name[:12]}, which is damaged (figure)",
+    ]
+    assert found["damaged"][0]["name"] == f"objects/{name}"
+    assert found["aside"]["count"] == 2
+    code, text = say("cache", "verify")
+    assert (code, "set aside because damaged: 2, " in text) == (0, True)
+    assert "set aside because damaged: 2, " in say("cache", "list")[1]
+    assert json.loads(say("cache", "gc", "--json")[1])["n_damaged"] == 2
+    assert say(*RUN, "again")[0] == 0

@@ -1,0 +1,525 @@
+"""What commands print, to the last letter: tables, numbers, comparisons, methods, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+from click.testing import CliRunner
+from orthoflow_provenance.model import RunRecord
+from pydantic import Field
+
+from orthoflow.cli import plugins as plugins_commands
+from orthoflow.cli import tables
+from orthoflow.cli.compare import _print, comparison_json
+from orthoflow.cli.export import _Choices, _make_empty, _refuse_filled
+from orthoflow.cli.program import program
+from orthoflow.errors import ArgumentError
+from orthoflow.products import PointCloud
+from orthoflow.records import (
+    CellFacts,
+    ComparedMetric,
+    Pair,
+    ParameterValue,
+    ProductDistance,
+    RecordedFile,
+    RunComparison,
+)
+from orthoflow.records.comparison import Distance
+from orthoflow.sdk import MethodParams, Ports
+from tests.laboratories import laboratory_catalog
+from tests.report_runs import cell, record
+
+MIB, GIB = 1 << 20, 1 << 30
+
+
+def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    return capsys.readouterr().out.splitlines()
+
+
+# --- numbers ---
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (0.0, "< 0.01 s"),
+        (0.01, "0.01 s"),
+        (0.996, "1.00 s"),
+        (1.0, "1.0 s"),
+        (59.94, "59.9 s"),
+        (59.95, "1 min 00 s"),
+        (61.0, "1 min 01 s"),
+        (3599.0, "59 min 59 s"),
+        (3599.5, "1 h 00 min"),
+        (7380.0, "2 h 03 min"),
+    ],
+)
+def test_times_are_said_as_people_do(seconds: float, said: str) -> None:
+    assert tables.duration(seconds) == said
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "said"),
+    [
+        (0, "0 B"),
+        (1023, "1023 B"),
+        (1024, "1.0 KiB"),
+        (1536, "1.5 KiB"),
+        (MIB, "1.0 MiB"),
+        (1.5 * GIB, "1.5 GiB"),
+        (1024 * GIB, "1.0 TiB"),
+        (4096 * 1024 * GIB, "4096.0 TiB"),
+    ],
+)
+def test_sizes_are_said_in_binary_units(n_bytes: float, said: str) -> None:
+    assert tables.size(n_bytes) == said
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (0.0, "0"),
+        (999_999_999_999_999.0, "999999999999999"),
+        (1e15, "1e+15"),
+        (1234567.5, "1.23457e+06"),
+        (-0.5, "-0.5"),
+        (float("nan"), "nan"),
+    ],
+)
+def test_numbers_are_said_to_six_digits(value: float, said: str) -> None:
+    assert tables.number(value) == said
+
+
+def test_columns_are_as_wide_as_what_is_in_them(capsys: pytest.CaptureFixture[str]) -> None:
+    tables.echo_table(("a", "name", ""), [("long one", "b", "c"), ("", "d", "")])
+    assert printed(capsys) == ["a         name", "long one  b     c", "          d"]
+    tables.echo_table(("a", "b"), [])
+    assert printed(capsys) == []
+    tables.echo_json({"b": ["ä"], "a": 1})
+    assert printed(capsys) == ["{", '  "b": [', '    "ä"', "  ],", '  "a": 1', "}"]
+
+
+def test_counts_are_said_with_their_noun() -> None:
+    assert [tables.counted(n, "cell") for n in (0, 1, 2)] == ["0 cells", "1 cell", "2 cells"]
+
+
+# --- comparisons ---
+
+
+def distance(port: str, verdict: str, reason: str = "", *parts: Distance) -> ProductDistance:
+    return ProductDistance(
+        cell="a",
+        port=port,
+        type_name="planes",
+        verdict=verdict,  # type: ignore[arg-type]
+        left="1",
+        right="2",
+        distances=parts,
+        reason=reason,
+    )
+
+
+def part(field: str, unit: str, largest: float | None) -> Distance:
+    return Distance(unit=unit, largest=largest, limit=0.1, field=field, n_values=3)
+
+
+PRODUCTS = (
+    distance("one", "identical"),
+    distance("two", "different", "other names", part("x", "m", 0.25), part("n", "1", None)),
+    distance("three", "within tolerance", "", part("rgb", "grey", 3.0), part("k", "1", 0.5)),
+    distance("four", "different"),
+)
+PRODUCT_LINES = [
+    "product  type    verdict           largest differences",
+    "a.one    planes  identical",
+    "a.two    planes  different         0.25 m (x), not comparable (n)",
+    "a.three  planes  within tolerance  3 grey levels (rgb), 0.5 (k)",
+    "a.four   planes  different",
+    "a.two different: other names",
+    "4 products: 1 identical, 1 within tolerance, 2 different",
+]
+FILES = tuple(
+    RecordedFile(name=f"{name}.jpg", size_bytes=3, sha256=f"{index}123456789abcdef" * 4)
+    for index, name in enumerate("abcde")
+)
+
+
+def facts(**more: Any) -> CellFacts:
+    plain: dict[str, Any] = {
+        "status": "ok",
+        "method": "plane.a",
+        "distribution": "toys 1.0",
+        "result_version": 1,
+        "determinism": "exact",
+        "seed": None,
+        "code": {},
+        "tools": {},
+        "error": "",
+    }
+    return CellFacts(**(plain | more))
+
+
+def metric(value: float, *, is_cost: bool = False) -> ComparedMetric:
+    return ComparedMetric(
+        value=value, unit="mm", is_cost=is_cost, is_cached=False, environment="e1"
+    )
+
+
+def runs() -> tuple[RunRecord, RunRecord]:
+    return record([cell("a")], name="room"), record([], run_id="r2", seed=9, name="room")
+
+
+def same_runs() -> RunComparison:
+    left, right = runs()
+    return RunComparison(
+        left=left,
+        right=right,
+        workflow=(),
+        overrides=Pair(name="options", left=("a=1",), right=("a=1",)),
+        inputs=(),
+        cells=(Pair(name="a", left=facts(), right=facts()),),
+        parameters=(),
+        environment=(),
+        metrics=(),
+        products=(),
+    )
+
+
+def different_runs() -> RunComparison:
+    left, right = runs()
+    other = facts(
+        status="failed",
+        seed=0,
+        code={"toys": "abcdef0123456789", "more": "1" * 64},
+        tools={"colmap": "4.2"},
+        error="no plane",
+    )
+    return RunComparison(
+        left=left,
+        right=right,
+        workflow=("--- a", "+++ b", "@@ -1 +1 @@", "-x", "+y"),
+        overrides=Pair(name="", left=("a=1", "b=2"), right=()),
+        inputs=(
+            Pair(name="scan", left=FILES[:3], right=FILES[:4]),
+            Pair(name="photos", left=FILES[:1], right=()),
+            Pair(name="same", left=FILES[:1], right=FILES[:1]),
+        ),
+        cells=(Pair(name="a", left=facts(), right=other), Pair(name="b", left=None, right=facts())),
+        parameters=(
+            Pair(
+                cell="a",
+                name="cell_m",
+                left=ParameterValue(value=0.123456789, is_set=True),
+                right=ParameterValue(value="ä", is_set=False),
+            ),
+        ),
+        environment=(Pair(name="python", left="3.11", right=None),),
+        metrics=(
+            Pair(cell="a", name="wall_s", left=metric(1.0, is_cost=True), right=metric(2.0)),
+            Pair(cell="a", name="rms_mm", left=metric(1.5), right=metric(1.25)),
+            Pair(cell="a", name="max_mm", left=None, right=metric(2.0)),
+            Pair(cell="a", name="same_mm", left=metric(2.0), right=metric(2.0)),
+        ),
+        products=PRODUCTS,
+    )
+
+
+HEADS = [
+    "A: room, run r1, orthoflow 0.1.0, 2026-01-02T03:04:05Z, seed 1, 1 cell",
+    "B: room, run r2, orthoflow 0.1.0, 2026-01-02T03:04:05Z, seed 9, 0 cells",
+]
+
+
+def test_equal_runs_are_said_to_be_equal(capsys: pytest.CaptureFixture[str]) -> None:
+    _print(same_runs())
+    titles = ["inputs", "workflow", "options", "cells", "parameters (* set, others are defaults)"]
+    lines = [f"{title}: same" for title in [*titles, "environment"]]
+    lines[1] = "workflow: same text"
+    lines += ["metrics: 0 of 0 differ, time and memory left aside", "products"]
+    spaced = [text for line in lines for text in ("", line)]
+    assert printed(capsys) == [*HEADS, *spaced, "0 products"]
+
+
+def test_all_that_differs_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    _print(different_runs())
+    first = "a.jpg 0123456789ab"
+    three = f"{first}, b.jpg 1123456789ab, c.jpg 2123456789ab"
+    fine = "ok, plane.a result version 1, toys 1.0"
+    failed = (
+        "failed, plane.a result version 1, toys 1.0, code toys abcdef01 more 11111111, colmap 4.2, "
+        "seed 0, no plane"
+    )
+    assert printed(capsys) == [
+        *HEADS,
+        "",
+        "inputs: 2 of 3 differ",
+        f"        {'A'.ljust(len(three))}  B",
+        f"scan    {three}  {three} and 1 more",
+        f"photos  {first.ljust(len(three))}  not given",
+        "",
+        "workflow, A (-) against B (+)",
+        *("@@ -1 +1 @@", "-x", "+y"),
+        "",
+        "options: 1 of 1 differ",
+        "  A        B",
+        "  a=1 b=2",
+        "",
+        "cells: 2 of 2 differ",
+        f"   {'A'.ljust(len(fine))}  B",
+        f"a  {fine}  {failed}",
+        f"b  {'-'.ljust(len(fine))}  {fine}",
+        "",
+        "parameters (* set, others are defaults): 1 of 1 differ",
+        "          A          B",
+        'a.cell_m  0.123457*  "ä"',
+        "",
+        "environment: 1 of 1 differ",
+        "        A     B",
+        "python  3.11  -",
+        "",
+        "metrics: 2 of 3 differ, time and memory left aside",
+        "metric    A    B     B - A  unit",
+        "a.wall_s  1    2     1      mm",
+        "a.rms_mm  1.5  1.25  -0.25  mm",
+        "a.max_mm  -    2            mm",
+        "",
+        "products",
+        *PRODUCT_LINES,
+    ]
+
+
+def test_a_comparison_in_json_says_of_each_row_whether_it_is_the_same() -> None:
+    found = json.loads(json.dumps(comparison_json(different_runs())))
+    assert [run["run_id"] for run in found["runs"]] == ["r1", "r2"]
+    assert found["runs"][1] == {
+        "run_id": "r2",
+        "name": "room",
+        "created_by": "orthoflow 0.1.0",
+        "status": "ok",
+        "started": "2026-01-02T03:04:05Z",
+        "ended": "2026-01-02T03:05:05Z",
+        "seed": 9,
+    }
+    assert found["workflow"] == ["--- a", "+++ b", "@@ -1 +1 @@", "-x", "+y"]
+    assert found["overrides"] == {
+        "cell": "",
+        "name": "",
+        "left": ["a=1", "b=2"],
+        "right": [],
+        "same": False,
+    }
+    rows = ("inputs", "cells", "parameters", "environment", "metrics")
+    assert [[row["same"] for row in found[name]] for name in rows] == [
+        [False, False, True],
+        [False, False],
+        [False],
+        [False],
+        [False, False, False, True],
+    ]
+    assert [item["verdict"] for item in found["products"]] == [item.verdict for item in PRODUCTS]
+
+
+# --- methods ---
+
+
+class Params(MethodParams):
+    """One of each."""
+
+    cell_m: float = Field(0.02, gt=0, le=1, description="Edge of a cell.")
+    limit_deg: float | None = Field(None, description="Limit.")
+    n_most: int = Field(3, ge=1, lt=10, description="Number.")
+    how: Literal["fast", "good"] = Field("fast", description="How.")
+    only: Literal["one"] = Field("one", description="One.")
+    pair: tuple[float, float] = Field((0.0, 1.0), description="Two.")
+    names: list[str] = Field(default=[], description="Names.")
+    kept_share: float = Field(0.5, description="Share.")
+    memory_mib: int = Field(1, description="Memory.")
+    plain: bool = Field(default=True)
+
+
+class In(Ports):
+    cloud: PointCloud
+    more: PointCloud | None = None
+
+
+def test_parameters_are_said_with_type_limits_and_unit() -> None:
+    assert plugins_commands._parameters(Params) == [
+        ("cell_m", "number > 0 <= 1", 0.02, "m", "Edge of a cell."),
+        ("limit_deg", "number | null", None, "deg", "Limit."),
+        ("n_most", "integer >= 1 < 10", 3, "", "Number."),
+        ("how", "fast | good", "fast", "", "How."),
+        ("only", "one", "one", "", "One."),
+        ("pair", "array", [0.0, 1.0], "", "Two."),
+        ("names", "array of string", [], "", "Names."),
+        ("kept_share", "number", 0.5, "1", "Share."),
+        ("memory_mib", "integer", 1, "MiB", "Memory."),
+        ("plain", "boolean", True, "", ""),
+    ]
+    assert plugins_commands._ports(In) == [("cloud", "cloud", True), ("more", "cloud", False)]
+    assert plugins_commands._type_text({}, {}) == "any"
+    assert plugins_commands._type_text({"$ref": "#/$defs/a"}, {"a": {"type": "object"}}) == "object"
+    units = {"a_mm": "mm", "a_px": "px", "a_rad": "rad", "a_s": "s", "a_grey": "grey levels"}
+    units |= {"a_cells": "cells", "m": "", "a_b": ""}
+    assert {name: plugins_commands._unit_of(name) for name in units} == units
+
+
+@pytest.fixture
+def laboratory(monkeypatch: pytest.MonkeyPatch) -> None:
+    catalog = laboratory_catalog(monkeypatch)
+    monkeypatch.setattr(plugins_commands, "discover_catalog", lambda: catalog)
+
+
+def answer(*arguments: str, code: int = 0) -> str:
+    result = CliRunner().invoke(program, ["plugins", *arguments])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.mark.usefixtures("laboratory")
+def test_a_method_is_shown_with_ports_and_parameters() -> None:
+    assert answer("show", "plane.ransac") == (
+        "plane.ransac: plane.ransac of the tests\n"
+        "\n"
+        "distribution  laboratory 1.0\n"
+        "state         fine\n"
+        "class         laboratory.methods:Ransac\n"
+        "determinism   seeded, result version 1\n"
+        "\n"
+        "port  name    product\n"
+        "in    cloud   cloud\n"
+        "out   planes  planes\n"
+        "out   labels  labels\n"
+        "\n"
+        "parameter    type          default  unit  description\n"
+        "tolerance_m  number > 0    0.05     m     Distance that counts as on the plane.\n"
+        "iterations   integer >= 1  2000           Trials.\n"
+    )
+    told = json.loads(answer("show", "plane.ransac", "--json"))
+    assert told == {
+        "id": "plane.ransac",
+        "summary": "plane.ransac of the tests",
+        "description": "",
+        "state": "fine",
+        "distribution": "laboratory",
+        "version": "1.0",
+        "target": "laboratory.methods:Ransac",
+        "result_version": 1,
+        "determinism": "seeded",
+        "citations": [],
+        "params": [
+            {
+                "name": "tolerance_m",
+                "type": "number > 0",
+                "default": 0.05,
+                "unit": "m",
+                "description": "Distance that counts as on the plane.",
+            },
+            {
+                "name": "iterations",
+                "type": "integer >= 1",
+                "default": 2000,
+                "unit": "",
+                "description": "Trials.",
+            },
+        ],
+        "in": [{"port": "cloud", "product": "cloud", "required": True}],
+        "out": [
+            {"port": "planes", "product": "planes"},
+            {"port": "labels", "product": "labels"},
+        ],
+    }
+    photos = answer("show", "read.photos")
+    assert "in    calibration  files    optional\n" in photos
+    assert photos.endswith("out   photos       photos\n\nno parameters\n")
+
+
+@pytest.mark.usefixtures("laboratory")
+def test_methods_kinds_and_products_are_listed() -> None:
+    blocks = [block.splitlines() for block in answer("list").split("\n\n")]
+    assert [block[0].split() for block in blocks] == [
+        ["method", "state", "distribution", "summary"],
+        ["kind", "takes", "gives", "distribution", "summary"],
+        ["product", "distribution", "summary"],
+    ]
+    assert "plane.ransac    fine   laboratory 1.0  plane.ransac of the tests" in blocks[0]
+    rows = {line.split()[0]: line for line in blocks[1]}
+    assert "planes, labels" in rows["plane"]
+    assert rows["read"].count("its methods' own") == 2
+    told = json.loads(answer("list", "--json"))
+    assert set(told) == {"methods", "kinds", "products", "broken"}
+    assert told["broken"] == []
+    assert next(item for item in told["methods"] if item["id"] == "plane.ransac") == {
+        "id": "plane.ransac",
+        "kind": "plane",
+        "state": "fine",
+        "problem": "",
+        "distribution": "laboratory",
+        "version": "1.0",
+        "summary": "plane.ransac of the tests",
+    }
+    kinds = {item["name"]: item for item in told["kinds"]}
+    assert kinds["plane"]["in"] == {"cloud": "cloud"}
+    assert kinds["plane"]["out"] == {"planes": "planes", "labels": "labels"}
+    assert (kinds["plane"]["is_source"], kinds["read"]["is_source"]) == (False, True)
+    assert {item["state"] for item in [*told["kinds"], *told["products"]]} == {"fine"}
+
+
+# --- options of exports ---
+
+
+def choices(**more: Any) -> _Choices:
+    plain: dict[str, Any] = {
+        "cell": None,
+        "license_text": None,
+        "embed": False,
+        "inputs": (),
+        "store": Path(),
+    }
+    return _Choices(**(plain | more))
+
+
+TARGETS = ("colmap", "csv", "figures", "laz", "ro-crate", None)
+
+
+@pytest.mark.parametrize(
+    ("option", "belongs_to", "says"),
+    [
+        ({"cell": "a"}, {"colmap", "figures", "laz"}, "--cell belongs to --to colmap"),
+        ({"license_text": ""}, {"ro-crate"}, "--license belongs to --to ro-crate"),
+        ({"embed": True}, {"ro-crate", None}, "writes no record"),
+        ({"inputs": ("a=b",), "embed": True}, {"ro-crate", None}, "writes no record"),
+        ({"inputs": ("a=b",)}, set(), "--input belongs to --embed"),
+    ],
+    ids=["cell", "license", "embed", "embedded inputs", "inputs"],
+)
+def test_options_belong_to_formats(
+    option: dict[str, Any], belongs_to: set[str | None], says: str
+) -> None:
+    for target in TARGETS:
+        chosen = choices(**option)
+        if target in belongs_to:
+            chosen.check(target)
+            continue
+        with pytest.raises(ArgumentError) as caught:
+            chosen.check(target)
+        is_nothing_said = target is None and not chosen.embed
+        assert ("say what to write" if is_nothing_said else says) in str(caught.value)
+    for target in TARGETS[:-1]:
+        choices().check(target)
+
+
+def test_only_an_empty_folder_is_written_to(tmp_path: Path) -> None:
+    _make_empty(tmp_path / "deep" / "er")
+    _make_empty(tmp_path / "deep" / "er")
+    assert (tmp_path / "deep" / "er").is_dir()
+    (tmp_path / "file").touch()
+    for taken in (tmp_path, tmp_path / "file"):
+        with pytest.raises(ArgumentError, match="exists already and is not empty: choose another"):
+            _refuse_filled(taken)
+    _refuse_filled(tmp_path / "deep" / "er")
+    _refuse_filled(tmp_path / "not there")
+    with pytest.raises(ArgumentError, match="cannot be made: Not a directory"):
+        _make_empty(tmp_path / "file" / "below")

@@ -1,0 +1,153 @@
+"""What is printed of a run, a store and a plan, to the last letter."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from orthoflow import engine
+from orthoflow.cli.plan import _as_json, _summary
+from orthoflow.cli.program import program
+from orthoflow.cli.verify import _summary as verified
+from orthoflow.engine import GarbageReport
+from orthoflow.records import Verification
+from tests.provenance_records import write_sample
+
+KIB = 1024
+
+
+def said(*arguments: object, code: int = 0) -> str:
+    result = CliRunner().invoke(program, [str(argument) for argument in arguments])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def test_a_run_is_shown_completely(tmp_path: Path) -> None:
+    path, record, _ = write_sample(tmp_path)
+    wall = "wall@plane=hough2d,orient=pnp#2"
+    sha256 = record.inputs[0].files[0].sha256[:12]
+    rows = [
+        ("cell", "method", "status", "time   memory"),
+        ("cloud", "read.scan 0.1.0", "ok (cached from earlier-run)", "1.5 s  64 MiB"),
+        (wall, "raster.grid 0.1.0", "ok", "1.5 s  64 MiB"),
+        ("ortho", "ortho.pointcloud-direct", "failed", ""),
+    ]
+    assert said("show", path).splitlines() == [
+        "court-yard, run 20250102-abc: 3 cells, 2 ok, 1 failed",
+        "2025-01-02T03:04:05Z to 2025-01-02T03:05:05Z, orthoflow 0.1.0, seed 7",
+        "overrides: wall.gsd_m=0.01",
+        f"input scan: hall.laz, 1.0 TiB, sha256 {sha256}",
+        "input calibration: not given",
+        "",
+        *(f"{row[0]:31}  {row[1]:23}  {row[2]:28}  {row[3]}".rstrip() for row in rows),
+        "ortho failed: no cell has enough points",
+        f"warning, {wall}: the scan has no intensity",
+        "",
+        f"{'cell':31}  metric  value  unit",
+        f"{wall}  rms_mm  1.25   mm",
+        f"{wall}  cells   5400   1",
+        "",
+        "environment: Python 3.11.7, Linux 6.1, A processor, 2 cores, 2 threads",
+        "numpy 2.4.0, h5py 3.16.0 and 0 others (--json names them)",
+        "",
+        f"products: {tmp_path / 'products'}, 0 files",
+    ]
+    told = json.loads(said("show", path, "--json"))
+    assert [cell["address"] for cell in told["cells"]] == ["cloud", wall, "ortho"]
+    assert told["cells"][1]["figures"] == [
+        {"name": "residuals", "caption": "Résidus", "media_type": "image/png"}
+    ]
+    assert told["files"] == []
+    assert (told["run_id"], told["seed"], told["overrides"]) == (
+        *("20250102-abc", 7, ["wall.gsd_m=0.01"]),
+    )
+
+
+def test_a_whole_record_is_verified_and_a_changed_one_named(tmp_path: Path) -> None:
+    path, _, _ = write_sample(tmp_path)
+    assert said("verify", path) == "verified: 1 product, seal ok\n"
+    assert json.loads(said("verify", path, "--json")) == {
+        "record": str(path),
+        "ok": True,
+        "products": 1,
+        "inputs": 0,
+        "published": 0,
+        "findings": [],
+        "notes": [],
+        "signed_with": "",
+    }
+    path.write_bytes(path.read_bytes()[:-1])
+    assert "is not as it was written, see above\n" in said("verify", path, code=3)
+    told = json.loads(said("verify", path, "--json", code=3))
+    assert (told["ok"], len(told["findings"])) == (False, 1)
+
+
+@pytest.mark.parametrize(
+    ("n_inputs", "n_published", "words"),
+    [
+        (0, 0, "3 products, seal ok"),
+        (1, 0, "3 products, 1 input file, seal ok"),
+        (0, 1, "3 products, seal ok, 1 published file unchanged"),
+        (2, 2, "3 products, 2 input files, seal ok, 2 published files unchanged"),
+    ],
+)
+def test_what_was_verified_is_counted(n_inputs: int, n_published: int, words: str) -> None:
+    found = Verification(
+        path=Path("run.h5"),
+        findings=(),
+        notes=(),
+        n_products=3,
+        n_inputs=n_inputs,
+        n_published=n_published,
+    )
+    assert verified(found) == f"verified: {words}"
+
+
+def test_garbage_is_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    def collect(store: engine.Store, *, older_than_days: float | None, dry_run: bool) -> object:
+        asked.append((store.folder, older_than_days, dry_run))
+        return GarbageReport(n_results=1, n_objects=2, n_damaged=0, freed_bytes=1536)
+
+    monkeypatch.setattr(engine, "collect_garbage", collect)
+    store = ("--store", tmp_path)
+    assert said("cache", "gc", *store) == "removed 1 result and 2 objects, 1.5 KiB\n"
+    dry = said("cache", "gc", *store, "--dry-run", "--older-than", "2.5")
+    assert dry == "would remove 1 result and 2 objects, 1.5 KiB\n"
+    assert json.loads(said("cache", "gc", *store, "--json")) == {
+        "dry_run": False,
+        "n_results": 1,
+        "n_objects": 2,
+        "n_damaged": 0,
+        "freed_bytes": 1536,
+    }
+    assert asked == [(tmp_path, None, False), (tmp_path, 2.5, True), (tmp_path, None, False)]
+
+
+def planned(status: str, *, key: object = None) -> Any:
+    cell = SimpleNamespace(address=f"a@b={status}", step="a", method="a.b", params={"n": 1})
+    return SimpleNamespace(status=status, reason="so", cell=cell, key=key)
+
+
+def test_a_plan_is_summed_up_by_status() -> None:
+    assert _summary([]) == "0 cells: "
+    statuses = ("skipped", "cached", "will run", "cached", "unknown yet")
+    assert _summary([planned(status) for status in statuses]) == (
+        "5 cells: 2 cached, 1 will run, 1 unknown yet, 1 skipped"
+    )
+    assert _as_json(planned("cached", key=SimpleNamespace(key="abc"))) == {
+        "cell": "a@b=cached",
+        "step": "a",
+        "method": "a.b",
+        "status": "cached",
+        "reason": "so",
+        "key": "abc",
+        "params": {"n": 1},
+    }
+    assert _as_json(planned("will run"))["key"] is None

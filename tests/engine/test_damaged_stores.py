@@ -1,0 +1,144 @@
+"""Whatever is damaged in a store, no run takes it for good: it is computed again, and said."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine import Store, check_store
+from tests.long_loops import IS_LONG
+from tests.stored_runs import StoredRuns, stored_runs
+
+DAMAGES = 300 if IS_LONG else 8
+
+
+# Kinds of damage ----------------------------------------------------------------------------------
+
+
+def flip(path: Path, rng: random.Random) -> None:
+    content = bytearray(path.read_bytes())
+    content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    path.write_bytes(content)
+
+
+def flip_and_keep_the_time(path: Path, rng: random.Random) -> None:
+    before = path.stat()
+    flip(path, rng)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def lose_a_page(path: Path, rng: random.Random) -> None:
+    content = bytearray(path.read_bytes())
+    start = rng.randrange(len(content))
+    page = bytes(1 if not byte else 0 for byte in content[start : start + 4096])
+    content[start : start + 4096] = page
+    path.write_bytes(content)
+
+
+def truncate(path: Path, rng: random.Random) -> None:
+    os.truncate(path, rng.randrange(path.stat().st_size))
+
+
+def empty(path: Path, _: random.Random) -> None:
+    path.write_bytes(b"")
+
+
+def lengthen(path: Path, _: random.Random) -> None:
+    with path.open("ab") as stream:
+        stream.write(bytes(512))
+
+
+def remove(path: Path, _: random.Random) -> None:
+    path.unlink()
+
+
+def make_a_folder_of_it(path: Path, _: random.Random) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def link_elsewhere(path: Path, rng: random.Random) -> None:
+    elsewhere = path.parents[2] / "elsewhere"
+    shutil.copy(path, elsewhere)
+    flip(elsewhere, rng)
+    path.unlink()
+    path.symlink_to(elsewhere)
+
+
+def swap_with_another(path: Path, rng: random.Random) -> None:
+    store = next(folder for folder in path.parents if folder.suffix == ".store")
+    like = [p for p in store.rglob(f"*{path.suffix}") if p.is_file() and p != path]
+    other = rng.choice(sorted(like) or [store / "digests.json"])
+    content = path.read_bytes()
+    path.write_bytes(other.read_bytes())
+    other.write_bytes(content)
+
+
+def lose_its_folder(path: Path, _: random.Random) -> None:
+    shutil.rmtree(path.parent)
+
+
+KINDS: tuple[Callable[[Path, random.Random], None], ...] = (
+    flip,
+    flip_and_keep_the_time,
+    lose_a_page,
+    truncate,
+    empty,
+    lengthen,
+    remove,
+    make_a_folder_of_it,
+    link_elsewhere,
+    swap_with_another,
+    lose_its_folder,
+)
+CLASSES = {
+    "product": "objects/*/product.h5",
+    "description": "objects/*/object.json",
+    "published file": "objects/*/files/*",
+    "figure": "objects/*/blob",
+    "result": "results/*.json",
+    "preimage": "preimages/*/*.json",
+    "memory of digests": "digests.json",
+    "lock": "lock",
+}
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoredRuns]:
+    with stored_runs(tmp_path_factory.mktemp("damaged")) as found:
+        yield found
+
+
+@pytest.mark.long  # one of each class in a normal run
+def test_no_damage_of_a_store_is_sealed_as_good(laboratory: StoredRuns) -> None:
+    rng = random.Random(20150808)
+    expected = laboratory.sealed("quiet")
+    quiet = laboratory.run("sound", "again")
+    assert (quiet.code, "damaged" in quiet.said) == (0, False)
+    n_said = 0
+    for number in range(DAMAGES):
+        name = f"damage{number}"
+        store = laboratory.copy_store(name)
+        kind = list(CLASSES)[number % len(CLASSES)]
+        files = sorted(path for path in store.glob(CLASSES[kind]) if path.stat().st_size)
+        path = rng.choice(files or [store / "digests.json"])
+        harm = rng.choice(KINDS)
+        if harm is lose_its_folder and path.parent == store:
+            harm = remove
+        harm(path, rng)
+        what = f"{harm.__name__} of {path.relative_to(store)}"
+        answer = laboratory.run(name, name)
+        assert answer.code == 0, f"{what}: {answer.said}"
+        assert laboratory.sealed(name) == expected, what
+        n_said += "was damaged" in answer.said
+        # What no run needed, such as a scan that nothing reads any more, is found by looking.
+        check_store(Store(store))
+        assert check_store(Store(store)).damaged == (), what
+        shutil.rmtree(store)
+        shutil.rmtree(laboratory.folder / name)
+    assert n_said > DAMAGES / 3

@@ -1,0 +1,270 @@
+"""What is damaged is computed again, as little of it as is needed, whenever the damage happens."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orthoflow.engine import CellStarted, RunOutcome, Store, check_store, collect_garbage, execute
+from orthoflow.engine.events import RunEvent
+from orthoflow.engine.results import CellResult, result_from_json, result_to_json
+from orthoflow.errors import DamageError, StoreError
+from tests.engine_world import World, toy_world
+
+STEPS = """
+steps:
+  scan: {use: make.scan}
+  means: {use: thin.means, in: {scan: scan.scan}}
+  noise: {use: work.noise, in: {numbers: means.numbers}}
+"""
+MORE = """\
+  more: {use: work.draws, in: {numbers: noise.numbers}}
+  other: {use: thin.means, in: {scan: scan.scan}}
+"""
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def run(world: World, steps: str, **options: Any) -> RunOutcome:
+    return world.run(steps, **{"executor": "inline", **options})
+
+
+def product_file(world: World, outcome: RunOutcome, address: str) -> Path:
+    (ref,) = outcome.results[address].outputs.values()
+    return world.store.objects / ref.digest.removeprefix("sha256:") / "product.h5"
+
+
+def flip(path: Path, place: int = -8) -> None:
+    """Damage a byte among the last ones, where arrays are, without a trace in time and size."""
+    before = path.stat()
+    content = bytearray(path.read_bytes())
+    content[place] ^= 0x10
+    path.write_bytes(content)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def digests(outcome: RunOutcome) -> dict[str, str]:
+    return {
+        f"{address}.{port}": ref.digest
+        for address, result in outcome.results.items()
+        for port, ref in result.outputs.items()
+    }
+
+
+def computed(outcome: RunOutcome) -> set[str]:
+    return set(outcome.results) - set(outcome.cached) - outcome.resumed
+
+
+def test_a_damaged_mapped_scan_is_computed_again_before_a_step_reads_it(world: World) -> None:
+    first = run(world, STEPS)
+    flip(product_file(world, first, "scan"))
+    again = run(world, STEPS + MORE, into="again", force=("means",))
+    assert again.status == "ok"
+    assert {**digests(again), **digests(first)} == digests(again)
+    assert computed(again) == {"scan", "means", "more"}
+    assert again.damaged == {"scan": "product file"}
+    (warning,) = again.results["scan"].warnings
+    assert warning == "the stored result was damaged (product file) and was computed again"
+    # Said once: the mended result is like any other.
+    third = run(world, STEPS + MORE, into="third")
+    assert (third.damaged, computed(third), third.results["scan"].warnings) == ({}, set(), ())
+
+
+def test_a_damaged_scan_that_no_step_needs_is_left_alone(world: World) -> None:
+    first = run(world, STEPS)
+    flip(product_file(world, first, "scan"))
+    again = run(
+        world, STEPS + "  more: {use: work.draws, in: {numbers: noise.numbers}}\n", into="b"
+    )
+    assert computed(again) == {"more"}
+    assert again.damaged == {}
+    found = check_store(world.store)
+    digest = digests(first)["scan.scan"]
+    assert [item.what for item in found.damaged] == [
+        "product file",
+        f"needs objects/{digest[7:19]}, which is damaged (product file)",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("executor", "harm"),
+    [
+        ("inline", flip),
+        ("inline", Path.unlink),
+        ("local", lambda path: os.truncate(path, 3000)),
+    ],
+    ids=["flipped", "removed", "truncated"],
+)
+def test_damage_between_plan_and_use_is_noticed(
+    world: World, executor: str, harm: Callable[[Path], object]
+) -> None:
+    first = run(world, STEPS)
+    plan = world.plan(STEPS + MORE, force=("means",), executor=executor)
+    harm(product_file(world, first, "scan"))
+    again = execute(plan, world.folder / "again", world.store)
+    assert again.status == "ok"
+    assert {**digests(again), **digests(first)} == digests(again)
+    assert set(again.damaged) == {"scan"}
+
+
+def test_a_step_that_fails_over_damage_is_repeated_and_its_method_not_blamed(world: World) -> None:
+    first = run(world, STEPS)
+    path = product_file(world, first, "scan")
+    plan = world.plan(STEPS, force=("means",), executor="inline")
+    harmed = []
+
+    def harm_behind_the_check(event: RunEvent) -> None:
+        # The check is over when a step starts; it has not read anything yet.
+        if isinstance(event, CellStarted) and event.address == "means" and not harmed:
+            harmed.append(event)
+            os.truncate(path, 3000)
+
+    again = execute(plan, world.folder / "again", world.store, harm_behind_the_check)
+    assert again.status == "ok"
+    assert digests(again) == digests(first)
+    assert set(again.damaged) == {"scan"}
+
+
+def test_a_failing_method_is_still_to_blame_for_sound_inputs(world: World) -> None:
+    steps = "steps: {a: {use: make.range}, b: {use: work.raises, in: {numbers: a.numbers}}}"
+    outcome = run(world, steps)
+    assert outcome.results["b"].error_type == "MethodError"
+    assert len([event for event in world.events if isinstance(event, CellStarted)]) == 2
+
+
+def test_what_is_computed_again_and_differs_takes_what_follows_along(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with a method that never gives the same bits twice."""
+    first = run(world, STEPS)
+    flip(product_file(world, first, "means"))
+    plan = world.plan(STEPS + MORE, executor="inline")
+    from toy_plugin import works
+
+    same = works.Means.run
+
+    def other(self: object, inputs: object, params: object, ctx: object) -> object:
+        numbers = same(self, inputs, params, ctx).numbers
+        return works.Means.Out(numbers=dataclasses.replace(numbers, values=numbers.values + 1.0))
+
+    monkeypatch.setattr(works.Means, "run", other)
+    flip(product_file(world, first, "noise"))
+    again = execute(plan, world.folder / "again", world.store)
+    assert again.status == "ok"
+    assert digests(again)["means.numbers"] != digests(first)["means.numbers"]
+    (given,) = again.results["noise"].inputs.values()
+    assert given.digest == digests(again)["means.numbers"]
+
+
+def test_a_result_that_another_run_set_aside_meanwhile_is_computed_again(world: World) -> None:
+    first = run(world, STEPS)
+    plan = world.plan(STEPS, force=("means",), executor="inline")
+    path = product_file(world, first, "scan")
+    flip(path)
+    other = Store(world.store.folder)
+    assert not other.is_sound(first.results["scan"].outputs["scan"].digest)
+    again = execute(plan, world.folder / "again", world.store)
+    assert digests(again) == digests(first)
+    # What was put there since is sound, and stays.
+    assert not other.damage(first.results["scan"].outputs["scan"].digest)
+    assert len(list(world.store.damaged.iterdir())) == 1
+
+
+def test_what_lies_aside_is_counted_and_is_garbage(world: World) -> None:
+    first = run(world, STEPS)
+    flip(product_file(world, first, "noise"))
+    found = check_store(world.store)
+    assert (found.n_results, found.n_objects, found.aside.count) == (2, 2, 2)
+    assert found.aside.size_bytes > 1000
+    assert check_store(world.store).damaged == ()
+    assert collect_garbage(world.store, dry_run=True).n_damaged == 2
+    assert collect_garbage(world.store).n_damaged == 2
+    assert check_store(world.store).aside.count == 0
+
+
+def test_a_result_file_that_is_damaged_is_set_aside(world: World) -> None:
+    first = run(world, STEPS)
+    path = world.store.results / f"{first.results['noise'].key}.json"
+    text = path.read_text()
+    # Still JSON, still of the right shape, and wrong.
+    path.write_text(text.replace('"wall_s": 0', '"wall_s": 9'))
+    assert path.read_text() != text
+    again = run(world, STEPS, into="again")
+    assert (computed(again), again.damaged) == ({"noise"}, {"noise": "result file"})
+
+
+# Stores of versions that kept no digests ----------------------------------------------------------
+
+
+def make_earlier(store: Store) -> None:
+    """Make a store what the version before wrote: no digest but in names."""
+    for path in store.results.iterdir():
+        result: CellResult = result_from_json(path.read_text(), path.name)
+        content = json.loads(result_to_json(result))
+        del content["sha256"]
+        path.write_text(json.dumps({**content, "format": "orthoflow/result/1"}))
+    for path in store.objects.glob("*/object.json"):
+        content = json.loads(path.read_text())
+        size = (path.parent / "product.h5").stat().st_size
+        earlier = {"type": content["type"], "size_bytes": size, "publisher": content["publisher"]}
+        path.write_text(json.dumps(earlier))
+
+
+def test_a_store_of_the_version_before_is_taken_over(world: World) -> None:
+    first = run(world, STEPS)
+    make_earlier(world.store)
+    again = run(world, STEPS + MORE, into="again", force=("noise",))
+    assert (again.damaged, computed(again)) == ({}, {"noise", "more"})
+    assert check_store(world.store).damaged == ()
+    assert {**digests(again), **digests(first)} == digests(again)
+    flip(product_file(world, first, "scan"))
+    assert len(check_store(world.store).damaged) == 2  # the product, and its result
+
+
+def test_damage_in_a_store_of_the_version_before_is_found_by_content(world: World) -> None:
+    first = run(world, STEPS)
+    make_earlier(world.store)
+    flip(product_file(world, first, "scan"))
+    again = run(world, STEPS, into="again", force=("means",))
+    assert again.damaged == {"scan": "product file"}
+    assert digests(again) == digests(first)
+
+
+# Reading without a run ----------------------------------------------------------------------------
+
+
+def test_a_store_that_cannot_be_written_still_tells_good_from_damaged(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from toy_plugin.products import Numbers, Scan
+
+    first = run(world, STEPS)
+    flip(product_file(world, first, "scan"))
+
+    def refuse(*_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("pathlib.Path.rename", refuse)
+    store = world.store
+    assert store.get_product(digests(first)["means.numbers"], Numbers).values.size == 8
+    with pytest.raises(StoreError, match=r"objects/.* is damaged, but cannot be set aside: .*read"):
+        store.get_product(digests(first)["scan.scan"], Scan)
+
+
+def test_a_product_that_is_read_with_its_arrays_missing_is_damage(world: World) -> None:
+    from toy_plugin.products import Scan
+
+    first = run(world, STEPS)
+    os.truncate(product_file(world, first, "scan"), 3000)
+    with pytest.raises(DamageError, match="was damaged; run again and it is computed anew"):
+        world.store.get_product(digests(first)["scan.scan"], Scan, is_checked=True)

@@ -1,0 +1,150 @@
+"""What a method does to its process and with its words harms neither run, record nor machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine import RunOutcome
+from orthoflow.engine.results import CellResult
+from tests.engine_world import World, has_ended, toy_world
+
+WHO = "method work.{} of toy-plugin 1.0"
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def all_of(world: World, *names: str, **options: object) -> RunOutcome:
+    """Run methods side by side, each on the same numbers; those that never end, for 2 s."""
+    limits = dict.fromkeys(("never_silent", "stops"), ", timeout: 2s")
+    variants = "".join(f"      {n}: {{use: work.{n}{limits.get(n, '')}}}\n" for n in names)
+    steps = (
+        "steps:\n  first: {use: make.range}\n  bad:\n    in: {numbers: first.numbers}\n"
+        f"    variants:\n{variants}compare: {{design: product}}\n"
+    )
+    outcome = world.run(steps, **options)  # type: ignore[arg-type]
+    assert list(world.store.scratch.iterdir()) == []
+    return outcome
+
+
+def result_of(outcome: RunOutcome, name: str) -> CellResult:
+    found = [result for result in outcome.results.values() if result.method == f"work.{name}"]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_daemons_end_with_their_step_however_it_ends(world: World) -> None:
+    outcome = all_of(world, "daemon", "daemon_then_crash")
+    crashed = result_of(outcome, "daemon_then_crash")
+    assert crashed.error_message == f"{WHO.format('daemon_then_crash')} crashed (abort, SIGABRT)"
+    digest = result_of(outcome, "daemon").outputs["numbers"].digest
+    from toy_plugin.products import Numbers
+
+    daemons = [int(world.store.get_product(digest, Numbers).values[0])]
+    daemons.append(int(crashed.log.split("started ")[1].split()[0]))
+    assert all(has_ended(daemon) for daemon in daemons)
+
+
+def test_the_process_that_a_method_forked_gives_no_result(world: World) -> None:
+    outcome = all_of(world, "forks")
+    address = next(a for a, result in outcome.results.items() if result.method == "work.forks")
+    assert world.values(outcome, address) == [1.0, 2.0, 3.0, 4.0]
+    assert result_of(outcome, "forks").cpu_s >= 0.0
+
+
+def test_what_a_method_says_is_bounded(world: World) -> None:
+    outcome = all_of(world, "long_line", "never_silent", "prints_much", "replaces_log")
+    flood = result_of(outcome, "never_silent")
+    assert "ran past its timeout of 2 s" in flood.error_message
+    assert flood.wall_s < 30
+    assert result_of(outcome, "long_line").status == "ok"
+    printed = result_of(outcome, "prints_much")
+    assert printed.log.startswith("... (")
+    assert printed.log.endswith("the end\n")
+    assert len(printed.log) < 300_000
+    sizes = {
+        path.name: path.stat().st_size
+        for path in (world.folder / "run" / "logs").iterdir()
+        if path.is_file()
+    }
+    assert sizes["bad@bad=prints_much.log"] <= 8 << 20
+    assert result_of(outcome, "replaces_log").log == "still heard\n"
+
+
+def test_a_method_that_closes_what_it_was_given_still_gives_its_result(world: World) -> None:
+    outcome = all_of(world, "closes_all", "closes_streams", "digs_deep")
+    assert [result.error_message for result in outcome.results.values()] == ["", "", "", ""]
+
+
+def test_what_lies_in_the_place_of_a_result_is_not_taken_for_one(world: World) -> None:
+    names = ["leaves_fifo", "leaves_giant", "leaves_brackets", "leaves_another"]
+    outcome = all_of(world, *names)
+    for name in names:
+        assert result_of(outcome, name).error_message == (
+            f"{WHO.format(name)} ended its process without a result (exit status 0)"
+        )
+
+
+def test_a_step_that_stands_still_with_its_keeper_is_killed(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.engine.local_executor._GRACE_S", 0.3)
+    stopped = result_of(all_of(world, "stops"), "stops")
+    assert "ran past its timeout of 2 s" in stopped.error_message
+
+
+def test_a_step_says_that_an_interrupt_was_its_own(world: World) -> None:
+    result = result_of(all_of(world, "raises_interrupt"), "raises_interrupt")
+    assert result.error_message == (
+        f"{WHO.format('raises_interrupt')} failed unexpectedly: KeyboardInterrupt"
+    )
+
+
+FAILED = {
+    "raises_base": "failed unexpectedly: BaseException: of no kind",
+    "raises_speechless": "failed unexpectedly: Speechless: a Speechless without words",
+    "raises_nothing": "failed without a word",
+    "raises_lines": r"failed unexpectedly: ValueError: one two \x1b[31m \udcff \x00",
+}
+
+
+def test_whatever_is_raised_is_one_printable_line(world: World) -> None:
+    outcome = all_of(world, *FAILED, "raises_much", executor="inline")
+    for name, sentence in FAILED.items():
+        assert result_of(outcome, name).error_message == f"{WHO.format(name)} {sentence}"
+    much = result_of(outcome, "raises_much")
+    assert len(much.error_message) < 2200
+    assert much.error_message.endswith("... (10485760 characters)")
+    assert len(much.traceback) <= 1 << 16
+
+
+def test_warnings_are_lines_and_the_first_ones_are_kept(world: World) -> None:
+    warnings = result_of(all_of(world, "warns_much", executor="inline"), "warns_much").warnings
+    assert len(warnings) == 201
+    assert warnings[7] == r"7 \x1b[31m\udcff"
+    assert warnings[-1] == "801 more warnings, which are not kept"
+
+
+def test_no_descriptor_is_left_open_by_a_run(world: World) -> None:
+    all_of(world, "raises_nothing")
+    before = n_open()
+    all_of(world, "raises_nothing", "raises_lines", into="again")
+    assert n_open() == before
+
+
+def n_open() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_an_output_that_a_thread_still_changes_is_refused(world: World) -> None:
+    result = result_of(all_of(world, "goes_on_writing"), "goes_on_writing")
+    assert result.error_message == (
+        f"{WHO.format('goes_on_writing')} changed its output numbers after it had returned it; it "
+        f"must wait for its threads"
+    )

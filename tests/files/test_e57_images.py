@@ -1,0 +1,194 @@
+"""Photos inside E57 files: their bytes as they are, lens and pose as ASTM E2807 has them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.read.cameras import ReadCameras
+from orthoflow_plugins.read.photos import ReadPhotos
+
+from orthoflow.errors import InputError
+from orthoflow.files.e57_images import read_e57_images
+from orthoflow.files.images import decode_image, encode_jpeg, encode_png
+from orthoflow.geometry.rotations import quaternion_from_rotation
+from orthoflow.products import Cameras, InputFiles, Photos
+from orthoflow.sdk import StepContext
+from tests import photo_files, scan_files, scenes
+
+PICTURE = photo_files.picture(64, 48)
+NUMBERS = {
+    "imageWidth": 64,
+    "imageHeight": 48,
+    "focalLength": 0.03,
+    "pixelWidth": 5e-4,
+    "pixelHeight": 6e-4,
+    "principalPointX": 33.5,
+    "principalPointY": 22.25,
+}
+CENTRE = np.array([400_000.25, 5_000_000.5, 112.0])
+ROTATION = scenes.random_rotation(np.random.default_rng(3))
+
+
+def pinhole(**more: Any) -> dict[str, Any]:
+    return {
+        "kind": "pinhole",
+        "content": encode_jpeg(PICTURE),
+        "numbers": NUMBERS,
+        "rotation": quaternion_from_rotation(ROTATION),
+        "translation": CENTRE,
+        **more,
+    }
+
+
+def written(folder: Path, *images: dict[str, Any]) -> Path:
+    points = np.random.default_rng(0).uniform(0, 1, (5, 3))
+    fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), points.T, strict=True))
+    return scan_files.write_e57(folder / "room.e57", [{"fields": fields}], images)
+
+
+def read(path: Path) -> tuple[Photos, Cameras]:
+    first, second = (
+        StepContext(rng=np.random.default_rng(0), cores=1, scratch=path.parent) for _ in range(2)
+    )
+    files = InputFiles(name="photos", paths=(path,))
+    photos = ReadPhotos().run(ReadPhotos.In(files=files), ReadPhotos.Params(), first).photos
+    inputs = ReadCameras.In(files=files, photos=photos)
+    return photos, ReadCameras().run(inputs, ReadCameras.Params(), second).cameras
+
+
+def e57_pixels(points_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """E2807: x right, y up, the camera looks along -z; rows count downwards."""
+    x, y, z = points_camera.T
+    return np.column_stack(
+        [33.5 - x / z * (0.03 / 5e-4), 22.25 + y / z * (0.03 / 6e-4)],
+    )
+
+
+def test_a_pinhole_image_becomes_a_photo_with_lens_and_pose(tmp_path: Path) -> None:
+    photos, cameras = read(written(tmp_path, pinhole(name="north wall")))
+    (photo,), (camera,) = photos.photos, cameras.cameras
+    assert photo.name == camera.photo == "room_000_north_wall.jpg"
+    assert photo.encoded == encode_jpeg(PICTURE)
+    assert photo.intrinsics is not None
+    assert photo.intrinsics == camera.intrinsics
+    assert camera.status == "ok"
+    points_camera = np.random.default_rng(4).uniform([-1, -1, -5], [1, 1, -3], (20, 3))
+    points_world = points_camera @ ROTATION.T + CENTRE
+    pixels = camera.viewing().shifted(CENTRE).project(points_world - CENTRE)[:, :2]
+    # Of coordinates of 5e6 m a nanometre is left, 1e-8 of a pixel.
+    np.testing.assert_allclose(pixels, e57_pixels(points_camera), atol=1e-6)
+
+
+def test_images_without_a_pose_are_photos_with_the_reason(tmp_path: Path) -> None:
+    reference = {"kind": "visualReference", "content": encode_png(PICTURE)}
+    unposed = {"kind": "pinhole", "content": encode_jpeg(PICTURE), "numbers": NUMBERS}
+    images = read_e57_images(written(tmp_path, reference, unposed, pinhole()))
+    assert [image.name for image in images] == ["room_000.png", "room_001.jpg", "room_002.jpg"]
+    reasons = [image.camera.reason for image in images]
+    assert "for reference only" in reasons[0]
+    assert "states no pose of it" in reasons[1]
+    assert reasons[2] == ""
+    assert images[0].encoded() == encode_png(PICTURE)
+    photos, cameras = read(tmp_path / "room.e57")
+    assert len(photos.photos) == 3
+    assert [camera.status == "ok" for camera in cameras.cameras] == [False, False, True]
+
+
+def coloured(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A colour for every direction, smooth on the sphere."""
+    return np.asarray(128.0 + 100.0 * directions)
+
+
+def panorama(width: int, height: int) -> NDArray[np.uint8]:
+    """E2807: azimuth (width / 2 - x) * pixel width, counter-clockwise; elevation alike."""
+    azimuth = (width / 2 - (np.arange(width) + 0.5)) * (2 * np.pi / width)
+    elevation = ((height / 2 - (np.arange(height) + 0.5)) * (np.pi / height))[:, None]
+    level = np.cos(elevation)
+    directions = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth]
+    return np.rint(coloured(np.stack(directions, axis=-1))).astype(np.uint8)
+
+
+def spherical(width: int = 720, height: int = 360, **more: Any) -> dict[str, Any]:
+    return {
+        "kind": "spherical",
+        "content": encode_png(panorama(width, height)),
+        "name": "pano",
+        "numbers": {
+            "imageWidth": width,
+            "imageHeight": height,
+            "pixelWidth": 2 * np.pi / width,
+            "pixelHeight": np.pi / height,
+        },
+        "rotation": quaternion_from_rotation(ROTATION),
+        "translation": CENTRE,
+        **more,
+    }
+
+
+def test_a_panorama_becomes_six_photos_that_show_each_direction_where_it_is(
+    tmp_path: Path,
+) -> None:
+    photos, cameras = read(written(tmp_path, spherical()))
+    assert [photo.name for photo in photos.photos] == [
+        f"room_000_pano_{face}.png" for face in ("back", "down", "front", "left", "right", "up")
+    ]
+    directions = np.random.default_rng(5).normal(size=(400, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # World points in these directions of the panorama, as far away as a wall is.
+    points_world = 4.0 * directions @ ROTATION.T + CENTRE
+    n_seen = np.zeros(len(directions), dtype=int)
+    for photo, camera in zip(photos.photos, cameras.cameras, strict=True):
+        assert camera.status == "ok"
+        viewing = camera.viewing()
+        np.testing.assert_allclose(viewing.centre_world, CENTRE, atol=1e-6)
+        pixels = viewing.shifted(CENTRE).project(points_world - CENTRE)[:, :2]
+        seen = viewing.sees(pixels)
+        n_seen += seen
+        at = np.floor(pixels[seen]).astype(int)
+        shown = decode_image(photo.encoded)[at[:, 1], at[:, 0]]
+        # Half a pixel beside the place, of 230 to a right angle, and the rounding of the colours.
+        assert np.abs(shown - coloured(directions[seen])).max() < 100 * 0.5 * np.pi / 180 + 1.5
+    # Every direction in one face.
+    assert (n_seen == 1).all()
+
+
+def test_the_seam_of_a_panorama_does_not_show(tmp_path: Path) -> None:
+    images = read_e57_images(written(tmp_path, spherical()))
+    back = next(image for image in images if image.name.endswith("_back.png"))
+    middle = decode_image(back.encoded()).astype(int)
+    column = middle.shape[1] // 2
+    steps = np.abs(np.diff(middle[:, column - 3 : column + 3], axis=1)).max()
+    assert steps <= 2
+
+
+def test_a_part_of_a_panorama_is_told(tmp_path: Path) -> None:
+    half = spherical()
+    half["numbers"] = half["numbers"] | {"pixelHeight": 0.5 * np.pi / 360}
+    (image,) = read_e57_images(written(tmp_path, half))
+    assert "a part of a panorama, only whole ones are taken" in image.camera.reason
+
+
+def test_names_in_the_file_cannot_lead_out_of_a_folder(tmp_path: Path) -> None:
+    (image,) = read_e57_images(written(tmp_path, pinhole(name="../../etc/pass wd\t.jpg")))
+    assert image.name == "room_000_etc_pass_wd.jpg"
+
+
+def test_a_file_without_photos_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"room\.e57 holds no photos"):
+        read(written(tmp_path))
+
+
+def test_a_size_that_is_not_the_photos_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, pinhole(numbers=NUMBERS | {"imageWidth": 65}))
+    with pytest.raises(InputError, match="has 64 x 48 pixels, but its file says 65 x 48"):
+        read(path)
+
+
+def test_a_lens_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, pinhole(numbers=NUMBERS | {"pixelWidth": 0.0}))
+    with pytest.raises(InputError, match=r"the lens of photo room_000\.jpg is none"):
+        read(path)

@@ -1,0 +1,443 @@
+"""Cameras of other programs, each against the formula that its program documents."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.camera_formats import read_given_cameras
+from orthoflow.files.colmap import write_colmap_model
+from orthoflow.files.given_cameras import CentredLens, GivenCamera
+from orthoflow.files.panoramas import face_picture
+from orthoflow.files.publishing import publish_cameras
+from orthoflow.geometry.rotations import quaternion_from_rotation
+from orthoflow.products import Camera, Cameras, Intrinsics
+from tests import scenes
+
+WIDTH, HEIGHT = 640, 480
+POINTS = np.random.default_rng(2).uniform([-1, -1, 3], [1, 1, 6], (20, 3))
+
+
+def pose(seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """World from camera (axes x right, y down, z forward): rotation and centre."""
+    rng = np.random.default_rng(seed)
+    return scenes.random_rotation(rng), rng.uniform(-50.0, 50.0, 3)
+
+
+def seen_world(rotation: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(POINTS @ rotation.T + centre)
+
+
+def pixels(given: GivenCamera, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What our own camera makes of it."""
+    lens = given.lens
+    if isinstance(lens, CentredLens):
+        lens = lens.of_size(WIDTH, HEIGHT)
+    assert lens is not None
+    assert lens.source == "given"
+    return lens.posed(given.rotation, given.translation).project(points_world)[:, :2]
+
+
+def words(values: object) -> str:
+    return " ".join(repr(float(v)) for v in np.ravel(np.asarray(values)))
+
+
+def write(folder: Path, files: dict[str, str | bytes]) -> list[Path]:
+    for name, content in files.items():
+        data = content if isinstance(content, bytes) else content.encode()
+        (folder / name).write_bytes(data)
+    return [folder / name for name in files]
+
+
+# COLMAP: x = f (X / Z) + c with the first pixel's centre at (0.5, 0.5), as ours.
+
+
+def opencv_of_colmap(
+    points: NDArray[np.float64], params: list[float], model: str
+) -> NDArray[np.float64]:
+    """COLMAP's sensor/models.h, its names of the parameters written out."""
+    u, v = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    r2 = u * u + v * v
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        f, cx, cy, *k = params
+        k1, k2 = [*k, 0.0, 0.0][:2]
+        radial = k1 * r2 + k2 * r2 * r2
+        return np.column_stack([f * (u + u * radial) + cx, f * (v + v * radial) + cy])
+    fx, fy, cx, cy, *k = params
+    k1, k2, p1, p2, k3 = [*k, 0.0, 0.0, 0.0, 0.0, 0.0][:5]
+    radial = k1 * r2 + k2 * r2 * r2 + k3 * r2**3
+    du = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
+    dv = v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+    return np.column_stack([fx * (u + du) + cx, fy * (v + dv) + cy])
+
+
+MODELS: dict[str, tuple[int, list[float]]] = {
+    "SIMPLE_PINHOLE": (0, [500, 321, 239]),
+    "PINHOLE": (1, [500, 505, 321, 239]),
+    "SIMPLE_RADIAL": (2, [500, 321, 239, -0.05]),
+    "RADIAL": (3, [500, 321, 239, -0.05, 0.02]),
+    "OPENCV": (4, [500, 505, 321, 239, -0.05, 0.02, 1e-3, -2e-3]),
+    "FULL_OPENCV": (6, [500, 505, 321, 239, -0.05, 0.02, 1e-3, -2e-3, 0.01, 0, 0, 0]),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_colmap_models_project_as_colmap_does(tmp_path: Path, model: str, form: str) -> None:
+    number, params = MODELS[model]
+    rotation, centre = pose(1)
+    quaternion = -quaternion_from_rotation(rotation.T)  # either sign is the same turn
+    shift = -rotation.T @ centre
+    name = "walls/north face/a.jpg"
+    if form == "txt":
+        files: dict[str, str | bytes] = {
+            "cameras.txt": f"# c\n7 {model} {WIDTH} {HEIGHT} {words(params)}\n",
+            # An image without points has an empty second line.
+            "images.txt": f"# i\n1 {words(quaternion)} {words(shift)} 7 b.jpg\n\n"
+            f"2 {words(quaternion)} {words(shift)} 7 {name}\n1.5 2.5 -1 3.5 4.5 9\n",
+        }
+    else:
+        head = struct.pack("<IiQQ", 7, number, WIDTH, HEIGHT)
+        image = struct.pack("<7dI", *quaternion, *shift, 7)
+        observed = struct.pack("<Q", 2) + struct.pack("<ddq", 1.5, 2.5, -1) * 2
+        files = {
+            "cameras.bin": struct.pack("<Q", 1) + head + struct.pack(f"<{len(params)}d", *params),
+            "images.bin": struct.pack("<Q", 2)
+            + (struct.pack("<I", 1) + image + b"b.jpg\0" + struct.pack("<Q", 0))
+            + (struct.pack("<I", 2) + image + name.encode() + b"\0" + observed),
+        }
+    first, second = read_given_cameras(write(tmp_path, files))
+    assert (first.name, second.name) == ("b.jpg", "a.jpg")
+    expected = opencv_of_colmap(POINTS, params, model)
+    for given in (first, second):
+        found = pixels(given, seen_world(rotation, centre))
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_what_we_write_for_colmap_comes_back(tmp_path: Path) -> None:
+    camera = oriented("a.jpg", 4)
+    write_colmap_model(tmp_path, Cameras(cameras=(camera,)))
+    (given,) = read_given_cameras(sorted(tmp_path.iterdir()))
+    points = seen_world(*pose(4))
+    np.testing.assert_allclose(
+        pixels(given, points), camera.viewing().project(points)[:, :2], atol=1e-8
+    )
+
+
+def oriented(name: str, seed: int) -> Camera:
+    rotation, centre = pose(seed)
+    lens = Intrinsics(
+        width=WIDTH,
+        height=HEIGHT,
+        fx=500.0,
+        fy=503.0,
+        cx=321.0,
+        cy=239.0,
+        distortion=(-0.05, 0.02, 1e-3, -2e-3, 0.01),
+    )
+    return Camera(
+        photo=name,
+        status="ok",
+        intrinsics=lens,
+        rotation_camera_from_world=rotation.T,
+        translation_camera_from_world=-rotation.T @ centre,
+        sigma_wall_m=0.0021,
+    )
+
+
+def test_the_cameras_of_a_run_come_back(tmp_path: Path) -> None:
+    camera = oriented("a.jpg", 5)
+    lost = Camera(photo="b.jpg", status="no wall is recognised in it")
+    publish_cameras(Cameras(cameras=(camera, lost)), tmp_path, "sha256:0")
+    given, without = read_given_cameras([tmp_path / "cameras.json"])
+    points = seen_world(*pose(5))
+    np.testing.assert_allclose(
+        pixels(given, points), camera.viewing().project(points)[:, :2], atol=1e-9
+    )
+    assert given.sigma_wall_m == pytest.approx(0.0021)
+    assert (without.name, without.reason) == ("b.jpg", "no wall is recognised in it")
+
+
+# Metashape: the formulas of its manual, appendix "Camera models".
+
+
+def metashape_pixels(points: NDArray[np.float64], c: dict[str, float]) -> NDArray[np.float64]:
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    r2 = x * x + y * y
+    radial = 1 + c["k1"] * r2 + c["k2"] * r2**2 + c["k3"] * r2**3
+    x1 = x * radial + c["p1"] * (r2 + 2 * x * x) + 2 * c["p2"] * x * y
+    y1 = y * radial + c["p2"] * (r2 + 2 * y * y) + 2 * c["p1"] * x * y
+    u = 0.5 * WIDTH + c["cx"] + x1 * c["f"] + x1 * c["b1"]
+    return np.column_stack([u, 0.5 * HEIGHT + c["cy"] + y1 * c["f"]])
+
+
+LENS = {
+    "f": 500.0, "cx": 1.5, "cy": -2.25, "b1": 0.75,
+    "k1": -0.05, "k2": 0.02, "k3": 0.01, "p1": 1e-3, "p2": -2e-3,
+}  # fmt: skip
+
+
+def metashape(
+    chunk_from_camera: NDArray[np.float64],
+    *,
+    lens: dict[str, float] | None = None,
+    chunk: str = "",
+    more: str = "",
+) -> str:
+    values = "".join(f"<{k}>{v!r}</{k}>" for k, v in (LENS if lens is None else lens).items())
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<document version="2.0.0"><chunk label="Chunk 1">
+<sensors><sensor id="0" label="NIKON" type="frame">{size}
+<calibration type="frame" class="initial">{size}<f>9</f></calibration>
+<calibration type="frame" class="adjusted">{size}{values}</calibration></sensor>
+<sensor id="1" label="Theta" type="fisheye">{size}</sensor>
+<sensor id="2" label="360" type="spherical"><resolution width="720" height="360"/></sensor>
+</sensors>
+{chunk}
+<cameras><group id="0"><camera id="0" sensor_id="0" component_id="0" label="a">
+<transform>{words(chunk_from_camera)}</transform></camera></group>
+<camera id="1" sensor_id="0" label="b.jpg"/>
+<camera id="2" sensor_id="1" label="c.jpg"><transform>{words(np.eye(4))}</transform></camera>
+{more}</cameras></chunk></document>"""
+
+
+@pytest.mark.parametrize("where", ["component", "chunk", "nowhere"])
+def test_metashape_cameras_project_as_its_manual_says(tmp_path: Path, where: str) -> None:
+    rotation, centre = pose(2)
+    turn, shift, scale = scenes.random_rotation(np.random.default_rng(9)), [3.0, -2.0, 5.0], 2.5
+    if where == "nowhere":
+        turn, shift, scale = np.eye(3), [0.0, 0.0, 0.0], 1.0
+    # World = scale * turn * chunk + shift.
+    chunk_from_camera = np.eye(4)
+    chunk_from_camera[:3, :3] = turn.T @ rotation
+    chunk_from_camera[:3, 3] = turn.T @ (centre - shift) / scale
+    transform = (
+        f"<transform><rotation>{words(turn)}</rotation><translation>{words(shift)}</translation>"
+        f"<scale>{scale}</scale></transform>"
+    )
+    chunk = {
+        "component": f'<components><component id="0">{transform}</component></components>',
+        "chunk": transform,
+        "nowhere": "",
+    }[where]
+    paths = write(tmp_path, {"cameras.xml": metashape(chunk_from_camera, chunk=chunk)})
+    given = {item.name: item for item in read_given_cameras(paths)}
+    assert set(given) == {"a", "b.jpg", "c.jpg"}
+    found = pixels(given["a"], seen_world(rotation, centre))
+    np.testing.assert_allclose(found, metashape_pixels(POINTS, LENS), atol=1e-8)
+    assert given["b.jpg"].reason == "Metashape did not align it"
+    assert "of type fisheye" in given["c.jpg"].reason
+
+
+def test_metashape_panoramas_give_the_cameras_of_their_faces(tmp_path: Path) -> None:
+    rotation, centre = pose(6)
+    chunk_from_camera = np.eye(4)
+    chunk_from_camera[:3, :3], chunk_from_camera[:3, 3] = rotation, centre
+    more = (
+        '<camera id="9" sensor_id="2" label="r.jpg"><transform>'
+        f"{words(chunk_from_camera)}</transform></camera>"
+    )
+    paths = write(tmp_path, {"cameras.xml": metashape(np.eye(4), more=more)})
+    faces = {item.name: item for item in read_given_cameras(paths) if item.name.startswith("r_")}
+    assert len(faces) == 6
+    # Its manual: u = w / 2 + f atan2(x, z), v = h / 2 + f atan2(y, hypot(x, z)), f = w / 2 pi.
+    points = np.random.default_rng(8).normal(size=(300, 3))
+    u = 360 + 720 / (2 * np.pi) * np.arctan2(points[:, 0], points[:, 2])
+    v = 180 + 720 / (2 * np.pi) * np.arctan2(points[:, 1], np.hypot(points[:, 0], points[:, 2]))
+    # A picture whose two channels are the column and the row, from which faces are looked up.
+    columns, rows = np.meshgrid(np.arange(720), np.arange(360))
+    n_seen = np.zeros(len(points), dtype=int)
+    for face in ("front", "left", "back", "right", "up", "down"):
+        given = faces[f"r_{face}.png"]
+        assert isinstance(given.lens, Intrinsics)
+        viewing = given.lens.posed(given.rotation, given.translation)
+        at_face = viewing.project(points @ rotation.T + centre)[:, :2]
+        seen = viewing.sees(at_face)
+        n_seen += seen
+        pixel = np.floor(at_face[seen]).astype(int)
+        channels = [
+            face_picture((values // scale).astype(np.uint8), face)[pixel[:, 1], pixel[:, 0]]
+            for values, scale in ((columns, 4), (rows, 2))
+        ]
+        across = np.abs(channels[0] - u[seen] / 4)
+        level = np.abs(v[seen] - 180) < 120  # columns run together at the poles
+        assert np.minimum(across, 180 - across)[level].max() < 2.0
+        assert np.abs(channels[1] - v[seen] / 2).max() < 2.0
+    assert (n_seen == 1).all()
+
+
+@pytest.mark.parametrize("term", ["k4", "b2", "p3"])
+def test_metashape_terms_that_opencv_has_not_are_said(tmp_path: Path, term: str) -> None:
+    text = metashape(np.eye(4), lens={**LENS, term: 1e-3})
+    (given, *_) = read_given_cameras(write(tmp_path, {"cameras.xml": text}))
+    assert given.rotation is None
+    assert f"its sensor NIKON has {term}, which OpenCV's model has not" in given.reason
+
+
+BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]><x>&b;</x>'
+OUTSIDE = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><x>&a;</x>'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (BOMB, "defines a document type"),
+        (OUTSIDE, "defines a document type"),
+        (BOMB.encode("utf-16"), "is no UTF-8 text"),
+        ("<document><chunk>", r"c.xml:1: it is no XML: no element found"),
+        ("<document/>", "holds no cameras of Metashape"),
+        (metashape(np.eye(4)[:3]), "the transform of a must be 16 numbers, got 12"),
+        (metashape(2.0 * np.eye(4)), "the rotation of a is no rotation matrix"),
+        (metashape(np.eye(4), lens={**LENS, "f": -1.0}), "the lens of sensor NIKON is none"),
+        (metashape(np.eye(4), chunk="<transform><scale>0</scale></transform>"), "must be positive"),
+        (metashape(np.diag([1.0, 1, 1, np.nan])), "the transform of a must be numbers, got '1.0"),
+    ],
+)
+def test_damaged_metashape_files_end_in_one_sentence(
+    tmp_path: Path, text: str | bytes, message: str
+) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_given_cameras(write(tmp_path, {"c.xml": text}))
+    assert "\n" not in str(caught.value)
+
+
+# Bundler: P = R X + t; p = -P / P.z; r(p) = 1 + k1 |p|^2 + k2 |p|^4; p' = f r(p) p, y upwards.
+
+
+def test_bundler_cameras_project_as_its_manual_says(tmp_path: Path) -> None:
+    rotation, centre = pose(3)
+    opengl = rotation @ np.diag([1.0, -1.0, -1.0])
+    bundler_rotation, bundler_shift = opengl.T, -opengl.T @ centre
+    focal, k1, k2 = 500.0, -0.05, 0.02
+    text = (
+        "# Bundle file v0.3\n2 1\n0 0 0\n0 0 0\n0 0 0\n0 0 0\n0 0 0\n"
+        f"{focal} {k1} {k2}\n"
+        + "".join(f"{words(row)}\n" for row in (*bundler_rotation, bundler_shift))
+        + "1 2 3\n255 255 255\n0\n"
+    )
+    files = {"bundle.out": text, "list.txt": "photos/a.jpg 0 500\nC:\\photos\\b.jpg\n"}
+    lost, given = read_given_cameras(write(tmp_path, files))
+    assert (lost.name, lost.reason) == ("a.jpg", "Bundler did not orient it")
+    assert given.name == "b.jpg"
+    points_world = seen_world(rotation, centre)
+    camera = points_world @ bundler_rotation.T + bundler_shift
+    p = -camera[:, :2] / camera[:, 2:]
+    r2 = (p**2).sum(axis=1, keepdims=True)
+    scaled = focal * (1 + k1 * r2 + k2 * r2**2) * p
+    expected = np.column_stack([WIDTH / 2 + scaled[:, 0], HEIGHT / 2 - scaled[:, 1]])
+    np.testing.assert_allclose(pixels(given, points_world), expected, atol=1e-9)
+
+
+# RealityCapture: the camera looks straight down with north up at heading, pitch and roll 0.
+
+
+@pytest.mark.parametrize(
+    ("angles", "forward", "up"),
+    [
+        ((0, 0, 0), (0, 0, -1), (0, 1, 0)),
+        ((0, 90, 0), (0, 1, 0), (0, 0, 1)),
+        ((90, 90, 0), (1, 0, 0), (0, 0, 1)),
+        ((-30, 90, 0), (-0.5, math.sqrt(0.75), 0), (0, 0, 1)),
+        ((0, 60, 0), (0, math.sqrt(0.75), -0.5), (0, 0.5, math.sqrt(0.75))),
+    ],
+)
+def test_realitycapture_angles_are_those_of_a_compass(
+    tmp_path: Path,
+    angles: tuple[float, float, float],
+    forward: tuple[float, float, float],
+    up: tuple[float, float, float],
+) -> None:
+    head = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+    row = f"a.jpg,10,20,30,{','.join(map(str, angles))},24,0.01,-0.02,-0.05,0.02,0.01,0,0,0\n"
+    (given,) = read_given_cameras(write(tmp_path, {"cameras.csv": head + row}))
+    assert given.rotation is not None
+    assert given.translation is not None
+    np.testing.assert_allclose(given.rotation[2], forward, atol=1e-12)
+    np.testing.assert_allclose(-given.rotation[1], up, atol=1e-12)
+    np.testing.assert_allclose(-given.rotation.T @ given.translation, [10, 20, 30], atol=1e-9)
+    assert isinstance(given.lens, CentredLens)
+    lens = given.lens.of_size(HEIGHT, WIDTH)  # upright: the longer side counts
+    assert lens.fx == pytest.approx(24 / 36 * 640)
+    assert (lens.cx, lens.cy) == pytest.approx((240 + 6.4, 320 - 12.8))
+    assert lens.distortion == (-0.05, 0.02, 0.0, 0.0, 0.01)
+
+
+# Files that make no sense.
+
+
+def cameras_json(change: Callable[[dict[str, object]], None]) -> str:
+    entry: dict[str, object] = {
+        "status": "ok",
+        "K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]],
+        "distortion": [0, 0, 0, 0, 0],
+        "width": WIDTH,
+        "height": HEIGHT,
+        "R_camera_from_world": np.eye(3).tolist(),
+        "t_camera_from_world": [0, 0, 0],
+    }
+    change(entry)
+    return json.dumps({"cameras": {"a.jpg": entry}})
+
+
+HEAD = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ({"a.jpg": ""}, "a.jpg holds no cameras that orthoflow reads: expected one cameras.json"),
+        ({"c.json": "[1"}, "c.json: it is no cameras.json of a run"),
+        ({"c.json": "[" * 100_000}, "c.json: it is no cameras.json of a run"),
+        ({"c.json": cameras_json(lambda e: e.pop("K"))}, "it is no cameras.json of a run"),
+        ({"c.json": cameras_json(lambda e: e.update(distortion=[0]))}, r"and k1, k2, p1, p2, k3"),
+        ({"c.json": cameras_json(lambda e: e.update(R_camera_from_world=[[1] * 3] * 3))},
+         "the rotation of a.jpg is no rotation matrix"),
+        ({"cameras.txt": CAMERA, "images.txt": "1 1 0 0 0 0 0 0 2 a.jpg\n\n"},
+         "a.jpg has camera 2, which cameras.txt has not"),
+        ({"cameras.txt": CAMERA, "images.txt": "1 0 0 0 0 0 0 0 1 a.jpg\n\n"},
+         "the pose of a.jpg must be finite numbers"),
+        ({"cameras.txt": CAMERA, "images.txt": "1 1 0 0 0 0 0\n"}, "images.txt:1: expected IMA"),
+        ({"cameras.txt": "1 PINHOLE 640 x 500 500 320 240\n", "images.txt": ""},
+         "cameras.txt:1: a camera's parameters must be numbers"),
+        ({"cameras.txt": "1 PINHOLE 640 480 500 320 240\n", "images.txt": ""},
+         "a camera PINHOLE has 4 parameters, got 3"),
+        ({"cameras.txt": CAMERA, "images.txt": "# none\n"}, "the model has no images"),
+        ({"cameras.bin": b"\xff" * 8, "images.bin": b""}, "more than it has bytes"),
+        ({"cameras.bin": b"\1" + b"\0" * 7, "images.bin": b""}, "cameras.bin: it ends too early"),
+        ({"cameras.bin": b"\0" * 8, "images.bin": b"\1" + b"\0" * 7 + b"x" * 64},
+         "images.bin: it ends too early"),
+        ({"b.out": "1 0\n", "list.txt": "a.jpg\nb.jpg\n"}, "1 cameras, but the list names 2"),
+        ({"b.out": "1 0\n500 0 0\n", "list.txt": "a.jpg\n"}, "it ends within camera 0"),
+        ({"b.out": "1 0\n"}, "says nothing of names"),
+        ({"c.csv": "name,x,y,z\n"}, "the column alt is missing"),
+        ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,0,0.1,0\n"}, "c.csv:2: .* tangential"),
+        ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,zero,0,0,0,0,0,0\n"}, "c.csv:2: the parameters"),
+    ],
+)  # fmt: skip
+def test_files_that_make_no_sense_end_in_one_sentence(
+    tmp_path: Path, files: dict[str, str | bytes], message: str
+) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_given_cameras(write(tmp_path, files))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_fisheye_of_colmap_is_said_and_not_bent(tmp_path: Path) -> None:
+    files: dict[str, str | bytes] = {
+        "cameras.txt": CAMERA + f"2 OPENCV_FISHEYE {WIDTH} {HEIGHT} {words([1] * 8)}\n",
+        "images.txt": "1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 0 0 0 2 b.jpg\n\n",
+    }
+    plain, fisheye = read_given_cameras(write(tmp_path, files))
+    assert plain.rotation is not None
+    assert fisheye.rotation is None
+    assert "its camera is of the model OPENCV_FISHEYE, which OpenCV's has not" in fisheye.reason

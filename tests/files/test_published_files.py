@@ -1,0 +1,446 @@
+"""Published files of the smallest products: every key, every value and every cell."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from orthoflow.errors import InputError
+from orthoflow.files import geotiff, images, publishing
+from orthoflow.files.sidecars import frame_of_raster, number, numbers
+from orthoflow.geometry import WallFrame
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Intrinsics,
+    Orthoimage,
+    Orthoimages,
+    Planes,
+    TieRole,
+    Ties,
+    Wall,
+    Walls,
+)
+
+DIGEST = "sha256:" + "ab" * 32
+UP = np.array([0.0, 0.0, 1.0])
+FRAME = WallFrame(
+    origin_world=np.array([10.0, 20.0, 30.0]),
+    u_world=np.array([0.0, 1.0, 0.0]),
+    v_world=np.array([0.0, 0.0, -1.0]),
+    normal_world=np.array([1.0, 0.0, 0.0]),
+    gsd_m=0.5,
+    width=3,
+    height=2,
+)
+PLACED: dict[str, Any] = {
+    "origin_world": [10.0, 20.0, 30.0],
+    "u_world": [0.0, 1.0, 0.0],
+    "v_world": [0.0, 0.0, -1.0],
+    "normal_world": [1.0, 0.0, 0.0],
+    "gsd_m": 0.5,
+    "width": 3,
+    "height": 2,
+    "plane": {"normal": [1.0, 0.0, 0.0], "offset_m": 10.0},
+    "corners_world": [
+        [10.0, 20.0, 30.0],
+        [10.0, 20.0, 29.0],
+        [10.0, 21.5, 29.0],
+        [10.0, 21.5, 30.0],
+    ],
+    "raster": {
+        "world_from_raster": "origin_world + gsd_m * (column * u_world + row * v_world) + "
+        "depth_m * normal_world; v_world points down, cell centres lie at .5",
+        "geotiff": "X = gsd_m * column, Y = -gsd_m * row, pixel is area",
+    },
+}
+TAGS = {
+    "AREA_OR_POINT": "Area",
+    "frame": '{"normal_world": [1.0, 0.0, 0.0], "origin_world": [10.0, 20.0, 30.0], '
+    '"u_world": [0.0, 1.0, 0.0], "v_world": [0.0, 0.0, -1.0]}',
+    "gsd_m": "0.5",
+    "plane": '{"normal": [1.0, 0.0, 0.0], "offset_m": 10.0}',
+    "product_digest": DIGEST,
+    "software": "orthoflow",
+}
+# One pixel is a cell: its size, and the centre of the first one.
+WORLD_FILE = "0.5\n0.0\n0.0\n-0.5\n0.25\n-0.25\n"
+
+
+def json_of(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
+def picture(path: Path) -> Any:
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+def names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_planes_are_told_completely(tmp_path: Path) -> None:
+    corners = np.array([[[3.0, 0, 2], [3.0, 0, 0], [3.0, 4, 0], [3.0, 4, 2]]] * 2)
+    corners[1] = [[0.0, 4, 0], [0.0, 0, 0], [2.0, 0, 0], [2.0, 4, 0]]
+    covariance = np.zeros((2, 4, 4))
+    covariance[0] = np.diag([0.0, 4e-6, 1e-6, 9e-6])
+    product = Planes(
+        normal=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+        offset=np.array([3.0, 0.0]),
+        corners=corners,
+        covariance=covariance,
+        n_points=np.array([1234, 12], np.int64),
+        rms_m=np.array([0.0025, np.nan]),
+        up=UP,
+        names=("north", "floor"),
+        viewpoint="parameter",
+        part_corners=np.concatenate([corners, corners[:1] + 1.0]),
+        part_plane=np.array([0, 1, 0], np.int32),
+    )
+    publishing.publish_planes(product, tmp_path, DIGEST)
+    told = json_of(tmp_path / "planes.json")
+    first, second = told.pop("planes")
+    assert told == {"up": [0.0, 0.0, 1.0], "product_digest": DIGEST}
+    # In the middle of the corners, (3, 2, 1): 4 mm^2 times 2^2, 1 times 1^2, and 9.
+    assert first.pop("sigma_offset_mm") == pytest.approx(np.sqrt(26.0), rel=1e-12)
+    assert first.pop("sigma_angle_deg") == pytest.approx(np.degrees(2e-3), rel=1e-12)
+    assert first == {
+        "normal": [1.0, 0.0, 0.0],
+        "offset_m": 3.0,
+        "corners_world": corners[0].tolist(),
+        "n_points": 1234,
+        "rms_mm": 2.5,
+        "label": "north",
+        "omega_deg": 0.0,
+        "phi_deg": 0.0,
+        "viewpoint": "parameter",
+        "side_from": "guess",
+        "part_corners_world": [corners[0].tolist(), (corners[0] + 1.0).tolist()],
+    }
+    assert second["rms_mm"] is None
+    assert second["part_corners_world"] == [corners[1].tolist()]
+    assert second["label"] == "floor"
+    without = replace(product, part_corners=None, part_plane=None)
+    publishing.publish_planes(without, tmp_path, DIGEST)
+    plain = json_of(tmp_path / "planes.json")["planes"]
+    assert ["part_corners_world" in plane for plane in plain] == [False, False]
+
+
+DEPTH = np.array([[0.0, 1.0, 2.0], [np.nan, 3.0, 4.0]], np.float32)
+
+
+def wall() -> Wall:
+    return Wall(
+        frame=FRAME,
+        plane_index=2,
+        name="north",
+        depth_m=DEPTH,
+        sigma_m=np.zeros((2, 3), np.float32),
+        count=np.ones((2, 3), np.uint32),
+        mask=np.array([[1, 1, 2], [0, 1, 1]], np.uint8),
+    )
+
+
+def walls() -> Walls:
+    return Walls(
+        walls=(wall(),),
+        up=UP,
+        intensity_source="laser",
+        buffer_front_m=0.3,
+        buffer_behind_m=0.2,
+    )
+
+
+def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
+    publishing.publish_walls(walls(), tmp_path, DIGEST)
+    files = {f"wall_0_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")}
+    assert names_in(tmp_path) == files
+    content = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
+    assert json_of(tmp_path / "wall_0_depth.json") == {
+        **PLACED,
+        "plane_index": 2,
+        "intensity_source": "laser",
+        "buffer": {"front_m": 0.3, "behind_m": 0.2},
+        "content": content,
+        "name": "north",
+        "mask": {
+            "0": "void: no point of the scan fell here",
+            "1": "measured: points of the scan fell here",
+            "2": "recovered: taken from neighbouring cells",
+        },
+        "mask_counts": {"0": 1, "1": 4, "2": 1},
+        "product_digest": DIGEST,
+    }
+    read = geotiff.read_raster(tmp_path / "wall_0_depth.tif")
+    np.testing.assert_array_equal(read.values, DEPTH)
+    np.testing.assert_array_equal(read.shown, np.isfinite(DEPTH))
+    assert read.tags == {**TAGS, "content": content, "name": "north", "unit": "m"}
+    assert (read.gsd_m, read.corner_m, read.overviews, read.layout) == (0.5, (0.0, 0.0), (), "")
+    assert (tmp_path / "wall_0_depth.pgw").read_text() == WORLD_FILE
+    # From the 1st percentile of 0, 1, 2, 3, 4, black, to the 99th, white; the void is transparent.
+    grey = np.array([[0, 63, 128], [0, 192, 255]])
+    shown = picture(tmp_path / "wall_0_depth.png")
+    np.testing.assert_allclose(shown[:, :, 0][DEPTH >= 0.0], grey[DEPTH >= 0.0], atol=1)
+    np.testing.assert_array_equal(shown[:, :, 3], [[255, 255, 255], [0, 255, 255]])
+
+
+def test_each_raster_of_a_wall_says_what_it_holds(tmp_path: Path) -> None:
+    intensity = np.linspace(0.0, 1.0, 6, dtype=np.float32).reshape(2, 3)
+    layered = np.stack([DEPTH, DEPTH + 1.0], axis=2)
+    full = replace(wall(), intensity=intensity, percentiles_m=layered)
+    both = (full, replace(wall(), percentiles_m=layered))
+    product = replace(walls(), walls=both, percentiles=(5.0, 50.0))
+    publishing.publish_walls(product, tmp_path, DIGEST)
+    stems = {"wall_0_depth", "wall_0_depth_p5_0", "wall_0_depth_p50_0", "wall_0_intensity"}
+    stems |= {"wall_1_depth", "wall_1_depth_p5_0", "wall_1_depth_p50_0"}
+    suffixes = (".tif", ".json", ".png", ".pgw")
+    assert names_in(tmp_path) == {f"{stem}{suffix}" for stem in stems for suffix in suffixes}
+    depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
+    contents = {
+        "wall_0_depth": (DEPTH, depth),
+        "wall_0_depth_p5_0": (DEPTH, f"percentile 5.0 of the cell's points: {depth}"),
+        "wall_0_depth_p50_0": (DEPTH + 1.0, f"percentile 50.0 of the cell's points: {depth}"),
+        "wall_0_intensity": (intensity, "intensity 0..1 (laser); NaN = nothing"),
+        "wall_1_depth": (DEPTH, depth),
+    }
+    for stem, (values, content) in contents.items():
+        read = geotiff.read_raster(tmp_path / f"{stem}.tif")
+        np.testing.assert_array_equal(read.values, values)
+        assert read.tags["content"] == json_of(tmp_path / f"{stem}.json")["content"] == content
+    told = geotiff.read_raster(tmp_path / "wall_0_intensity.tif").tags
+    assert (told["unit"], told["intensity_source"]) == ("1", "laser")
+
+
+MASK = np.array([[0, 1, 2], [3, 4, 1]], np.uint8)
+RGB = np.arange(18, dtype=np.uint8).reshape(2, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("profile", "colours"),
+    [(None, "sRGB"), (bytes(range(200)), "ICC profile of the photos")],
+    ids=["srgb", "profile"],
+)
+def test_orthoimages_are_told_completely(
+    tmp_path: Path, profile: bytes | None, colours: str
+) -> None:
+    image = Orthoimage(
+        frame=FRAME,
+        wall=7,
+        name="north",
+        rgb=RGB,
+        mask=MASK,
+        source=np.zeros((2, 3), np.int16),
+        sources=("a.jpg", "b.jpg"),
+    )
+    publishing.publish_orthoimages(
+        Orthoimages(images=(image,), icc_profile=profile), tmp_path, DIGEST
+    )
+    suffixes = (".tif", ".tfw", ".json", ".png", ".pgw", "_mask.tif", "_mask.json")
+    assert names_in(tmp_path) == {f"wall_7_ortho{suffix}" for suffix in suffixes}
+    told: dict[str, Any] = {
+        **PLACED,
+        "wall": 7,
+        "name": "north",
+        "sources": ["a.jpg", "b.jpg"],
+        "mask": {
+            "0": "none: no source covers this cell",
+            "1": "painted: a source shows this cell",
+            "2": "filled: inpainted from neighbouring cells",
+            "3": "occluded: hidden in every source",
+            "4": "no surface: the scan does not know the surface here",
+        },
+        "mask_counts": {"0": 1, "1": 2, "2": 1, "3": 1, "4": 1},
+        "dataset_mask": "255 where the mask is painted (1) or filled (2), else 0",
+        "mask_raster": "wall_7_ortho_mask.tif",
+        "product_digest": DIGEST,
+    }
+    content = f"orthoimage, {colours}"
+    assert json_of(tmp_path / "wall_7_ortho.json") == {**told, "content": content}
+    of_mask = "mask of the orthoimage"
+    assert json_of(tmp_path / "wall_7_ortho_mask.json") == {**told, "content": of_mask}
+    shown = np.isin(MASK, (1, 2))
+    read = geotiff.read_raster(tmp_path / "wall_7_ortho.tif")
+    np.testing.assert_array_equal(read.values, RGB)
+    np.testing.assert_array_equal(read.shown, shown)
+    assert read.nodata is None
+    tags = {**TAGS, "name": "north"}
+    assert {key: read.tags[key] for key in [*tags, "content"]} == {**tags, "content": content}
+    mask = geotiff.read_raster(tmp_path / "wall_7_ortho_mask.tif")
+    np.testing.assert_array_equal(mask.values, MASK)
+    assert mask.tags == {**tags, "content": of_mask}
+    assert mask.nodata is None
+    for suffix in (".tfw", ".pgw"):
+        assert (tmp_path / f"wall_7_ortho{suffix}").read_text() == WORLD_FILE
+    preview = picture(tmp_path / "wall_7_ortho.png")
+    np.testing.assert_array_equal(preview[:, :, 2::-1], RGB)
+    np.testing.assert_array_equal(preview[:, :, 3], 255 * shown)
+
+
+POSE: dict[str, Any] = {
+    "rotation_camera_from_world": np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]]),
+    "translation_camera_from_world": np.array([1.0, 2.0, 3.0]),
+}
+
+
+def test_cameras_and_ties_are_told_completely(tmp_path: Path) -> None:
+    lens = replace(
+        Intrinsics(width=30, height=20, fx=25.0, fy=26.0, cx=15.0, cy=10.0),
+        distortion=(0.1, 0.2, 0.3, 0.4, 0.5),
+    )
+    cameras = (
+        Camera(photo="b.jpg", status="ok", intrinsics=lens, sigma0_px=0.5, **POSE),
+        Camera(photo="a.jpg", status="ok", intrinsics=lens, sigma_wall_m=0.25, **POSE),
+        Camera(photo="c.jpg", status="too few ties", intrinsics=lens, sigma0_px=np.nan),
+    )
+    ties = Ties(
+        photo_names=("b.jpg", "a, b.jpg"),
+        photo=np.array([1, 0, 0], np.int32),
+        wall=np.array([0, 2, 1], np.int32),
+        pixels_photo=np.array([[0.5, 0.5], [100.25, 7.125], [1.0, 2.0]]),
+        points_world=np.array([[634512.347, 1.0, 2.0], [0.1, 0.2, 0.3], [7.0, 8.0, 9.0]]),
+        sigma_px=np.array([0.5, 1.0, np.nan]),
+        sigma_m=np.array([0.001, 0.002, 0.003]),
+        role=np.array([TieRole.CONTROL, TieRole.REJECTED, TieRole.CHECK], np.uint8),
+        residual_px=np.array([[0.25, -0.125], [np.nan, np.nan], [np.inf, 1.0]]),
+    )
+    publishing.publish_cameras(Cameras(cameras=cameras, ties=ties), tmp_path, DIGEST)
+    assert names_in(tmp_path) == {"cameras.json", "ties.csv"}
+    inner = {
+        "K": [[25.0, 0.0, 14.5], [0.0, 26.0, 9.5], [0.0, 0.0, 1.0]],
+        "distortion": [0.1, 0.2, 0.3, 0.4, 0.5],
+        "width": 30,
+        "height": 20,
+    }
+    pose = {
+        "R_camera_from_world": [[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]],
+        "t_camera_from_world": [1.0, 2.0, 3.0],
+    }
+    assert json_of(tmp_path / "cameras.json") == {
+        "pixel_convention": "OpenCV: the centre of the first (top-left) pixel is at (0, 0)",
+        "camera_axes": "x right, y down, z forward; X_camera = R X_world + t, metres",
+        "cameras": {
+            "b.jpg": {"status": "ok", **inner, **pose, "sigma0_px": 0.5},
+            "a.jpg": {"status": "ok", **inner, **pose, "sigma_wall_mm": 250.0},
+            "c.jpg": {"status": "too few ties", **inner, "sigma0_px": None},
+        },
+        "product_digest": DIGEST,
+    }
+    assert (tmp_path / "ties.csv").read_text() == (
+        "photo,wall,u_px,v_px,x,y,z,role,residual_u_px,residual_v_px,sigma_px,"
+        "opencv_pixel_convention\n"
+        '"a, b.jpg",0,0.0,0.0,634512.347,1.0,2.0,control,0.25,-0.125,0.5,'
+        "first pixel centre at 0 0\n"
+        "b.jpg,2,99.75,6.625,0.1,0.2,0.3,rejected,,,1.0,first pixel centre at 0 0\n"
+        "b.jpg,1,0.5,1.5,7.0,8.0,9.0,check,,1.0,,first pixel centre at 0 0\n"
+    )
+
+
+def test_a_part_of_a_raster_lies_where_its_corner_says() -> None:
+    whole = {key: PLACED[key] for key in ("origin_world", "u_world", "v_world", "normal_world")}
+    part = frame_of_raster(whole, corner_m=(1.0, -0.5), gsd_m=0.25, shape=(4, 5), name="a.tif")
+    np.testing.assert_array_equal(part.origin_world, [10.0, 21.0, 29.5])
+    assert (part.gsd_m, part.width, part.height) == (0.25, 5, 4)
+
+
+@pytest.mark.parametrize(
+    ("key", "given"),
+    [
+        ("origin_world", None),
+        ("u_world", "text"),
+        ("v_world", [1.0, 2.0]),
+        ("normal_world", [1.0, 2.0, None]),
+        ("normal_world", [[1.0, 2.0, 3.0]]),
+        ("origin_world", [np.inf, 0.0, 0.0]),
+        ("u_world", {"x": 1.0}),
+    ],
+)
+def test_vectors_that_are_none_are_named(key: str, given: object) -> None:
+    whole = {key: PLACED[key] for key in ("origin_world", "u_world", "v_world", "normal_world")}
+    with pytest.raises(InputError) as caught:
+        frame_of_raster(
+            whole | {key: given}, corner_m=(0.0, 0.0), gsd_m=0.5, shape=(2, 3), name="a.json"
+        )
+    assert str(caught.value) == f"a.json: {key} must be three numbers below 1e+09, got {given!r}"
+    with pytest.raises(InputError, match=r"^a\.json: "):
+        frame_of_raster(
+            whole | {"u_world": [0.0, 2.0, 0.0]},
+            corner_m=(0.0, 0.0),
+            gsd_m=0.5,
+            shape=(2, 3),
+            name="a.json",
+        )
+
+
+def test_what_json_cannot_hold_is_null() -> None:
+    assert numbers(np.array([[1.5, np.nan], [np.inf, -0.25]])) == [[1.5, None], [None, -0.25]]
+    assert numbers(np.array([True, False])) == [True, False]
+    assert json.dumps(numbers(np.array([3, 4], np.uint8))) == "[3, 4]"
+    assert [number(value) for value in (None, np.nan, -np.inf, 2)] == [None, None, None, 2.0]
+
+
+# --- previews ---
+
+
+@pytest.mark.parametrize(
+    ("shape", "whole_px", "covered"),
+    [
+        ((1600, 3), 1 << 26, (1.0, 1.0)),
+        ((3200, 800), 1 << 26, (2.0, 2.0)),
+        ((3200, 3), 1 << 26, (2.0, 1.5)),
+        ((4000, 1), 1 << 26, (2.5, 1.0)),
+        # Squares of two cells are averaged first; of 6401 rows one is left over.
+        ((6401, 3200), 1000, (4.0, 4.0)),
+        ((6401, 3200), 1 << 26, (6401 / 1600, 4.0)),
+    ],
+)
+def test_a_pixel_of_a_preview_covers_so_many_cells(
+    monkeypatch: pytest.MonkeyPatch,
+    shape: tuple[int, int],
+    whole_px: int,
+    covered: tuple[float, float],
+) -> None:
+    monkeypatch.setattr(images, "_WHOLE_PX", whole_px)
+    assert images.cells_per_preview_px(shape) == covered
+
+
+def test_colours_of_a_preview_are_those_of_the_shown_cells_alone() -> None:
+    rgb = np.zeros((2, 8, 3), np.uint8)
+    rgb[:, :4] = (90, 60, 30)
+    shown = np.zeros((2, 8), np.bool_)
+    shown[0, 0] = shown[:, 2:4] = True
+    encoded = images.preview_png(rgb, shown, longest_side_px=4)
+    small = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert small is not None
+    assert small.tolist() == [[[30, 60, 90, 64], [30, 60, 90, 255], [0] * 4, [0] * 4]]
+    grey = images.preview_png(rgb[:, :, 0], shown, longest_side_px=8)
+    whole = cv2.imdecode(np.frombuffer(grey, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert whole is not None
+    np.testing.assert_array_equal(whole[:, :, :3], rgb[:, :, :1].repeat(3, axis=2))
+    np.testing.assert_array_equal(whole[:, :, 3], 255 * shown)
+
+
+@pytest.mark.parametrize("side", [39, 40, 41])
+def test_a_shrunk_picture_has_its_longest_side(side: int) -> None:
+    picture = np.full((20, 40, 3), (200, 100, 50), np.uint8)
+    shrunk = images.shrunk_webp(images.encode_png(picture), "a", longest_side_px=side)
+    found = images.decode_image(shrunk, "b")
+    assert found.shape == (20, min(side, 40), 3)
+    assert np.abs(found.astype(int) - picture[:, : min(side, 40)]).max() <= 6
+
+
+@pytest.mark.parametrize(("n_rows", "n_kept"), [(10, 10), (11, 6), (25, 9)])
+def test_large_rasters_are_sampled_by_rows(
+    monkeypatch: pytest.MonkeyPatch, n_rows: int, n_kept: int
+) -> None:
+    monkeypatch.setattr(images, "_WHOLE_PX", 30)
+    values = np.arange(3 * n_rows).reshape(n_rows, 3)
+    kept = images.sampled_rows(values)
+    assert len(kept) == n_kept
+    step = -(-3 * n_rows // 30)
+    np.testing.assert_array_equal(kept, values[::step])

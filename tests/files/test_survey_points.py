@@ -1,0 +1,178 @@
+"""Files of named points, as programs and people write them, and the whole sentence of a mistake."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from orthoflow.errors import InputError
+from orthoflow.files.survey_points import SurveyPoint, read_survey_points
+
+KNOWN = "known are name, x, y, z, class, wall, u_px, v_px"
+NAMES_EXPECTED = "expected the names of the columns, name,x,y,z[,class][,wall,u_px,v_px]"
+CSV_EXPECTED = "expected a CSV file with the columns name,x,y,z"
+ALL = "name,x,y,z,wall,u_px,v_px\n"
+
+
+def read(folder: Path, text: str | bytes) -> tuple[SurveyPoint, ...]:
+    path = folder / "p.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_survey_points(path)
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"], ids=["comma", "semicolon", "tab"])
+def test_all_columns_are_read_in_any_order(tmp_path: Path, mark: str) -> None:
+    lines = ["# a total station's", "", "Name,Class,x,Y,z,wall,v_px,u_px"]
+    lines += ["P1,flat,634512.3475,-2,1e-3,0,20.25,10.5", " ", "P 2,,4,5,6,,,", "  # the end"]
+    lines += ["P3,flat,7,8,9,32000,1,2"]
+    text = "\r\n".join(lines)
+    assert read(tmp_path, text.replace(",", mark)) == (
+        SurveyPoint(
+            name="P1",
+            position=(634512.3475, -2.0, 0.001),
+            class_name="flat",
+            wall=0,
+            pixel_wall=(10.5, 20.25),
+        ),
+        SurveyPoint(name="P 2", position=(4, 5, 6), class_name="", wall=None, pixel_wall=None),
+        SurveyPoint(
+            name="P3", position=(7, 8, 9), class_name="flat", wall=32_000, pixel_wall=(2, 1)
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "classes"),
+    [
+        ("P1,1,2,3\nP2,4,5,6\n", ("", "")),
+        ("\ufeffP1;1;2;3;flat\r\nP2;4;5;6;\r\n", ("flat", "")),
+        ('Name,X,Y,Z\n"P1",1,2,3\nP2,4,5,6', ("", "")),
+        ("P1\t1\t2\t3\tan edge, broken\nP2\t4\t5\t6\t7\n", ("an edge, broken", "7")),
+    ],
+    ids=["no header", "mark of the byte order and a class", "capitals and quotes", "a comma"],
+)
+def test_usual_exports_are_read(tmp_path: Path, text: str, classes: tuple[str, str]) -> None:
+    assert read(tmp_path, text) == (
+        SurveyPoint(name="P1", position=(1, 2, 3), class_name=classes[0]),
+        SurveyPoint(name="P2", position=(4, 5, 6), class_name=classes[1]),
+    )
+
+
+@pytest.mark.parametrize("first", ["P,1,a,b", "P,a,1,b", "P,a,b,1"])
+def test_one_number_among_the_first_makes_a_line_a_point(tmp_path: Path, first: str) -> None:
+    with pytest.raises(InputError, match=r"^p\.csv:1: [xyz] must be a number, got a"):
+        read(tmp_path, first)
+
+
+def test_names_of_columns_may_be_followed_by_a_number(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^p\.csv:1: unknown column 1; known are"):
+        read(tmp_path, "name,x,y,z,1\nP,1,2,3,4")
+
+
+@pytest.mark.parametrize(
+    ("text", "problems"),
+    [
+        ("", ["p.csv holds no points: expected name,x,y,z per line"]),
+        ("# nothing\n", ["p.csv holds no points: expected name,x,y,z per line"]),
+        ("name,x,y,z\n", ["p.csv:1: only the names of the columns, no points"]),
+        (
+            "name,x,y,zz\nP,1,2,3",
+            [
+                f"p.csv:1: unknown column zz (did you mean z?); {KNOWN}",
+                "p.csv:1: the column z is missing",
+            ],
+        ),
+        ("name,x,y,z,colour\nP,1,2,3,4", [f"p.csv:1: unknown column colour; {KNOWN}"]),
+        ("name,y\nP,1", ["p.csv:1: the column x, z is missing"]),
+        ("name,x,y,z,x\nP,1,2,3,4", ["p.csv:1: the column x is there 2 times"] * 2),
+        (
+            "name,x,y,z,v_px,u_px\nP,1,2,3,4,5",
+            ["p.csv:1: wall, u_px, v_px belong together, got only u_px"],
+        ),
+        (
+            "P,1,2\n",
+            [f"p.csv:1: {NAMES_EXPECTED}, got 3 values without names"],
+        ),
+        ("name,x,y,z\nP,1,2\n", ["p.csv:2: expected 4 columns, got 3"]),
+        (
+            "name,x,y,z\nP,1,5,2,5\n",
+            ["p.csv:2: expected 4 columns, got 5; write decimal points, not commas"],
+        ),
+        (
+            "name;x;y;z\nP;1,5;2;c,d\n",
+            [
+                "p.csv:2: x must be a number, got 1,5; write a decimal point",
+                "p.csv:2: z must be a number, got c,d",
+            ],
+        ),
+        ("name,x,y,z\nP,1,,3\n", ["p.csv:2: y must be a number, got nothing"]),
+        ("name,x,y,z\nP,1,nan,3\n", ["p.csv:2: y must be a number, got nan"]),
+        ("name,x,y,z\nP,1,2,inf\n", ["p.csv:2: z must be a number, got inf"]),
+        ("name,x,y,z\nP,1_0,2,3\n", ["p.csv:2: x must be a number, got 1_0"]),
+        ("name,x,y,z\n,1,2,3\n", ["p.csv:2: the name is missing"]),
+        (
+            "P,1,2,3\n\nP,4,5,6\n#\nP,7,8,9",
+            [f"p.csv:{line}: the name P is there already, in line 1" for line in (3, 5)],
+        ),
+        (
+            f"{ALL}P,1,2,3,0,5,\n",
+            ["p.csv:2: wall, u_px, v_px belong together, got only wall, u_px"],
+        ),
+        (
+            f"{ALL}P,1,2,3,0,x,y\n",
+            ["p.csv:2: u_px must be a number, got x", "p.csv:2: v_px must be a number, got y"],
+        ),
+        (f"{ALL}P,1,2,3,a,5,6\n", ["p.csv:2: wall must be a number, got a"]),
+        (
+            "P,1,2,3\n" + "x" * 10_001,
+            ["p.csv:2: the line is longer than 10000 letters: this is no list"],
+        ),
+        (
+            b"P,1,2,\xff\n",
+            [f"p.csv is no UTF-8 text: {CSV_EXPECTED}; save it as UTF-8"],
+        ),
+    ],
+)
+def test_a_mistake_is_one_sentence_with_its_line(
+    tmp_path: Path, text: str | bytes, problems: list[str]
+) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    assert str(caught.value).splitlines() == problems
+
+
+@pytest.mark.parametrize("wall", ["0.5", "-1", "32001"])
+def test_walls_are_counted(tmp_path: Path, wall: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, f"{ALL}P,1,2,3,{wall},5,6\n")
+    asked = "wall must be the number of a wall, from 0"
+    assert str(caught.value) == f"p.csv:2: {asked}, got {wall}"
+
+
+@pytest.mark.parametrize("n", [20, 21, 30])
+def test_all_mistakes_come_at_once_and_many_are_counted(tmp_path: Path, n: int) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, "name,x,y,z\n" + "P,1,x,3\n" * n)
+    expected = [f"p.csv:{k}: y must be a number, got x" for k in range(2, 22)]
+    more = [] if n == 20 else [f"... and {n - 20} more problems"]
+    assert str(caught.value).splitlines() == expected + more
+
+
+def test_a_line_may_have_ten_thousand_letters(tmp_path: Path) -> None:
+    name = "x" * (10_000 - len(",1,2,3"))
+    assert [point.name for point in read(tmp_path, f"{name},1,2,3")] == [name]
+
+
+def test_a_file_of_a_hundred_megabytes_is_no_list(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    path.touch()
+    os.truncate(path, 100_000_001)  # without a byte on the disk
+    with pytest.raises(InputError, match=r"^p\.csv is too large for a list of points: expected a"):
+        read_survey_points(path)
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^p\.csv cannot be read: No such file or directory$"):
+        read_survey_points(tmp_path / "p.csv")

@@ -1,0 +1,214 @@
+"""Damage to records: bytes that flip, and structures that are changed and sealed again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import h5py
+import numpy as np
+from orthoflow_provenance.encoding import write_text
+from orthoflow_provenance.errors import RecordFormatError
+from orthoflow_provenance.layout import PUBLISHED
+from orthoflow_provenance.seal import seal_file
+
+TEXTS = (
+    *(
+        "",
+        ".",
+        "..",
+        "../../x",
+        "/etc/passwd",
+        "C:\\x",
+        "nul",
+        "a\x1b[2J",
+        "a\u202eb",
+        "\n",
+        "x" * 300,
+    ),
+    *("=1+1", "<script>alert(1)</script>", "ok", "failed", "sha256:" + "0" * 64, "0" * 64, "1e999"),
+    *(
+        "inputs.number",
+        "inputs.",
+        "survey.planes",
+        ".",
+        "{}",
+        "[]",
+        "null",
+        "[" * 2000,
+        "-1",
+        "NaN",
+    ),
+)
+NUMBERS = (0, -1, 1, 2**31, 2**62, -(2**62), float("nan"), float("inf"), -0.0, 1e308)
+NAMES = (b"..", b"a\x1b", b"\xff\xfe", b"x" * 300, b"nul", b" ", b"0001", b"a=b@c")
+
+
+# What the library raises for what it cannot do to a damaged file.
+REFUSALS = (RecordFormatError, ValueError, KeyError, TypeError, RuntimeError, OSError)
+
+
+def damage_bytes(path: Path, random: Random) -> None:
+    """Flip, cut, or fill."""
+    content = bytearray(path.read_bytes())
+    kind = random.randrange(4)
+    if kind == 0:
+        del content[random.randrange(len(content)) :]
+    elif kind == 1:
+        start = random.randrange(len(content))
+        content[start : start + random.choice((4, 64, 4096))] = bytes(
+            random.choice((0, 255)) for _ in range(random.choice((4, 64, 4096)))
+        )
+    else:
+        for _ in range(random.choice((1, 2, 8, 64))):
+            content[random.randrange(len(content))] ^= 1 << random.randrange(8)
+    path.write_bytes(content)
+
+
+def damage_structure(path: Path, random: Random) -> None:
+    """Change a few things in a record, and seal it again where it still can be sealed."""
+    with suppress(*REFUSALS), h5py.File(path, "r+") as file:
+        for _ in range(random.choice((1, 1, 1, 2, 4))):
+            with suppress(*REFUSALS):
+                random.choice(CHANGES)(file, random)
+        if sum(item.nbytes for item in datasets(file)) > 1 << 30:
+            # Digesting what is not there would take longer than all else; nobody opens it.
+            return
+        for name in {"seal"} & set(file):
+            del file[name]
+        for name in {"content_sha256"} & set(file.attrs):
+            del file.attrs[name]
+        seal_file(file)
+
+
+def objects(file: h5py.File) -> list[Any]:
+    found: list[Any] = [file]
+    file.visititems(lambda _, item: found.append(item))
+    return found
+
+
+def groups(file: h5py.File) -> list[Any]:
+    return [item for item in objects(file) if isinstance(item, h5py.Group)]
+
+
+def datasets(file: h5py.File) -> list[Any]:
+    return [item for item in objects(file) if isinstance(item, h5py.Dataset)]
+
+
+def change_attribute(file: h5py.File, random: Random) -> None:
+    item = random.choice([item for item in objects(file) if len(item.attrs)])
+    name = random.choice(sorted(item.attrs))
+    del item.attrs[name]
+    kind = random.randrange(5)
+    if kind == 0:
+        return
+    if kind == 1:
+        item.attrs[name] = np.bytes_(random.choice(TEXTS).encode())
+    elif kind == 2:
+        item.attrs[name] = np.asarray(random.choice(NUMBERS))
+    elif kind == 3:
+        item.attrs[name] = np.zeros(random.choice(((0,), (3,), (2, 2))))
+    else:
+        item.attrs[name] = np.bytes_(bytes(random.randrange(256) for _ in range(8)))
+
+
+def change_dataset(file: h5py.File, random: Random) -> None:
+    item = random.choice(datasets(file))
+    parent, name, attributes = item.parent, item.name.rpartition("/")[2], dict(item.attrs)
+    content = item[()]
+    del parent[name]
+    kind = random.randrange(7)
+    if kind == 0:
+        return
+    if kind == 1:
+        write_text(parent, name, random.choice(TEXTS))
+    elif kind == 2:
+        shape = random.choice(((0,), (1 << 22,), (1 << 26,), (1 << 16, 1 << 10), (1 << 40,)))
+        chunks = tuple(min(4096, length) or 1 for length in shape)
+        parent.create_dataset(name, shape, np.uint8, chunks=chunks, compression="gzip")
+    elif kind == 3:
+        values = np.zeros(
+            random.choice((0, 1, 3, 100_000)), random.choice(("<f4", "S7", "?", "<i8"))
+        )
+        parent.create_dataset(name, data=values)
+    elif kind == 4 and isinstance(content, bytes):
+        write_text(parent, name, changed_json(content, random))
+    elif kind == 5 and isinstance(content, np.ndarray) and content.dtype.names and content.size:
+        column = random.choice(content.dtype.names)
+        is_text = content.dtype[column].kind == "S"
+        value = random.choice(TEXTS).encode() if is_text else random.choice(NUMBERS[:6])
+        content[column][random.randrange(content.size)] = value
+        parent.create_dataset(name, data=content)
+    else:
+        parent.create_dataset(name, data=np.atleast_1d(np.asarray(content))[:-1])
+    for key, value in attributes.items():
+        parent[name].attrs[key] = value
+
+
+def changed_json(content: bytes, random: Random) -> str:
+    """Exchange something deep inside for something else."""
+    try:
+        value = json.loads(content)
+    except ValueError:
+        return random.choice(TEXTS)
+    inner = value
+    while isinstance(inner, dict | list) and inner:
+        key = random.choice(sorted(inner) if isinstance(inner, dict) else range(len(inner)))
+        if random.random() < 0.4 or not isinstance(inner[key], dict | list):
+            inner[key] = random.choice((*TEXTS, *NUMBERS[:6], None, [], {}, True))
+            break
+        inner = inner[key]
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+
+
+def rename(file: h5py.File, random: Random) -> None:
+    group = random.choice([item for item in groups(file) if len(item)])
+    name = random.choice(sorted(group)).encode()
+    group.id.links.move(name, group.id, random.choice(NAMES))
+
+
+def copy(file: h5py.File, random: Random) -> None:
+    source, target = random.choice(objects(file)[1:]), random.choice(groups(file))
+    if f"{target.name}/".startswith(f"{source.name}/"):
+        # The library would never come to an end.
+        return
+    file.copy(source, target, name=random.choice(("copy", "survey", "paint", "0001", "content")))
+
+
+def remove(file: h5py.File, random: Random) -> None:
+    del file[random.choice(objects(file)[1:]).name]
+
+
+def flood(file: h5py.File, random: Random) -> None:
+    """Many small things that unpack to much."""
+    cell = random.choice(sorted(file["cells"]))
+    figures = file["cells"][cell]["figures"]
+    for index in range(40):
+        figure = figures.create_dataset(
+            f"{index:04}", (1 << 24,), np.uint8, chunks=(1 << 20,), compression="gzip"
+        )
+        if index % 8 == 0:
+            figure[: 1 << 20] = np.uint8(1)
+        for name, text in (("name", f"n{index}"), ("caption", ""), ("media_type", "image/png")):
+            figure.attrs[name] = np.bytes_(text.encode() or b"\0")
+
+
+def publish(file: h5py.File, random: Random) -> None:
+    rows = np.array(
+        [(random.choice(TEXTS).encode(), random.choice(NUMBERS[:6]), b"0" * 64) for _ in range(3)],
+        dtype=[("path", "S320"), ("size_bytes", "<i8"), ("sha256", "S64")],
+    )
+    del file[PUBLISHED]
+    file.create_dataset(PUBLISHED, data=rows)
+
+
+CHANGES: tuple[Callable[[h5py.File, Random], None], ...] = (
+    *(change_attribute,) * 4,
+    *(change_dataset,) * 5,
+    *(rename, copy, remove, publish),
+    flood,
+)

@@ -1,0 +1,309 @@
+"""Small valid files made wrong: bytes, numbers, lines and structures changed at random places.
+
+Everything follows from the generator that is passed in, so that a case can be had again.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from random import Random
+from typing import Any, Final, TypeAlias
+
+from tests.fuzz.e57_pages import e57_of, logical_of
+
+# Content, the generator, and other valid files of the same reader to take pieces from.
+Mutate: TypeAlias = Callable[[bytes, Random, Sequence[bytes]], bytes]
+
+_MOST_ROUNDS: Final = 4
+_LARGEST: Final = 1 << 20
+_HEADER_BYTES: Final = 512
+_NUMBER: Final = re.compile(rb"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?")
+_NUMBERS: Final = (
+    *(b"0", b"-1", b"-0.0", b"1", b"255", b"256", b"65535", b"65536", b"2147483647"),
+    *(b"-2147483648", b"4294967295", b"4294967296", b"9223372036854775807"),
+    *(b"-9223372036854775809", b"18446744073709551616", b"1e9", b"1e30", b"-1e30", b"1e308"),
+    *(b"1e309", b"-1e309", b"1e-320", b"nan", b"-nan", b"inf", b"-inf", b"NaN", b"Infinity"),
+    *(b".inf", b".nan", b"0x7fffffff", b"0o17", b"1_000", b"1,5", b"1.2.3", b"--1", b"true"),
+    *(b"false", b"null", b"", b"~", b'""', b"[]", b"{}", b"9" * 5000, b"1e" + b"9" * 400),
+)
+_FRAGMENTS: Final = (
+    *(b"\0", b"\n", b"\r", b"\t", b"\xff\xfe", b"\xef\xbb\xbf", b"\xed\xa0\x80", b"\x1b[2J"),
+    *("\u202e".encode(), "\u2028".encode(), "\U0001f4a5".encode(), b"\\ud800", b"\\u0000"),
+    *(
+        b"[" * 60,
+        b"[" * 50_000,
+        b"{" * 200,
+        b'{"a":' * 3000,
+        b"- " * 200,
+        b"&a ",
+        b"*a ",
+        b"<<: *a",
+    ),
+    *(
+        b"&a [*a, *a, *a]",
+        b"!!python/object:os.system ",
+        b"? ",
+        b": ",
+        b"|\n",
+        b">-\n",
+        b"%YAML 1.1\n",
+    ),
+    *(
+        b"---\n",
+        b"...\n",
+        b"#",
+        b"'",
+        b'"',
+        b",",
+        b";",
+        b"}",
+        b"]",
+        b"../../outside",
+        b"/etc/passwd",
+    ),
+    *(b"<!DOCTYPE a [<!ENTITY b 'c'>]>", b"&b;", b"<a>" * 500, b"</a>", b"]]>", b"x" * 20_000),
+)
+# (format, values) of numbers as they lie in binary files.
+_BINARY: Final = (
+    ("B", (0, 1, 127, 128, 255)),
+    ("H", (0, 1, 32767, 32768, 65535)),
+    ("I", (0, 1, 255, 65536, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)),
+    ("Q", (0, 1, 2**31, 2**32, 2**40, 2**63 - 1, 2**63, 2**64 - 1)),
+    ("f", (0.0, -1.0, 1e30, float("nan"), float("inf"), 1e-40)),
+    ("d", (0.0, -1.0, 1e30, 1e308, float("nan"), float("inf"), -float("inf"), 5e-324)),
+)
+
+
+def mutate_bytes(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    """Change a binary file, its first bytes as often as all the others."""
+    return _in_rounds(content, rng, others, _BYTE_STEPS)
+
+
+def mutate_text(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    """Change a text file: its numbers, its lines, and what stands between."""
+    return _in_rounds(content, rng, others, (*_TEXT_STEPS, *_TEXT_STEPS, *_BYTE_STEPS))
+
+
+def mutate_json(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    """Change the values and keys of a JSON document, and sometimes its text."""
+    if rng.random() < 0.7:
+        content = _changed_tree(_json_tree(content), rng)
+    return mutate_text(content, rng, others) if rng.random() < 0.4 else content
+
+
+def mutate_yaml(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    """Change a YAML document as a tree, which is JSON then, or as text."""
+    if rng.random() < 0.4:
+        content = _changed_tree(_yaml_tree(content), rng)
+        return mutate_text(content, rng, others) if rng.random() < 0.3 else content
+    return mutate_text(content, rng, others)
+
+
+def mutate_e57(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    """Change an E57 file, mostly behind its checksums: the XML, or the points."""
+    if rng.random() < 0.15:
+        return mutate_bytes(content, rng, others)
+    parts = logical_of(content)
+    if rng.random() < 0.6:
+        return e57_of(parts.binary, mutate_text(parts.xml, rng, [parts.xml]))
+    head, body = parts.binary[:48], parts.binary[48:]
+    return e57_of(head + mutate_bytes(body, rng, [body]), parts.xml)
+
+
+def mutate_png(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    """Change a PNG file, mostly behind its checksums."""
+    if rng.random() < 0.3:
+        return mutate_bytes(content, rng, others)
+    chunks = _png_chunks(content)
+    place = rng.randrange(len(chunks))
+    kind, data = chunks[place]
+    match rng.randrange(4):
+        case 0:
+            del chunks[place]
+        case 1:
+            chunks.insert(rng.randrange(len(chunks)), (kind, data))
+        case 2 if kind in (b"IDAT", b"iCCP") and len(data) < 100_000:
+            plain = _unpacked(data)
+            chunks[place] = (kind, zlib.compress(mutate_bytes(plain or data, rng, [data])))
+        case _:
+            chunks[place] = (kind, mutate_bytes(data, rng, [data]))
+    whole = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    ]
+    return content[:8] + b"".join(whole)
+
+
+def _in_rounds(
+    content: bytes, rng: Random, others: Sequence[bytes], steps: Sequence[Mutate]
+) -> bytes:
+    for _ in range(rng.randint(1, _MOST_ROUNDS)):
+        content = rng.choice(steps)(content, rng, others)[:_LARGEST]
+    return content
+
+
+def _place(content: bytes, rng: Random) -> int:
+    end = len(content) if rng.random() < 0.5 else min(len(content), _HEADER_BYTES)
+    return rng.randrange(end + 1)
+
+
+def _piece(content: bytes, rng: Random) -> bytes:
+    start = _place(content, rng)
+    return content[start : start + int(2 ** rng.uniform(0.0, 12.0))]
+
+
+def _flip(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    changed = bytearray(content)
+    for _ in range(rng.choice((1, 1, 2, 8)) if content else 0):
+        changed[min(_place(content, rng), len(content) - 1)] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
+def _overwrite(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    kind, values = rng.choice(_BINARY)
+    raw = struct.pack(rng.choice("<>") + kind, rng.choice(values))
+    at = _place(content, rng) // len(raw) * len(raw) if rng.random() < 0.5 else _place(content, rng)
+    return content[:at] + raw + content[at + len(raw) :]
+
+
+def _truncate(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    return content[: _place(content, rng)]
+
+
+def _double(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    at = _place(content, rng)
+    return content[:at] + _piece(content, rng) * rng.choice((1, 1, 3, 50)) + content[at:]
+
+
+def _drop(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    at = _place(content, rng)
+    return content[:at] + content[at + len(_piece(content, rng)) :]
+
+
+def _splice(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    at, piece = _place(content, rng), _piece(rng.choice(others), rng)
+    return content[:at] + piece + content[at + rng.choice((0, len(piece))) :]
+
+
+def _noise(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    at, raw = _place(content, rng), rng.randbytes(rng.randint(1, 16))
+    return content[:at] + raw + content[at + len(raw) :]
+
+
+def _number(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    found = list(_NUMBER.finditer(content[:_LARGEST]))
+    if not found:
+        return _fragment(content, rng, others)
+    chosen = rng.choice(found)
+    return content[: chosen.start()] + rng.choice(_NUMBERS) + content[chosen.end() :]
+
+
+def _fragment(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    at = _place(content, rng)
+    return content[:at] + rng.choice(_FRAGMENTS) + content[at:]
+
+
+def _word(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    words = list(re.finditer(rb"[A-Za-z_]+", content[:_LARGEST]))
+    if not words:
+        return _fragment(content, rng, others)
+    chosen, other = rng.choice(words), rng.choice(words)
+    return content[: chosen.start()] + other.group() + content[chosen.end() :]
+
+
+def _line(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    lines = content.split(b"\n")
+    place = rng.randrange(len(lines))
+    match rng.randrange(5):
+        case 0:
+            del lines[place]
+        case 1:
+            lines.insert(rng.randrange(len(lines)), lines[place])
+        case 2:
+            lines[place] = b"  " + lines[place]
+        case 3:
+            lines[place : place + 1] = [lines[place]] * rng.choice((2, 40, 2000))
+        case _:
+            lines[place] = lines[place].lstrip()
+    return b"\n".join(lines)
+
+
+_BYTE_STEPS: Final[tuple[Mutate, ...]] = (
+    *(_flip, _flip, _overwrite, _overwrite, _truncate, _double, _drop, _splice, _noise),
+)
+_TEXT_STEPS: Final[tuple[Mutate, ...]] = (_number, _number, _fragment, _word, _line)
+
+
+@lru_cache(maxsize=64)
+def _json_tree(content: bytes) -> str:
+    return json.dumps(json.loads(content))
+
+
+@lru_cache(maxsize=64)
+def _yaml_tree(content: bytes) -> str:
+    from ruamel.yaml import YAML
+
+    return json.dumps(YAML(typ="safe", pure=True).load(content))
+
+
+# Any: a tree of JSON values, changed wherever it is.
+def _changed_tree(text: str, rng: Random) -> bytes:
+    tree: Any = {"": json.loads(text)}
+    places = _places(tree)
+    raws: list[bytes] = []
+    for _ in range(rng.randint(1, 3)):
+        container, key = rng.choice(places)
+        match rng.randrange(7):
+            case 0 | 1 | 2:
+                raws.append(rng.choice(_NUMBERS) or b"0")
+                container[key] = f"@{len(raws) - 1}@"
+            case 3:
+                other, other_key = rng.choice(places)
+                container[key] = json.loads(json.dumps(other[other_key]))
+            case 4 if isinstance(container, dict) and key:
+                container[rng.choice(("", "..", "a/b", "\0", "x" * 5000, key + " "))] = container[
+                    key
+                ]
+            case 5:
+                raws.append(rng.choice((b"[" * 50_000 + b"]" * 50_000, b"[" * 70 + b"]" * 70)))
+                container[key] = f"@{len(raws) - 1}@"
+            case _:
+                container[key] = [container[key]] * rng.choice((0, 1, 5, 1000))
+        places = _places(tree)
+    dumped = json.dumps(tree[""]).encode()
+    for index, raw in enumerate(raws):
+        dumped = dumped.replace(f'"@{index}@"'.encode(), raw)
+    return dumped
+
+
+def _places(tree: Any) -> list[tuple[Any, Any]]:
+    """All places of a tree, each as a container and its key or index."""
+    found: list[tuple[Any, Any]] = []
+    waiting = [tree]
+    while waiting and len(found) < 10_000:
+        container = waiting.pop()
+        keys = list(container) if isinstance(container, dict) else range(len(container))
+        found += [(container, key) for key in keys]
+        waiting += [container[key] for key in keys if isinstance(container[key], dict | list)]
+    return found
+
+
+def _png_chunks(content: bytes) -> list[tuple[bytes, bytes]]:
+    chunks, at = [], 8
+    while at + 12 <= len(content):
+        length = int.from_bytes(content[at : at + 4], "big")
+        chunks.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + length]))
+        at += 12 + length
+    return chunks
+
+
+def _unpacked(data: bytes) -> bytes:
+    try:
+        return zlib.decompressobj().decompress(data, _LARGEST)
+    except zlib.error:
+        return b""

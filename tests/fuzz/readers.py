@@ -1,0 +1,504 @@
+"""Readers of everything that comes from outside, as targets of the fuzzing, with their seeds."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from orthoflow_plugins.read.checkpoints import ReadCheckpoints
+from orthoflow_plugins.read.orthoimage import ReadOrthoimage
+from orthoflow_plugins.read.photos import ReadPhotos
+from orthoflow_plugins.read.scan import ReadScan
+
+from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.engine.results import (
+    CellResult,
+    FigureRef,
+    Metric,
+    ProductRef,
+    RecordedEnvironment,
+    result_to_json,
+)
+from orthoflow.engine.run_folder import JOURNAL, CellBegan, CellEnded, Journal
+from orthoflow.engine.store import Store, list_results
+from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput, read_task, write_task
+from orthoflow.files.containers import icc_profile, is_cut_off
+from orthoflow.files.exif import focal_length, read_exif
+from orthoflow.files.geotiff import write_orthoimage
+from orthoflow.files.images import encode_webp, shrunk_webp
+from orthoflow.files.sidecars import frame_json, write_json
+from orthoflow.geometry import WallFrame
+from orthoflow.products import CheckPoints, InputFiles
+from orthoflow.sdk import Method
+from orthoflow.testing.trials import Trial, run_trial
+from orthoflow.workflow import expand_cells, load_workflow, resolved_json
+from orthoflow.workflow.recipes import shipped_workflows
+from orthoflow.workflow.resolved import workflow_from_resolved
+from tests import photo_files, scan_files
+from tests.fuzz.harness import Target
+from tests.fuzz.mutation import (
+    mutate_e57,
+    mutate_json,
+    mutate_png,
+    mutate_text,
+    mutate_yaml,
+)
+
+_N: Final = 40
+
+
+def _read_with(method: type[Method], files: InputFiles, **more: InputFiles) -> object:
+    trial = Trial(method=method, inputs={"files": files, **more})
+    return run_trial(trial, files.paths[0].parent / "scratch", draws=False).digests
+
+
+def _files(*paths: Path) -> InputFiles:
+    return InputFiles(name="files", paths=paths)
+
+
+# Scans --------------------------------------------------------------------------------------------
+
+
+def _read_scan(path: Path) -> object:
+    return _read_with(ReadScan, _files(path))
+
+
+def _points() -> NDArray[np.float64]:
+    return np.random.default_rng(1).uniform(-5.0, 5.0, (_N, 3)).round(4)
+
+
+def _rgb() -> NDArray[np.int64]:
+    return np.random.default_rng(2).integers(0, 256, (_N, 3))
+
+
+def _intensity() -> NDArray[np.int64]:
+    return np.random.default_rng(3).integers(0, 65536, _N)
+
+
+def _fields() -> dict[str, NDArray[np.generic]]:
+    named = dict(zip("xyz", _points().T.astype(np.float32), strict=True))
+    channels = zip(("red", "green", "blue"), _rgb().T.astype(np.uint8), strict=True)
+    return {**named, "intensity": _intensity().astype(np.float32), **dict(channels)}
+
+
+def _e57_files(folder: Path) -> None:
+    x, y, z = _points().T
+    red, green, blue = _rgb().T
+    cartesian = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
+    colours = {"colorRed": red, "colorGreen": green, "colorBlue": blue}
+    grid = {"rowIndex": np.arange(_N) % 8, "columnIndex": np.arange(_N) // 8}
+    whole = {
+        "fields": {**cartesian, "intensity": _intensity(), **colours, **grid},
+        "rotation": (0.8, 0.0, 0.0, 0.6),
+        "translation": (1.0, 2.0, 3.0),
+        "intensity_limits": (0.0, 65535.0),
+        "rgb_limit": 255,
+    }
+    spherical = {
+        "sphericalRange": np.linspace(1.0, 9.0, _N),
+        "sphericalAzimuth": np.linspace(-3.0, 3.0, _N),
+        "sphericalElevation": np.linspace(-1.0, 1.0, _N),
+        "sphericalInvalidState": np.arange(_N) % 2,
+    }
+    scan_files.write_e57(folder / "two.e57", [whole, {"fields": cartesian}])
+    scan_files.write_e57(folder / "spherical.e57", [{"fields": spherical}])
+
+
+def _las_files(folder: Path) -> None:
+    for name in ("plain.las", "packed.laz"):
+        scan_files.write_las(folder / name, _points(), intensity=_intensity(), rgb=_rgb())
+    scan_files.write_las(folder / "bare.las", _points(), withheld=np.arange(_N) % 5 == 0)
+
+
+def _ply_files(folder: Path) -> None:
+    for encoding in ("ascii", "binary_little_endian", "binary_big_endian"):
+        scan_files.write_ply(folder / f"{encoding}.ply", _fields(), encoding=encoding)
+    scan_files.write_ply(
+        folder / "faces_first.ply",
+        _fields(),
+        before="element face 2\nproperty list uchar int vertex_indices",
+        before_data=b"\x01\0\0\0\0\x02\0\0\0\0\0\0\0\0",
+    )
+
+
+def _pcd_files(folder: Path) -> None:
+    fields = {name: _fields()[name] for name in ("x", "y", "z", "intensity")}
+    fields["rgb"] = np.arange(_N, dtype=np.uint32)
+    for data in ("ascii", "binary", "binary_compressed"):
+        scan_files.write_pcd(folder / f"{data}.pcd", fields, data=data, width=8)
+
+
+def _ptx_files(folder: Path) -> None:
+    shade = np.linspace(0.0, 1.0, _N)[:, None]
+    table = np.hstack([_points(), shade, _rgb().astype(np.float64)])
+    matrix = np.eye(4)
+    matrix[:3, 3] = (1.0, 2.0, 3.0)
+    scan_files.write_ptx(folder / "two.ptx", [(table, 8, matrix), (table, 5, np.eye(4))])
+
+
+def _text_files(folder: Path) -> None:
+    rows = np.hstack([_points(), _rgb(), _intensity()[:, None]]).tolist()
+    for name, separator in (("plain.xyz", " "), ("table.csv", ";"), ("tabs.txt", "\t")):
+        lines = [separator.join(f"{value:g}" for value in row) for row in rows]
+        head = separator.join(("X", "Y", "Z", "R", "G", "B", "Intensity"))
+        (folder / name).write_text("\n".join([head, *lines, ""]))
+    counted = [" ".join(f"{value:g}" for value in row[:3]) for row in rows]
+    (folder / "counted.pts").write_text("\n".join([str(_N), *counted, ""]))
+    commas = ["\t".join(f"{value:.3f}".replace(".", ",") for value in row[:3]) for row in rows]
+    (folder / "commas.asc").write_text("\n".join(["# made by hand", *commas, ""]))
+
+
+E57 = Target(seeds=_e57_files, read=_read_scan, mutate=mutate_e57)
+LAS = Target(seeds=_las_files, read=_read_scan)
+PLY = Target(seeds=_ply_files, read=_read_scan, mutate=mutate_text)
+PCD = Target(seeds=_pcd_files, read=_read_scan, mutate=mutate_text)
+PTX = Target(seeds=_ptx_files, read=_read_scan, mutate=mutate_text)
+TEXT = Target(seeds=_text_files, read=_read_scan, mutate=mutate_text)
+
+
+# Photos, and other pictures -----------------------------------------------------------------------
+
+
+def _exif() -> bytes:
+    main = {photo_files.MAKE: "Maker", photo_files.MODEL: "Model", photo_files.ORIENTATION: 6}
+    inner = {
+        photo_files.FOCAL: (240, 10),
+        photo_files.FOCAL_35MM: 36,
+        photo_files.WIDTH: 64,
+        photo_files.HEIGHT: 48,
+        photo_files.RESOLUTION_X: (4000, 10),
+        photo_files.RESOLUTION_UNIT: 3,
+    }
+    return photo_files.exif_block({**main}, {**inner})
+
+
+def _jpeg_files(folder: Path) -> None:
+    photo_files.write(folder, {"a.jpg": photo_files.jpeg(photo_files.picture(), _exif())})
+
+
+def _png_files(folder: Path) -> None:
+    photo_files.write(folder, {"a.png": photo_files.png(photo_files.picture(), _exif())})
+
+
+def _tiff_files(folder: Path) -> None:
+    photo_files.write(folder, {"a.tif": photo_files.tiff(photo_files.picture(), orientation=6)})
+
+
+def _read_photo(path: Path) -> object:
+    return _read_with(ReadPhotos, _files(path))
+
+
+def _exif_files(folder: Path) -> None:
+    _jpeg_files(folder)
+    _png_files(folder)
+    _tiff_files(folder)
+
+
+def _read_exif(path: Path) -> object:
+    encoded = path.read_bytes()
+    exif = read_exif(encoded)
+    return exif.camera, focal_length(exif, 64, 48), icc_profile(encoded), is_cut_off(encoded)
+
+
+def _figure_files(folder: Path) -> None:
+    (folder / "a.webp").write_bytes(encode_webp(photo_files.picture()))
+    transparent = np.dstack([photo_files.picture(), photo_files.picture()[..., 0]])
+    (folder / "b.webp").write_bytes(encode_webp(transparent))
+
+
+def _read_figure(path: Path) -> object:
+    return shrunk_webp(path.read_bytes(), path.name, longest_side_px=32)
+
+
+JPEG = Target(seeds=_jpeg_files, read=_read_photo)
+PNG = Target(seeds=_png_files, read=_read_photo, mutate=mutate_png)
+TIFF = Target(seeds=_tiff_files, read=_read_photo)
+EXIF = Target(seeds=_exif_files, read=_read_exif)
+FIGURE = Target(seeds=_figure_files, read=_read_figure)
+
+
+# Orthoimages of other programs --------------------------------------------------------------------
+
+
+def _frame() -> WallFrame:
+    return WallFrame(
+        origin_world=np.array([1.0, 2.0, 3.0]),
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=np.array([0.0, 0.0, -1.0]),
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=0.01,
+        width=64,
+        height=48,
+    )
+
+
+def _write_image(path: Path) -> None:
+    shown = np.ones((48, 64), dtype=np.bool_)
+    write_orthoimage(path, photo_files.picture(), shown, gsd_m=0.01, tags={"name": "wall"})
+
+
+@cache
+def _image() -> bytes:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "wall.tif"
+        _write_image(path)
+        return path.read_bytes()
+
+
+def _read_sidecar(path: Path) -> object:
+    image = path.with_suffix(".tif")
+    image.write_bytes(_image())
+    return _read_with(ReadOrthoimage, _files(image, path))
+
+
+def _read_geotiff(path: Path) -> object:
+    sidecar = path.with_suffix(".json")
+    write_json(sidecar, {"wall": 3, **frame_json(_frame())})
+    return _read_with(ReadOrthoimage, _files(path, sidecar))
+
+
+SIDECAR = Target(
+    seeds=lambda folder: write_json(folder / "wall.json", {"wall": 3, **frame_json(_frame())}),
+    read=_read_sidecar,
+    mutate=mutate_json,
+)
+GEOTIFF = Target(seeds=lambda folder: _write_image(folder / "wall.tif"), read=_read_geotiff)
+
+
+# Calibration, check points, workflows -------------------------------------------------------------
+
+_CALIBRATION: Final = """\
+cameras:
+  "IMG_00*.jpg": &wide {width: 64, height: 48, fx: 60.5, fy: 61.2, cx: 31.1, cy: 23.7,
+                        distortion: [-0.08, 0.05, 0.0002, -0.0001, 0.0]}
+  "b.jpg": {<<: *wide, fx: 62}
+  "*": {width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5}
+"""
+_CHECKPOINTS: Final = """\
+# made by hand
+name,x,y,z,class,wall,u_px,v_px
+p1,1.0,2.0,3.0,target,0,10.5,20.5
+p2,-1e2,2.5,0.001,,,,
+"p, 3",0,0,0,nail,3,1,2
+"""
+_POINT_LINES: Final = "A;1.5;2.5;3.5\nB;-1.5;2.5;3.25\n"
+
+
+def _checkpoint_files(folder: Path) -> None:
+    (folder / "points.csv").write_text(_CHECKPOINTS)
+    (folder / "lines.txt").write_text(_POINT_LINES)
+
+
+def _read_calibration(path: Path) -> object:
+    photo = path.with_name("b.jpg")
+    photo.write_bytes(photo_files.jpeg(photo_files.picture(), _exif()))
+    return _read_with(ReadPhotos, _files(photo), calibration=_files(path))
+
+
+def _read_checkpoints(path: Path) -> object:
+    return _read_with(ReadCheckpoints, _files(path))
+
+
+def _workflow_files(folder: Path) -> None:
+    for name in ("photos-on-scan", "plane-methods"):
+        (folder / f"{name}.yaml").write_bytes(shipped_workflows()[name].read_bytes())
+
+
+@cache
+def _catalog() -> Catalog:
+    return discover_catalog()
+
+
+def _read_workflow(path: Path) -> object:
+    workflow = load_workflow(path, _catalog())
+    return len(expand_cells(workflow, _catalog()))
+
+
+def _resolved_files(folder: Path) -> None:
+    for name in ("photos-on-scan", "plane-methods"):
+        workflow = load_workflow(shipped_workflows()[name], _catalog())
+        (folder / f"{name}.json").write_text(resolved_json(workflow))
+
+
+def _read_resolved(path: Path) -> object:
+    workflow = workflow_from_resolved(path.read_text(encoding="utf-8", errors="replace"), "")
+    return len(expand_cells(workflow, _catalog()))
+
+
+CALIBRATION = Target(
+    seeds=lambda folder: (folder / "calibration.yaml").write_text(_CALIBRATION),
+    read=_read_calibration,
+    mutate=mutate_yaml,
+)
+CHECKPOINTS = Target(seeds=_checkpoint_files, read=_read_checkpoints, mutate=mutate_text)
+WORKFLOW = Target(seeds=_workflow_files, read=_read_workflow, mutate=mutate_yaml)
+RESOLVED = Target(seeds=_resolved_files, read=_read_resolved, mutate=mutate_json)
+
+
+# The engine's own files ---------------------------------------------------------------------------
+
+_KEY: Final = "ab" * 32
+_DIGEST: Final = "sha256:" + "cd" * 32
+
+
+def _task(folder: Path) -> Task:
+    return Task(
+        method="plane.hough2d",
+        distribution="orthoflow-tls",
+        distribution_version="0.1.0",
+        result_version=1,
+        determinism="exact",
+        citations=("somebody 2015",),
+        address="plane@plane=hough2d",
+        run_id="20260101T000000Z-abcdef",
+        target="orthoflow_plugins.plane.hough2d:Hough2d",
+        key=_KEY,
+        key_preimage="{}",
+        params={"cell_m": 0.02, "limits": [1, 2], "normal": None},
+        seed=1729,
+        inputs={
+            "cloud": TaskInput(
+                ref=ProductRef(type_name="cloud", encoding_version=1, digest=_DIGEST),
+                target="orthoflow.products:PointCloud",
+            ),
+            "files": TaskInput(
+                ref=ProductRef(type_name="files", encoding_version=0, digest=_DIGEST),
+                input_name="scan",
+                files=(TaskFile(path="/data/room.e57", identity="1-2-5-7", sha256="ab" * 32),),
+            ),
+        },
+        outputs={"planes": TaskOutput(type_name="planes", target="orthoflow.products:Planes")},
+        cores=2,
+        timeout_s=90.0,
+        store="/store",
+        folder=str(folder),
+        log="/run/logs/plane.log",
+        numba_folder="/store/numba",
+    )
+
+
+def _result() -> CellResult:
+    return CellResult(
+        status="ok",
+        method="make.range",
+        key=_KEY,
+        key_preimage='{"method": "make.range"}',
+        seed=2**70,
+        metrics=(Metric(name="n", value=4.0, unit="1"),),
+        warnings=("a warning",),
+        environment=RecordedEnvironment(
+            id="e",
+            python="3.11",
+            os="Linux",
+            cpu="a",
+            cores=2,
+            threads=2,
+            git_commit="",
+            packages={"numpy": "2.4"},
+        ),
+        outputs={
+            "numbers": ProductRef(type_name="checkpoints", encoding_version=1, digest=_DIGEST)
+        },
+        figures=(FigureRef(name="f", caption="c", media_type="image/png", sha256="ef" * 32),),
+    )
+
+
+def _read_result(path: Path) -> object:
+    store = Store(path.parent / "store")
+    with store.in_use():
+        (store.results / f"{_KEY}.json").write_bytes(path.read_bytes())
+        preimages = store.preimages / "make.range"
+        preimages.mkdir()
+        (preimages / f"{_KEY}.json").write_bytes(path.read_bytes())
+        (store.folder / "digests.json").write_bytes(path.read_bytes())
+        store.file_digests().digest(path)
+        return store.result(_KEY), list_results(store), store.earlier_preimages("make.range")
+
+
+def _read_object(path: Path) -> object:
+    """Read the notes beside a product, then put the product again."""
+    store = Store(path.parent / "store")
+    product = _product()
+    with store.in_use():
+        ref = store.put_product(product)
+        folder = store.objects / ref.digest.removeprefix("sha256:")
+        (folder / "object.json").write_bytes(path.read_bytes())
+        return store.product_file(ref.digest), store.put_product(product)
+
+
+def _product() -> CheckPoints:
+    return CheckPoints(
+        names=("a", "b"),
+        points_world=np.arange(6.0).reshape(2, 3),
+        classes=("", "nail"),
+        wall=np.array([-1, 2], dtype=np.int32),
+        pixels_wall=np.array([[np.nan, np.nan], [1.5, 2.5]]),
+    )
+
+
+def _product_files(folder: Path) -> None:
+    store = Store(folder / "store")
+    with store.in_use():
+        ref = store.put_product(_product())
+    path = store.product_file(ref.digest)
+    assert path is not None
+    path.rename(folder / "product.h5")
+    import shutil
+
+    shutil.rmtree(folder / "store")
+
+
+def _read_product(path: Path) -> object:
+    store = Store(path.parent / "store")
+    folder = store.objects / ("cd" * 32)
+    folder.mkdir(parents=True)
+    path.rename(folder / "product.h5")
+    product = store.get_product(_DIGEST, CheckPoints, is_checked=True)
+    return store.put_product(product)
+
+
+def _journal_files(folder: Path) -> None:
+    with Journal(folder / "run", "toy") as journal:
+        journal.write(CellBegan(time="2026-01-01T00:00:00Z", address="a", key=_KEY))
+        ended = CellEnded(
+            time="2026-01-01T00:00:01Z", address="a", key=_KEY, status="ok", cached=False, error=""
+        )
+        journal.write(ended)
+    (folder / "run" / JOURNAL).rename(folder / JOURNAL)
+    (folder / "run").rmdir()
+
+
+def _read_journal(path: Path) -> object:
+    folder = path.parent / "run"
+    folder.mkdir()
+    path.rename(folder / JOURNAL)
+    with Journal(folder, "toy") as journal:
+        return journal.finished_keys
+
+
+TASK = Target(
+    seeds=lambda folder: write_task(_task(folder)),
+    read=lambda path: read_task(path).task_file,
+    mutate=mutate_json,
+)
+RESULT = Target(
+    seeds=lambda folder: (folder / "result.json").write_text(result_to_json(_result())),
+    read=_read_result,
+    mutate=mutate_json,
+)
+OBJECT = Target(
+    seeds=lambda folder: (folder / "object.json").write_text(
+        '{"type": "checkpoints", "size_bytes": 5000, "publisher": ""}'
+    ),
+    read=_read_object,
+    mutate=mutate_json,
+)
+PRODUCT = Target(seeds=_product_files, read=_read_product)
+JOURNAL_FILE = Target(seeds=_journal_files, read=_read_journal, mutate=mutate_text)
+
+NAMES: Final = tuple(name for name, value in globals().items() if isinstance(value, Target))

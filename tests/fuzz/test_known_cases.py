@@ -1,0 +1,463 @@
+"""Small files that once took minutes, gigabytes or a traceback: each is refused, or read, at once.
+
+Each is built here, or lies in `corpus/<target>/`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import time
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import InputError, OrthoflowError
+from orthoflow.files.images import encode_png
+from orthoflow.files.sidecars import frame_json
+from tests import scan_files
+from tests.fuzz import readers
+from tests.fuzz.e57_pages import LogicalE57, e57_of, logical_of
+from tests.fuzz.harness import MOST_CPU_S, Target, target_named
+
+_CORPUS: Final = Path(__file__).parent / "corpus"
+_STEPS: Final = "orthoflow: 1\nsteps:\n  room: {use: simulate.room}\n"
+_LENS: Final = "{width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Known:
+    """A file and what must become of it.
+
+    Attributes:
+        target: name of the target in `readers`.
+        file: name of the file.
+        content: its bytes, or what makes them in a folder that may be written to.
+        words: pattern of the refusal.
+    """
+
+    target: str
+    file: str
+    content: bytes | Callable[[Path], bytes]
+    words: str
+
+
+def _variants(n_steps: int, n_variants: int) -> str:
+    """A comparison of detectors whose planes all go into one raster."""
+    calls = "".join(f"      v{j}: {{use: plane.hough2d}}\n" for j in range(n_variants))
+    steps = [
+        f"  p{i}:\n    in: {{cloud: room.cloud}}\n    variants:\n{calls}" for i in range(n_steps)
+    ]
+    planes = ", ".join(f"p{i}.planes" for i in range(n_steps))
+    wall = f"  wall: {{use: raster.grid, in: {{cloud: room.cloud, planes: [{planes}]}}}}\n"
+    return _STEPS + "".join(steps) + wall + "compare: {design: product}\n"
+
+
+def _sidecar(**changed: object) -> bytes:
+    return json.dumps({**frame_json(readers._frame()), **changed}).encode()
+
+
+def _e57(change: Callable[[LogicalE57], bytes]) -> Callable[[Path], bytes]:
+    def content(folder: Path) -> bytes:
+        readers.E57.seeds(folder)
+        return change(logical_of((folder / "two.e57").read_bytes()))
+
+    return content
+
+
+def _with_xml(old: bytes, new: bytes) -> Callable[[Path], bytes]:
+    return _e57(lambda parts: e57_of(parts.binary, parts.xml.replace(old, new, 1)))
+
+
+def _wrong_checksum(folder: Path) -> bytes:
+    readers.E57.seeds(folder)
+    content = bytearray((folder / "two.e57").read_bytes())
+    content[1022] ^= 1
+    return bytes(content)
+
+
+def _large_png(side: int) -> Callable[[Path], bytes]:
+    """A PNG file of black pixels, which pack to a thousandth."""
+
+    def content(folder: Path) -> bytes:
+        packing = zlib.compressobj(9)
+        row = bytes(1 + 3 * side)
+        packed = b"".join(packing.compress(row) for _ in range(100)) + packing.flush()
+        head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+        chunks = [(b"IHDR", head), (b"IDAT", packed), (b"IEND", b"")]
+        whole = [
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+            for kind, data in chunks
+        ]
+        return encode_png(np.zeros((1, 1), np.uint8))[:8] + b"".join(whole)
+
+    return content
+
+
+def _las(change: Callable[[bytearray], None], name: str = "bare.las") -> Callable[[Path], bytes]:
+    def content(folder: Path) -> bytes:
+        readers.LAS.seeds(folder)
+        changed = bytearray((folder / name).read_bytes())
+        change(changed)
+        return bytes(changed)
+
+    return content
+
+
+def _ply(*lines: str, data: bytes = b"") -> bytes:
+    return "\n".join(["ply", *lines, "end_header", ""]).encode() + data
+
+
+_XYZ: Final = ("property float x", "property float y", "property float z")
+_BINARY: Final = "format binary_little_endian 1.0"
+
+KNOWN: Final = {
+    # Workflows.
+    "a billion repeats": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=(
+            _STEPS + "  p: {use: plane.ransac, in: {cloud: room.cloud}, repeat: 1000000000}\n"
+        ).encode(),
+        words="expected a whole number from 1 to 10000, got 1000000000",
+    ),
+    "cells by the million": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=_variants(12, 10).encode(),
+        words=r"has \d{13} cells .* more than 20000",
+    ),
+    "cells by repeats": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=(
+            _variants(2, 3).replace(
+                "v1: {use: plane.hough2d}", "v1: {use: plane.ransac, repeat: 9999}"
+            )
+        ).encode(),
+        words="has 20012 cells",
+    ),
+    "brackets": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=b"orthoflow: 1\nsteps: " + b"[" * 50_000,
+        words="nested deeper than 60 levels",
+    ),
+    "aliases within aliases": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=b"a: &a [x,x,x,x,x,x,x,x,x]\n"
+        + b"".join(
+            b"%c: &%c [%s]\n" % (98 + i, 98 + i, b",".join([b"*%c" % (97 + i)] * 9))
+            for i in range(9)
+        ),
+        words="more than 10000 values once aliases are expanded",
+    ),
+    "a hundred unknown names": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=(
+            _STEPS
+            + "".join(f"  s{i}: {{use: plane.hugh, in: {{cloud: rom{i}.x}}}}\n" for i in range(300))
+        ).encode(),
+        words="more than 100 problems; correct those above",
+    ),
+    "thousands of combinations left out": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=(
+            _variants(1, 2).replace("product}", "product, exclude: [" + "{p0: v1}, " * 2000 + "]}")
+        ).encode(),
+        words="at most 500 combinations to leave out, got 2000",
+    ),
+    "a hexadecimal seed": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=_STEPS.encode() + b"seed: 0x" + b"f" * 5000,
+        words="is no int",
+    ),
+    "a seed that no record can keep": Known(
+        target="WORKFLOW",
+        file="w.yaml",
+        content=_STEPS.encode() + b"seed: 1" + b"0" * 120,
+        words="expected a whole number from 0 on",
+    ),
+    # Calibrations.
+    "40,000 cameras": Known(
+        target="CALIBRATION",
+        file="c.yaml",
+        content=f"cameras:\n  a: &a {_LENS}\n".encode()
+        + b"".join(b"  %d: *a\n" % i for i in range(40_000)),
+        words=r"has \d+ bytes, .* at most 400000|more than 20000 values",
+    ),
+    "2,000 cameras": Known(
+        target="CALIBRATION",
+        file="c.yaml",
+        content=b"cameras:\n  a: &a {width: 1}\n"
+        + b"".join(b'  "%d": *a\n' % i for i in range(2000)),
+        words="expected at most 1000 entries, got 2001",
+    ),
+    "a merge loop": Known(
+        target="CALIBRATION",
+        file="c.yaml",
+        content=b"cameras:\n  a: &a\n    <<: *a\n    width: 1\n",
+        words="contains itself",
+    ),
+    "a tag of a megabyte": Known(
+        target="CALIBRATION", file="c.yaml", content=b"a: " + b"!" * 900_000, words="900003 bytes"
+    ),
+    # Check points.
+    "300,000 check points": Known(
+        target="CHECKPOINTS",
+        file="p.csv",
+        content=b"a,1,2,3\n" * 300_000,
+        words="more than 100000 points: split it",
+    ),
+    # Sidecars.
+    "deep JSON": Known(
+        target="SIDECAR", file="wall.json", content=b"[" * 50_000, words="no JSON, it is nested"
+    ),
+    "a number of 5,000 digits": Known(
+        target="SIDECAR",
+        file="wall.json",
+        content=b'{"wall": ' + b"9" * 5000 + b"}",
+        words=r"wall\.json: no JSON",
+    ),
+    "wall: true": Known(
+        target="SIDECAR", file="wall.json", content=_sidecar(wall=True), words="from 0, got True"
+    ),
+    "a wall beyond 16 bits": Known(
+        target="SIDECAR", file="wall.json", content=_sidecar(wall=10**30), words="from 0, got 1000"
+    ),
+    "a vector of true and false": Known(
+        target="SIDECAR",
+        file="wall.json",
+        content=_sidecar(u_world=[True, False, False]),
+        words="u_world must be three numbers below 1e.09, got .True",
+    ),
+    "a coordinate of 400 digits": Known(
+        target="SIDECAR",
+        file="wall.json",
+        content=_sidecar(origin_world=[10**400, 0, 0]),
+        words="origin_world must be three numbers",
+    ),
+    "a megabyte of JSON": Known(
+        target="SIDECAR", file="wall.json", content=b" " * 1_100_000, words="1100000 bytes, more"
+    ),
+    # Pictures.
+    "30,000 x 30,000 pixels": Known(
+        target="PNG", file="a.png", content=_large_png(30_000), words="a.png is too large: 30000 x"
+    ),
+    "40,000 x 40,000 pixels": Known(
+        target="PNG", file="a.png", content=_large_png(40_000), words="a.png is too large: 40000 x"
+    ),
+    "another format": Known(
+        target="FIGURE",
+        file="a.bmp",
+        content=b"BM" + bytes(200),
+        words="cannot be decoded as an image",
+    ),
+    # Scans as text.
+    "a line of 60 MB": Known(
+        target="TEXT",
+        file="a.xyz",
+        content=b"1 2 3 " * 10_000_000,
+        words="line 1: the line has more than 10000 bytes",
+    ),
+    "a long line later": Known(
+        target="TEXT",
+        file="a.xyz",
+        content=b"1 2 3\n" * 25_000 + b"1 " * 10_000_000,
+        words="line 25001: the line has more than 10000 bytes",
+    ),
+    "a long line in a PTX file": Known(
+        target="PTX", file="a.ptx", content=b"1" * 60_000_000, words="line 1: the line has more"
+    ),
+    # Scans with headers.
+    "PLY of a billion points": Known(
+        target="PLY",
+        file="a.ply",
+        content=_ply(_BINARY, "element vertex 1000000000", *_XYZ),
+        words=r"states 1000000000 points but has \d+ bytes",
+    ),
+    "PLY that steps back for ever": Known(
+        target="PLY",
+        file="a.ply",
+        content=_ply(
+            _BINARY,
+            "element face 4000000000",
+            "property list char char vertex_indices",
+            "element vertex 1",
+            *_XYZ,
+            data=b"\xff" * 12,
+        ),
+        words="element face has a list of -1 entries",
+    ),
+    "PLY with a negative count": Known(
+        target="PLY",
+        file="a.ply",
+        content=_ply(_BINARY, "element face -5", "element vertex 1", *_XYZ, data=bytes(12)),
+        words="element face has -5 entries",
+    ),
+    "PLY of 60,000 properties": Known(
+        target="PLY",
+        file="a.ply",
+        content=_ply(_BINARY, "element vertex 1", *_XYZ, *["property int a"] * 60_000),
+        words="element vertex has more than 1000 properties",
+    ),
+    "PCD of a billion fields": Known(
+        target="PCD",
+        file="a.pcd",
+        content=b"VERSION 0.7\nFIELDS x y z a\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1000000000\n"
+        b"WIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n1 2 3 4\n",
+        words="a point has more than 1000 fields",
+    ),
+    "LAS of a billion points": Known(
+        target="LAS",
+        file="a.las",
+        content=_las(lambda raw: struct.pack_into("<Q", raw, 247, 10**9)),
+        words="states 1000000000 points but has",
+    ),
+    "LAS with extended records outside": Known(
+        target="LAS",
+        file="a.las",
+        content=_las(lambda raw: struct.pack_into("<QI", raw, 235, len(raw), 0xFFFFFFFF)),
+        words="records at its end are missing",
+    ),
+    # E57.
+    "E57 with a wrong checksum": Known(
+        target="E57", file="a.e57", content=_wrong_checksum, words="cannot be read as E57"
+    ),
+    "E57 with entities within entities": Known(
+        target="E57",
+        file="a.e57",
+        content=_with_xml(
+            b"<e57Root",
+            b'<!DOCTYPE e57Root [<!ENTITY a "ha">'
+            + b"".join(b'<!ENTITY %c "%s">' % (98 + i, b"&%c;" % (97 + i) * 10) for i in range(9))
+            + b"]><e57Root",
+        ),
+        words="declares a document type or entities",
+    ),
+    "E57 with an entity that names a file": Known(
+        target="E57",
+        file="a.e57",
+        content=_with_xml(
+            b"<e57Root", b'<!DOCTYPE e57Root [<!ENTITY a SYSTEM "file:///etc/passwd">]><e57Root'
+        ),
+        words="declares a document type or entities",
+    ),
+    "E57 in another encoding": Known(
+        target="E57", file="a.e57", content=_with_xml(b"UTF-8", b"UTF-7"), words="it is in b'UTF-7'"
+    ),
+    "E57 nested deeply": Known(
+        target="E57",
+        file="a.e57",
+        content=_with_xml(b"</e57Root>", b'<a type="Structure">' * 50_000),
+        words="nested deeper than 64 elements",
+    ),
+    "E57 with 60,000 elements in a structure": Known(
+        target="E57",
+        file="a.e57",
+        content=_with_xml(
+            b"</e57Root>",
+            b"".join(b'<b%d type="Integer"/>' % i for i in range(60_000)) + b"</e57Root>",
+        ),
+        words="a structure in it has more than 500 elements",
+    ),
+    "E57 of 200,001 elements": Known(
+        target="E57",
+        file="a.e57",
+        content=_with_xml(
+            b"</e57Root>", b'<a type="Vector">' + b"<a/>" * 200_001 + b"</a></e57Root>"
+        ),
+        words="has more than 200000 elements",
+    ),
+    # The engine's own files.
+    "a task that is none": Known(
+        target="TASK", file="task.json", content=b"[" * 50_000, words=r"the task .* is damaged"
+    ),
+    "a journal of brackets": Known(
+        target="JOURNAL_FILE", file="journal.jsonl", content=b"[" * 50_000 + b"\n", words="damaged"
+    ),
+    "a resolved workflow of brackets": Known(
+        target="RESOLVED", file="r.json", content=b"[" * 50_000, words="nested too deeply"
+    ),
+}
+
+
+def _read(target: Target, path: Path) -> float:
+    """Read a file; gives the processor time, also when it is refused."""
+    began = time.process_time()
+    try:
+        target.read(path)
+    finally:
+        spent_s = time.process_time() - began
+        assert spent_s < MOST_CPU_S
+    return spent_s
+
+
+@pytest.mark.parametrize("case", KNOWN)
+def test_a_small_file_costs_little_and_is_refused_with_the_reason(
+    case: str, tmp_path: Path
+) -> None:
+    known = KNOWN[case]
+    target = target_named(f"tests.fuzz.readers:{known.target}")
+    content = known.content if isinstance(known.content, bytes) else known.content(_made(tmp_path))
+    path = tmp_path / "read" / known.file
+    path.parent.mkdir()
+    path.write_bytes(content)
+    with pytest.raises(OrthoflowError, match=re.compile(known.words, re.DOTALL)) as refused:
+        _read(target, path)
+    assert len(str(refused.value)) < 50_000
+
+
+def _made(folder: Path) -> Path:
+    (folder / "made").mkdir()
+    return folder / "made"
+
+
+@pytest.mark.parametrize("path", sorted(_CORPUS.glob("*/*")), ids=lambda path: path.stem)
+def test_what_once_failed_is_refused(path: Path, tmp_path: Path) -> None:
+    target = target_named(f"tests.fuzz.readers:{path.parent.name.upper()}")
+    copied = tmp_path / path.name
+    copied.write_bytes(path.read_bytes())
+    with pytest.raises(InputError):
+        _read(target, copied)
+
+
+@pytest.mark.parametrize("n_bytes", [10, 3 * 10**9, 2**40, 2**63])
+def test_records_behind_the_points_of_a_las_file_are_not_read(n_bytes: int, tmp_path: Path) -> None:
+    made = _made(tmp_path)
+    content = bytearray(_las(lambda raw: None)(made))
+    struct.pack_into("<QI", content, 235, len(content), 1)
+    content += struct.pack("<H16sHQ32s", 0, b"orthoflow", 1, n_bytes, b"") + bytes(10)
+    (tmp_path / "a.las").write_bytes(content)
+    assert len(scan_files.read_points(tmp_path / "a.las")) == 32  # eight are withheld
+
+
+def test_pictures_that_an_e57_only_claims_to_hold_are_not_read(tmp_path: Path) -> None:
+    made = _made(tmp_path)
+    image = (
+        b'<images2D type="Vector" allowHeterogeneousChildren="1"><vectorChild type="Structure">'
+        b'<pinholeRepresentation type="Structure"><jpegImage type="Blob" fileOffset="48" '
+        b'length="999999999999999"/></pinholeRepresentation></vectorChild></images2D>'
+    )
+    seed = _e57(lambda parts: parts.xml)(made)
+    (old,) = re.findall(rb"<images2D[^>]*/>|<images2D.*</images2D>", seed, re.DOTALL)
+    (tmp_path / "a.e57").write_bytes(_with_xml(old, image)(made))
+    assert _read(readers.E57, tmp_path / "a.e57") < MOST_CPU_S
+
+
+def test_the_results_of_a_store_full_of_brackets_are_no_results(tmp_path: Path) -> None:
+    for name, target in (("result.json", readers.RESULT), ("object.json", readers.OBJECT)):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / name).write_bytes(b"[" * 50_000)
+        target.read(folder / name)

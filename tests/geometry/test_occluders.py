@@ -1,0 +1,178 @@
+"""What stands before a photo: counts of points around, splats, and the holes between them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.depth_buffer_kernels import COUNT_MOST
+from orthoflow.geometry.occluders import (
+    Box,
+    _closed,
+    depth_buffer,
+    nothing_in_the_way,
+    occluders_in,
+)
+from tests import scenes
+from tests.plane_scenes import cloud_of
+
+ORIGIN = np.array([10.0, -4.0, 2.0])
+LOW, HIGH, SPACING_M = np.array([-0.6, -0.4, 1.8]), np.array([0.7, 0.5, 3.1]), 0.03
+# Six cells of a spacing each.
+SIDE_M = 6.0 * SPACING_M
+
+
+def points_m(seed: int) -> NDArray[np.float64]:
+    """Offsets of which some lie outside the box; float32, as kernels see them."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(LOW - 0.2, HIGH + 0.2, (3_000, 3)).astype(np.float32).astype(np.float64)
+
+
+def box() -> Box:
+    return Box(low=LOW, high=HIGH, spacing_m=SPACING_M)
+
+
+def expected_around(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    shape = np.ceil((HIGH - LOW) / SIDE_M).astype(int)
+    cells = np.floor((points - LOW) / SIDE_M).astype(int)
+    inside = ((cells >= 0) & (cells < shape)).all(axis=1)
+    counts = np.zeros(shape, dtype=np.int64)
+    np.add.at(counts, tuple(cells[inside].T), 1)
+    return ndimage.convolve(counts, np.ones((3, 3, 3), dtype=int), mode="constant")
+
+
+def camera() -> ViewingCamera:
+    """At the cloud's origin, looking up along z, turned a little."""
+    turn = scenes.rotation_about(np.array([0.3, 0.9, 0.1]), 4.0)
+    return ViewingCamera(
+        rotation=turn,
+        translation=-turn @ ORIGIN,
+        fx=90.0,
+        fy=110.0,
+        cx=50.0,
+        cy=40.0,
+        distortion=np.array([0.01, 0.0, 0.001, 0.0, 0.0]),
+        width=100,
+        height=80,
+    )
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_points_are_counted_with_those_in_the_voxels_around(seed: int) -> None:
+    points = points_m(seed)
+    found = occluders_in(cloud_of(points, origin=tuple(ORIGIN)), box(), None, n_least=4, threads=2)
+    np.testing.assert_array_equal(found.around.counts, expected_around(points))
+    assert found.around.side_m == pytest.approx(SIDE_M)
+    np.testing.assert_array_equal(found.around.low, LOW)
+
+
+def test_nothing_is_where_a_scanner_is_blind() -> None:
+    points = points_m(0)
+    station = np.array([0.1, 0.0, 2.4])
+    beside = np.array([0.65, -0.5, 1.7])
+    found = occluders_in(
+        cloud_of(points, origin=tuple(ORIGIN)),
+        box(),
+        np.array([ORIGIN + station, ORIGIN + beside]),
+        n_least=4,
+        threads=1,
+    )
+    middles = LOW + SIDE_M * (np.indices(found.around.counts.shape).transpose(1, 2, 3, 0) + 0.5)
+    expected = expected_around(points)
+    for place in (station, beside):
+        expected[np.linalg.norm(middles - place, axis=-1) < 0.3] = 0
+    assert (expected == 0).sum() > 10
+    np.testing.assert_array_equal(found.around.counts, expected)
+
+
+def test_counts_end_before_their_sums_overflow() -> None:
+    crowd = np.tile([0.0, 0.0, 2.5], (COUNT_MOST + 500, 1))
+    found = occluders_in(cloud_of(crowd), box(), None, n_least=4, threads=1)
+    assert found.around.counts.max() == COUNT_MOST
+
+
+def test_voxels_grow_where_a_box_would_have_too_many() -> None:
+    wide = Box(low=np.zeros(3), high=np.array([200.0, 300.0, 40.0]), spacing_m=0.005)
+    found = occluders_in(cloud_of(np.zeros((3, 3))), wide, None, n_least=4, threads=1)
+    assert found.around.counts.size <= 1 << 24
+    # A tenth wider at a time.
+    assert found.around.counts.size * 1.1**3 > 0.95 * (1 << 24)
+    thin = Box(low=np.zeros(3), high=np.array([0.5, 0.0, 0.5]), spacing_m=0.05)
+    found = occluders_in(cloud_of(np.zeros((3, 3))), thin, None, n_least=4, threads=1)
+    assert found.around.counts.shape == (2, 1, 2)
+
+
+@pytest.mark.parametrize("scale", [1, 30], ids=["full size", "reduced"])
+def test_a_photo_sees_the_nearest_of_squares_as_large_as_the_gaps(scale: int) -> None:
+    points = points_m(1)
+    cloud = cloud_of(points, origin=tuple(ORIGIN))
+    small = camera()
+    seen_by = replace(
+        small, fx=small.fx * scale, fy=small.fy * scale, cx=small.cx * scale, cy=small.cy * scale,
+        width=small.width * scale, height=small.height * scale,
+    )  # fmt: skip
+    n_least = 40
+    occluders = occluders_in(cloud, box(), None, n_least=n_least, threads=3)
+    found = depth_buffer(occluders, seen_by)
+    # No side of more than 2048 pixels.
+    reduction = 2 if scale == 30 else 1
+    assert found.reduction == reduction
+    shape = (-(-seen_by.height // reduction), -(-seen_by.width // reduction))
+    assert found.nearest.shape == shape
+    around = expected_around(points)
+    cells = np.floor((points - LOW) / SIDE_M).astype(int)
+    nearest = np.full(shape, np.inf, dtype=np.float32)
+    projected = seen_by.project(points + ORIGIN)
+    focal = math.sqrt(seen_by.fx * seen_by.fy)
+    n_drawn = 0
+    for cell, (u, v, distance) in zip(cells, projected, strict=True):
+        if (cell < 0).any() or (cell >= around.shape).any() or around[tuple(cell)] < n_least:
+            continue
+        # Nine faces of a voxel hold so many points.
+        spacing_m = math.sqrt((3.0 * SIDE_M) ** 2 / around[tuple(cell)])
+        half = min(spacing_m * focal / distance / reduction, 24.0)
+        first = [max(0, math.floor(place / reduction - half)) for place in (v, u)]
+        end = [math.floor(place / reduction + half) + 1 for place in (v, u)]
+        part = nearest[first[0] : max(end[0], 0), first[1] : max(end[1], 0)]
+        np.minimum(part, np.float32(distance), out=part)
+        n_drawn += 1
+    assert 100 < n_drawn < 2_900
+    np.testing.assert_allclose(found.nearest, closed(nearest), rtol=1e-6)
+
+
+def closed(nearest: NDArray[np.float32]) -> NDArray[np.float32]:
+    lowest = ndimage.minimum_filter(nearest, 3, mode="nearest")
+    return ndimage.maximum_filter(lowest, 3, mode="nearest")
+
+
+def test_holes_of_a_pixel_or_two_are_closed() -> None:
+    nearest = np.random.default_rng(0).uniform(1.0, 9.0, (12, 17)).astype(np.float32)
+    nearest[nearest > 6.0] = np.inf
+    before = nearest.copy()
+    np.testing.assert_array_equal(_closed(nearest), closed(nearest))
+    np.testing.assert_array_equal(nearest, before)
+
+
+def test_what_is_at_the_camera_or_behind_it_hides_nothing() -> None:
+    at = np.tile([[0.0, 0.0, 0.04], [0.0, 0.0, -0.5]], (50, 1))
+    around = Box(low=np.full(3, -1.0), high=np.ones(3), spacing_m=0.1)
+    level = replace(camera(), rotation=np.eye(3), translation=-ORIGIN, distortion=np.zeros(5))
+    cloud = cloud_of(at, origin=tuple(ORIGIN))
+    found = depth_buffer(occluders_in(cloud, around, None, n_least=2, threads=1), level)
+    assert np.isinf(found.nearest).all()
+    cloud = cloud_of(at + np.array([0.0, 0.0, 0.02]), origin=tuple(ORIGIN))
+    found = depth_buffer(occluders_in(cloud, around, None, n_least=2, threads=1), level)
+    assert found.nearest.min() == pytest.approx(0.06)
+
+
+def test_an_empty_world_hides_nothing() -> None:
+    found = nothing_in_the_way(camera())
+    assert found.reduction == 100.0
+    assert found.nearest.shape == (1, 1)
+    assert np.isinf(found.nearest).all()

@@ -1,0 +1,91 @@
+"""Numbers of an inspection, each by its definition, on a handful of values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.inspect.findings import check_findings, displacement_findings, report
+
+from orthoflow.products import Finding
+from orthoflow.sdk import StepContext
+
+SHIFT_M = np.array([[0.001, 0.002], [-0.003, 0.0], [0.002, -0.001], [0.02, 0.004], [0.0, 0.001]])
+
+
+def test_displacements_are_summed_up_by_axis_and_length() -> None:
+    found = {item.name: item for item in displacement_findings(SHIFT_M, 0.004, 3, prefix="a_")}
+    mm = 1e3 * SHIFT_M
+    rmse = np.sqrt((mm**2).mean(axis=0))
+    expected = {}
+    for axis, name in enumerate("xy"):
+        values = mm[:, axis]
+        middle = np.median(values)
+        expected |= {
+            f"a_rmse_{name}_mm": (rmse[axis], "mm"),
+            f"a_rmse_{name}_cells": (rmse[axis] / 4.0, "cells"),
+            f"a_mean_{name}_mm": (values.mean(), "mm"),
+            f"a_nmad_{name}_mm": (1.4826 * np.median(np.abs(values - middle)), "mm"),
+            f"a_max_{name}_mm": (np.abs(values).max(), "mm"),
+            f"a_beyond_2rmse_{name}_share": (np.mean(np.abs(values) > 2 * rmse[axis]), "1"),
+        }
+    expected["a_beyond_2rmse_any_share"] = (np.mean((np.abs(mm) > 2 * rmse).any(axis=1)), "1")
+    expected["a_p95_mm"] = (np.percentile(np.hypot(*mm.T), 95), "mm")
+    assert found.keys() == expected.keys()
+    assert expected["a_beyond_2rmse_x_share"][0] == 0.2
+    for name, (value, unit) in expected.items():
+        assert found[name].value == pytest.approx(value, rel=1e-4), name
+        assert (found[name].unit, found[name].wall) == (unit, 3)
+
+
+def test_check_points_are_summed_up_by_lengths_and_outliers() -> None:
+    found = {item.name: item for item in check_findings(SHIFT_M, 0.004, prefix="flat_")}
+    length = 1e3 * np.hypot(*SHIFT_M.T)
+    rms = np.sqrt((length**2).mean())
+    mean_shift = 1e3 * np.hypot(*SHIFT_M.mean(axis=0))
+    out = length > 2.0 * rms
+    assert out.sum() == 1
+    left = np.sqrt((length[~out] ** 2).mean())
+    expected = {
+        "n_found": 5.0,
+        "rms_mm": rms,
+        "sd_mm": length.std(ddof=1),
+        "mean_shift_mm": mean_shift,
+        "mean_shift_share": mean_shift / rms,
+        "n_outliers_once": 1.0,
+        "n_outliers_iterated": 1.0,
+        "rms_after_once_mm": left,
+        "rms_after_iterated_mm": left,
+    }
+    for name, value in expected.items():
+        assert found[f"flat_{name}"].value == pytest.approx(value), name
+        assert found[f"flat_{name}"].unit == ("mm" if name.endswith("_mm") else "1")
+    assert found["flat_rmse_x_cells"].wall == -1
+    alone = {item.name: item.value for item in check_findings(SHIFT_M[:1], 0.004)}
+    assert "sd_mm" not in alone
+    assert alone["mean_shift_share"] == pytest.approx(1.0)
+    still = {item.name: item.value for item in check_findings(np.zeros((3, 2)), 0.004)}
+    assert still["mean_shift_share"] == 0.0
+
+
+def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: Path) -> None:
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+
+    def of(name: str, value: float, wall: int) -> Finding:
+        return Finding(name=name, value=value, unit="mm", wall=wall)
+
+    findings = [
+        of("rmse_u_mm", 1.0, 1), of("rmse_u_mm", 2.0, 0), of("rmse_u_mm", 3.0, -1),
+        of("p99_mm", 4.0, 1), of("p99_mm", 5.0, 0),
+        of("n_photos", 6.0, -1), of("n_points[a]", 7.0, -1),
+    ]  # fmt: skip
+    report(findings, 1, ctx)
+    assert {metric.name: metric.value for metric in ctx.metrics} == {
+        "rmse_u_mm": 1.0,
+        "wall_0_rmse_u_mm": 2.0,
+        "all_rmse_u_mm": 3.0,
+        "p99_mm": 4.0,
+        "n_photos": 6.0,
+    }
+    assert {metric.unit for metric in ctx.metrics} == {"mm"}

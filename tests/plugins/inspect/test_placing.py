@@ -1,0 +1,110 @@
+"""Walls laid onto the cells of orthoimages of other programs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from orthoflow_plugins.inspect.placing import wall_of
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import frame_over
+from orthoflow.products import SurfaceMask, Walls
+from tests import inspect_scenes, scenes
+from tests.inspect_scenes import BUFFER_M, image_of
+
+
+def slanted() -> Walls:
+    """A wall whose depth, count and deviation tell the cell."""
+    given = inspect_scenes.walls()
+    wall = given.walls[0]
+    rows, columns = np.indices(wall.frame.shape)
+    known = wall.mask == SurfaceMask.MEASURED
+    depth = np.where(known, 1e-4 * columns + 1e-5 * rows, np.nan).astype(np.float32)
+    intensity = (1e-3 * columns + 1e-4 * rows).astype(np.float32)
+    changed = replace(
+        wall,
+        depth_m=depth,
+        sigma_m=(1e-3 * columns).astype(np.float32),
+        count=(1000 * rows + columns).astype(np.uint32),
+        intensity=intensity,
+    )
+    return replace(given, walls=(changed,))
+
+
+def test_a_wall_on_the_image_s_own_cells_is_taken_as_it_is() -> None:
+    walls = slanted()
+    image = image_of(np.full(walls.walls[0].frame.shape, 100.0))
+    assert wall_of(image, walls) is walls.walls[0]
+    with pytest.raises(MethodError, match="is of wall 1, but there are 1 walls"):
+        wall_of(replace(image, wall=1), walls)
+    with pytest.raises(MethodError, match="is of wall -1"):
+        wall_of(replace(image, wall=-1), walls)
+
+
+def test_cells_take_what_the_nearest_cell_of_the_wall_holds() -> None:
+    walls = slanted()
+    wall = walls.walls[0]
+    frame = wall.frame
+    # Coarser, begun 3.3 cells to the left and 2.2 higher, and a centimetre before the wall.
+    corner = frame.world_from_wall(np.array([[-3.3, -2.2]]), 0.01)[0]
+    shape = (40, 50)
+    other = replace(
+        frame, origin_world=corner, gsd_m=1.5 * frame.gsd_m, width=shape[1], height=shape[0]
+    )
+    laid = wall_of(image_of(np.full(shape, 100.0), other), walls)
+    assert laid.frame is other
+    rows, columns = np.indices(shape)
+    exact = np.stack([-3.3 + 1.5 * (columns + 0.5), -2.2 + 1.5 * (rows + 0.5)], axis=-1)
+    place = np.floor(exact).astype(int)
+    inside = (place >= 0).all(axis=-1)
+    assert (~inside).any()
+    expected = 1000 * place[..., 1] + place[..., 0]
+    np.testing.assert_array_equal(laid.count, np.where(inside, expected, 0))
+    np.testing.assert_allclose(laid.sigma_m[inside], 1e-3 * place[inside, 0], rtol=1e-6)
+    assert np.isnan(laid.sigma_m[~inside]).all()
+    assert (laid.mask[~inside] == SurfaceMask.VOID).all()
+    held = wall.mask[place[inside][:, 1], place[inside][:, 0]]
+    np.testing.assert_array_equal(laid.mask[inside], held)
+    known = inside.copy()
+    known[inside] = held == SurfaceMask.MEASURED
+    depth = 1e-4 * place[..., 0] + 1e-5 * place[..., 1]
+    # Counted from the image's own plane.
+    np.testing.assert_allclose(laid.depth_m[known], depth[known] - 0.01, atol=1e-6)
+    assert np.isnan(laid.depth_m[~known]).all()
+    assert laid.intensity is not None
+    whole = (exact >= 1.0).all(axis=-1)
+    # Between the four nearest, which OpenCV places to a 32nd of a cell.
+    shade = 1e-3 * (exact[..., 0] - 0.5) + 1e-4 * (exact[..., 1] - 0.5)
+    np.testing.assert_allclose(laid.intensity[whole], shade[whole], atol=5e-5)
+    blind = replace(walls, walls=(replace(wall, intensity=None),))
+    assert wall_of(image_of(np.full(shape, 100.0), other), blind).intensity is None
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "angle_deg", "is_refused"),
+    [
+        (0.99 * BUFFER_M, 0.0, False),
+        (1.01 * BUFFER_M, 0.0, True),
+        (-0.99 * BUFFER_M, 0.0, False),
+        (-1.01 * BUFFER_M, 0.0, True),
+        (0.0, 80.0, True),
+    ],
+)
+def test_images_that_lie_elsewhere_or_askew_are_refused(
+    shift_m: float, angle_deg: float, is_refused: bool
+) -> None:
+    walls = slanted()
+    frame = walls.walls[0].frame
+    corners = frame.corners_world() + shift_m * frame.normal_world
+    middle = corners.mean(axis=0)
+    turn = scenes.rotation_about(frame.v_world, angle_deg)
+    turned = (corners - middle) @ turn.T + middle
+    other = frame_over(turned, turn @ frame.normal_world, gsd_m=2.0 * frame.gsd_m)
+    image = image_of(np.full(other.shape, 100.0), other)
+    if is_refused:
+        with pytest.raises(MethodError, match="wire the walls that the orthoimages are of"):
+            wall_of(image, walls)
+    else:
+        assert wall_of(image, walls).frame is other

@@ -1,0 +1,92 @@
+"""Findings about painted cells, from displacements that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from orthoflow_plugins.inspect.source_errors import SourceErrors, source_findings
+
+from tests.inspect_scenes import frame
+
+
+def source_errors() -> SourceErrors:
+    """Ten cells in a row: four traced on the wall, two at steps, ghosts, one of nothing."""
+    where = frame(shape=(1, 10))
+    displacement_m = np.full((1, 10, 2), np.nan)
+    displacement_m[0, :4] = [[0.001, 0.0], [-0.002, 0.001], [0.003, 0.0], [0.004, -0.005]]
+    displacement_m[0, 4:6] = [[0.01, 0.02], [-0.03, 0.02]]
+    displacement_m[0, 6:8] = 0.001
+    mask = np.zeros((1, 10), dtype=np.bool_)
+    traced, steps, ghosts = mask.copy(), mask.copy(), mask.copy()
+    # The ninth looks at nothing.
+    traced[0, :9] = True
+    steps[0, 4:6] = True
+    ghosts[0, 6:8] = True
+    return SourceErrors(
+        frame=where, displacement_m=displacement_m, traced=traced, steps=steps, ghosts=ghosts,
+        n_seen_by_both=8, n_seen_painted=6,
+    )  # fmt: skip
+
+
+def test_displacements_are_summed_up_without_ghosts_and_steps_apart() -> None:
+    errors = source_errors()
+    cell_m = errors.frame.gsd_m
+    far = replace(errors, displacement_m=errors.displacement_m.copy())
+    far.displacement_m[0, 0] = (0.0, 3.1 * cell_m)
+    near = replace(errors, displacement_m=errors.displacement_m.copy())
+    near.displacement_m[0, 0] = (0.0, 2.9 * cell_m)
+    found = {item.name: item for item in source_findings([errors], 4)}
+    u = np.array([1.0, -2.0, 3.0, 4.0])
+    v = np.array([0.0, 1.0, 0.0, -5.0])
+    expected = {"n_traced": 9.0, "ghost_share": 2 / 9, "n_ghost_cells": 2.0}
+    for name, values in (("u", u), ("v", v)):
+        middle = np.median(values)
+        expected |= {
+            f"rmse_{name}_mm": np.sqrt((values**2).mean()),
+            f"mean_{name}_mm": values.mean(),
+            f"nmad_{name}_mm": 1.4826 * np.median(np.abs(values - middle)),
+            f"p99_{name}_mm": np.percentile(np.abs(values), 99),
+        }
+    expected |= {"step_rmse_u_mm": np.sqrt(500.0), "step_rmse_v_mm": 20.0}
+    expected["completeness_seen_by_both"] = 0.75
+    for name, value in expected.items():
+        assert found[name].value == pytest.approx(value, rel=1e-4), name
+        assert found[name].unit == ("mm" if name.endswith("_mm") else "1")
+        assert found[name].wall == 4
+    assert found.keys() == expected.keys() | {"far_source_share"}
+    shares = [
+        {item.name: item.value for item in source_findings([some], 0)}["far_source_share"]
+        for some in (near, far)
+    ]
+    # Of nine cells, one more is further away than three.
+    assert shares[1] - shares[0] == pytest.approx(1.0 / 9.0)
+    # What looks at nothing is far away too.
+    n_far = np.count_nonzero(np.linalg.norm(near.displacement_m[0, :8], axis=1) > 3.0 * cell_m)
+    assert shares[0] == pytest.approx((n_far + 1) / 9.0)
+
+
+def test_walls_are_summed_up_together_and_those_without_painted_cells_left_out() -> None:
+    errors = source_errors()
+    empty = replace(errors, traced=np.zeros((1, 10), dtype=np.bool_))
+    assert source_findings([empty], 0) == []
+    twice = {item.name: item.value for item in source_findings([errors, empty, errors], -1)}
+    once = {item.name: item.value for item in source_findings([errors], -1)}
+    doubled = {"n_traced", "n_ghost_cells"}
+    for name, value in once.items():
+        # Percentiles lie between other cells.
+        if not name.startswith("p99"):
+            assert twice[name] == pytest.approx((2.0 if name in doubled else 1.0) * value), name
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    errors = source_errors()
+    only_steps = replace(errors, steps=errors.traced, n_seen_by_both=0)
+    names = {item.name for item in source_findings([only_steps], 0)}
+    assert names == {
+        "n_traced", "step_rmse_u_mm", "step_rmse_v_mm", "far_source_share", "ghost_share",
+        "n_ghost_cells",
+    }  # fmt: skip
+    no_steps = replace(errors, steps=np.zeros((1, 10), dtype=np.bool_))
+    assert "step_rmse_u_mm" not in {item.name for item in source_findings([no_steps], 0)}

@@ -1,0 +1,223 @@
+"""Compiled matching of patches against plain formulations of the same."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.match.displacements import _window
+from orthoflow_plugins.match.patch_kernels import Picture, match_patches, search_shifts
+
+SIDE = 44
+HALF = 5
+
+
+def texture(columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(..., 2) two channels of waves longer than a patch is fine."""
+    waves = np.random.default_rng(7).uniform(-0.5, 0.5, (2, 6, 2))
+    phases = np.random.default_rng(8).uniform(0.0, 6.0, (2, 6))
+    return np.stack(
+        [
+            sum(
+                np.cos(a * columns + b * rows + phase)
+                for (a, b), phase in zip(waves[c], phases[c], strict=True)
+            )
+            for c in range(2)
+        ],
+        axis=-1,
+    )
+
+
+def picture(shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float32]:
+    rows, columns = np.mgrid[:SIDE, :SIDE].astype(np.float64)
+    return texture(columns - shift[0], rows - shift[1]).astype(np.float32)
+
+
+def rooms(side: int) -> tuple[NDArray[np.float64], ...]:
+    shapes = ((side, side), (side + 3, side, 2), (side, side, 2))
+    return tuple(np.empty(shape) for shape in shapes)
+
+
+# --- whole cells ---
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_shift_of_highest_correlation_is_found_with_its_lead(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    half, radius = 4, 3
+    first = rng.normal(size=(30, 34, 2)).astype(np.float32)
+    shift = rng.integers(-2, 3, 2)
+    noise = rng.normal(size=first.shape).astype(np.float32)
+    second = np.roll(first, tuple(shift[::-1]), axis=(0, 1)) + 0.5 * noise
+    places = rng.integers(half + radius, [34 - half - radius, 30 - half - radius], (6, 2))
+    # The last one has its best place on the rim.
+    edge = np.roll(first, (0, radius), axis=(0, 1))
+    for other, wanted in ((second, shift), (edge, (radius, 0))):
+        found = np.zeros((6, 4))
+        search_shifts(first, other, places, (half, radius), found)
+        for (column, row), result in zip(places, found, strict=True):
+            steps = np.arange(-half, half + 1, 2)
+            scores = np.empty((7, 7))
+            own = first[np.ix_(row + steps, column + steps)].astype(np.float64)
+            own = own - own.mean(axis=(0, 1))
+            for down in range(-radius, radius + 1):
+                for across in range(-radius, radius + 1):
+                    there = other[np.ix_(row + down + steps, column + across + steps)]
+                    there = there.astype(np.float64) - there.mean(axis=(0, 1), dtype=np.float64)
+                    length = math.sqrt((own**2).sum() * (there**2).sum())
+                    scores[down + radius, across + radius] = (own * there).sum() / length
+            down, across = np.unravel_index(scores.argmax(), scores.shape)
+            np.testing.assert_array_equal(result[:2], [across - radius, down - radius])
+            np.testing.assert_array_equal(result[:2], wanted)
+            assert result[2] == pytest.approx(scores.max(), abs=1e-6)
+            if other is edge:
+                assert result[3] == -1.0
+                continue
+            rows, columns = np.indices(scores.shape)
+            away = np.maximum(np.abs(rows - down), np.abs(columns - across)) > 2
+            lead = scores.max() - scores[away].max()
+            assert result[3] == pytest.approx(lead, abs=1e-6)
+
+
+def test_where_no_other_place_is_the_lead_is_that_over_the_worst() -> None:
+    first = np.random.default_rng(0).normal(size=(20, 20, 2)).astype(np.float32)
+    found = np.zeros((1, 4))
+    search_shifts(first, first, np.array([[10, 10]]), (4, 1), found)
+    np.testing.assert_allclose(found, [[0.0, 0.0, 1.0, 2.0]], atol=1e-6)
+
+
+# --- fractions of a cell ---
+
+
+def matched(
+    first: Picture, second: Picture, start: tuple[float, float], place: tuple[int, int] = (22, 20)
+) -> NDArray[np.float64]:
+    window = _window(HALF)
+    found = np.array([[*start, 0.0, 0.0]])
+    match_patches(first, second, np.array([place]), window, rooms(len(window)), found)
+    return found[0]
+
+
+def known(value: float = 1.0) -> NDArray[np.float32]:
+    return np.full((SIDE, SIDE), value, dtype=np.float32)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.45), (-1.2, 2.4), (3.6, 0.5)])
+@pytest.mark.parametrize("gain", [1.0, 0.4])
+def test_a_shift_is_found_whatever_gain_and_offsets_are(
+    shift: tuple[float, float], gain: float
+) -> None:
+    offsets = np.array([3.0, -2.0], dtype=np.float32)
+    first = Picture(picture(), known())
+    second = Picture(np.float32(gain) * picture(shift) + offsets, known())
+    start = (round(shift[0] + 0.3), round(shift[1] - 0.3))
+    across, down, sigma, score = matched(first, second, (float(start[0]), float(start[1])))
+    # Cubic convolution of waves of a dozen cells.
+    np.testing.assert_allclose([across, down], shift, atol=0.004)
+    assert score > 0.9995
+    assert 0.0 <= sigma < 0.002
+
+
+def keys(t: float) -> NDArray[np.float64]:
+    """Weights of cubic convolution by its definition: of distances 1 + t, t, 1 - t, 2 - t."""
+    away = np.array([1.0 + t, t, 1.0 - t, 2.0 - t])
+    near = 1.5 * away**3 - 2.5 * away**2 + 1.0
+    far = -0.5 * away**3 + 2.5 * away**2 - 4.0 * away + 2.0
+    return np.where(away <= 1.0, near, far)
+
+
+def test_deviation_and_correlation_are_those_of_weighted_least_squares() -> None:
+    rng = np.random.default_rng(1)
+    noisy = [
+        (values + rng.normal(0.0, 0.05, values.shape)).astype(np.float32)
+        for values in (picture(), picture((0.6, -0.3)))
+    ]
+    mask = known()
+    mask[15:19, 18:24] = 0.0
+    first, second = Picture(noisy[0], mask), Picture(noisy[1], known())
+    across, down, sigma, score = matched(first, second, (1.0, 0.0))
+    window = _window(HALF)
+    rows = 20 + np.arange(-HALF, HALF + 1)
+    columns = 22 + np.arange(-HALF, HALF + 1)
+
+    def shown(values: NDArray[np.float32], i: int, j: int) -> NDArray[np.float64]:
+        return values[np.ix_(rows + i, columns + j)].astype(np.float64)
+
+    low = (math.floor(20 + down) - 20, math.floor(22 + across) - 22)
+    weights = (keys(down - low[0]), keys(across - low[1]))
+    moved = sum(
+        weights[0][i] * weights[1][j] * shown(noisy[1], low[0] + i - 1, low[1] + j - 1)
+        for i in range(4)
+        for j in range(4)
+    )
+    w = (window * mask[np.ix_(rows, columns)])[:, :, None]
+    total = w.sum()
+
+    def centred(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values - (w * values).sum(axis=(0, 1)) / total
+
+    a = centred(shown(noisy[0], 0, 0))
+    b = centred(moved)
+    slopes = [
+        centred(0.5 * (shown(noisy[0], i, j) - shown(noisy[0], -i, -j)))
+        for i, j in ((0, 1), (1, 0))
+    ]
+    saa, sab, sbb = (w * a * a).sum(), (w * a * b).sum(), (w * b * b).sum()
+    assert score == pytest.approx(sab / math.sqrt(saa * sbb), abs=1e-4)
+    normal = np.array([[(w * p * q).sum() for q in slopes] for p in slopes])
+    noise = (saa - sab**2 / sbb) / (2.0 * total)
+    expected = math.sqrt(noise * 0.5 * np.trace(np.linalg.inv(normal)))
+    assert sigma == pytest.approx(expected, rel=0.01)
+    # Nothing is left to gain: the residual has no part along the slopes.
+    residual = sab / sbb * b - a
+    pull = np.linalg.solve(normal, [(w * residual * slope).sum() for slope in slopes])
+    assert np.abs(pull).max() < 0.002
+
+
+def test_what_is_not_known_does_not_matter() -> None:
+    first, second = picture(), picture((0.5, 0.25))
+    unknown = known()
+    unknown[18:24, 24:30] = 0.0
+    spoilt = second.copy()
+    spoilt[19:23, 25:29] = 1e3
+    clean = matched(Picture(first, known()), Picture(second, unknown), (0.0, 0.0))
+    dirty = matched(Picture(first, known()), Picture(spoilt, unknown), (0.0, 0.0))
+    np.testing.assert_allclose(clean, dirty, atol=1e-9)
+    spoilt = first.copy()
+    spoilt[20:22, 26:28] = 1e3
+    dirty = matched(Picture(spoilt, unknown), Picture(second, known()), (0.0, 0.0))
+    np.testing.assert_allclose(dirty[:2], [0.5, 0.25], atol=0.01)
+
+
+def test_patches_that_fix_no_shift_have_no_deviation() -> None:
+    first, second = Picture(picture(), known()), Picture(picture((0.5, 0.25)), known())
+    # Too near to the border, in either picture.
+    reach = HALF + 3
+    for place, is_fine in (
+        ((reach, 20), True),
+        ((reach - 1, 20), False),
+        ((20, reach - 1), False),
+        ((SIDE - reach - 1, 20), True),
+        ((SIDE - reach, 20), False),
+        ((20, SIDE - reach), False),
+    ):
+        assert math.isfinite(matched(first, second, (0.2, 0.1), place)[2]) == is_fine, place
+    assert math.isinf(matched(first, second, (-30.0, 0.0))[2])
+    assert math.isinf(matched(first, second, (0.0, 30.0))[2])
+    # Three tenths of the weights must be known.
+    window = _window(HALF)
+    verdicts = set()
+    for n_rows in range(15, 26):
+        mask = known(0.0)
+        mask[:n_rows] = 1.0
+        share = float((window * mask[15:26, 17:28]).sum() / window.sum())
+        is_fine = math.isfinite(matched(Picture(picture(), mask), second, (0.0, 0.0))[2])
+        assert is_fine == (share > 0.3), share
+        verdicts.add(is_fine)
+    assert verdicts == {False, True}
+    flat = Picture(np.ones((SIDE, SIDE, 2), dtype=np.float32), known())
+    assert math.isinf(matched(flat, second, (0.0, 0.0))[2])
+    negative = Picture(-picture(), known())
+    assert math.isinf(matched(first, negative, (0.0, 0.0))[2])

@@ -1,0 +1,297 @@
+"""Every gate of an orientation, on either side of its bound."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from orthoflow_plugins.orient.acceptance import (
+    Candidate,
+    GateRule,
+    reason_against,
+    reason_to_leave_out,
+    too_few,
+    warnings_for,
+)
+from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
+
+from orthoflow.geometry.resection import SeenPoints
+from orthoflow.products import Photo
+
+N_TIES = 100
+WALL = KnownWall(
+    index=0,
+    corners_world=np.array(
+        [[-1.0, 2.0, 1.0], [-1.0, 2.0, -1.0], [1.0, 2.0, -1.0], [1.0, 2.0, 1.0]]
+    ),
+    normal=np.array([0.0, -1.0, 0.0]),
+    gsd_m=0.002,
+    has_side=True,
+)
+RULE = GateRule(
+    n_control_least=20,
+    n_quadrant_least=2,
+    quadrants_are_strict=False,
+    inlier_share_least=0.3,
+    hull_ratio_least=0.2,
+    sigma_wall_most_gsd=0.5,
+    sigma_corner_most_gsd=1.5,
+)
+
+
+def grid(n: int = 10) -> np.ndarray:
+    """(n * n, 2) pixels all over a photo of 1000 x 800, in an order that mixes its quarters."""
+    places = np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2) + 0.5
+    pixels = places / n * (1000.0, 800.0)
+    return pixels[np.random.default_rng(3).permutation(n * n)]
+
+
+def candidate(**changes: Any) -> Candidate:
+    """A good orientation: 80 of 100 ties agree, of 20 withheld ones 16."""
+    is_check = np.arange(N_TIES) % 5 == 0
+    agreeing = np.arange(N_TIES) % 25 >= 5
+    lengths = np.where(agreeing, 0.5, 8.0)
+    footprint = grid(20)
+    error = WallError(
+        rms_m=0.0008,
+        worst_m=0.002,
+        corners_m=np.full(4, 0.002),
+        footprint_px=footprint,
+        sigmas_m=np.full(len(footprint), 0.0008),
+    )
+    estimate: Any = SimpleNamespace(
+        agreeing=agreeing,
+        limit=3.0,
+        source="calibration",
+        fit=SimpleNamespace(normalised=lengths, residuals_px=lengths[:, None] * (0.6, 0.8)),
+        resection=SimpleNamespace(camera=SimpleNamespace(centre_world=np.zeros(3))),
+        without_one=(),
+    )
+    pixels = changes.pop("pixels", grid())
+    for name in ("agreeing", "source"):
+        if name in changes:
+            setattr(estimate, name, changes.pop(name))
+    if "normalised" in changes:
+        estimate.fit.normalised = changes.pop("normalised")
+    if "centre" in changes:
+        estimate.resection.camera.centre_world = changes.pop("centre")
+    if "error" in changes and changes["error"] is not None:
+        changes["error"] = replace(error, **changes["error"])
+    usual: dict[str, Any] = {
+        "photo": Photo(name="a.png", encoded=b"", width=1000, height=800),
+        "seen": SeenPoints(
+            pixels_photo=pixels,
+            points_world=np.zeros((N_TIES, 3)),
+            sigma_px=np.ones(N_TIES),
+            sigma_m=np.zeros(N_TIES),
+        ),
+        "is_check": is_check,
+        "walls": np.zeros(N_TIES, dtype=np.int32),
+        "estimate": estimate,
+        "known": (WALL,),
+        "error": error,
+        "rule": RULE,
+    }
+    return Candidate(**{**usual, **changes})
+
+
+def test_a_good_orientation_is_ok_without_a_note() -> None:
+    good = candidate()
+    assert reason_against(good) == reason_to_leave_out(good) == ""
+    assert warnings_for(good) == []
+    assert good.control.sum() == 64
+    assert good.checked.sum() == 16
+    assert sum(good.quadrant_counts) == 80
+    assert good.gsd_m == 0.002
+    # 8 of 10 cells' distance in each direction of a grid, over 19 of 20.
+    assert good.hull_ratio == pytest.approx((0.9 / 0.95) ** 2, rel=0.05)
+
+
+def test_eight_ties_are_needed() -> None:
+    assert too_few(8) == ""
+    assert too_few(7).startswith("7 ties with the walls, at least 8 are needed")
+
+
+def gated(**changes: Any) -> str:
+    return reason_against(candidate(**changes))
+
+
+def rule(**changes: Any) -> GateRule:
+    return replace(RULE, **changes)
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "reason"),
+    [
+        (
+            {"rule": rule(n_control_least=64)},
+            {"rule": rule(n_control_least=65)},
+            "only 64 of 80 control ties agree with one pose, at least 65 must",
+        ),
+        (
+            {"rule": rule(inlier_share_least=0.79)},
+            {"rule": rule(inlier_share_least=0.81)},
+            "only 80.0% of 100 ties agree with one pose, at least 81.0% must",
+        ),
+        (
+            {"rule": rule(hull_ratio_least=0.8)},
+            {"rule": rule(hull_ratio_least=0.95)},
+            "the control covers .*% of the part of the photo that shows",
+        ),
+        (
+            {"error": {"rms_m": 0.00099}},
+            {"error": {"rms_m": 0.00101}},
+            r"its predicted error on the wall is 1\.0 mm, at most 0\.5 cells of 2 mm",
+        ),
+        (
+            {"error": {"worst_m": 0.0029}},
+            {"error": {"worst_m": 0.0031}},
+            r"at the worst place of the wall is 3\.1 mm, at most 1\.5 cells of 2 mm",
+        ),
+        (
+            {"centre": np.array([0.0, 1.9, 0.0])},
+            {"centre": np.array([0.0, 2.1, 0.0])},
+            "the pose lies behind the wall",
+        ),
+        ({}, {"error": None}, "the photo would show no wall"),
+    ],
+    ids=["control", "share", "hull", "error", "worst place", "side", "no wall"],
+)
+def test_each_gate_refuses_what_is_beyond_its_bound(
+    good: dict[str, Any], bad: dict[str, Any], reason: str
+) -> None:
+
+    assert gated(**good) == ""
+    assert re.search(reason, gated(**bad))
+
+
+def test_check_ties_must_agree_half_as_often_as_the_control() -> None:
+    is_check = candidate().is_check
+    # 80 % of the control agree: of 20 withheld ties 8 must.
+    for n_agree, is_fine in ((8, True), (7, False)):
+        agreeing = candidate().estimate.agreeing.copy()
+        agreeing[is_check] = np.arange(20) < n_agree
+        reason = gated(agreeing=agreeing, normalised=np.where(agreeing, 0.5, 8.0))
+        assert (reason == "") == is_fine
+        assert is_fine or "the pose was fitted to chance" in reason
+
+
+def test_check_ties_may_deviate_twice_as_much_as_the_control() -> None:
+    good = candidate()
+    for factor, is_fine in ((1.95, True), (2.05, False)):
+        lengths = np.where(good.is_check, 0.5 * factor, 0.5)
+        reason = gated(normalised=np.where(good.estimate.agreeing, lengths, 8.0))
+        assert (reason == "") == is_fine
+        assert is_fine or reason.startswith("the check ties deviate 2.0 times as much")
+    # Four that agree say nothing yet, and few withheld ties none.
+    few = np.zeros(N_TIES, dtype=np.bool_)
+    few[[6, 7, 8, 9]] = True
+    lengths = np.where(few, 2.0, 0.5)
+    loose = candidate(is_check=few, normalised=np.where(good.estimate.agreeing, lengths, 8.0))
+    assert "deviate" not in reason_against(loose)
+
+
+def test_withheld_ties_that_agree_by_chance_say_nothing() -> None:
+    # Two of twenty within three pixels of a search over ten: each by chance with 0.28 / 4.
+    agreeing = candidate().estimate.agreeing.copy()
+    agreeing[candidate().is_check] = np.arange(20) < 2
+    lengths = np.where(agreeing, 2.9, 8.0)
+    reason = gated(agreeing=agreeing, normalised=lengths, search_radius_px=5.0)
+    assert reason == (
+        "2 of 20 withheld ties agree with the pose, as a wrong pose could have by chance"
+    )
+    assert "by chance" not in gated(search_radius_px=50.0)
+    assert "by chance" in gated(search_radius_px=0.4)
+    # All at one place are one.
+    good = candidate()
+    pixels = good.seen.pixels_photo.copy()
+    pixels[good.is_check] = (100.0, 100.0)
+    assert "by chance" in gated(pixels=pixels, search_radius_px=20.0)
+    assert "by chance" not in gated(search_radius_px=20.0)
+
+
+def in_quarter(quarter: int, n: int) -> np.ndarray:
+    """Whether ties agree: all but those of a quarter, of which only so many."""
+    good = candidate()
+    columns, rows = (good.seen.pixels_photo >= (500.0, 400.0)).T
+    mine = np.flatnonzero((2 * rows + columns == quarter) & good.estimate.agreeing)
+    agreeing = good.estimate.agreeing.copy()
+    agreeing[mine[n:]] = False
+    return agreeing
+
+
+def quarter_error(quarter: int, sigma_m: float) -> dict[str, Any]:
+    columns, rows = (grid(20) >= (500.0, 400.0)).T
+    return {"sigmas_m": np.where(2 * rows + columns == quarter, sigma_m, 0.0)}
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_quarters_without_ties_must_be_known_from_the_others(quarter: int) -> None:
+    def reason(n: int, sigma_m: float = 0.01, **changes: Any) -> str:
+        error = quarter_error(quarter, sigma_m)
+        return gated(agreeing=in_quarter(quarter, n), error=error, **changes)
+
+    assert reason(2) == ""
+    assert reason(1).startswith(
+        "a quarter of the photo has 1 ties, each needs 2: the pose would be extrapolated there, "
+        "with a predicted error of 10.0 mm, at most 1.0 mm is allowed"
+    )
+    # Half a cell of 2 mm; what shows no wall needs nothing.
+    assert reason(1, 0.00099) == reason(0, 0.0) == ""
+    assert reason(1, 0.00101) != ""
+    strict = rule(quadrants_are_strict=True)
+    assert reason(1, 0.0, rule=strict) == "a quarter of the photo has 1 ties, each needs 2"
+    assert reason(2, 0.01, rule=strict) == ""
+    unknown = (replace(WALL, gsd_m=None),)
+    assert reason(1, 0.0001, known=unknown).endswith("with a predicted error of 0.1 mm")
+    assert reason_to_leave_out(candidate(agreeing=in_quarter(quarter, 0))) == ""
+
+
+def test_the_side_of_a_wall_is_asked_where_it_is_known_and_tied() -> None:
+    behind = np.array([0.0, 3.0, 0.0])
+    blind = replace(WALL, has_side=False)
+    assert gated(centre=behind, known=(blind,)) == ""
+    other = replace(WALL, index=1)
+    assert gated(centre=behind, known=(other,)) == ""
+    walls = np.zeros(N_TIES, dtype=np.int32)
+    control = np.flatnonzero(candidate().control)
+    walls[control[:3]] = 1
+    assert gated(centre=behind, known=(other,), walls=walls) == ""
+    walls[control[:4]] = 1
+    assert "behind the wall" in gated(centre=behind, known=(other,), walls=walls)
+    assert "behind the wall" in reason_to_leave_out(candidate(centre=behind))
+
+
+def test_limits_of_good_orientations_are_said() -> None:
+    def said(**changes: Any) -> list[str]:
+        return warnings_for(candidate(**changes))
+
+    assert said(source="none") == [
+        "neither calibration nor EXIF says its focal length, which was estimated"
+    ]
+    counts = candidate(agreeing=in_quarter(0, 2)).quadrant_counts
+    assert counts[0] == 2
+    assert max(counts) > 20
+    assert "another 2: more than 10 times as many" in said(agreeing=in_quarter(0, 2))[0]
+    assert max(candidate(agreeing=in_quarter(0, 3)).quadrant_counts) <= 30
+    assert said(agreeing=in_quarter(0, 3)) == []
+    ratio = candidate().hull_ratio
+    assert said(rule=rule(hull_ratio_least=ratio / 1.51)) == []
+    covers = said(rule=rule(hull_ratio_least=ratio / 1.49))
+    assert covers == [f"the control covers {ratio:.0%} of the part that shows the walls"]
+    nowhere = candidate(error=None)
+    assert (nowhere.hull_ratio, nowhere.worst_in_quarter_m(0)) == (0.0, 0.0)
+    assert math.isinf(nowhere.search_radius_px)
+
+
+def test_the_smallest_cell_of_the_walls_counts() -> None:
+    known = (replace(WALL, gsd_m=0.004), replace(WALL, gsd_m=None), replace(WALL, gsd_m=0.003))
+    assert candidate(known=known).gsd_m == 0.003
+    assert candidate(known=(replace(WALL, gsd_m=None),)).gsd_m is None
+    unknown = candidate(known=(replace(WALL, gsd_m=None),), error={"rms_m": 1.0, "worst_m": 1.0})
+    assert reason_against(unknown) == ""

@@ -1,0 +1,230 @@
+"""The covariance of a block against one normal matrix of all its unknowns, points among them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.orient.block import (
+    Block,
+    Lens,
+    Observations,
+    Points,
+    block_covariance,
+    correlation_notes,
+    lens_statistics,
+    lenses_json,
+    pixel_covariances,
+)
+
+from orthoflow.errors import GeometryError
+from orthoflow.geometry.lenses import LensFreedom, stepped
+from orthoflow.products import Photo
+from tests import block_scenes as bs
+
+SIGMA_PX = 0.3
+FREEDOM = LensFreedom(focal_sigma=0.02, k1_sigma=0.05)
+
+
+def block_of(
+    *, freedoms: tuple[LensFreedom, ...] = (FREEDOM,), lens_of: tuple[int, ...] = (0, 0, 0)
+) -> Block:
+    """Three photos; of the points a third is seen once, a third is not in the scan."""
+    rng = np.random.default_rng(0)
+    cameras = bs.viewers()[:3]
+    points = rng.uniform([0.6, -0.1, 0.4], [2.4, 0.1, 1.6], (90, 3))
+    sigma_m = np.where(np.arange(90) < 60, 0.002, np.inf)
+    known = points + np.where(np.arange(90) < 60, 0.002, 0.0)[:, None] * rng.normal(size=(90, 3))
+    photo, point = [], []
+    for k in range(90):
+        inside = [
+            at for at in range(3) if cameras[at].sees(cameras[at].project(points[[k]])[:, :2])
+        ]
+        wanted = inside[:1] if k < 30 else inside
+        if k >= 60 and len(wanted) < 2:
+            wanted = []
+        photo += wanted
+        point += [k] * len(wanted)
+    seen_by, of = np.array(photo, dtype=np.intp), np.array(point, dtype=np.intp)
+    exact = np.vstack(
+        [cameras[at].project(points[[k]])[:, :2] for at, k in zip(photo, point, strict=True)]
+    )
+    return Block(
+        cameras=cameras,
+        lens_of=lens_of,
+        lenses=tuple(
+            Lens(prior=cameras[lens_of.index(k)], freedom=freedom, source="calibration")
+            for k, freedom in enumerate(freedoms)
+        ),
+        points=Points(now=points, known=known, sigma_m=sigma_m),
+        seen=Observations(
+            photo=seen_by,
+            point=of,
+            pixels=exact + SIGMA_PX * rng.normal(size=exact.shape),
+            sigma_px=np.full(len(exact), SIGMA_PX),
+        ),
+    )
+
+
+def by_differences(block: Block) -> tuple[NDArray[np.float64], int, int]:
+    """Normal matrix of poses, lenses and points from differences; unknowns and observations."""
+    n_free = int(block.column_starts[1][-1])
+    n_unknowns = n_free + 3 * len(block.points)
+    jacobian = np.zeros((2 * len(block.seen), n_unknowns))
+    for row, (photo, point) in enumerate(zip(block.seen.photo, block.seen.point, strict=True)):
+        freedom = block.lenses[block.lens_of[photo]].freedom
+        columns = block.columns(int(photo))
+        now = block.points.now if block.is_joint[point] else block.points.known
+        at = now[[point]]
+
+        def pixel(step: Any, moved: Any, photo: int = photo, freedom: Any = freedom) -> Any:
+            return stepped(block.cameras[photo], step, freedom).project(moved)[0, :2]
+
+        own = slice(2 * row, 2 * row + 2)
+        for nth, column in enumerate(columns):
+            step = np.zeros(len(columns))
+            step[nth] = 1e-6
+            jacobian[own, column] = (pixel(step, at) - pixel(-step, at)) / 2e-6
+        still = np.zeros(len(columns))
+        for axis in range(3):
+            move = 1e-6 * np.eye(3)[axis]
+            change = pixel(still, at + move) - pixel(still, at - move)
+            jacobian[own, n_free + 3 * point + axis] = change / 2e-6
+    normal = jacobian.T @ jacobian / SIGMA_PX**2
+    for start, lens in zip(block.column_starts[1][:-1], block.lenses, strict=True):
+        for nth, sigma in enumerate(lens.freedom.sigmas):
+            normal[start + nth, start + nth] += 1.0 / sigma**2
+    known = np.repeat(np.where(np.isfinite(block.points.sigma_m), block.points.sigma_m, np.inf), 3)
+    normal[np.diag_indices(n_unknowns)] += np.append(np.zeros(n_free), 1.0 / known**2)
+    used = np.append(
+        np.ones(n_free, dtype=bool),
+        np.repeat(np.bincount(block.seen.point, minlength=len(block.points)) > 0, 3),
+    )
+    return normal[np.ix_(used, used)], n_free, 2 * len(block.seen)
+
+
+@pytest.mark.parametrize("lens_of", [(0, 0, 0), (0, 1, 0)], ids=["one lens", "two lenses"])
+def test_cofactors_are_those_of_all_unknowns_at_once(lens_of: tuple[int, ...]) -> None:
+    second = LensFreedom(focal_sigma=0.01, centre_sigma_px=5.0)
+    freedoms = (FREEDOM, second)[: max(lens_of) + 1]
+    block = block_of(freedoms=freedoms, lens_of=lens_of)
+    counts = np.bincount(block.seen.point)
+    assert set(counts[:30]) == {1}
+    assert (counts[60:] > 1).sum() > 5
+    found = block_covariance(block, soft_limit=100.0)
+    normal, n_free, n_observations = by_differences(block)
+    expected = np.linalg.inv(normal)[:n_free, :n_free]
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        found.cofactors / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-5
+    )
+    # Points that the scan does not know cost three observations each.
+    prior = np.concatenate([1.0 / freedom.sigmas**2 for freedom in freedoms])
+    n_new = int(np.count_nonzero(counts[60:]))
+    learnt = float((np.diag(expected)[18:] * prior).sum())
+    redundancy = n_observations - 3 * n_new - n_free + learnt
+    assert found.redundancy == pytest.approx(redundancy, rel=1e-5)
+    assert found.sigma0 == pytest.approx(1.0, abs=0.15)
+    # No direction is more exact than least squares say.
+    least = np.linalg.eigvals(np.linalg.solve(found.sigma0**2 * found.cofactors, found.matrix))
+    assert least.real.min() > 1.0 - 1e-6
+    # Wherever residuals are larger than the limit they count less.
+    softer = block_covariance(block, soft_limit=0.5)
+    assert (np.diag(softer.cofactors) > np.diag(found.cofactors)).all()
+
+
+def test_pixels_of_points_seen_once_bear_the_error_of_the_point() -> None:
+    block = block_of()
+    covariances = pixel_covariances(block)
+    alone = ~block.is_joint[block.seen.point]
+    np.testing.assert_allclose(
+        covariances[~alone], np.tile(SIGMA_PX**2 * np.eye(2), (np.count_nonzero(~alone), 1, 1))
+    )
+    for nth in np.flatnonzero(alone)[:10]:
+        camera = block.cameras[block.seen.photo[nth]]
+        at = block.points.known[[block.seen.point[nth]]]
+        moves = 1e-6 * np.eye(3)
+        by_point = np.column_stack(
+            [(camera.project(at + m) - camera.project(at - m))[0, :2] / 2e-6 for m in moves]
+        )
+        expected = SIGMA_PX**2 * np.eye(2) + 0.002**2 * by_point @ by_point.T
+        np.testing.assert_allclose(covariances[nth], expected, rtol=1e-5)
+
+
+def test_too_few_observations_determine_no_block() -> None:
+    block = block_of()
+    few = replace(block, seen=block.seen.take(np.arange(12)))
+    with pytest.raises(GeometryError, match="do not determine the block"):
+        block_covariance(few, soft_limit=3.0)
+
+
+# --- what is said of lenses ---
+
+
+def photos() -> list[Photo]:
+    return [Photo(name=f"{name}.png", encoded=b"", width=4, height=3) for name in "abc"]
+
+
+def test_lenses_are_told_with_their_photos_and_deviations() -> None:
+    block = block_of(freedoms=(FREEDOM, LensFreedom()), lens_of=(0, 1, 0))
+    covariance = np.diag(np.arange(1.0, 21.0) ** 2)
+    first, second = lenses_json(block, photos(), covariance)  # type: ignore[misc]
+    camera = block.cameras[0]
+    assert first == {
+        "photos": ["a.png", "c.png"],
+        "known_from": "calibration",
+        "focal_px": camera.fx,
+        "centre_px": [camera.cx, camera.cy],
+        "distortion": camera.distortion.tolist(),
+        "free": ["focal", "k1"],
+        # The nineteenth and the twentieth unknown; focal lengths are logarithms.
+        "sigmas": {"focal": pytest.approx(19.0 * camera.fx), "k1": pytest.approx(20.0)},
+    }
+    assert (second["photos"], second["free"], second["sigmas"]) == (["b.png"], [], {})
+
+
+def test_lenses_that_are_free_alike_are_averaged() -> None:
+    block = block_of(freedoms=(FREEDOM, FREEDOM, LensFreedom()), lens_of=(0, 1, 2))
+    cameras = [
+        replace(camera, fx=focal, fy=focal, distortion=np.array([k1, 0.0, 0.0, 0.0, 0.0]))
+        for camera, focal, k1 in zip(
+            block.cameras, (900.0, 1_000.0, 700.0), (0.01, 0.03, 0.5), strict=True
+        )
+    ]
+    prior = block.lenses[0].prior
+    (entry,) = lens_statistics(replace(block, cameras=tuple(cameras)))  # type: ignore[misc]
+    assert entry == {
+        "width": prior.width,
+        "height": prior.height,
+        "n_lenses": 2,
+        "mean": {"focal": pytest.approx(950.0), "k1": pytest.approx(0.02)},
+        "sd": {
+            "focal": pytest.approx(100.0 / np.sqrt(2.0)),
+            "k1": pytest.approx(0.02 / np.sqrt(2.0)),
+        },
+    }
+    (alone,) = lens_statistics(block_of())  # type: ignore[misc]
+    assert (alone["n_lenses"], alone["sd"]) == (1, {"focal": 0.0, "k1": 0.0})
+
+
+def test_lenses_that_all_photos_confuse_with_their_pose_are_named() -> None:
+    block = block_of()
+    cofactors = np.eye(20)
+
+    def correlate(photo: int, pose: int, lens: int, share: float) -> None:
+        cofactors[6 * photo + pose, 18 + lens] = cofactors[18 + lens, 6 * photo + pose] = share
+
+    for photo in range(2):
+        correlate(photo, 5, 0, -0.97)
+    assert correlation_notes(block, photos(), cofactors) == []
+    correlate(2, 5, 0, 0.94)
+    assert correlation_notes(block, photos(), cofactors) == []
+    correlate(2, 5, 0, 0.96)
+    scale = np.linspace(1.0, 3.0, 20)
+    (note,) = correlation_notes(block, photos(), cofactors * np.outer(scale, scale))
+    assert note.startswith(
+        "the focal of the lens of a.png and the distance of its photos correlate by 0.960"
+    )

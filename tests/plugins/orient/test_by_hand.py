@@ -1,0 +1,228 @@
+"""Ties that a person measured: six orient a photo as well as they say, a wrong one never does."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.orient.bundle import OrientColmapBundle
+from orthoflow_plugins.orient.dlt import OrientDlt
+from orthoflow_plugins.orient.pnp import OrientPnp
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Camera, Cameras, Intrinsics, Photos, TieRole, Ties, TieWall
+from orthoflow.sdk import StepContext
+from orthoflow.testing import photographed as ms
+from tests.plugins.orient.test_pnp import PIXEL, known_ties
+
+SCENE = ms.textured_wall(0)
+CAMERA = ms.camera_before(SCENE, centre=(1.3, -2.6, 1.1))
+SIGMA_PX = 1.0
+# Two rows of clicks as a person spreads them, in shares of the photo; the points lie on a relief.
+SPREAD = ((0.12, 0.15), (0.5, 0.12), (0.88, 0.16), (0.13, 0.86), (0.52, 0.88), (0.87, 0.84))
+MORE = ((0.3, 0.5), (0.7, 0.45))
+
+
+def clicked(
+    seed: int,
+    *,
+    n: int = 6,
+    blunder: NDArray[np.float64] | None = None,
+    places: tuple[tuple[float, float], ...] = (),
+) -> Ties:
+    """Ties that a person measured with the noise that is stated, the last one off by a blunder."""
+    rng = np.random.default_rng(seed)
+    shares = np.array(places or (*SPREAD, *MORE)[:n])
+    n = len(shares)
+    pixels = (shares + rng.uniform(-0.03, 0.03, (n, 2))) * [CAMERA.width, CAMERA.height]
+    # The wall point behind a pixel: along the ray to the plane, then onto the relief.
+    rays = CAMERA.rays_world(pixels)
+    points = CAMERA.centre_world + rays * (-CAMERA.centre_world[1] / rays[:, 1:2])
+    cells = SCENE.frame.wall_from_world(points)[:, :2]
+    depth = SCENE.depth_m(cells[:, 0] * ms.GSD_M, cells[:, 1] * ms.GSD_M)
+    points = SCENE.frame.world_from_wall(cells, depth)
+    pixels = CAMERA.project(points)[:, :2] + rng.normal(0.0, SIGMA_PX, (n, 2))
+    if blunder is not None:
+        pixels[-1] += blunder
+    return Ties(
+        photo_names=("a.png",),
+        photo=np.zeros(n, np.int32),
+        wall=np.zeros(n, np.int32),
+        pixels_photo=pixels,
+        points_world=points,
+        sigma_px=np.full(n, SIGMA_PX),
+        sigma_m=np.full(n, 1e-4),
+        role=np.zeros(n, np.uint8),
+        residual_px=np.full((n, 2), np.nan),
+        by_hand=np.ones(n, np.uint8),
+        walls=(
+            TieWall(
+                gsd_m=ms.GSD_M,
+                normal_world=(0.0, -1.0, 0.0),
+                corners_world=tuple(map(tuple, SCENE.frame.corners_world().tolist())),
+            ),
+        ),
+    )
+
+
+def joined(first: Ties, second: Ties) -> Ties:
+    arrays = ("photo", "wall", "pixels_photo", "points_world", "sigma_px", "sigma_m", "role")
+    by_hand = [
+        np.zeros(len(ties.photo), np.uint8) if ties.by_hand is None else ties.by_hand
+        for ties in (first, second)
+    ]
+    return replace(
+        first,
+        by_hand=np.concatenate(by_hand),
+        residual_px=np.concatenate([first.residual_px, second.residual_px]),
+        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in arrays},
+    )
+
+
+Orient = Callable[[Ties, Photos], tuple[Cameras, list[str]]]
+
+
+@pytest.fixture(params=["pnp", "bundle"])
+def orient(request: pytest.FixtureRequest, tmp_path: Path) -> Orient:
+    method = {"pnp": OrientPnp, "dlt": OrientDlt, "bundle": OrientColmapBundle}[request.param]
+
+    def run(ties: Ties, photos: Photos) -> tuple[Cameras, list[str]]:
+        ctx = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+        inputs = method.In(ties=ties, photos=photos)
+        return method().run(inputs, method.Params(), ctx).cameras, list(ctx.warnings)
+
+    return run
+
+
+def calibrated(camera: ViewingCamera = CAMERA) -> Photos:
+    return ms.photos(replace(PIXEL, intrinsics=Intrinsics.of(camera)))
+
+
+def error_share(found: Camera) -> float:
+    """Error on the wall over the standard deviation that is stated."""
+    assert found.sigma_wall_m is not None
+    return ms.wall_error_m(SCENE, found.viewing(), CAMERA) / found.sigma_wall_m
+
+
+def test_six_ties_orient_a_photo_within_what_their_sigma_says(orient: Orient) -> None:
+    shares = []
+    for seed in range(8):
+        cameras, _ = orient(clicked(seed), calibrated())
+        assert cameras.cameras[0].status == "ok", seed
+        shares.append(error_share(cameras.cameras[0]))
+        assert cameras.ties is not None
+        assert (cameras.ties.role == TieRole.CONTROL).all()
+    # Of a chi distribution with about as many degrees of freedom, the mean square is near 1.
+    assert 0.4 < np.sqrt(np.mean(np.square(shares))) < 1.6
+    assert max(shares) < 3.0
+
+
+@pytest.mark.parametrize("size_px", [15.0, 60.0, 400.0])
+def test_a_gross_blunder_among_eight_is_left_out_or_refused(orient: Orient, size_px: float) -> None:
+    for seed in range(3):
+        angle = seed * 2.1
+        blunder = size_px * np.array([np.cos(angle), np.sin(angle)])
+        cameras, warnings = orient(clicked(seed, n=8, blunder=blunder), calibrated())
+        found = cameras.cameras[0]
+        assert cameras.ties is not None
+        if found.status == "ok":
+            assert error_share(found) < 3.0
+            assert cameras.ties.role.tolist() == [0] * 7 + [int(TieRole.REJECTED)]
+            assert any("left out of them, as they contradict" in text for text in warnings)
+        else:
+            assert "measured by hand contradict" in found.status
+    # Far off, the blunder is plain.
+    assert size_px < 50.0 or found.status == "ok"
+
+
+def test_a_blunder_among_six_is_refused(orient: Orient) -> None:
+    for seed in range(4):
+        (found,) = orient(clicked(seed, blunder=np.array([40.0, -30.0])), calibrated())[0].cameras
+        assert "its 6 ties measured by hand contradict each other" in found.status
+
+
+def test_three_blunders_among_fifteen_are_refused(orient: Orient) -> None:
+    # Nothing is withheld of them, so that the gates for matched ties could not judge the pose.
+    rng = np.random.default_rng(5)
+    ties = clicked(2, places=tuple(map(tuple, rng.uniform(0.08, 0.92, (15, 2)))))
+    pixels = ties.pixels_photo.copy()
+    pixels[:3] += [[60.0, 0.0], [0.0, -80.0], [-50.0, 50.0]]
+    (found,) = orient(replace(ties, pixels_photo=pixels), calibrated())[0].cameras
+    assert "its 15 ties measured by hand contradict each other by more than" in found.status
+
+
+def test_ties_that_hang_on_one_of_them_are_refused(orient: Orient) -> None:
+    # Five in a corner and one far away: the error that they predict is small, but were that one
+    # wrong, the pose without it would be worth little.
+    corner = ((0.06, 0.1), (0.2, 0.1), (0.06, 0.3), (0.2, 0.3), (0.13, 0.2))
+    hanging = orient(clicked(3, places=(*corner, (0.95, 0.9))), calibrated())[0].cameras[0]
+    assert re.match(r"without the tie at \(u 8\d\d, v 5\d\d\) its predicted", hanging.status)
+    far = ((0.95, 0.9), (0.9, 0.2))
+    held = orient(clicked(3, places=(*corner, *far)), calibrated())[0].cameras[0]
+    assert held.status == "ok"
+
+
+def test_ties_by_hand_join_those_that_matching_found(orient: Orient) -> None:
+    matched = known_ties(CAMERA, 5, n=120, wrong_share=0.2)
+    alone = orient(clicked(1), calibrated())[0].cameras[0]
+    both, _ = orient(joined(matched, clicked(1)), calibrated())
+    found = both.cameras[0]
+    assert found.status == "ok"
+    assert found.sigma_wall_m is not None
+    assert alone.sigma_wall_m is not None
+    assert found.sigma_wall_m < 0.5 * alone.sigma_wall_m
+    assert error_share(found) < 3.0
+    assert both.ties is not None
+    # Never withheld.
+    assert (both.ties.role[-6:] == TieRole.CONTROL).all()
+    assert (both.ties.role == TieRole.CHECK).sum() >= 15
+
+
+def test_ties_by_hand_stand_against_a_repeated_motif(orient: Orient) -> None:
+    # Matching took the next window for this one: 120 ties agree with a pose 0.4 m beside.
+    beside = known_ties(CAMERA, 5, n=120, shift_m=np.array([0.4, 0.0, 0.0]))
+    wrong = orient(beside, calibrated())[0].cameras[0]
+    assert wrong.status == "ok"
+    assert ms.wall_error_m(SCENE, wrong.viewing(), CAMERA) > 0.2
+    cameras, _ = orient(joined(replace(beside, walls=clicked(1).walls), clicked(1)), calibrated())
+    assert cameras.cameras[0].status == "ok"
+    assert error_share(cameras.cameras[0]) < 3.0
+
+
+def test_wrong_matches_do_not_harm_a_photo_that_is_tied_by_hand(orient: Orient) -> None:
+    garbage = known_ties(CAMERA, 5, n=60, wrong_share=1.0)
+    assert orient(garbage, calibrated())[0].cameras[0].status != "ok"
+    cameras, _ = orient(joined(garbage, clicked(2)), calibrated())
+    assert cameras.cameras[0].status == "ok"
+    assert error_share(cameras.cameras[0]) < 3.0
+
+
+def test_a_focal_length_from_exif_is_refined_by_ties_by_hand(orient: Orient) -> None:
+    photos = ms.photos(replace(PIXEL, exif_focal_px=1.02 * CAMERA.fx))
+    for seed in range(4):
+        (found,) = orient(clicked(seed), photos)[0].cameras
+        assert found.status == "ok"
+        assert error_share(found) < 3.0
+        assert found.intrinsics is not None
+        assert found.intrinsics.source == "estimated"
+
+
+def test_fewer_than_six_are_ordinary_ties(orient: Orient) -> None:
+    ties = clicked(1)
+    five = replace(
+        ties,
+        **{
+            name: getattr(ties, name)[:5]
+            for name in ("photo", "wall", "pixels_photo", "points_world", "sigma_px", "sigma_m")
+        },
+        role=ties.role[:5],
+        residual_px=ties.residual_px[:5],
+        by_hand=np.ones(5, np.uint8),
+    )
+    (found,) = orient(five, calibrated())[0].cameras
+    assert "5 ties with the walls, at least 8 are needed" in found.status

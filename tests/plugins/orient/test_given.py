@@ -1,0 +1,151 @@
+"""`read.cameras` and `orient.given`: poses of another program, taken, checked or corrected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.orient.given import OrientGiven
+from orthoflow_plugins.read.cameras import ReadCameras
+
+from orthoflow.errors import InputError, MethodError
+from orthoflow.files.colmap import write_colmap_model
+from orthoflow.files.publishing import publish_cameras
+from orthoflow.products import Camera, Cameras, InputFiles, Intrinsics, Photos, Ties
+from orthoflow.sdk import StepContext
+from orthoflow.testing import photographed as ms
+from tests.plugins.orient.test_by_hand import CAMERA, SCENE, clicked, error_share
+from tests.plugins.orient.test_pnp import PIXEL
+
+WALLS = ms.walls_of(SCENE)
+PHOTOS = ms.photos(PIXEL)
+
+
+def context(folder: Path) -> StepContext:
+    return StepContext(rng=np.random.default_rng(1), cores=1, scratch=folder)
+
+
+def oriented(camera: object = CAMERA, *, name: str = "a.png") -> Cameras:
+    return ms.cameras(ms.oriented(camera, name=name))  # type: ignore[arg-type]
+
+
+def read(folder: Path, photos: Photos = PHOTOS, **params: object) -> tuple[Cameras, list[str]]:
+    ctx = context(folder)
+    files = InputFiles(name="cameras", paths=tuple(sorted((folder / "given").iterdir())))
+    inputs = ReadCameras.In(files=files, photos=photos)
+    found = ReadCameras().run(inputs, ReadCameras.Params.model_validate(params), ctx).cameras
+    return found, list(ctx.warnings)
+
+
+def given(
+    folder: Path, cameras: Cameras, ties: Ties | None = None, **params: object
+) -> tuple[Cameras, list[str]]:
+    ctx = context(folder)
+    inputs = OrientGiven.In(cameras=cameras, photos=PHOTOS, walls=WALLS, ties=ties)
+    found = OrientGiven().run(inputs, OrientGiven.Params.model_validate(params), ctx).cameras
+    return found, list(ctx.warnings)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "given").mkdir()
+    return tmp_path
+
+
+def test_a_model_gives_the_poses_of_the_photos_by_name(folder: Path) -> None:
+    write_colmap_model(folder / "given", oriented(name="A.JPG"))
+    photos = ms.photos(replace(PIXEL, name="a.jpg"), replace(PIXEL, name="b.jpg"))
+    cameras, warnings = read(folder, photos)
+    first, second = cameras.cameras
+    assert first.status == "ok"
+    assert first.intrinsics is not None
+    assert first.intrinsics.source == "given"
+    assert ms.wall_error_m(SCENE, first.viewing(), CAMERA) < 1e-9
+    assert second.status == "the files of given cameras say nothing of it"
+    assert warnings == [f"photo b.jpg is not oriented: {second.status}"]
+
+
+def test_the_unit_of_a_model_scales_its_poses(folder: Path) -> None:
+    millimetres = replace(CAMERA, translation=1000.0 * CAMERA.translation)
+    write_colmap_model(folder / "given", oriented(millimetres))
+    (camera,) = read(folder, unit="mm")[0].cameras
+    np.testing.assert_allclose(camera.viewing().centre_world, CAMERA.centre_world, atol=1e-9)
+
+
+def test_photos_of_another_size_are_refused(folder: Path) -> None:
+    write_colmap_model(folder / "given", oriented())
+    small = ms.photos(replace(PIXEL, width=450, height=320))
+    with pytest.raises(
+        InputError, match=r"photo a\.png has 450 x 320 pixels, but its given camera"
+    ):
+        read(folder, small)
+
+
+def test_a_model_of_other_photos_is_refused(folder: Path) -> None:
+    publish_cameras(oriented(name="other.png"), folder / "given", "sha256:0")
+    with pytest.raises(
+        InputError, match=r"orients none of the 1 photos, such as a\.png: it speaks"
+    ):
+        read(folder)
+
+
+def test_given_poses_are_taken_as_they_are(tmp_path: Path) -> None:
+    cameras, warnings = given(tmp_path, oriented())
+    (found,) = cameras.cameras
+    assert found.status == "ok"
+    assert found.sigma_wall_m is None
+    np.testing.assert_array_equal(found.rotation_camera_from_world, CAMERA.rotation)
+    assert not warnings
+    assert cameras.ties is None
+    assert cameras.details["given"] == ["a.png"]
+
+
+@pytest.mark.parametrize("where", ["elsewhere", "behind"])
+def test_poses_that_show_no_wall_are_refused(tmp_path: Path, where: str) -> None:
+    away = {
+        "elsewhere": replace(CAMERA, translation=CAMERA.translation + np.array([500.0, 0, 0])),
+        "behind": ms.camera_before(SCENE, centre=(1.3, 2.6, 1.1)),
+    }[where]
+    with pytest.raises(MethodError, match=r"none of the 1 given poses shows a wall: they stand at"):
+        given(tmp_path, oriented(away))
+
+
+def test_six_ties_by_hand_correct_a_given_pose(tmp_path: Path) -> None:
+    off = ms.nudged(CAMERA, (0.02, -0.02, 0.01, 0.1, -0.05, 0.1))
+    cameras, _ = given(tmp_path, oriented(off), clicked(4))
+    (found,) = cameras.cameras
+    assert found.status == "ok"
+    assert error_share(found) < 3.0
+    assert ms.wall_error_m(SCENE, off, CAMERA) > 0.05
+    assert found.intrinsics == Intrinsics.of(CAMERA)
+    assert cameras.details["given"] == []
+
+
+def test_fewer_ties_check_a_given_pose(tmp_path: Path) -> None:
+    three = first_of(clicked(4), 3)
+    cameras, warnings = given(tmp_path, oriented(), three)
+    assert not warnings
+    off = ms.nudged(CAMERA, (0.02, -0.02, 0.01, 0.1, -0.05, 0.1))
+    again, warnings = given(tmp_path, oriented(off), three)
+    assert again.cameras[0].status == cameras.cameras[0].status == "ok"
+    (warning,) = warnings
+    assert "3 of its 3 ties measured by hand disagree with the given pose, by up to" in warning
+
+
+def test_ties_by_hand_orient_a_photo_without_a_pose(tmp_path: Path) -> None:
+    lost = Cameras(cameras=(Camera(photo="a.png", status="Metashape did not align it"),))
+    (found,) = given(tmp_path, lost)[0].cameras
+    assert found.status == "Metashape did not align it"
+    photos = ms.photos(replace(PIXEL, intrinsics=Intrinsics.of(CAMERA)))
+    inputs = OrientGiven.In(cameras=lost, photos=photos, walls=WALLS, ties=clicked(4))
+    (found,) = OrientGiven().run(inputs, OrientGiven.Params(), context(tmp_path)).cameras.cameras
+    assert found.status == "ok"
+    assert error_share(found) < 3.0
+
+
+def first_of(ties: Ties, count: int) -> Ties:
+    names = ("photo", "wall", "pixels_photo", "points_world", "sigma_px", "sigma_m", "role")
+    arrays = {name: getattr(ties, name)[:count] for name in (*names, "residual_px", "by_hand")}
+    return replace(ties, **arrays)

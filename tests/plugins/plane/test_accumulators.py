@@ -1,0 +1,143 @@
+"""What stands out of an accumulator, who votes, and what planes leave over."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from orthoflow_plugins.plane.accumulators import (
+    ResidualCounts,
+    contrast,
+    parabola,
+    plan_centre_m,
+    vote_counts,
+    voters,
+)
+from orthoflow_plugins.plane.block_kernels import Boxes, PlanCounts, PlanGrid, blocked, box_blocks
+from orthoflow_plugins.plane.sample import Sample
+
+from orthoflow.geometry.point_kernels import read_only
+from tests import scenes
+
+GRID = PlanGrid(
+    basis=scenes.random_rotation(np.random.default_rng(5)),
+    low_m=np.array([-2.0, 3.0, -1.0]),
+    cell_m=0.5,
+    shape=(6, 4, 3),
+)
+
+
+@pytest.mark.parametrize("half", [0, 1, 2])
+def test_contrast_is_a_window_less_the_emptier_one_beside_it(half: int) -> None:
+    votes = np.random.default_rng(half).integers(0, 20, (3, 17))
+    found = contrast(votes, half)
+    assert found.shape == votes.shape
+    apart = 2 * half + 2
+    for row, line in zip(votes, found, strict=True):
+        for place in range(len(row)):
+            windows = [
+                sum(
+                    int(row[k])
+                    for k in range(middle - half, middle + half + 1)
+                    if 0 <= k < len(row)
+                )
+                for middle in (place - apart, place, place + apart)
+            ]
+            assert line[place] == windows[1] - min(windows[0], windows[2])
+
+
+@pytest.mark.parametrize("shift", [-0.4, 0.0, 0.25])
+def test_a_parabola_tells_where_between_bins_its_top_is(shift: float) -> None:
+    values = 9.0 - 2.0 * (np.arange(7) - 3.0 - shift) ** 2
+    assert parabola(values, 3) == pytest.approx(shift)
+
+
+def test_maxima_at_an_end_or_without_a_bend_stay_where_they_are() -> None:
+    rising = np.array([1.0, 2.0, 5.0, 4.0])
+    assert parabola(rising, 0) == parabola(rising, 3) == 0.0
+    assert parabola(np.array([2.0, 1.0, 9.0]), 1) == 0.0
+    assert parabola(np.array([1.0, 2.0, 3.0]), 1) == 0.0
+    # No further than the side of the bin.
+    assert parabola(np.array([0.0, 1.0, 1.9]), 1) == 0.5
+    assert parabola(np.array([1.9, 1.0, 0.0]), 1) == -0.5
+
+
+def test_cells_vote_with_their_points_or_alike() -> None:
+    counts = np.array([[0, 4, 0], [9, 0, 2], [0, 0, 7]])
+    assert vote_counts(counts, "counts") is counts
+    # Four cells, 5.5 points on average.
+    np.testing.assert_array_equal(vote_counts(counts, "unit"), np.where(counts > 0, 6, 0))
+    np.testing.assert_array_equal(vote_counts(np.zeros_like(counts), "unit"), 0)
+    few = np.array([[1, 0], [0, 0]])
+    np.testing.assert_array_equal(vote_counts(few, "unit"), few)
+
+
+def test_edges_of_the_density_vote_alone() -> None:
+    counts = np.zeros((40, 40), dtype=np.int64)
+    counts[10:30, 10:30] = 50
+    votes = vote_counts(counts, "canny")
+    assert set(np.unique(votes)) == {0, 50}
+    rows, columns = np.nonzero(votes)
+    inner = (rows > 12) & (rows < 27) & (columns > 12) & (columns < 27)
+    assert not inner.any()
+    # Of the four sides, two have their edge within the density.
+    assert len(rows) >= 38
+    assert not vote_counts(np.zeros((5, 5), dtype=np.int64), "canny").any()
+
+
+def test_voters_stand_in_the_middle_of_their_cells() -> None:
+    votes = np.zeros((6, 4), dtype=np.int64)
+    votes[0, 0], votes[5, 1] = 3, -2
+    found = voters(GRID, votes)
+    np.testing.assert_allclose(found.centre_m, [-0.5, 4.0])
+    np.testing.assert_allclose(plan_centre_m(GRID), [-0.5, 4.0])
+    np.testing.assert_allclose(found.places_m + found.centre_m, [[-1.75, 3.25], [0.75, 3.75]])
+    np.testing.assert_array_equal(found.votes, [3, -2])
+
+
+def sampled(n_represented: float) -> tuple[ResidualCounts, PlanCounts, np.ndarray, np.ndarray]:
+    """Points in known cells and storeys, some outside; the plan has twice as many of each."""
+    rng = np.random.default_rng(1)
+    places = rng.integers(-1, np.array(GRID.shape) + 1, (900, 3))
+    offsets_m = (GRID.low_m + GRID.cell_m * (places + rng.uniform(0.1, 0.9, (900, 3)))) @ GRID.basis
+    columns = read_only(*np.ascontiguousarray(offsets_m.T.astype(np.float32)))
+    points = blocked(columns, box_blocks(columns, parts=1).boxes)
+    sample = Sample(
+        index=np.arange(900), offsets_m=offsets_m, points=points, n_represented=n_represented
+    )
+    cells, heights = counted(places)
+    plan = PlanCounts(
+        cells=2 * cells, heights=2 * heights, boxed=Boxes(boxes=points.boxes, n_unusable=0)
+    )
+    return ResidualCounts(plan, GRID, sample), plan, places, rng.random(900) < 0.4
+
+
+def counted(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    inside = (places >= 0) & (places < np.array(GRID.shape))
+    over = inside[:, 0] & inside[:, 1]
+    cells = np.zeros(GRID.shape[:2], dtype=np.int64)
+    np.add.at(cells, tuple(places[over, :2].T), 1)
+    heights = np.bincount(places[over & inside[:, 2], 2], minlength=GRID.shape[2])
+    return cells, heights
+
+
+def test_of_a_full_sample_each_cell_is_left_what_nobody_took() -> None:
+    residuals, plan, places, is_taken = sampled(1.0)
+    claims = np.where(is_taken, 3, -1).astype(np.int8)
+    cells, heights = counted(places[~is_taken])
+    np.testing.assert_array_equal(residuals.cells(claims), 2 * cells)
+    np.testing.assert_array_equal(residuals.heights(claims), 2 * heights)
+    nobody = np.full(900, -1, dtype=np.int8)
+    np.testing.assert_array_equal(residuals.cells(nobody), plan.cells)
+    np.testing.assert_array_equal(residuals.heights(np.zeros(900, dtype=np.int8)), 0)
+
+
+def test_of_a_thin_sample_cells_ask_their_neighbours_too() -> None:
+    residuals, plan, places, is_taken = sampled(2.0)
+    claims = np.where(is_taken, 0, -1).astype(np.int8)
+    every, left = counted(places)[0], counted(places[~is_taken])[0]
+    wide = [np.pad(values, 1) for values in (every, left)]
+    around = [
+        sum(values[i : i + 6, j : j + 4] for i in range(3) for j in range(3)) for values in wide
+    ]
+    expected = np.rint(plan.cells * (around[1] / around[0]))
+    np.testing.assert_array_equal(residuals.cells(claims), expected)

@@ -1,0 +1,108 @@
+"""Intensities of scans brought together: what was put into them comes out again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from orthoflow_plugins.raster.balancing import balanced
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import PointCloud
+from tests import raster_scenes as scenes
+from tests.plane_scenes import cloud_of
+
+STATIONS = np.array([[-1.5, -3.0, 0.2], [2.0, -1.5, -0.3], [0.2, -5.0, 0.0]])
+SCALES = np.array([1.0, 0.7, 1.3])
+RANGE_POWER, COSINE_POWER = -0.8, 0.6
+ORIGIN = (1000.0, 2000.0, 100.0)
+
+
+def slab() -> Slab:
+    """The wall y = 0 of 4 x 3 m, seen from the south."""
+    frame = WallFrame(
+        origin_world=np.array([-2.0, 0.0, 1.5]) + ORIGIN,
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=np.array([0.0, 0.0, -1.0]),
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=0.01,
+        width=400,
+        height=300,
+    )
+    return Slab(frame=frame, front_m=0.05, behind_m=0.03)
+
+
+def albedo(points: np.ndarray) -> np.ndarray:
+    return 0.2 + 0.05 * np.sin(2.0 * points[:, 0]) * np.cos(3.0 * points[:, 2])
+
+
+def cloud(n_scans: int = 3, n_points: int = 40_000) -> tuple[PointCloud, np.ndarray]:
+    """A wall seen by several scans, with a tenth of the points off it; and what each should be."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack(
+        [rng.uniform(-2.3, 2.3, n_points), np.zeros(n_points), rng.uniform(-1.8, 1.8, n_points)]
+    )
+    # Before the slab, behind it, and just within.
+    points[::10, 1], points[1::10, 1], points[2::10, 1] = -0.06, 0.04, -0.04
+    scan = rng.integers(0, n_scans, n_points)
+    rays = STATIONS[scan] - points
+    range_m = np.linalg.norm(rays, axis=1)
+    cosine = -rays[:, 1] / range_m
+    true = albedo(points)
+    seen = true * SCALES[scan] * range_m**RANGE_POWER * cosine**COSINE_POWER
+    plain = cloud_of(points, origin=ORIGIN, stations=STATIONS[:n_scans])
+    return (
+        replace(plain, scan=scan.astype(np.uint16), intensity=seen.astype(np.float32)),
+        true,
+    )
+
+
+def test_scale_range_and_incidence_are_told_from_places_that_several_scans_see(
+    tmp_path: Path,
+) -> None:
+    known, true = cloud()
+    ctx = scenes.context(tmp_path)
+    found = balanced(known, [slab()], ctx)
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    assert metrics["intensity_range_power"] == pytest.approx(RANGE_POWER, abs=0.03)
+    assert metrics["intensity_cosine_power"] == pytest.approx(COSINE_POWER, abs=0.06)
+    assert metrics["intensity_scale_spread"] == pytest.approx(0.6, abs=0.03)
+    points = known.points_world() - ORIGIN
+    on_wall = (np.abs(points[:, 0]) < 2.0) & (np.abs(points[:, 2]) < 1.5)
+    on_wall &= (points[:, 1] < 0.03) & (points[:, 1] > -0.05)
+    assert 0.3 < on_wall.mean() < 0.9
+    assert found.intensity is not None
+    assert known.intensity is not None
+    # What does not lie on the wall stays.
+    np.testing.assert_array_equal(found.intensity[~on_wall], known.intensity[~on_wall])
+    # As the first scan would see all from three metres, straight on.
+    ratio = found.intensity[on_wall] / true[on_wall]
+    spread_before = np.std(known.intensity[on_wall] / true[on_wall])
+    assert np.std(ratio) < 0.05 * spread_before
+    assert np.median(ratio) == pytest.approx(3.0**RANGE_POWER, rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["intensity", "scan", "stations"])
+def test_without_scans_that_are_known_nothing_changes_and_that_is_said(
+    name: str, tmp_path: Path
+) -> None:
+    known, _ = cloud(n_points=500)
+    missing: Any = {name: None}
+    if name == "stations":
+        missing["stations_source"] = None
+    plain = replace(known, **missing)
+    ctx = scenes.context(tmp_path)
+    assert balanced(plain, [slab()], ctx) is plain
+    assert any("balancing takes scans with known stations" in text for text in ctx.warnings)
+    assert not ctx.metrics
+
+
+def test_scans_that_do_not_overlap_stay_as_they_are(tmp_path: Path) -> None:
+    known, _ = cloud(n_scans=1, n_points=4_000)
+    ctx = scenes.context(tmp_path)
+    assert balanced(known, [slab()], ctx) is known
+    assert any("no two scans overlap" in text for text in ctx.warnings)

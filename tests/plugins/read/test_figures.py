@@ -1,0 +1,192 @@
+"""Pictures of what was read: the pixels of views from above and of the scanner, and the sheet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.read import figures
+from orthoflow_plugins.read.figures import ContactSheet, plan_view_png, polar_view_png
+
+from orthoflow.products import PointCloud
+from tests.plane_scenes import cloud_of
+
+
+def pixels(encoded: bytes | None) -> NDArray[np.uint8]:
+    assert encoded is not None
+    return np.asarray(cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED))
+
+
+# --- from above ---
+
+
+def test_a_plan_is_as_bright_as_the_logarithm_of_its_points() -> None:
+    # A grid of two by one metres with one point per pixel, and a corner with seven more.
+    x, y = np.meshgrid(np.arange(640) / 320.0, np.arange(320) / 320.0)
+    grid = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    crowd = np.tile([1.6, 0.8, 3.0], (7, 1))
+    shown = pixels(plan_view_png(cloud_of(np.concatenate([grid, crowd]))))
+    # The outermost thousandth is cut off.
+    assert shown.shape[1] == 640
+    assert shown.shape[0] == pytest.approx(320, abs=2)
+    values, counts = np.unique(shown, return_counts=True)
+    # One point, two where points share a pixel, none between; eight or nine at the crowd.
+    assert shown.max() == 255
+    row, column = np.unravel_index(shown.argmax(), shown.shape)
+    assert column / 639 == pytest.approx(0.8, abs=0.01)
+    # Row 0 is the top: four fifths up.
+    assert 1.0 - row / (len(shown) - 1) == pytest.approx(0.8, abs=0.01)
+    single = values[counts.argmax()]
+    crowded = {round(255.0 * np.log(2.0) / np.log(1.0 + n)) for n in (8, 9, 10)}
+    assert int(single) in crowded
+
+
+def test_a_plan_follows_up_and_bears_a_single_place() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform((0.0, 0.0, 0.0), (1.0, 0.01, 4.0), (30_000, 3))
+    # Seen along y: what lies along z is across the view.
+    shown = pixels(plan_view_png(cloud_of(points, up=(0.0, 1.0, 0.0))))
+    assert sorted(shown.shape) == [pytest.approx(160, abs=3), 640]
+    assert pixels(plan_view_png(cloud_of(np.ones((5, 3))))).shape == (1, 1)
+
+
+# --- as its scanner saw it ---
+
+
+def scanned(rows: int = 20, columns: int = 30) -> PointCloud:
+    """A station in the middle of a cylinder: row 0 lowest, column 0 in the east, to the left."""
+    row, column = (grid.ravel() for grid in np.mgrid[:rows, :columns])
+    azimuth, elevation = np.radians(3.0 * column), np.radians(2.0 * (row - 9.5))
+    points = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
+    cloud = cloud_of(points, stations=np.zeros((1, 3)))
+    return replace(
+        cloud,
+        row=row.astype(np.uint32),
+        column=column.astype(np.uint32),
+        intensity=(row / (rows - 1.0)).astype(np.float32),
+    )
+
+
+def some_of(cloud: PointCloud, kept: NDArray[np.intp]) -> PointCloud:
+    names = ("x", "y", "z", "row", "column", "intensity")
+    return replace(cloud, **{name: getattr(cloud, name)[kept] for name in names})
+
+
+def expected_grey(cloud: PointCloud, rows: int, columns: int) -> NDArray[np.uint8]:
+    """Brightness over rows and columns as they are numbered."""
+    assert cloud.intensity is not None
+    values = np.full((rows, columns), np.nan)
+    values[cloud.row, cloud.column] = cloud.intensity
+    low, high = np.nanquantile(values, (0.01, 0.99))
+    bright = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return np.where(np.isnan(values), 0.0, np.rint(32.0 + 223.0 * bright)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_a_scan_is_shown_as_its_station_saw_it(mirrored: bool, upside_down: bool) -> None:
+    cloud = scanned()
+    # A place from which no point came, and a point more beside it.
+    column = np.where((cloud.row == 3) & (cloud.column == 4), 5, cloud.column)
+    cloud = replace(cloud, column=column.astype(np.uint32))
+    # Azimuth grows with the columns: to the left.
+    truth = expected_grey(cloud, 20, 30)[::-1, ::-1]
+    if mirrored:
+        cloud = replace(cloud, column=29 - cloud.column)
+    if upside_down:
+        cloud = replace(cloud, row=19 - cloud.row)
+    shown = pixels(polar_view_png(cloud))
+    assert np.abs(shown.astype(int) - truth).max() <= 1
+    assert shown[16, 25] == 0
+
+
+def test_a_scan_without_a_station_is_shown_with_its_rows_upwards() -> None:
+    cloud = scanned()
+    truth = expected_grey(cloud, 20, 30)[::-1]
+    for blind in (
+        replace(cloud, stations=None, stations_source=None),
+        replace(cloud, stations_source="view_from"),
+    ):
+        assert np.abs(pixels(polar_view_png(blind)).astype(int) - truth).max() <= 1
+
+
+def test_the_scan_with_most_points_is_shown() -> None:
+    cloud = scanned()
+    scan = np.where(cloud.column < 10, 0, 1).astype(np.uint16)
+    both = replace(cloud, scan=scan, stations=np.zeros((2, 3)), column=cloud.column + 5)
+    shown = pixels(polar_view_png(both))
+    assert shown.shape == (20, 20)
+    # A station that is not known tells no side.
+    one = replace(both, stations=np.zeros((1, 3)))
+    np.testing.assert_array_equal(pixels(polar_view_png(one)), shown[:, ::-1])
+
+
+def test_thin_scans_are_shown_with_wider_pixels() -> None:
+    cloud = scanned(20, 30)
+    every = replace(cloud, row=4 * cloud.row, column=4 * cloud.column)
+    shown = pixels(polar_view_png(every))
+    # 600 points on 77 x 117 places: one in fifteen.
+    assert shown.shape == (20, 30)
+    assert (shown > 0).all()
+
+
+def test_clouds_without_rows_or_intensity_have_no_such_view() -> None:
+    cloud = scanned()
+    for name in ("row", "column", "intensity"):
+        names = ("row", "column") if name != "intensity" else ("intensity",)
+        assert polar_view_png(replace(cloud, **dict.fromkeys(names))) is None
+    assert polar_view_png(some_of(cloud, np.empty(0, dtype=np.intp))) is None
+
+
+# --- the sheet ---
+
+
+@pytest.fixture
+def _exact_sheets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "encode_webp", np.array)
+
+
+@pytest.mark.usefixtures("_exact_sheets")
+def test_photos_stand_in_rows_above_their_names() -> None:
+    sheet = ContactSheet(3)
+    assert sheet.caption == "The photos, as they are stored."
+    colours = [(200, 10, 10), (10, 200, 10), (10, 10, 200)]
+    shapes = [(400, 800), (800, 400), (200, 576)]
+    for k, (colour, shape) in enumerate(zip(colours, shapes, strict=True)):
+        sheet.add(f"photo {k}.jpg", np.full((*shape, 3), colour, dtype=np.uint8))
+    shown: Any = np.array(sheet.encoded())
+    # Two columns of 300 pixels, photos 6 from the side; 18 for the name below.
+    sizes = [(144, 288), (270, 135), (100, 288)]
+    top_of_second = 270 + 18 + 12
+    assert shown.shape == (top_of_second + 100 + 30, 600, 3)
+    corners = [(6, 6), (6, 306), (top_of_second + 6, 6)]
+    for colour, (height, width), (top, left) in zip(colours, sizes, corners, strict=True):
+        is_photo = (shown == colour).all(axis=2)
+        rows, columns = np.nonzero(is_photo)
+        assert (rows.min(), rows.max() + 1) == (top, top + height)
+        assert (columns.min(), columns.max() + 1) == (left, left + width)
+        below = shown[top + height : top + height + 18, left : left + 200]
+        assert (below < 100).any()
+    assert (shown[top_of_second:, 300:] == 245).all()
+
+
+@pytest.mark.usefixtures("_exact_sheets")
+def test_sheets_hold_no_more_than_a_hundred_photos_and_twelve_hundred_pixels() -> None:
+    sheet = ContactSheet(130)
+    assert (sheet.n_shown, sheet.n_photos) == (100, 130)
+    assert sheet.caption == "The first 100 of 130 photos, as they are stored."
+    for k in range(130):
+        sheet.add(f"{k}", np.zeros((50, 50, 3), dtype=np.uint8))
+    shown: Any = np.array(sheet.encoded())
+    assert shown.shape[:2] == (10 * (90 + 18 + 12), 1200)
+
+
+def test_long_names_are_cut_in_the_middle() -> None:
+    assert figures._shortened("abcdefghij", 10) == "abcdefghij"
+    assert figures._shortened("abcdefghijk", 10) == "abc..ghijk"
+    assert figures._shortened("abcdefghijkl", 9) == "abc..ijkl"
+    assert figures._shortened("Gebäude.jpg", 40) == "Geb?ude.jpg"

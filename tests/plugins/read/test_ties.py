@@ -1,0 +1,84 @@
+"""`read.ties`: what a person measured, and a sentence with its line for what cannot be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.read.ties import ReadTies
+
+from orthoflow.errors import InputError
+from orthoflow.files.images import encode_png
+from orthoflow.products import InputFiles, Photo, Photos, Ties
+from orthoflow.sdk import StepContext
+
+PHOTOS = Photos(
+    photos=tuple(
+        Photo(name=name, encoded=encode_png(np.zeros((48, 64), np.uint8)), width=64, height=48)
+        for name in ("a.jpg", "b c.jpg")
+    )
+)
+
+
+def read(folder: Path, *texts: str, **params: object) -> Ties:
+    paths = []
+    for index, text in enumerate(texts):
+        paths.append(folder / f"ties{index}.csv")
+        paths[-1].write_text(text)
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
+    inputs = ReadTies.In(files=InputFiles(name="ties", paths=tuple(paths)), photos=PHOTOS)
+    return ReadTies().run(inputs, ReadTies.Params.model_validate(params), ctx).ties
+
+
+def test_ties_come_out_with_our_pixels_and_the_sigmas_that_are_said(tmp_path: Path) -> None:
+    text = (
+        "x,y,z,photo,v_px,u_px,sigma_px\n1,2,3,b c.jpg,20.25,10.5,0.4\n# later\n4,5,6,a.jpg,0,0,\n"
+    )
+    ties = read(tmp_path, text, "a.jpg;63;47;7;8;634512.345\n", sigma_px=2.0, sigma_m=0.005)
+    assert ties.photo_names == ("a.jpg", "b c.jpg")
+    np.testing.assert_array_equal(ties.photo, [1, 0, 0])
+    # OpenCV's first pixel centre is at (0, 0), ours at (0.5, 0.5).
+    np.testing.assert_array_equal(ties.pixels_photo, [[11.0, 20.75], [0.5, 0.5], [63.5, 47.5]])
+    np.testing.assert_array_equal(ties.points_world, [[1, 2, 3], [4, 5, 6], [7, 8, 634512.345]])
+    np.testing.assert_array_equal(ties.sigma_px, [0.4, 2.0, 2.0])
+    np.testing.assert_array_equal(ties.sigma_m, [0.005] * 3)
+    np.testing.assert_array_equal(ties.by_hand, [1, 1, 1])
+    np.testing.assert_array_equal(ties.wall, [-1, -1, -1])
+
+
+def test_points_come_out_in_metres(tmp_path: Path) -> None:
+    ties = read(tmp_path, "a.jpg,1,2,1000,2000,3000\n", unit="ft")
+    np.testing.assert_allclose(ties.points_world, [[304.8, 609.6, 914.4]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("photo,u_px,v_px,x,y,z\nA.jpg,1,2,3,4,5\n", "ties0.csv:2: there is no photo A.jpg among"),
+        ("A.jpg,1,2,3,4,5\n", r"photo A.jpg among those given \(did you mean a.jpg\?\)"),
+        ("a.jpg,64,2,3,4,5\n", r"ties0.csv:1: \(u 64, v 2\) lies outside photo a.jpg, which"),
+        ("a.jpg,1,47.6,3,4,5\n", "photo a.jpg, which is 64 x 48 pixels as it is stored"),
+        ("photo,u_px,v_px,x,y,z\na.jpg,1,2,3,4\n", "ties0.csv:2: expected 6 columns, got 5"),
+        ("a.jpg,1,2,3,4,nan\n", "ties0.csv:1: z must be a number, got nan"),
+        ("photo,u_px,v_px,x,y,z,sigma_px\na.jpg,1,2,3,4,5,0\n", "sigma_px must be positive, got 0"),
+        ("photo,u,v,x,y,z\n", r"unknown column u; known are photo, u_px|unknown column u \("),
+        ("photo,u_px,x,y,z\na.jpg,1,2,3,4\n", "the column v_px is missing"),
+        ("a.jpg,1,2,3\n", r"photo,u_px,v_px,x,y,z\[,sigma_px\], got 4 values without names"),
+        ("photo,u_px,v_px,x,y,z\n", "only the names of the columns, no ties"),
+        ("", "holds no ties: expected photo,u_px,v_px,x,y,z per line"),
+        (",1,2,3,4,5\n", "ties0.csv:1: the name of the photo is missing"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_said_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, text)
+
+
+def test_all_problems_are_said_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, "photo,u_px,v_px,x,y,z\na.jpg,x,2,3,4,5\na.jpg,1,2,3,4,5\na.jpg,1,2,3,4,!\n")
+    assert [line.split(": ")[0] for line in str(caught.value).splitlines()] == [
+        "ties0.csv:2",
+        "ties0.csv:4",
+    ]

@@ -1,0 +1,205 @@
+"""Names from strangers become files in their folder, or nothing at all."""
+
+from __future__ import annotations
+
+import os
+import socket
+import unicodedata
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from orthoflow_provenance.errors import UnsafeFileError
+from orthoflow_provenance.inner_files import (
+    colliding,
+    create_below,
+    files_below,
+    name_problem,
+    open_below,
+    path_below,
+    path_problem,
+)
+
+REFUSED = {
+    "": "is empty",
+    ".": "is . or ..",
+    "..": "is . or ..",
+    "../x": "holds / or a backslash",
+    "/etc/passwd": "holds / or a backslash",
+    "..\\x": "holds / or a backslash",
+    "a\0b": "holds a control character",
+    "a\nb": "holds a control character",
+    "a\x1b[31m": "holds a control character",
+    "a\x85b": "holds a control character",
+    "a\u2028b": "holds a control character",
+    "a\ud800b": "holds a control character",
+    "ä" * 128: "is longer than 255 bytes",
+    "photo.": "ends with a dot or a space",
+    "photo ": "ends with a dot or a space",
+    "con": "is reserved for a device",
+    "NUL.txt": "is reserved for a device",
+    "Aux .tar.gz": "is reserved for a device",
+    "com1": "is reserved for a device",
+    "LPT³": "is reserved for a device",
+    "CONIN$": "is reserved for a device",
+    "C:x": "begins with the letter of a drive",
+}
+TAKEN = ("hall.e57", "ortho@plane=ransac,orient=pnp#2", ".hidden", "Saal 12:30.jpg", "ä" * 127)
+TAKEN += ("console", "com10", "null", "a..b", "..a", "שלום.jpg", "a\u200cb", "👩‍🚒.png")
+# Letters that paths are made of, and any others.
+NAMES = st.text(st.sampled_from("./\\ab:\0\n ~-") | st.characters(), max_size=12)
+
+
+@pytest.mark.parametrize("name", REFUSED, ids=ascii)
+def test_names_that_lead_elsewhere_or_are_no_names_everywhere_are_refused(name: str) -> None:
+    assert name_problem(name) == REFUSED[name]
+    with pytest.raises(UnsafeFileError, match="so it cannot be the name of a file here"):
+        path_below(Path("folder"), name)
+
+
+@pytest.mark.parametrize("name", TAKEN, ids=ascii)
+def test_ordinary_names_are_taken_as_they_are(tmp_path: Path, name: str) -> None:
+    assert name_problem(name) == ""
+    assert path_below(tmp_path, f"walls/{name}") == tmp_path / "walls" / name
+
+
+@pytest.mark.parametrize(
+    ("path", "problem"),
+    [
+        ("", "is empty"),
+        ("/etc/passwd", "is absolute"),
+        ("products//a.tif", "has a part that is empty"),
+        ("products/../../a.tif", "has a part that is . or .."),
+        ("products/a.tif/", "has a part that is empty"),
+        ("/".join(["a" * 200] * 21), "is longer than 4095 bytes"),
+    ],
+)
+def test_paths_that_lead_elsewhere_are_refused(path: str, problem: str) -> None:
+    assert path_problem(path) == problem
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(NAMES, max_size=4).map("/".join))
+@example("..")
+@example("a/../../b")
+@example("//a")
+def test_whatever_is_accepted_stays_below_its_folder(path: str) -> None:
+    folder = Path("/some/where")
+    if path_problem(path):
+        with pytest.raises(UnsafeFileError):
+            path_below(folder, path)
+        return
+    made = path_below(folder, path)
+    assert os.path.normpath(made) == str(made)
+    assert str(made) == f"{folder}/{path}"
+    assert not any(unicodedata.category(letter) in {"Cc", "Cs"} for letter in str(made))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(NAMES, min_size=1, max_size=3).map("/".join), st.binary(max_size=20))
+def test_what_is_written_under_any_name_comes_back_or_nothing_is_written(
+    tmp_path_factory: pytest.TempPathFactory, path: str, content: bytes
+) -> None:
+    outside = tmp_path_factory.mktemp("outside")
+    folder = outside / "inside"
+    folder.mkdir()
+    try:
+        with create_below(folder, path) as stream:
+            stream.write(content)
+    except UnsafeFileError:
+        assert list(outside.rglob("*")) == [folder]
+        return
+    with open_below(folder, path) as stream:
+        assert stream.read() == content
+    assert [item for item in outside.rglob("*") if item.is_file()] == [folder / path]
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [("a.png", "A.png"), ("ä.png", "a\u0308.png"), ("straße", "STRASSE"), ("x", "x")],
+)
+def test_names_that_some_systems_take_for_one_collide(one: str, other: str) -> None:
+    assert colliding(["b", one, "c", other]) == other
+    assert colliding(["b", one, "c"]) == ""
+
+
+def test_only_files_are_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    secret = tmp_path / "secret"
+    secret.write_text("secret")
+    (folder / "folder").mkdir()
+    os.mkfifo(folder / "pipe")
+    (folder / "zero").symlink_to("/dev/zero")
+    (folder / "link").symlink_to(secret)
+    (folder / "dangling").symlink_to(tmp_path / "nothing")
+    (folder / "way").symlink_to(tmp_path)
+    (folder / "own").write_text("own")
+    (folder / "to-own").symlink_to("own")
+    with socket.socket(socket.AF_UNIX) as opened:
+        # Addresses of sockets are short.
+        monkeypatch.chdir(folder)
+        opened.bind("socket")
+        for name in ("folder", "pipe", "zero", "link", "dangling", "to-own", "socket"):
+            with pytest.raises(UnsafeFileError, match=f"'{name}' must be a file, but a"):
+                open_below(folder, name)
+    with pytest.raises(UnsafeFileError, match="'way' is a link, and links are not followed"):
+        open_below(folder, "way/secret")
+    with pytest.raises(FileNotFoundError):
+        open_below(folder, "nothing")
+    with open_below(folder, "own") as stream:
+        assert stream.read() == b"own"
+    assert files_below(tmp_path, "run") == ("own",)
+    assert files_below(folder, "way") == ()
+    assert files_below(folder, "nothing") == ()
+
+
+def test_a_file_exchanged_for_a_link_after_the_look_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "secret").write_text("secret")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "a.tif").write_text("pixels")
+    look = os.stat
+
+    def stat(*arguments: object, **options: object) -> os.stat_result:
+        found = look(*arguments, **options)  # type: ignore[arg-type,call-overload]
+        if arguments == ("a.tif",):
+            (tmp_path / "run" / "a.tif").unlink()
+            (tmp_path / "run" / "a.tif").symlink_to(tmp_path / "secret")
+        return found  # type: ignore[no-any-return]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "stat", stat)
+        with pytest.raises((UnsafeFileError, OSError)):
+            open_below(tmp_path / "run", "a.tif")
+
+
+def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "outside").mkdir()
+    other = tmp_path / "outside" / "other.txt"
+    other.write_text("as it was")
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "way").symlink_to(tmp_path / "outside")
+    (folder / "other.txt").symlink_to(other)
+    with (
+        pytest.raises(UnsafeFileError, match="'way' is a link"),
+        create_below(folder, "way/new.txt"),
+    ):
+        pass
+    # The link itself is replaced.
+    with create_below(folder, "other.txt") as stream:
+        stream.write(b"new")
+    assert other.read_text() == "as it was"
+    assert (folder / "other.txt").read_text() == "new"
+    assert list((tmp_path / "outside").iterdir()) == [other]
+
+
+def test_a_file_that_could_not_be_completed_leaves_the_older_one(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("older")
+    with pytest.raises(TypeError), create_below(tmp_path, "a.txt") as stream:
+        stream.writelines([b"new", None])  # type: ignore[list-item]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "older"

@@ -1,0 +1,322 @@
+"""A record from a stranger, sealed as it is, writes and reads nothing outside its folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import h5py
+import pytest
+from orthoflow_provenance.encoding import write_table, write_texts
+
+from orthoflow.records import verify_run
+from tests import hostile_records as hostile
+from tests.studios import Studio, open_studio
+
+LEADING_OUT = ("../../../out", "/out", "..", "nul", "a\x1b]0;b", "x" * 256, "")
+COMMANDS = (
+    ("show",),
+    ("report",),
+    ("replay",),
+    ("export", "--to", "csv"),
+    ("export", "--to", "figures"),
+    ("export", "--to", "ro-crate"),
+    ("export", "--embed"),
+)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    """A run `first` with its input file in the record."""
+    with pytest.MonkeyPatch.context() as patch:
+        studio = open_studio(tmp_path_factory.mktemp("hostile"), patch)
+        (studio.folder / "n.txt").write_text("1.5")
+        studio.run("first", "--input", "number=n.txt", "--embed")
+        yield studio
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory three folders deep, so that a way out would be seen."""
+    place = tmp_path / "x" / "y" / "z"
+    place.mkdir(parents=True)
+    monkeypatch.chdir(place)
+    return place
+
+
+def everything(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if not path.is_relative_to(folder / "x/y/z")}
+
+
+def rename_step(file: h5py.File, name: str) -> None:
+    hostile.set_attribute(file["cells/survey"], "step", name)
+
+
+def name_run(file: h5py.File, name: str) -> None:
+    hostile.set_attribute(file, "name", name)
+
+
+NAMED: dict[str, Callable[[h5py.File, str], None]] = {
+    "figure": lambda file, name: hostile.add_figure(file["cells/paint"], name),
+    "input file": lambda file, name: hostile.rename_files(file, "number", name),
+    "published file": hostile.name_published,
+    "step": rename_step,
+    "run": name_run,
+}
+
+
+@pytest.mark.parametrize("what", NAMED)
+def test_names_that_lead_elsewhere_are_found_and_nothing_is_written_there(
+    finished: Studio, folder: Path, tmp_path: Path, what: str
+) -> None:
+    run = hostile.changed(
+        finished.folder / "first", folder / "run", lambda file: NAMED[what](file, "../../../out")
+    )
+    before = everything(tmp_path)
+    done = finished("verify", run)
+    assert done.exit_code == 3, done.output
+    # The seal fits and keys are those of their preimages, so it is the name alone.
+    assert len(done.stdout.splitlines()) == 1
+    assert "../../../out' holds / or a backslash" in done.stdout or "is . or .." in done.stdout
+    for command in COMMANDS:
+        done = finished(command[0], run, *command[1:])
+        assert done.exit_code == (3 if command[0] == "replay" else done.exit_code), done.output
+        assert done.exit_code in (0, 3), (command, done.output)
+    assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize("what", NAMED)
+def test_every_impossible_name_is_a_finding(finished: Studio, folder: Path, what: str) -> None:
+    for index, name in enumerate(LEADING_OUT):
+        run = hostile.changed(
+            finished.folder / "first",
+            folder / str(index),
+            lambda file, name=name: NAMED[what](file, name),  # type: ignore[misc]
+        )
+        assert verify_run(run).findings, name
+
+
+@pytest.mark.parametrize("name", LEADING_OUT, ids=ascii)
+def test_figures_with_impossible_names_are_not_written(
+    finished: Studio, folder: Path, name: str
+) -> None:
+    run = hostile.changed(
+        finished.folder / "first", folder / "run", lambda file: NAMED["figure"](file, name)
+    )
+    (run / "report.html").unlink()
+    for command in (("report", run), ("export", run, "--to", "figures", "-o", "drawn")):
+        done = finished(*command)
+        assert done.exit_code == 3, done.output
+        assert "so no file can be written for it" in done.output
+    assert sorted(path.name for path in folder.iterdir()) == ["run"]
+    assert not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize("name", ["..", "a\nb", "a\x9b31m"], ids=ascii)
+def test_a_cell_that_no_path_can_name_is_refused_whatever_is_asked(
+    finished: Studio, folder: Path, name: str
+) -> None:
+    def rename(file: h5py.File) -> None:
+        cells = file["cells"].id
+        cells.links.move(b"paint", cells, name.encode())
+
+    run = hostile.changed(finished.folder / "first", folder / "run", rename)
+    for command in (("verify",), *COMMANDS):
+        done = finished(command[0], run, *command[1:])
+        assert done.exit_code == 3, (command, done.output)
+        assert "is no place in a record" in done.output
+    assert sorted(path.name for path in folder.iterdir()) == ["run"]
+
+
+def test_figures_that_some_systems_take_for_one_are_not_laid_over_each_other(
+    finished: Studio, folder: Path
+) -> None:
+    def draw(file: h5py.File) -> None:
+        for name in ("depth", "Depth"):
+            hostile.add_figure(file["cells/paint"], name)
+
+    run = hostile.changed(finished.folder / "first", folder / "run", draw)
+    for command in (("verify", run), ("export", run, "--to", "figures"), ("report", run)):
+        done = finished(*command)
+        assert done.exit_code == 3
+        assert "as some systems see it" in done.output
+    assert not list((run / "figures").rglob("*epth*"))
+
+
+def test_links_and_devices_beside_a_record_are_not_followed(
+    finished: Studio, folder: Path, tmp_path: Path
+) -> None:
+    secret = tmp_path / "secret.txt"
+    secret.write_text("secret")
+
+    def publish(file: h5py.File) -> None:
+        hostile.name_published(file, "products/paint/a", "products/paint/b", "products/paint/c")
+
+    run = hostile.changed(finished.folder / "first", folder / "run", publish)
+    (run / "products" / "paint" / "a").symlink_to("/dev/zero")
+    (run / "products" / "paint" / "b").symlink_to(secret)
+    os.mkfifo(run / "products" / "paint" / "c")
+    done = finished("verify", run)
+    assert done.exit_code == 3
+    assert done.output.count("a link, a folder or a device stands where a file was published") == 3
+    done = finished("export", run, "--to", "ro-crate", "-o", "crate")
+    assert done.exit_code == 0, done.output
+    assert not [path for path in Path("crate").rglob("*") if path.is_symlink()]
+    assert {"a", "b", "c"}.isdisjoint(path.name for path in Path("crate").rglob("*"))
+    (run / "report.html").unlink()
+    (run / "report.html").symlink_to(secret)
+    done = finished("export", run, "--to", "ro-crate", "-o", "other")
+    assert done.exit_code == 3
+    assert "'report.html' must be a file, but a link stands there" in done.output
+    assert b"secret" not in b"".join(
+        p.read_bytes() for p in Path("other").rglob("*") if p.is_file()
+    )
+
+
+def test_a_folder_of_products_elsewhere_is_not_followed(
+    finished: Studio, folder: Path, tmp_path: Path
+) -> None:
+    run = hostile.changed(finished.folder / "first", folder / "run", lambda file: None)
+    (run / "products").rename(tmp_path / "elsewhere")
+    (run / "products").symlink_to(tmp_path / "elsewhere")
+    done = finished("verify", run)
+    assert done.exit_code == 3
+    assert "a link, a folder or a device stands where a file was published" in done.output
+    assert finished.json("show", run)["files"] == []
+
+
+def test_a_sparse_file_is_told_by_its_size(finished: Studio, folder: Path) -> None:
+    run = hostile.changed(finished.folder / "first", folder / "run", lambda file: None)
+    path = run / "products" / "metrics.csv"
+    os.truncate(path, 1 << 40)
+    before = os.times()
+    done = finished("verify", run)
+    after = os.times()
+    assert done.exit_code == 3
+    assert "products/metrics.csv: changed since it was published" in done.output
+    done = finished("export", run, "--to", "ro-crate", "-o", "crate")
+    assert done.exit_code == 3
+    assert "products/metrics.csv has 1099511627776 bytes, but was published with" in done.output
+    path.unlink()
+    os.truncate(run / "report.html", 1 << 40)
+    done = finished("export", run, "--to", "ro-crate", "-o", "other")
+    assert done.exit_code == 3
+    assert "report.html says it has 1099511627776 bytes, but most of it is a hole" in done.output
+    assert after.user + after.system - before.user - before.system < 5
+
+
+@pytest.mark.parametrize(
+    ("command", "link"),
+    [
+        (("report",), "figures"),
+        (("export", "--to", "csv"), "csv"),
+        (("export", "--to", "figures"), "all-figures"),
+        (("export", "--to", "ro-crate"), "ro-crate"),
+        (("export", "--embed"), "embedded"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
+)
+def test_folders_in_a_run_that_are_links_are_not_written_through(
+    finished: Studio, folder: Path, tmp_path: Path, command: tuple[str, ...], link: str
+) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    run = hostile.changed(
+        finished.folder / "first",
+        folder / "run",
+        lambda file: hostile.add_figure(file["cells/paint"], "depth"),
+    )
+    shutil.rmtree(run / link, ignore_errors=True)
+    (run / link).symlink_to(outside)
+    done = finished(command[0], run, *command[1:])
+    assert done.exit_code in (1, 2), done.output
+    assert "is a link" in done.output
+    assert list(outside.iterdir()) == []
+
+
+def test_a_pipe_in_the_place_of_a_record_is_refused_at_once(finished: Studio, folder: Path) -> None:
+    os.mkfifo(folder / "run.h5")
+    for path in (folder, folder / "run.h5", Path("/dev/zero")):
+        done = finished("verify", path)
+        assert done.exit_code == 2, done.output
+        assert done.output.startswith("error: ")
+
+
+def test_an_unfinished_run_with_links_is_not_gone_on_with(
+    finished: Studio, folder: Path, tmp_path: Path
+) -> None:
+    precious = tmp_path / "precious.txt"
+    precious.write_text("a line\nno end")
+    (folder / "run").mkdir()
+    (folder / "run" / "journal.jsonl").symlink_to(precious)
+    done = finished("run", finished.folder / "studio.yaml", "-o", folder / "run")
+    assert done.exit_code == 2
+    assert "holds a link, journal.jsonl" in done.output
+    assert precious.read_text() == "a line\nno end"
+
+
+def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Path) -> None:
+    evil = "\x1b]0;title\x07\x9b2J\u202e\r\nverified: 9 products, seal ok"
+    written = "\\x1b]0;title\\x07\\x9b2J\\u202e\\r\\nverified: 9 products, seal ok"
+
+    def write(file: h5py.File) -> None:
+        hostile.set_attribute(file, "name", f"name {evil}")
+        hostile.set_text(file["cells/paint"], "log", evil)
+        for column in ("warnings", "citations"):
+            del file["cells/paint"][column]
+            write_texts(file["cells/paint"], column, [f"{column} {evil}"])
+        hostile.add_figure(file["cells/paint"], f"figure {evil}")
+
+    run = hostile.changed(finished.folder / "first", folder / "run", write)
+    done = finished("show", run)
+    assert done.exit_code == 0, done.output
+    assert f"name {written}, run " in done.output
+    assert f"warning, paint: warnings {written}\n" in done.output
+    said = json.loads(finished("show", run, "--json").output)
+    assert said["name"] == f"name {evil}"
+    outputs = [done.output]
+    outputs += [
+        finished(words[0], run, *words[1:]).output
+        for command in (("verify",), ("compare", finished.folder / "first"), *COMMANDS)
+        for words in (command, (*command, "--json"))
+    ]
+    obeyed = set("".join(outputs)) & set(evil) - set(" ]:;,0129Jtile\nverifdpouckasx")
+    assert obeyed == set()
+    assert not re.search("^verified: 9", "".join(outputs), re.MULTILINE)
+
+
+def test_tables_for_spreadsheets_hold_no_formulas(finished: Studio, folder: Path) -> None:
+    def write(file: h5py.File) -> None:
+        rows = [("=HYPERLINK(1)", -1.5, "@unit"), ("plain", 2.0, "1")]
+        del file["cells/paint/metrics"]
+        write_table(
+            file["cells/paint"], "metrics", (("name", str), ("value", float), ("unit", str)), rows
+        )
+
+    run = hostile.changed(finished.folder / "first", folder / "run", write)
+    assert finished("export", run, "--to", "csv", "-o", "csv").exit_code == 0
+    text = Path("csv/metrics.csv").read_text()
+    assert "paint,paint,paint.plain,'=HYPERLINK(1),-1.5,'@unit\n" in text
+    assert "paint,paint,paint.plain,plain,2.0,1\n" in text
+
+
+@pytest.mark.parametrize("command", [("compare",), ("show",), ("report",)], ids=" ".join)
+def test_what_fails_on_a_damaged_record_is_said_to_be_its_fault(
+    finished: Studio, folder: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(finished.folder / "first", folder / "run")
+    with h5py.File(folder / "run" / "run.h5", "r+") as file:
+        hostile.set_text(file["cells/paint"], "key_preimage", "{")
+    # Nothing there reads the preimage, so let something fail in its place.
+    monkeypatch.setattr("orthoflow.records.open_run", lambda _: {}["missing"])
+    runs = (finished.folder / "first", folder / "run") if command[0] == "compare" else ("run",)
+    done = finished(command[0], *runs)
+    assert done.exit_code == 3, done.output
+    assert "is not as it was written: /cells/paint/key_preimage: changed after" in done.output
+    done = finished(command[0], *[finished.folder / "first"] * len(runs))
+    assert done.exit_code == 1
+    assert "orthoflow itself failed" in done.output

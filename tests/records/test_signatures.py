@@ -1,0 +1,244 @@
+"""A record can be signed: who signed it is told from everybody else, and a change is noticed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    KeySerializationEncryption,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+)
+
+from tests import hostile_records as hostile
+from tests.studios import Studio, open_studio
+
+PASSWORD = "correct horse"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Studio]:
+    """Two runs, and keys of two people."""
+    with pytest.MonkeyPatch.context() as patch:
+        studio = open_studio(tmp_path_factory.mktemp("signatures"), patch)
+        studio.run("first")
+        studio.run("second", "--set", "paint.grey=99")
+        write_keys(studio.folder)
+        yield studio
+
+
+def write_keys(folder: Path) -> None:
+    jane, joe = Ed25519PrivateKey.generate(), Ed25519PrivateKey.generate()
+    protected = BestAvailableEncryption(PASSWORD.encode())
+    write_key(folder, "jane", jane, PrivateFormat.OpenSSH, NoEncryption())
+    write_key(folder, "jane-pem", jane, PrivateFormat.PKCS8, NoEncryption())
+    write_key(folder, "jane-protected", jane, PrivateFormat.OpenSSH, protected)
+    write_key(folder, "jane-pem-protected", jane, PrivateFormat.PKCS8, protected)
+    write_key(folder, "joe", joe, PrivateFormat.OpenSSH, NoEncryption())
+    other = ec.generate_private_key(ec.SECP256R1())
+    write_key(folder, "other", other, PrivateFormat.PKCS8, NoEncryption())
+    pem = jane.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+    (folder / "jane-pem.pub").write_bytes(pem)
+
+
+def write_key(
+    folder: Path,
+    name: str,
+    key: Ed25519PrivateKey | ec.EllipticCurvePrivateKey,
+    form: PrivateFormat,
+    protection: KeySerializationEncryption,
+) -> None:
+    (folder / name).write_bytes(key.private_bytes(Encoding.PEM, form, protection))
+    public = key.public_key().public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH)
+    (folder / f"{name}.pub").write_bytes(public + b" jane@example.org\n")
+
+
+@pytest.fixture
+def run(finished: Studio, tmp_path: Path) -> Path:
+    shutil.copytree(finished.folder / "first", tmp_path / "run")
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("key", ["jane", "jane-pem"])
+@pytest.mark.parametrize("signer", ["jane.pub", "jane-pem.pub"])
+def test_a_signed_record_is_told_by_the_key_of_its_signer(
+    finished: Studio, run: Path, key: str, signer: str
+) -> None:
+    before = (run / "run.h5").read_bytes()
+    done = finished("sign", run, "--key", key)
+    assert done.exit_code == 0, done.output
+    assert f"signed: {run / 'run.h5'}.sig, with the key SHA256:" in done.output
+    assert (run / "run.h5").read_bytes() == before
+    done = finished("verify", run, "--signer", signer)
+    assert done.exit_code == 0, done.output
+    assert "seal ok" in done.output
+    assert "signed with SHA256:" in done.output
+    assert "not checked" not in done.output
+    said = finished.json("verify", run, "--signer", signer)
+    assert said["signed_with"] == done.output.rpartition("signed with ")[2].strip()
+    # Signed again with the same key it stays signed.
+    assert finished("sign", run, "--key", "jane").exit_code == 0
+    assert finished("verify", run, "--signer", signer).exit_code == 0
+
+
+def test_verifying_without_a_key_says_that_the_signature_was_not_checked(
+    finished: Studio, run: Path
+) -> None:
+    assert "signature" not in finished("verify", run).output
+    finished("sign", run, "--key", "jane")
+    done = finished("verify", run)
+    assert done.exit_code == 0
+    assert "note: there is a signature, said to be of the key SHA256:" in done.output
+    assert "not checked: name the signer's public key with --signer" in done.output
+    assert finished.json("verify", run)["signed_with"] == ""
+
+
+def test_a_missing_signature_and_anothers_are_findings(finished: Studio, run: Path) -> None:
+    done = finished("verify", run, "--signer", "jane.pub")
+    assert done.exit_code == 3
+    assert "run.h5 is not signed: there is no run.h5.sig beside it" in done.output
+    finished("sign", run, "--key", "joe")
+    done = finished("verify", run, "--signer", "jane.pub")
+    assert done.exit_code == 3
+    assert "run.h5 is signed with the key SHA256:" in done.output
+    assert "not with SHA256:" in done.output
+    # Who says to be jane has not her key.
+    signature = json.loads((run / "run.h5.sig").read_text())
+    signature["public_key"] = " ".join(Path("jane.pub").read_text().split()[:2])
+    (run / "run.h5.sig").write_text(json.dumps(signature))
+    done = finished("verify", run, "--signer", "jane.pub")
+    assert done.exit_code == 3
+    assert "the signature beside run.h5 does not fit it" in done.output
+
+
+def test_the_signature_of_another_record_does_not_fit(finished: Studio, run: Path) -> None:
+    second = run.parent / "second"
+    shutil.copytree(finished.folder / "second", second)
+    finished("sign", second, "--key", "jane")
+    shutil.copy(second / "run.h5.sig", run)
+    done = finished("verify", run, "--signer", "jane.pub")
+    assert done.exit_code == 3
+    assert "does not fit it: it is another record's" in done.output
+
+
+def test_a_record_that_was_changed_and_sealed_again_is_noticed(finished: Studio, run: Path) -> None:
+    finished("sign", run, "--key", "jane")
+    hostile.reseal(
+        run / "run.h5", lambda file: hostile.set_text(file["cells/paint"], "log", "nothing wrong")
+    )
+    assert finished("verify", run).exit_code == 0
+    done = finished("verify", run, "--signer", "jane.pub")
+    assert done.exit_code == 3
+    assert "does not fit it" in done.output
+
+
+def test_a_record_that_does_not_verify_is_not_signed(finished: Studio, run: Path) -> None:
+    (run / "products" / "metrics.csv").write_text("changed")
+    done = finished("sign", run, "--key", "jane")
+    assert done.exit_code == 3
+    assert "so it is not signed: products/metrics.csv: changed" in done.output
+    assert not (run / "run.h5.sig").exists()
+
+
+def test_the_signature_of_somebody_else_is_not_replaced(finished: Studio, run: Path) -> None:
+    finished("sign", run, "--key", "joe")
+    before = (run / "run.h5.sig").read_text()
+    done = finished("sign", run, "--key", "jane")
+    assert done.exit_code == 2
+    assert "already: remove run.h5.sig to sign it with another" in done.output
+    assert (run / "run.h5.sig").read_text() == before
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "{}", "[]", "\x1b[2J", "[" * 60_000, '{"format": "orthoflow-signature"}', "link"],
+    ids=lambda text: ascii(text[:20]),
+)
+def test_what_is_no_signature_is_a_finding_only_when_one_is_asked_for(
+    finished: Studio, run: Path, content: str
+) -> None:
+    path = run / "run.h5.sig"
+    if content == "link":
+        path.symlink_to("/dev/zero")
+    else:
+        path.write_text(content)
+    done = finished("verify", run)
+    assert done.exit_code == 0, done.output
+    assert "note: run.h5.sig is no signature, or damaged" in done.output
+    done = finished("verify", run, "--signer", "jane.pub")
+    assert done.exit_code == 3
+    assert done.stdout.startswith("run.h5.sig is no signature, or damaged")
+    assert "\x1b" not in done.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("sign", "--key", "nothing"), "there is no key file nothing"),
+        (("sign", "--key", "jane.pub"), "jane.pub is no private key in OpenSSH or PEM format"),
+        (("sign", "--key", "other"), "other must be an Ed25519 key; `ssh-keygen -t ed25519` makes"),
+        (("sign", "--key", "jane-protected"), "is protected by a password, and there is no term"),
+        (("verify", "--signer", "jane"), "jane is no public key in OpenSSH or PEM format"),
+        (("verify", "--signer", "other.pub"), "other.pub must be an Ed25519 key"),
+        (("verify", "--signer", "studio.yaml"), "studio.yaml is no public key in OpenSSH or PEM"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
+)
+def test_keys_that_cannot_be_used_get_a_sentence(
+    finished: Studio, run: Path, arguments: tuple[str, ...], sentence: str
+) -> None:
+    done = finished(arguments[0], run, *arguments[1:])
+    assert done.exit_code == 2, done.output
+    assert done.output.startswith("error: ")
+    assert sentence in done.output
+    assert len(done.output.splitlines()) == 1
+    assert not (run / "run.h5.sig").exists()
+
+
+@pytest.mark.parametrize("key", ["jane-protected", "jane-pem-protected"])
+def test_the_password_of_a_key_is_asked_for(
+    finished: Studio, run: Path, key: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: "wrong")
+    done = finished("sign", run, "--key", key)
+    assert done.exit_code == 2
+    assert "or the password is another one" in done.output
+    monkeypatch.setattr("orthoflow.cli.sign._password", lambda _: PASSWORD)
+    assert finished("sign", run, "--key", key).exit_code == 0
+    assert finished("verify", run, "--signer", "jane.pub").exit_code == 0
+
+
+def test_without_the_library_the_commands_say_so_and_others_do_without(
+    finished: Studio, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finished("sign", run, "--key", "jane")
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    for command in (("sign", run, "--key", "jane"), ("verify", run, "--signer", "jane.pub")):
+        done = finished(*command)
+        assert done.exit_code == 4, done.output
+        assert "python -m pip install 'orthoflow-tls[sign]'" in done.output
+    done = finished("verify", run)
+    assert done.exit_code == 0
+    assert "there is a signature" in done.output
+
+
+def test_a_crate_takes_the_signature_along(finished: Studio, run: Path, tmp_path: Path) -> None:
+    finished("sign", run, "--key", "jane")
+    assert finished("export", run, "--to", "ro-crate", "-o", tmp_path / "crate").exit_code == 0
+    assert finished("verify", tmp_path / "crate", "--signer", "jane.pub").exit_code == 0
+    # Another record has another seal.
+    assert (
+        finished("export", run, "--to", "ro-crate", "--embed", "-o", tmp_path / "all").exit_code
+        == 0
+    )
+    assert not (tmp_path / "all" / "run.h5.sig").exists()

@@ -1,0 +1,441 @@
+"""What the report prints, to the last letter: numbers, ranks, differences and the drawn graph."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from orthoflow.records import (
+    CellFacts,
+    ComparedMetric,
+    Pair,
+    ParameterValue,
+    ProductDistance,
+    RecordedFile,
+    RunComparison,
+)
+from orthoflow.records.comparison import Distance
+from orthoflow.report import numbers
+from orthoflow.report.combinations import (
+    baseline_cells,
+    baseline_of,
+    combinations_of,
+    wanted_metrics,
+)
+from orthoflow.report.diagrams import run_diagram
+from orthoflow.report.differences import Difference, ProductRow, differences
+from orthoflow.report.rankings import Sense, Value, badness, rank
+from orthoflow.report.summaries import Answer, Limit, answers, limits
+from tests.report_runs import HeldRun, cell, compared_resolved, given, metrics, record
+
+
+def run(*cells: object, **more: object) -> HeldRun:
+    return HeldRun(path=Path("run.h5"), record=record(cells, **more))  # type: ignore[arg-type]
+
+
+# --- numbers ---
+
+
+@pytest.mark.parametrize(
+    ("value", "printed"),
+    [
+        (0.0, "0"),
+        (-7.0, "-7"),
+        (999_999_999_999_999.0, "999999999999999"),
+        (1e15, "1000000000000000"),
+        (1e16, "10000000000000000"),
+        (123456.7, "123457"),
+        (1230.4, "1230"),
+        (-999.96, "-1000"),
+        (999.96, "1000"),
+        (1234.5678, "1235"),
+        (123.45678, "123.5"),
+        (1.23456, "1.235"),
+        (1.5, "1.5"),
+        (0.1, "0.1"),
+        (-0.000123456, "-0.0001235"),
+        (1.23456e-6, "0.000001235"),
+        (1.23456e-7, "1.23e-07"),
+    ],
+)
+def test_a_number_has_four_digits(value: float, printed: str) -> None:
+    assert numbers.number(value) == printed
+
+
+@pytest.mark.parametrize(
+    ("value", "spread", "printed"),
+    [
+        (12.3456, 0.0, "12.35"),
+        (12.3456, 1.0, "12.3 ± 1.0"),
+        (12.3456, 9.96, "12.3 ± 10.0"),
+        (123.4, 10.0, "123 ± 10"),
+        (1234.0, 100.0, "1234 ± 100"),
+        (1234.56, 123.456, "1235 ± 123.5"),
+        (0.01234, 0.00056, "0.01234 ± 0.00056"),
+        (0.0, 0.25, "0.00 ± 0.25"),
+        (12.3456, 0.0012, "12.3456 ± 0.0012"),
+        (12.3456, 0.00012, "12.35 ± 0.0001"),
+        (-1.5, 0.25, "-1.50 ± 0.25"),
+    ],
+)
+def test_a_mean_is_printed_to_the_second_digit_of_its_spread(
+    value: float, spread: float, printed: str
+) -> None:
+    assert numbers.number_with_spread(value, spread) == printed
+
+
+@pytest.mark.parametrize(
+    ("seconds", "printed"),
+    [
+        (0.0, "0.00 s"),
+        (9.994, "9.99 s"),
+        (10.0, "10.0 s"),
+        (59.94, "59.9 s"),
+        (60.0, "1 min 00 s"),
+        (61.4, "1 min 01 s"),
+        (3725.0, "62 min 05 s"),
+    ],
+)
+def test_a_time_is_printed_in_seconds_or_minutes(seconds: float, printed: str) -> None:
+    assert numbers.seconds_in_words(seconds) == printed
+
+
+def test_numbers_may_have_fewer_digits_and_labels_say_a_unit_once() -> None:
+    assert numbers.number(0.14151, significant=2) == "0.14"
+    assert numbers.number_with_unit(0.14151, "m", significant=2) == "0.14 m"
+    assert numbers.number_with_unit(0.14151, "1") == "0.1415"
+    assert numbers.metric_label("peak_rss_mib", "MiB") == "peak_rss_mib"
+    assert numbers.metric_label("rms", "mm") == "rms (mm)"
+    assert numbers.metric_label("n_points", "1") == "n_points"
+
+
+# --- ranks ---
+
+
+def marks(sense: Sense, *values: tuple[float, ...], groups: str = "") -> list[str]:
+    found = rank(
+        [
+            Value(sort=value[0], spread=value[1] if len(value) > 1 else math.nan, group=group)
+            for value, group in zip(values, groups or "a" * len(values), strict=True)
+        ],
+        sense,
+    )
+    return [value.mark.name for value in found]
+
+
+def test_the_best_and_the_worst_are_marked() -> None:
+    assert marks(Sense.LESS, (2,), (-1,), (3,), (-3,)) == ["NONE", "BEST", "WORST", "WORST"]
+    assert marks(Sense.MORE, (2,), (-1,), (3,)) == ["NONE", "WORST", "BEST"]
+    assert marks(Sense.ONE, (2,), (0.9,), (0.0,), (4,)) == ["NONE", "BEST", "WORST", "NONE"]
+    assert marks(Sense.NEITHER, (2,), (-1,)) == ["NONE", "NONE"]
+    assert marks(Sense.LESS, (2,), (2,)) == ["NONE", "NONE"]
+    assert marks(Sense.LESS, (2,), (math.nan,)) == ["NONE", "NONE"]
+    assert marks(Sense.LESS, (2,), (math.nan,), (1,)) == ["WORST", "NONE", "BEST"]
+    assert marks(Sense.LESS, (1,), (2,), (3,), (4,), groups="abab") == [
+        *("BEST", "BEST"),
+        *("WORST", "WORST"),
+    ]
+
+
+def test_what_lies_within_both_spreads_of_the_best_is_near_it() -> None:
+    # 3 and 4 in quadrature are 5.
+    assert marks(Sense.LESS, (10, 3), (15, 4), (15.1, 4)) == ["BEST", "NEAR", "WORST"]
+    assert marks(Sense.LESS, (10, 3), (13,), (13.5,)) == ["BEST", "NEAR", "WORST"]
+    assert marks(Sense.MORE, (10, 3), (5, 4), (4.9, 4)) == ["BEST", "NEAR", "WORST"]
+
+
+def test_badness_grows_as_values_get_worse() -> None:
+    assert badness(-2.0, Sense.LESS) == 2.0
+    assert badness(-2.0, Sense.MORE) == 2.0
+    assert badness(2.0, Sense.ONE) == badness(0.5, Sense.ONE) == math.log(2.0)
+    assert badness(0.0, Sense.ONE) == math.inf
+    with pytest.raises(ValueError, match="a metric without a good side cannot be ranked"):
+        badness(1.0, Sense.NEITHER)
+
+
+# --- combinations ---
+
+
+def test_parts_of_larger_combinations_are_no_rows_of_their_own() -> None:
+    cells = [
+        cell("scan"),
+        cell("plane@plane=a", metrics=metrics(rms_mm=1.0)),
+        cell("plane@plane=a#1", metrics=metrics(rms_mm=4.0)),
+        cell("plane@plane=b", status="failed"),
+        cell("orient@plane=a,orient=c"),
+        cell("orient@plane=a,orient=d", status="failed"),
+        cell("orient@plane=a,orient=d#1", status="failed"),
+        cell("orient@plane=a,orient=d#2", status="failed"),
+    ]
+    found = combinations_of(run(*cells, workflow_resolved=compared_resolved("*.wall_s", "a.b")))
+    assert [one.name for one in found] == [
+        "plane=b",
+        "plane=a, orient=c",
+        "plane=a, orient=d",
+    ]
+    failed, good, bad = found
+    assert [one.is_baseline for one in found] == [False, False, False]
+    assert failed.failure is not None
+    assert failed.failure.address == "plane@plane=b"
+    assert good.failure is None
+    assert bad.failure is not None
+    assert bad.failure.address == "orient@plane=a,orient=d"
+    assert (good.n_failed_repeats, bad.n_failed_repeats) == (0, 2)
+    assert [item.address for item in good.cells] == [
+        *("scan", "plane@plane=a", "plane@plane=a#1"),
+        "orient@plane=a,orient=c",
+    ]
+    assert [item.address for item in good.varied_cells] == [
+        "plane@plane=a",
+        "orient@plane=a,orient=c",
+    ]
+    measured = good.measured("plane", "rms_mm")
+    assert measured is not None
+    assert (measured.value, measured.n_repeats, measured.unit) == (2.5, 2, "mm")
+    assert measured.spread == pytest.approx(3.0 / math.sqrt(2.0), rel=1e-12)
+    once = good.measured("plane", "wall_s")
+    assert once is not None
+    assert (once.value, once.spread, once.unit) == (1.0, 0.0, "s")
+    single = good.measured("orient", "wall_s")
+    assert single is not None
+    assert math.isnan(single.spread)
+    assert good.measured("plane", "other") is None
+    assert good.measured("scan", "rms_mm") is None
+
+
+def test_the_baseline_is_what_the_workflow_says() -> None:
+    cells = [cell("plane@plane=fine"), cell("plane@plane=coarse"), cell("plane@plane=fine#1")]
+    named = run(*cells, workflow_resolved=compared_resolved("*.wall_s", "a.b"))
+    assert baseline_of(named) == {"plane": "fine"}
+    assert wanted_metrics(named) == ("*.wall_s", "a.b")
+    assert [one.is_baseline for one in combinations_of(named)] == [True, False]
+    assert [item.address for item in baseline_cells(named)] == ["plane@plane=fine"]
+    for resolved in ("{}", "no JSON", "[]", '{"compare": 3}', '{"compare": {"metrics": 1}}'):
+        silent = run(*reversed(cells), workflow_resolved=resolved)
+        assert (baseline_of(silent), wanted_metrics(silent)) == ({}, ())
+        assert [one.is_baseline for one in combinations_of(silent)] == [False, False]
+        assert [item.address for item in baseline_cells(silent)] == ["plane@plane=fine"]
+    assert baseline_cells(run()) == ()
+
+
+# --- what the first screen says ---
+
+
+def test_answers_come_in_the_order_in_which_a_reader_wants_them() -> None:
+    told = run(
+        cell("plane", metrics=metrics(rms_mm=1.25, completeness=0.5)),
+        cell("first", metrics=metrics(n_oriented=2.0, n_photos=9.0)),
+        cell("second", metrics=metrics(n_oriented=7.0)),
+        cell("check", metrics=metrics(completeness=0.5, completeness_seen_by_both=0.75)),
+        cell("other", metrics=metrics(n_photos=4.0, n_oriented=3.0, depth_rmse_mm=2.0)),
+    )
+    assert answers(told) == (
+        Answer(what="painted, of what a station and a photo see", value="75.0 %", cell="check"),
+        Answer(what="photos oriented", value="3 of 4", cell="other"),
+        Answer(what="error of the depth, RMS", value="2 mm", cell="other"),
+        Answer(what="points to their plane, RMS", value="1.25 mm", cell="plane"),
+    )
+
+
+def test_limits_name_all_cells_that_say_the_same() -> None:
+    told = run(
+        cell("plane@plane=coarse", warnings=("odd", "few points")),
+        cell("plane@plane=fine", warnings=("few points",)),
+        cell("plane@plane=bad", status="failed", error_message="no plane"),
+        cell("plane@plane=worse", status="failed", error_message="no plane", warnings=("odd",)),
+        workflow_resolved=compared_resolved(),
+    )
+    assert limits(told) == (
+        Limit(text="failed: no plane", cells=("plane@plane=bad", "plane@plane=worse")),
+        Limit(text="few points", cells=("plane@plane=fine", "plane@plane=coarse")),
+        Limit(text="odd", cells=("plane@plane=coarse", "plane@plane=worse")),
+    )
+
+
+# --- differences ---
+
+FACTS = CellFacts(
+    status="ok",
+    method="plane.a",
+    distribution="",
+    result_version=1,
+    determinism="exact",
+    seed=None,
+    code={},
+    tools={},
+    error="",
+)
+OTHER_FACTS = CellFacts(
+    status="failed",
+    method="plane.b",
+    distribution="toys 1.0",
+    result_version=2,
+    determinism="seeded",
+    seed=0,
+    code={"toys": "abcdef0123456789"},
+    tools={"colmap": "4.2"},
+    error="no plane",
+)
+
+
+def metric(value: float, *, is_cost: bool = False) -> ComparedMetric:
+    return ComparedMetric(
+        value=value, unit="mm", is_cost=is_cost, is_cached=False, environment="e1"
+    )
+
+
+def distance(port: str, verdict: str, reason: str = "", *parts: Distance) -> ProductDistance:
+    return ProductDistance(
+        cell="a",
+        port=port,
+        type_name="planes",
+        verdict=verdict,  # type: ignore[arg-type]
+        left="1",
+        right="2",
+        distances=parts,
+        reason=reason,
+    )
+
+
+def test_all_that_differs_between_two_runs_is_told() -> None:
+    file = RecordedFile(name="a.e57", size_bytes=3, sha256="0123456789abcdef" * 4)
+    far = Distance(unit="m", largest=0.25, limit=0.1, field="offset", n_values=3)
+    odd = Distance(unit="", largest=None, limit=0.0, field="names", n_values=3)
+    told = differences(
+        RunComparison(
+            left=record([], run_id="r1"),
+            right=record([], run_id="r2"),
+            workflow=("--- a", "+++ b", "@@ -1 +1 @@", "-x", "+y"),
+            overrides=Pair(name="options", left=("a=1", "b=2"), right=()),
+            inputs=(
+                Pair(name="scan", left=(file, file), right=()),
+                Pair(name="photos", left=(file,), right=(file,)),
+            ),
+            cells=(Pair(name="a", left=FACTS, right=OTHER_FACTS),),
+            parameters=(
+                Pair(
+                    cell="a",
+                    name="cell_m",
+                    left=ParameterValue(value="ä", is_set=True),
+                    right=ParameterValue(value=None, is_set=False),
+                ),
+            ),
+            environment=(
+                Pair(name="python", left="3.11", right=None),
+                Pair(name="cpu", left="x", right="x"),
+            ),
+            metrics=(
+                Pair(cell="a", name="wall_s", left=metric(1, is_cost=True), right=None),
+                Pair(cell="a", name="rms_mm", left=metric(1.5), right=metric(1.25)),
+                Pair(cell="a", name="max_mm", left=None, right=metric(2.0)),
+                Pair(cell="a", name="min_mm", left=metric(2.0), right=None),
+                Pair(cell="a", name="same_mm", left=metric(2.0), right=metric(2.0)),
+            ),
+            products=(
+                distance("one", "identical"),
+                distance("two", "different", "", far, odd),
+                distance("three", "different", "other shapes", far),
+            ),
+        )
+    )
+    assert (told.left, told.right, told.workflow) == ("r1", "r2", "@@ -1 +1 @@\n-x\n+y")
+    facts = (
+        "failed, plane.b result version 2, toys 1.0, code of toys abcdef01, colmap 4.2, seed 0, "
+        "no plane"
+    )
+    assert [(table.title, table.n_compared) for table in told.tables] == [
+        ("Inputs", 2),
+        ("Options", 1),
+        ("Steps", 1),
+        ("Parameters", 1),
+        ("Environment", 2),
+        ("Metrics, time and memory left aside", 4),
+    ]
+    named = "a.e57 0123456789ab"
+    assert [table.rows for table in told.tables] == [
+        (Difference(cell="", name="scan", left=f"{named}, {named}", right="not given"),),
+        (Difference(cell="", name="options", left="a=1 b=2", right=""),),
+        (Difference(cell="", name="a", left="ok, plane.a result version 1", right=facts),),
+        (Difference(cell="a", name="cell_m", left='"ä" (set)', right="null"),),
+        (Difference(cell="", name="python", left="3.11", right="-"),),
+        (
+            Difference(cell="a", name="rms_mm", left="1.5 mm", right="1.25 mm", change="-0.25"),
+            Difference(cell="a", name="max_mm", left="-", right="2 mm"),
+            Difference(cell="a", name="min_mm", left="2 mm", right="-"),
+        ),
+    ]
+    apart = "0.25 m at most in offset"
+    assert told.products == (
+        ProductRow(
+            cell="a",
+            name="two (planes)",
+            verdict="different",
+            words=f"{apart}; names cannot be subtracted",
+        ),
+        ProductRow(
+            cell="a", name="three (planes)", verdict="different", words=f"{apart}; other shapes"
+        ),
+        ProductRow(cell="a", name="one (planes)", verdict="identical", words=""),
+    )
+
+
+# --- the graph ---
+
+
+def test_the_graph_is_drawn_from_left_to_right() -> None:
+    cloud = given("scan.cloud", "1", "cloud")
+    told = run(
+        cell("scan", wall_s=125.0),
+        cell("plane", inputs={"cloud": cloud}, cached_from="r0"),
+        cell("a-name-of-twenty-six-chars", inputs={"cloud": cloud}, status="failed"),
+        cell("w", inputs={"c": cloud, "p": given("plane.p", "2", "planes")}, status="skipped"),
+    )
+    assert run_diagram(told) == (
+        '<svg viewBox="0 0 693 111" width="693" role="img" aria-label="graph of the run">'
+        '<path class="arrow" d="M191,24 C221,24 221,24 251,24"/>'
+        '<path class="arrow" d="M191,24 C221,24 221,86 251,86"/>'
+        '<path class="arrow" d="M191,24 C346,24 346,24 501,24"/>'
+        '<path class="arrow" d="M441,24 C471,24 471,24 501,24"/>'
+        '<g class="cell ok"><title>scan: scan.toy, 2 min 05 s</title>'
+        '<rect x="1" y="1" width="190" height="46" rx="6"/>'
+        '<text x="11" y="20">scan</text>'
+        '<text class="small" x="11" y="37">scan.toy, 2 min 05 s</text></g>'
+        '<g class="cell cached"><title>plane: plane.toy, 1.00 s</title>'
+        '<rect x="251" y="1" width="190" height="46" rx="6"/>'
+        '<text x="261" y="20">plane</text>'
+        '<text class="small" x="261" y="37">plane.toy, 1.00 s</text></g>'
+        '<g class="cell failed"><title>a-name-of-twenty-six-chars: failed</title>'
+        '<rect x="251" y="63" width="190" height="46" rx="6"/>'
+        '<text x="261" y="82">a-name-of-twenty-six-cha…</text>'
+        '<text class="small" x="261" y="99">failed</text></g>'
+        '<g class="cell skipped"><title>w: skipped</title>'
+        '<rect x="501" y="1" width="190" height="46" rx="6"/>'
+        '<text x="511" y="20">w</text>'
+        '<text class="small" x="511" y="37">skipped</text></g></svg>'
+    )
+    alone = run_diagram(told, stands_alone=True)
+    assert alone.startswith(
+        '<svg xmlns="http://www.w3.org/2000/svg" height="111" viewBox="0 0 693 '
+    )
+    assert "<style>svg{" in alone
+
+
+@pytest.mark.parametrize(("n_cells", "n_boxes"), [(24, 24), (25, 1)])
+def test_more_than_two_dozen_cells_become_a_box_per_step(n_cells: int, n_boxes: int) -> None:
+    cells = [cell(f"plane@plane=v{k}", status="failed" if k < 3 else "ok") for k in range(n_cells)]
+    drawing = run_diagram(run(*cells))
+    assert drawing.count("<rect") == n_boxes
+    if n_boxes == 1:
+        assert "plane: 25 cells, 22.0 s, 3 failed<" in drawing
+
+
+def test_a_box_of_some_cached_cells_is_not_cached() -> None:
+    def state(*froms: str) -> str:
+        cells = [cell(f"p@p=v{k}", cached_from=froms[k % len(froms)]) for k in range(30)]
+        return run_diagram(run(*cells)).partition('class="cell ')[2].partition('"')[0]
+
+    assert state("r0") == "cached"
+    assert state("r0", "") == "ok"
+    assert run_diagram(run()).startswith('<svg viewBox="0 0 0 0" width="0"')

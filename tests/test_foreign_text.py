@@ -1,0 +1,108 @@
+"""What strangers call things is shown as it is, and neither obeyed nor turned round."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import unicodedata
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from orthoflow.foreign_text import csv_text, shown, shown_json
+
+ANY = st.text(
+    st.characters() | st.sampled_from("\x1b\x9b\u202e\u2066\u200f\u2028\ud800=+-@\t\r\n'")
+)
+DANGEROUS = {
+    "\x1b[31m": "\\x1b[31m",
+    "\x9b31m": "\\x9b31m",
+    "\x7f": "\\x7f",
+    "\0\a\b\r\n": "\\x00\\x07\\x08\\r\\n",
+    "a\u202egnp.exe": "a\\u202egnp.exe",
+    "\u200e\u200f\u061c": "\\u200e\\u200f\\u061c",
+    "\u202a\u202b\u202c\u202d": "\\u202a\\u202b\\u202c\\u202d",
+    "\u2066\u2067\u2068\u2069": "\\u2066\\u2067\\u2068\\u2069",
+    "\u2028\u2029": "\\u2028\\u2029",
+    "\ud800": "\\ud800",
+    "\U000e0041\ufeff": "\\U000e0041\\ufeff",
+}
+
+
+@pytest.mark.parametrize("text", DANGEROUS, ids=ascii)
+def test_what_a_terminal_obeys_or_readers_cannot_see_is_written_out(text: str) -> None:
+    assert shown(text) == DANGEROUS[text]
+
+
+@pytest.mark.parametrize(
+    "text", ["Saal 12", "żółć", "שלום", "\u06a9\u200c\u0647", "👩‍🚒", "a\u00a0b", "漢字"]
+)
+def test_writing_of_all_the_world_stays_as_it_is(text: str) -> None:
+    assert shown(text) == text
+
+
+@given(ANY)
+def test_nothing_shown_has_a_letter_that_is_obeyed(text: str) -> None:
+    said = shown(text)
+    assert not {unicodedata.category(letter) for letter in said} & {"Cc", "Cs", "Zl", "Zp"}
+    said.encode("utf-8")
+    assert shown(said) == said
+    assert "\n" in shown("one\ntwo", keep="\n")
+
+
+@given(st.dictionaries(ANY, ANY, max_size=3))
+def test_json_stays_the_same_json(value: dict[str, str]) -> None:
+    text = shown_json(json.dumps(value, ensure_ascii=False, indent=1))
+    assert json.loads(text) == value
+    text.encode("utf-8")
+    assert shown(text, keep="\n") == text
+
+
+@given(
+    st.lists(
+        st.lists(
+            st.text(st.characters(exclude_categories=["Cs"]))
+            | st.integers()
+            | st.floats(allow_nan=False),
+            min_size=1,
+        ),
+        min_size=1,
+    )
+)
+def test_tables_come_back_and_no_cell_is_a_formula(rows: list[list[str | int | float]]) -> None:
+    text = csv_text(rows)
+    read = list(csv.reader(io.StringIO(text, newline="")))
+    for cells, row in zip(read, rows, strict=True):
+        for cell, value in zip(cells, row, strict=True):
+            if isinstance(value, str):
+                assert (cell.removeprefix("'") if cell[:1] == "'" else cell) == value
+            else:
+                assert type(value)(cell) == value
+            if cell[:1] in ("=", "+", "-", "@", "\t", "\r", "\n"):
+                float(cell)
+
+
+@pytest.mark.parametrize(
+    ("cell", "written"),
+    [
+        ("=HYPERLINK(1)", "'=HYPERLINK(1)"),
+        ("+1+cmd", "'+1+cmd"),
+        ("-2+3", "'-2+3"),
+        ("@SUM(1)", "'@SUM(1)"),
+        ("\t=1", "'\t=1"),
+        ("\uff1d1", "'\uff1d1"),
+        ("'quoted", "''quoted"),
+        ("-1_000", "'-1_000"),
+        ("-1.5e-07", "-1.5e-07"),
+        ("+3", "+3"),
+        ("-.5", "-.5"),
+        ("DSC-1.jpg", "DSC-1.jpg"),
+        (-2.5, "-2.5"),
+        (-7, "-7"),
+        (float("-inf"), "-inf"),
+    ],
+)
+def test_formulas_get_an_apostrophe_and_numbers_none(cell: str | float, written: str) -> None:
+    assert csv_text([[cell, "x"]]) == f"{written},x\n"
