@@ -24,8 +24,11 @@ from typing import Any, Final
 from orthoflow.errors import OrthoflowError
 from tests.fuzz.mutation import Mutate, mutate_bytes
 
-# Seconds that each reader is fuzzed; `.ci/run` gives more.
-BUDGET_S: Final = float(os.environ.get("ORTHOFLOW_FUZZ_S", "0.5"))
+# Seconds that each reader is fuzzed at most; `.ci/run` gives more.
+BUDGET_S: Final = float(os.environ.get("ORTHOFLOW_FUZZ_S", "5"))
+# Cases of a target, 0 for as many as the time allows. What must pass everywhere has a number: a
+# machine twice as fast would else meet cases that nobody has seen, which is for the long loops.
+N_CASES: Final = int(os.environ.get("ORTHOFLOW_FUZZ_CASES", "30"))
 SEED: Final = int(os.environ.get("ORTHOFLOW_FUZZ_SEED", "0"))
 # One case to repeat instead.
 CASE: Final = os.environ.get("ORTHOFLOW_FUZZ_CASE", "")
@@ -142,7 +145,7 @@ def fuzz(
     *,
     seed: int = SEED,
     budget_s: float = BUDGET_S,
-    most_cases: int | None = None,
+    most_cases: int = N_CASES,
 ) -> Outcome:
     """Fuzz a target until the time is over or all cases have run.
 
@@ -151,21 +154,21 @@ def fuzz(
         folder: takes seeds and findings; must be empty.
         seed: of the cases.
         budget_s: seconds, beginning when the seeds have been read.
-        most_cases: end earlier after so many.
+        most_cases: end earlier after so many, unless 0.
     """
     for part in ("seeds", "case", "findings"):
         (folder / part).mkdir(parents=True)
     target_named(name).seeds(folder / "seeds")
     outcome = Outcome(name=name, seed=seed)
-    first, most = (int(CASE), 1) if CASE else (0, most_cases)
+    first, most = (int(CASE), 1) if CASE else (0, most_cases or sys.maxsize)
     left_s = budget_s
-    while left_s > 0.0 and (most is None or outcome.n_cases < most):
+    while left_s > 0.0 and outcome.n_cases < most:
         request = {
             "name": name,
             "folder": str(folder),
             "seed": seed,
             "first": first + outcome.n_cases,
-            "most": min(_MOST_PER_PROCESS, (most or sys.maxsize) - outcome.n_cases),
+            "most": min(_MOST_PER_PROCESS, most - outcome.n_cases),
             "budget_s": left_s,
         }
         for answer in _server().ask(request):

@@ -25,6 +25,8 @@ from orthoflow.files.points.tables import Layout, read_table
 FORMAT: Final = "PCD"
 _HEADER_BYTES: Final = 1 << 16
 _KINDS: Final = {"I": "i", "U": "u", "F": "f"}
+_COLOURS: Final = ("rgb", "rgba")
+_READ: Final = ("x", "y", "z", "intensity", *_COLOURS)
 _KEYS: Final = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "DATA")
 
 
@@ -55,7 +57,7 @@ class PcdHeader:
     @property
     def colour(self) -> str | None:
         """Name of the packed colour field."""
-        found = [name for name in ("rgb", "rgba") if name in self.fields]
+        found = [name for name in _COLOURS if name in self.fields]
         return found[0] if found else None
 
 
@@ -190,8 +192,8 @@ def _field_arrays(plain: NDArray[np.uint8], header: PcdHeader) -> dict[str, NDAr
 
 
 def _wanted(header: PcdHeader) -> list[str]:
-    names = ["x", "y", "z", "intensity", header.colour]
-    return [name for name in names if name is not None and name in header.fields]
+    names = [name for name in _READ if name not in _COLOURS or name == header.colour]
+    return [name for name in names if name in header.fields]
 
 
 def _base(header: PcdHeader, name: str) -> np.dtype[np.generic]:
@@ -242,11 +244,16 @@ def _parse_header(entries: Mapping[str, list[str]], n_bytes: int) -> PcdHeader:
     ]
     if not {"x", "y", "z"} <= set(names):
         raise ValueError(f"its fields are {' '.join(fields)}, expected x, y and z")
+    for name, count in zip(names, counts, strict=True):
+        if count != 1 and name in _READ:
+            raise ValueError(f"field {name} has {count} values in a point, expected one")
     data = entries["DATA"][0].lower()
     if data not in {"ascii", "binary", "binary_compressed"}:
         raise ValueError(f"data are {data}, expected ascii, binary or binary_compressed")
     width, height = int(entries["WIDTH"][0]), int(entries["HEIGHT"][0])
-    pose = [float(item) for item in entries.get("VIEWPOINT", [])]
+    pose = [float(item) for item in entries.get("VIEWPOINT", ["0"] * 7)]
+    if len(pose) < 3:
+        raise ValueError(f"VIEWPOINT has {len(pose)} numbers, expected 7")
     return PcdHeader(
         fields=tuple(names),
         dtype=np.dtype(members),

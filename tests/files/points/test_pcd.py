@@ -87,6 +87,9 @@ def test_a_damaged_compressed_pcd_file_is_refused(
         (b"FIELDS", b"FIELDZ", "without FIELDS"),
         (b"DATA binary", b"DATA zipped", "data are zipped, expected ascii"),
         (b"FIELDS x y", b"FIELDS u v", "its fields are u v z rgb intensity, expected x, y and z"),
+        (b"COUNT 1 1 1", b"COUNT 1 1 0", "field z has 0 values in a point, expected one"),
+        (b"COUNT 1 1 1 1 1", b"COUNT 1 1 1 1 2", "field intensity has 2 values in a point"),
+        (b"VIEWPOINT 0 0 0 1 0 0 0", b"VIEWPOINT 1", "VIEWPOINT has 1 numbers, expected 7"),
     ],
 )
 def test_pcd_headers_that_make_no_sense_are_refused(
