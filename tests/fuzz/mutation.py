@@ -227,7 +227,9 @@ def _line(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
         case 2:
             lines[place] = b"  " + lines[place]
         case 3:
-            lines[place : place + 1] = [lines[place]] * rng.choice((2, 40, 2000))
+            # No more than is kept: two thousand long lines are more than the process may hold.
+            times = min(rng.choice((2, 40, 2000)), _LARGEST // (len(lines[place]) + 1) + 1)
+            lines[place : place + 1] = [lines[place]] * times
         case _:
             lines[place] = lines[place].lstrip()
     return b"\n".join(lines)
