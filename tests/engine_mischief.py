@@ -21,11 +21,14 @@ SLEEPER = [sys.executable, "-c", "import time; time.sleep(600)"]
 
 def _pipe():
     # The progress pipe is the only one a step has.
-    names = {n: os.readlink(f"/proc/self/fd/{n}") for n in range(3, 64) if _is_open(n)}
-    return next(n for n, name in names.items() if name.startswith("pipe:"))
+    return next(n for n in range(3, 64) if _name(n).startswith("pipe:"))
 
-def _is_open(number):
-    return os.path.lexists(f"/proc/self/fd/{number}")
+def _name(number):
+    # What watches the memory opens and closes files in a thread of its own meanwhile.
+    try:
+        return os.readlink(f"/proc/self/fd/{number}")
+    except FileNotFoundError:
+        return ""
 
 def _say(content):
     pipe = _pipe()
