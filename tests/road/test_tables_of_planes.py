@@ -19,6 +19,7 @@ DETECTORS = (
     "hough3d", "hough3d-1in20", "hough3d-full",
     "ransac", "ransac-2d", "ransac-1in20", "ransac-2d-1in20",
     "region", "region-normals", "region-1in20",
+    "open3d-ransac", "open3d-patches",
 )  # fmt: skip
 
 

@@ -154,7 +154,7 @@ def robust_start(
     if rule.threshold_px is None:
         # A lens known only roughly misplaces even right ties.
         slack = 1.0 if prior.source not in ("exif", "none") else 2.0
-        rule = replace(rule, threshold_px=slack * rule.rejection_sigma * _expected_px(control))
+        rule = replace(rule, threshold_px=slack * rule.rejection_sigma * expected_px(control))
     best: _RobustPose | None = None
     for intrinsics in prior.guesses:
         pose = _robust_pose(control, intrinsics.posed(), rule)
@@ -240,6 +240,15 @@ def unit_deviation(normalised: NDArray[np.float64]) -> float:
     """Robust standard deviation of unit weight, kept within reason."""
     median = float(np.median(normalised)) if normalised.size else 1.0
     return float(np.clip(median / MEDIAN_LENGTH, *_SIGMA0_RANGE))
+
+
+def expected_px(seen: SeenPoints) -> float:
+    """Usual deviation of a tie before any pose: the photo's scale from the spread of its ties."""
+    spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
+    lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
+    per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
+    sigma = np.hypot(np.median(seen.sigma_px), per_metre * np.median(seen.sigma_m))
+    return float(sigma)
 
 
 def metres_per_pixel(camera: ViewingCamera, points_world: NDArray[np.float64]) -> float:
@@ -345,15 +354,6 @@ def _robust_pose(seen: SeenPoints, lens: ViewingCamera, rule: EstimationRule) ->
     agreeing = np.zeros(len(inside), dtype=np.bool_)
     agreeing[np.flatnonzero(inside)[np.asarray(agreed).ravel()]] = True
     return _RobustPose(camera=local.shifted(-middle), agreeing=agreeing)
-
-
-def _expected_px(seen: SeenPoints) -> float:
-    """Usual deviation of a tie before any pose: the photo's scale from the spread of its ties."""
-    spread_px = float(np.median(np.abs(seen.pixels_photo - np.median(seen.pixels_photo, axis=0))))
-    lengths = np.abs(seen.points_world - np.median(seen.points_world, axis=0)).max(axis=1)
-    per_metre = spread_px / max(0.5 * float(np.median(lengths)), 1e-6)
-    sigma = np.hypot(np.median(seen.sigma_px), per_metre * np.median(seen.sigma_m))
-    return float(sigma)
 
 
 def _usac(rule: EstimationRule) -> Any:

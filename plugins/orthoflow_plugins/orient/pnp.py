@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from importlib.metadata import version
-from typing import ClassVar
+from typing import ClassVar, Final, Literal
+
+from pydantic import Field
 
 from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.estimation import estimate_pose
+from orthoflow_plugins.orient.opencv_pose import estimate_by_opencv
 from orthoflow_plugins.orient.parameters import OrientParams
 from orthoflow_plugins.orient.reporting import hand_over
-from orthoflow_plugins.orient.single_photo import each_by_itself
+from orthoflow_plugins.orient.single_photo import Estimator, each_by_itself
+
+PoseMethod = Literal["weighted", "opencv"]
+_ESTIMATORS: Final[dict[PoseMethod, Estimator]] = {
+    "weighted": estimate_pose,
+    "opencv": estimate_by_opencv,
+}
 
 
 class OrientPnp(Method):
@@ -33,7 +42,14 @@ class OrientPnp(Method):
     )
 
     class Params(OrientParams):
-        """Rejection, withheld share, and the gates an orientation has to pass."""
+        """How the pose is adjusted, rejection, withheld share, and the gates to pass."""
+
+        method: PoseMethod = Field(
+            default="weighted",
+            description="weighted: each tie counts by its own sigmas and an uncalibrated lens is "
+            "refined; opencv: cv2.solvePnP, iterative, all ties alike, the lens as it is known "
+            "(markiewicz2015).",
+        )
 
     class In(Ports):
         """Ties, and the photos they are in."""
@@ -48,7 +64,8 @@ class OrientPnp(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Orient the photos one after the other."""
-        found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimate_pose)
+        estimator = _ESTIMATORS[params.method]
+        found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
         return self.Out(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 
     @classmethod

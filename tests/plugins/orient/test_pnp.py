@@ -291,6 +291,44 @@ def test_nothing_known_of_the_lens_is_said(tmp_path: Path) -> None:
     assert any("neither calibration nor EXIF" in warning for warning in ctx.warnings)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_opencvs_pose_is_the_least_squares_of_ties_that_count_alike(
+    tmp_path: Path, seed: int
+) -> None:
+    camera = ms.camera_before(ms.textured_wall(0), centre=(0.4 + 0.6 * seed, -2.5, 0.9))
+    ties = known_ties(camera, seed, n=300, wrong_share=0.3, shift_m=SURVEY_SHIFT_M)
+    found = orient(ties, calibrated(camera), context(tmp_path), method="opencv")
+    oriented = found.cameras[0]
+    assert oriented.status == "ok"
+    assert found.ties is not None
+    used = found.ties.role == TieRole.CONTROL
+    alike = SeenPoints(
+        pixels_photo=ties.pixels_photo[used],
+        points_world=ties.points_world[used],
+        sigma_px=np.ones(int(used.sum())),
+        sigma_m=np.zeros(int(used.sum())),
+    )
+    best = adjust(alike, oriented.viewing())
+    away_m = np.linalg.norm(best.camera.centre_world - oriented.viewing().centre_world)
+    # solvePnP stops when a step changes the parameters by 1e-7 or so.
+    assert away_m < 1e-5
+    assert ms.wall_error_m(
+        ms.textured_wall(0), oriented.viewing().shifted(SURVEY_SHIFT_M), camera
+    ) < 3.0 * (oriented.sigma_wall_m or 0.0)
+
+
+def test_opencvs_pose_leaves_the_lens_as_it_is_known(tmp_path: Path) -> None:
+    camera = ms.camera_before(ms.textured_wall(0), centre=(0.2, -1.8, 0.4))
+    photos = ms.photos(replace(PIXEL, exif_focal_px=1.01 * camera.fx))
+    ties = known_ties(camera, 8, n=400)
+    wide = {"sigma_wall_max_cells": 20.0, "sigma_corner_max_cells": 60.0}
+    found = orient(ties, photos, context(tmp_path), method="opencv", **wide).cameras[0]
+    assert found.status == "ok"
+    assert found.intrinsics is not None
+    assert found.intrinsics.fx == pytest.approx(1.01 * camera.fx)
+    assert found.intrinsics.source == "exif"
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_random_ties_are_never_ok(tmp_path: Path, seed: int) -> None:
     camera = ms.camera_before(ms.textured_wall(0))
