@@ -25,7 +25,7 @@ from orthoflow.products import (
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
-from orthoflow_plugins.inspect.findings import check_findings, report, rms
+from orthoflow_plugins.inspect.findings import CAPPED, check_findings, report, rms
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
@@ -39,13 +39,14 @@ class InspectCheckpoints(Method):
     a black and white quadrant target is recognised, or, in a simulated room, where its surroundings
     are found by the scene's truth. Without orthoimages the intensity of the walls is the picture.
     RMS and standard deviation are of the lengths of residuals; outliers are those beyond twice the
-    RMS, of all (`once`) or of what is left (`iterated`). Classes of points (flat, vertical ...) are
+    RMS, of all (`once`, the one to compare) or of what is left (`iterated`, a quarter of the points
+    at most; `iterated_capped` where that is too few). Classes of points (flat, vertical ...) are
     told apart by a prefix. `x` is along u, to the right, `y` along v, down, shown - surveyed.
     Targets are carried back into space, on the plane through the depths around them (`3d`).
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Skarlatos and Kiparissi 2012 (direct orthoimages from point clouds, 4.5, Table 1)",
@@ -108,6 +109,7 @@ class InspectCheckpoints(Method):
             findings += _findings_of_images(pictures, inputs.cameras)
         ctx.metric("n_points", len(points), "1")
         report(findings, pictures[0].wall, ctx)
+        _warn_of_cap(findings, ctx)
         _draw(pictures, [points[k] for k in found], ctx)
         names = tuple(dict.fromkeys(classes))
         return self.Out(
@@ -208,6 +210,20 @@ def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) ->
             *quality_findings(picture.image, picture.surface, picture.grey, cameras),
         )
     ]
+
+
+def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
+    """Say in words that a rule for outliers ran into its cap."""
+    ending = f"n_outliers_iterated{CAPPED}"
+    for finding in findings:
+        if finding.name.endswith(ending):
+            prefix = finding.name.removesuffix(ending)
+            ctx.warn(
+                f"{finding.name}: the iterated rule for outliers ends at {finding.value:.0f} "
+                f"points, the quarter that it may leave out, though more lie beyond twice the RMS "
+                f"of the rest: the residuals are of two kinds, which the rule cannot part; compare "
+                f"{prefix}n_outliers_once"
+            )
 
 
 def _draw(pictures: Sequence[Picture], points: Sequence[ShownPoint], ctx: StepContext) -> None:

@@ -20,6 +20,10 @@ from orthoflow.sdk import StepContext
 _AXES: Final = ("x", "y")
 # Never are more than so many of the points called outliers.
 _OUTLIERS_MOST: Final = 0.25
+# More than half are no outliers by any rule.
+_MOST_WITHOUT_CAP: Final = 0.5
+# Behind the rule in the name of a number that the cap has made.
+CAPPED: Final = "_capped"
 # What a comparison asks of every wall; the record has the rest.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
 
@@ -82,9 +86,10 @@ def check_findings(
         ("mean_shift_mm", 1e3 * mean_shift, "mm"),
         ("mean_shift_share", mean_shift / max(rms(length), 1e-12), "1"),
     ]
+    is_capped = cap_binds(length)
     for name, out in (
         ("once", outliers_at_once(length)),
-        ("iterated", outliers_iterated(length)),
+        (f"iterated{CAPPED}" if is_capped else "iterated", outliers_iterated(length)),
     ):
         numbers += [
             (f"n_outliers_{name}", float(np.count_nonzero(out)), "1"),
@@ -106,15 +111,16 @@ def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which lengths (n,) exceed twice the RMS of the others that do not.
 
     The largest set of longest ones, a quarter at most, each beyond twice the RMS of what is left.
-    The numbers of skarlatos2012 for the point cloud fit this rule only: of 30 points with an RMS
-    of 4.39 cm two are out, and 4.00 cm are left, so that none exceeded twice the RMS of all.
+    Lengths of two kinds, at edges and on flat parts, go on to lose the longer kind; `cap_binds`
+    says where they do. So the rule of all points is the one to compare.
     """
-    order = np.argsort(-length_m, kind="stable")
-    chosen = np.zeros(len(length_m), dtype=np.bool_)
-    for count in range(1, math.floor(_OUTLIERS_MOST * len(length_m)) + 1):
-        if length_m[order[count - 1]] > 2.0 * rms(length_m[order[count:]]):
-            chosen[order[:count]] = True
-    return chosen
+    return _iterated(length_m, _OUTLIERS_MOST)
+
+
+def cap_binds(length_m: NDArray[np.float64]) -> bool:
+    """Whether the iterated rule would call more of the lengths (n,) outliers if it might."""
+    allowed = np.count_nonzero(_iterated(length_m, _OUTLIERS_MOST))
+    return bool(np.count_nonzero(_iterated(length_m, _MOST_WITHOUT_CAP)) > allowed)
 
 
 def rms(values: ArrayLike) -> float:
@@ -142,3 +148,12 @@ def report(findings: Sequence[Finding], main: int, ctx: StepContext) -> None:
             ctx.metric(f"all_{finding.name}", finding.value, finding.unit)
         elif finding.wall < 0 and "[" not in finding.name:
             ctx.metric(finding.name, finding.value, finding.unit)
+
+
+def _iterated(length_m: NDArray[np.float64], most_share: float) -> NDArray[np.bool_]:
+    order = np.argsort(-length_m, kind="stable")
+    chosen = np.zeros(len(length_m), dtype=np.bool_)
+    for count in range(1, math.floor(most_share * len(length_m)) + 1):
+        if length_m[order[count - 1]] > 2.0 * rms(length_m[order[count:]]):
+            chosen[order[:count]] = True
+    return chosen

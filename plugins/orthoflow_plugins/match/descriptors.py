@@ -115,6 +115,23 @@ def mutual_matches(
     return Matches(first=kept, second=found.index[kept], ratio=ratio[kept])
 
 
+def best_matches(
+    first: NDArray[np.float32], second: NDArray[np.float32], *, ratio_most: float
+) -> Matches:
+    """Pair each descriptor of the first set with its nearest in the second, in one direction.
+
+    Args:
+        first: (n, d) whole numbers, small enough that products are exact in float32.
+        second: (m, d) likewise, at least one.
+        ratio_most: largest distance of the best over the distance of the second best (Lowe 2004);
+            1 for any.
+    """
+    found = two_nearest(first, second)
+    ratio = _ratio(found.best, found.next_best)
+    kept = np.flatnonzero(ratio <= ratio_most)
+    return Matches(first=kept, second=found.index[kept], ratio=ratio[kept])
+
+
 def mutual_matches_within(
     first: NDArray[np.float32],
     second: NDArray[np.float32],

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, Ties, Walls
@@ -13,6 +13,13 @@ from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
+from orthoflow_plugins.match.paper import (
+    footprints,
+    largest_ratio,
+    paper_pieces,
+    paper_wall_features,
+    with_paper_ratio,
+)
 from orthoflow_plugins.match.pictures import photo_grey, require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, ties_of
 
@@ -31,7 +38,7 @@ class MatchGuided(Method):
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.3",
@@ -46,8 +53,15 @@ class MatchGuided(Method):
         preset: Literal["none", "paper"] = Field(
             default="none",
             description="paper: the mask of markiewicz2015 and no more: key points as OpenCV sets "
-            "SIFT, those of a wall that the photo shows by its pose, each with its best match in "
-            "the photo, once; no other option applies.",
+            "SIFT, those of a wall that the photo shows by its pose with their best match in "
+            "the photo, once; of the other options `ratio` applies.",
+        )
+        ratio: float | None = Field(
+            default=None,
+            gt=0,
+            le=1,
+            description="With preset: paper alone: largest distance of the best match over the "
+            "second best, 0.8 unless given, as its openMVG has it; null for any.",
         )
         search_radius_cells: int = Field(
             default=8,
@@ -85,6 +99,11 @@ class MatchGuided(Method):
             "the walls.",
         )
 
+        @model_validator(mode="before")
+        @classmethod
+        def _preset_fills_in(cls, given: Any) -> Any:
+            return with_paper_ratio(given)
+
     class In(Ports):
         """Photos, the walls, where the photos were taken, roughly, and ties measured by hand."""
 
@@ -111,7 +130,7 @@ class MatchGuided(Method):
             return self.Out(ties=alone)
         oriented = _oriented(inputs.cameras)
         if params.preset == "paper":
-            ties = _masked(photos, walls, oriented, ctx)
+            ties = _masked(photos, walls, oriented, largest_ratio(params.ratio), ctx)
             return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
         ctx.progress(0.0, "walls")
         targets = [target_of(wall) for wall in walls.walls]
@@ -158,10 +177,14 @@ class MatchGuided(Method):
         return opencv_version()
 
 
-def _masked(photos: Photos, walls: Walls, oriented: dict[str, Camera], ctx: StepContext) -> Ties:
+def _masked(
+    photos: Photos,
+    walls: Walls,
+    oriented: dict[str, Camera],
+    ratio_most: float,
+    ctx: StepContext,
+) -> Ties:
     """Match as markiewicz2015 did, within the footprint of each oriented photo."""
-    from orthoflow_plugins.match.paper import footprints, paper_pieces, paper_wall_features
-
     on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
     pieces: list[TiePiece] = []
     for index, photo in enumerate(photos.photos):
@@ -169,7 +192,7 @@ def _masked(photos: Photos, walls: Walls, oriented: dict[str, Camera], ctx: Step
             continue
         ctx.progress(index / len(photos.photos), photo.name)
         masks = footprints(oriented[photo.name].viewing(), walls)
-        pieces += paper_pieces(index, photo, on_walls, walls, masks)
+        pieces += paper_pieces(index, photo, on_walls, walls, masks, ratio_most=ratio_most)
     ties = ties_of(pieces, photos, walls, {"intensity_source": walls.intensity_source})
     _report(ctx, ties, {})
     return ties

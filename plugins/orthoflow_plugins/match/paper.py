@@ -1,26 +1,29 @@
 """Matching as markiewicz2015 did (3.5, 3.6, 4.3): SIFT as OpenCV sets it, and the best match.
 
-Every key point of the wall takes its nearest descriptor in the photo, however near it is. Without a
-mask that is every key point of the wall; with one, those in the part that the photo shows by its
-first pose.
+The best match is that of its reference [36], openMVG: a key point of the wall takes its nearest
+descriptor in the photo where the next one is clearly farther (the ratio of distances, 0.8 in
+openMVG's documentation); without a ratio, however near it is. Without a mask that is every key
+point of the wall; with one, those in the part that the photo shows by its first pose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photo, Wall, Walls
-from orthoflow_plugins.match.descriptors import nearest
+from orthoflow_plugins.match.descriptors import best_matches
 from orthoflow_plugins.match.features import FeatureRule, Features, find_features
 from orthoflow_plugins.match.pictures import photo_grey, wall_picture
 from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties
 from orthoflow_plugins.match.warping import project_walls
 
+# What openMVG's documentation names for its best match.
+_PAPER_RATIO: Final = 0.8
 _VOID_MARGIN_CELLS: Final = 3
 # OpenCV's own values.
 PAPER_FEATURES: Final = FeatureRule(
@@ -30,6 +33,19 @@ PAPER_FEATURES: Final = FeatureRule(
     upscales_precisely=False,
     is_rooted=False,
 )
+
+
+# Any: what a user wrote, before it is checked.
+def with_paper_ratio(given: Any) -> Any:
+    """Fill in the ratio of `preset: paper` where the parameters of a matcher say none."""
+    if isinstance(given, dict) and given.get("preset") == "paper":
+        return {"ratio": _PAPER_RATIO, **given}
+    return given
+
+
+def largest_ratio(ratio: float | None) -> float:
+    """Give the ratio up to which matches count, 1 where all do."""
+    return 1.0 if ratio is None else ratio
 
 
 def paper_wall_features(wall: Wall) -> Features | None:
@@ -60,6 +76,8 @@ def paper_pieces(
     on_walls: Sequence[Features | None],
     walls: Walls,
     masks: Sequence[NDArray[np.bool_] | None] | None,
+    *,
+    ratio_most: float,
 ) -> list[TiePiece]:
     """Best matches of a photo with every wall.
 
@@ -69,6 +87,7 @@ def paper_pieces(
         on_walls: key points per wall, None where it shows nothing.
         walls: the walls.
         masks: cells of each wall that may be matched, None for none; without, all may.
+        ratio_most: largest distance of the best match over the second best; 1 for any.
     """
     in_photo = find_features(photo_grey(photo), PAPER_FEATURES)
     pieces = []
@@ -78,8 +97,9 @@ def paper_pieces(
             chosen = _within(features, masks[place])
         if chosen is None or not len(chosen) or not len(in_photo):
             continue
-        best = nearest(chosen.descriptors, in_photo.descriptors)
-        pieces.append(key_point_ties((index, place), wall, (in_photo.take(best), chosen)))
+        best = best_matches(chosen.descriptors, in_photo.descriptors, ratio_most=ratio_most)
+        pairs = in_photo.take(best.second), chosen.take(best.first)
+        pieces.append(key_point_ties((index, place), wall, pairs))
     return pieces
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
@@ -14,7 +14,12 @@ from orthoflow_plugins.match.features import FeatureRule, Features
 from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
-from orthoflow_plugins.match.paper import paper_pieces, paper_wall_features
+from orthoflow_plugins.match.paper import (
+    largest_ratio,
+    paper_pieces,
+    paper_wall_features,
+    with_paper_ratio,
+)
 from orthoflow_plugins.match.pictures import photo_grey, require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
@@ -28,7 +33,7 @@ class MatchSift(Method):
     """
 
     id: ClassVar[str] = "match.sift"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.5, 3.6",
@@ -41,18 +46,19 @@ class MatchSift(Method):
 
         preset: Literal["none", "paper"] = Field(
             default="none",
-            description="paper: SIFT as OpenCV sets it, on the pictures as they are, and every key "
-            "point of a wall with its best match in the photo, as in markiewicz2015; no other "
-            "option applies.",
+            description="paper: SIFT as OpenCV sets it, on the pictures as they are, and the key "
+            "points of a wall with their best match in the photo, as in markiewicz2015; of the "
+            "other options `ratio` applies.",
         )
         n_features_max: int = Field(
             default=8000, ge=50, description="Key points per photo and per wall, spread evenly."
         )
-        ratio: float = Field(
+        ratio: float | None = Field(
             default=0.85,
             gt=0,
             le=1,
-            description="Largest distance of the best match over the second best.",
+            description="Largest distance of the best match over the second best; null for any. "
+            "With preset: paper 0.8 unless given, as its openMVG has it.",
         )
         search: Literal["exact", "approximate"] = Field(
             default="exact",
@@ -87,6 +93,11 @@ class MatchSift(Method):
             "as wide as a cell of the walls.",
         )
 
+        @model_validator(mode="before")
+        @classmethod
+        def _preset_fills_in(cls, given: Any) -> Any:
+            return with_paper_ratio(given)
+
     class In(Ports):
         """The photos, the rastered walls, and ties measured by hand."""
 
@@ -107,7 +118,7 @@ class MatchSift(Method):
         if alone is not None:
             return self.Out(ties=alone)
         if params.preset == "paper":
-            ties = _paper(photos, walls, ctx)
+            ties = _paper(photos, walls, largest_ratio(params.ratio), ctx)
             return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
         rule = _rule(params)
         ctx.progress(0.0, "key points of the walls")
@@ -139,12 +150,12 @@ class MatchSift(Method):
         return opencv_version()
 
 
-def _paper(photos: Photos, walls: Walls, ctx: StepContext) -> Ties:
+def _paper(photos: Photos, walls: Walls, ratio_most: float, ctx: StepContext) -> Ties:
     on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
     pieces: list[TiePiece] = []
     for index, photo in enumerate(photos.photos):
         ctx.progress(index / len(photos.photos), photo.name)
-        pieces += paper_pieces(index, photo, on_walls, walls, None)
+        pieces += paper_pieces(index, photo, on_walls, walls, None, ratio_most=ratio_most)
     ties = ties_of(pieces, photos, walls, {"intensity_source": walls.intensity_source})
     _report(ctx, ties, on_walls)
     return ties
@@ -157,7 +168,7 @@ def _rule(params: MatchSift.Params) -> PairingRule:
             contrast_threshold=params.contrast_threshold_factor,
             edge_threshold=params.edge_threshold_ratio,
         ),
-        ratio_most=params.ratio,
+        ratio_most=largest_ratio(params.ratio),
         n_verified_least=params.n_verified_min,
         longest_side_px=params.longest_side_max_px,
         clip_limit=params.equalise_clip_factor,

@@ -97,7 +97,25 @@ def test_measured_points_give_their_residuals_by_class(tmp_path: Path) -> None:
     }
 
 
-def test_the_papers_table_fits_the_iterated_rule_only() -> None:
+def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
+    walls = inspect_scenes.walls()
+    places = np.column_stack([np.linspace(40.0, 300.0, 20), np.linspace(40.0, 200.0, 20)])
+    surveyed = walls.walls[0].frame.world_from_wall(places, 0.01)
+    off = np.zeros((20, 2))
+    off[:, 0] = np.append(np.full(12, 0.1), np.linspace(1.0, 2.0, 8))
+    image = inspect_scenes.displaced(0, 0)
+    metrics, _, ctx = inspect(tmp_path, points_at(surveyed, pixels=places + off), walls, image)
+    assert metrics["n_outliers_iterated_capped"] == 5
+    (said,) = ctx.warnings
+    assert said.startswith("n_outliers_iterated_capped: the iterated rule for outliers ends at 5 p")
+    assert said.endswith("of two kinds, which the rule cannot part; compare n_outliers_once")
+    off[12:] = off[:8]
+    metrics, _, ctx = inspect(tmp_path, points_at(surveyed, pixels=places + off), walls, image)
+    assert metrics["n_outliers_iterated"] == 0
+    assert ctx.warnings == []
+
+
+def test_the_papers_numbers_for_points_fit_the_iterated_rule_only() -> None:
     # skarlatos2012, Table 1, point cloud: 30 points, RMS 4.39 cm, 2 outliers, 4.00 cm without.
     length = np.append(np.full(28, 0.0400), [0.0805, 0.0806])
     assert np.sqrt(np.mean(length**2)) == pytest.approx(0.0439, abs=5e-5)

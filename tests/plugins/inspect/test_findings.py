@@ -69,6 +69,19 @@ def test_check_points_are_summed_up_by_lengths_and_outliers() -> None:
     assert still["mean_shift_share"] == 0.0
 
 
+def test_a_cap_that_binds_is_told_in_the_name() -> None:
+    """Lengths of two kinds: the iterated rule goes on until its cap, the plain one does not."""
+    two_kinds = np.append(np.full(40, 0.1), np.linspace(1.0, 2.0, 28))
+    shift_m = 1e-3 * two_kinds[:, None] * np.array([0.6, 0.8])
+    found = {item.name: item.value for item in check_findings(shift_m, 0.004, prefix="all_")}
+    rms = np.sqrt((two_kinds**2).mean())
+    assert found["all_n_outliers_once"] == np.count_nonzero(two_kinds > 2.0 * rms)
+    assert found["all_n_outliers_iterated_capped"] == 17
+    left = np.sort(two_kinds)[:-17]
+    assert found["all_rms_after_iterated_capped_mm"] == pytest.approx(np.sqrt((left**2).mean()))
+    assert "all_n_outliers_iterated" not in found
+
+
 def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: Path) -> None:
     ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
 
