@@ -54,6 +54,10 @@ class StepFailedError(OrthoflowError, RuntimeError):
     """A step ended without a result: crashed, killed, out of memory, or past its timeout."""
 
 
+class DiskSpaceError(StepFailedError):
+    """A step wanted more room on the disk than there was; given more, the same run goes on."""
+
+
 class CancelledStepError(OrthoflowError, RuntimeError):
     """A step was asked to stop and did."""
 

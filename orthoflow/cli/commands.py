@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import click
+from click.core import ParameterSource
 
 from orthoflow.errors import OrthoflowError, RecordError
 
@@ -33,6 +35,23 @@ def current_session() -> Session:
     context = click.get_current_context(silent=True)
     session = context.find_object(Session) if context is not None else None
     return session if session is not None else Session()
+
+
+def command_again(output: Path) -> str:
+    """Write the running command as a shell takes it, with a folder behind -o."""
+    context = click.get_current_context()
+    words = [context.command_path]
+    for item in context.command.params:
+        name = str(item.name)
+        is_given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        if not is_given or name == "output":
+            continue
+        value = context.params[name]
+        for text in value if isinstance(value, tuple) else (value,):
+            is_flag = isinstance(item, click.Option) and item.is_flag
+            words += [item.opts[0]] if isinstance(item, click.Option) else []
+            words += [] if is_flag else [shlex.quote(str(text))]
+    return " ".join([*words, "-o", shlex.quote(str(output))])
 
 
 def debug_parameter() -> click.Option:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from orthoflow.cli.commands import Command, current_session
+from orthoflow.cli.commands import Command, command_again, current_session
 from orthoflow.cli.failures import say_error, silence_stdout
 from orthoflow.cli.options import (
     execution_options,
@@ -82,6 +83,7 @@ class _Call:
     def go(self) -> int:
         """Execute, record, report and say what came out."""
         from orthoflow.engine.run_folder import new_run_folder, new_run_id
+        from orthoflow.errors import DamageError, DiskSpaceError, StoreError
         from orthoflow.records import REPORT_FILE, executed_and_written, write_run
         from orthoflow.report import write_page
 
@@ -94,18 +96,25 @@ class _Call:
         report = folder / REPORT_FILE
 
         def write(outcome: RunOutcome) -> Run:
-            return write_run(
-                outcome,
-                self.plan,
-                self.workflow,
-                folder,
-                self.store,
-                embed=self.embed,
-                before_finish=lambda run: write_page(run, report),
-            )
+            try:
+                return write_run(
+                    outcome,
+                    self.plan,
+                    self.workflow,
+                    folder,
+                    self.store,
+                    embed=self.embed,
+                    before_finish=lambda run: write_page(run, report),
+                )
+            except StoreError as error:
+                if not isinstance(error, DamageError):
+                    self._show_unfinished(folder, outcome)
+                raise
 
         made = executed_and_written(lambda: self._execute(folder, run_id), write)
         _print_failures(made.run.record.cells)
+        if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
+            say_error(f"with more room on the disk, the same command with -o {folder} goes on")
         try:
             _print_summary(made, report)
         except BrokenPipeError:
@@ -119,7 +128,28 @@ class _Call:
 
         addresses = tuple(item.cell.address for item in self.plan.cells)
         with make_progress(addresses) as progress:
-            return execute(self.plan, folder, self.store, progress.tell, run_id=run_id)
+            return execute(
+                self.plan,
+                folder,
+                self.store,
+                progress.tell,
+                run_id=run_id,
+                on_interruption=partial(self._show_unfinished, folder),
+            )
+
+    def _show_unfinished(self, folder: Path, outcome: RunOutcome) -> None:
+        """Write the report of a run that was broken off: what is there, and how to go on."""
+        from orthoflow.records import REPORT_FILE, show_unfinished
+        from orthoflow.report import write_page
+
+        report = folder / REPORT_FILE
+        go_on = command_again(folder)
+
+        def show(run: Run) -> None:
+            write_page(run, report, go_on=go_on)
+
+        if show_unfinished(outcome, self.plan, self.workflow, folder, self.store, show):
+            say_error(f"report of what there is so far: {report}")
 
 
 def _print_failures(cells: Iterable[RecordedCell]) -> None:
@@ -135,14 +165,17 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
     echo()
     echo_table(
         ("cell", "method", "status", "time", "remark"),
-        [(cell.address, cell.method, _status(cell), _time(cell), _remark(cell)) for cell in cells],
+        [
+            (cell.address, cell.method, _status(cell, made.kept), _time(cell), _remark(cell))
+            for cell in cells
+        ],
     )
     warnings = [f"warning, {cell.address}: {text}" for cell in cells for text in cell.warnings]
     if warnings:
         echo()
     for warning in warnings:
         echo(warning)
-    echo("", _cached_text(cells))
+    echo("", _cached_text(cells, made.kept))
     if made.outcome.damaged:
         echo(_damaged_text(made.outcome.damaged))
     echo(f"products: {run.products_folder}")
@@ -152,8 +185,8 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
         echo(f"orthoimage: {image}")
 
 
-def _cached_text(cells: Iterable[RecordedCell]) -> str:
-    """Say how many cells came from the store, skipped ones left aside."""
+def _cached_text(cells: Iterable[RecordedCell], kept: Collection[str]) -> str:
+    """Say how many cells came from the store, or from before an interruption; no skipped ones."""
     counted_cells = [cell for cell in cells if cell.status != "skipped"]
     n_cells = len(counted_cells)
     n_cached = sum(bool(cell.cached_from) for cell in counted_cells)
@@ -163,7 +196,9 @@ def _cached_text(cells: Iterable[RecordedCell]) -> str:
             if n_cells > 1
             else ("the only step was cached")
         )
-    return f"{n_cached} of {counted(n_cells, 'step')} cached"
+    n_kept = sum(cell.address in kept for cell in counted_cells)
+    before = f", {n_kept} kept from before the interruption" if n_kept else ""
+    return f"{n_cached} of {counted(n_cells, 'step')} cached{before}"
 
 
 def _damaged_text(damaged: Mapping[str, str]) -> str:
@@ -174,8 +209,8 @@ def _damaged_text(damaged: Mapping[str, str]) -> str:
     return f"{count} of the store {were} damaged and computed again: {named}"
 
 
-def _status(cell: RecordedCell) -> str:
-    return "cached" if cell.cached_from else cell.status
+def _status(cell: RecordedCell, kept: Collection[str]) -> str:
+    return "cached" if cell.cached_from else "kept" if cell.address in kept else cell.status
 
 
 def _time(cell: RecordedCell) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.durability import size_of
+from orthoflow.engine.failures import Failures
 from orthoflow.engine.locks import exclusive_lock
 from orthoflow.engine.store import Store
 from orthoflow.errors import ArgumentError
@@ -71,7 +72,14 @@ def _collect(store: Store, older_than_days: float | None, *, is_dry: bool) -> Ga
         if path.stem in gone or not (store.results / path.name).exists()
     )
     damaged = _children(store.damaged)
-    rest = (*damaged, *_children(store.scratch), *_stale_kernels(store), *_half_written(store))
+    failures = _children(Failures.of_store(store.folder).folder)
+    rest = (
+        *damaged,
+        *failures,
+        *_children(store.scratch),
+        *_stale_kernels(store),
+        *_half_written(store),
+    )
     freed = sum(size_of(path) for path in (*results, *objects, *preimages, *rest))
     if not is_dry:
         # Results first: killed in between, no result is left whose objects are gone.

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from orthoflow.catalog import Catalog
+from orthoflow.engine.failures import Failures
 from orthoflow.engine.file_digests import FileRef
 from orthoflow.engine.keys import (
     CellKey,
@@ -241,12 +242,18 @@ class _Planner:
         is_forced = cell.step in self.force
         result = None if is_forced else self.store.result(key.key)
         if result is None:
-            reason = "forced" if is_forced else explain(key, cell.step, self._before(cell.method))
+            reason = "forced" if is_forced else self._why(cell, key)
             return PlannedCell(cell=cell, status="will run", reason=reason, key=key, inputs=refs)
         reason = f"in the store since {result.ended}"
         return PlannedCell(
             cell=cell, status="cached", reason=reason, key=key, inputs=refs, result=result
         )
+
+    def _why(self, cell: Cell, key: CellKey) -> str:
+        failure = Failures.of_store(self.store.folder).sentence(key.key)
+        if failure:
+            return f"failed last time: {failure}"
+        return explain(key, cell.step, self._before(cell.method))
 
     def _before(self, method: str) -> tuple[Preimage, ...]:
         if method not in self._earlier:

@@ -7,6 +7,8 @@ import hashlib
 import json
 import os
 import uuid
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,7 +22,7 @@ from pydantic import TypeAdapter
 from orthoflow.engine.clock import now, time_in_a_name
 from orthoflow.engine.durability import sync_folder, writing_to
 from orthoflow.engine.results import CellStatus
-from orthoflow.errors import ArgumentError, RecordError, StoreError
+from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
 
 JOURNAL: Final = "journal.jsonl"
 RECORD_FILE: Final = "run.h5"
@@ -67,7 +69,18 @@ class CellBegan:
 
 @dataclass(frozen=True, kw_only=True)
 class CellEnded:
-    """A cell has its outcome; `cached` when it was in the store."""
+    """A cell has its outcome.
+
+    Attributes:
+        event: of the line.
+        time: ISO 8601 UTC.
+        address: of the cell.
+        key: its key.
+        status: ok, failed or skipped.
+        cached: it was in the store.
+        error: the sentence of a failure.
+        error_type: class of a failure.
+    """
 
     event: Literal["finished"] = "finished"
     time: str
@@ -76,6 +89,7 @@ class CellEnded:
     status: CellStatus
     cached: bool
     error: str
+    error_type: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +126,8 @@ class Journal:
             run_id: id of a new run, made up when empty; a resumed run keeps its own.
 
         Raises:
-            ArgumentError: the folder holds a finished run, another workflow's run, or other files.
+            ArgumentError: the folder holds a finished run in which nothing lacked room on the
+                disk, another workflow's run, or other files.
             StoreError: it is in use by another run, or the disk refuses.
         """
         self._folder = folder
@@ -162,6 +177,8 @@ class Journal:
                 f"choose another folder with -o"
             ) from error
         lines = self._read_lines()
+        if (self._folder / RECORD_FILE).exists():
+            self._reopen(lines)
         self.is_resumed = bool(lines)
         first = next((line for line in lines if isinstance(line, RunBegan)), None)
         if lines and first is None:
@@ -187,6 +204,14 @@ class Journal:
         with writing_to(self._folder):
             sync_folder(self._folder)
 
+    def _reopen(self, lines: Sequence[JournalLine]) -> None:
+        """Take the name of a finished run from a record; the next one replaces it."""
+        if not _lacked_room(lines):
+            raise _is_finished(self._folder)
+        record = self._folder / RECORD_FILE
+        with writing_to(self._folder):
+            record.replace(self._folder / f".{RECORD_FILE}.earlier")
+
     def _read_lines(self) -> list[JournalLine]:
         """Read whole lines; a last one that was cut off by a kill is removed."""
         content = self._path.read_bytes()
@@ -195,7 +220,7 @@ class Journal:
             os.ftruncate(self._descriptor, len(whole))
             os.lseek(self._descriptor, 0, os.SEEK_END)
         try:
-            return [_codec().validate_json(line, strict=True) for line in whole.splitlines()]
+            return _parsed(whole)
         except ValueError as error:
             raise self._damage() from error
 
@@ -210,11 +235,29 @@ def _codec() -> TypeAdapter[JournalLine]:
     return TypeAdapter(JournalLine)
 
 
+def _parsed(lines: bytes) -> list[JournalLine]:
+    return [_codec().validate_json(line, strict=True) for line in lines.splitlines()]
+
+
+def _is_finished(folder: Path) -> ArgumentError:
+    return ArgumentError(
+        f"{folder} holds a finished run ({RECORD_FILE}); choose another folder with -o"
+    )
+
+
+def _lacked_room(lines: Sequence[JournalLine]) -> bool:
+    """Whether a cell failed because the disk was full: with more room, the run goes on."""
+    ends = {line.address: line for line in lines if isinstance(line, CellEnded)}
+    return any(end.error_type == DiskSpaceError.__name__ for end in ends.values())
+
+
 def _check_folder(folder: Path) -> None:
     if (folder / RECORD_FILE).exists():
-        raise ArgumentError(
-            f"{folder} holds a finished run ({RECORD_FILE}); choose another folder with -o"
-        )
+        lines: list[JournalLine] = []
+        with suppress(OSError, ValueError):
+            lines = _parsed((folder / JOURNAL).read_bytes())
+        if not _lacked_room(lines):
+            raise _is_finished(folder)
     if not folder.is_dir():
         return
     if link := next((path for path in folder.iterdir() if path.is_symlink()), None):

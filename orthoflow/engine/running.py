@@ -34,7 +34,14 @@ from orthoflow.engine.results import (
 )
 from orthoflow.engine.store import Publisher, Store, digest_of
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput
-from orthoflow.errors import InputError, MethodError, OrthoflowError, PluginError, StepFailedError
+from orthoflow.errors import (
+    DiskSpaceError,
+    InputError,
+    MethodError,
+    OrthoflowError,
+    PluginError,
+    StepFailedError,
+)
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import StepContext, StepEvent
@@ -123,7 +130,8 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
         )
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         # No StoreError: the method wanted more than there is, and stands failed in the record.
-        return StepFailedError(str(store_error(error, Path(task.store))))
+        kind = StepFailedError if error.errno == errno.EFBIG else DiskSpaceError
+        return kind(str(store_error(error, Path(task.store))))
     if isinstance(error, ValueError) and "read-only" in one_line(error):
         return MethodError(
             f"{task.who} writes to an array that is read-only, as all its inputs are ({error}); it "

@@ -6,8 +6,8 @@ import dataclasses
 import signal
 import threading
 import uuid
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -27,6 +27,7 @@ from orthoflow.engine.events import (
     ignore,
 )
 from orthoflow.engine.executors import Executor, InlineExecutor, TaskEnd, Tell
+from orthoflow.engine.failures import Failures
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.local_executor import LocalExecutor
 from orthoflow.engine.locks import exclusive_lock, is_locked
@@ -49,7 +50,7 @@ from orthoflow.engine.run_folder import (
 )
 from orthoflow.engine.store import Store
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput
-from orthoflow.errors import ArgumentError, CancelledStepError, DamageError
+from orthoflow.errors import ArgumentError, CancelledStepError, DamageError, StoreError
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
 from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
@@ -114,6 +115,7 @@ def execute(
     listen: RunListener = ignore,
     *,
     run_id: str = "",
+    on_interruption: Callable[[RunOutcome], None] | None = None,
 ) -> RunOutcome:
     """Run a plan to its end.
 
@@ -126,6 +128,8 @@ def execute(
         store: where products and results go.
         listen: gets events as they happen.
         run_id: id of a new run, made up when empty; a resumed run keeps its own.
+        on_interruption: gets what there is so far before the run ends with `StoreError` or
+            `CancelledStepError`; cells that have no result are not in it.
 
     Raises:
         ArgumentError: the run folder holds a finished run or other files, or a path is no text.
@@ -157,9 +161,12 @@ def execute(
             executor = _executor(plan.options.executor, _passing_on(listen), interruption)
             run = _Run(tasks, journal, listen)
             try:
-                run.go(executor, interruption)
-            finally:
-                executor.close()
+                with closing(executor):
+                    run.go(executor, interruption)
+            except (CancelledStepError, StoreError):
+                if on_interruption is not None:
+                    on_interruption(run.so_far())
+                raise
         return run.outcome()
 
 
@@ -178,6 +185,7 @@ class _Run:
         self._tasks = tasks
         self._plan = tasks.plan
         self._store = tasks.store
+        self._failures = Failures.of_store(tasks.store.folder)
         self._journal = journal
         self._listen = listen
         self._results: dict[str, CellResult] = {}
@@ -205,7 +213,19 @@ class _Run:
     def outcome(self) -> RunOutcome:
         """Give what the run left, in the order of the plan."""
         self._journal.write(RunWent(event="ended", time=now()))
-        order = [item.cell.address for item in self._plan.cells]
+        return self._outcome_of(item.cell.address for item in self._plan.cells)
+
+    def so_far(self) -> RunOutcome:
+        """Give what there is, without cells that were asked to stop."""
+        return self._outcome_of(
+            address
+            for item in self._plan.cells
+            if (address := item.cell.address) in self._results
+            and self._results[address].exit_code != CancelledStepError.exit_code
+        )
+
+    def _outcome_of(self, addresses: Iterable[str]) -> RunOutcome:
+        order = tuple(addresses)
         return RunOutcome(
             run_id=self._journal.run_id,
             started=self._journal.started,
@@ -353,10 +373,13 @@ class _Run:
             self._made.add(task.key)
             self._store.put_result(task.key, result, cell.step)
             self._store.trust(result)
+            self._failures.forget(task.key)
         elif result.status == "ok":
             # Kept under its key it would pass for what the code of that key computes.
             self._listen(CellWarned(address=cell.address, text=_CODE_CHANGED))
             result = _with_warning(result, _CODE_CHANGED)
+        elif result.exit_code != CancelledStepError.exit_code:
+            self._failures.remember(task.key, result.error_message)
         if self._has_other_inputs_now(cell, task):
             # What it took was damaged and came out differently when it was computed again.
             self._waiting[cell.address] = planned
@@ -400,6 +423,7 @@ class _Run:
                 status=result.status,
                 cached=is_cached,
                 error=result.error_message,
+                error_type=result.error_type,
             )
         )
         self._listen(CellFinished(address=cell.address, result=result, cached=is_cached))

@@ -7,6 +7,7 @@ Layout below the store's folder:
     results/<key>.json              what a cell gave, naming objects
     damaged/                        what was set aside; garbage
     preimages/<method>/<key>.json   small copies of the keys' preimages, for explanations
+    failures/<key>.json             how cells failed last time (`failures`); disposable
     digests.json                    memory of input files' digests; disposable
     numba/<source digest>/          compiled kernels; disposable
     scratch/<run id>/               work in progress; removed with its run

@@ -32,7 +32,7 @@ from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.run_files import figure_files, write_files
 from orthoflow.records.runs import REPORT_FILE, Run, open_run
 from orthoflow.records.verification import Verification, verify_run
-from orthoflow.records.writing import WrittenRun, executed_and_written, write_run
+from orthoflow.records.writing import WrittenRun, executed_and_written, show_unfinished, write_run
 
 __all__ = [
     "COSTS",
@@ -65,6 +65,7 @@ __all__ = [
     "figure_files",
     "open_run",
     "product_distances",
+    "show_unfinished",
     "verify_run",
     "write_files",
     "write_run",

@@ -14,6 +14,7 @@ from orthoflow_provenance.errors import InputFileError, RecordFormatError
 from orthoflow_provenance.model import (
     CellOutcome,
     Figure,
+    MethodIdentity,
     ProductRef,
     RecordedCell,
     RecordedEnvironment,
@@ -29,8 +30,9 @@ from orthoflow_provenance.writer import write_record
 
 from orthoflow.engine.durability import sync_folder, sync_tree, writing_to
 from orthoflow.engine.file_digests import FileDigests
+from orthoflow.engine.results import CellResult
 from orthoflow.engine.run_folder import RECORD_FILE
-from orthoflow.errors import DamageError, InputError, StoreError
+from orthoflow.errors import DamageError, InputError, OrthoflowError, StoreError
 from orthoflow.records.input_files import embedded_inputs, find_inputs
 from orthoflow.records.published import publish_products
 from orthoflow.records.runs import Run
@@ -39,21 +41,29 @@ from orthoflow.workflow import resolved_json
 from orthoflow.workflow.resolved import workflow_from_resolved
 
 if TYPE_CHECKING:
-    from orthoflow.engine import CellResult, RunOutcome, RunPlan, Store
+    from orthoflow.engine import RunOutcome, RunPlan, Store
     from orthoflow.engine.results import FigureRef
     from orthoflow.workflow import Workflow
     from orthoflow.workflow.cells import Cell
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4
+_NOT_YET: Final = "not computed yet: the run was broken off"
 
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenRun:
-    """A run that was executed, and its record."""
+    """A run that was executed, and its record.
+
+    Attributes:
+        run: the finished run.
+        outcome: what the engine gave.
+        kept: addresses that the run folder had before, from an interrupted attempt.
+    """
 
     run: Run
     outcome: RunOutcome
+    kept: frozenset[str] = frozenset()
 
 
 def write_run(
@@ -125,6 +135,27 @@ def _write_run(
     embed: bool,
     before_finish: Callable[[Run], None] | None,
 ) -> Run:
+    record, unfinished = _publish(outcome, plan, workflow, run_folder, store, embed=embed)
+    with writing_to(run_folder):
+        if before_finish is not None:
+            before_finish(Run(path=unfinished, record=read_record(unfinished)))
+        # All that the record names, before its own name says that it is there.
+        sync_tree(run_folder)
+        finished = unfinished.replace(run_folder / RECORD_FILE)
+        sync_folder(run_folder)
+    return Run(path=finished, record=record)
+
+
+def _publish(
+    outcome: RunOutcome,
+    plan: RunPlan,
+    workflow: Workflow,
+    run_folder: Path,
+    store: Store,
+    *,
+    embed: bool,
+) -> tuple[RunRecord, Path]:
+    """Fill `products/` and write the record under the name that it has until it is finished."""
     record = build_record(outcome, plan, workflow, store, embed=embed)
     with writing_to(run_folder):
         run_folder.mkdir(parents=True, exist_ok=True)
@@ -135,13 +166,54 @@ def _write_run(
         for leftover in run_folder.glob(f".*{RECORD_FILE}.*"):
             leftover.unlink()
         _write_record(unfinished, record, store, plan, embed=embed)
-        if before_finish is not None:
-            before_finish(Run(path=unfinished, record=read_record(unfinished)))
-        # All that the record names, before its own name says that it is there.
-        sync_tree(run_folder)
-        finished = unfinished.replace(run_folder / RECORD_FILE)
-        sync_folder(run_folder)
-    return Run(path=finished, record=record)
+    return record, unfinished
+
+
+def show_unfinished(
+    outcome: RunOutcome,
+    plan: RunPlan,
+    workflow: Workflow,
+    run_folder: Path,
+    store: Store,
+    show: Callable[[Run], None],
+) -> bool:
+    """Publish what a run has that was broken off, and show it; the run stays unfinished.
+
+    Args:
+        outcome: what there is, as `execute` gives it to `on_interruption`.
+        plan: what was to be done.
+        workflow: the document behind the plan.
+        run_folder: its folder.
+        store: holds the products and pictures.
+        show: gets a run whose record goes away again, e.g. to write the report; what has no
+            result yet is skipped in it.
+
+    Returns:
+        False when it cannot be shown, as on a full disk: the run itself loses nothing by that.
+    """
+    missing = {
+        item.cell.address: CellResult(
+            status="skipped",
+            run_id=outcome.run_id,
+            error_message=_NOT_YET,
+            **shared_fields(
+                plan.methods.get(item.cell.method) or MethodIdentity(method=item.cell.method),
+                MethodIdentity,
+            ),
+        )
+        for item in plan.cells
+        if item.cell.address not in outcome.results
+    }
+    whole = dataclasses.replace(outcome, results={**outcome.results, **missing})
+    try:
+        _, unfinished = _publish(whole, plan, workflow, run_folder, store, embed=False)
+        try:
+            show(Run(path=unfinished, record=read_record(unfinished)))
+        finally:
+            unfinished.unlink(missing_ok=True)
+    except (OrthoflowError, OSError):
+        return False
+    return True
 
 
 def executed_and_written(
@@ -156,12 +228,15 @@ def executed_and_written(
     Raises:
         DamageError: the store loses things faster than they can be computed.
     """
-    for _ in range(_MOST_ATTEMPTS - 1):
-        outcome = execute()
-        with suppress(DamageError):
-            return WrittenRun(run=write(outcome), outcome=outcome)
     outcome = execute()
-    return WrittenRun(run=write(outcome), outcome=outcome)
+    kept = outcome.resumed
+    for _ in range(_MOST_ATTEMPTS - 1):
+        with suppress(DamageError):
+            return WrittenRun(run=write(outcome), outcome=outcome, kept=kept)
+        outcome = execute()
+        # Of what the first attempt computed, the second says that it was there before.
+        kept &= outcome.resumed
+    return WrittenRun(run=write(outcome), outcome=outcome, kept=kept)
 
 
 def _write_record(

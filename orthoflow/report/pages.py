@@ -45,7 +45,7 @@ from orthoflow.report.pictures import (
     wall_pictures,
 )
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
-from orthoflow.report.summaries import Answer, Limit, answers, citations, limits
+from orthoflow.report.summaries import Answer, Limit, answers, citations, limits, results
 
 # Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
 _DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")
@@ -69,6 +69,7 @@ class _Section:
     prefix: str
     answers: tuple[Answer, ...]
     limits: tuple[Limit, ...]
+    results: Mapping[str, tuple[str, ...]]
     comparison: ComparisonTable | None
     orthoimages: tuple[Picture, ...]
     walls: tuple[Picture, ...]
@@ -82,10 +83,15 @@ class _Section:
     citations: Mapping[str, tuple[str, ...]]
 
 
-def write_page(run: Run, path: Path) -> None:
+def write_page(run: Run, path: Path, *, go_on: str = "") -> None:
     """Write the report of one run, and its figures as PNG and SVG files into `figures/` beside it.
 
     Of a comparison these are the figures of the baseline; `write_figures` writes those of any cell.
+
+    Args:
+        run: the run.
+        path: file to write.
+        go_on: of a run that was broken off, the command that goes on with it.
 
     Raises:
         StoreError: a file cannot be written.
@@ -94,16 +100,17 @@ def write_page(run: Run, path: Path) -> None:
     addresses = baseline_addresses(run)
     # Before the page is written: a record with such names gets none.
     figure_files(run, addresses)
-    write_report([run], path)
+    write_report([run], path, go_on=go_on)
     write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
 
-def write_report(runs: Sequence[Run], path: Path) -> None:
+def write_report(runs: Sequence[Run], path: Path, *, go_on: str = "") -> None:
     """Write one self-contained HTML file about one or more runs.
 
     Args:
         runs: opened with `orthoflow.open_run`; of two, the page also says what differs.
         path: file to write; replaced as a whole, never half.
+        go_on: of a run that was broken off, the command that goes on with it.
 
     Raises:
         StoreError: the file cannot be written.
@@ -118,6 +125,7 @@ def write_report(runs: Sequence[Run], path: Path) -> None:
         differences=differences(compare_runs(*runs)) if len(runs) == 2 else None,
         title=", ".join(dict.fromkeys(run.record.name for run in runs)),
         version=__version__,
+        go_on=go_on,
     )
     aside = path.with_name(f".report-{secrets.token_hex(8)}")
     try:
@@ -219,6 +227,7 @@ def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
         prefix=prefix,
         answers=answers(run),
         limits=limits(run),
+        results=results(run),
         comparison=comparison_table([run]),
         orthoimages=tuple(orthoimages),
         walls=tuple(walls),

@@ -79,6 +79,14 @@ def limits(run: Run) -> tuple[Limit, ...]:
     return tuple(Limit(text=text, cells=tuple(cells)) for text, cells in addresses.items())
 
 
+def results(run: Run) -> dict[str, tuple[str, ...]]:
+    """Which cells have a result, failed, or were not computed: status -> addresses."""
+    found: dict[str, tuple[str, ...]] = {"ok": (), "failed": (), "skipped": ()}
+    for cell in run.record.cells:
+        found[cell.status] = (*found[cell.status], cell.address)
+    return found
+
+
 def _in_words(metric: str, value: float, unit: str) -> str:
     if metric.startswith("completeness"):
         return f"{100 * value:.1f} %"

@@ -194,8 +194,9 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     write_studio(tmp_path, "paint.slow")
+    arguments = ("run", "studio.yaml", "--set", "survey.offset_m=2", "-o", "r")
     with subprocess.Popen(
-        command("run", "studio.yaml", "-o", "r"),
+        command(*arguments),
         cwd=tmp_path,
         env=workshop_environment(),
         stdout=subprocess.PIPE,
@@ -211,15 +212,54 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
         running.send_signal(number)
         _, rest = running.communicate(timeout=30)
     assert running.returncode == 130
-    assert rest.splitlines()[-1] == (
-        "interrupted; what is finished is kept, and the same command with -o r goes on from there"
-    )
+    assert rest.splitlines()[-2:] == [
+        "report of what there is so far: r/report.html",
+        "interrupted; what is finished is kept, and the same command with -o r goes on from there",
+    ]
     assert "Traceback" not in rest
+    assert {path.name for path in (tmp_path / "r").iterdir()} == {
+        *("figures", "journal.jsonl", "logs", "products", "report.html")
+    }
+    page = (tmp_path / "r" / "report.html").read_text()
+    assert "<li>There: survey</li>" in page
+    assert "<li>Not computed: paint</li>" in page
+    assert "<pre>orthoflow run studio.yaml --set survey.offset_m=2 -o r</pre>" in page
+    assert "not finished" in page
     write_studio(tmp_path, "paint.plain")
-    again = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r")
+    again = orthoflow(tmp_path, *arguments)
     assert again.returncode == 0, again.stderr
     assert again.stderr.startswith("going on with run ")
+    assert "0 of 2 steps cached, 1 kept from before the interruption" in again.stdout.splitlines()
+    assert ["survey", "survey.offset", "kept"] in [
+        line.split()[:3] for line in again.stdout.splitlines()
+    ]
     assert open_run(tmp_path / "r").cells["survey"].cached_from == ""
+    assert "not finished" not in (tmp_path / "r" / "report.html").read_text()
+
+
+def test_a_run_that_failed_for_want_of_room_goes_on_with_the_same_folder(tmp_path: Path) -> None:
+    write_studio(tmp_path, "paint.room")
+    arguments = ("run", "studio.yaml", "-o", "r")
+    failed = subprocess.run(
+        command(*arguments),
+        cwd=tmp_path,
+        env={**workshop_environment(), "WORKSHOP_DISK_IS_FULL": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert failed.returncode == 1
+    assert "with more room on the disk, the same command with -o r goes on" in failed.stderr
+    assert open_run(tmp_path / "r").cells["paint"].error_type == "DiskSpaceError"
+    page = (tmp_path / "r" / "report.html").read_text()
+    assert "<li>Failed: paint</li>" in page
+    again = orthoflow(tmp_path, *arguments)
+    assert again.returncode == 0, again.stderr
+    assert "0 of 2 steps cached, 1 kept from before the interruption" in again.stdout.splitlines()
+    assert open_run(tmp_path / "r").record.status == "ok"
+    assert orthoflow(tmp_path, "verify", "r").returncode == 0
+    assert not list((tmp_path / "r").glob(".run.h5*"))
+    assert orthoflow(tmp_path, *arguments).returncode == 2
 
 
 def test_a_terminal_gets_a_live_table_that_leaves_nothing_behind(tmp_path: Path) -> None:

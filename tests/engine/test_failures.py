@@ -138,7 +138,7 @@ def test_running_out_of_memory_in_an_allocation_is_a_sentence(world: World) -> N
 
 def test_a_full_disk_in_a_method_names_the_store(world: World) -> None:
     result = bad_result(world, "full_disk", executor="inline")
-    assert result.error_type == "StepFailedError"
+    assert result.error_type == "DiskSpaceError"
     assert result.error_message.startswith(
         f"cannot write to {world.store.folder}: No space left on the disk"
     )
@@ -339,7 +339,7 @@ steps:
 
 def test_a_disk_that_fills_up_under_a_mapped_file_fails_the_cell(tiny_world: World) -> None:
     result = bad_result(tiny_world, "fills_mapped")
-    assert result.error_type in ("StoreError", "StepFailedError")
+    assert result.error_type == "DiskSpaceError"
     assert "disk" in result.error_message
 
 

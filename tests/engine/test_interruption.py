@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from orthoflow.engine import RunOutcome, collect_garbage
-from orthoflow.errors import StoreError
+from orthoflow.engine import RunOutcome, collect_garbage, execute
+from orthoflow.errors import CancelledStepError, StoreError
 from tests.engine_world import World, start_coordinator, toy_world
 from tests.long_loops import IS_LONG
 
@@ -143,11 +143,12 @@ def test_an_inline_run_can_be_interrupted_too(world: World) -> None:
         if type(event).__name__ == "CellProgress":
             os.kill(os.getpid(), signal.SIGINT)
 
-    from orthoflow.engine import execute
-    from orthoflow.errors import CancelledStepError
-
+    left: list[RunOutcome] = []
     with pytest.raises(CancelledStepError, match="the run was interrupted"):
-        execute(plan, world.folder / "run", world.store, interrupt)
+        execute(plan, world.folder / "run", world.store, interrupt, on_interruption=left.append)
+    assert {address: result.status for address, result in left[0].results.items()} == {
+        "first": "ok"
+    }
     assert events(world, "run")[-1]["event"] == "interrupted"
     assert signal.getsignal(signal.SIGINT) is before
 

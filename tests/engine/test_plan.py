@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from orthoflow.engine import collect_garbage
+from orthoflow.engine.failures import Failures
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.plan import explain
 from orthoflow.engine.results import ProductRef
@@ -365,3 +367,52 @@ def test_an_input_that_is_not_wired_in_the_workflow_is_still_digested(world: Wor
     assert given is not None
     assert [(file.name, file.size_bytes) for file in given.files] == [("data.txt", 1)]
     assert str(WorkflowInput(name="data")) == "inputs.data"
+
+
+# What failed last time ----------------------------------------------------------------------------
+
+FAILING = """
+steps:
+  first: {use: make.range}
+  second: {use: work.unreadable, in: {numbers: first.numbers}}
+"""
+
+
+def test_the_plan_says_what_failed_last_time_until_garbage_is_collected(world: World) -> None:
+    world.run(FAILING, executor="inline")
+    planned = world.status(FAILING)
+    assert planned["second"] == ("will run", "failed last time: the numbers are unreadable")
+    assert world.status(FAILING, force=("second",))["second"] == ("will run", "forced")
+    assert collect_garbage(world.store, dry_run=True).freed_bytes > 0
+    collect_garbage(world.store)
+    assert world.status(FAILING)["second"] == ("will run", "never ran before")
+
+
+def test_a_result_takes_back_the_failure_before_it(world: World) -> None:
+    failures = Failures.of_store(world.store.folder)
+    key = next(item.key for item in world.plan(CHAIN).cells if item.key is not None)
+    failures.remember(key.key, "no\x1b[2J room")
+    assert world.status(CHAIN)["first"] == ("will run", "failed last time: no\\x1b[2J room")
+    run(world, CHAIN)
+    assert failures.sentence(key.key) == ""
+    assert list(failures.folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b'{"error":"forged"}', b"no json", b"\xff", b"[" * 100_000, b'{"sha256":"0","error":1}'],
+    ids=["without digest", "text", "bytes", "too large", "wrong digest"],
+)
+def test_a_memory_of_failures_that_is_not_ours_says_nothing(tmp_path: Path, content: bytes) -> None:
+    failures = Failures(tmp_path)
+    (tmp_path / "key.json").write_bytes(content)
+    assert failures.sentence("key") == ""
+
+
+def test_the_memory_of_a_failure_is_short_and_no_link_is_followed(tmp_path: Path) -> None:
+    failures = Failures(tmp_path / "failures")
+    failures.remember("long", "no " * 100_000)
+    assert len(failures.sentence("long")) < 500
+    (tmp_path / "failures" / "link.json").symlink_to(tmp_path / "failures" / "long.json")
+    assert failures.sentence("link") == ""
+    assert failures.sentence("unknown") == ""

@@ -17,7 +17,7 @@ from orthoflow.catalog import discover_catalog
 from orthoflow.engine import RunOptions, RunOutcome, RunPlan, Store, execute, plan_run
 from orthoflow.engine.results import FigureRef
 from orthoflow.errors import StoreError
-from orthoflow.records import Run, open_run, verify_run, write_run
+from orthoflow.records import Run, open_run, show_unfinished, verify_run, write_run
 from orthoflow.workflow import Workflow, expand_cells, load_workflow
 from tests import photo_files
 from tests.engine_world import toy_world
@@ -103,6 +103,35 @@ def test_a_failing_report_leaves_the_run_unfinished_and_the_next_attempt_cleans_
     names = {path.name for path in executed.folder.iterdir()}
     assert names == {"journal.jsonl", "logs", "products", "run.h5"}
     assert not (executed.folder / "products" / "left-over").exists()
+
+
+def test_what_was_broken_off_is_shown_and_stays_unfinished(executed: Executed) -> None:
+    survey = {"survey": executed.outcome.results["survey"]}
+    broken_off = dataclasses.replace(executed.outcome, results=survey)
+    seen: list[Run] = []
+
+    def look(run: Run) -> None:
+        assert run.product("survey", "planes") is not None
+        seen.append(run)
+
+    def refuse(_run: Run) -> None:
+        raise OSError(28, "No space left on device")
+
+    shown = [
+        show_unfinished(
+            broken_off, executed.plan, executed.workflow, executed.folder, executed.store, show
+        )
+        for show in (look, refuse)
+    ]
+    assert shown == [True, False]
+    assert {address: cell.status for address, cell in seen[0].cells.items()} == {
+        "survey": "ok",
+        "paint": "skipped",
+    }
+    assert seen[0].cells["paint"].error_message == "not computed yet: the run was broken off"
+    assert (executed.folder / "products" / "survey" / "planes.json").is_file()
+    assert not list(executed.folder.glob("*run.h5*"))
+    assert executed.write().record.status == "ok"
 
 
 def test_copies_do_not_share_their_bytes_with_the_store(executed: Executed) -> None:

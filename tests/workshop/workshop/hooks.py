@@ -25,6 +25,7 @@ def orthoflow_methods() -> list[MethodSpec]:
         "paint.plain": ("PaintPlain", "one colour"),
         "paint.fail": ("PaintFail", "finds no result"),
         "paint.lacking": ("PaintLacking", "needs a library that is not there"),
+        "paint.room": ("PaintRoom", "wants room on the disk"),
         "paint.slow": ("PaintSlow", "takes its time"),
     }
     return [
