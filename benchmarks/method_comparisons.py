@@ -7,8 +7,8 @@
 
 Each recipe runs into `FOLDER/<recipe>` on its simulated room, as `orthoflow run <recipe>.yaml` does
 it, unless that folder holds a finished run; a single report of all of them goes to
-`FOLDER/report.html`. Best values are bold where a metric has a good side. Processor seconds include
-compiling where a kernel was new; docs/performance.md measures speed.
+`FOLDER/report.html`. Best values are bold where a metric has a good side. Processor seconds are
+without loading and compiling; docs/performance.md measures speed.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from toy_plugin.mischief_names import MISCHIEF
 WORKS = ["add", "noise", "sign", "slow", "segfault", "abort", "eat", "hang", "stubborn", "quit",
          "leave", "raises", "refuses", "unreadable", "needs_library", "no_memory", "full_disk",
          "changes_input", "wrong_type", "wrong_out", "bad_param", "draws", "chatty", "unstorable",
-         "spawns", "spawns_and_waits", "threads", "fills_mapped"]
+         "spawns", "spawns_and_waits", "threads", "fills_mapped", "compiles", "loads"]
 
 @hookimpl
 def orthoflow_kinds():
@@ -187,6 +187,47 @@ def noise(values, params, ctx):
 @work("exact")
 def sign(values, params, ctx):
     return np.sign(values)
+
+@work("exact")
+def compiles(values, params, ctx):
+    # A kernel that takes so many seconds to compile.
+    import numba
+    from numba.extending import overload
+
+    def slowly_typed(values):
+        raise NotImplementedError
+
+    waited = []
+
+    @overload(slowly_typed)
+    def typed(values):
+        if not waited:
+            waited.append(True)
+            time.sleep(params.amount)
+        return lambda values: values
+
+    @numba.njit(nogil=True)
+    def kernel(values):
+        return slowly_typed(values) + 1.0
+
+    started = ctx.clock_s()
+    kernel(values)
+    result = kernel(values)
+    time.sleep(0.2)
+    ctx.metric("kernel_s", ctx.clock_s() - started, "s")
+    return result
+
+@work("exact")
+def loads(values, params, ctx):
+    # A library that takes its time to load, and one that a daemon thread loads.
+    started = ctx.clock_s()
+    thread = threading.Thread(target=lambda: __import__("toy_plugin.aside"), daemon=True)
+    thread.start()
+    thread.join()
+    from toy_plugin import heavy
+
+    ctx.metric("loads_s", ctx.clock_s() - started, "s")
+    return values
 
 @work("exact")
 def slow(values, params, ctx):

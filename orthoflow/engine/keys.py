@@ -131,6 +131,9 @@ def cell_key(cell: Cell, facts: MethodFacts, inputs: Mapping[str, ProductRef]) -
             for port, ref in inputs.items()
         },
     }
+    if facts.determinism == "exact" and cell.repeat:
+        # The same result, computed once more to be timed.
+        preimage["repeat"] = cell.repeat
     text = canonical_json(preimage)
     return CellKey(key=hashlib.sha256(text.encode()).hexdigest(), preimage=text)
 

@@ -22,6 +22,7 @@ from pydantic import ValidationError
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import store_error, writing_to
 from orthoflow.engine.file_digests import file_identity, file_sha256
+from orthoflow.engine.loading import LoadingMeter
 from orthoflow.engine.memory import MIB, MemorySampler, is_for_want_of_memory
 from orthoflow.engine.results import (
     CellResult,
@@ -68,10 +69,10 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         is_cancelled: asks whether to stop.
     """
     started = now()
-    sampler = MemorySampler()
-    call = _Call(task, listen, is_cancelled)
+    sampler, meter = MemorySampler(), LoadingMeter()
+    call = _Call(task, listen, is_cancelled, meter)
     try:
-        with sampler:
+        with sampler, meter:
             result = call.run()
     except BaseException as error:
         # Where Ctrl-C is ignored, nobody but the method can have raised it.
@@ -146,10 +147,16 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
 class _Call:
     """One call of a method, with what it measured so far also when it fails."""
 
-    def __init__(self, task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        task: Task,
+        listen: Listener,
+        is_cancelled: Callable[[], bool],
+        meter: LoadingMeter,
+    ) -> None:
         self.task = task
-        self._wall_s = 0.0
-        self._cpu_s = 0.0
+        self._meter = meter
+        self._wall_s = self._processor_s = 0.0
         self._stored_mib: float | None = None
         self._store = Store(Path(task.store), workspace=Path(task.folder))
         with writing_to(self._store.folder):
@@ -160,6 +167,7 @@ class _Call:
             scratch=task.scratch,
             listen=listen,
             is_cancelled=is_cancelled,
+            clock_s=meter.clock_s,
         )
 
     @property
@@ -170,24 +178,25 @@ class _Call:
         """What the call took so far."""
         return Costs(
             wall_s=self._wall_s,
-            cpu_s=self._cpu_s,
+            cpu_s=self._processor_s,
             peak_rss_mib=sampler.peak_mib,
             stored_mib=self._stored_mib,
+            compile_s=round(self._meter.total_s, 4),
         )
 
     def run(self) -> CellResult:
         cls = cast("type[Method]", load_target(self.task.target))
         inputs = {port: self._read(given) for port, given in self.task.inputs.items()}
         params = self._params(cls)
-        wall, cpu, process = time.perf_counter(), _cpu_s(), os.getpid()
+        wall_s, cpu_s, process = self._meter.clock_s(), self._cpu_s(), os.getpid()
         try:
             outputs = cls().run(cls.In(**inputs), params, self._context)
         finally:
             if os.getpid() != process:
                 # The method forked, and this is not the process whose result counts.
                 os._exit(1)
-            self._wall_s = round(time.perf_counter() - wall, 4)
-            self._cpu_s = round(_cpu_s() - cpu, 4)
+            self._wall_s = round(self._meter.clock_s() - wall_s, 4)
+            self._processor_s = round(self._cpu_s() - cpu_s, 4)
         self._check_inputs(inputs)
         result = dataclasses.replace(
             blank_result(self.task),
@@ -197,6 +206,12 @@ class _Call:
         )
         self._stored_mib = round(self._store.size_bytes(result) / MIB, 3)
         return result
+
+    def _cpu_s(self) -> float:
+        """Processor seconds of this process and its children so far, but for loading."""
+        children = resource.getrusage(resource.RUSAGE_CHILDREN)
+        children_s = children.ru_utime + children.ru_stime
+        return time.process_time() + children_s - self._meter.processor_s
 
     def _read(self, given: TaskInput) -> Product | InputFiles:
         if given.input_name:
@@ -298,11 +313,6 @@ def _check_file(file: TaskFile) -> None:
 
 def _n_bytes(product: Product) -> int:
     return sum(array.nbytes for array in product.to_payload().arrays.values())
-
-
-def _cpu_s() -> float:
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + children.ru_utime + children.ru_stime
 
 
 def _trace(error: BaseException) -> str:

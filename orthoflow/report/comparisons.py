@@ -190,6 +190,10 @@ def _remark(one: Combination) -> str:
             f"{len(cached)} of {len(one.varied_cells)} steps cached, with their time in run "
             f"{sources}"
         )
+    n_older = sum(cell.status == "ok" and cell.compile_s is None for cell in one.varied_cells)
+    if n_older:
+        of_all = f"{n_older} of {len(one.varied_cells)} steps"
+        parts.append(f"{of_all} with loading and compiling in their time")
     if one.n_failed_repeats:
         parts.append(f"{one.n_failed_repeats} repeats failed")
     return "; ".join(parts)

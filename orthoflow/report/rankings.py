@@ -95,6 +95,8 @@ _PATTERNS: Final[tuple[tuple[str, Sense], ...]] = (
     ("raw_omega_deg", Sense.NEITHER),
     ("raw_phi_deg", Sense.NEITHER),
     ("sigma0*", Sense.NEITHER),
+    # It hangs on what ran before, not on the method.
+    ("*compile_s", Sense.NEITHER),
     ("*wrong_share*", Sense.LESS),
     ("*stretch_share", Sense.LESS),
     ("*smear_share", Sense.LESS),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,6 +77,9 @@ class StepContext:
         scratch: existing empty folder, the only place a method may write to.
         listen: where progress, log lines and warnings go as they happen.
         is_cancelled: asks whether the step should stop.
+        clock_s: seconds as `time.perf_counter`, which stand still while modules are loaded and
+            kernels compiled: what a method measures of its own speed must not hang on what ran
+            before. The engine states that time as `compile_s`.
         metrics: what `metric` collected.
         figures: what `figure` collected.
         warnings: what `warn` collected.
@@ -86,6 +90,7 @@ class StepContext:
     scratch: Path
     listen: Callable[[StepEvent], None] = _ignore
     is_cancelled: Callable[[], bool] = _never
+    clock_s: Callable[[], float] = time.perf_counter
     metrics: list[Metric] = field(default_factory=list)
     figures: list[DrawnFigure] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)

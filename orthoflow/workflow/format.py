@@ -111,7 +111,8 @@ PARAMS: Final = Key(
 REPEAT: Final = Key(
     name="repeat",
     shape=whole_number(minimum=1, maximum=MOST_REPEATS),
-    meaning="How many runs with seeds of their own; what follows takes the first.",
+    meaning="How many runs with seeds of their own; of a method without randomness, to time it. "
+    "What follows takes the first.",
     example="10",
     default="1",
 )
@@ -180,7 +181,7 @@ class StepVariant:
         method: method id.
         params: resolved parameters, defaults included, JSON.
         params_set: parameters as written in the file or set on the command line, JSON.
-        repeat: how many runs with seeds of their own.
+        repeat: how many runs, with seeds of their own where the method is random.
         cores: cores asked for, None for all.
         timeout_s: seconds, None for no limit.
     """

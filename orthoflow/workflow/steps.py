@@ -146,7 +146,7 @@ class _StepReader:
             call=StepVariant(
                 name=name,
                 method=method or "",
-                repeat=self._repeat(table, path, info),
+                repeat=REPEAT.read(table, path, self.log) or 1,
                 cores=self._cores(table, path),
                 timeout_s=TIMEOUT.read(table, path, self.log),
             ),
@@ -163,18 +163,6 @@ class _StepReader:
         except PluginError as error:
             self.log.add_plugin(position, path, str(error))
         return None
-
-    def _repeat(self, table: Table, path: str, info: MethodInfo | None) -> int:
-        repeat = REPEAT.read(table, path, self.log) or 1
-        entry = table.get(REPEAT.name)
-        if entry and repeat > 1 and info is not None and info.method.determinism == "exact":
-            self.log.add(
-                entry.position,
-                join(path, REPEAT.name),
-                f"{info.id} gives the same result every time, so repeating it tells nothing; "
-                f"remove repeat",
-            )
-        return repeat
 
     def _cores(self, table: Table, path: str) -> int | None:
         resources = RESOURCES.read(table, path, self.log)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 RUN_FORMAT: Final = "orthoflow-run"
 # Of the record; the minor number rises with every field that is added below (SPEC, 1.2).
-RUN_FORMAT_VERSION: Final = "1.2"
+RUN_FORMAT_VERSION: Final = "1.3"
 
 # What a figure may be, and what its file is called.
 FIGURE_SUFFIXES: Final[Mapping[str, str]] = {
@@ -241,17 +241,21 @@ class Costs:
     One that came with a later version of the format is None where an older record lacks it.
 
     Attributes:
-        wall_s: seconds on the clock.
-        cpu_s: processor seconds of the step's process.
+        wall_s: seconds on the clock that the method ran, without `compile_s`; with it where
+            `compile_s` is None.
+        cpu_s: processor seconds of the step's process meanwhile, likewise.
         peak_rss_mib: largest memory of the step's process.
         stored_mib: what its products, their published files and its figures take in the store;
             equal ones of several cells lie there once. None for cells without a result too.
+        compile_s: seconds on the clock that the step's process loaded modules and compiled kernels,
+            before, in and after the call. It hangs on what ran before, so nothing is ranked by it.
     """
 
     wall_s: Annotated[float, Quantity(label="time", unit="s")] = 0.0
     cpu_s: Annotated[float, Quantity(label="processor", unit="s")] = 0.0
     peak_rss_mib: Annotated[float, Quantity(label="memory", unit="MiB")] = 0.0
     stored_mib: Annotated[float | None, Quantity(label="stored", unit="MiB")] = None
+    compile_s: Annotated[float | None, Quantity(label="loading and compiling", unit="s")] = None
 
 
 COSTS: Final[Mapping[str, Quantity]] = {

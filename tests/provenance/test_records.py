@@ -76,6 +76,7 @@ CELL = st.builds(
     cpu_s=NUMBER,
     peak_rss_mib=NUMBER,
     stored_mib=st.none() | NUMBER,
+    compile_s=st.none() | NUMBER,
     environment=TEXT,
     cached_from=TEXT,
     metrics=st.lists(st.builds(Metric, name=TEXT, value=NUMBER, unit=TEXT), max_size=3).map(tuple),
@@ -293,7 +294,7 @@ def test_a_newer_format_is_refused_with_a_sentence(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     with h5py.File(path, "r+") as file:
         file.attrs["format_version"] = np.bytes_(b"2.0")
-    message = r"run\.h5 has format version 2\.0, this program reads version 1\.2: use a newer"
+    message = r"run\.h5 has format version 2\.0, this program reads version 1\.3: use a newer"
     with pytest.raises(RecordFormatError, match=message):
         read_record(path)
     (finding,) = verify_record(path)

@@ -113,7 +113,7 @@ def graph(crate: dict[str, Any]) -> Any:
             """SELECT ?name ?unit ?value WHERE {
                 ?action a s:CreateAction; wfrun:resourceUsage ?usage.
                 ?usage a s:PropertyValue; s:propertyID ?name; s:unitCode ?unit; s:value ?value }""",
-            11,
+            14,
             id="2-how-much-memory-and-time",
         ),
         pytest.param(

@@ -32,13 +32,14 @@ def test_tables_hold_a_line_per_fact(run: Run) -> None:
     ]
     texts = {path.name: path.read_text() for path in written}
     first, second, third = run.record.cells
-    # Nothing is known of what the results take in the store.
-    spent = "2025-01-02T03:04:05Z,2025-01-02T03:04:06Z,1.5,2.5,64.0,,"
+    # Nothing is known of what the results take in the store, and of the time to load.
+    spent = "2025-01-02T03:04:05Z,2025-01-02T03:04:06Z,1.5,2.5,64.0,,,"
     built_in = "orthoflow-tls,0.1.0,1,exact"
     assert texts["cells.csv"].splitlines() == [
         (
             "cell,step,variants,repeat,status,method,distribution,distribution_version,"
             "result_version,determinism,seed,started,ended,wall_s,cpu_s,peak_rss_mib,stored_mib,"
+            "compile_s,"
             "environment,cached_from,key,error_type,error_message,warnings"
         ),
         f"cloud,cloud,,0,ok,read.scan,{built_in},,{spent}{ENVIRONMENT},earlier-run,{first.key},,,",
@@ -48,7 +49,7 @@ def test_tables_hold_a_line_per_fact(run: Run) -> None:
         ),
         (
             f"ortho,ortho,,0,failed,{third.method},,,{third.result_version},{third.determinism}"
-            ",,,,0.0,0.0,0.0,,,,,MethodError,no cell has enough points,"
+            ",,,,0.0,0.0,0.0,,,,,,MethodError,no cell has enough points,"
         ),
     ]
     parameters = "gsd_m,0.01,1\n", 'windows,"[3, 5, 7]",0\n', "label,null,0\n"

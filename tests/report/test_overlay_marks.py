@@ -216,6 +216,7 @@ def test_rows_of_a_comparison_stand_beside_each_other(tmp_path: Path) -> None:
         ("check", "wall_s", "wall_s", Sense.LESS),
         ("check", "cpu_s", "cpu_s", Sense.LESS),
         ("check", "peak_rss_mib", "peak_rss_mib", Sense.LESS),
+        ("check", "compile_s", "compile_s", Sense.NEITHER),
     ]
     fine, coarse, broken = table.rows
     assert {row.run for row in table.rows} == {"toy <run>, r1"}

@@ -189,6 +189,7 @@ def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
         ("check", "wall_s"),
         ("check", "cpu_s"),
         ("check", "peak_rss_mib"),
+        ("check", "compile_s"),
     ]
     fine, coarse, broken = table.rows
     assert fine.is_baseline
@@ -297,6 +298,7 @@ def test_equal_values_have_no_winner() -> None:
         ("rmse_u_mm", Sense.LESS),
         ("check_rmse_px_median", Sense.LESS),
         ("wall_s", Sense.LESS),
+        ("compile_s", Sense.NEITHER),
         ("match_wrong_share", Sense.LESS),
         ("match_wrong_share_own_wall", Sense.LESS),
         ("label_recall", Sense.MORE),

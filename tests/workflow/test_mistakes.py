@@ -81,11 +81,6 @@ CASES = {
         "steps.x.params",
         "expected a mapping, got a list",
     ),
-    "exact method repeated": (
-        STEP % ", repeat: 3",
-        "steps.x.repeat",
-        "plane.hough2d gives the same result every time, so repeating it tells nothing",
-    ),
     "repeat is no number": (
         STEP % ", repeat: often",
         "steps.x.repeat",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -94,26 +93,26 @@ class DsmBackward(Method):
             ctx.warn("visibility none: cells that a photo cannot see are painted as well")
         surfaces = surfaces_of(inputs.walls, params, ctx, hides=hides)
         seconds: defaultdict[str, float] = defaultdict(float)
-        started = time.perf_counter()
+        started = ctx.clock_s()
         viewers = [camera.viewing() for _, camera in oriented]
         occluders = (
             occluders_before(inputs, viewers, params, ctx, method=self.id) if hides else None
         )
-        seconds["occluders_s"] += time.perf_counter() - started
+        seconds["occluders_s"] += ctx.clock_s() - started
         stack = LayerStack(inputs.walls, surfaces, ctx)
         footprints: list[CellFootprint] = []
         for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
             ctx.progress(place / len(oriented), photo.name)
-            started = time.perf_counter()
+            started = ctx.clock_s()
             pixels = pixels_of(photo, camera)
-            decoded = time.perf_counter()
+            decoded = ctx.clock_s()
             buffer = depth_buffer_of(occluders, viewer)
-            looked = time.perf_counter()
+            looked = ctx.clock_s()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
             footprints += _lay(opened, stack, params, threads=ctx.cores)
             seconds["decoding_s"] += decoded - started
             seconds["occluders_s"] += looked - decoded
-            seconds["painting_s"] += time.perf_counter() - looked
+            seconds["painting_s"] += ctx.clock_s() - looked
             # The next photo is decoded without this one in memory.
             del pixels, buffer, opened
         profile = shared_profile([photo for photo, _ in oriented], ctx)

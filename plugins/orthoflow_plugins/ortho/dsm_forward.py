@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
@@ -71,17 +70,17 @@ class DsmForward(Method):
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
         viewers = [camera.viewing() for _, camera in oriented]
         seconds: defaultdict[str, float] = defaultdict(float)
-        started = time.perf_counter()
+        started = ctx.clock_s()
         occluders = occluders_before(inputs, viewers, params, ctx, method=self.id)
-        seconds["occluders_s"] = time.perf_counter() - started
+        seconds["occluders_s"] = ctx.clock_s() - started
         surfaces = surfaces_of(inputs.walls, params, ctx)
         stack = LayerStack(inputs.walls, surfaces, ctx)
         for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
             ctx.progress(place / len(oriented), photo.name)
             pixels = pixels_of(photo, camera)
-            started = time.perf_counter()
+            started = ctx.clock_s()
             buffer = depth_buffer_of(occluders, viewer)
-            looked = time.perf_counter()
+            looked = ctx.clock_s()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
             with stack.painting_from(photo.name):
                 for index, surface in enumerate(surfaces):
@@ -89,7 +88,7 @@ class DsmForward(Method):
                     if layer is not None:
                         stack.add(layer)
             seconds["occluders_s"] += looked - started
-            seconds["painting_s"] += time.perf_counter() - looked
+            seconds["painting_s"] += ctx.clock_s() - looked
         profile = shared_profile([photo for photo, _ in oriented], ctx)
         layers = stack.complete()
         _report(ctx, stack, layers, seconds)

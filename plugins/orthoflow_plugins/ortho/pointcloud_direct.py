@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -118,11 +117,11 @@ class PointcloudDirect(Method):
         best_preview: tuple[int, bytes] | None = None
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
-            started = time.perf_counter()
+            started = ctx.clock_s()
             projection = _project(inputs, colours, wall, rule)
-            projected = time.perf_counter()
+            projected = ctx.clock_s()
             layers.append(_filled(projection, wall, k, params, threads=ctx.cores))
-            seconds += (projected - started, time.perf_counter() - projected)
+            seconds += (projected - started, ctx.clock_s() - projected)
             n_filled = _n_filled(layers[-1])
             if best_preview is None or n_filled > best_preview[0]:
                 best_preview = (n_filled, filling_preview(projection.rgb, layers[-1]))

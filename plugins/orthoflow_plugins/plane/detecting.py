@@ -12,7 +12,6 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from threading import Thread
-from time import perf_counter
 from typing import Final, Protocol
 
 import numpy as np
@@ -230,7 +229,7 @@ def _found(
 ) -> tuple[PreparedCloud, list[FoundPlane]]:
     """Prepare a cloud, and find, fit and label its planes; reports how long that takes."""
     rules = rules_of(params)
-    moments_s = [perf_counter()]
+    moments_s = [ctx.clock_s()]
     Thread(target=_load_charts, daemon=True).start()
     ctx.progress(0.0, "preparing the points")
 
@@ -246,7 +245,7 @@ def _found(
 
     def heard(part: float, text: str) -> None:
         if text.startswith(_PLANE_FOUND):
-            moments_s.append(perf_counter())
+            moments_s.append(ctx.clock_s())
         ctx.progress(0.1 + 0.7 * part, text)
 
     whole = prepared(thinned(cloud, params.thinning))
@@ -268,7 +267,7 @@ def _found(
         label(found, whole, rules.find_m)
     if detector.relabel is not None:
         detector.relabel(found, whole)
-    moments_s.append(perf_counter())
+    moments_s.append(ctx.clock_s())
     _report_times(ctx, np.diff(moments_s))
     return whole, found
 

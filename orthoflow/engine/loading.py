@@ -1,0 +1,138 @@
+"""The time that a process spends loading modules and compiling kernels, apart from all other.
+
+It says something of the disk and of what ran before, and nothing of a method: a kernel that was
+compiled once is read from a file ever after. So `compile_s` is measured here, and a clock that
+stands still meanwhile measures the rest.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import threading
+import time
+from collections.abc import Callable
+from functools import wraps
+from types import TracebackType
+from typing import Any, Final, Self, cast
+
+# Every import goes through these, where a module is not there yet and where another thread still
+# loads it. Private, but finders and loaders only hear when a module is looked for, not when all
+# that it imports is there.
+_BOOTSTRAP: Final = cast("Any", importlib)._bootstrap  # noqa: SLF001
+_IMPORTS: Final = ("_find_and_load", "_lock_unlock_module")
+_NUMBA_EVENTS: Final = "numba.core.event"
+# Held while a kernel is compiled, or read from its file.
+_COMPILER_LOCK: Final = "numba:compiler_lock"
+
+
+class LoadingMeter:
+    """Measures, while it is entered, how long this process loads modules and compiles.
+
+    Times of several threads that load at once count once. A daemon thread that loads keeps nobody
+    waiting: its seconds stop no clock, only its processor time is known.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._own = threading.local()
+        self._n_open = 0
+        self._opened_s = 0.0
+        self._total_s = 0.0
+        self._processor_s = 0.0
+        self._replaced: dict[str, Callable[..., object]] = {}
+        self._listener: object | None = None
+
+    def __enter__(self) -> Self:
+        for name in _IMPORTS:
+            self._replaced[name] = getattr(_BOOTSTRAP, name)
+            setattr(_BOOTSTRAP, name, self._timed(self._replaced[name]))
+        self._listen_to_numba()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for name, function in self._replaced.items():
+            setattr(_BOOTSTRAP, name, function)
+        if self._listener is not None:
+            sys.modules[_NUMBA_EVENTS].unregister(_COMPILER_LOCK, self._listener)
+            self._listener = None
+
+    @property
+    def total_s(self) -> float:
+        """Seconds so far, on the clock."""
+        with self._lock:
+            running_s = time.perf_counter() - self._opened_s if self._n_open else 0.0
+            return self._total_s + running_s
+
+    @property
+    def processor_s(self) -> float:
+        """Processor seconds so far, of all threads, without what is being loaded right now."""
+        with self._lock:
+            return self._processor_s
+
+    def clock_s(self) -> float:
+        """Give seconds as `time.perf_counter`, but stand still while something is loaded."""
+        with self._lock:
+            return time.perf_counter() - self.total_s
+
+    def begin(self) -> None:
+        """Hear that this thread begins to load; what it loads for that is part of it."""
+        own = self._own
+        own.depth = getattr(own, "depth", 0) + 1
+        if own.depth > 1:
+            return
+        own.processor_s = time.thread_time()
+        if threading.current_thread().daemon:
+            return
+        with self._lock:
+            if self._n_open == 0:
+                self._opened_s = time.perf_counter()
+            self._n_open += 1
+
+    def end(self) -> None:
+        """Hear that this thread has loaded what it began with."""
+        own = self._own
+        depth = getattr(own, "depth", 0)
+        if depth == 0:
+            # It began before anybody listened.
+            return
+        own.depth = depth - 1
+        if own.depth:
+            return
+        with self._lock:
+            self._processor_s += time.thread_time() - own.processor_s
+            if threading.current_thread().daemon:
+                return
+            self._n_open -= 1
+            if self._n_open == 0:
+                self._total_s += time.perf_counter() - self._opened_s
+
+    def _timed(self, function: Callable[..., object]) -> Callable[..., object]:
+        @wraps(function)
+        def timed(*arguments: object) -> object:
+            self.begin()
+            try:
+                return function(*arguments)
+            finally:
+                self.end()
+                self._listen_to_numba()
+
+        return timed
+
+    def _listen_to_numba(self) -> None:
+        # Numba is not loaded for this: a method that compiles loads it.
+        events = cast("Any", sys.modules.get(_NUMBA_EVENTS))
+        if self._listener is not None or not hasattr(events, "install_listener"):
+            return
+        listener = type(
+            "Listener",
+            (events.Listener,),
+            {"on_start": lambda _, event: self.begin(), "on_end": lambda _, event: self.end()},
+        )()
+        events.register(_COMPILER_LOCK, listener)
+        self._listener = listener
