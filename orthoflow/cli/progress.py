@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Protocol, Self
 
+from orthoflow.alike import sense
 from orthoflow.cli.failures import say_error
+from orthoflow.cli.forecast import CellState, left_of_cell, left_of_run
 from orthoflow.cli.tables import counted, duration
 from orthoflow.engine.events import (
     CellFinished,
@@ -24,9 +25,15 @@ from orthoflow.engine.events import (
 from orthoflow.foreign_text import shown
 
 if TYPE_CHECKING:
+    from rich.console import Group
     from rich.table import Table
 
+    from orthoflow.engine import PlannedCell
+
 _REFRESH_PER_S: Final = 4
+# A log file gets a line at least so often.
+_EVERY_S: Final = 10.0
+_STARTING: Final = "starting"
 _STYLES: Final = {
     "running": "cyan",
     "ok": "green",
@@ -44,14 +51,73 @@ class Progress(AbstractContextManager["Progress"], Protocol):
         raise AssertionError("a protocol is never called")
 
 
-class PlainProgress:
-    """One line on standard error per start, warning and end, fit for log files."""
+class RunState:
+    """What the cells of a run do; threads may share it."""
 
-    def __init__(self) -> None:
-        self._n_cells = 0
-        self._n_ended = 0
+    def __init__(self, cells: Sequence[PlannedCell], jobs: int) -> None:
+        self._jobs = jobs
+        self._lock = threading.Lock()
+        self._cells = {item.cell.address: CellState(took_s=item.took_s) for item in cells}
+        self._senses: set[str] = set()
+
+    def take(self, event: RunEvent) -> None:
+        """Hear of an event."""
+        with self._lock:
+            match event:
+                case CellStarted():
+                    cell = self._cells.setdefault(event.address, CellState())
+                    cell.state, cell.text, cell.started = "running", _STARTING, time.monotonic()
+                    cell.fraction = 0.0
+                case CellProgress():
+                    cell = self._cells.setdefault(event.address, CellState(state="running"))
+                    cell.fraction, cell.text = event.fraction, event.text
+                case CellFinished():
+                    result = event.result
+                    self._cells[event.address] = CellState(
+                        state="cached" if event.cached else result.status,
+                        text=result.error_message,
+                        wall_s=result.wall_s,
+                    )
+                case _:
+                    return
+
+    def is_new(self, warning: CellWarned) -> bool:
+        """Whether nothing of its sense was said before."""
+        with self._lock:
+            n_before = len(self._senses)
+            self._senses.add(sense(warning.text))
+            return len(self._senses) > n_before
+
+    def cells(self) -> dict[str, CellState]:
+        """Give all cells, as they are now."""
+        with self._lock:
+            return dict(self._cells)
+
+    def left(self) -> str:
+        """Say how long the run still takes; empty when nobody knows."""
+        return left_of_run(self.cells().values(), time.monotonic(), jobs=self._jobs)
+
+    @property
+    def n_ended(self) -> int:
+        """How many cells have an outcome."""
+        return sum(cell.state not in ("waiting", "running") for cell in self.cells().values())
+
+
+class PlainProgress:
+    """Lines on standard error, fit for log files.
+
+    One per start and end and per sense of warnings; one about what runs where none came for long.
+    """
+
+    def __init__(
+        self, cells: Sequence[PlannedCell] = (), *, jobs: int = 1, every_s: float = _EVERY_S
+    ) -> None:
+        self._n_cells = len(cells)
+        self._state = RunState(cells, jobs)
+        self._clock = _Clock(self._remind, every_s)
 
     def __enter__(self) -> Self:
+        self._clock.start()
         return self
 
     def __exit__(
@@ -60,23 +126,40 @@ class PlainProgress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        return None
+        self._clock.stop()
 
     def tell(self, event: RunEvent) -> None:
-        """Print an event; percentages and log lines would drown the rest."""
+        """Print an event; each percentage and log line would drown the rest."""
+        self._state.take(event)
         match event:
             case RunStarted():
                 self._n_cells = event.n_cells
-                say_error(start_text(event))
+                left = self._state.left()
+                self._say(f"{start_text(event)}{', ' if left else ''}{left}")
             case CellStarted():
-                say_error(f"{event.address}: started")
-            case CellWarned():
-                say_error(f"{event.address}: warning: {event.text}")
+                self._say(f"{event.address}: started")
+            case CellWarned() if self._state.is_new(event):
+                self._say(f"{event.address}: warning: {event.text}")
             case CellFinished():
-                self._n_ended += 1
-                say_error(f"{end_text(event)} ({self._n_ended} of {self._n_cells})")
+                self._say(f"{end_text(event)} ({self._state.n_ended} of {self._n_cells})")
             case _:
                 return
+
+    def _say(self, line: str) -> None:
+        self._clock.reset()
+        say_error(line)
+
+    def _remind(self) -> None:
+        now_s = time.monotonic()
+        for address, cell in self._state.cells().items():
+            if cell.state == "running":
+                parts = [
+                    f"{100 * cell.done(now_s):.0f} %",
+                    cell.text,
+                    f"{duration(now_s - cell.started)} so far",
+                    left_of_cell(cell, now_s),
+                ]
+                say_error(f"{address}: {', '.join(part for part in parts if part)}")
 
 
 def start_text(event: RunStarted) -> str:
@@ -95,38 +178,18 @@ def end_text(event: CellFinished) -> str:
     return f"{event.address}: {result.status}{took}{why}"
 
 
-@dataclass
-class ProgressRow:
-    """One cell in the live table.
-
-    Attributes:
-        state: `waiting`, `running`, or how it ended.
-        fraction: 0..1 while it runs.
-        text: what it does, or why it ended so.
-        started: monotonic seconds.
-        wall_s: how long it took.
-    """
-
-    state: str = "waiting"
-    fraction: float = 0.0
-    text: str = ""
-    started: float = 0.0
-    wall_s: float = 0.0
-
-
 class LiveProgress:
     """A table of all cells that redraws itself, on standard error."""
 
-    def __init__(self, addresses: tuple[str, ...]) -> None:
+    def __init__(self, cells: Sequence[PlannedCell], *, jobs: int = 1) -> None:
         from rich.console import Console
         from rich.live import Live
 
-        self._rows = {address: ProgressRow() for address in addresses}
-        self._lock = threading.Lock()
+        self._state = RunState(cells, jobs)
         self._console = Console(stderr=True)
         self._live = Live(
             console=self._console,
-            get_renderable=self.table,
+            get_renderable=self.drawn,
             refresh_per_second=_REFRESH_PER_S,
             transient=True,
         )
@@ -145,84 +208,134 @@ class LiveProgress:
 
     def tell(self, event: RunEvent) -> None:
         """Change the table; what must stay readable is printed above it."""
+        self._state.take(event)
         match event:
             case RunStarted():
                 self._print(start_text(event))
-            case CellStarted():
-                self._change(event.address, ProgressRow(state="running", started=time.monotonic()))
-            case CellProgress():
-                self._advance(event)
-            case CellWarned():
+            case CellWarned() if self._state.is_new(event):
                 self._print(f"{event.address}: warning: {event.text}", style="yellow")
-            case CellFinished():
-                result = event.result
-                self._change(
-                    event.address,
-                    ProgressRow(
-                        state="cached" if event.cached else result.status,
-                        text=result.error_message,
-                        wall_s=result.wall_s,
-                    ),
-                )
             case _:
                 return
 
     def _print(self, text: str, style: str | None = None) -> None:
         self._live.console.print(shown(text), style=style, markup=False, highlight=False)
 
-    def _advance(self, event: CellProgress) -> None:
-        with self._lock:
-            row = self._rows.setdefault(event.address, ProgressRow(state="running"))
-            row.fraction, row.text = event.fraction, event.text
+    def drawn(self) -> Group:
+        """Give the table, and below it how far the whole run is."""
+        from rich.console import Group
+        from rich.text import Text
 
-    def _change(self, address: str, row: ProgressRow) -> None:
-        with self._lock:
-            self._rows[address] = row
+        return Group(self.table(), Text(self._whole(), style="dim"))
 
     def table(self) -> Table:
         """Give the table as it is now."""
         from rich.table import Table
         from rich.text import Text
 
+        cells, now_s = self._state.cells(), time.monotonic()
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for title in ("cell", "state", "time", ""):
+        for title in ("cell", "state", "time", "left", ""):
             table.add_column(title, no_wrap=True, overflow="ellipsis")
-        with self._lock:
-            rows = dict(self._rows)
-        visible = visible_rows(rows, self._console.height - 3)
-        for address, row in visible.items():
-            running = row.state == "running"
-            state = f"{100 * row.fraction:3.0f} %" if running else row.state
-            seconds = time.monotonic() - row.started if running else row.wall_s
+        for address, cell in visible_cells(cells, self._console.height - 4).items():
+            running = cell.state == "running"
+            state = f"{100 * cell.done(now_s):3.0f} %" if running else cell.state
+            seconds = now_s - cell.started if running else cell.wall_s
+            left = left_of_cell(cell, now_s).removeprefix("about ").removesuffix(" left")
             table.add_row(
                 Text(shown(address)),
-                Text(state, style=_STYLES.get(row.state, "dim")),
+                Text(state, style=_STYLES.get(cell.state, "dim")),
                 Text(duration(seconds) if seconds else ""),
-                Text(shown(row.text)),
+                Text(left),
+                Text(shown(cell.text)),
             )
-        if len(visible) < len(rows):
-            n_ended = sum(row.state not in ("waiting", "running") for row in rows.values())
-            table.add_row(Text(f"{n_ended} of {len(rows)} ended", style="dim"))
         return table
 
+    def _whole(self) -> str:
+        ended = f"{self._state.n_ended} of {counted(len(self._state.cells()), 'step')} ended"
+        left = self._state.left()
+        return f"{ended}, {left}" if left else ended
 
-def visible_rows(rows: Mapping[str, ProgressRow], height: int) -> dict[str, ProgressRow]:
+
+def visible_cells(cells: Mapping[str, CellState], height: int) -> dict[str, CellState]:
     """Choose the rows that fit: running ones, then failed, waiting, and the rest; in their order.
 
     Args:
-        rows: all rows.
+        cells: all of them.
         height: lines there are for rows.
     """
-    if len(rows) <= height:
-        return dict(rows)
+    if len(cells) <= height:
+        return dict(cells)
     urgency = {"running": 0, "failed": 1, "waiting": 2}
-    by_urgency = sorted(rows, key=lambda address: urgency.get(rows[address].state, 3))
+    by_urgency = sorted(cells, key=lambda address: urgency.get(cells[address].state, 3))
     chosen = set(by_urgency[: max(1, height)])
-    return {address: row for address, row in rows.items() if address in chosen}
+    return {address: cell for address, cell in cells.items() if address in chosen}
 
 
-def make_progress(addresses: tuple[str, ...]) -> Progress:
+def make_progress(cells: Sequence[PlannedCell], *, jobs: int = 1) -> Progress:
     """Give the live table when standard error is a terminal, plain lines otherwise."""
     if sys.stderr.isatty():
-        return LiveProgress(addresses)
-    return PlainProgress()
+        return LiveProgress(cells, jobs=jobs)
+    return PlainProgress(cells, jobs=jobs)
+
+
+@contextmanager
+def working_on(what: str, *, every_s: float = _EVERY_S) -> Iterator[None]:
+    """Show while the block runs that something is done that no cell does, and since when."""
+    started = time.monotonic()
+
+    def line() -> str:
+        return f"{what}, {duration(time.monotonic() - started)} so far"
+
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.live import Live
+        from rich.text import Text
+
+        with Live(
+            console=Console(stderr=True),
+            get_renderable=lambda: Text(line()),
+            refresh_per_second=_REFRESH_PER_S,
+            transient=True,
+        ):
+            yield
+        return
+    clock = _Clock(lambda: say_error(line()), every_s)
+    clock.start()
+    try:
+        yield
+    finally:
+        clock.stop()
+
+
+class _Clock:
+    """Calls somebody where nothing was said for some seconds."""
+
+    def __init__(self, call: Callable[[], None], every_s: float) -> None:
+        self._call = call
+        self._every_s = every_s
+        self._last = time.monotonic()
+        self._is_over = threading.Event()
+        self._thread = threading.Thread(target=self._go, daemon=True)
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self.reset()
+        self._thread.start()
+
+    def reset(self) -> None:
+        """Hear that something was said."""
+        self._last = time.monotonic()
+
+    def stop(self) -> None:
+        """End; nothing is said after that."""
+        self._is_over.set()
+        self._thread.join()
+
+    def _go(self) -> None:
+        wait_s = self._every_s
+        while not self._is_over.wait(wait_s):
+            wait_s = self._last + self._every_s - time.monotonic()
+            if wait_s <= 0:
+                self._call()
+                self.reset()
+                wait_s = self._every_s

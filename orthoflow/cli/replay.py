@@ -159,7 +159,7 @@ class _Call:
         plan = self.replay.plan
 
         def run() -> RunOutcome:
-            with make_progress(tuple(item.cell.address for item in plan.cells)) as progress:
+            with make_progress(plan.cells, jobs=plan.options.jobs) as progress:
                 return execute(plan, self.folder, self.store, progress.tell, run_id=self.run_id)
 
         def write(outcome: RunOutcome) -> Run:

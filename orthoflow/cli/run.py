@@ -19,7 +19,7 @@ from orthoflow.cli.options import (
     store_option,
     workflow_arguments,
 )
-from orthoflow.cli.tables import counted, duration, echo, echo_table
+from orthoflow.cli.tables import counted, duration, echo, echo_table, echo_warnings
 
 if TYPE_CHECKING:
     from orthoflow.engine import RunOutcome, RunPlan, Store
@@ -56,6 +56,7 @@ def run(
     products/ with the files for other programs.
     """
     from orthoflow.catalog import discover_catalog
+    from orthoflow.cli.progress import working_on
     from orthoflow.engine import RunOptions, Store, plan_run
     from orthoflow.workflow import expand_cells, load_workflow
 
@@ -64,7 +65,8 @@ def run(
     loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
     opened = Store(store)
     cells = expand_cells(loaded, catalog)
-    planned = plan_run(cells, loaded, catalog, opened, options)
+    with working_on("looking at inputs and stored results"):
+        planned = plan_run(cells, loaded, catalog, opened, options)
     # Held until the record is written, so that no `cache gc` takes what it needs.
     with opened.in_use():
         return _Call(workflow=loaded, plan=planned, store=opened, folder=output, embed=embed).go()
@@ -82,6 +84,7 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report and say what came out."""
+        from orthoflow.cli.progress import working_on
         from orthoflow.engine.run_folder import new_run_folder, new_run_id
         from orthoflow.errors import DamageError, DiskSpaceError, StoreError
         from orthoflow.records import REPORT_FILE, executed_and_written, write_run
@@ -97,15 +100,16 @@ class _Call:
 
         def write(outcome: RunOutcome) -> Run:
             try:
-                return write_run(
-                    outcome,
-                    self.plan,
-                    self.workflow,
-                    folder,
-                    self.store,
-                    embed=self.embed,
-                    before_finish=lambda run: write_page(run, report),
-                )
+                with working_on("writing the products, the record and the report"):
+                    return write_run(
+                        outcome,
+                        self.plan,
+                        self.workflow,
+                        folder,
+                        self.store,
+                        embed=self.embed,
+                        before_finish=lambda run: write_page(run, report),
+                    )
             except StoreError as error:
                 if not isinstance(error, DamageError):
                     self._show_unfinished(folder, outcome)
@@ -126,8 +130,7 @@ class _Call:
         from orthoflow.cli.progress import make_progress
         from orthoflow.engine import execute
 
-        addresses = tuple(item.cell.address for item in self.plan.cells)
-        with make_progress(addresses) as progress:
+        with make_progress(self.plan.cells, jobs=self.plan.options.jobs) as progress:
             return execute(
                 self.plan,
                 folder,
@@ -170,11 +173,9 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
             for cell in cells
         ],
     )
-    warnings = [f"warning, {cell.address}: {text}" for cell in cells for text in cell.warnings]
-    if warnings:
+    if any(cell.warnings for cell in cells):
         echo()
-    for warning in warnings:
-        echo(warning)
+    echo_warnings(cells)
     echo("", _cached_text(cells, made.kept))
     if made.outcome.damaged:
         echo(_damaged_text(made.outcome.damaged))

@@ -12,7 +12,16 @@ from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.diagnosis import LIBRARIES
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option
-from orthoflow.cli.tables import counted, duration, echo, echo_json, echo_table, number, size
+from orthoflow.cli.tables import (
+    counted,
+    duration,
+    echo,
+    echo_json,
+    echo_table,
+    echo_warnings,
+    number,
+    size,
+)
 
 if TYPE_CHECKING:
     from orthoflow.records import RecordedCell, Run
@@ -82,9 +91,7 @@ def _print_cells(run: Run) -> None:
     for cell in run.record.cells:
         if cell.error_message:
             echo(f"{cell.address} {cell.status}: {cell.error_message}")
-    for cell in run.record.cells:
-        for warning in cell.warnings:
-            echo(f"warning, {cell.address}: {warning}")
+    echo_warnings(run.record.cells)
 
 
 def _cell_status(cell: RecordedCell) -> str:

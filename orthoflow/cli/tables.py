@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
 import click
 
+from orthoflow.alike import alike
 from orthoflow.foreign_text import shown, shown_json
 
 if TYPE_CHECKING:
-    from orthoflow.records import Distance, ProductDistance
+    from orthoflow.records import Distance, ProductDistance, RecordedCell
 
 _VERDICTS: Final = ("identical", "within tolerance", "different", "not measured")
 # How people say the units of tolerances; `1` stands for plain numbers.
@@ -25,6 +29,29 @@ def echo(*lines: str, err: bool = False) -> None:
     """
     for line in lines or ("",):
         click.echo(shown(line), err=err)  # noqa: TID251 - the one place
+
+
+def echo_folded(line: str) -> None:
+    """Print a sentence; on a terminal its lines end at words."""
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+    echo(*(folded(shown(line), width) if width else (line,)))
+
+
+def folded(line: str, width: int) -> list[str]:
+    """Break a line at words, longer words left whole; what follows the first is set in.
+
+    >>> folded("warning, wall: no point lies within its buffer", 24)
+    ['warning, wall: no point', '  lies within its buffer']
+    """
+    return textwrap.wrap(
+        line, width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    )
+
+
+def echo_warnings(cells: Iterable[RecordedCell]) -> None:
+    """Print what limits the results of cells, a line per sense: the ones that help first."""
+    for item in alike((cell.address, text) for cell in cells for text in cell.warnings):
+        echo_folded(f"warning, {item.where}: {item.sentence}")
 
 
 def echo_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -37,13 +37,20 @@ class ProgressPipe:
         self._descriptor = descriptor
         self._lock = threading.Lock()
         self._last = 0.0
+        self._sent = 0.0
+        self._text = ""
 
     def listen(self, event: StepEvent) -> None:
-        """Pass on an event; progress at most ten times a second, the rest into the log too."""
+        """Pass on an event; progress at most ten times a second, the rest into the log too.
+
+        Another text of the same fraction is another activity, and always passed on.
+        """
         if event.kind == "progress":
-            if time.monotonic() - self._last < _PROGRESS_EVERY_S and event.fraction < 1.0:
+            is_soon = time.monotonic() - self._last < _PROGRESS_EVERY_S
+            is_same_text = event.text == self._text
+            if is_soon and event.fraction < 1.0 and (event.fraction > self._sent or is_same_text):
                 return
-            self._last = time.monotonic()
+            self._last, self._sent, self._text = time.monotonic(), event.fraction, event.text
         else:
             # The method may have closed it, or put something else into its place.
             with suppress(AttributeError, OSError, ValueError):

@@ -6,7 +6,7 @@ import contextlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal
@@ -35,6 +35,10 @@ CellPlan = Literal["cached", "will run", "unknown yet", "skipped"]
 _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
 _ABSENT: Final = "absent"
+# Of results that lost their objects so many are passed over.
+_MOST_LOOKED_AT: Final = 5
+# To start a process and to read and keep its products.
+_START_S: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +88,8 @@ class PlannedCell:
         key: its key where its inputs are known, else None.
         inputs: port -> product where they are known.
         result: what the store has, for cached cells.
+        took_s: how long the method took when it ran last, in this step where it did; 0 for cells
+            that do not run, None when nobody knows.
     """
 
     cell: Cell
@@ -92,6 +98,7 @@ class PlannedCell:
     key: CellKey | None = None
     inputs: Mapping[str, ProductRef] | None = None
     result: CellResult | None = None
+    took_s: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,10 +221,14 @@ class _Planner:
     force: tuple[str, ...]
     planned: dict[str, PlannedCell] = field(default_factory=dict)
     _earlier: dict[str, tuple[Preimage, ...]] = field(default_factory=dict)
+    _times: dict[tuple[str, str], float | None] = field(default_factory=dict)
 
     def add(self, cell: Cell) -> None:
         """Plan one more cell."""
-        self.planned[cell.address] = self._without_inputs(cell) or self._with_inputs(cell)
+        planned = self._without_inputs(cell) or self._with_inputs(cell)
+        is_run = planned.status in ("will run", "unknown yet")
+        took_s = self._took_s(cell) if is_run else 0.0
+        self.planned[cell.address] = replace(planned, took_s=took_s)
 
     def _without_inputs(self, cell: Cell) -> PlannedCell | None:
         if cell.skip_reason:
@@ -254,6 +265,18 @@ class _Planner:
         if failure:
             return f"failed last time: {failure}"
         return explain(key, cell.step, self._before(cell.method))
+
+    def _took_s(self, cell: Cell) -> float | None:
+        """How long the last result of the method took, one of the same step rather than others."""
+        place = (cell.method, cell.step)
+        if place not in self._times:
+            before = self._before(cell.method)
+            # Stable: the newest of each comes first.
+            nearest = sorted(before, key=lambda preimage: preimage.step != cell.step)
+            results = (self.store.result(item.key) for item in nearest[:_MOST_LOOKED_AT])
+            found = next((result for result in results if result is not None), None)
+            self._times[place] = None if found is None else found.wall_s + _START_S
+        return self._times[place]
 
     def _before(self, method: str) -> tuple[Preimage, ...]:
         if method not in self._earlier:

@@ -43,6 +43,7 @@ from orthoflow.errors import (
     PluginError,
     StepFailedError,
 )
+from orthoflow.geometry.kernel_news import heard_by
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import StepContext, StepEvent
@@ -69,10 +70,10 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         is_cancelled: asks whether to stop.
     """
     started = now()
-    sampler, meter = MemorySampler(), LoadingMeter()
-    call = _Call(task, listen, is_cancelled, meter)
+    sampler, meter, news = MemorySampler(), LoadingMeter(), _News(listen)
+    call = _Call(task, news.listen, is_cancelled, meter)
     try:
-        with sampler, meter:
+        with sampler, meter, heard_by(news.compiling):
             result = call.run()
     except BaseException as error:
         # Where Ctrl-C is ignored, nobody but the method can have raised it.
@@ -144,6 +145,24 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
     return MethodError(f"{task.who} {said}")
 
 
+class _News:
+    """Passes on what a step says, and between that which kernel it waits for."""
+
+    def __init__(self, listen: Listener) -> None:
+        self._listen = listen
+        self._last = StepEvent(kind="progress", text="", fraction=0.0)
+
+    def listen(self, event: StepEvent) -> None:
+        """Pass on what the method says."""
+        if event.kind == "progress":
+            self._last = event
+        self._listen(event)
+
+    def compiling(self, text: str) -> None:
+        """Say what is compiled; when that is over, what was said before."""
+        self._listen(dataclasses.replace(self._last, text=text or self._last.text))
+
+
 class _Call:
     """One call of a method, with what it measured so far also when it fails."""
 
@@ -197,6 +216,8 @@ class _Call:
                 os._exit(1)
             self._wall_s = round(self._meter.clock_s() - wall_s, 4)
             self._processor_s = round(self._cpu_s() - cpu_s, 4)
+        # Not through `progress`: who was asked to stop, and ended all the same, has a result.
+        self._context.listen(StepEvent(kind="progress", text="keeping the results", fraction=1.0))
         self._check_inputs(inputs)
         result = dataclasses.replace(
             blank_result(self.task),

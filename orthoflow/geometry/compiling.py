@@ -11,6 +11,10 @@ from collections.abc import Callable
 from typing import Any, Final, TypeVar, cast
 
 import numba
+from numba.core import event
+from numba.core.dispatcher import Dispatcher
+
+from orthoflow.geometry.kernel_news import tell
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
@@ -54,3 +58,46 @@ def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
         return cast("_Kernel", compiler(function))
 
     return compile_part
+
+
+class _Compilation(event.Listener):
+    """Hears from numba which kernel is compiled; one that needs others waits for these.
+
+    The compiler's own lock lets one thread compile at a time.
+    """
+
+    def __init__(self) -> None:
+        self._depth = 0
+        self._n_begun = 0
+        self._n_needed = 0
+
+    def on_start(self, event: event.Event) -> None:
+        """Say what is compiled."""
+        kernel = event.data["dispatcher"]
+        if self._depth == 0:
+            self._n_begun, self._n_needed = 0, len(_uncompiled(kernel, {}))
+        self._depth += 1
+        self._n_begun += 1
+        n_needed = max(self._n_needed, self._n_begun)
+        tell(f"compiling {self._n_begun} of {n_needed}: {kernel.py_func.__name__}")
+
+    def on_end(self, event: event.Event) -> None:
+        """Say that it is there."""
+        self._depth -= 1
+        if self._depth == 0:
+            tell("")
+
+
+def _uncompiled(kernel: Dispatcher, found: dict[Dispatcher, None]) -> dict[Dispatcher, None]:
+    """A kernel and all that it calls, as far as nothing of them is compiled in this process."""
+    if kernel in found or kernel.signatures or kernel.targetoptions.get("inline") == "always":
+        return found
+    found[kernel] = None
+    for name in kernel.py_func.__code__.co_names:
+        called = kernel.py_func.__globals__.get(name)
+        if isinstance(called, Dispatcher):
+            _uncompiled(called, found)
+    return found
+
+
+event.register("numba:compile", _Compilation())  # type: ignore[no-untyped-call]

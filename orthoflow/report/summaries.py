@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from orthoflow.alike import alike
 from orthoflow.records import Run, cell_metrics
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.numbers import number, number_with_unit
@@ -67,16 +68,21 @@ def answers(run: Run) -> tuple[Answer, ...]:
 
 
 def limits(run: Run) -> tuple[Limit, ...]:
-    """What limits the results: failures, then warnings, the baseline's first, each said once."""
+    """What limits the results: failures, then warnings, those of one sense together.
+
+    Of the warnings those that help stand first, then the frequent ones, then the baseline's.
+    """
     addresses: dict[str, list[str]] = {}
     for cell in run.record.cells:
         if cell.status == "failed":
             addresses.setdefault(f"failed: {cell.error_message}", []).append(cell.address)
     first = {cell.address for cell in baseline_cells(run)}
-    for cell in sorted(run.record.cells, key=lambda cell: cell.address not in first):
-        for text in cell.warnings:
-            addresses.setdefault(text, []).append(cell.address)
-    return tuple(Limit(text=text, cells=tuple(cells)) for text, cells in addresses.items())
+    by_baseline = sorted(run.record.cells, key=lambda cell: cell.address not in first)
+    warnings = alike((cell.address, text) for cell in by_baseline for text in cell.warnings)
+    return (
+        *(Limit(text=text, cells=tuple(cells)) for text, cells in addresses.items()),
+        *(Limit(text=item.sentence, cells=item.places) for item in warnings),
+    )
 
 
 def results(run: Run) -> dict[str, tuple[str, ...]]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import re
+import time
 
 import pytest
 from rich.console import Console
 
-from orthoflow.cli.progress import LiveProgress, PlainProgress, ProgressRow, visible_rows
+from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
+from orthoflow.cli.progress import LiveProgress, PlainProgress, visible_cells, working_on
 from orthoflow.engine import (
     CellFinished,
     CellLogged,
@@ -15,9 +18,11 @@ from orthoflow.engine import (
     CellResult,
     CellStarted,
     CellWarned,
+    PlannedCell,
     RunEvent,
     RunStarted,
 )
+from orthoflow.workflow.cells import Cell
 
 OK = CellResult(status="ok", started="2026-01-02T03:04:05.000Z", wall_s=1.25)
 FAILED = CellResult(
@@ -31,13 +36,27 @@ EVENTS: list[RunEvent] = [
     CellProgress(address="plane", fraction=0.5, text="peeling"),
     CellLogged(address="plane", text="a detail"),
     CellWarned(address="plane", text="the side is a [guess]"),
+    CellWarned(address="plane", text="wall 2: no point lies within its buffer"),
+    CellWarned(address="plane", text="wall 17: no point lies within its buffer"),
     CellFinished(address="plane", result=FAILED, cached=False),
     CellFinished(address="wall", result=SKIPPED, cached=False),
     CellFinished(address="other", result=OK, cached=False),
 ]
 
 
-def test_plain_progress_is_one_line_per_start_warning_and_end(
+def planned(*addresses: str, took_s: float | None = None) -> tuple[PlannedCell, ...]:
+    return tuple(
+        PlannedCell(
+            cell=Cell(address=address, step=address, method="toy.toy"),
+            status="will run",
+            reason="",
+            took_s=took_s,
+        )
+        for address in addresses
+    )
+
+
+def test_plain_progress_is_one_line_per_start_sense_of_warning_and_end(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with PlainProgress() as progress:
@@ -50,6 +69,7 @@ def test_plain_progress_is_one_line_per_start_warning_and_end(
         "cloud: cached (1 of 4)",
         "plane: started",
         "plane: warning: the side is a [guess]",
+        "plane: warning: wall 2: no point lies within its buffer",
         "plane: failed in 1 min 15 s: no plane (2 of 4)",
         "wall: skipped: needs plane, which failed (3 of 4)",
         "other: ok in 1.2 s (4 of 4)",
@@ -64,7 +84,7 @@ def test_a_resumed_run_says_so(capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_live_table_keeps_warnings_readable_and_shows_every_state(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    progress = LiveProgress(("cloud", "plane", "wall", "other"))
+    progress = LiveProgress(planned("cloud", "plane", "wall", "other"))
     with progress:
         for event in EVENTS[:6]:
             progress.tell(event)
@@ -72,16 +92,73 @@ def test_the_live_table_keeps_warnings_readable_and_shows_every_state(
         columns = [[str(cell) for cell in column.cells] for column in table.columns]
         assert columns[0] == ["cloud", "plane", "wall", "other"]
         assert columns[1] == ["cached", " 50 %", "waiting", "waiting"]
-        assert columns[3] == ["", "peeling", "", ""]
+        assert columns[4] == ["", "peeling", "", ""]
+        assert str(progress.drawn().renderables[1]) == "1 of 4 steps ended"
     assert "plane: warning: the side is a [guess]" in capsys.readouterr().err
 
 
 def test_what_does_not_fit_is_what_matters_least() -> None:
     states = ["ok", "cached", "running", "failed", "waiting", "waiting"]
-    rows = {f"step{i}": ProgressRow(state=state) for i, state in enumerate(states)}
-    assert list(visible_rows(rows, 6)) == list(rows)
-    assert list(visible_rows(rows, 3)) == ["step2", "step3", "step4"]
-    assert list(visible_rows(rows, 0)) == ["step2"]
+    cells = {f"step{i}": CellState(state=state) for i, state in enumerate(states)}
+    assert list(visible_cells(cells, 6)) == list(cells)
+    assert list(visible_cells(cells, 3)) == ["step2", "step3", "step4"]
+    assert list(visible_cells(cells, 0)) == ["step2"]
+
+
+def test_a_step_that_says_nothing_still_moves_in_plain_lines(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with PlainProgress(planned("plane", "wall", took_s=60.0), every_s=0.2) as progress:
+        progress.tell(RunStarted(run_id="r1", n_cells=2, is_resumed=False))
+        progress.tell(CellStarted(address="plane"))
+        progress.tell(CellProgress(address="plane", fraction=0.25, text="compiling 3 of 7: peel"))
+        time.sleep(0.7)
+    said = capsys.readouterr().err.splitlines()
+    assert said[:2] == ["run r1: 2 steps, about 2 min 00 s left", "plane: started"]
+    assert 2 <= len(said[2:]) <= 3
+    for line in said[2:]:
+        assert re.fullmatch(
+            r"plane: 25 %, compiling 3 of 7: peel, 0\.\d\d s so far, about 1 min 00 s left", line
+        )
+
+
+def test_what_no_cell_does_is_said_while_it_takes_long(capsys: pytest.CaptureFixture[str]) -> None:
+    with working_on("writing the record", every_s=0.2):
+        time.sleep(0.3)
+    with working_on("reading", every_s=5.0):
+        pass
+    said = capsys.readouterr().err
+    assert re.fullmatch(r"writing the record, 0\.2\d s so far\n", said)
+
+
+def test_what_a_step_took_before_says_how_long_it_takes() -> None:
+    cell = CellState(state="running", started=100.0, took_s=40.0)
+    assert [cell.left_s(now_s) for now_s in (100.0, 130.0, 150.0)] == [40.0, 10.0, None]
+    assert [cell.done(now_s) for now_s in (100.0, 130.0, 150.0)] == [0.0, 0.75, 0.95]
+    assert left_of_cell(cell, 130.0) == "about 10 s left"
+
+
+def test_how_far_a_step_says_it_is_counts_where_nothing_is_known() -> None:
+    cell = CellState(state="running", started=100.0, fraction=0.2)
+    assert [cell.left_s(now_s) for now_s in (101.0, 110.0)] == [None, 40.0]
+    assert cell.done(110.0) == 0.2
+    assert CellState(state="running", started=0.0, fraction=0.5, took_s=10.0).left_s(20.0) == 20.0
+
+
+def test_a_run_takes_as_long_as_what_is_left_of_it() -> None:
+    running = CellState(state="running", started=0.0, took_s=30.0)
+    waiting, unknown = CellState(took_s=50.0), CellState()
+    ended = CellState(state="ok", took_s=500.0)
+    assert left_of_run([running, waiting, ended], 10.0) == "about 1 min 10 s left"
+    assert left_of_run([running, waiting, ended], 10.0, jobs=2) == "about 50 s left"
+    assert left_of_run([running, waiting, unknown], 10.0) == "at least 1 min 10 s left"
+    assert left_of_run([unknown, ended], 10.0) == ""
+
+
+def test_a_forecast_is_no_more_exact_than_it_can_be() -> None:
+    assert [about(seconds) for seconds in (0.0, 41.0, 59.0, 61.0, 599.0, 601.0)] == [
+        *("5 s", "45 s", "1 min 00 s", "1 min 10 s", "10 min 00 s", "11 min 00 s")
+    ]
 
 
 def test_what_steps_say_is_shown_and_not_obeyed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -416,3 +416,22 @@ def test_the_memory_of_a_failure_is_short_and_no_link_is_followed(tmp_path: Path
     (tmp_path / "failures" / "link.json").symlink_to(tmp_path / "failures" / "long.json")
     assert failures.sentence("link") == ""
     assert failures.sentence("unknown") == ""
+
+
+# How long it takes --------------------------------------------------------------------------------
+
+
+def test_the_plan_knows_how_long_a_method_took_before(world: World) -> None:
+    assert {item.took_s for item in world.plan(CHAIN).cells} == {None}
+    run(world, CHAIN)
+    assert {item.took_s for item in world.plan(CHAIN).cells} == {0.0}
+    changed = world.plan(CHAIN, sets=["first.count=7"])
+    results = {item.cell.address: item.result for item in world.plan(CHAIN).cells}
+    for item in changed.cells:
+        before = results[item.cell.address]
+        assert before is not None
+        # A second to start a process comes on top.
+        assert item.took_s == before.wall_s + 1.0
+    other_names = CHAIN.replace("second", "other").replace("first:", "begin:")
+    renamed = world.plan(other_names.replace("first.", "begin."), sets=["begin.count=8"])
+    assert all(item.took_s is not None and item.took_s >= 1.0 for item in renamed.cells)

@@ -1,0 +1,141 @@
+"""Puts together what is said of many things in the same words: four causes are four lines."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+_MOST_NAMED: Final = 3
+# What differs from thing to thing: quoted names, names of files, words and amounts with a digit.
+_VARYING: Final = re.compile(
+    r"""
+    (?<![^\s,;:()\[\]])     # a word begins here: a search from each letter would take long
+    (?:
+        "[^"]*" | '[^'\s][^']*' | `[^`]*`
+        | [^\s,;:()\[\]\d]*\d[^\s,;:()\[\]]*
+        | [^\s,;:()\[\]]+\.[A-Za-z][A-Za-z0-9]{1,4}\b
+    )
+    """,
+    re.VERBOSE,
+)
+_MARK: Final = "\0"
+# A list of them is one: a photo, or two and three more.
+_MARKS: Final = re.compile(
+    rf"\[?{_MARK}(?:(?:, | and |,? or | of |/| ){_MARK}| \.\.\.| more\b)*\]?"
+)
+# Words of sentences that say what one can do.
+_ADVICE: Final = re.compile(
+    r"\b(?:set|give|check|choose|turn|lower|raise|free|repeat|helps?|need(?:s|ed)?|instead)\b|--\w",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alike:
+    """Sentences of one sense.
+
+    Attributes:
+        text: the first of them.
+        others: what stands in the others where the first has its name, each once, in their order.
+        count: how many there are.
+        places: who said it, each once, in their order; cells of a run, say.
+    """
+
+    text: str
+    others: tuple[str, ...]
+    count: int
+    places: tuple[str, ...]
+
+    @property
+    def sentence(self) -> str:
+        """The first of them, how many there are, and the names of a few others.
+
+        >>> alike([("ties", f"photo {name}.jpg: no wall is recognised") for name in "abcdef"])[
+        ...     0
+        ... ].sentence
+        'photo a.jpg: no wall is recognised (6 times; also b.jpg, c.jpg, d.jpg and 2 more)'
+        """
+        if self.count == len(self.places) and not self.others:
+            return self.text
+        named = first_few(self.others)
+        return f"{self.text} ({self.count} times{'; also ' if named else ''}{named})"
+
+    @property
+    def where(self) -> str:
+        """The first of the places, and how many more there are."""
+        n_more = len(self.places) - 1
+        return f"{self.places[0]} and {n_more} more" if n_more else self.places[0]
+
+
+def alike(said: Iterable[tuple[str, str]]) -> tuple[Alike, ...]:
+    """Put sentences together that differ only in names and numbers.
+
+    Args:
+        said: place and sentence, in the order in which they were said.
+
+    Returns:
+        One entry per sense: first those that say what one can do, then those said most often, then
+        in the order of `said`.
+    """
+    groups: dict[str, list[tuple[str, str]]] = {}
+    for place, text in said:
+        groups.setdefault(sense(text), []).append((place, text))
+    found = [_together(group) for group in groups.values()]
+    return tuple(sorted(found, key=lambda item: (not _ADVICE.search(item.text), -item.count)))
+
+
+def sense(text: str) -> str:
+    """What is left of a sentence without names and numbers; alike sentences have the same.
+
+    >>> sense("photo a.jpg: 3 ties") == sense("photo b.jpg: 17 ties")
+    True
+    >>> sense("photo a.jpg: no wall") == sense("photo a.jpg: no plane")
+    False
+    """
+    return _MARKS.sub(_MARK, _VARYING.sub(_MARK, text.replace(_MARK, "")))
+
+
+def first_few(names: Sequence[str]) -> str:
+    """Name the first three, and count the others.
+
+    >>> first_few(["a", "b", "c", "d", "e"])
+    'a, b, c and 2 more'
+    """
+    n_more = len(names) - _MOST_NAMED
+    named = ", ".join(names[:_MOST_NAMED])
+    return f"{named} and {n_more} more" if n_more > 0 else named
+
+
+def _together(group: Sequence[tuple[str, str]]) -> Alike:
+    first = group[0][1]
+    return Alike(
+        text=first,
+        others=_others([text for _, text in group]),
+        count=len(group),
+        places=tuple(dict.fromkeys(place for place, _ in group)),
+    )
+
+
+def _others(texts: Sequence[str]) -> tuple[str, ...]:
+    """What varies first among sentences of one sense, without that of the first sentence."""
+    if len(set(texts)) == 1:
+        return ()
+    parts = [_parts(text) for text in texts]
+    # Sentences of one sense have equally many varying parts.
+    column = next(column for column in zip(*parts, strict=True) if len(set(column)) > 1)
+    return tuple(dict.fromkeys(part for part in column[1:] if part != column[0]))
+
+
+def _parts(text: str) -> tuple[str, ...]:
+    """The varying parts of a sentence, a list as one."""
+    names = _VARYING.findall(text.replace(_MARK, ""))
+    marked = _VARYING.sub(_MARK, text.replace(_MARK, ""))
+    found, n_taken = [], 0
+    for match in _MARKS.finditer(marked):
+        n_names = match[0].count(_MARK)
+        pieces = iter(names[n_taken : n_taken + n_names])
+        found.append(re.sub(_MARK, lambda _, pieces=pieces: next(pieces), match[0]))  # type: ignore[misc]
+        n_taken += n_names
+    return tuple(found)

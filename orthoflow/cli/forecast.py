@@ -1,0 +1,93 @@
+"""How long a run still takes: what its cells took before, and how far they say they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from orthoflow.cli.tables import duration
+
+# Below these, what a step has done so far says nothing of what is left.
+_SMALLEST_FRACTION: Final = 0.05
+_SHORTEST_S: Final = 2.0
+# So far the clock alone moves a step that says less of itself.
+_MOST_BY_CLOCK: Final = 0.95
+
+
+@dataclass
+class CellState:
+    """One cell of a run that goes on.
+
+    Attributes:
+        state: `waiting`, `running`, or how it ended.
+        fraction: 0..1 while it runs, as it says itself.
+        text: what it does, or why it ended so.
+        started: seconds of a clock.
+        wall_s: how long it took.
+        took_s: how long it, or one like it, took before; None when nobody knows.
+    """
+
+    state: str = "waiting"
+    fraction: float = 0.0
+    text: str = ""
+    started: float = 0.0
+    wall_s: float = 0.0
+    took_s: float | None = None
+
+    def left_s(self, now_s: float) -> float | None:
+        """Seconds that it still takes; None when nobody knows.
+
+        What it took before counts until that is over, then how far it says it is.
+        """
+        if self.state == "waiting":
+            return self.took_s
+        if self.state != "running":
+            return 0.0
+        elapsed_s = now_s - self.started
+        if self.took_s is not None and elapsed_s < self.took_s:
+            return self.took_s - elapsed_s
+        if self.fraction < _SMALLEST_FRACTION or elapsed_s < _SHORTEST_S:
+            return None
+        return elapsed_s * (1 - self.fraction) / self.fraction
+
+    def done(self, now_s: float) -> float:
+        """How far it is, 0..1: as it says, or as far as such a step usually is by now."""
+        if not self.took_s or self.state != "running":
+            return self.fraction
+        by_clock = (now_s - self.started) / self.took_s
+        return max(self.fraction, min(by_clock, _MOST_BY_CLOCK))
+
+
+def left_of_run(cells: Iterable[CellState], now_s: float, *, jobs: int = 1) -> str:
+    """Say how long a run still takes; empty when nobody knows.
+
+    Args:
+        cells: all of them.
+        now_s: on the clock that started them.
+        jobs: how many run at the same time.
+    """
+    open_cells = [cell for cell in cells if cell.state in ("waiting", "running")]
+    left = [cell.left_s(now_s) for cell in open_cells]
+    known = [seconds for seconds in left if seconds is not None]
+    if not known:
+        return ""
+    seconds = max(*known, sum(known) / jobs, 0.0)
+    return f"{'about' if len(known) == len(left) else 'at least'} {about(seconds)} left"
+
+
+def left_of_cell(cell: CellState, now_s: float) -> str:
+    """Say how long a running cell still takes; empty when nobody knows."""
+    seconds = cell.left_s(now_s) if cell.state == "running" else None
+    return f"about {about(seconds)} left" if seconds is not None else ""
+
+
+def about(seconds: float) -> str:
+    """Say a time as exactly as a forecast is.
+
+    >>> [about(seconds) for seconds in (0.3, 7, 42, 130, 4000)]
+    ['5 s', '10 s', '45 s', '2 min 10 s', '1 h 07 min']
+    """
+    step = 5 if seconds <= 60 else 10 if seconds <= 600 else 60
+    rounded = max(step, step * -(-round(seconds) // step))
+    return f"{rounded} s" if rounded < 60 else duration(rounded)
