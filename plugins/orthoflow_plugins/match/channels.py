@@ -2,7 +2,9 @@
 
 Dense channels of oriented gradients (after Ye et al. 2019, CFOG): the strength of the gradient
 across each of several directions, smoothed, and evened out locally. A light joint on dark stone and
-a dark joint on light stone look alike in them. Where bands look alike, the grey itself is sharper.
+a dark joint on light stone look alike in them. Where bands look alike, the grey itself is sharper;
+where they do not, a mixture of a photo's colours, another one about each place, may be what the
+laser sees.
 """
 
 from __future__ import annotations
@@ -70,20 +72,27 @@ def gradient_channels(grey: NDArray[np.float32]) -> Channels:
 
 def grey_channels(grey: NDArray[np.float32]) -> Channels:
     """Give a picture itself, less its local mean, evened out; for bands that look alike."""
+    return colour_channels(grey[:, :, None])
+
+
+def colour_channels(colours: NDArray[np.float32]) -> Channels:
+    """Give the colours (rows, cols, c) of a picture, less their local means, evened out as one."""
     import cv2
 
-    filled = filled_smoothly(grey)
-    smooth = np.asarray(cv2.GaussianBlur(filled, (0, 0), 0.5), dtype=np.float32)
-    known = _safe(np.isfinite(grey))
-    flat = smooth - _broadly(smooth)
-    return Channels(values=_evened(flat[:, :, None], known), known=known)
+    known = _safe(np.asarray(np.isfinite(colours).all(axis=2)))
+    layers = []
+    for layer in np.moveaxis(colours, 2, 0):
+        filled = filled_smoothly(np.ascontiguousarray(layer))
+        smooth = np.asarray(cv2.GaussianBlur(filled, (0, 0), 0.5), dtype=np.float32)
+        layers.append(smooth - _broadly(smooth))
+    return Channels(values=_evened(np.stack(layers, axis=-1), known), known=known)
 
 
 CHANNELS: Final[Mapping[str, Callable[[NDArray[np.float32]], Channels]]] = {
     "gradients": gradient_channels,
     "grey": grey_channels,
 }
-"""By name, what may be compared."""
+"""By name, what of a wall's intensity may be compared."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ the shift, with its standard deviation, that brings both patches together.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.threads import even_parts, in_threads
 from orthoflow_plugins.match.channels import Channels
-from orthoflow_plugins.match.patch_kernels import Picture, match_patches, search_shifts
+from orthoflow_plugins.match.patch_kernels import (
+    Picture,
+    match_patches,
+    search_mixtures,
+    search_shifts,
+)
 
 # Patches of which less is known than this say nothing.
 _KNOWN_LEAST: Final = 0.6
@@ -24,6 +29,8 @@ _KNOWN_LEAST: Final = 0.6
 _CORRELATION_AREA_CELLS: Final = 6.0
 _DRIFT_MOST_CELLS: Final = 1.5
 _DISAGREEMENT_MOST_CELLS: Final = 0.5
+# About patches that are cut out: as far as they drift, and what interpolates there.
+_CUT_MARGIN_CELLS: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,18 +81,69 @@ class Displacements:
 def measure(
     first: Channels, second: Channels, places: NDArray[np.intp], rule: SearchRule
 ) -> Displacements:
-    """Measure displacements from the first picture to the second at cells (n, 2) of the first."""
+    """Measure displacements from the first picture to the second at cells (n, 2) of the first.
+
+    Where the first has one channel and the second three, each patch of the first is compared with
+    the mixture of the second's channels that fits it best.
+    """
     places = _well_known(first, second, places, rule)
-    found = np.zeros((len(places), 4))
+    is_mixed = (first.values.shape[2], second.values.shape[2]) == (1, 3)
+    search = search_mixtures if is_mixed else search_shifts
+    found = np.zeros((len(places), 7 if is_mixed else 4))
     reach = (rule.half_patch_cells, rule.radius_cells)
     in_threads(
         [
-            partial(search_shifts, first.values, second.values, places[part], reach, found[part])
+            partial(search, first.values, second.values, places[part], reach, found[part])
             for part in even_parts(len(places), rule.threads)
         ]
     )
     kept = (found[:, 2] >= rule.score_least) & (found[:, 3] >= rule.distinct_least)
+    if is_mixed:
+        return _mixed_and_refined(first, second, (places[kept], found[kept]), rule)
     return _refined(first, second, (places[kept], found[kept, :2]), rule)
+
+
+def _mixed_and_refined(
+    first: Channels,
+    second: Channels,
+    start: tuple[NDArray[np.intp], NDArray[np.float64]],
+    rule: SearchRule,
+) -> Displacements:
+    """Refine each patch in a mixture of its own: all patches, cut out, one below the other."""
+    places, found = start
+    begun = found[:, :2].astype(np.intp)
+    reach = rule.half_patch_cells + _CUT_MARGIN_CELLS
+    one = _cut_out(first, places, reach, np.ones((len(places), 1), dtype=np.float32))
+    other = _cut_out(second, places + begun, reach, found[:, 4:].astype(np.float32))
+    side = 2 * reach + 1
+    centres = np.column_stack(
+        [np.full(len(places), reach), reach + side * np.arange(len(places))]
+    ).astype(np.intp)
+    refined = _refined(one, other, (centres, np.zeros((len(places), 2))), rule)
+    nth = refined.places[:, 1] // side
+    return replace(refined, places=places[nth], shift_cells=refined.shift_cells + begun[nth])
+
+
+def _cut_out(
+    picture: Channels, centres: NDArray[np.intp], reach: int, gains: NDArray[np.float32]
+) -> Channels:
+    """Cut out patches about centres (n, 2), each mixed by its gains (n, c) to a single channel."""
+    side = 2 * reach + 1
+    rows, columns = picture.known.shape
+    values = np.zeros((len(centres), side, side, 1), dtype=np.float32)
+    known = np.zeros((len(centres), side, side), dtype=np.float32)
+    for nth, (column, row) in enumerate(centres.tolist()):
+        top, left = max(0, row - reach), max(0, column - reach)
+        part = (
+            slice(top, min(rows, row + reach + 1)),
+            slice(left, min(columns, column + reach + 1)),
+        )
+        height, width = picture.known[part].shape
+        to = (nth, slice(top - row + reach, top - row + reach + height))
+        across = slice(left - column + reach, left - column + reach + width)
+        values[*to, across, 0] = picture.values[part] @ gains[nth]
+        known[*to, across] = picture.known[part]
+    return Channels(values=values.reshape(-1, side, 1), known=known.reshape(-1, side))
 
 
 def _well_known(

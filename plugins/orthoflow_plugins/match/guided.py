@@ -20,7 +20,7 @@ from orthoflow_plugins.match.paper import (
     paper_wall_features,
     with_paper_ratio,
 )
-from orthoflow_plugins.match.pictures import photo_grey, require_photos
+from orthoflow_plugins.match.pictures import require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, ties_of
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ class MatchGuided(Method):
     """Warp each photo into the walls by its pose and measure how far it is displaced there.
 
     Only what the photo shows of a wall is searched, within a small radius (the mask of
-    markiewicz2015 taken to its end), in oriented gradients, which survive that a laser sees another
-    colour than a camera. The pose is refitted and the photo warped again until held-out ties stop
-    improving. Photos without a pose are looked for on what the others show of the walls, then
-    traced like these; those not found there give no ties.
+    markiewicz2015 taken to its end), in oriented gradients and in mixtures of the photo's colours,
+    which survive that a laser sees another colour than a camera. The pose is refitted and the photo
+    warped again until held-out ties stop improving. Photos without a pose are looked for on what
+    the others show of the walls, then traced like these; those not found there give no ties.
     """
 
     id: ClassVar[str] = "match.guided"
@@ -72,11 +72,13 @@ class MatchGuided(Method):
         half_patch_cells: int = Field(
             default=10, ge=4, le=40, description="Patches are (2 h + 1) cells wide."
         )
-        channels: Literal["auto", "gradients", "grey"] = Field(
+        channels: Literal["auto", "gradients", "grey", "colours"] = Field(
             default="auto",
             description="What is compared: oriented gradients; the grey itself, which is sharper "
-            "where laser and camera see the same; or both, of which each photo keeps the one with "
-            "the smaller error of held-out ties over the root of the number of ties.",
+            "where laser and camera see the same; colours, mixed in each patch as fits the wall "
+            "best, where they do not. auto: gradients and grey, and colours where grey is not the "
+            "better one; each photo keeps what has the smallest error of held-out ties over the "
+            "root of their number and over how far apart they lie.",
         )
         score_min_share: float = Field(
             default=0.35, ge=0, lt=1, description="Smallest correlation of two patches."
@@ -140,7 +142,7 @@ class MatchGuided(Method):
         def trace(index: int) -> Trace:
             photo = photos.photos[index]
             camera = oriented[photo.name].viewing()
-            return trace_photo(index, photo_grey(photo), camera, targets, rule)
+            return trace_photo(index, photo, camera, targets, rule)
 
         pieces: list[TiePiece] = []
         traces: dict[str, Trace] = {}
@@ -215,7 +217,7 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
 
 
 def _rule(params: MatchGuided.Params, threads: int) -> TracingRule:
-    from orthoflow_plugins.match.tracing import TracingRule
+    from orthoflow_plugins.match.tracing import CONTENTS, TracingRule
 
     return TracingRule(
         radius_cells=params.search_radius_cells,
@@ -225,7 +227,7 @@ def _rule(params: MatchGuided.Params, threads: int) -> TracingRule:
         n_ties_most=params.n_ties_max,
         n_rounds_most=params.n_rounds_max,
         threads=threads,
-        contents=("gradients", "grey") if params.channels == "auto" else (params.channels,),
+        contents=CONTENTS if params.channels == "auto" else (params.channels,),
     )
 
 

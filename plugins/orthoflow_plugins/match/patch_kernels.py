@@ -19,6 +19,9 @@ _ITERATIONS: Final = 12
 _CONVERGED_CELLS: Final = 0.002
 _STEP_MOST_CELLS: Final = 0.7
 _KNOWN_SHARE_LEAST: Final = 0.3
+_RIDGE: Final = 1e-3
+# Of the cells that a search looks at, which are every second: neighbours still agree somewhat.
+_INDEPENDENT: Final = 1.5
 
 
 class Picture(NamedTuple):
@@ -51,29 +54,110 @@ def search_shifts(
         found: (n, 4) float64, filled with the shift (across, down), its correlation, and its lead
             over the best place elsewhere, -1 where the best lies on the rim of the search.
     """
-    half, radius = reach
-    side = 2 * radius + 1
+    side = 2 * reach[1] + 1
     scores = np.empty(side * side)
     for i in range(places.shape[0]):
         at = (places[i, 1], places[i, 0])
-        top = 0
         for k in range(side * side):
-            to = (at[0] + k // side - radius, at[1] + k % side - radius)
-            scores[k] = _correlation(first, second, at, to, half)
-            if scores[k] > scores[top]:
-                top = k
-        down, across = top // side, top % side
-        found[i, 0] = across - radius
-        found[i, 1] = down - radius
-        found[i, 2] = scores[top]
-        found[i, 3] = -1.0
-        if 0 < down < side - 1 and 0 < across < side - 1:
-            # Correlations reach down to -1: that much the best leads by where no other place is.
-            elsewhere = -1.0
-            for k in range(side * side):
-                if max(abs(k // side - down), abs(k % side - across)) > 2:
-                    elsewhere = max(elsewhere, scores[k])
-            found[i, 3] = scores[top] - elsewhere
+            to = (at[0] + k // side - reach[1], at[1] + k % side - reach[1])
+            scores[k] = _correlation(first, second, at, to, reach[0])
+        _take_best(scores, found[i])
+
+
+@compiled
+def search_mixtures(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    places: NDArray[np.int64],
+    reach: tuple[int, int],
+    found: NDArray[np.float64],
+) -> None:
+    """As `search_shifts`, with the mixture of the second's channels that fits best at each shift.
+
+    Args:
+        first: (rows, cols, 1) float32.
+        second: (rows, cols, 3) float32.
+        places: as there.
+        reach: as there.
+        found: (n, 7) float64, as there, and the gains of the three channels at the best shift.
+    """
+    side = 2 * reach[1] + 1
+    scores = np.empty(side * side)
+    gains = np.empty(3)
+    for i in range(places.shape[0]):
+        at = (places[i, 1], places[i, 0])
+        for k in range(side * side):
+            to = (at[0] + k // side - reach[1], at[1] + k % side - reach[1])
+            scores[k] = _mixed(first, second, (at, to, reach[0]), gains)
+        _take_best(scores, found[i, :4])
+        to = (at[0] + int(found[i, 1]), at[1] + int(found[i, 0]))
+        _mixed(first, second, (at, to, reach[0]), gains)
+        found[i, 4:] = gains
+
+
+@kernel_part
+def _take_best(scores: NDArray[np.float64], found: NDArray[np.float64]) -> None:
+    """Fill in the shift with the highest of (side^2,) scores, the score, and its lead."""
+    side = round(math.sqrt(scores.shape[0]))
+    top = 0
+    for k in range(side * side):
+        if scores[k] > scores[top]:
+            top = k
+    down, across = top // side, top % side
+    found[0] = across - side // 2
+    found[1] = down - side // 2
+    found[2] = scores[top]
+    found[3] = -1.0
+    if 0 < down < side - 1 and 0 < across < side - 1:
+        # Correlations reach down to -1: that much the best leads by where no other place is.
+        elsewhere = -1.0
+        for k in range(side * side):
+            if max(abs(k // side - down), abs(k % side - across)) > 2:
+                elsewhere = max(elsewhere, scores[k])
+        found[3] = scores[top] - elsewhere
+
+
+@kernel_part
+def _mixed(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    where: tuple[tuple[int, int], tuple[int, int], int],
+    gains: NDArray[np.float64],
+) -> float:
+    """Correlation of a patch with the best mixture of three channels, whose gains are filled in."""
+    at, to, half = where
+    n, sa, sb, sc, sd = 0, 0.0, 0.0, 0.0, 0.0
+    saa, sab, sac, sad = 0.0, 0.0, 0.0, 0.0
+    sbb, sbc, sbd, scc, scd, sdd = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for y in range(-half, half + 1, _STRIDE):
+        for x in range(-half, half + 1, _STRIDE):
+            a = first[at[0] + y, at[1] + x, 0]
+            b = second[to[0] + y, to[1] + x, 0]
+            c = second[to[0] + y, to[1] + x, 1]
+            d = second[to[0] + y, to[1] + x, 2]
+            n += 1
+            sa, sb, sc, sd = sa + a, sb + b, sc + c, sd + d
+            saa, sab, sac, sad = saa + a * a, sab + a * b, sac + a * c, sad + a * d
+            sbb, sbc, sbd = sbb + b * b, sbc + b * c, sbd + b * d
+            scc, scd, sdd = scc + c * c, scd + c * d, sdd + d * d
+    saa, sab, sac, sad = saa - sa * sa / n, sab - sa * sb / n, sac - sa * sc / n, sad - sa * sd / n
+    sbc, sbd, scd = sbc - sb * sc / n, sbd - sb * sd / n, scd - sc * sd / n
+    sbb, scc, sdd = sbb - sb * sb / n, scc - sc * sc / n, sdd - sd * sd / n
+    # Colours of one material follow each other: their small differences must not decide.
+    ridge = _RIDGE * (sbb + scc + sdd) + 1e-12
+    sbb, scc, sdd = sbb + ridge, scc + ridge, sdd + ridge
+    # Cofactors of the symmetric matrix of products.
+    kbb, kcc, kdd = scc * sdd - scd * scd, sbb * sdd - sbd * sbd, sbb * scc - sbc * sbc
+    kbc, kbd, kcd = scd * sbd - sbc * sdd, sbc * scd - scc * sbd, sbc * sbd - sbb * scd
+    determinant = sbb * kbb + sbc * kbc + sbd * kbd
+    gains[0] = (kbb * sab + kbc * sac + kbd * sad) / determinant
+    gains[1] = (kbc * sab + kcc * sac + kcd * sad) / determinant
+    gains[2] = (kbd * sab + kcd * sac + kdd * sad) / determinant
+    explained = gains[0] * sab + gains[1] * sac + gains[2] * sad
+    # Three gains fit some of what is chance: of the rest, as much as they may have taken.
+    free = n / _INDEPENDENT
+    share = explained / max(saa, 1e-20)
+    return math.sqrt(max(0.0, 1.0 - (1.0 - share) * (free - 1.0) / max(free - 4.0, 1.0)))
 
 
 @kernel_part

@@ -133,22 +133,27 @@ def equalised(grey: NDArray[np.uint8], clip_limit: float) -> NDArray[np.uint8]:
     return np.asarray(clahe.apply(grey), dtype=np.uint8)
 
 
-def photo_grey(photo: Photo) -> NDArray[np.uint8]:
-    """Give a photo's grey (Rec. 601), (height, width).
+def photo_rgb(photo: Photo) -> NDArray[np.uint8]:
+    """Give a photo's colours, (height, width, 3).
 
     Raises:
         InputError: the file is no image.
         MethodError: the image has another size than the photo claims.
     """
-    import cv2
-
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
     if rgb.shape[:2] != (photo.height, photo.width):
         raise MethodError(
             f"photo {photo.name} has {rgb.shape[1]} x {rgb.shape[0]} pixels, but is listed with "
             f"{photo.width} x {photo.height}"
         )
-    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    return rgb
+
+
+def photo_grey(photo: Photo) -> NDArray[np.uint8]:
+    """Give a photo's grey (Rec. 601), (height, width); raises as `photo_rgb` does."""
+    import cv2
+
+    return np.asarray(cv2.cvtColor(photo_rgb(photo), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def shrunk(grey: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:

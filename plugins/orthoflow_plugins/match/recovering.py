@@ -91,9 +91,8 @@ def _recovered(
 ) -> Trace | None:
     if lens is None:
         return None
-    grey = photo_grey(photo)
-    pose = recovered_pose(grey, painted, lens)
-    found = None if pose is None else trace_photo(index, grey, pose, *how)
+    pose = recovered_pose(photo_grey(photo), painted, lens)
+    found = None if pose is None else trace_photo(index, photo, pose, *how)
     return found if found is not None and found.n_ties else None
 
 

@@ -14,12 +14,18 @@ from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
-from orthoflow.products import Wall
-from orthoflow_plugins.match.channels import CHANNELS, WallTarget, textured_places
+from orthoflow.products import Photo, Wall
+from orthoflow_plugins.match.channels import (
+    CHANNELS,
+    Channels,
+    WallTarget,
+    colour_channels,
+    textured_places,
+)
 from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
 from orthoflow_plugins.match.pictures import points_on_wall
 from orthoflow_plugins.match.tie_pieces import TiePiece
-from orthoflow_plugins.match.warping import Projection, View, project_walls
+from orthoflow_plugins.match.warping import Projection, View, view_of
 
 _NEIGHBOURS: Final = 12
 _MEDIAN_TOLERANCE_CELLS: Final = 0.6
@@ -35,6 +41,12 @@ _RADIUS_LEAST: Final = 2
 _SETTLED_CELLS: Final = 0.3
 # Held-out error has to fall by this share for another round.
 _GAIN_LEAST: Final = 0.03
+# Compared only where what came before leaves doubts.
+_LAST: Final = "colours"
+_FEW_SHARE: Final = 0.25
+
+CONTENTS: Final = ("gradients", "grey", _LAST)
+"""All that may be compared, in the order in which it is tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +60,7 @@ class TracingRule:
         distinct_least: by how much the best correlation must exceed the next peak.
         n_ties_most: per photo.
         n_rounds_most: measured at most so often.
-        contents: what is compared, `gradients`, `grey` or both, of which the better one is kept.
+        contents: what is compared, of `gradients`, `grey` and `colours`; the best one is kept.
         threads: patches are shared between so many.
     """
 
@@ -96,8 +108,8 @@ class _Round:
 
 
 def trace_photo(
-    photo: int,
-    grey: NDArray[np.uint8],
+    index: int,
+    photo: Photo,
     camera: ViewingCamera,
     targets: Sequence[WallTarget],
     rule: TracingRule,
@@ -105,16 +117,17 @@ def trace_photo(
     """Match a photo with the walls it shows by its pose, until held-out ties stop improving.
 
     Args:
-        photo: index of the photo.
-        grey: (height, width) of the photo.
+        index: of the photo.
+        photo: the photo.
         camera: its pose, good to a few cells on the walls.
         targets: all walls; any of them may hide another.
         rule: how.
     """
-    walls = [target.wall for target in targets]
-    view = View(photo=photo, grey=grey, camera=camera, projections=project_walls(camera, walls))
+    view = view_of(index, photo, camera, [target.wall for target in targets])
     found: Trace | None = None
     for content in rule.contents:
+        if content == _LAST and found is not None and not _is_doubtful(found, rule):
+            continue
         # What one content found out about the pose is the next one's start.
         start = (view, rule.radius_cells) if found is None else (found.view, _RADIUS_LEAST)
         tried = _traced(start, targets, rule, content)
@@ -124,14 +137,25 @@ def trace_photo(
     return found
 
 
+def _is_doubtful(found: Trace, rule: TracingRule) -> bool:
+    """Whether laser and camera may see different things: grey says less than edges, or little."""
+    return found.content != "grey" or found.n_ties < _FEW_SHARE * rule.n_ties_most
+
+
 def _is_better(tried: Trace, found: Trace) -> bool:
-    """Whether another content promises a better pose: held-out error over the root of n."""
+    """Whether another content promises a better pose."""
     if not (tried.held_out_px and found.held_out_px):
         return tried.n_ties > found.n_ties
-    promised = [
-        min(trace.held_out_px) / math.sqrt(max(trace.n_ties, 1)) for trace in (tried, found)
-    ]
-    return promised[0] < promised[1]
+    return _promised(tried) < _promised(found)
+
+
+def _promised(trace: Trace) -> float:
+    """Held-out error over the root of the number of ties and over how far apart they lie."""
+    pixels = np.concatenate([piece.pixels_photo for piece in trace.pieces])
+    if len(pixels) < _LEAST:
+        return math.inf
+    spread_px = math.sqrt(math.sqrt(max(float(np.linalg.det(np.cov(pixels.T))), 1.0)))
+    return min(trace.held_out_px) / (math.sqrt(len(pixels)) * spread_px)
 
 
 def _traced(
@@ -153,8 +177,7 @@ def _traced(
             best = found
         if not improved or _moved_cells(found, view, refitted) < _SETTLED_CELLS:
             break
-        projections = project_walls(refitted, [target.wall for target in targets])
-        view = View(photo=view.photo, grey=view.grey, camera=refitted, projections=projections)
+        view = view.posed(refitted, [target.wall for target in targets])
         radius = max(_RADIUS_LEAST, radius // 2)
     result = best or _Round(pieces=[], n_measured=0, n_outliers=0)
     cleaned = _without_misfits(result.pieces, view.camera)
@@ -197,11 +220,11 @@ def _measured(
         if projection is None or target.grey is None or sizes[index] == 0:
             continue
         share = sizes[index] / sum(sizes)
-        grey = view.on_wall(index, projection)
-        target.prepare(content, rule.half_patch_cells)
-        channels = target.channels[content].part(projection.part)
-        usable = (channels.known > 0.0) & np.isfinite(grey)
-        strength = target.textures[content][projection.part]
+        on_wall = "grey" if content == "colours" else content
+        target.prepare(on_wall, rule.half_patch_cells)
+        channels = target.channels[on_wall].part(projection.part)
+        usable = (channels.known > 0.0) & np.isfinite(projection.u)
+        strength = target.textures[on_wall][projection.part]
         places = textured_places(strength, usable, max(50, round(rule.n_ties_most * share)))
         places = _unoccupied(places, projection, occupied)
         search = SearchRule(
@@ -211,17 +234,26 @@ def _measured(
             distinct_least=rule.distinct_least,
             threads=rule.threads,
         )
-        moved = measure(channels, CHANNELS[content](grey), places, search)
+        moved = measure(channels, _seen(view, index, content), places, search)
         n_measured += len(moved.places)
         moved = moved.take(_agrees_around(moved))
         grain = target.grains[rule.half_patch_cells][projection.part]
-        pieces.append(_piece(view.photo, index, target.wall, (moved, projection), grain))
+        pieces.append(_piece(view.index, index, target.wall, (moved, projection), grain))
     pieces.sort(key=lambda piece: piece.wall)
     return _Round(
         pieces=pieces,
         n_measured=n_measured,
         n_outliers=n_measured - sum(len(piece) for piece in pieces),
     )
+
+
+def _seen(view: View, index: int, content: str) -> Channels:
+    """What of a photo is compared with a wall."""
+    projection = view.projections[index]
+    assert projection is not None  # noqa: S101 - the photo shows the wall
+    if content == "colours":
+        return colour_channels(view.colours_on_wall(projection))
+    return CHANNELS[content](view.on_wall(index, projection))
 
 
 def _piece(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import to_opencv
-from orthoflow.products import Wall
-from orthoflow_plugins.match.pictures import shrunk
+from orthoflow.products import Photo, Wall
+from orthoflow_plugins.match.pictures import photo_grey, photo_rgb, shrunk
 
 # A view flatter than this onto the wall shows too little to match.
 _GRAZING_COSINE: Final = 0.15
@@ -54,42 +54,49 @@ class Projection:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WarpedPhoto:
-    """A photo in a wall's raster.
-
-    Attributes:
-        grey: (rows, cols) float32 over `projection.part`, 0..255; NaN where the photo does not show
-            the wall.
-        projection: where the cells are in the photo; NaN where hidden too.
-    """
-
-    grey: NDArray[np.float32]
-    projection: Projection
-
-
-@dataclass(frozen=True, kw_only=True)
 class View:
     """A photo laid onto the walls by a pose.
 
     Attributes:
-        photo: index of the photo.
+        index: of the photo.
+        photo: the photo.
         grey: (height, width) of the photo.
         camera: the pose.
         projections: of each wall, None where the photo does not show it.
-        warped: the photo in the raster of each wall, as far as it was needed.
+        warped: the grey in the raster of each wall, as far as it was needed.
     """
 
-    photo: int
+    index: int
+    photo: Photo
     grey: NDArray[np.uint8]
     camera: ViewingCamera
     projections: Sequence[Projection | None]
-    warped: dict[int, WarpedPhoto] = field(default_factory=dict)
+    warped: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
     def on_wall(self, index: int, projection: Projection) -> NDArray[np.float32]:
         """Give the photo's grey in the raster of a wall."""
         if index not in self.warped:
             self.warped[index] = warp_photo(self.grey, projection)
-        return self.warped[index].grey
+        return self.warped[index]
+
+    def colours_on_wall(self, projection: Projection) -> NDArray[np.float32]:
+        """Give the photo's colours (rows, cols, 3) in the raster of a wall."""
+        return warp_photo(photo_rgb(self.photo), projection)
+
+    def posed(self, camera: ViewingCamera, walls: Sequence[Wall]) -> View:
+        """Lay the photo onto the walls by another pose."""
+        return replace(self, camera=camera, projections=project_walls(camera, walls), warped={})
+
+
+def view_of(index: int, photo: Photo, camera: ViewingCamera, walls: Sequence[Wall]) -> View:
+    """Lay a photo onto the walls by a pose."""
+    return View(
+        index=index,
+        photo=photo,
+        grey=photo_grey(photo),
+        camera=camera,
+        projections=project_walls(camera, walls),
+    )
 
 
 def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projection | None]:
@@ -121,22 +128,34 @@ def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projecti
     return list(seen)
 
 
-def warp_photo(grey: NDArray[np.uint8], projection: Projection) -> WarpedPhoto:
-    """Resample a photo at the cells of a wall, averaged down to the cells' size first."""
+def warp_photo(picture: NDArray[np.uint8], projection: Projection) -> NDArray[np.float32]:
+    """Resample a photo at the cells of a wall, averaged down to the cells' size first.
+
+    Args:
+        picture: (height, width) or (height, width, c).
+        projection: where the cells are in the photo.
+
+    Returns:
+        (rows, cols) or (rows, cols, c) over `projection.part`, 0..255; NaN where the photo does not
+        show the wall.
+    """
     import cv2
 
     factor = min(1.0, 1.0 / max(projection.pixels_per_cell, 1e-6))
-    small = shrunk(grey, factor)
+    small = shrunk(picture, factor)
     known = np.isfinite(projection.u)
     map_u, map_v = (
         np.where(known, to_opencv(pixels * factor), _OUTSIDE_PX).astype(np.float32)
         for pixels in (projection.u, projection.v)
     )
-    warped = cv2.remap(
-        small.astype(np.float32), map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    warped = np.asarray(
+        cv2.remap(
+            small.astype(np.float32), map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        ),
+        dtype=np.float32,
     )
-    grey_warped = np.where(known, warped, np.nan).astype(np.float32)
-    return WarpedPhoto(grey=grey_warped, projection=projection)
+    warped[~known] = np.nan
+    return warped
 
 
 def _in_photo(camera: ViewingCamera, wall: Wall) -> Projection | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from orthoflow_plugins.match.channels import (
+    colour_channels,
     gradient_channels,
     grey_channels,
     texture,
@@ -83,7 +84,36 @@ def test_inverted_contrast_is_matched_in_gradients() -> None:
     np.testing.assert_allclose(found.shift_cells, 0.0, atol=0.01)
 
 
-@pytest.mark.parametrize("contents", ["auto", "gradients", "grey"])
+@pytest.mark.parametrize("moved", [(0.0, 0.0), (2.37, -1.41)], ids=str)
+def test_colours_are_mixed_in_each_patch_as_the_wall_shows_them(
+    moved: tuple[float, float],
+) -> None:
+    rng = np.random.default_rng(5)
+    colours = np.stack([_smooth(rng) for _ in range(3)], axis=-1)
+    # The laser sees red bright to the left, red dark and green bright to the right.
+    response = np.where(np.arange(300)[None, :, None] < 150, [0.7, 0.1, 0.2], [-0.6, 0.5, 0.0])
+    wall = (colours * response).sum(axis=2)
+    later = shift(colours, (moved[1], moved[0], 0.0), order=5, mode="grid-wrap")
+    first = grey_channels((wall + rng.normal(size=wall.shape)).astype(np.float32))
+    noisy = (later + rng.normal(size=later.shape)).astype(np.float32)
+    places = textured_places(texture(first, half_patch_cells=10), first.known > 0.0, 200)
+    places = places[np.abs(places[:, 0] - 150) > 12]
+    found = measure(first, colour_channels(noisy), places, SEARCH)
+    as_grey = measure(first, grey_channels(noisy.mean(axis=2)), places, SEARCH)
+    assert len(found.places) > 100
+    # In the half whose contrast is mixed, grey finds next to nothing.
+    n_right = [int((each.places[:, 0] > 150).sum()) for each in (found, as_grey)]
+    assert n_right[0] > 50 > 4 * n_right[1]
+    error = found.shift_cells - moved
+    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.035)  # three deviations of a mean
+    assert np.sqrt(np.mean(error**2)) < 0.12
+
+
+def _smooth(rng: np.random.Generator) -> np.ndarray:
+    return 200.0 * gaussian_filter(rng.normal(size=(240, 300)), 2.0, mode="wrap")
+
+
+@pytest.mark.parametrize("contents", ["auto", "gradients", "grey", "colours"])
 def test_a_rough_pose_suffices(
     scene: ms.TexturedWall, walls: Walls, tmp_path: Path, contents: str
 ) -> None:
@@ -148,7 +178,7 @@ def test_a_warped_photo_shows_the_walls_own_grey(scene: ms.TexturedWall, walls: 
     camera = ms.camera_before(scene)
     projection = project_walls(camera, walls.walls)[0]
     assert projection is not None
-    warped = warp_photo(photo_grey(ms.photo_of(scene, camera)), projection).grey
+    warped = warp_photo(photo_grey(ms.photo_of(scene, camera)), projection)
     rows, columns = np.nonzero(np.isfinite(warped))
     at = np.column_stack([columns, rows]) + projection.corner + 0.5
     grey = scene.grey(at[:, 0] * ms.GSD_M, at[:, 1] * ms.GSD_M)
