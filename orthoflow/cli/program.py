@@ -31,6 +31,7 @@ _SUMMARIES: Final = {
     "export": "Write a run's results for other programs.",
     "plugins": "List, show and check methods, and write a plugin of your own.",
     "schema": "Print the JSON Schema of workflow files.",
+    "warm": "Compile beforehand what runs would compile.",
     "cache": "List, check or clean the store of results.",
     "doctor": "Say what is installed, what is missing, and what that costs.",
 }

@@ -55,17 +55,20 @@ def run(
     same command and the same -o. The folder of the run gets run.h5 (the record), report.html, and
     products/ with the files for other programs.
     """
-    from orthoflow.catalog import discover_catalog
     from orthoflow.cli.progress import working_on
-    from orthoflow.engine import RunOptions, Store, plan_run
-    from orthoflow.workflow import expand_cells, load_workflow
 
-    options = RunOptions(**choices)
-    catalog = discover_catalog()
-    loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
-    opened = Store(store)
-    cells = expand_cells(loaded, catalog)
-    with working_on("looking at inputs and stored results"):
+    with working_on("reading the workflow, its inputs and what is stored"):
+        # What takes a second to load is loaded in here.
+        import orthoflow.report  # noqa: F401
+        from orthoflow.catalog import discover_catalog
+        from orthoflow.engine import RunOptions, Store, plan_run
+        from orthoflow.workflow import expand_cells, load_workflow
+
+        options = RunOptions(**choices)
+        catalog = discover_catalog()
+        loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
+        opened = Store(store)
+        cells = expand_cells(loaded, catalog)
         planned = plan_run(cells, loaded, catalog, opened, options)
     # Held until the record is written, so that no `cache gc` takes what it needs.
     with opened.in_use():

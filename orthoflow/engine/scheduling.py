@@ -14,6 +14,7 @@ from types import FrameType
 from typing import Final, Literal
 
 from orthoflow.engine.clock import now
+from orthoflow.engine.compiled_code import begun_with_warm
 from orthoflow.engine.durability import remove_tree, writing_to
 from orthoflow.engine.environment import environment
 from orthoflow.engine.events import (
@@ -518,7 +519,7 @@ class _TaskMaker:
             store=str(self.store.folder),
             folder=str(self.scratch / uuid.uuid4().hex[:12]),
             log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
-            numba_folder=str(self.store.numba_folder(facts.compiled_digest)),
+            numba_folder=str(begun_with_warm(self.store.numba_folder(facts.compiled_digest))),
             publisher_tag=self.plan.publisher_tag,
             environment=environment(cores),
             **shared_fields(facts, MethodIdentity),

@@ -24,6 +24,7 @@ def orthoflow_methods() -> list[MethodSpec]:
         "survey.offset": ("SurveyOffset", "one plane at a distance"),
         "paint.plain": ("PaintPlain", "one colour"),
         "paint.fail": ("PaintFail", "finds no result"),
+        "paint.kernel": ("PaintKernel", "computes with compiled code"),
         "paint.lacking": ("PaintLacking", "needs a library that is not there"),
         "paint.room": ("PaintRoom", "wants room on the disk"),
         "paint.slow": ("PaintSlow", "takes its time"),

@@ -103,6 +103,18 @@ class PaintFail(PaintPlain):
         raise MethodError("no colour sticks to this plane")
 
 
+class PaintKernel(PaintPlain):
+    """Runs a kernel that needs another."""
+
+    id = "paint.kernel"
+
+    def run(self, inputs: PaintPlain.In, params: PaintPlain.Params, ctx: StepContext) -> object:
+        from workshop.kernels import doubled_sum
+
+        ctx.metric("doubled_sum", doubled_sum(inputs.planes.offset), "1")
+        return super().run(inputs, params, ctx)
+
+
 class PaintLacking(PaintPlain):
     """Needs a library that nobody has."""
 

@@ -1,0 +1,148 @@
+"""How long a line of the live table stands still: records a terminal while a workflow runs.
+
+    python benchmarks/standing_lines.py -o terminal.txt -- orthoflow run quickstart.yaml
+
+prints, per step, how long it ran and the longest time in which its line did not change, and the
+same for the whole screen. The recording has a frame per change, each with its second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+_ROWS, _COLUMNS = 40, 120
+_SEQUENCE = re.compile(r"\x1b\[([0-9;?]*)([A-Za-z])")
+
+
+@dataclass
+class Screen:
+    """As much of a terminal as rich asks for: text, line ends, cursor up, lines cleared."""
+
+    lines: list[str] = field(default_factory=lambda: [""])
+    row: int = 0
+    column: int = 0
+
+    def feed(self, text: str) -> None:
+        """Take what a program writes."""
+        place = 0
+        while place < len(text):
+            found = _SEQUENCE.match(text, place)
+            if found:
+                self._obey(found[1], found[2])
+                place = found.end()
+                continue
+            letter = text[place]
+            place += 1
+            if letter == "\n":
+                self.row += 1
+                self.column = 0
+                if self.row == len(self.lines):
+                    self.lines.append("")
+            elif letter == "\r":
+                self.column = 0
+            elif letter >= " ":
+                line = self.lines[self.row].ljust(self.column)
+                self.lines[self.row] = line[: self.column] + letter + line[self.column + 1 :]
+                self.column += 1
+
+    def _obey(self, number: str, letter: str) -> None:
+        if letter == "A":
+            self.row = max(0, self.row - int(number or 1))
+        elif letter == "K":
+            self.lines[self.row] = "" if number == "2" else self.lines[self.row][: self.column]
+
+    def text(self) -> tuple[str, ...]:
+        """The last lines, as many as fit."""
+        return tuple(line.rstrip() for line in self.lines[-_ROWS:])
+
+
+@dataclass
+class Stillness:
+    """How long something was watched, and the longest time in which it stayed as it was."""
+
+    began_s: float
+    changed_s: float
+    ended_s: float
+    content: str
+    longest_s: float = 0.0
+
+    def see(self, content: str, now_s: float) -> None:
+        """Look at it once more."""
+        self.longest_s = max(self.longest_s, now_s - self.changed_s)
+        self.ended_s = now_s
+        if content != self.content:
+            self.content, self.changed_s = content, now_s
+
+
+def record(command: list[str], frames: Path | None) -> dict[str, Stillness]:
+    """Run a command on a terminal of its own; watch the lines of what runs, and the whole."""
+    controlling, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", _ROWS, _COLUMNS, 0, 0))
+    started = time.monotonic()
+    process = subprocess.Popen(
+        command,
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": str(_COLUMNS), "LINES": str(_ROWS)},
+    )
+    os.close(terminal)
+    screen, watched, told = Screen(), {}, ()
+    out = frames.open("w", encoding="utf-8") if frames else None
+    while True:
+        ready, _, _ = select.select([controlling], [], [], 0.1)
+        now_s = time.monotonic() - started
+        if ready:
+            try:
+                block = os.read(controlling, 1 << 16)
+            except OSError:
+                break
+            if not block:
+                break
+            screen.feed(block.decode("utf-8", errors="replace"))
+        shown = screen.text()
+        _watch(watched, shown, now_s)
+        if out and shown != told:
+            print(f"--- {now_s:.2f} s", *shown, sep="\n", file=out)
+        told = shown
+    process.wait()
+    if out:
+        out.close()
+    return watched
+
+
+def _watch(watched: dict[str, Stillness], shown: tuple[str, ...], now_s: float) -> None:
+    running = {line.split()[0]: line for line in shown if re.search(r"^\S+ +\d+ %", line)}
+    for name, content in {**running, "(the whole)": "\n".join(shown)}.items():
+        first = Stillness(began_s=now_s, changed_s=now_s, ended_s=now_s, content=content)
+        watched.setdefault(name, first).see(content, now_s)
+
+
+def main() -> None:
+    """Record and say."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, help="file for the frames")
+    parser.add_argument("command", nargs="+")
+    arguments = parser.parse_args()
+    load = os.getloadavg()[0]
+    watched = record(arguments.command, arguments.output)
+    for name, item in watched.items():
+        seconds = item.ended_s - item.began_s
+        sys.stdout.write(f"{name:20s} {seconds:7.1f} s, at most {item.longest_s:4.1f} s still\n")
+    sys.stdout.write(f"load before {load:.1f}, after {os.getloadavg()[0]:.1f}\n")
+
+
+if __name__ == "__main__":
+    main()

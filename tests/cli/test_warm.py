@@ -1,0 +1,114 @@
+"""Kernels compiled beforehand: every store begins with them, and nothing hangs on them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from orthoflow.cli import warm
+from orthoflow.cli.program import program
+from orthoflow.engine.compiled_code import VARIABLE, begun_with_warm, warm_folder
+from tests.workshop_runs import WORKSHOP, command, workshop_environment, write_studio
+
+
+@pytest.fixture
+def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where warm kernels go in a test."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "kernels"))
+    return tmp_path / "kernels"
+
+
+def compiled(folder: Path) -> set[str]:
+    return {path.name for path in folder.rglob("*.nbc")}
+
+
+def test_a_store_begins_with_what_was_compiled_beforehand(
+    tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(WORKSHOP))
+    studio = write_studio(tmp_path, "paint.kernel")
+    monkeypatch.setattr(warm, "_recipes", lambda: {studio: ("survey.offset_m=2",)})
+    called = CliRunner().invoke(program, ["warm", "--json"])
+    assert called.exit_code == 0, called.output
+    told = json.loads(called.stdout)
+    assert told["methods"] == ["paint.kernel", "survey.offset"]
+    assert (told["n_compiled"], told["n_before"], told["failed"]) == (2, 0, {})
+    assert told["folder"] == str(kernels)
+    again = CliRunner().invoke(program, ["warm", str(studio)])
+    assert again.stdout.splitlines()[0].startswith("compiled 0 kernels of 2 methods in ")
+    assert again.stdout.splitlines()[0].endswith(", 2 were there")
+    done = subprocess.run(
+        command("run", "studio.yaml", "-o", "run"),
+        cwd=tmp_path,
+        env={**workshop_environment(), VARIABLE: str(kernels)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (store,) = (tmp_path / ".orthoflow" / "numba").iterdir()
+    assert compiled(store) == compiled(kernels)
+    assert len(compiled(store)) == 2
+    began = {path.name: path.read_bytes() for path in kernels.rglob("*.nbi")}
+    # An index that had got another kernel would differ.
+    assert {path.name: path.read_bytes() for path in store.rglob("*.nbi")} == began
+
+
+def test_a_folder_of_kernels_is_copied_once_and_only_where_there_is_none(
+    tmp_path: Path, kernels: Path
+) -> None:
+    (kernels / "abc" / "plane_1").mkdir(parents=True)
+    (kernels / "abc" / "plane_1" / "f.nbc").write_bytes(b"code")
+    folder = tmp_path / "store" / "numba" / "abc"
+    assert begun_with_warm(folder) == folder
+    assert (folder / "plane_1" / "f.nbc").read_bytes() == b"code"
+    assert [path.name for path in folder.parent.iterdir()] == ["abc"]
+    (kernels / "abc" / "plane_1" / "g.nbc").write_bytes(b"more")
+    begun_with_warm(folder)
+    assert not (folder / "plane_1" / "g.nbc").exists()
+    assert not begun_with_warm(folder.with_name("def")).exists()
+
+
+def test_kernels_that_cannot_be_copied_are_compiled_instead(tmp_path: Path, kernels: Path) -> None:
+    (kernels / "abc").mkdir(parents=True)
+    (kernels / "abc" / "f.nbc").write_bytes(b"code")
+    (tmp_path / "store").touch()
+    folder = tmp_path / "store" / "numba" / "abc"
+    assert begun_with_warm(folder) == folder
+    assert (tmp_path / "store").read_bytes() == b""
+
+
+def test_a_folder_that_cannot_be_written_is_one_sentence_with_the_way_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "file" / "kernels"))
+    called = CliRunner().invoke(program, ["warm"])
+    assert called.exit_code == 1
+    assert "cannot write to" in called.stderr
+    assert f"; name one with the variable {VARIABLE}" in called.stderr
+
+
+def test_without_a_name_kernels_are_in_the_users_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert warm_folder() == tmp_path / "orthoflow" / "kernels"
+
+
+def test_methods_that_no_recipe_tries_are_named(
+    tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(WORKSHOP))
+    monkeypatch.setattr(warm, "_recipes", dict)
+    called = CliRunner().invoke(program, ["warm", str(write_studio(tmp_path))])
+    assert called.exit_code == 0
+    assert called.stdout.splitlines()[:2] == [
+        "paint.plain: no simulated room tries it: it compiles when it first runs",
+        "survey.offset: no simulated room tries it: it compiles when it first runs",
+    ]
