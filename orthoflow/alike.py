@@ -14,6 +14,7 @@ _VARYING: Final = re.compile(
     (?<![^\s,;:()\[\]])     # a word begins here: a search from each letter would take long
     (?:
         "[^"]*" | '[^'\s][^']*' | `[^`]*`
+        | (?:wall|floor|ceiling)\ \d+ | (?:floor|ceiling)(?=:)
         | [^\s,;:()\[\]\d]*\d[^\s,;:()\[\]]*
         | [^\s,;:()\[\]]+\.[A-Za-z][A-Za-z0-9]{1,4}\b
     )

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from orthoflow.alike import alike
 from orthoflow.foreign_text import shown, shown_json
 
 if TYPE_CHECKING:
@@ -50,6 +49,8 @@ def folded(line: str, width: int) -> list[str]:
 
 def echo_warnings(cells: Iterable[RecordedCell]) -> None:
     """Print what limits the results of cells, a line per sense: the ones that help first."""
+    from orthoflow.alike import alike
+
     for item in alike((cell.address, text) for cell in cells for text in cell.warnings):
         echo_folded(f"warning, {item.where}: {item.sentence}")
 

@@ -43,6 +43,7 @@ COMMANDS = [
     "export",
     "plugins",
     "schema",
+    "warm",
     "cache",
     "doctor",
 ]

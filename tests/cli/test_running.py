@@ -46,7 +46,8 @@ def test_a_run_shows_every_cell_and_every_warning(finished: tuple[Path, str, str
     assert ["survey", "survey.offset", "ok"] in [row[:3] for row in rows]
     assert "warning, survey: the plane lies behind the viewer" in stdout.splitlines()
     assert "0 of 2 steps cached" in stdout.splitlines()
-    said = stderr.splitlines()
+    # Without what is said of time on a machine that is busy.
+    said = [line for line in stderr.splitlines() if " so far" not in line]
     assert said[1:3] == [
         "survey: started",
         "survey: warning: the plane lies behind the viewer",
@@ -228,7 +229,7 @@ def test_an_interrupted_run_ends_with_130_and_goes_on_with_the_same_folder(
     write_studio(tmp_path, "paint.plain")
     again = orthoflow(tmp_path, *arguments)
     assert again.returncode == 0, again.stderr
-    assert again.stderr.startswith("going on with run ")
+    assert any(line.startswith("going on with run ") for line in again.stderr.splitlines())
     assert "0 of 2 steps cached, 1 kept from before the interruption" in again.stdout.splitlines()
     assert ["survey", "survey.offset", "kept"] in [
         line.split()[:3] for line in again.stdout.splitlines()
