@@ -1,7 +1,7 @@
 """A file layer that fails at the n-th operation, for the process that puts it in place.
 
 It stands between Python and the system, below everything that writes here: HDF5 too writes through
-`os.pwrite` (`orthoflow_provenance.sinks`). Only what lies below one folder is counted.
+`os.pwrite` (`orthoflow_provenance.sinks`). Only what lies in folders below one folder is counted.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class FaultyFiles:
         Raises:
             OSError: it is, or the disk has been full since.
         """
-        if not path.is_relative_to(self._folder) or path.parent == self._folder:
+        if not path.is_relative_to(self._folder) or self._folder in (path, path.parent):
             return
         is_reading = what in ("read", "look")
         is_freeing = what in ("unlink", "rmdir")

@@ -14,6 +14,7 @@ from orthoflow.engine.durability import size_of
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.locks import exclusive_lock
 from orthoflow.engine.store import Store
+from orthoflow.engine.store_folder import is_store, require_store
 from orthoflow.errors import ArgumentError
 
 _DAY_S: Final = 86_400.0
@@ -49,12 +50,13 @@ def collect_garbage(
         dry_run: only say what would go.
 
     Raises:
-        ArgumentError: the number of days is negative.
+        ArgumentError: the number of days is negative, or something else lies in the folder.
         StoreError: a run uses the store.
     """
     if older_than_days is not None and older_than_days < 0:
         raise ArgumentError(f"days must be 0 or more, got {older_than_days:g}")
-    if not store.folder.is_dir():
+    require_store(store.folder)
+    if not is_store(store.folder):
         return GarbageReport(n_results=0, n_objects=0, n_damaged=0, freed_bytes=0)
     busy = f"the store {store.folder} is in use by a run; wait until it has ended"
     with exclusive_lock(store.lock_file, busy):

@@ -11,6 +11,7 @@ from orthoflow.engine.durability import size_of
 from orthoflow.engine.locks import shared_lock
 from orthoflow.engine.objects import WHOLE
 from orthoflow.engine.store import Store
+from orthoflow.engine.store_folder import is_store, require_store
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,9 +58,11 @@ def check_store(store: Store) -> Soundness:
     A result whose products or figures are not all there is set aside too.
 
     Raises:
+        ArgumentError: something else lies in the folder.
         StoreError: the store cannot be read, or something damaged cannot be set aside.
     """
-    if not store.folder.is_dir():
+    require_store(store.folder)
+    if not is_store(store.folder):
         return Soundness(n_results=0, n_objects=0, damaged=(), aside=Aside(count=0, size_bytes=0))
     with shared_lock(store.lock_file):
         names = _named_by_digest(store.objects)

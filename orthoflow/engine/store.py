@@ -64,6 +64,7 @@ from orthoflow.engine.objects import (
     require_plain_files,
 )
 from orthoflow.engine.results import CellResult, ProductRef, result_from_json, result_to_json
+from orthoflow.engine.store_folder import make_store
 from orthoflow.errors import DamageError, ProductError, StoreError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import Payload, Product
@@ -180,14 +181,10 @@ class Store:
         """Keep garbage collection away.
 
         Raises:
+            ArgumentError: something else lies in the folder.
             StoreError: the store's folder cannot be made.
         """
-        with writing_to(self.folder):
-            for folder in (self.scratch, self.results, self.objects, self.preimages):
-                folder.mkdir(parents=True, exist_ok=True)
-            ignore = self.folder / ".gitignore"
-            if not ignore.exists():
-                ignore.write_text("*\n", encoding="utf-8")
+        make_store(self.folder)
         with shared_lock(self.lock_file):
             yield
 

@@ -8,6 +8,7 @@ needs neither.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final, TypeVar, cast
 
 import numba
@@ -16,10 +17,10 @@ from numba.core.dispatcher import Dispatcher
 
 from orthoflow.geometry.kernel_news import tell
 
+from orthoflow.geometry.kept_kernels import KeptKernels
+
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 
-# Compiled code is kept between processes. Divisions do not stop at 0: lanes of a vector can fill.
-_KEPT: Final = {"cache": True, "error_model": "numpy"}
 _UNWRAPPED: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
@@ -29,12 +30,12 @@ def compiled(function: _Kernel) -> _Kernel:
     Threads come from `geometry.threads`, not from numba's own loops: those take seconds more to
     compile.
     """
-    return cast("_Kernel", numba.njit(**_KEPT, nogil=True)(function))  # type: ignore[call-overload]  # the stubs leave options out
+    return cast("_Kernel", _kept(function, nogil=True))
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Put a function of a few instructions into each kernel that calls it."""
-    return cast("Callable[..., Any]", numba.njit(**_KEPT, inline="always")(function))  # type: ignore[call-overload]
+    return cast("Callable[..., Any]", _kept(function, inline="always"))
 
 
 def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
@@ -44,7 +45,7 @@ def interpreted(kernel: Callable[..., Any]) -> Callable[..., Any]:
 
 def kernel_part(function: _Kernel) -> _Kernel:
     """Compile a function that only kernels call, when one that does is compiled."""
-    return cast("_Kernel", numba.njit(**_KEPT, **_UNWRAPPED)(function))  # type: ignore[call-overload]
+    return cast("_Kernel", _kept(function, **_UNWRAPPED))
 
 
 def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
@@ -54,10 +55,24 @@ def typed_kernel_part(signature: str) -> Callable[[_Kernel], _Kernel]:
     """
 
     def compile_part(function: _Kernel) -> _Kernel:
-        compiler = numba.njit(signature, **_KEPT, **_UNWRAPPED)  # type: ignore[call-overload]
-        return cast("_Kernel", compiler(function))
+        kernel = _kept(function, **_UNWRAPPED)
+        kernel.compile(signature)
+        kernel.disable_compile()
+        return cast("_Kernel", kernel)
 
     return compile_part
+
+
+# Any: numba's kernels have no types.
+def _kept(function: Callable[..., Any], **options: object) -> Any:
+    """Make a kernel whose compiled code is kept between processes."""
+    # Divisions do not stop at 0: lanes of a vector can fill.
+    kernel = numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload]  # the stubs leave options out
+    # Where nothing can be kept, no home and a program that only others may change, it is compiled
+    # in each process.
+    with suppress(RuntimeError):
+        kernel._cache = KeptKernels(function)  # noqa: SLF001 - numba has no other door for it
+    return kernel
 
 
 class _Compilation(event.Listener):

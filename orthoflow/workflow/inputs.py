@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Final
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import InputError
@@ -13,6 +16,9 @@ from orthoflow.files.yaml_positions import Value, join
 from orthoflow.products.input_files import InputFiles
 from orthoflow.workflow.format import FILES, INPUT, INPUTS, OPTIONAL, Workflow, WorkflowInputSpec
 from orthoflow.workflow.problems import ProblemLog
+
+# Files and folders that are looked at for one input: `/**` would go on for hours.
+MOST_LOOKED_AT: Final = 100_000
 
 
 def read_inputs(value: Value, folder: Path, log: ProblemLog) -> dict[str, WorkflowInputSpec]:
@@ -135,18 +141,76 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     where = " in the working directory" if spec.is_given else f" beside the workflow ({path})"
     if Path(pattern).is_absolute():
         where = ""
+    look = _Look(f"input {spec.name}: {pattern}{where}")
     if path.is_dir():
-        files = [item for item in path.iterdir() if item.is_file() and item.name[0] != "."]
+        files = [item for item in look.into(path) if item.is_file() and item.name[0] != "."]
         missing = f"the folder {pattern}{where} holds no files"
     elif path.exists():
         files, missing = [path], ""
     elif glob.has_magic(pattern):
         # Names may themselves hold brackets; only what is no existing path is taken as a pattern.
-        matches = glob.glob(str(path), recursive=True)  # noqa: PTH207 - pathlib refuses absolute ones
-        files = [Path(match) for match in matches if Path(match).is_file()]
+        files = [match for match in look.for_pattern(spec.folder, pattern) if match.is_file()]
         missing = f"no file matches {pattern}{where}"
     else:
         files, missing = [], f"there is no file {pattern}{where}"
     if not files:
         raise InputError(f"input {spec.name}: {missing}")
     return [item.absolute() for item in files]
+
+
+class _Look:
+    """Looks into folders, and counts what it sees there."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._n_seen = 0
+
+    def into(self, folder: Path) -> Iterator[Path]:
+        """Give what lies in a folder, nothing when it cannot be read.
+
+        Raises:
+            InputError: it was too much.
+        """
+        try:
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    self._n_seen += 1
+                    if self._n_seen > MOST_LOOKED_AT:
+                        raise InputError(
+                            f"{self._what} has more than {MOST_LOOKED_AT} files and folders to "
+                            "look at; name a folder nearer to the files"
+                        )
+                    yield folder / entry.name
+        except OSError:
+            return
+
+    def for_pattern(self, folder: Path, pattern: str) -> list[Path]:
+        """Give what a pattern matches below a folder, as `glob` does with `recursive`.
+
+        Raises:
+            InputError: it was too much.
+        """
+        anchor = Path(pattern).anchor
+        found = [folder / anchor]
+        for part in Path(pattern).parts[bool(anchor) :]:
+            matches = (path for place in found for path in self._matches(place, part))
+            # `**/**` comes to one place by many ways.
+            found = list(dict.fromkeys(matches))
+        return found
+
+    def _matches(self, folder: Path, part: str) -> Iterator[Path]:
+        if part == "**":
+            yield from self._below(folder)
+        elif not glob.has_magic(part) or os.path.lexists(folder / part):
+            yield folder / part
+        else:
+            for path in self.into(folder):
+                if fnmatchcase(path.name, part) and (path.name[0] != "." or part[0] == "."):
+                    yield path
+
+    def _below(self, folder: Path) -> Iterator[Path]:
+        waiting = [folder]
+        while waiting:
+            place = waiting.pop()
+            yield place
+            waiting += (path for path in self.into(place) if path.name[0] != ".")

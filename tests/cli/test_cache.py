@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from orthoflow.cli.program import program
 from tests.engine_world import toy_world
 from tests.killed_runs import run_here
 
@@ -92,3 +94,20 @@ def test_verify_names_what_is_damaged_and_sets_it_aside(say: Said, tmp_path: Pat
     assert "set aside because damaged: 2, " in say("cache", "list")[1]
     assert json.loads(say("cache", "gc", "--json")[1])["n_damaged"] == 2
     assert say(*RUN, "again")[0] == 0
+
+
+@pytest.mark.parametrize("command", [(*RUN, "first"), ("cache", "gc"), ("cache", "verify")])
+def test_a_folder_of_something_else_is_no_store(
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with toy_world(tmp_path):
+        (tmp_path / "toy.yaml").write_text(WORKFLOW)
+        before = {path for path in tmp_path.rglob("*") if path.suffix != ".pyc"}
+        done = CliRunner().invoke(program, [*command, "--store", "."])
+    assert done.exit_code == 2
+    assert done.stderr == (
+        f"error: {tmp_path} is no store of orthoflow: it holds site and 1 more; name a store, or a "
+        "folder that is empty or not there yet, with --store\n"
+    )
+    assert {path for path in tmp_path.rglob("*") if path.suffix != ".pyc"} <= before

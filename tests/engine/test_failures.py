@@ -344,7 +344,7 @@ def test_a_disk_that_fills_up_under_a_mapped_file_fails_the_cell(tiny_world: Wor
 
 
 def test_a_disk_that_is_full_from_the_start_is_one_sentence(tiny_world: World) -> None:
-    filler = tiny_world.folder / "store" / "filler"
+    filler = tiny_world.folder / "store" / ".filler"
     with pytest.raises(OSError, match="No space left"):
         filler.write_bytes(bytes(4 * MIB))
     with pytest.raises(StoreError, match=r"cannot write to .*store.*: No space left on the disk"):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import glob
+import json
+import re
+import time
 from pathlib import Path
 
 import pytest
@@ -114,3 +118,52 @@ def test_an_input_option_must_exist_even_when_the_input_is_optional(
 def test_a_link_keeps_its_own_name(project: Path, catalog: Catalog) -> None:
     (project / "photos" / "deep" / "link.jpg").symlink_to(project / "photos" / "a.jpg")
     assert names(project, catalog, "{files: photos/deep}") == ["c.jpg", "link.jpg"]
+
+
+def test_a_pattern_matches_what_glob_matches(
+    project: Path, catalog: Catalog, tmp_path: Path
+) -> None:
+    for name in ("x/y/c.jpg", "x/.z/d.jpg", "x/e[2]/f.jpg", "x/e2/g.jpg"):
+        path = project / "photos" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    (project / "photos" / "x" / "again").symlink_to("y")
+    for pattern in (
+        *("photos/**", "**/c.jpg", "photos/x/*/*.jpg", "**/**/[cd].jpg", "photos/**/.*.jpg"),
+        *("photos/x/../?.jpg", "p*/x/.z/*", "photos/x/e[[]2]/*", f"{tmp_path}/*/photos/*/*/c.jpg"),
+    ):
+        matches = glob.glob(str(project / pattern), recursive=True)  # noqa: PTH207 - the one to be like
+        expected = sorted({Path(match).name for match in matches if Path(match).is_file()})
+        found = names(project, catalog, f"{{files: {json.dumps(pattern)}}}")
+        assert found is not None
+        assert sorted(set(found)) == expected, pattern
+        assert expected, pattern
+
+
+def test_a_folder_named_with_brackets_is_looked_into(project: Path, catalog: Catalog) -> None:
+    folder = project.rename(project.with_name("scans [1]"))
+    assert names(folder, catalog, "{files: photos/*.jpg}") == ["[1].jpg", "a.jpg", "b.jpg"]
+
+
+@pytest.mark.parametrize("pattern", ["photos", "photos/*.jpg", "**/*.e57", "**/**/**/*"])
+def test_looking_ends_where_there_is_too_much(
+    project: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch, pattern: str
+) -> None:
+    monkeypatch.setattr("orthoflow.workflow.inputs.MOST_LOOKED_AT", 4)
+    place = re.escape(str(project / pattern))
+    with pytest.raises(
+        InputError,
+        match=f"^input photos: {re.escape(pattern)} beside the workflow \\({place}\\) has more "
+        "than 4 files and folders to look at; name a folder nearer to the files$",
+    ):
+        names(project, catalog, f"{{files: {json.dumps(pattern)}}}")
+
+
+def test_looking_through_the_whole_machine_ends_soon(project: Path, catalog: Catalog) -> None:
+    loop = project / "photos" / "deep"
+    for name in ("a", "b", "c"):
+        (loop / name).symlink_to("..")
+    started = time.process_time()
+    with pytest.raises(InputError, match="has more than 100000 files and folders"):
+        names(project, catalog, "{files: '**/*.e57'}")
+    assert time.process_time() - started < 5.0

@@ -1,0 +1,80 @@
+"""Compiled kernels that are kept between processes, looked at before they are loaded.
+
+What numba keeps are pickles, and to read one is to run it. Each file begins with the SHA-256 of the
+rest here: one that was damaged, cut off or written by somebody else is as good as none, and its
+kernel is compiled again. That finds damage, not an enemy, who can write a digest as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+_DIGEST_BYTES: Final = 32
+
+
+class KeptKernels(FunctionCache):
+    """The kept versions of one kernel; stands in the place of numba's own."""
+
+    # Any: numba's classes have no types.
+    def __init__(self, function: Callable[..., Any]) -> None:
+        """Find where they are kept, as numba does.
+
+        Raises:
+            RuntimeError: nowhere on this machine can anything be kept.
+        """
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        self._cache_file = _CheckedFiles(  # type: ignore[no-untyped-call]
+            self._cache_path,
+            # Another name than numba's: a version before could not read these files.
+            f"{self._impl.filename_base}.checked",
+            self._impl.locator.get_source_stamp(),
+        )
+
+
+class _CheckedFiles(IndexDataCacheFile):
+    """The index of a kernel's versions and the file of each, with their digests."""
+
+    def _load_index(self) -> dict[Any, str]:
+        content = _checked(Path(self._index_path))
+        if content is None:
+            return {}
+        stream = io.BytesIO(content)
+        # As in numba: what another version of it kept may not even be readable.
+        if pickle.load(stream) != self._version:
+            return {}
+        stamp, overloads = pickle.load(stream)
+        return overloads if stamp == self._source_stamp else {}
+
+    def _load_data(self, name: str) -> Any:
+        content = _checked(Path(self._cache_path) / name)
+        return None if content is None else pickle.loads(content)
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[BinaryIO]:
+        content = io.BytesIO()
+        yield content
+        with super()._open_for_write(filepath) as stream:
+            stream.write(hashlib.sha256(content.getvalue()).digest())
+            stream.write(content.getvalue())
+
+
+def _checked(path: Path) -> bytes | None:
+    """The content of a file behind its digest; None, and the file is gone, when they disagree."""
+    try:
+        whole = path.read_bytes()
+    except OSError:
+        return None
+    digest, content = whole[:_DIGEST_BYTES], whole[_DIGEST_BYTES:]
+    if hashlib.sha256(content).digest() == digest:
+        return content
+    with suppress(OSError):
+        path.unlink()
+    return None

@@ -1,0 +1,85 @@
+"""A store is made where nothing else lies, and nothing else is cleaned up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine import Store, check_store, collect_garbage
+from orthoflow.errors import ArgumentError
+
+
+def use(store: Store) -> None:
+    with store.in_use():
+        pass
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() if path.is_file() else b"" for path in folder.rglob("*")}
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """What looks like a store to who looks at `objects` alone."""
+    folder = tmp_path / "place" / ".git"
+    (folder / "objects" / "ab").mkdir(parents=True)
+    (folder / "objects" / "ab" / "cd").write_bytes(b"precious")
+    (folder / "HEAD").write_text("ref: refs/heads/main")
+    return folder
+
+
+@pytest.mark.parametrize("command", [use, collect_garbage, check_store])
+def test_a_folder_of_something_else_is_refused_and_left_as_it_was(
+    repository: Path, command: Callable[[Store], object]
+) -> None:
+    (repository / "results").mkdir()
+    before = contents(repository)
+    with pytest.raises(ArgumentError, match=r"\.git is no store of orthoflow: it holds HEAD; name"):
+        command(Store(repository))
+    assert contents(repository) == before
+    (repository / "refs").mkdir()
+    with pytest.raises(ArgumentError, match=r"it holds HEAD and 1 more;"):
+        command(Store(repository))
+
+
+@pytest.mark.parametrize(
+    "first",
+    [
+        *(
+            "numba/abc/kernel.nbc",
+            "objects/abc",
+            "results/",
+            "scratch/run/log",
+            "damaged/",
+            "lock",
+            "failures/",
+        ),
+        *(
+            "matplotlib/fonts.json",
+            "digests.json",
+            ".digests.json-0a1b",
+            ".DS_Store",
+            "lost+found/",
+        ),
+    ],
+)
+def test_what_a_store_has_itself_may_be_there_first(tmp_path: Path, first: str) -> None:
+    store = Store(tmp_path / "store")
+    path = store.folder / first
+    path.parent.mkdir(parents=True)
+    path.mkdir() if first.endswith("/") else path.touch()
+    assert collect_garbage(store).freed_bytes == 0
+    assert check_store(store).damaged == ()
+    use(store)
+    assert path.exists()
+
+
+def test_a_store_stays_one_whatever_else_is_put_there(tmp_path: Path) -> None:
+    store = Store(tmp_path / "store")
+    use(store)
+    (store.folder / "README").write_text("of this machine")
+    use(store)
+    collect_garbage(store)
+    assert (store.folder / "README").read_text() == "of this machine"

@@ -1,0 +1,123 @@
+"""Kept kernels are loaded again, and what is not as it was kept is never run."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from numba.core import config
+
+KERNELS = """
+from orthoflow.geometry.compiling import compiled, inlined, kernel_part, typed_kernel_part
+
+@inlined
+def twice(x):
+    return 2 * x
+
+@kernel_part
+def more(x):
+    return twice(x) + 1
+
+@typed_kernel_part("int64(int64)")
+def most(x):
+    return more(x) + 100
+
+@compiled
+def asked(x):
+    return most(x) // 0.5
+"""
+
+
+@pytest.fixture
+def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
+    """Import the kernels as a new process does."""
+    path = tmp_path / "kernels.py"
+    path.write_text(KERNELS)
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
+
+    def load_again() -> Any:
+        spec = importlib.util.spec_from_file_location("kernels", path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return load_again
+
+
+def kept(folder: Path, name: str, ending: str) -> Path:
+    [path] = (folder / "kept").rglob(f"kernels.{name}-*.{ending}")
+    return path
+
+
+def counts(kernel: Any) -> tuple[int, int]:
+    return sum(kernel.stats.cache_hits.values()), sum(kernel.stats.cache_misses.values())
+
+
+def test_what_one_process_compiled_another_loads(load: Callable[[], Any]) -> None:
+    first, again = load(), load()
+    assert first.asked(3) == again.asked(3) == 214.0
+    assert counts(first.asked) == (0, 1)
+    assert counts(again.asked) == (1, 0)
+    assert counts(first.most) == (0, 1)
+    assert counts(again.most) == (1, 0)
+
+
+class _WritesWhenRead:
+    """A pickle that does what its maker wants."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
+        return os.mkdir, (str(self.path),)
+
+
+def flip(path: Path, _: object) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def cut(path: Path, _: object) -> None:
+    os.truncate(path, path.stat().st_size - 1)
+
+
+def empty(path: Path, _: object) -> None:
+    os.truncate(path, 0)
+
+
+def put_pickle(path: Path, trap: Path) -> None:
+    path.write_bytes(pickle.dumps(_WritesWhenRead(trap)))
+
+
+def put_pickle_behind(path: Path, trap: Path) -> None:
+    path.write_bytes(path.read_bytes()[:32] + pickle.dumps(_WritesWhenRead(trap)))
+
+
+@pytest.mark.parametrize(
+    ("ending", "damage"),
+    [
+        *(("nbc", damage) for damage in (flip, cut, empty, put_pickle, put_pickle_behind)),
+        *(("nbi", damage) for damage in (flip, put_pickle)),
+    ],
+)
+def test_what_was_damaged_or_replaced_is_not_run_but_compiled_again(
+    load: Callable[[], Any], tmp_path: Path, ending: str, damage: Callable[[Path, Path], None]
+) -> None:
+    load().asked(3)
+    trap = tmp_path / "trap"
+    damage(kept(tmp_path, "asked", ending), trap)
+    again = load()
+    assert again.asked(3) == 214.0
+    assert counts(again.asked) == (0, 1)
+    assert not trap.exists()
+    mended = load()
+    assert mended.asked(3) == 214.0
+    assert counts(mended.asked) == (1, 0)
