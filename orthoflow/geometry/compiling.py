@@ -15,9 +15,8 @@ import numba
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
-from orthoflow.geometry.kernel_news import tell
-
 from orthoflow.geometry.kept_kernels import KeptKernels
+from orthoflow.geometry.kernel_news import tell
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., object])
 

@@ -299,6 +299,12 @@ KNOWN: Final = {
         ),
         words="element face has a list of -1 entries",
     ),
+    "PLY with a property of brackets": Known(
+        target="PLY",
+        file="p.ply",
+        content=_ply(_BINARY, "element vertex 2", f"property float {'[' * 50_000}", *_XYZ[1:]),
+        words="",
+    ),
     "PLY with a negative count": Known(
         target="PLY",
         file="a.ply",

@@ -31,6 +31,8 @@ _ALIASES: Final = {
     "column": "column columnindex col",
 }
 _MEANINGS: Final = {alias: name for name, text in _ALIASES.items() for alias in text.split()}
+# Looking for brackets takes time with the square of it.
+_LONGEST_NAME: Final = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +72,8 @@ class Columns:
 
 def meaning_of(name: str) -> str:
     """Meaning of a column's or property's name in a file, `_` when it has none for us."""
+    if len(name) > _LONGEST_NAME:
+        return IGNORED
     plain = re.sub(r"[\[(].*?[\])]", "", name.lower())
     return _MEANINGS.get(re.sub(r"[^a-z]", "", plain), IGNORED)
 
