@@ -1,7 +1,8 @@
 """GeoTIFF in the plane of a wall: one-band rasters and cloud-optimised orthoimages.
 
 X = gsd * column and Y = -gsd * row in a local metric coordinate system, pixel-is-area, so that GIS
-and CAD programs measure metres on the wall. Equal rasters give equal bytes.
+and CAD programs measure metres on the wall. Rasters of level planes may lie in a map instead, X to
+the east and Y to the north. Equal rasters give equal bytes.
 """
 
 from __future__ import annotations
@@ -19,14 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError, StoreError
+from orthoflow.geometry import WallFrame
 
 if TYPE_CHECKING:
+    from rasterio.crs import CRS
     from rasterio.io import DatasetReader, DatasetWriter
     from rasterio.transform import Affine
     from rasterio.windows import Window
 
 LOCAL_CRS_WKT: Final = (
     'LOCAL_CS["plane of the wall, metres",UNIT["metre",1.0],AXIS["X",EAST],AXIS["Y",NORTH]]'
+)
+SITE_CRS: Final = "site"
+SITE_CRS_WKT: Final = (
+    'LOCAL_CS["coordinates of the scan, metres",UNIT["metre",1.0],AXIS["X",EAST],AXIS["Y",NORTH]]'
 )
 # What is read is held as a whole, beside copies of it.
 MOST_CELLS: Final = 1 << 28
@@ -74,8 +81,63 @@ class RasterFile:
     layout: str = ""
 
 
+@dataclass(frozen=True, kw_only=True)
+class MapPlace:
+    """Where a raster lies in a map.
+
+    Attributes:
+        corner_m: east and north of the outer corner of the top-left cell.
+        crs: an EPSG code, or `site`.
+    """
+
+    corner_m: tuple[float, float]
+    crs: str
+
+
+def map_place(frame: WallFrame) -> MapPlace | None:
+    """Give where a raster lies in a map; None for one in the plane of its wall."""
+    if frame.map_crs is None:
+        return None
+    return MapPlace(corner_m=frame.raster_corner_m, crs=frame.map_crs)
+
+
+def require_map_crs(crs: str) -> None:
+    """Refuse what no map in metres has.
+
+    Raises:
+        InputError: there is no such coordinate system, or it is not in metres.
+    """
+    from rasterio.errors import CRSError
+
+    try:
+        with _quiet():
+            found = _map_crs(crs)
+    except CRSError as error:
+        raise InputError(
+            f"there is no coordinate system {crs}: expected the EPSG code of a projected one, "
+            f"such as EPSG:2100, or {SITE_CRS}"
+        ) from error
+    # Of a local system GDAL says the unit, but not that it is projected.
+    if crs != SITE_CRS and not (found.is_projected and found.linear_units_factor[1] == 1.0):
+        raise InputError(
+            f"{crs} is no coordinate system in metres: expected a projected one, such as "
+            f"EPSG:2100, or {SITE_CRS}"
+        )
+
+
+def _map_crs(crs: str) -> CRS:
+    from rasterio.crs import CRS
+
+    return CRS.from_wkt(SITE_CRS_WKT) if crs == SITE_CRS else CRS.from_user_input(crs)
+
+
 def write_raster(
-    path: Path, values: NDArray[np.generic], *, gsd_m: float, tags: Mapping[str, str]
+    path: Path,
+    values: NDArray[np.generic],
+    *,
+    gsd_m: float,
+    tags: Mapping[str, str],
+    place: MapPlace | None = None,
 ) -> None:
     """Write one band: float32 with NaN for nothing, or uint8 classes without a nodata value.
 
@@ -86,6 +148,7 @@ def write_raster(
         values: (rows, cols) float32 or uint8.
         gsd_m: side of a cell in metres.
         tags: text to keep with the raster.
+        place: in a map; without one X and Y count from the top-left corner.
 
     Raises:
         StoreError: the file cannot be written.
@@ -108,7 +171,7 @@ def write_raster(
     }
     if is_float:
         profile["nodata"] = math.nan
-    profile |= _placed(values.shape, gsd_m)
+    profile |= _placed(values.shape, gsd_m, place)
     if values.size > _IN_MEMORY_CELLS:
         _write_large_raster(path, values, profile, tags)
     else:
@@ -140,6 +203,7 @@ def write_orthoimage(
     gsd_m: float,
     tags: Mapping[str, str],
     icc_profile: bytes | None = None,
+    place: MapPlace | None = None,
 ) -> None:
     """Write a cloud-optimised RGB GeoTIFF with overviews and an internal dataset mask.
 
@@ -153,6 +217,7 @@ def write_orthoimage(
         gsd_m: side of a cell in metres.
         tags: text to keep with the image.
         icc_profile: what the colours mean; None for sRGB or unknown.
+        place: in a map; without one X and Y count from the top-left corner.
 
     Raises:
         StoreError: the file cannot be written.
@@ -163,7 +228,7 @@ def write_orthoimage(
             f"{rgb.shape} and a mask of {shown.shape}"
         )
     image = _Image(rgb=rgb, shown=shown, tags=tags, icc_profile=icc_profile)
-    placed: dict[str, object] = {"count": 3, "dtype": "uint8"} | _placed(shown.shape, gsd_m)
+    placed: dict[str, object] = {"count": 3, "dtype": "uint8"} | _placed(shown.shape, gsd_m, place)
     if shown.size > _IN_MEMORY_CELLS:
         _write_banded(path, image, placed)
     else:
@@ -226,7 +291,13 @@ def _require_written(path: Path, values: NDArray[np.generic]) -> None:
                 raise OSError(f"rows {rows.start} to {rows.stop} do not read back")
 
 
-def world_file_text(gsd_m: float, *, rows: float = 1.0, columns: float = 1.0) -> str:
+def world_file_text(
+    gsd_m: float,
+    *,
+    rows: float = 1.0,
+    columns: float = 1.0,
+    corner_m: tuple[float, float] = (0.0, 0.0),
+) -> str:
     """Give the world file of a wall's raster, for programs that read no GeoTIFF tags.
 
     Six lines: step along a row, two rotations, step down a column, and the centre of the first
@@ -236,9 +307,11 @@ def world_file_text(gsd_m: float, *, rows: float = 1.0, columns: float = 1.0) ->
         gsd_m: side of a cell in metres.
         rows: of cells that a pixel covers; more than one for a preview.
         columns: of cells that a pixel covers.
+        corner_m: X and Y of the outer corner of the top-left cell.
     """
     across_m, down_m = columns * gsd_m, rows * gsd_m
-    numbers = (across_m, 0.0, 0.0, -down_m, 0.5 * across_m, -0.5 * down_m)
+    first = (corner_m[0] + 0.5 * across_m, corner_m[1] - 0.5 * down_m)
+    numbers = (across_m, 0.0, 0.0, -down_m, *first)
     return "".join(f"{number!r}\n" for number in numbers)
 
 
@@ -302,15 +375,16 @@ def _gsd_m(path: Path, transform: Affine) -> float:
     return side
 
 
-def _placed(shape: tuple[int, ...], gsd_m: float) -> dict[str, object]:
+def _placed(shape: tuple[int, ...], gsd_m: float, place: MapPlace | None) -> dict[str, object]:
     from rasterio.crs import CRS
     from rasterio.transform import Affine
 
+    left_m, top_m = (0.0, 0.0) if place is None else place.corner_m
     return {
         "height": shape[0],
         "width": shape[1],
-        "crs": CRS.from_wkt(LOCAL_CRS_WKT),
-        "transform": Affine(gsd_m, 0.0, 0.0, 0.0, -gsd_m, 0.0),
+        "crs": CRS.from_wkt(LOCAL_CRS_WKT) if place is None else _map_crs(place.crs),
+        "transform": Affine(gsd_m, 0.0, left_m, 0.0, -gsd_m, top_m),
     }
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.calibration import write_calibration
-from orthoflow.files.geotiff import world_file_text, write_orthoimage, write_raster
+from orthoflow.files.geotiff import map_place, world_file_text, write_orthoimage, write_raster
 from orthoflow.files.images import cells_per_preview_px, cells_png, grey_cells, preview_png
 from orthoflow.files.sidecars import (
     ORTHO_MASK_MEANINGS,
@@ -137,7 +137,7 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
         for rows in row_bands(shown.shape):
             shown[rows] |= image.mask[rows] == OrthoMask.FILLED
         stem = f"wall_{image.wall}_ortho"
-        gsd_m = image.frame.gsd_m
+        gsd_m, place = image.frame.gsd_m, map_place(image.frame)
         colours = "sRGB" if product.icc_profile is None else "ICC profile of the photos"
         content = f"orthoimage, {colours}"
         tags = raster_tags(image.frame, digest=digest, name=image.name, content=content, extra={})
@@ -148,10 +148,13 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
             gsd_m=gsd_m,
             tags=tags,
             icc_profile=product.icc_profile,
+            place=place,
         )
-        write_text(folder / f"{stem}.tfw", world_file_text(gsd_m))
+        world_file = world_file_text(gsd_m, corner_m=image.frame.raster_corner_m)
+        write_text(folder / f"{stem}.tfw", world_file)
         mask_tags = tags | {"content": "mask of the orthoimage"}
-        write_raster(folder / f"{stem}_mask.tif", image.mask, gsd_m=gsd_m, tags=mask_tags)
+        mask_path = folder / f"{stem}_mask.tif"
+        write_raster(mask_path, image.mask, gsd_m=gsd_m, tags=mask_tags, place=place)
         _write_ortho_sidecars(folder, stem, image, {"content": content}, digest)
         _write_preview(folder / f"{stem}.png", preview_png(image.rgb, shown), image.frame)
 
@@ -233,7 +236,13 @@ def _publish_raster(
         digest: of the product.
     """
     all_tags = raster_tags(wall.frame, digest=digest, name=wall.name, content=content, extra=tags)
-    write_raster(stem.with_suffix(".tif"), values, gsd_m=wall.frame.gsd_m, tags=all_tags)
+    write_raster(
+        stem.with_suffix(".tif"),
+        values,
+        gsd_m=wall.frame.gsd_m,
+        tags=all_tags,
+        place=map_place(wall.frame),
+    )
     write_json(
         stem.with_suffix(".json"),
         {
@@ -253,8 +262,10 @@ def _publish_raster(
 def _write_preview(path: Path, picture: bytes, frame: WallFrame) -> None:
     """Write the preview of a raster, and the world file that places it where the raster lies."""
     rows, columns = cells_per_preview_px(frame.shape)
+    corner_m = frame.raster_corner_m
+    text = world_file_text(frame.gsd_m, rows=rows, columns=columns, corner_m=corner_m)
     write_bytes(path, picture)
-    write_text(path.with_suffix(".pgw"), world_file_text(frame.gsd_m, rows=rows, columns=columns))
+    write_text(path.with_suffix(".pgw"), text)
 
 
 def _write_ortho_sidecars(

@@ -39,7 +39,12 @@ ORTHO_MASK_MEANINGS: Final[dict[OrthoMask, str]] = {
 def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
     """Frame of a wall's raster: world = origin + gsd * (column * u + row * v) + depth * n."""
     plane = frame.plane
-    return {
+    placed: dict[str, JsonValue] = {} if frame.map_crs is None else {"map_crs": frame.map_crs}
+    geotiff = "X = gsd_m * column, Y = -gsd_m * row, pixel is area"
+    if frame.map_crs is not None:
+        geotiff = "X = origin_world[0] + gsd_m * column (east), Y = origin_world[1] - gsd_m * row "
+        geotiff += "(north), pixel is area"
+    return placed | {
         "origin_world": numbers(frame.origin_world),
         "u_world": numbers(frame.u_world),
         "v_world": numbers(frame.v_world),
@@ -52,7 +57,7 @@ def frame_json(frame: WallFrame) -> dict[str, JsonValue]:
         "raster": {
             "world_from_raster": "origin_world + gsd_m * (column * u_world + row * v_world) + "
             "depth_m * normal_world; v_world points down, cell centres lie at .5",
-            "geotiff": "X = gsd_m * column, Y = -gsd_m * row, pixel is area",
+            "geotiff": geotiff,
         },
     }
 
@@ -108,7 +113,8 @@ def frame_of_raster(
 
     Args:
         content: `origin_world`, `u_world`, `v_world` (down), `normal_world` of that plane, as in
-            the sidecars that orthoflow writes; X counts along u, Y against v.
+            the sidecars that orthoflow writes; X counts along u, Y against v, from that origin,
+            or with `map_crs` from that of the map.
         corner_m: X and Y of the outer corner of its top-left cell.
         gsd_m: side of its cells.
         shape: its rows and columns.
@@ -125,16 +131,20 @@ def frame_of_raster(
                 f"{name}: {key} must be three numbers below {FARTHEST_M:g}, got "
                 f"{shown_value(content.get(key))}"
             )
-    u, v = vectors["u_world"], vectors["v_world"]
+    u, v, origin = vectors["u_world"], vectors["v_world"], vectors["origin_world"]
+    map_crs = content.get("map_crs")
+    if map_crs is not None:
+        corner_m = (corner_m[0] - float(origin[0]), corner_m[1] - float(origin[1]))
     try:
         return WallFrame(
-            origin_world=vectors["origin_world"] + corner_m[0] * u - corner_m[1] * v,
+            origin_world=origin + corner_m[0] * u - corner_m[1] * v,
             u_world=u,
             v_world=v,
             normal_world=vectors["normal_world"],
             gsd_m=gsd_m,
             width=shape[1],
             height=shape[0],
+            map_crs=None if map_crs is None else str(map_crs),
         )
     except GeometryError as error:
         raise InputError(f"{name}: {error}") from error
@@ -155,10 +165,12 @@ def raster_tags(
 ) -> dict[str, str]:
     """Tags of a GeoTIFF: enough to place it in the world without the JSON file beside it."""
     plane = frame.plane
+    placed = {} if frame.map_crs is None else {"map_crs": frame.map_crs}
     return {
         "content": content,
         "frame": json.dumps(
             {
+                **placed,
                 "origin_world": numbers(frame.origin_world),
                 "u_world": numbers(frame.u_world),
                 "v_world": numbers(frame.v_world),

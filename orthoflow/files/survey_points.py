@@ -14,6 +14,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.sidecars import MOST_WALLS
 
 _MEASURED: Final = ("wall", "u_px", "v_px")
+_IN_MAP: Final = ("map_x", "map_y")
 _SEPARATORS: Final = (";", "\t", ",")
 MOST_BYTES: Final = 20_000_000
 MOST_POINTS: Final = 100_000
@@ -31,6 +32,7 @@ class SurveyPoint:
         class_name: empty without one.
         wall: wall in whose orthoimage the point was measured, or None.
         pixel_wall: measured column and row there, or None.
+        place_m: measured X and Y there, as its GeoTIFF has them, or None.
     """
 
     name: str
@@ -38,6 +40,7 @@ class SurveyPoint:
     class_name: str = ""
     wall: int | None = None
     pixel_wall: tuple[float, float] | None = None
+    place_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +76,9 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
     """Read a file of points.
 
     Columns are separated by commas, semicolons or tabs and named in the first line, in any order:
-    `name,x,y,z[,class][,wall,u_px,v_px]`. Without such a line there are four or five columns in
-    that order. Lines that are empty or begin with # are skipped.
+    `name,x,y,z[,class][,wall,u_px,v_px]`, or `map_x,map_y[,wall]` instead of the last three.
+    Without such a line there are four or five columns in that order. Lines that are empty or begin
+    with # are skipped.
 
     Raises:
         InputError: the file cannot be used; one line per problem, `file:line: ...`.
@@ -93,6 +97,8 @@ class _Form:
         known: all columns, in the order of a table whose first line does not name them.
         bare: how many such a table may have.
         together: columns of which all are there or none.
+        in_map: columns that stand for them, of which all are there or none; the first of
+            `together` may go with them.
     """
 
     content: str
@@ -100,14 +106,16 @@ class _Form:
     known: tuple[str, ...]
     bare: tuple[int, ...]
     together: tuple[str, ...] = ()
+    in_map: tuple[str, ...] = ()
 
 
 _POINTS: Final = _Form(
     content="points",
     required=("name", "x", "y", "z"),
-    known=("name", "x", "y", "z", "class", *_MEASURED),
+    known=("name", "x", "y", "z", "class", *_MEASURED, *_IN_MAP),
     bare=(4, 5),
     together=_MEASURED,
+    in_map=_IN_MAP,
 )
 _TIES: Final = _Form(
     content="ties",
@@ -195,7 +203,9 @@ class _TableReader:
             if len(first.cells) in form.bare:
                 return form.known[: len(first.cells)]
             single = [
-                name for name in form.known[len(form.required) :] if name not in form.together
+                name
+                for name in form.known[len(form.required) :]
+                if name not in form.together + form.in_map
             ]
             optional = [f"[,{name}]" for name in single]
             optional += [f"[,{','.join(form.together)}]"] if form.together else []
@@ -217,7 +227,12 @@ class _TableReader:
         missing = [name for name in form.required if name not in names]
         if missing:
             self._add(first, f"the column {', '.join(missing)} is missing")
+        in_map = [name for name in form.in_map if name in names]
+        if in_map and len(in_map) < len(form.in_map):
+            self._add(first, f"{', '.join(form.in_map)} belong together, got only {in_map[0]}")
         given = [name for name in form.together if name in names]
+        if in_map and given == [form.together[0]]:
+            given = []
         if given and len(given) < len(form.together):
             self._add(first, f"{', '.join(form.together)} belong together, got only {given[0]}")
         return names if len(self.problems) == n_before else None
@@ -258,7 +273,8 @@ class _PointReader(_TableReader):
         if not cells["name"]:
             self._add(row, "the name is missing")
         x, y, z = (self._number(row, key, cells[key]) for key in "xyz")
-        wall, pixel = self._measured(row, cells)
+        place = self._place(row, cells)
+        wall, pixel = self._measured(row, cells, is_placed=place is not None)
         if len(self.problems) > n_before:
             return None
         return SurveyPoint(
@@ -267,23 +283,39 @@ class _PointReader(_TableReader):
             class_name=cells.get("class", ""),
             wall=wall,
             pixel_wall=pixel,
+            place_m=place,
         )
 
+    def _place(self, row: _Row, cells: dict[str, str]) -> tuple[float, float] | None:
+        given = [key for key in _IN_MAP if cells.get(key)]
+        if not given:
+            return None
+        if len(given) < len(_IN_MAP):
+            self._add(row, f"{', '.join(_IN_MAP)} belong together, got only {given[0]}")
+            return None
+        if cells.get("u_px") or cells.get("v_px"):
+            self._add(row, "measured twice, as u_px, v_px and as map_x, map_y: leave one pair out")
+        x, y = (self._number(row, key, cells[key]) for key in _IN_MAP)
+        return x, y
+
     def _measured(
-        self, row: _Row, cells: dict[str, str]
+        self, row: _Row, cells: dict[str, str], *, is_placed: bool
     ) -> tuple[int | None, tuple[float, float] | None]:
         given = [key for key in _MEASURED if cells.get(key)]
         if not given:
             return None, None
-        if len(given) < len(_MEASURED):
+        if len(given) < len(_MEASURED) and not (is_placed and given == ["wall"]):
             self._add(row, f"{', '.join(_MEASURED)} belong together, got only {', '.join(given)}")
             return None, None
         wall = self._number(row, "wall", cells["wall"])
         if math.isfinite(wall) and not (wall.is_integer() and 0 <= wall <= MOST_WALLS):
             self._add(row, f"wall must be the number of a wall, from 0, got {cells['wall']}")
             return None, None
+        number = int(wall) if math.isfinite(wall) else None
+        if is_placed:
+            return number, None
         pixel = (self._number(row, "u_px", cells["u_px"]), self._number(row, "v_px", cells["v_px"]))
-        return (int(wall) if math.isfinite(wall) else None), pixel
+        return number, pixel
 
 
 class _TieReader(_TableReader):

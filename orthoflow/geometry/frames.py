@@ -36,6 +36,8 @@ class WallFrame:
         gsd_m: side of a cell in metres.
         width: number of columns.
         height: number of rows.
+        map_crs: set where the raster is a map, with u to the east and v to the south: its
+            coordinate system, an EPSG code, or `site` for the world's own without a name.
     """
 
     origin_world: NDArray[np.float64]
@@ -45,6 +47,7 @@ class WallFrame:
     gsd_m: float
     width: int
     height: int
+    map_crs: str | None = None
 
     def __post_init__(self) -> None:
         if not (self.gsd_m > 0.0 and self.width > 0 and self.height > 0):
@@ -59,6 +62,13 @@ class WallFrame:
     def shape(self) -> tuple[int, int]:
         """Rows and columns, as numpy arrays have them."""
         return self.height, self.width
+
+    @property
+    def raster_corner_m(self) -> tuple[float, float]:
+        """X and Y of the outer corner of the top-left cell in the raster's GeoTIFF."""
+        if self.map_crs is None:
+            return 0.0, 0.0
+        return float(self.origin_world[0]), float(self.origin_world[1])
 
     @property
     def plane(self) -> Plane:

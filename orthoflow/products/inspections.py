@@ -25,6 +25,9 @@ class CheckPoints(Product):
         classes: class of each point, e.g. `flat`, `vertical`; empty strings without one.
         wall: (n,) int32 wall in whose orthoimage the point was measured, -1 for none.
         pixels_wall: (n, 2) float64 measured (column, row), NaN where not measured.
+        places_m: (n, 2) float64 measured X and Y as the orthoimage's GeoTIFF has them, metres in
+            the plane of the wall, or east and north of a map; NaN where not measured so. None
+            where no point was.
     """
 
     type_name: ClassVar[str] = "checkpoints"
@@ -34,6 +37,7 @@ class CheckPoints(Product):
     classes: tuple[str, ...]
     wall: NDArray[np.int32]
     pixels_wall: NDArray[np.float64]
+    places_m: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

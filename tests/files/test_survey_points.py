@@ -10,7 +10,7 @@ import pytest
 from orthoflow.errors import InputError
 from orthoflow.files.survey_points import SurveyPoint, read_survey_points
 
-KNOWN = "known are name, x, y, z, class, wall, u_px, v_px"
+KNOWN = "known are name, x, y, z, class, wall, u_px, v_px, map_x, map_y"
 NAMES_EXPECTED = "expected the names of the columns, name,x,y,z[,class][,wall,u_px,v_px]"
 CSV_EXPECTED = "expected a CSV file with the columns name,x,y,z"
 ALL = "name,x,y,z,wall,u_px,v_px\n"
@@ -176,3 +176,33 @@ def test_a_file_of_a_hundred_megabytes_is_no_list(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^p\.csv cannot be read: No such file or directory$"):
         read_survey_points(tmp_path / "p.csv")
+
+
+def test_points_measured_in_metres(tmp_path: Path) -> None:
+    points = read(
+        tmp_path, "name,x,y,z,map_x,map_y,wall\nA,1,2,3,634512.5,486215,\nB,1,2,3,4,-5,2\n"
+    )
+    assert [(point.place_m, point.wall, point.pixel_wall) for point in points] == [
+        ((634512.5, 486215.0), None, None),
+        ((4.0, -5.0), 2, None),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("name,x,y,z,map_x\nP,1,2,3,4\n", "p.csv:1: map_x, map_y belong together, got only map_x"),
+        (
+            "name,x,y,z,map_x,map_y\nP,1,2,3,4,\n",
+            "p.csv:2: map_x, map_y belong together, got only map_x",
+        ),
+        (
+            "name,x,y,z,wall,u_px,v_px,map_x,map_y\nP,1,2,3,0,1,2,4,5\n",
+            "p.csv:2: measured twice, as u_px, v_px and as map_x, map_y: leave one pair out",
+        ),
+    ],
+)
+def test_half_or_double_measurements_are_refused(tmp_path: Path, text: str, problem: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    assert str(caught.value).splitlines() == [problem]

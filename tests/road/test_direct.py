@@ -50,7 +50,17 @@ def test_a_second_run_comes_from_the_cache_and_says_so(road: Shell) -> None:
 def test_the_record_verifies_and_reads_back(road: Shell) -> None:
     assert road("verify", "run").code == 0
     run = orthoflow.open_run(road.folder / "run")
-    assert set(run.cells) == {"cloud", "room", "plane", "wall", "ortho", "mosaic", "check"}
+    assert set(run.cells) == {
+        "cloud",
+        "room",
+        "survey",
+        "plane",
+        "wall",
+        "ortho",
+        "mosaic",
+        "points",
+        "check",
+    }
     assert run.cells["cloud"].status == "skipped"
     assert run.cells["check"].status == "ok"
 

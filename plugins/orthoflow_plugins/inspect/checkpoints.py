@@ -35,7 +35,7 @@ from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPo
 class InspectCheckpoints(Method):
     """Measure how far surveyed points lie off in the orthoimages (skarlatos2012, Table 1).
 
-    A point counts where it was measured (`wall`, `u_px`, `v_px` of the check-point file), where
+    A point counts where it was measured (in cells or in metres, see `read.checkpoints`), where
     a black and white quadrant target is recognised, or, in a simulated room, where its surroundings
     are found by the scene's truth. Without orthoimages the intensity of the walls is the picture.
     RMS and standard deviation are of the lengths of residuals; outliers are those beyond twice the
@@ -95,8 +95,8 @@ class InspectCheckpoints(Method):
         if not found:
             raise MethodError(
                 f"none of the {len(points)} check points was found in an orthoimage: measure them "
-                "(columns wall, u_px, v_px), or check that scan and points have one coordinate "
-                "system (inspect.checkpoints)"
+                "(columns wall, u_px, v_px, or map_x, map_y), or check that scan and points have "
+                "one coordinate system (inspect.checkpoints)"
             )
         gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
         shift_m = np.array(

@@ -102,13 +102,18 @@ class PointFinder:
             return ShownPoint(
                 how="outside", wall=-1, expected=nowhere, place=nowhere, point_world=_NOWHERE
             )
-        expected = picture.frame.wall_from_world(world[None])[0, :2]
-        if wall >= 0:
+        frame = picture.frame
+        expected = frame.wall_from_world(world[None])[0, :2]
+        measured = points.pixels_wall[index]
+        if points.places_m is not None and np.isfinite(points.places_m[index]).all():
+            right, up = points.places_m[index] - np.array(frame.raster_corner_m)
+            measured = np.array([right, -up]) / frame.gsd_m
+        if np.isfinite(measured).all():
             return ShownPoint(
                 how="measured",
-                wall=wall,
+                wall=picture.wall,
                 expected=expected,
-                place=points.pixels_wall[index],
+                place=measured,
                 point_world=_NOWHERE,
             )
         if self.truth is not None:

@@ -24,6 +24,7 @@ from orthoflow_plugins.raster.crops import (
     blank_outside,
     cropped,
 )
+from orthoflow_plugins.raster.maps import mapped
 from orthoflow_plugins.raster.reporting import report, warn
 from orthoflow_plugins.raster.rules import GapRule, RasterRule, Surface, SurfaceRule
 from orthoflow_plugins.raster.selection import (
@@ -152,6 +153,12 @@ class RasterGrid(Method):
         margin_m: float = Field(
             default=0.0, ge=0, description="Widens the rectangle of a plane on all sides."
         )
+        crs: str | None = Field(
+            default=None,
+            pattern=r"^(EPSG:[0-9]{4,6}|site)$",
+            description="Coordinate system of the cloud, EPSG:nnnn, or site for one without a "
+            "name: rasters of level planes seen from above are maps of it, x east, y north.",
+        )
 
         @model_validator(mode="after")
         def _one_choice_of_walls(self) -> Self:
@@ -256,6 +263,8 @@ def _crops(planes: Planes, params: RasterGrid.Params, ctx: StepContext) -> dict[
         index: frame_of(planes, index, gsd_m=params.gsd_m, margin_m=params.margin_m)
         for index in chosen_planes(planes, choice)
     }
+    if params.crs is not None:
+        frames = mapped(frames, planes, params.crs, reach_m=max(front, behind), ctx=ctx)
     for place in params.near:
         index = nearest_plane(planes, list(frames), np.array(place))
         apart_m = distance_m(planes, index, np.array(place))

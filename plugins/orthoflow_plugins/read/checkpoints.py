@@ -15,11 +15,14 @@ from orthoflow_plugins.read.scan import UNITS_M, Unit
 
 
 class ReadCheckpoints(Method):
-    """Read check points: `name,x,y,z[,class]`, and `wall,u_px,v_px` where one was measured.
+    """Read check points: `name,x,y,z[,class]`, and where one was measured in an orthoimage.
 
     World coordinates are those of the scan's files. `wall` is the number of the wall, `u_px,v_px`
     the column and row in its orthoimage, counted from the image's corner as GIS programs do: the
-    centre of the first cell is at (0.5, 0.5).
+    centre of the first cell is at (0.5, 0.5). Instead of them `map_x,map_y` are X and Y in metres
+    as a GIS shows them in the GeoTIFF: in the plane of the wall, or east and north of a map
+    (`crs` of `raster.grid`); then `wall` may be left out. East and north hold for any cell size
+    and for images of other programs.
     """
 
     id = "read.checkpoints"
@@ -61,7 +64,7 @@ class ReadCheckpoints(Method):
                 points.append(point)
             places.update((point.name, path.name) for point in points)
         checkpoints = _checkpoints(points, UNITS_M[params.unit])
-        n_measured = int(np.count_nonzero(checkpoints.wall >= 0))
+        n_measured = sum(bool(point.pixel_wall or point.place_m) for point in points)
         ctx.metric("n_points", len(points), "1")
         ctx.metric("n_measured", n_measured, "1")
         extent = np.ptp(checkpoints.points_world, axis=0)
@@ -73,10 +76,14 @@ class ReadCheckpoints(Method):
 
 def _checkpoints(points: list[SurveyPoint], unit_m: float) -> CheckPoints:
     nowhere = (np.nan, np.nan)
+    is_placed = any(point.place_m is not None for point in points)
     return CheckPoints(
         names=tuple(point.name for point in points),
         points_world=unit_m * np.array([point.position for point in points], dtype=np.float64),
         classes=tuple(point.class_name for point in points),
         wall=np.array([-1 if p.wall is None else p.wall for p in points], dtype=np.int32),
         pixels_wall=np.array([p.pixel_wall or nowhere for p in points], dtype=np.float64),
+        places_m=np.array([p.place_m or nowhere for p in points], dtype=np.float64)
+        if is_placed
+        else None,
     )

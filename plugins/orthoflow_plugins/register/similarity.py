@@ -14,6 +14,8 @@ from orthoflow.products import CheckPoints, Finding, Inspection, JsonValue, Poin
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 
 _AT_ONCE: Final = 1 << 20
+# Lists that fit so many times better as mirror images of each other are that.
+_MIRRORED_TIMES: Final = 10.0
 # Points whose second-largest spread is a smaller share of the largest lie on one line.
 _LINE_SHARE: Final = 1e-6
 
@@ -28,7 +30,7 @@ class RegisterSimilarity(Method):
     """
 
     id: ClassVar[str] = "register.similarity"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism = "loose"
     citations: ClassVar[tuple[str, ...]] = (
         "Umeyama 1991, doi:10.1109/34.88573 (least squares of a similarity)",
@@ -73,6 +75,7 @@ class RegisterSimilarity(Method):
         try:
             fitted = fit_similarity(source, target, with_scale=params.with_scale)
             left_out = _left_out(source, target, with_scale=params.with_scale)
+            _require_same_hand(source, target, fitted, with_scale=params.with_scale)
         except GeometryError as error:
             raise MethodError(f"{error} (register.similarity)") from error
         residual_m = fitted.apply(source) - target
@@ -145,6 +148,32 @@ def fit_similarity(
     )
 
 
+def _require_same_hand(
+    source: NDArray[np.float64],
+    target: NDArray[np.float64],
+    fitted: Similarity,
+    *,
+    with_scale: bool,
+) -> None:
+    """Refuse lists of which one mirrors the other: they would fit, badly, with a wrong scale.
+
+    Raises:
+        GeometryError: they fit far better after one of them is mirrored.
+    """
+    if len(source) < 4:
+        return
+    mirror = np.array([1.0, 1.0, -1.0])
+    mirrored = fit_similarity(source * mirror, target, with_scale=with_scale)
+    off_m = float(np.linalg.norm(fitted.apply(source) - target))
+    mirrored_off_m = float(np.linalg.norm(mirrored.apply(source * mirror) - target))
+    if off_m > _MIRRORED_TIMES * mirrored_off_m and off_m > 1e-3:
+        raise GeometryError(
+            f"the lists of points mirror each other: they fit to {off_m:.3g} m as they are, and "
+            f"to {mirrored_off_m:.3g} m with the sign of one axis changed; exchange x and y, or "
+            "change that sign, in one of them"
+        )
+
+
 def _left_out(
     source: NDArray[np.float64], target: NDArray[np.float64], *, with_scale: bool
 ) -> NDArray[np.float64]:
@@ -171,6 +200,7 @@ def _findings(
         ("sigma0_mm", 1e3 * float(np.sqrt(np.sum(residual_m**2) / n_free)), "mm"),
         ("rms_mm", float(np.sqrt(np.mean(length_mm**2))), "mm"),
         ("max_mm", float(length_mm.max()), "mm"),
+        ("scale", fitted.scale, "1"),
         ("scale_ppm", 1e6 * (fitted.scale - 1.0), "ppm"),
     ]
     if len(left_out):

@@ -187,3 +187,17 @@ def test_mirrored_points_are_turned_as_well_as_may_be() -> None:
         fit_similarity(source[:2], source[:2], with_scale=True)
     with pytest.raises(GeometryError, match="at least 3 pairs"):
         fit_similarity(source, source[:5], with_scale=True)
+
+
+@pytest.mark.parametrize("with_scale", [True, False])
+def test_lists_that_mirror_each_other_are_refused(tmp_path: Path, with_scale: bool) -> None:
+    source = places(3)
+    control = source[:, [1, 0, 2]] + SURVEY  # north, east
+    with pytest.raises(MethodError, match=r"mirror each other: .* exchange x and y"):
+        register(tmp_path, points_at(source), points_at(control), with_scale=with_scale)
+
+
+def test_points_of_a_plane_mirror_nothing(tmp_path: Path) -> None:
+    source = places(4) * [1.0, 1.0, 0.0]
+    _, metrics = register(tmp_path, points_at(source), points_at(turned(4).apply(source)))
+    assert metrics["scale"] == pytest.approx(turned(4).scale, rel=1e-9)
