@@ -22,6 +22,8 @@ Vector = tuple[float, float, float]
 
 # The horizontal plane lies below this share of the points: below the scene, above stray echoes.
 _GROUND_SHARE: Final = 0.01
+# So many points beside the rectangle are no few echoes.
+_STRAY_TOLD: Final = 1e-3
 # The paper's buffer of three tolerances on either side of a wall.
 _BUFFER_TOLERANCES: Final = 3.0
 
@@ -113,6 +115,14 @@ class GivenPlane(Method):
             description="Points this near to the plane span its rectangle; by default three "
             "times tolerance_m, and every point for the horizontal plane.",
         )
+        part_min_share: float = Field(
+            0.03,
+            ge=0.0,
+            lt=1.0,
+            description="Points that hang together but cover a smaller share of what all of them "
+            "cover are taken for stray and left out of the rectangle; 0 keeps every part, but for "
+            "the few echoes that a sample of the cloud does not show.",
+        )
 
         @model_validator(mode="after")
         def _one_or_several(self) -> Self:
@@ -148,7 +158,7 @@ class GivenPlane(Method):
         if len(cloud) < 3:
             cloud.require_points(3)
         ctx.progress(0.0, "placing the plane")
-        prepared = prepare_for_references(cloud, parts=ctx.cores)
+        prepared = prepare_for_references(cloud, parts=ctx.cores, part_share=params.part_min_share)
         references = []
         for nth, stated in enumerate(params.planes or (params,)):
             which = f"planes[{nth}]" if params.planes else "the given plane"
@@ -157,6 +167,8 @@ class GivenPlane(Method):
             except MethodError as error:
                 raise MethodError(f"{which}: {error}") from error
         ctx.progress(0.4, "labelling points")
+        for reference in references:
+            _warn_of_stray(reference.n_beside, len(cloud), params.part_min_share, ctx)
         labels = ctx.allocate("labels", "plane_index", (len(cloud),), np.int16).view(np.int16)
         planes = lay_references(
             references, cloud, prepared, labels, tolerance_m=params.tolerance_m, ctx=ctx
@@ -174,7 +186,12 @@ class GivenPlane(Method):
         if buffer_m is None and (stated.normal is not None or stated.points is not None):
             buffer_m = _BUFFER_TOLERANCES * params.tolerance_m
         reference = place_reference(
-            plane, cloud, prepared, buffer_m=buffer_m, keeps_side=is_settled
+            plane,
+            cloud,
+            prepared,
+            buffer_m=buffer_m,
+            keeps_side=is_settled,
+            part_share=params.part_min_share,
         )
         if reference is None:
             low_m, high_m = _reach(plane, cloud)
@@ -203,6 +220,15 @@ class GivenPlane(Method):
         if params.height_m is not None:
             return Plane(normal=up, offset_m=params.height_m - float(up @ cloud.origin)), True
         return Plane(normal=up, offset_m=_ground_m(cloud, up)), True
+
+
+def _warn_of_stray(n_beside: int, n_points: int, part_share: float, ctx: StepContext) -> None:
+    if n_beside > _STRAY_TOLD * n_points:
+        ctx.warn(
+            f"{n_beside} points ({n_beside / n_points:.2%}) lie beside the rectangle of the plane, "
+            f"in parts that cover less than {part_share:.0%} of what all cover: part_min_share "
+            "set to 0 keeps them"
+        )
 
 
 def _ground_m(cloud: PointCloud, up: NDArray[np.float64]) -> float:

@@ -24,6 +24,7 @@ from orthoflow_plugins.plane.assembling import (
 from orthoflow_plugins.plane.measuring import Deviations, measure_planes
 from orthoflow_plugins.plane.sample import Claim, PreparedCloud, prepare
 from orthoflow_plugins.plane.support import (
+    PART_SHARE,
     Support,
     SurfaceRaster,
     cell_for,
@@ -47,16 +48,20 @@ class Reference:
         corners_m: (4, 3) offsets, top-left first, counter-clockwise for the viewer.
         part_corners_m: (p, 4, 3) the same of each connected part.
         viewpoint: how the side was chosen.
+        n_beside: points beside its rectangle, where every point could have spanned it.
     """
 
     plane: Plane
     corners_m: NDArray[np.float64]
     part_corners_m: NDArray[np.float64]
     viewpoint: str
+    n_beside: int
 
 
-def prepare_for_references(cloud: PointCloud, *, parts: int) -> PreparedCloud:
-    """Prepare a cloud that planes are laid over.
+def prepare_for_references(
+    cloud: PointCloud, *, parts: int, part_share: float = PART_SHARE
+) -> PreparedCloud:
+    """Prepare a cloud that planes are laid over; with a `part_share` of 0 no point is stray.
 
     Raises:
         MethodError: the points of the cloud coincide or lie on one line.
@@ -65,7 +70,7 @@ def prepare_for_references(cloud: PointCloud, *, parts: int) -> PreparedCloud:
         cloud,
         basis_from_up(cloud.up),
         cell_m=_PLAN_CELL_M,
-        least_share=_STRAY_SHARE,
+        least_share=_STRAY_SHARE if part_share else 0.0,
         parts=parts,
     )
 
@@ -77,6 +82,7 @@ def place_reference(
     *,
     buffer_m: float | None,
     keeps_side: bool,
+    part_share: float = PART_SHARE,
 ) -> Reference | None:
     """Put a rectangle about the points near a plane, and turn its normal to the viewer.
 
@@ -86,14 +92,15 @@ def place_reference(
         prepared: the same; its claims are overwritten.
         buffer_m: points this near span the rectangle; None for all points.
         keeps_side: leave the normal as it is.
+        part_share: parts that cover a smaller share of what all cover do not count.
 
     Returns:
         The plane with its rectangle, or None where no point is near.
     """
-    raster, place = _rectangle(plane, prepared, buffer_m)
+    raster, place, n_near = _rectangle(plane, prepared, buffer_m, part_share)
     if place is None:
         return None
-    extent_m = _extent(raster, place, prepared, buffer_m)
+    extent_m, n_inside = _extent(raster, place, prepared, buffer_m)
     corners_m = rectangle_m(plane, raster.axes, extent_m)
     parts_m = [
         rectangle_m(
@@ -120,6 +127,7 @@ def place_reference(
         corners_m=enclosing(corners_m, plane, axes),
         part_corners_m=np.array([enclosing(part, plane, axes) for part in parts_m]),
         viewpoint=viewpoint,
+        n_beside=max(0, n_near - n_inside) if buffer_m is None else 0,
     )
 
 
@@ -225,9 +233,9 @@ def _nearest_claims(
 
 
 def _rectangle(
-    plane: Plane, prepared: PreparedCloud, buffer_m: float | None
-) -> tuple[SurfaceRaster, Support | None]:
-    """Cells of the points near a plane that hang together."""
+    plane: Plane, prepared: PreparedCloud, buffer_m: float | None, part_share: float
+) -> tuple[SurfaceRaster, Support | None, int]:
+    """Cells of the points near a plane that hang together, and how many points are near."""
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
     points_m = prepared.sample.offsets_m
     near = points_m[np.abs(plane.distances_m(points_m)) <= reach_m]
@@ -245,13 +253,14 @@ def _rectangle(
         fit_m=reach_m,
         parts=prepared.parts,
     )
-    return raster, support_of(raster, sums.n_find > 0, sums)
+    n_points = int(sums.n_find.sum())
+    return raster, support_of(raster, sums.n_find > 0, sums, part_share=part_share), n_points
 
 
 def _extent(
     raster: SurfaceRaster, place: Support, prepared: PreparedCloud, buffer_m: float | None
-) -> NDArray[np.float64]:
-    """(4,) smallest and largest u and v of the points near a plane in its cells' rectangle."""
+) -> tuple[NDArray[np.float64], int]:
+    """(4,) smallest and largest u and v of the points in the cells' rectangle, and how many."""
     reach_m = _EVERYWHERE_M if buffer_m is None else buffer_m
     slab = raster.slab()
     bounds_m = np.concatenate([[reach_m], place.bounds_m])
@@ -260,7 +269,7 @@ def _extent(
         prepared, slab[None], place.bounds_m[None], find_m=reach_m, fit_m=reach_m
     )
     extent_m: NDArray[np.float64] = deviations.extents_m[0]
-    return extent_m
+    return extent_m, int(deviations.n_find[0])
 
 
 def _report(

@@ -27,7 +27,7 @@ _POINTS_PER_CELL: Final = 12.0
 INNER_SHARE: Final = 0.4
 _CROWDED_SHARE: Final = 0.6
 # A part smaller than this share of the plane's cells is a chance meeting, not a piece of wall.
-_PART_SHARE: Final = 0.03
+PART_SHARE: Final = 0.03
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,10 +199,11 @@ def support_of(
     sums: CellSums,
     *,
     joins_parts: bool = True,
+    part_share: float = PART_SHARE,
 ) -> Support | None:
     """Join cells into parts and put rectangles about them.
 
-    Parts are connected over gaps of up to four cells. Every part with a fair share of the cells
+    Parts are connected over gaps of up to four cells. Every part with `part_share` of the cells
     counts, so that the rectangle holds the entire wall, also where a pilaster cuts it in two;
     without `joins_parts` only the one with most points.
 
@@ -216,7 +217,7 @@ def support_of(
     joined = closed(belongs, 2)
     names, n_parts = ndimage.label(joined | belongs, np.ones((3, 3), dtype=int))
     sizes = np.bincount(names[belongs], minlength=n_parts + 1)
-    kept = np.flatnonzero(sizes >= _PART_SHARE * belongs.sum())
+    kept = np.flatnonzero(sizes >= max(part_share * belongs.sum(), 1.0))
     n_points = np.bincount(names[belongs], sums.n_find[belongs], minlength=n_parts + 1)
     kept = kept[np.argsort(-n_points[kept], kind="stable")]
     kept = kept if joins_parts else kept[:1]

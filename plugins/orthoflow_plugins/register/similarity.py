@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import GeometryError, MethodError
+from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.products import CheckPoints, Finding, Inspection, JsonValue, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 
@@ -26,7 +27,8 @@ class RegisterSimilarity(Method):
     The seven-parameter transformation of skarlatos2012: `points` are places in the cloud's own
     coordinates, `control` the surveyed ones; equal names make a pair. All pairs count alike;
     `sigma0_mm` is the standard deviation of one coordinate, `left_out_rms_mm` the distance of each
-    control point from where the other pairs put it, which no pair can flatter.
+    control point from where the other pairs put it, which no pair can flatter. Which way is up in
+    the cloud is that of the control from then on.
     """
 
     id: ClassVar[str] = "register.similarity"
@@ -43,6 +45,9 @@ class RegisterSimilarity(Method):
         with_scale: bool = Field(
             default=True,
             description="Estimate a scale, for clouds from photos; a scanner's is 1.",
+        )
+        up: UpDirection = Field(
+            default="z", description="Direction that is up in the system of the control."
         )
 
     class In(Ports):
@@ -92,7 +97,8 @@ class RegisterSimilarity(Method):
             findings=tuple(findings),
             details=details,
         )
-        return self.Out(cloud=_moved(inputs.cloud, fitted, ctx), inspection=inspection)
+        moved = replace(_moved(inputs.cloud, fitted, ctx), up=up_vector(params.up))
+        return self.Out(cloud=moved, inspection=inspection)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from orthoflow_plugins.plane.given import GivenPlane
 from pydantic import ValidationError
 
 from orthoflow.errors import MethodError, ProductError
-from orthoflow.products import PointCloud
+from orthoflow.products import Planes, PointCloud
 from tests.plane_scenes import ROOM, Rectangle, cloud_of, context, sampled
 
 SURVEY = (634512.347, 486215.781, 112.193)
@@ -216,3 +216,26 @@ def test_the_rectangle_spans_what_lies_within_the_buffer(tmp_path: Path) -> None
     assert three.corners[0, :, 0].max() == pytest.approx(2.0, abs=0.01)
     three = lay(cloud, tmp_path / "usual three", points=points).planes
     assert three.corners[0, :, 0].max() == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_plan_tells_of_parts_that_it_leaves_out_and_takes_them_when_asked(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(3)
+    ground = rng.uniform([0.0, 0.0, 0.0], [6.0, 4.0, 0.02], (60_000, 3))
+    # A hut apart from the rest, on half a per cent of the area.
+    hut = rng.uniform([8.0, 6.0, 0.0], [8.4, 6.3, 0.02], (400, 3))
+    cloud = cloud_of(np.vstack([ground, hut, [[8.4, 6.3, 0.0]]]))
+
+    def planes(**params: object) -> tuple[Planes, list[str]]:
+        ctx = context(tmp_path)
+        given = GivenPlane.Params.model_validate({"horizontal": True, **params})
+        out = GivenPlane().run(GivenPlane.In(cloud=cloud), given, ctx)
+        return out.planes, list(ctx.warnings)
+
+    found, warnings = planes()
+    assert found.corners[0].max(axis=0)[:2] == pytest.approx([6.0, 4.0], abs=1e-3)
+    assert "401 points (0.66%) lie beside the rectangle of the plane" in warnings[0]
+    found, warnings = planes(part_min_share=0)
+    assert found.corners[0].max(axis=0)[:2] == pytest.approx([8.4, 6.3], abs=1e-6)
+    assert warnings == []

@@ -32,6 +32,8 @@ def register(
 ) -> tuple[RegisterSimilarity.Out, dict[str, float]]:
     ctx = scenes.context(folder)
     cloud = scenes.cloud_of(np.random.default_rng(1).uniform(-4.0, 4.0, (500, 3)))
+    # As from photos: its z points down.
+    cloud = replace(cloud, up=np.array([0.0, 0.0, -1.0]))
     inputs = RegisterSimilarity.In(cloud=cloud, points=points, control=control)
     out = RegisterSimilarity().run(inputs, RegisterSimilarity.Params.model_validate(params), ctx)
     return out, {metric.name: metric.value for metric in ctx.metrics}
@@ -201,3 +203,11 @@ def test_points_of_a_plane_mirror_nothing(tmp_path: Path) -> None:
     source = places(4) * [1.0, 1.0, 0.0]
     _, metrics = register(tmp_path, points_at(source), points_at(turned(4).apply(source)))
     assert metrics["scale"] == pytest.approx(turned(4).scale, rel=1e-9)
+
+
+@pytest.mark.parametrize(("params", "up"), [({}, [0, 0, 1]), ({"up": "-y"}, [0, -1, 0])])
+def test_up_is_that_of_the_control(tmp_path: Path, params: dict[str, str], up: list[int]) -> None:
+    out, _ = register(
+        tmp_path, points_at(places(1)), points_at(turned(1).apply(places(1))), **params
+    )
+    np.testing.assert_array_equal(out.cloud.up, up)
