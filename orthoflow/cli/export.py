@@ -16,14 +16,15 @@ from orthoflow.cli.tables import counted, echo
 from orthoflow.errors import ArgumentError, StoreError
 
 if TYPE_CHECKING:
-    from orthoflow.products import PointCloud, PointLabels
+    from orthoflow.products import Layers, PointCloud, PointLabels
     from orthoflow.records import Run
 
-    ProductT = TypeVar("ProductT", PointCloud, PointLabels)
+    ProductT = TypeVar("ProductT", Layers, PointCloud, PointLabels)
 
 # What a product type is called where a cell has none, and where a run has none.
 _SAID: Final = {
     "cameras": ("orientations", "has oriented no photos"),
+    "layers": ("layers", "has laid nothing onto walls"),
     "labels": ("labels of points", "has found no planes"),
 }
 
@@ -33,7 +34,7 @@ _SAID: Final = {
 @click.option(
     "--to",
     "target",
-    type=click.Choice(["colmap", "csv", "figures", "laz", "ro-crate"]),
+    type=click.Choice(["colmap", "csv", "figures", "layers", "laz", "ro-crate"]),
     help="The format to write.",
 )
 @click.option(
@@ -48,8 +49,8 @@ _SAID: Final = {
     "--cell",
     metavar="ADDRESS",
     help="colmap: the cell whose orientations are meant; without it the last one that oriented "
-    "photos. laz: the cell that found the planes; without it the last one that did. figures: the "
-    "only cell that is meant.",
+    "photos. laz: the cell that found the planes; without it the last one that did. layers: the "
+    "cell that laid photos onto walls, likewise. figures: the only cell that is meant.",
 )
 @click.option(
     "--license",
@@ -70,11 +71,11 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
 
     colmap: the oriented photos with their lenses and ties as a text model that COLMAP opens. csv:
     tables of cells, metrics, parameters, inputs, products and environments. figures: every figure
-    as PNG or SVG. laz: the cloud, each point in the colour of its plane, from the store unless the
-    run was made with --embed. ro-crate: record, report and products as a Provenance Run Crate, for
-    archives. --embed: run.h5 alone, which verifies and replays without any other file; what it
-    lacks so far comes from the store and from the input files, looked for by content or given with
-    --input.
+    as PNG or SVG. layers: what each photo shows of each wall by itself, as GeoTIFFs, from the store
+    unless the run was made with --embed. laz: the cloud, each point in the colour of its plane,
+    likewise. ro-crate: record, report and products as a Provenance Run Crate, for archives.
+    --embed: run.h5 alone, which verifies and replays without any other file; what it lacks so far
+    comes from the store and from the input files, looked for by content or given with --input.
     """
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records import open_run
@@ -100,8 +101,8 @@ def _exported(target: str | None, run: Run, folder: Path, chosen: _Choices) -> s
         return _export_csv(run, folder)
     if target == "figures":
         return _export_figures(run, folder, chosen.cell)
-    if target == "laz":
-        return _export_laz(run, folder, chosen)
+    if target in {"layers", "laz"}:
+        return (_export_laz if target == "laz" else _export_layers)(run, folder, chosen)
     if target == "ro-crate":
         return _export_crate(run, folder, chosen)
     return _export_embedded(run, folder, chosen)
@@ -121,11 +122,13 @@ class _Choices:
         """Refuse options that do not belong to the format."""
         if target is None and not self.embed:
             raise ArgumentError(
-                "say what to write: --to colmap, csv, figures, laz or ro-crate, or --embed"
+                "say what to write: --to colmap, csv, figures, layers, laz or ro-crate, or --embed"
             )
         said = f"--to {target}" if target else "--embed"
-        if self.cell is not None and target not in {"colmap", "figures", "laz"}:
-            raise ArgumentError(f"--cell belongs to --to colmap, figures or laz, not to {said}")
+        if self.cell is not None and target not in {"colmap", "figures", "layers", "laz"}:
+            raise ArgumentError(
+                f"--cell belongs to --to colmap, figures, layers or laz, not to {said}"
+            )
         if self.license_text is not None and target != "ro-crate":
             raise ArgumentError(f"--license belongs to --to ro-crate, not to {said}")
         if self.embed and target not in {None, "ro-crate"}:
@@ -193,6 +196,18 @@ def _embedded(run: Run, folder: Path, chosen: _Choices) -> Run:
     from orthoflow.records.writing import write_embedded
 
     return write_embedded(run, folder / RECORD_FILE, Store(chosen.store), chosen.inputs)
+
+
+def _export_layers(run: Run, folder: Path, chosen: _Choices) -> str:
+    from orthoflow.files.publishing import publish_layers
+    from orthoflow.products import Layers
+
+    address, port = _output_of(run, "layers", chosen.cell)
+    digest = run.cell(address).outputs[port].digest
+    layers = _product(run, digest, Layers, chosen.store)
+    _make_empty(folder)
+    publish_layers(layers, folder, digest)
+    return f"{counted(len(layers.layers), 'layer')} of {address}"
 
 
 def _export_laz(run: Run, folder: Path, chosen: _Choices) -> str:

@@ -6,6 +6,7 @@ for the same product. The `k` in file names is the wall's position in `Walls`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, fields
 from functools import partial
@@ -20,6 +21,7 @@ from orthoflow.files.calibration import write_calibration
 from orthoflow.files.geotiff import map_place, world_file_text, write_orthoimage, write_raster
 from orthoflow.files.images import cells_per_preview_px, cells_png, grey_cells, preview_png
 from orthoflow.files.sidecars import (
+    LAYER_MASK_MEANINGS,
     ORTHO_MASK_MEANINGS,
     SURFACE_MASK_MEANINGS,
     frame_json,
@@ -40,6 +42,9 @@ from orthoflow.products import (
     Camera,
     Cameras,
     JsonValue,
+    Layer,
+    LayerMask,
+    Layers,
     Orthoimage,
     Orthoimages,
     OrthoMask,
@@ -131,7 +136,14 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
 
 
 def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None:
-    """Write `wall_<k>_ortho.tif`, the raster of its mask, sidecars, preview, and world files."""
+    """Write `wall_<k>_ortho.tif`, the raster of its mask, sidecars, preview, and world files.
+
+    Layers that were asked for follow as `publish_layers` writes them.
+    """
+    if product.layers:
+        names = {image.wall: image.name for image in product.images}
+        named = [names.get(wall, f"wall {wall}") for wall in range(max(names, default=-1) + 1)]
+        _write_layers(folder, product.layers, named, product.icc_profile, digest)
     for image in product.images:
         shown = image.mask == OrthoMask.PAINTED
         for rows in row_bands(shown.shape):
@@ -157,6 +169,51 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
         write_raster(mask_path, image.mask, gsd_m=gsd_m, tags=mask_tags, place=place)
         _write_ortho_sidecars(folder, stem, image, {"content": content}, digest)
         _write_preview(folder / f"{stem}.png", preview_png(image.rgb, shown), image.frame)
+
+
+def publish_layers(product: Layers, folder: Path, digest: str) -> None:
+    """Write `wall_<k>_layer_<n>_<source>.tif` and its sidecar for each source: what it shows alone.
+
+    `n` counts the sources of a wall from 0, because names of photos need not differ in a file's.
+    """
+    _write_layers(folder, product.layers, product.names, product.icc_profile, digest)
+
+
+def _write_layers(
+    folder: Path,
+    layers: Sequence[Layer],
+    names: Sequence[str],
+    icc_profile: bytes | None,
+    digest: str,
+) -> None:
+    counts: dict[int, int] = {}
+    for layer in layers:
+        number = counts[layer.wall] = counts.get(layer.wall, -1) + 1
+        source = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(layer.source).stem)
+        stem = f"wall_{layer.wall}_layer_{number}_{source}"
+        name = names[layer.wall] if layer.wall < len(names) else f"wall {layer.wall}"
+        content = f"what {layer.source} shows of the wall"
+        tags = raster_tags(layer.frame, digest=digest, name=name, content=content, extra={})
+        write_orthoimage(
+            folder / f"{stem}.tif",
+            layer.rgb,
+            layer.mask == LayerMask.PAINTED,
+            gsd_m=layer.frame.gsd_m,
+            tags=tags,
+            icc_profile=icc_profile,
+            place=map_place(layer.frame),
+        )
+        about: dict[str, JsonValue] = {
+            "wall": layer.wall,
+            "name": name,
+            "source": layer.source,
+            "content": content,
+            "mask": mask_meanings(LAYER_MASK_MEANINGS),
+            "mask_counts": _counts(layer.mask),
+            "dataset_mask": "255 where the mask is painted (1), else 0",
+            "product_digest": digest,
+        }
+        write_json(folder / f"{stem}.json", frame_json(layer.frame) | about)
 
 
 def publish_ties(product: Ties, folder: Path, digest: str) -> None:

@@ -15,7 +15,7 @@ from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import FARTHEST_M
-from orthoflow.products import JsonValue, OrthoMask, SurfaceMask
+from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
 
 MOST_SIDECAR_BYTES: Final = 1 << 20
 # Numbers of walls are kept in 16 bits.
@@ -26,6 +26,12 @@ SURFACE_MASK_MEANINGS: Final[dict[SurfaceMask, str]] = {
     SurfaceMask.VOID: "void: no point of the scan fell here",
     SurfaceMask.MEASURED: "measured: points of the scan fell here",
     SurfaceMask.RECOVERED: "recovered: taken from neighbouring cells",
+}
+LAYER_MASK_MEANINGS: Final[dict[LayerMask, str]] = {
+    LayerMask.OUTSIDE: "outside: the source does not show this cell",
+    LayerMask.PAINTED: "painted: the source shows this cell",
+    LayerMask.OCCLUDED: "occluded: something stands before it",
+    LayerMask.NO_SURFACE: "no surface: the scan does not know the surface here",
 }
 ORTHO_MASK_MEANINGS: Final[dict[OrthoMask, str]] = {
     OrthoMask.NONE: "none: no source covers this cell",
@@ -189,7 +195,9 @@ def raster_tags(
     }
 
 
-def mask_meanings(meanings: Mapping[SurfaceMask, str] | Mapping[OrthoMask, str]) -> JsonValue:
+def mask_meanings(
+    meanings: Mapping[SurfaceMask, str] | Mapping[OrthoMask, str] | Mapping[LayerMask, str],
+) -> JsonValue:
     """Meaning of each mask value, keyed by the value as JSON wants it, as text."""
     return {str(int(value)): text for value, text in meanings.items()}
 

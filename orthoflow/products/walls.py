@@ -256,6 +256,7 @@ class Orthoimages(Product):
     Attributes:
         images: one per wall.
         icc_profile: colour profile of the colours, or None: sRGB, or not known.
+        layers: what each source shows by itself, where that was asked for; None otherwise.
         details: what else the method says, JSON.
     """
 
@@ -267,6 +268,7 @@ class Orthoimages(Product):
 
     images: tuple[Orthoimage, ...]
     icc_profile: bytes | None = None
+    layers: tuple[Layer, ...] | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
 
 

@@ -93,7 +93,7 @@ def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
     for words, sentence in (
         (("--to", "csv", "--embed"), "writes no record"),
         (("--to", "csv", "--input", "number=n.txt"), "--input belongs to --embed"),
-        ((), "say what to write: --to colmap, csv, figures, laz or ro-crate, or --embed"),
+        ((), "say what to write: --to colmap, csv, figures, layers, laz or ro-crate, or --embed"),
     ):
         refused = studio("export", "first", *words, "-o", "other")
         assert (refused.exit_code, sentence in refused.stderr) == (2, True), refused.output

@@ -47,6 +47,16 @@ def test_a_second_run_comes_from_the_cache_and_says_so(road: Shell) -> None:
         assert (road.folder / "again" / "products" / "plane" / product).read_bytes() == first
 
 
+def test_layers_are_written_when_asked_for(road: Shell) -> None:
+    ended = road("export", "run", "--to", "layers", "--store", str(road.store))
+    assert ended.code == 0, ended.said
+    layer = read_raster(road.folder / "run" / "layers" / "wall_0_layer_0_cloud.tif")
+    # A single layer is its mosaic.
+    mosaic = read_raster(road.folder / "run" / "products" / "mosaic" / "wall_0_ortho.tif")
+    np.testing.assert_array_equal(layer.values[layer.shown], mosaic.values[layer.shown])
+    assert layer.shown.sum() == mosaic.shown.sum()
+
+
 def test_the_record_verifies_and_reads_back(road: Shell) -> None:
     assert road("verify", "run").code == 0
     run = orthoflow.open_run(road.folder / "run")

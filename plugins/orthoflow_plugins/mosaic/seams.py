@@ -105,6 +105,11 @@ class MosaicSeams(Method):
             "where it sees them too; 1 keeps every cell's best view.",
         )
 
+        publish_layers: bool = Field(
+            default=False,
+            description="Publish what each photo shows by itself, too, as GeoTIFFs of their own.",
+        )
+
     class In(Ports):
         """Layers of all walls, and the walls themselves for seams off their depth edges."""
 
@@ -138,7 +143,12 @@ class MosaicSeams(Method):
         images = tuple(item.image for item in verdicts)
         profile = inputs.layers.icc_profile
         return self.Out(
-            orthoimages=Orthoimages(images=images, icc_profile=profile, details=details)
+            orthoimages=Orthoimages(
+                images=images,
+                icc_profile=profile,
+                layers=inputs.layers.layers if params.publish_layers else None,
+                details=details,
+            )
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.errors import MethodError
+from orthoflow.files.geotiff import read_raster
 from orthoflow.files.images import decode_image
+from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.products import Layer, LayerMask, Layers, Orthoimages, OrthoMask
 from tests import raster_scenes as scenes
@@ -299,3 +302,22 @@ def test_a_wall_joined_in_bands_is_the_same(
     (banded,) = joined(layers, tmp_path, island_cells_min=4).images
     for name in ("rgb", "mask", "source"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name))
+
+
+def test_layers_are_published_when_asked_for(tmp_path: Path) -> None:
+    named = ("b/a b.jpg", "c/a b.jpg")
+    layers = [dataclasses.replace(random_layer(k), source=name) for k, name in enumerate(named)]
+    inputs = MosaicSeams.In(layers=Layers(layers=tuple(layers), names=("west wall",)))
+    ctx = scenes.context(tmp_path)
+    assert MosaicSeams().run(inputs, MosaicSeams.Params(), ctx).orthoimages.layers is None
+    params = MosaicSeams.Params(publish_layers=True)
+    asked = MosaicSeams().run(inputs, params, scenes.context(tmp_path)).orthoimages
+    publish_orthoimages(Orthoimages.from_payload(asked.to_payload()), tmp_path, "digest")
+    for number, layer in enumerate(layers):
+        stem = f"wall_0_layer_{number}_a-b"
+        raster = read_raster(tmp_path / f"{stem}.tif")
+        np.testing.assert_array_equal(raster.values, layer.rgb)
+        np.testing.assert_array_equal(raster.shown, layer.mask == LayerMask.PAINTED)
+        said = json.loads((tmp_path / f"{stem}.json").read_text())
+        assert (said["source"], said["name"]) == (layer.source, "west wall")
+        assert sum(said["mask_counts"].values()) == layer.mask.size
