@@ -108,10 +108,11 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
     Percentiles of the depths follow as `wall_<k>_depth_p<percent>.tif` where they were wanted.
     """
     for index, wall in enumerate(product.walls):
+        slab = product.slab(index)
         about: dict[str, JsonValue] = {
             "plane_index": wall.plane_index,
             "intensity_source": product.intensity_source,
-            "buffer": {"front_m": product.buffer_front_m, "behind_m": product.buffer_behind_m},
+            "buffer": {"front_m": slab.front_m, "behind_m": slab.behind_m},
         }
         publish = partial(_publish_raster, wall=wall, about=about, digest=digest)
         depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 
 # What the intensity of a wall is: of the laser; the grey of the colours instead; or there is none.
@@ -101,15 +102,16 @@ class Walls(Product):
         up: (3,) float64 unit vector.
         intensity_source: `laser`, `luminance` (no laser intensity: grey of the colours stands
             in) or `none`.
-        buffer_front_m: how far in front of the plane points were taken.
-        buffer_behind_m: how far behind.
+        buffer_front_m: how far in front of the planes points were taken, at most.
+        buffer_behind_m: how far behind, at most.
+        buffers_m: the same of each wall, in front and behind; empty where all walls have these.
         percentiles: which percentiles (0..100) of the depths in a cell each `Wall.percentiles_m`
             has, in its order; empty if none were wanted.
         details: what else the method says, JSON.
     """
 
     type_name: ClassVar[str] = "walls"
-    encoding_version: ClassVar[int] = 2
+    encoding_version: ClassVar[int] = 3
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "depth_m": Tolerance(limit=1e-4, unit="m"),
         "sigma_m": Tolerance(limit=1e-4, unit="m"),
@@ -127,10 +129,15 @@ class Walls(Product):
     intensity_source: IntensitySource
     buffer_front_m: float
     buffer_behind_m: float
+    buffers_m: tuple[tuple[float, float], ...] = ()
     percentiles: tuple[float, ...] = ()
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.buffers_m and len(self.buffers_m) != len(self.walls):
+            raise ProductError(
+                f"{len(self.walls)} walls need a buffer each or none, got {len(self.buffers_m)}"
+            )
         for wall in self.walls:
             rasters = wall.percentiles_m
             if rasters is not None and rasters.shape[2:] != (len(self.percentiles),):
@@ -138,6 +145,13 @@ class Walls(Product):
                     f"wall {wall.name}: percentiles_m has shape {rasters.shape}, but the walls "
                     f"have {len(self.percentiles)} percentiles"
                 )
+
+    def slab(self, index: int) -> Slab:
+        """The raster of a wall, and how far before and behind its plane points were taken."""
+        front_m, behind_m = (
+            self.buffers_m[index] if self.buffers_m else (self.buffer_front_m, self.buffer_behind_m)
+        )
+        return Slab(frame=self.walls[index].frame, front_m=front_m, behind_m=behind_m)
 
     def nearest(self, points_world: NDArray[np.float64]) -> NDArray[np.int32]:
         """Index (n,) of the wall whose rectangle is nearest to each point (n, 3); -1 for none."""
@@ -150,7 +164,8 @@ class Walls(Product):
     def upgraded(cls, payload: Payload) -> Payload:
         """Move the percentiles, which stood in the details before version 2."""
         metadata = dict(payload.metadata)
-        if isinstance(details := metadata.get("details"), dict):
+        details = metadata.get("details")
+        if payload.encoding_version < 2 and isinstance(details, dict):
             metadata["details"] = {
                 name: value for name, value in details.items() if name != "percentiles"
             }

@@ -155,8 +155,8 @@ def test_a_payload_of_another_type_is_refused() -> None:
 
 
 def test_a_payload_of_a_newer_encoding_is_refused() -> None:
-    payload = dataclasses.replace(walls().to_payload(), encoding_version=3)
-    with pytest.raises(ProductError, match="encoding version 3, this orthoflow reads version 2"):
+    payload = dataclasses.replace(walls().to_payload(), encoding_version=4)
+    with pytest.raises(ProductError, match="encoding version 4, this orthoflow reads version 3"):
         Walls.from_payload(payload)
 
 
@@ -212,7 +212,7 @@ def test_walls_of_the_first_encoding_have_their_percentiles_from_the_details(
     assert read.percentiles == percentiles
     assert read.details == {"surface": "median"}
     payload = read.to_payload()
-    assert payload.encoding_version == 2
+    assert payload.encoding_version == 3
     assert Walls.from_payload(payload).percentiles == percentiles
 
 

@@ -286,8 +286,9 @@ def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]
     """Which points lie on a wall: within its raster and buffer, on a surface that faces as it."""
     on_walls = np.zeros(len(seen.points), dtype=np.bool_)
     hit = seen.rectangle >= 0
-    for wall in walls.walls:
-        frame = wall.frame
+    for index in range(len(walls.walls)):
+        slab = walls.slab(index)
+        frame = slab.frame
         relative = seen.points[hit] - (frame.origin_world - scene.origin)
         columns, rows = relative @ frame.u_world, relative @ frame.v_world
         depths = relative @ frame.normal_world
@@ -298,8 +299,8 @@ def _on_walls(seen: SeenPoints, walls: Walls, scene: Scene) -> NDArray[np.bool_]
             & (columns < frame.gsd_m * frame.width)
             & (rows > 0.0)
             & (rows < frame.gsd_m * frame.height)
-            & (depths < walls.buffer_front_m)
-            & (depths > -walls.buffer_behind_m)
+            & (depths < slab.front_m)
+            & (depths > -slab.behind_m)
         )
     return on_walls
 

@@ -45,7 +45,8 @@ def _laid_onto(image: Orthoimage, wall: Wall, walls: Walls) -> Wall:
     middle = frame.corners_world().mean(axis=0)
     aside = float(wall.frame.plane.distances_m(middle[None])[0])
     angle = angle_between_deg(frame.normal_world, wall.frame.normal_world)
-    if angle > _SAME_DIRECTION_DEG or not (-walls.buffer_behind_m <= aside <= walls.buffer_front_m):
+    slab = walls.slab(image.wall)
+    if angle > _SAME_DIRECTION_DEG or not (-slab.behind_m <= aside <= slab.front_m):
         raise MethodError(
             f"orthoimage {image.name} lies {aside:.3f} m before wall {image.wall} and "
             f"{angle:.2f} deg askew: wire the walls that the orthoimages are of"

@@ -123,13 +123,13 @@ class PointFinder:
     def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> Picture | None:
         """The picture that a point belongs to: the nearest wall whose rectangle it lies before."""
         best, nearest = None, np.inf
-        walls = self.walls
         for picture in self.pictures:
             if wall is not None and picture.wall == wall:
                 return picture
             column, row, depth = picture.frame.wall_from_world(world[None])[0]
             inside = 0 <= column < picture.frame.width and 0 <= row < picture.frame.height
-            within = -walls.buffer_behind_m <= depth <= walls.buffer_front_m
+            slab = self.walls.slab(picture.wall)
+            within = -slab.behind_m <= depth <= slab.front_m
             if wall is None and inside and within and abs(depth) < nearest:
                 best, nearest = picture, abs(float(depth))
         return best
@@ -137,13 +137,13 @@ class PointFinder:
     def _by_truth(
         self, picture: Picture, expected: NDArray[np.float64], truth: Truth
     ) -> ShownPoint:
-        walls = self.walls
+        slab = self.walls.slab(picture.wall)
         place = find_by_truth(
             picture.grey,
             picture.frame,
             expected,
             truth,
-            buffers_m=(walls.buffer_front_m, walls.buffer_behind_m),
+            buffers_m=(slab.front_m, slab.behind_m),
             search_cells=int(np.clip(np.ceil(self.search_m / picture.frame.gsd_m), 2, 12)),
         )
         return ShownPoint(

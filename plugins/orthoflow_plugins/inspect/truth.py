@@ -260,9 +260,10 @@ class _Judge:
             lowest_elevation_deg=truth.lowest_elevation_deg,
             highest_elevation_deg=truth.highest_elevation_deg,
         )
+        slab = self.walls.slab(image.wall)
         rendering = Rendering(
-            buffer_front_m=self.walls.buffer_front_m,
-            buffer_behind_m=self.walls.buffer_behind_m,
+            buffer_front_m=slab.front_m,
+            buffer_behind_m=slab.behind_m,
             viewers=viewers,
             supersample=self.params.supersample,
             coloured=chosen.coloured,

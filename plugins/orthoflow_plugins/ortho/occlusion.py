@@ -95,8 +95,8 @@ def _box_between(
     cloud: PointCloud, walls: Walls, cameras: Sequence[ViewingCamera]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     places = [camera.centre_world for camera in cameras]
-    for wall in walls.walls:
+    for index, wall in enumerate(walls.walls):
         corners = wall.frame.corners_world()
-        places += [*(corners + walls.buffer_front_m * wall.frame.normal_world), *corners]
+        places += [*(corners + walls.slab(index).front_m * wall.frame.normal_world), *corners]
     between = np.array(places) - cloud.origin
     return between.min(axis=0), between.max(axis=0)

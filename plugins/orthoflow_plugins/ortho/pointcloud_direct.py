@@ -118,7 +118,7 @@ class PointcloudDirect(Method):
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
             started = ctx.clock_s()
-            projection = _project(inputs, colours, wall, rule)
+            projection = _project(inputs.cloud, colours, inputs.walls.slab(k), rule)
             projected = ctx.clock_s()
             layers.append(_filled(projection, wall, k, params, threads=ctx.cores))
             seconds += (projected - started, ctx.clock_s() - projected)
@@ -148,12 +148,10 @@ def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
 
 
 def _project(
-    inputs: PointcloudDirect.In, colours: NDArray[np.uint8], wall: Wall, rule: ColourRule
+    cloud: PointCloud, colours: NDArray[np.uint8], slab: Slab, rule: ColourRule
 ) -> _Projection:
-    walls = inputs.walls
-    slab = Slab(frame=wall.frame, front_m=walls.buffer_front_m, behind_m=walls.buffer_behind_m)
-    found = colours_of(inputs.cloud, colours, slab, rule)
-    shape = wall.frame.shape
+    found = colours_of(cloud, colours, slab, rule)
+    shape = slab.frame.shape
     return _Projection(
         rgb=found.rgb.reshape(*shape, 3),
         is_void=~found.has_point.reshape(shape),

@@ -60,7 +60,7 @@ def surfaces_of(
         Surface(
             frame=wall.frame,
             relief=prepared(index, wall),
-            front_m=walls.buffer_front_m,
+            front_m=walls.slab(index).front_m,
             tolerance_m=params.tolerance_sigma * depth_noise_m(wall.depth_m)
             + params.tolerance_cells * wall.frame.gsd_m,
         )

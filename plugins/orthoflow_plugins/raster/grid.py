@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
-from typing import Annotated, ClassVar, Final, Self
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache, partial
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -24,6 +25,7 @@ from orthoflow_plugins.raster.crops import (
     blank_outside,
     cropped,
 )
+from orthoflow_plugins.raster.extents import Extent, Reach, extent_of, sampled
 from orthoflow_plugins.raster.maps import mapped
 from orthoflow_plugins.raster.reporting import report, warn
 from orthoflow_plugins.raster.rules import GapRule, RasterRule, Surface, SurfaceRule
@@ -37,6 +39,9 @@ from orthoflow_plugins.raster.selection import (
     nearest_plane,
 )
 from orthoflow_plugins.raster.walls import WallRaster, rastered_wall, require_memory
+
+RectangleRule = Literal["points", "room"]
+ExtentOf = Callable[[int], Extent]
 
 # A point that somebody took for one on a wall is farther from it than any relief.
 _FAR_M: Final = 1.0
@@ -52,7 +57,7 @@ class RasterGrid(Method):
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "exact"
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.4, 4.2",
@@ -67,14 +72,20 @@ class RasterGrid(Method):
         buffer_m: float | None = Field(
             default=None,
             gt=0,
-            description="Points so far from the plane, on both sides, count; unset, three times "
-            "the tolerance with which the planes were found (markiewicz2015: 3 x 5 cm).",
+            description="Points so far from the plane, on both sides, count; unset, as far as the "
+            "relief that hangs together with the wall, 0.5 m in front and 1 m behind at most, and "
+            "at least three times the tolerance of the planes (markiewicz2015: 3 x 5 cm).",
         )
         buffer_front_m: float | None = Field(
             default=None, ge=0, description="Reach towards the viewer instead of buffer_m."
         )
         buffer_behind_m: float | None = Field(
             default=None, ge=0, description="Reach behind the plane instead of buffer_m."
+        )
+        rectangle: RectangleRule = Field(
+            default="room",
+            description="room: the wall as far as its surface goes, cornices and pilasters in, up "
+            "to adjoining walls, floor and ceiling; points: the rectangle of its plane's points.",
         )
         surface: Surface = Field(
             default="median",
@@ -191,8 +202,9 @@ class RasterGrid(Method):
         """Raster the chosen planes, one pass over the cloud or a few for each."""
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
-        crops = _crops(planes, params, ctx)
-        slabs = _slabs(planes, params, crops)
+        extent_of = _extents(cloud, planes, params, ctx)
+        crops = _crops(planes, params, extent_of, ctx)
+        slabs = _slabs(params, crops, extent_of)
         rule = _raster_rule(params, threads=ctx.cores)
         rasters: list[WallRaster] = []
         source = _intensity_source(cloud)
@@ -217,14 +229,14 @@ class RasterGrid(Method):
         _require_points_near(walls, next(iter(slabs.values())))
         warn(ctx, rasters, source)
         report(ctx, rasters)
-        slab = next(iter(slabs.values()))
         return self.Out(
             walls=Walls(
                 walls=walls,
                 up=planes.up.copy(),
                 intensity_source=source,
-                buffer_front_m=slab.front_m,
-                buffer_behind_m=slab.behind_m,
+                buffer_front_m=max(slab.front_m for slab in slabs.values()),
+                buffer_behind_m=max(slab.behind_m for slab in slabs.values()),
+                buffers_m=tuple((slab.front_m, slab.behind_m) for slab in slabs.values()),
                 percentiles=params.percentiles,
                 details={
                     "surface": params.surface,
@@ -234,28 +246,41 @@ class RasterGrid(Method):
         )
 
 
-def _reach_m(planes: Planes, params: RasterGrid.Params) -> tuple[float, float]:
-    """Reach before and behind the planes."""
-    both = 3.0 * planes.tolerance_m if params.buffer_m is None else params.buffer_m
-    front = both if params.buffer_front_m is None else params.buffer_front_m
-    behind = both if params.buffer_behind_m is None else params.buffer_behind_m
-    return front, behind
+def _extents(
+    cloud: PointCloud, planes: Planes, params: RasterGrid.Params, ctx: StepContext
+) -> ExtentOf:
+    """How far the wall of each plane reaches, found when it is asked for."""
+    reach = Reach(
+        front_m=params.buffer_m if params.buffer_front_m is None else params.buffer_front_m,
+        behind_m=params.buffer_m if params.buffer_behind_m is None else params.buffer_behind_m,
+        least_m=3.0 * planes.tolerance_m,
+    )
+    if params.rectangle == "points" and reach.is_set:
+        return lambda _: reach.as_set
+    points = sampled(cloud)
+
+    @cache
+    def extent(index: int) -> Extent:
+        found = extent_of(points, planes, index, reach, threads=ctx.cores)
+        return found if params.rectangle == "room" else replace(found, growth_m=(0.0,) * 4)
+
+    return extent
 
 
-def _crops(planes: Planes, params: RasterGrid.Params, ctx: StepContext) -> dict[int, CroppedFrame]:
+def _crops(
+    planes: Planes, params: RasterGrid.Params, extent_of: ExtentOf, ctx: StepContext
+) -> dict[int, CroppedFrame]:
     """Grid of each chosen plane by its index, the whole or a part.
 
     Raises:
         MethodError: there is no such plane, or no wall has the part that is wanted.
     """
-    front, behind = _reach_m(planes, params)
     choice = WallChoice(
         constraint=params.constraint,
         min_area_m2=params.min_area_m2,
         n_walls_max=params.n_walls_max,
         skip_covered=params.skip_covered,
-        front_m=front,
-        behind_m=behind,
+        buffer_m=lambda index: extent_of(index).buffer_m,
         ranks=params.ranks,
         near=params.near,
     )
@@ -264,7 +289,9 @@ def _crops(planes: Planes, params: RasterGrid.Params, ctx: StepContext) -> dict[
         for index in chosen_planes(planes, choice)
     }
     if params.crs is not None:
-        frames = mapped(frames, planes, params.crs, reach_m=max(front, behind), ctx=ctx)
+        reach_m = max(max(extent_of(index).buffer_m) for index in frames)
+        frames = mapped(frames, planes, params.crs, reach_m=reach_m, ctx=ctx)
+    frames = {index: extent_of(index).widened(frame) for index, frame in frames.items()}
     for place in params.near:
         index = nearest_plane(planes, list(frames), np.array(place))
         apart_m = distance_m(planes, index, np.array(place))
@@ -293,16 +320,19 @@ def _crops(planes: Planes, params: RasterGrid.Params, ctx: StepContext) -> dict[
 
 
 def _slabs(
-    planes: Planes, params: RasterGrid.Params, crops: Mapping[int, CroppedFrame]
+    params: RasterGrid.Params, crops: Mapping[int, CroppedFrame], extent_of: ExtentOf
 ) -> dict[int, Slab]:
     """Slab of each chosen plane by its index.
 
     Raises:
         MethodError: the rasters would not fit into memory.
     """
-    front, behind = _reach_m(planes, params)
     slabs = {
-        index: Slab(frame=crop.frame, front_m=front, behind_m=behind)
+        index: Slab(
+            frame=crop.frame,
+            front_m=extent_of(index).front_m,
+            behind_m=extent_of(index).behind_m,
+        )
         for index, crop in crops.items()
     }
     require_memory([slab.frame for slab in slabs.values()], params.surface)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -33,8 +33,7 @@ class WallChoice:
         min_area_m2: smallest rectangle; the plane with the most support is exempt.
         n_walls_max: at most so many, by support.
         skip_covered: leave out planes that a larger wall shows as its relief.
-        front_m: reach of a wall towards the viewer.
-        behind_m: reach behind it.
+        buffer_m: gives how far the wall of a plane reaches in front of and behind it.
         ranks: these planes and no others, whatever else is said; empty for no such choice.
         near: (x, y, z) in metres: to each the plane of the right direction whose rectangle is
             nearest, and no others; empty for no such choice.
@@ -44,8 +43,7 @@ class WallChoice:
     min_area_m2: float
     n_walls_max: int
     skip_covered: bool
-    front_m: float
-    behind_m: float
+    buffer_m: Callable[[int], tuple[float, float]]
     ranks: tuple[int, ...] = ()
     near: tuple[Place, ...] = ()
 
@@ -78,10 +76,12 @@ def chosen_planes(planes: Planes, choice: WallChoice) -> list[int]:
     # The best supported plane stays whatever its size: a scan of one small object has a wall too.
     chosen: list[int] = []
     for index in sorted({fitting[0], *large}):
+        if len(chosen) == choice.n_walls_max:
+            break
         if choice.skip_covered and any(_covers(planes, wall, index, choice) for wall in chosen):
             continue
         chosen.append(index)
-    return chosen[: choice.n_walls_max]
+    return chosen
 
 
 def nearest_plane(planes: Planes, among: Sequence[int], place: NDArray[np.float64]) -> int:
@@ -131,7 +131,8 @@ def _covers(planes: Planes, wall: int, index: int, choice: WallChoice) -> bool:
     if float(normal @ planes.normal[index]) < math.cos(math.radians(_PARALLEL_DEG)):
         return False
     depths_m = planes.corners[index] @ normal - planes.offset[wall]
-    if depths_m.min() < -choice.behind_m or depths_m.max() > choice.front_m:
+    front_m, behind_m = choice.buffer_m(wall)
+    if depths_m.min() < -behind_m or depths_m.max() > front_m:
         return False
     corners = planes.corners[wall]
     axes = np.vstack([_unit(corners[3] - corners[0]), _unit(corners[1] - corners[0])])

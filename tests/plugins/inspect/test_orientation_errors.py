@@ -24,6 +24,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products import TieRole
 from tests import scenes
 
@@ -132,6 +133,11 @@ def test_the_angle_between_orientations_is_that_of_the_rotation(angle_deg: float
 # --- on the walls ---
 
 
+def one_wall(frame: WallFrame, *, front_m: float, behind_m: float) -> Any:
+    slab = Slab(frame=frame, front_m=front_m, behind_m=behind_m)
+    return SimpleNamespace(walls=(SimpleNamespace(frame=frame),), slab=lambda _: slab)
+
+
 def test_points_on_a_wall_lie_in_its_raster_and_buffer_on_a_surface_that_faces_as_it() -> None:
     scene: Any = SimpleNamespace(
         origin=np.array([10.0, 20.0, 30.0]),
@@ -139,9 +145,7 @@ def test_points_on_a_wall_lie_in_its_raster_and_buffer_on_a_surface_that_faces_a
         normal=np.array([[0, -1.0, 0], [0, 1.0, 0], [0, -0.866, 0.5], [1.0, 0, 0]]),
     )
     frame = frame_at(9.0, 31.0, depth_m=24.0)
-    walls: Any = SimpleNamespace(
-        walls=(SimpleNamespace(frame=frame),), buffer_front_m=0.5, buffer_behind_m=0.2
-    )
+    walls = one_wall(frame, front_m=0.5, behind_m=0.2)
     # (x, y, z, rectangle, whether on the wall), relative to the scene's origin.
     cases = [
         (0.0, 4.0, 0.0, 0, True),
@@ -171,11 +175,8 @@ def test_points_on_a_wall_lie_in_its_raster_and_buffer_on_a_surface_that_faces_a
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool) -> None:
     scene: Any = SimpleNamespace(origin=np.array([10.0, 20.0, 30.0]), normal=FACING[2:] * -1.0)
-    walls: Any = SimpleNamespace(
-        walls=(SimpleNamespace(frame=frame_at(6.0, 34.0, depth_m=24.0, size_m=8.0)),),
-        buffer_front_m=0.1,
-        buffer_behind_m=0.1,
-    )
+    frame = frame_at(6.0, 34.0, depth_m=24.0, size_m=8.0)
+    walls = one_wall(frame, front_m=0.1, behind_m=0.1)
     true = camera_at(np.zeros(3) + scene.origin)
     asked = []
 
@@ -199,7 +200,7 @@ def test_a_displaced_camera_is_off_on_the_walls_by_its_displacement(turned: bool
     assert pixels.shape == (24 * 18, 2)
     np.testing.assert_allclose(np.unique(pixels[:, 0]), 1000.0 * (np.arange(24) + 0.5) / 24.0)
     np.testing.assert_allclose(np.unique(pixels[:, 1]), 800.0 * (np.arange(18) + 0.5) / 18.0)
-    nothing: Any = SimpleNamespace(**{**vars(walls), "buffer_behind_m": -1.0})
+    nothing = one_wall(frame, front_m=0.1, behind_m=-1.0)
     assert _error_on_walls(found, true, nothing, scene, views) is None
 
 

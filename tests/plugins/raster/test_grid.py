@@ -146,7 +146,7 @@ def test_counts_conserve_the_points_and_threads_change_nothing(
     rgb = rng.integers(0, 256, (n_points, 3), dtype=np.uint8)
     intensity = rng.random(n_points, dtype=np.float32)
     cloud = scenes.cloud_of(known.world(columns, rows, depths_m), rgb=rgb, intensity=intensity)
-    params = {"gsd_m": known.gsd_m, "surface": surface}
+    params = {"gsd_m": known.gsd_m, "surface": surface, "rectangle": "points", "buffer_m": 0.15}
     folder, other = tmp_path / "a", tmp_path / "b"
     folder.mkdir()
     other.mkdir()

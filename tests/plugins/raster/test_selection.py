@@ -17,8 +17,7 @@ CHOICE = WallChoice(
     min_area_m2=0.5,
     n_walls_max=10,
     skip_covered=True,
-    front_m=0.15,
-    behind_m=0.15,
+    buffer_m=lambda _: (0.15, 0.15),
 )
 
 

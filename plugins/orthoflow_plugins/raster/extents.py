@@ -1,0 +1,501 @@
+"""How far a wall reaches: to the surfaces that adjoin it, and over the relief that it has.
+
+markiewicz2015 (section 6) lets each plane define the range before and behind it that is rastered.
+Here both it and the rectangle follow from the points that hang together with the wall: voxels of a
+sample of the cloud, step by step along the wall and in depth, from those on the plane. A detected
+plane that adjoins the wall ends it; where none was detected, it ends with the points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Planes, PointCloud
+from orthoflow_plugins.raster.selection import area_m2, frame_of
+
+Side = Literal["left", "right", "top", "bottom"]
+
+# How far a rectangle may grow on each side, and how far from the plane relief is looked for.
+_GROWTH_MOST_M: Final = 1.0
+_FRONT_MOST_M: Final = 0.5
+_BEHIND_MOST_M: Final = 1.0
+# More points are not read: one of every so many, spread by chance.
+_POINTS_MOST: Final = 1 << 21
+# Voxels: their number, their smallest side along the wall, in points of the sample, and in depth.
+_VOXELS_MOST: Final = 1 << 22
+_SIDE_LEAST_M: Final = 0.03
+_SIDE_STEPS: Final = 3.0
+_DEPTH_STEP_M: Final = 0.025
+# Sides of relief are seldom scanned: surfaces hang together across steps of so many in depth.
+_BRIDGED_STEPS: Final = 4
+# A part of the surface has so many voxels on the plane.
+_SEEDS_LEAST: Final = 4
+# A line of cells beside the rectangle belongs to the wall if this share of it is covered.
+_COVERED_LEAST: Final = 0.2
+# Share of the outermost points that may be stray ones.
+_STRAY_SHARE: Final = 0.02
+# Relief that covers less than this share of the wall decides no buffer.
+_RELIEF_LEAST: Final = 5e-4
+_BEYOND_RELIEF_M: Final = 0.02
+# Which planes adjoin: angle, part of the side along which they run, how far they stand out or back.
+_ADJOINING_COSINE: Final = 0.7
+_BESIDE_SINE: Final = 0.9
+_BESIDE_SHARE: Final = 0.3
+_STANDING_M: Final = 0.5
+_APART_M: Final = 0.3
+# How far within the rectangle of the points their line may lie.
+_WITHIN_M: Final = 0.1
+# Points of an adjoining surface lie within so many of its sigmas, and no farther than this.
+_NOISE_SIGMAS: Final = 3.0
+_NOISE_MOST_M: Final = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extent:
+    """How far a wall reaches.
+
+    Attributes:
+        growth_m: how far beyond the rectangle of its points, to the left, right, top and bottom.
+        front_m: from the plane towards the viewer.
+        behind_m: behind the plane.
+    """
+
+    growth_m: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    front_m: float
+    behind_m: float
+
+    @property
+    def buffer_m(self) -> tuple[float, float]:
+        """Reach in front of the plane and behind it."""
+        return self.front_m, self.behind_m
+
+    def widened(self, frame: WallFrame) -> WallFrame:
+        """Add whole cells on each side, so that the others stay where they are."""
+        # A millionth of a cell of slack, as `frame_over` has it.
+        left, right, top, bottom = (int(grown / frame.gsd_m + 1e-6) for grown in self.growth_m)
+        corner = np.array([[-left, -top]], dtype=np.float64)
+        return replace(
+            frame,
+            origin_world=frame.world_from_wall(corner)[0],
+            width=frame.width + left + right,
+            height=frame.height + top + bottom,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach:
+    """How far in depth to look, and what the buffer is at least.
+
+    Attributes:
+        front_m: buffer towards the viewer that is set; None to find it.
+        behind_m: buffer behind the plane that is set; None to find it.
+        least_m: one that is found is no narrower.
+    """
+
+    front_m: float | None
+    behind_m: float | None
+    least_m: float
+
+    @property
+    def is_set(self) -> bool:
+        """Whether nothing is left to find."""
+        return self.front_m is not None and self.behind_m is not None
+
+    @property
+    def as_set(self) -> Extent:
+        """Extent of a wall of which nothing is looked for."""
+        return Extent(
+            front_m=self.least_m if self.front_m is None else self.front_m,
+            behind_m=self.least_m if self.behind_m is None else self.behind_m,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampledPoints:
+    """Some points of a cloud; offsets (n,) float32 metres from the origin as the cloud has them."""
+
+    origin: NDArray[np.float64]
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+    n_represented: float
+
+
+def sampled(cloud: PointCloud) -> SampledPoints:
+    """Take one point of every so many, so that a look at all walls is short."""
+    every = -(-len(cloud) // _POINTS_MOST)
+    index = np.arange(0, len(cloud), every)
+    if every > 1:
+        # Neither rows nor columns of a scan repeat as this does (Fibonacci hashing).
+        turn = (
+            np.arange(index.size, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+        ) >> np.uint64(32)
+        index = np.minimum(index + (turn % np.uint64(every)).astype(np.int64), len(cloud) - 1)
+    x, y, z = (np.ascontiguousarray(axis[index]) for axis in (cloud.x, cloud.y, cloud.z))
+    return SampledPoints(origin=cloud.origin, x=x, y=y, z=z, n_represented=float(every))
+
+
+def extent_of(
+    points: SampledPoints, planes: Planes, index: int, reach: Reach, *, threads: int
+) -> Extent:
+    """Find how far the wall of a plane reaches.
+
+    Args:
+        points: of the cloud.
+        planes: all that were found.
+        index: of the wall's plane.
+        reach: of the wall in depth.
+        threads: how many threads work.
+    """
+    search = _Search.of(points, planes, index, reach)
+    inside = _inside(points, search.slab, threads=threads)
+    surface = _surface(inside, search)
+    if surface is None:
+        return reach.as_set
+    front_m, behind_m = reach.as_set.front_m, reach.as_set.behind_m
+    if reach.front_m is None:
+        relief_m = _relief_m(surface.front_m, search)
+        front_m = max(front_m, min(round(relief_m + _BEYOND_RELIEF_M, 3), _FRONT_MOST_M))
+    if reach.behind_m is None:
+        relief_m = _relief_m(-surface.behind_m, search)
+        behind_m = max(behind_m, min(round(relief_m + _BEYOND_RELIEF_M, 3), _BEHIND_MOST_M))
+    left, right, top, bottom = (
+        _growth_m(side, surface, inside, search) for side in ("left", "right", "top", "bottom")
+    )
+    return Extent(growth_m=(left, right, top, bottom), front_m=front_m, behind_m=behind_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Bound:
+    """An adjoining plane: distance of (right, down, depth) in metres from it, positive inside.
+
+    Attributes:
+        side: of the rectangle that it bounds.
+        slopes: (3,) change of the distance along right, down and depth.
+        offset_m: distance at the top-left corner of the rectangle of the points.
+        noise_m: how far from it its points lie.
+        beyond_m: how far beyond the rectangle's side it lies, where it lies nearest.
+    """
+
+    side: Side
+    slopes: NDArray[np.float64]
+    offset_m: float
+    noise_m: float
+    beyond_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Search:
+    """Where the points of a wall are looked for.
+
+    Attributes:
+        slab: voxels' cells along the wall, and the depths that are looked at.
+        width_m: of the rectangle of the points.
+        height_m: of the rectangle of the points.
+        seed_m: points so near to the plane are on it.
+        bounds: adjoining planes.
+    """
+
+    slab: Slab
+    width_m: float
+    height_m: float
+    seed_m: float
+    bounds: tuple[_Bound, ...]
+
+    @classmethod
+    def of(cls, points: SampledPoints, planes: Planes, index: int, reach: Reach) -> _Search:
+        rectangle = frame_of(planes, index, gsd_m=1.0, margin_m=0.0)
+        corners = planes.corners[index]
+        width_m = float(np.linalg.norm(corners[3] - corners[0]))
+        height_m = float(np.linalg.norm(corners[1] - corners[0]))
+        # Found or set, farther off is no part of a wall that it could grow by.
+        front_m = _FRONT_MOST_M if reach.front_m is None else min(reach.front_m, _FRONT_MOST_M)
+        behind_m = _BEHIND_MOST_M if reach.behind_m is None else min(reach.behind_m, _BEHIND_MOST_M)
+        n_sampled = max(1.0, float(planes.n_points[index]) / points.n_represented)
+        step_m = math.sqrt(_covered_m2(planes, index) / n_sampled)
+        n_steps = (front_m + behind_m) / _DEPTH_STEP_M + 2.0
+        searched_m2 = (width_m + 2.0 * _GROWTH_MOST_M) * (height_m + 2.0 * _GROWTH_MOST_M)
+        side_m = max(
+            min(max(_SIDE_LEAST_M, _SIDE_STEPS * step_m), 0.25 * min(width_m, height_m)),
+            math.sqrt(searched_m2 * n_steps / _VOXELS_MOST),
+        )
+        # Whole cells of growth: a cell begins at the rectangle's corner.
+        growth_m = side_m * math.ceil(_GROWTH_MOST_M / side_m)
+        frame = frame_of(planes, index, gsd_m=side_m, margin_m=growth_m)
+        return cls(
+            slab=Slab(frame=frame, front_m=front_m, behind_m=behind_m),
+            width_m=width_m,
+            height_m=height_m,
+            seed_m=planes.tolerance_m,
+            bounds=tuple(_bounds(planes, index, rectangle, (width_m, height_m))),
+        )
+
+    @property
+    def n_beside(self) -> int:
+        """Cells between the frame's and the rectangle's side."""
+        return math.ceil(_GROWTH_MOST_M / self.slab.frame.gsd_m)
+
+    @property
+    def inside(self) -> tuple[slice, slice]:
+        """Rows and columns of the cells that lie in the rectangle of the points."""
+        side_m, first = self.slab.frame.gsd_m, self.n_beside
+        rows, columns = (
+            max(1, int(length_m / side_m)) for length_m in (self.height_m, self.width_m)
+        )
+        return slice(first, first + rows), slice(first, first + columns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Inside:
+    """Points that are looked at.
+
+    Attributes:
+        right_m: (n,) metres to the right of the top-left corner of the points' rectangle.
+        down_m: (n,) metres below it.
+        depth_m: (n,) metres before the plane.
+        cells: (n,) cell of each point's voxel.
+        steps: (n,) its step in depth.
+    """
+
+    right_m: NDArray[np.float64]
+    down_m: NDArray[np.float64]
+    depth_m: NDArray[np.float64]
+    cells: NDArray[np.int64]
+    steps: NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Surface:
+    """What hangs together with the wall.
+
+    Attributes:
+        is_covered: (rows, cols) cells of the surface, strays left out.
+        front_m: (rows, cols) its largest depth there; -inf without.
+        behind_m: (rows, cols) its smallest; inf without.
+        is_own: (n,) which points are on it.
+    """
+
+    is_covered: NDArray[np.bool_]
+    front_m: NDArray[np.float64]
+    behind_m: NDArray[np.float64]
+    is_own: NDArray[np.bool_]
+
+
+def _inside(points: SampledPoints, slab: Slab, *, threads: int) -> _Inside:
+    from orthoflow.geometry.raster_kernels import BLOCK
+    from orthoflow.geometry.rastering import entries_inside, wall_from_offset
+
+    found, cells = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+    for entries in entries_inside(points, slab, threads=threads):
+        for block, n_inside in enumerate(entries.n_inside):
+            part = slice(block * BLOCK, block * BLOCK + int(n_inside))
+            found.append(entries.points[part].astype(np.int64))
+            cells.append(entries.cells[part].astype(np.int64))
+    own = np.concatenate(found)
+    offsets_m = np.column_stack([points.x[own], points.y[own], points.z[own]]).astype(np.float64)
+    matrix = wall_from_offset(slab.frame, points.origin)
+    column, row, depth_m = (offsets_m @ matrix[:, :3].T + matrix[:, 3]).T
+    side_m = slab.frame.gsd_m
+    before_m = side_m * math.ceil(_GROWTH_MOST_M / side_m)
+    return _Inside(
+        right_m=side_m * column - before_m,
+        down_m=side_m * row - before_m,
+        depth_m=depth_m,
+        cells=np.concatenate(cells),
+        steps=np.floor((depth_m + slab.behind_m) / _DEPTH_STEP_M).astype(np.int64).clip(0),
+    )
+
+
+def _surface(inside: _Inside, search: _Search) -> _Surface | None:
+    """Find the voxels that hang together with those on the plane; None without any of these."""
+    from scipy import ndimage
+
+    slab = search.slab
+    n_steps = int((slab.front_m + slab.behind_m) / _DEPTH_STEP_M) + 2
+    shape = (*slab.frame.shape, n_steps)
+    is_before = np.ones(len(inside.cells), dtype=np.bool_)
+    for bound in search.bounds:
+        right, down, depth = bound.slopes
+        distance_m = (
+            bound.offset_m + right * inside.right_m + down * inside.down_m + depth * inside.depth_m
+        )
+        is_before &= distance_m > bound.noise_m
+    voxels = inside.cells * n_steps + inside.steps
+    occupied = np.zeros(math.prod(shape), dtype=np.bool_)
+    occupied[voxels[is_before]] = True
+    bridged = ndimage.maximum_filter1d(
+        occupied.reshape(shape).view(np.uint8), 2 * (_BRIDGED_STEPS // 2) + 1, axis=2
+    )
+    labels, _ = ndimage.label(bridged, structure=np.ones((3, 3, 3)))
+    is_near = np.zeros(shape, dtype=np.bool_)
+    depths_m = (np.arange(n_steps) + 0.5) * _DEPTH_STEP_M - slab.behind_m
+    is_near[(*search.inside, np.abs(depths_m) <= search.seed_m)] = True
+    seeds = np.bincount(labels[is_near & occupied.reshape(shape)])
+    is_wall = seeds >= min(_SEEDS_LEAST, seeds[1:].max(initial=_SEEDS_LEAST))
+    is_wall[:1] = False
+    if not is_wall.any():
+        return None
+    of_wall = np.zeros(int(labels.max()) + 1, dtype=np.bool_)
+    of_wall[: len(is_wall)] = is_wall
+    is_own = is_before & of_wall[labels.ravel()[voxels]]
+    surface = occupied.reshape(shape) & of_wall[labels]
+    shown = np.asarray(surface.any(axis=2), dtype=np.bool_)
+    front_m = np.where(shown, depths_m[n_steps - 1 - surface[:, :, ::-1].argmax(axis=2)], -np.inf)
+    behind_m = np.where(shown, depths_m[surface.argmax(axis=2)], np.inf)
+    square = np.ones((3, 3), dtype=np.bool_)
+    closed = shown | ndimage.binary_closing(shown, square)
+    return _Surface(
+        is_covered=ndimage.binary_opening(closed, square),
+        front_m=front_m,
+        behind_m=behind_m,
+        is_own=is_own,
+    )
+
+
+def _relief_m(depth_m: NDArray[np.float64], search: _Search) -> float:
+    """How far the relief of the wall stands out where it is more than thin or tiny."""
+    from scipy import ndimage
+
+    inner = np.where(np.isfinite(depth_m), depth_m, -np.inf)
+    # A floor or ceiling that nobody detected, and the sides of relief, are thin from here.
+    opened = np.asarray(ndimage.minimum_filter(inner, 3, mode="constant", cval=-np.inf))
+    opened = np.sort(opened[np.isfinite(opened)])
+    rows, columns = search.inside
+    n_wall = (rows.stop - rows.start) * (columns.stop - columns.start)
+    n_least = max(1, round(_RELIEF_LEAST * n_wall))
+    if len(opened) < n_least:
+        return 0.0
+    return float(opened[-n_least]) + 0.5 * _DEPTH_STEP_M
+
+
+def _growth_m(side: Side, surface: _Surface, inside: _Inside, search: _Search) -> float:
+    """How far the wall reaches beyond a side of the rectangle of its points."""
+    side_m, first = search.slab.frame.gsd_m, search.n_beside
+    rows, columns = search.inside
+    is_covered = surface.is_covered
+    if side in {"left", "right"}:
+        is_within = (inside.down_m >= 0.0) & (inside.down_m <= search.height_m)
+    else:
+        is_within = (inside.right_m >= 0.0) & (inside.right_m <= search.width_m)
+    # Lines of cells from the rectangle outwards; the first may lie partly within it.
+    lines, beyond_m, within_m = {
+        "left": (is_covered[rows, :first].T[::-1], -inside.right_m, 0.0),
+        "right": (
+            is_covered[rows, columns.stop :].T,
+            inside.right_m - search.width_m,
+            search.width_m - side_m * (columns.stop - first),
+        ),
+        "top": (is_covered[:first, columns][::-1], -inside.down_m, 0.0),
+        "bottom": (
+            is_covered[rows.stop :, columns],
+            inside.down_m - search.height_m,
+            search.height_m - side_m * (rows.stop - first),
+        ),
+    }[side]
+    n_lines = int(np.argmin(np.append(lines.mean(axis=1) >= _COVERED_LEAST, [False])))
+    most_m = min(n_lines * side_m - within_m, _GROWTH_MOST_M)
+    is_outer = surface.is_own & is_within & (beyond_m <= most_m)
+    outer_m = beyond_m[is_outer & (beyond_m > most_m - 2.0 * side_m)]
+    if n_lines == 0 or not outer_m.size:
+        return 0.0
+    grown_m = float(np.quantile(outer_m, 1.0 - _STRAY_SHARE))
+    for bound in search.bounds:
+        line_m = bound.beyond_m - bound.noise_m
+        if bound.side == side and grown_m > line_m - side_m:
+            # What lies nearer to the adjoining surface belongs to either.
+            grown_m = line_m
+    return max(0.0, grown_m)
+
+
+def _covered_m2(planes: Planes, index: int) -> float:
+    """Area of the connected parts of a plane, of its rectangle where none are known."""
+    whole = area_m2(planes.corners[index])
+    parts = sum(area_m2(corners) for corners in _parts(planes, index))
+    return min(whole, parts) if parts > 0.0 else whole
+
+
+def _parts(planes: Planes, index: int) -> NDArray[np.float64]:
+    if planes.part_corners is None or planes.part_plane is None:
+        return planes.corners[[index]]
+    own: NDArray[np.float64] = planes.part_corners[planes.part_plane == index]
+    return own if len(own) else planes.corners[[index]]
+
+
+def _bounds(
+    planes: Planes, index: int, rectangle: WallFrame, size_m: tuple[float, float]
+) -> Iterator[_Bound]:
+    """The planes that adjoin a wall along one of its sides, of several on a side the innermost."""
+    found: dict[Side, _Bound] = {}
+    for other in range(len(planes)):
+        if other == index or abs(float(planes.normal[other] @ rectangle.normal_world)) > (
+            _ADJOINING_COSINE
+        ):
+            continue
+        bound = _bound(planes, other, rectangle, size_m)
+        if bound is None:
+            continue
+        before = found.get(bound.side)
+        if before is None or bound.beyond_m < before.beyond_m:
+            found[bound.side] = bound
+    yield from found.values()
+
+
+def _bound(
+    planes: Planes, other: int, rectangle: WallFrame, size_m: tuple[float, float]
+) -> _Bound | None:
+    normal = planes.normal[other]
+    axes = np.array([rectangle.u_world, rectangle.v_world, rectangle.normal_world])
+    slopes = axes @ normal
+    offset_m = float(normal @ rectangle.origin_world - planes.offset[other])
+    across = float(np.hypot(slopes[0], slopes[1]))
+    axis = int(np.argmax(np.abs(slopes[:2])))
+    if abs(slopes[axis]) < _BESIDE_SINE * across:
+        return None
+    middle = np.array([0.5 * size_m[0], 0.5 * size_m[1], 0.0])
+    if offset_m + float(slopes @ middle) < 0.0:
+        slopes, offset_m = -slopes, -offset_m
+    # Inside is to the right of a left wall and below a ceiling: there distances rise.
+    sides: tuple[Side, Side] = ("left", "right") if axis == 0 else ("top", "bottom")
+    is_first = bool(slopes[axis] > 0.0)
+    along = 1 - axis
+    ends_m = np.array([0.0, size_m[along]])
+    line_m = -(offset_m + slopes[along] * ends_m) / slopes[axis]
+    beyond_m = float((-line_m if is_first else line_m - size_m[axis]).min())
+    if not -_WITHIN_M <= beyond_m <= _GROWTH_MOST_M:
+        return None
+    placed = (_parts(planes, other) - rectangle.origin_world) @ axes.T
+    if not any(_stands(part, along, size_m[along]) for part in placed):
+        return None
+    noise_m = min(_NOISE_SIGMAS * _sigma_m(planes, other), _NOISE_MOST_M)
+    return _Bound(
+        side=sides[0] if is_first else sides[1],
+        slopes=slopes,
+        offset_m=offset_m,
+        noise_m=noise_m,
+        beyond_m=beyond_m,
+    )
+
+
+def _stands(part: NDArray[np.float64], along: int, length_m: float) -> bool:
+    """Whether a rectangle (4, 3), right, down, depth, runs beside a wall and stands out of it."""
+    low, high = part.min(axis=0), part.max(axis=0)
+    beside_m = min(high[along], length_m) - max(low[along], 0.0)
+    is_near = bool(low[2] <= _APART_M and high[2] >= -_APART_M)
+    return (
+        bool(beside_m >= _BESIDE_SHARE * length_m)
+        and is_near
+        and bool(max(high[2], -low[2]) >= _STANDING_M)
+    )
+
+
+def _sigma_m(planes: Planes, index: int) -> float:
+    thickness = planes.thickness[index] if planes.thickness else None
+    return float(planes.rms_m[index]) if thickness is None else thickness.sigma_m

@@ -1,0 +1,219 @@
+"""How far walls reach: rooms and facades of known corners, with and without what bounds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.raster.grid import RasterGrid
+
+from orthoflow.products import Planes, PointCloud, Walls
+from tests import raster_scenes as scenes
+
+# The wall is seen along +y at y = 0, 4 m wide and 3 m high; depth is -y.
+WIDTH_M, HEIGHT_M = 4.0, 3.0
+STEP_M = 0.006
+NOISE_M = 0.001
+GSD_M = 0.01
+# Points beside a corner are left out by three sigmas of the adjoining surface, then whole cells.
+CORNER_M = 3.0 * NOISE_M + GSD_M
+
+Box = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
+
+
+def patch(x: tuple[float, float], depth: tuple[float, float], z: tuple[float, float]) -> NDArray:
+    """Points (n, 3) of a rectangle along two axes; the third has both ends alike."""
+    ranges = [x, (-depth[1], -depth[0]), z]
+    along = [np.arange(low, high + 1e-9, STEP_M) for low, high in ranges]
+    grids = np.meshgrid(*along, indexing="ij")
+    return np.column_stack([grid.ravel() for grid in grids])
+
+
+def scanned(*patches: NDArray) -> PointCloud:
+    points = np.vstack(patches)
+    rng = np.random.default_rng(5)
+    return scenes.cloud_of(points + rng.normal(0.0, NOISE_M, points.shape))
+
+
+def wall(
+    x: tuple[float, float] = (0.0, WIDTH_M), z: tuple[float, float] = (0.0, HEIGHT_M)
+) -> NDArray:
+    return patch(x, (0.0, 0.0), z)
+
+
+def planes_of(
+    x: tuple[float, float], z: tuple[float, float], *adjoining: tuple[NDArray, NDArray]
+) -> Planes:
+    """The wall's plane with the rectangle of its points, and planes as (normal, corners)."""
+    outline = np.array([[x[0], 0, z[1]], [x[0], 0, z[0]], [x[1], 0, z[0]], [x[1], 0, z[1]]])
+    normals = np.array([[0.0, -1.0, 0.0], *(normal for normal, _ in adjoining)])
+    corners = np.array([outline, *(rectangle for _, rectangle in adjoining)])
+    count = len(normals)
+    return Planes(
+        normal=normals,
+        offset=np.einsum("ij,ij->i", normals, corners[:, 0]),
+        corners=corners,
+        covariance=np.zeros((count, 4, 4)),
+        n_points=np.full(count, int((x[1] - x[0]) * (z[1] - z[0]) / STEP_M**2)),
+        rms_m=np.full(count, NOISE_M),
+        up=scenes.UP,
+        names=tuple(f"plane {k}" for k in range(count)),
+    )
+
+
+def upright(x: float, depth: tuple[float, float], *, towards: float) -> tuple[NDArray, NDArray]:
+    front, back = -depth[1], -depth[0]
+    corners = [[x, back, HEIGHT_M], [x, back, 0], [x, front, 0], [x, front, HEIGHT_M]]
+    return np.array([towards, 0.0, 0.0]), np.array(corners)
+
+
+def level(z: float, depth: tuple[float, float], *, towards: float) -> tuple[NDArray, NDArray]:
+    front, back = -depth[1], -depth[0]
+    corners = [[0, back, z], [0, front, z], [WIDTH_M, front, z], [WIDTH_M, back, z]]
+    return np.array([0.0, 0.0, towards]), np.array(corners)
+
+
+ROOM = (
+    upright(0.0, (0.0, 3.0), towards=1.0),
+    upright(WIDTH_M, (0.0, 3.0), towards=-1.0),
+    level(0.0, (0.0, 3.0), towards=1.0),
+    level(HEIGHT_M, (0.0, 3.0), towards=-1.0),
+)
+SIDES = (
+    patch((0.0, 0.0), (0.0, 3.0), (0.0, HEIGHT_M)),
+    patch((WIDTH_M, WIDTH_M), (0.0, 3.0), (0.0, HEIGHT_M)),
+    patch((0.0, WIDTH_M), (0.0, 3.0), (0.0, 0.0)),
+    patch((0.0, WIDTH_M), (0.0, 3.0), (HEIGHT_M, HEIGHT_M)),
+)
+# A cornice 12 cm before the wall over its topmost 30 cm, and a pilaster 10 cm before its left end.
+CORNICE = patch((0.0, WIDTH_M), (0.12, 0.12), (2.7, HEIGHT_M))
+PILASTER = patch((0.0, 0.25), (0.1, 0.1), (0.0, 2.7))
+# What of the plane's own points is left beside them.
+BESIDE_X, BESIDE_Z = (0.25, WIDTH_M), (0.0, 2.7)
+
+
+def laid(cloud: PointCloud, planes: Planes, folder: Path, **params: object) -> Walls:
+    chosen = {"gsd_m": GSD_M, "ranks": [0], **params}
+    inputs = RasterGrid.In(cloud=cloud, planes=planes)
+    ctx = scenes.context(folder)
+    return RasterGrid().run(inputs, RasterGrid.Params.model_validate(chosen), ctx).walls
+
+
+def edges_m(walls: Walls) -> NDArray[np.float64]:
+    """Left, right, bottom and top of the first wall's raster, world x and z."""
+    corners = walls.walls[0].frame.corners_world()
+    return np.array(
+        [corners[:, 0].min(), corners[:, 0].max(), corners[:, 2].min(), corners[:, 2].max()]
+    )
+
+
+def test_a_wall_reaches_over_cornice_and_pilaster_to_what_adjoins_it(tmp_path: Path) -> None:
+    cloud = scanned(wall(BESIDE_X, BESIDE_Z), CORNICE, PILASTER, *SIDES)
+    walls = laid(cloud, planes_of(BESIDE_X, BESIDE_Z, *ROOM), tmp_path)
+    np.testing.assert_allclose(edges_m(walls), [0.0, WIDTH_M, 0.0, HEIGHT_M], atol=CORNER_M)
+    found = walls.walls[0]
+    # 3 mm: the median of a few points, and half a step between rows of a scan.
+    assert np.nanmedian(found.depth_m[2:20]) == pytest.approx(0.12, abs=0.003)
+    assert np.nanmedian(found.depth_m[60:200, 2:20]) == pytest.approx(0.10, abs=0.003)
+    # Nothing of the adjoining walls is taken for the wall's relief.
+    assert np.nanmax(found.depth_m) < 0.13
+
+
+def test_growth_adds_whole_cells_and_moves_none(tmp_path: Path) -> None:
+    cloud = scanned(wall(BESIDE_X, BESIDE_Z), CORNICE, PILASTER, *SIDES)
+    planes = planes_of(BESIDE_X, BESIDE_Z, *ROOM)
+    room = laid(cloud, planes, tmp_path).walls[0].frame
+    points = laid(cloud, planes, tmp_path, rectangle="points").walls[0].frame
+    moved = room.wall_from_world(points.corners_world()[:1])[0, :2]
+    np.testing.assert_allclose(moved, np.rint(moved), atol=1e-6)
+    assert points.shape == (270, 375)
+
+
+@pytest.mark.parametrize(
+    ("surfaces", "detected", "top_m"),
+    [
+        ((0, 1, 2), (0, 1, 2), HEIGHT_M),
+        ((0, 1, 2, 3), (0, 1, 2), HEIGHT_M),
+        ((0, 1, 2, 3), (), HEIGHT_M),
+    ],
+    ids=["no ceiling", "a ceiling that was not detected", "nothing detected"],
+)
+def test_where_no_plane_ends_it_a_wall_ends_with_its_points(
+    tmp_path: Path, surfaces: tuple[int, ...], detected: tuple[int, ...], top_m: float
+) -> None:
+    patches = [SIDES[k] for k in surfaces]
+    cloud = scanned(wall(BESIDE_X, BESIDE_Z), CORNICE, PILASTER, *patches)
+    planes = planes_of(BESIDE_X, BESIDE_Z, *(ROOM[k] for k in detected))
+    walls = laid(cloud, planes, tmp_path)
+    np.testing.assert_allclose(edges_m(walls), [0.0, WIDTH_M, 0.0, top_m], atol=CORNER_M)
+    # A ceiling seen along is no relief: the buffer stays that of cornice and pilaster.
+    assert walls.slab(0).front_m == pytest.approx(0.15, abs=0.03)
+
+
+def test_a_facade_without_anything_about_it_keeps_the_rectangle_of_its_points(
+    tmp_path: Path,
+) -> None:
+    # Ground that rises slowly towards the viewer, and stray points about the wall.
+    ground = patch((-2.0, 6.0), (0.0, 2.0), (0.0, 0.0))
+    ground[:, 2] -= 0.03 * ground[:, 1]
+    rng = np.random.default_rng(8)
+    stray = rng.uniform([-1.0, -0.5, 0.0], [5.0, 0.5, 4.0], (2000, 3))
+    cloud = scanned(wall(), ground, stray)
+    walls = laid(cloud, planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)), tmp_path)
+    # Ground 1 m and more before the wall lies 3 cm lower than its foot at most.
+    np.testing.assert_allclose(edges_m(walls), [0.0, WIDTH_M, 0.0, HEIGHT_M], atol=0.03)
+    assert walls.slab(0).front_m == pytest.approx(0.15)
+    assert walls.slab(0).behind_m == pytest.approx(0.15)
+
+
+def test_a_wall_that_ends_in_the_room_ends_there(tmp_path: Path) -> None:
+    # Another wall, 2 m behind, goes on where this one ends; a post stands beyond, apart from it.
+    beyond = patch((WIDTH_M, 7.0), (-2.0, -2.0), (0.0, HEIGHT_M))
+    post = patch((WIDTH_M + 0.4, WIDTH_M + 0.6), (0.05, 0.05), (0.0, HEIGHT_M))
+    cloud = scanned(wall(), beyond, post, *SIDES[2:], SIDES[0])
+    planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M), ROOM[0], *ROOM[2:])
+    walls = laid(cloud, planes, tmp_path)
+    np.testing.assert_allclose(edges_m(walls), [0.0, WIDTH_M, 0.0, HEIGHT_M], atol=CORNER_M)
+
+
+def test_a_cable_that_leaves_the_wall_does_not_widen_it(tmp_path: Path) -> None:
+    cable = patch((WIDTH_M, WIDTH_M + 0.9), (0.02, 0.02), (1.5, 1.52))
+    walls = laid(scanned(wall(), cable), planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)), tmp_path)
+    np.testing.assert_allclose(edges_m(walls), [0.0, WIDTH_M, 0.0, HEIGHT_M], atol=CORNER_M)
+
+
+def with_door(depth_m: float) -> PointCloud:
+    """A wall with a door set back, its jamb on one side seen, and a room 3 m behind a window."""
+    whole = wall()
+    in_door = (abs(whole[:, 0] - 1.0) < 0.4) & (whole[:, 2] < 2.0)
+    in_window = (abs(whole[:, 0] - 3.0) < 0.4) & (abs(whole[:, 2] - 1.5) < 0.4)
+    jamb = patch((0.6, 0.6), (-depth_m, 0.0), (0.0, 2.0))
+    leaf = patch((0.6, 1.4), (-depth_m, -depth_m), (0.0, 2.0))
+    outside = patch((2.6, 3.4), (-3.0, -3.0), (1.1, 1.9))
+    return scanned(whole[~in_door & ~in_window], jamb, leaf, outside)
+
+
+def test_the_buffer_follows_a_door_that_stands_back(tmp_path: Path) -> None:
+    planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M))
+    walls = laid(with_door(0.36), planes, tmp_path)
+    # A step in depth, and what is added beyond the relief.
+    assert walls.slab(0).behind_m == pytest.approx(0.36, abs=0.06)
+    assert walls.slab(0).front_m == pytest.approx(0.15)
+    leaf = walls.walls[0].depth_m[120:290, 65:135]
+    np.testing.assert_allclose(leaf, -0.36, atol=6.0 * NOISE_M)
+
+
+def test_a_buffer_that_is_set_is_kept(tmp_path: Path) -> None:
+    planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M))
+    both = laid(with_door(0.36), planes, tmp_path, buffer_m=0.1).slab(0)
+    assert (both.front_m, both.behind_m) == (0.1, 0.1)
+    behind = laid(with_door(0.36), planes, tmp_path, buffer_behind_m=0.2).slab(0)
+    assert (behind.front_m, behind.behind_m) == (pytest.approx(0.15), 0.2)
+
+
+def test_what_stands_apart_before_a_wall_is_no_relief(tmp_path: Path) -> None:
+    screen = patch((1.0, 2.0), (0.4, 0.4), (0.0, 1.5))
+    walls = laid(scanned(wall(), screen), planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)), tmp_path)
+    assert walls.slab(0).front_m == pytest.approx(0.15)
