@@ -52,10 +52,15 @@ class CellState:
         return elapsed_s * (1 - self.fraction) / self.fraction
 
     def done(self, now_s: float) -> float:
-        """How far it is, 0..1: as it says, or as far as such a step usually is by now."""
+        """How far it is, 0..1: as it says, or as far as such a step was by now.
+
+        What it took before counts as long as it may be true, and where it says nothing itself.
+        """
         if not self.took_s or self.state != "running":
             return self.fraction
         by_clock = (now_s - self.started) / self.took_s
+        if by_clock > 1 and self.fraction:
+            return self.fraction
         return max(self.fraction, min(by_clock, _MOST_BY_CLOCK))
 
 

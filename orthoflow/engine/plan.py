@@ -221,7 +221,7 @@ class _Planner:
     force: tuple[str, ...]
     planned: dict[str, PlannedCell] = field(default_factory=dict)
     _earlier: dict[str, tuple[Preimage, ...]] = field(default_factory=dict)
-    _times: dict[tuple[str, str], float | None] = field(default_factory=dict)
+    _times: dict[tuple[str, ...], float | None] = field(default_factory=dict)
 
     def add(self, cell: Cell) -> None:
         """Plan one more cell."""
@@ -267,13 +267,22 @@ class _Planner:
         return explain(key, cell.step, self._before(cell.method))
 
     def _took_s(self, cell: Cell) -> float | None:
-        """How long the last result of the method took, one of the same step rather than others."""
-        place = (cell.method, cell.step)
+        """How long the method took when it did what is nearest to this: same step, same params."""
+        params = {
+            f"params.{name}": json.dumps(value, ensure_ascii=False, sort_keys=True)
+            for name, value in cell.params.items()
+        }
+        place = (cell.method, cell.step, *params.values())
+
+        def distance(earlier: Preimage) -> tuple[bool, int]:
+            before = _ingredients(earlier.text)
+            n_changed = sum(before.get(name) != value for name, value in params.items())
+            return (earlier.step != cell.step, n_changed)
+
         if place not in self._times:
-            before = self._before(cell.method)
-            # Stable: the newest of each comes first.
-            nearest = sorted(before, key=lambda preimage: preimage.step != cell.step)
-            results = (self.store.result(item.key) for item in nearest[:_MOST_LOOKED_AT])
+            # Stable: the newest of those that are as near comes first.
+            nearest = sorted(self._before(cell.method), key=distance)[:_MOST_LOOKED_AT]
+            results = (self.store.result(item.key) for item in nearest)
             found = next((result for result in results if result is not None), None)
             self._times[place] = None if found is None else found.wall_s + _START_S
         return self._times[place]

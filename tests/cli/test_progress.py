@@ -136,6 +136,9 @@ def test_what_a_step_took_before_says_how_long_it_takes() -> None:
     assert [cell.left_s(now_s) for now_s in (100.0, 130.0, 150.0)] == [40.0, 10.0, None]
     assert [cell.done(now_s) for now_s in (100.0, 130.0, 150.0)] == [0.0, 0.75, 0.95]
     assert left_of_cell(cell, 130.0) == "about 10 s left"
+    cell.fraction = 0.2
+    # It takes longer than before: only what it says of itself holds.
+    assert [cell.done(now_s) for now_s in (130.0, 150.0)] == [0.75, 0.2]
 
 
 def test_how_far_a_step_says_it_is_counts_where_nothing_is_known() -> None:

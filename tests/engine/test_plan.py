@@ -435,3 +435,23 @@ def test_the_plan_knows_how_long_a_method_took_before(world: World) -> None:
     other_names = CHAIN.replace("second", "other").replace("first:", "begin:")
     renamed = world.plan(other_names.replace("first.", "begin."), sets=["begin.count=8"])
     assert all(item.took_s is not None and item.took_s >= 1.0 for item in renamed.cells)
+
+
+def test_of_what_a_method_took_the_nearest_counts(world: World) -> None:
+    steps = """
+steps:
+  first: {use: make.range}
+  second: {use: work.slow, in: {numbers: first.numbers}, params: {steps: 1}}
+"""
+    run(world, steps, into="short")
+    run(world, steps.replace("steps: 1", "steps: 8"), into="long")
+    took = {
+        n_steps: world.plan(steps, sets=[f"second.steps={n_steps}"], force=("second",))
+        .cells[1]
+        .took_s
+        for n_steps in (1, 8)
+    }
+    assert took[1] is not None
+    assert took[8] is not None
+    # Seven steps more, of a twentieth of a second each.
+    assert took[8] - took[1] > 0.3
