@@ -89,7 +89,7 @@ class _Compilation(event.Listener):
         """Say what is compiled."""
         kernel = event.data["dispatcher"]
         if self._depth == 0:
-            self._n_begun, self._n_needed = 0, len(_uncompiled(kernel, {}))
+            self._n_begun, self._n_needed = 0, _uncompiled(kernel, set())
         self._depth += 1
         self._n_begun += 1
         n_needed = max(self._n_needed, self._n_begun)
@@ -102,16 +102,19 @@ class _Compilation(event.Listener):
             tell("")
 
 
-def _uncompiled(kernel: Dispatcher, found: dict[Dispatcher, None]) -> dict[Dispatcher, None]:
-    """A kernel and all that it calls, as far as nothing of them is compiled in this process."""
-    if kernel in found or kernel.signatures or kernel.targetoptions.get("inline") == "always":
-        return found
-    found[kernel] = None
-    for name in kernel.py_func.__code__.co_names:
-        called = kernel.py_func.__globals__.get(name)
-        if isinstance(called, Dispatcher):
-            _uncompiled(called, found)
-    return found
+def _uncompiled(kernel: Dispatcher, looked_at: set[Dispatcher]) -> int:
+    """How many there are of a kernel and all that it calls, without what is compiled already.
+
+    What is put into its callers is not compiled for itself, but may call others.
+    """
+    if kernel in looked_at:
+        return 0
+    looked_at.add(kernel)
+    is_counted = not kernel.signatures and kernel.targetoptions.get("inline") != "always"
+    called = (kernel.py_func.__globals__.get(name) for name in kernel.py_func.__code__.co_names)
+    return is_counted + sum(
+        _uncompiled(item, looked_at) for item in called if isinstance(item, Dispatcher)
+    )
 
 
 event.register("numba:compile", _Compilation())  # type: ignore[no-untyped-call]
