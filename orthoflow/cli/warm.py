@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -79,13 +79,14 @@ class Warmed:
 
 @dataclass(frozen=True)
 class _Call:
-    """A method with the words and switches among its parameters.
+    """A method with the words and switches among its parameters, and the inputs that it gets.
 
     Numbers decide what kernels compute, not which.
     """
 
     method: str
     words: tuple[tuple[str, str | bool], ...] = ()
+    ports: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, cell: Cell) -> _Call:
@@ -95,7 +96,7 @@ class _Call:
             for name, value in sorted(cell.params_set.items())
             if isinstance(value, str | bool)
         ]
-        return cls(cell.method, tuple(words))
+        return cls(cell.method, tuple(words), frozenset(cell.inputs))
 
 
 def _warm(workflow: str | None) -> Warmed:
@@ -141,8 +142,9 @@ def _calls_of(workflow: str, catalog: Catalog) -> frozenset[_Call]:
 
     loaded = load_workflow(workflow, catalog)
     calls = {_Call.of(cell) for cell in expand_cells(loaded, catalog)}
-    # The plain ones too, where no recipe has just these words.
-    return frozenset(calls | {_Call(call.method) for call in calls})
+    # Where no recipe has just these inputs or words, what comes near.
+    near = {replace(call, ports=frozenset()) for call in calls}
+    return frozenset(calls | near | {_Call(call.method) for call in calls})
 
 
 def _results(
@@ -154,7 +156,7 @@ def _results(
 
     found: dict[str, CellResult] = {}
     methods = None if wanted is None else {call.method for call in wanted}
-    seen: set[object] = set()
+    seen: set[_Call] = set()
     with tempfile.TemporaryDirectory(prefix="orthoflow-warm-") as scratch:
         store = Store(Path(scratch) / "store")
         store.folder.mkdir()
@@ -178,7 +180,7 @@ def _recipes() -> dict[Path, tuple[str, ...]]:
 
 
 def _new_cells(
-    cells: Iterable[Cell], wanted: Collection[_Call] | None, seen: set[object]
+    cells: Iterable[Cell], wanted: Collection[_Call] | None, seen: set[_Call]
 ) -> tuple[Cell, ...]:
     """The cells that may need other kernels than those before, and all that these need."""
     from orthoflow.engine.plan import needed_addresses
@@ -186,10 +188,12 @@ def _new_cells(
     by_address = {cell.address: cell for cell in cells}
     chosen: set[str] = set()
     for address, cell in by_address.items():
-        call, ports = _Call.of(cell), frozenset(cell.inputs)
+        call = _Call.of(cell)
+        near = replace(call, ports=frozenset())
+        call = call if wanted is None or call in wanted else near
         is_wanted = wanted is None or call in wanted
-        if is_wanted and (call, ports) not in seen and not cell.skip_reason:
-            seen.add((call, ports))
+        if is_wanted and call not in seen and not cell.skip_reason:
+            seen.update((call, near))
             chosen.add(address)
     for address in reversed(by_address):
         if address in chosen:

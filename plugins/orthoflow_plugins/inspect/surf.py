@@ -92,7 +92,7 @@ class InspectSurf(Method):
         reason = _unfit(inputs)
         verdicts = []
         for place, image in enumerate(images if reason is None else ()):
-            ctx.progress(place / len(images), f"wall {image.name}")
+            ctx.progress(place / len(images), image.name)
             wall = wall_of(image, inputs.walls)
             verdicts.append(_compare(image, wall, inputs.cameras, params.radius_cells))
         fit = [item for item in verdicts if len(item.pairs) >= _FEWEST_PAIRS]

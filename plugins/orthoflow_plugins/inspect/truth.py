@@ -153,7 +153,7 @@ class InspectTruth(Method):
         verdicts: list[_Verdict] = []
         findings: list[Finding] = []
         for place, image in enumerate(inputs.orthoimages.images):
-            ctx.progress(place / len(inputs.orthoimages.images), f"wall {image.name}")
+            ctx.progress(place / len(inputs.orthoimages.images), image.name)
             verdict = judge.verdict_on(image)
             verdicts.append(verdict)
             findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
