@@ -141,8 +141,14 @@ def estimate_dlt(
     rule: EstimationRule,
     *,
     distortion: Distortion,
+    forgets_lens: bool = False,
 ) -> Estimate | str:
-    """Orient a photo by a direct linear transform of its control ties, or say why not."""
+    """Orient a photo by a direct linear transform of its control ties, or say why not.
+
+    With `forgets_lens` neither calibration nor EXIF helps to reject wrong ties either.
+    """
+    if forgets_lens:
+        photo = replace(photo, intrinsics=None, exif_focal_px=None)
     robust = robust_start(photo, seen, is_check, rule)
     if robust is None:
         return no_pose(seen)

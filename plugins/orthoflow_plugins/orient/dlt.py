@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from importlib.metadata import version
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -20,10 +20,11 @@ from orthoflow_plugins.orient.single_photo import each_by_itself
 class OrientDlt(Method):
     """Orient each photo by eleven parameters, or more with distortion, known from its ties alone.
 
-    Calibration and EXIF serve only to reject wrong ties. The linear solution starts a weighted
-    adjustment of pose, fx, fy and principal point (and distortion); of the eleven parameters the
-    skew is recorded but not kept, since no lens of today has one. Control that lies near one plane
-    does not determine the parameters and is refused. Everything is judged as in `orient.pnp`.
+    Calibration and EXIF serve only to reject wrong ties, with `prior: none` not even that. The
+    linear solution starts a weighted adjustment of pose, fx, fy and principal point (and
+    distortion); of the eleven parameters the skew is recorded but not kept, since no lens of today
+    has one. Control that lies near one plane does not determine the parameters and is refused.
+    Everything is judged as in `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.dlt"
@@ -43,6 +44,11 @@ class OrientDlt(Method):
             description="Distortion estimated with the eleven parameters: none, k1, or "
             "k1 k2 p1 p2.",
         )
+        prior: Literal["lens", "none"] = Field(
+            default="lens",
+            description="What wrong ties are rejected by: the lens as calibration or EXIF know it, "
+            "or none, the usual focal lengths tried in turn (markiewicz2015).",
+        )
 
     class In(Ports):
         """Ties, and the photos they are in."""
@@ -57,7 +63,9 @@ class OrientDlt(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Orient the photos one after the other."""
-        estimator = partial(estimate_dlt, distortion=params.distortion)
+        estimator = partial(
+            estimate_dlt, distortion=params.distortion, forgets_lens=params.prior == "none"
+        )
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
         return self.Out(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 

@@ -25,6 +25,7 @@ _PAPER: Final[dict[str, object]] = {
     "angle_deg": 1.0,
     "thinning": 10,
     "labels": "region",
+    "stop_unclassified_share": 0.1,
 }
 
 
@@ -39,8 +40,8 @@ class Region(Method):
 
     `criterion: normal` asks for the normal alone, wherever a cell lies, as in markiewicz2015; with
     `labels: region` a niche then belongs to its wall, whatever its depth. `preset: paper` sets both
-    and the other values of that paper (a cube of 10 mm, 1 degree, every 10th point), each of which
-    can still be set otherwise.
+    and the other values of that paper (a cube of 10 mm, 1 degree, every 10th point, an end at 10 %
+    unclassified), each of which can still be set otherwise.
 
     Where the cloud is so thin that a neighbourhood would hold too few points, it is enlarged;
     `neighbourhood_mm` says to what. `normal_scatter_deg` says how far the normals of the first

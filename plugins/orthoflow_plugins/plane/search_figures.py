@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -188,7 +189,9 @@ def draw_normals(ctx: StepContext, regions: Regions, planes: Planes, cloud: Poin
     picture = _normal_map(
         placed[shown], depth_m[shown], away_deg[shown], size_m, voxels.grid.cell_m
     )
-    _draw_normals(ctx, away_deg, voxels.counts, picture, size_m, planes.names[0])
+    across_deg = np.degrees(np.arcsin(np.clip(normals @ basis_from_up(planes.up)[1], -1.0, 1.0)))
+    angles_deg = {f"angle between normal and {planes.names[0]}": away_deg, "Ny": across_deg}
+    _draw_normals(ctx, angles_deg, voxels.counts, picture, size_m)
 
 
 def _line_of(
@@ -291,21 +294,22 @@ def _normal_map(
 
 def _draw_normals(
     ctx: StepContext,
-    away_deg: NDArray[np.float64],
+    angles_deg: Mapping[str, NDArray[np.float64]],
     counts: NDArray[np.int64],
     picture: NDArray[np.float64],
     size_m: NDArray[np.float64],
-    name: str,
 ) -> None:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 4.0), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(2.0, 3.0))
-    edges_deg = np.arange(0.0, 90.0 + _BIN_DEG, _BIN_DEG)
-    histogram, _ = np.histogram(away_deg, edges_deg, weights=counts.astype(np.float64))
-    left.stairs(histogram / max(1.0, float(counts.sum())), edges_deg, fill=True, color="#9db8d2")
-    left.set_xlabel(f"angle between normal and {name} [deg]", fontsize=9)
-    left.set_ylabel("share of the points", fontsize=9)
+    figure = Figure(figsize=(14.0, 4.0), layout="constrained")
+    *histograms, right = figure.subplots(1, 3, width_ratios=(2.0, 2.0, 3.0))
+    for axes, (name, values_deg) in zip(histograms, angles_deg.items(), strict=True):
+        edges_deg = np.arange(-90.0 if values_deg.min() < 0.0 else 0.0, 90.0 + _BIN_DEG, _BIN_DEG)
+        histogram, _ = np.histogram(values_deg, edges_deg, weights=counts.astype(np.float64))
+        shares = histogram / max(1.0, float(counts.sum()))
+        axes.stairs(shares, edges_deg, fill=True, color="#9db8d2")
+        axes.set_xlabel(f"{name} [deg]", fontsize=9)
+    histograms[0].set_ylabel("share of the points", fontsize=9)
     image = right.imshow(
         np.minimum(picture, _MAP_MOST_DEG),
         cmap="viridis",
@@ -318,7 +322,8 @@ def _draw_normals(
     ctx.figure(
         "normals",
         figure,
-        "Left: how the normals of the neighbourhoods lie to the first plane, by points. Right: the "
-        f"same over the plane's rectangle, up to {1000.0 * _MAP_DEPTH_M:.0f} mm before and behind "
-        "it; what has the wall's colour is told from it by its distance alone.",
+        "Left: how the normals of the neighbourhoods lie to the first plane, by points. Middle: "
+        "how far they point along the second horizontal axis (markiewicz2015, Figure 8). Right: "
+        f"the first over the plane's rectangle, up to {1000.0 * _MAP_DEPTH_M:.0f} mm before and "
+        "behind it; what has the wall's colour is told from it by its distance alone.",
     )

@@ -210,6 +210,28 @@ def test_control_near_a_plane_is_refused(
     assert re.search(reason, found.status)
 
 
+def test_without_a_prior_what_exif_says_does_not_matter(tmp_path: Path) -> None:
+    ties = ties_of(camera(), 2)
+    found = {}
+    for prior in ("lens", "none"):
+        for focal_px in (3150.0, 900.0):
+            photo = replace(photos().photos[0], exif_focal_px=focal_px)
+            (folder := tmp_path / f"{prior}-{focal_px:g}").mkdir()
+            inputs = OrientDlt.In(ties=ties, photos=ms.photos(photo))
+            params = OrientDlt.Params(distortion="k1", prior=prior)
+            cameras = OrientDlt().run(inputs, params, context(folder)).cameras
+            found[prior, focal_px] = cameras.cameras[0]
+    assert found["lens", 3150.0].status == "ok"
+    # The wrong focal length leaves too few ties that agree.
+    assert found["lens", 900.0].status != "ok"
+    first, second = found["none", 3150.0], found["none", 900.0]
+    assert first.status == "ok"
+    np.testing.assert_array_equal(
+        first.translation_camera_from_world, second.translation_camera_from_world
+    )
+    assert frame_errors_px(first.viewing(), camera()).max() <= 4.0
+
+
 def test_little_control_is_refused(tmp_path: Path) -> None:
     ties = ties_of(camera(), 1, n=24)
     found = orient(ties, context(tmp_path), distortion="k1 k2 p1 p2").cameras[0]

@@ -490,13 +490,19 @@ def test_normals_are_drawn_by_points_and_over_the_first_plane(
     slope_rad = 1e-3 / (0.15 / math.sqrt(12.0) * 15.0)
     expected_deg = math.degrees(1.18 * slope_rad)
     assert metrics["normal_scatter_deg"] == pytest.approx(expected_deg, rel=0.1)
-    left, right, _ = drawings["normals"].axes
+    left, middle, right, _ = drawings["normals"].axes
     (stairs,) = left.patches
     share, edges_deg, _ = stairs.get_data()
     np.testing.assert_allclose(edges_deg, np.arange(91.0))
     assert share.sum() == pytest.approx(1.0)
     assert share[0] == pytest.approx(60_000 / 69_000, abs=0.03)
     assert share[29:31].sum() == pytest.approx(9_000 / 69_000, abs=0.03)
+    (stairs,) = middle.patches
+    share, edges_deg, _ = stairs.get_data()
+    np.testing.assert_allclose(edges_deg, np.arange(-90.0, 91.0))
+    # Ny of the wall is -1, of the slope -cos 30 deg.
+    assert share[:10].sum() == pytest.approx(60_000 / 69_000, abs=0.03)
+    assert share[28:32].sum() == pytest.approx(9_000 / 69_000, abs=0.03)
     shown, extent = image(right)
     np.testing.assert_allclose(extent, (0.0, 3.0, 2.0, 0.0))
     assert shown.shape == (40, 60)

@@ -1,0 +1,62 @@
+"""`docs/papers.md` names methods, parameters and workflows that exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from orthoflow.catalog import discover_catalog
+from orthoflow.workflow import shipped_workflow
+from orthoflow.workflow.recipes import shipped_workflows
+
+ROOT = Path(__file__).resolve().parents[1]
+TEXT = (ROOT / "docs" / "papers.md").read_text()
+CODE = sorted(set(re.findall(r"`([^`]+)`", TEXT)))
+KINDS = sorted({method_id.partition(".")[0] for method_id in discover_catalog().methods})
+METHOD = re.compile(rf"({'|'.join(KINDS)})\.[a-z0-9-]+")
+NAMED = [code for code in CODE if METHOD.match(code)]
+
+
+def test_the_page_names_most_built_in_methods() -> None:
+    methods = discover_catalog().methods
+    ours = {name for name in methods if methods[name].distribution.name == "orthoflow-tls"}
+    named = {METHOD.match(code).group() for code in NAMED}  # type: ignore[union-attr]
+    assert named <= ours, "a method was renamed"
+    for kind in ("plane", "ortho", "mosaic", "register", "inspect"):
+        missing = {name for name in ours if name.startswith(f"{kind}.")} - named
+        assert missing <= {"inspect.truth", "plane.open3d-patches"}
+
+
+@pytest.mark.parametrize("code", NAMED)
+def test_every_parameter_named_exists_and_takes_the_value(code: str) -> None:
+    method_id, _, setting = code.partition(" ")
+    params = discover_catalog().method(method_id).load().Params
+    if not setting:
+        return
+    name, _, value = setting.partition(": ")
+    assert name in params.model_fields
+    if value:
+        params.model_validate({name: YAML(typ="safe").load(value)})
+
+
+@pytest.mark.parametrize("code", [code for code in CODE if re.fullmatch(r"[a-z-]+\.yaml", code)])
+def test_every_workflow_named_is_shipped(code: str) -> None:
+    assert code.removesuffix(".yaml") in shipped_workflows()
+
+
+@pytest.mark.parametrize("code", [code for code in CODE if code.startswith("orthoflow run")])
+def test_every_command_named_sets_what_its_workflow_has(code: str) -> None:
+    _, _, recipe, *options = code.split()
+    steps = YAML(typ="safe").load(shipped_workflow(recipe).read_text())["steps"]
+    for setting in options[1::2]:
+        step, parameter = setting.partition("=")[0].split(".")
+        method_id = steps[step]["use"]
+        assert parameter in discover_catalog().method(method_id).load().Params.model_fields
+
+
+@pytest.mark.parametrize("path", [code for code in CODE if re.match(r"(tests|benchmarks)/", code)])
+def test_every_file_named_is_there(path: str) -> None:
+    assert (ROOT / path).is_file()
