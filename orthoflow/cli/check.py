@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 import click
 
@@ -21,24 +21,35 @@ def check(workflow: str, sets: Sequence[str], inputs: Sequence[str], *, as_json:
     """Say everything that is wrong with WORKFLOW, a file or the name of a shipped one.
 
     Every problem is named in one pass, as file:line:column: path: message; input files are looked
-    for as well. Ends with 2 when something is wrong, with 4 when a plugin is missing.
+    for as well. Warnings say what is allowed and can hardly be meant. Ends with 2 when something is
+    wrong, with 4 when a plugin is missing.
     """
     if not as_json:
-        echo(_check(workflow, sets, inputs))
+        verdict = _check(workflow, sets, inputs)
+        echo(verdict.summary, *(f"warning: {text}" for text in verdict.warnings))
         return EXIT_GOOD
     try:
-        summary = _check(workflow, sets, inputs)
+        verdict = _check(workflow, sets, inputs)
     except OrthoflowError as error:
         problems = [asdict(problem) for problem in getattr(error, "problems", ())]
-        echo_json({"ok": False, "message": str(error), "problems": problems})
+        echo_json({"ok": False, "message": str(error), "problems": problems, "warnings": []})
         return error.exit_code
-    echo_json({"ok": True, "message": summary, "problems": []})
+    warnings = list(verdict.warnings)
+    echo_json({"ok": True, "message": verdict.summary, "problems": [], "warnings": warnings})
     return EXIT_GOOD
 
 
-def _check(workflow: str, sets: Sequence[str], inputs: Sequence[str]) -> str:
+@dataclass(frozen=True, kw_only=True)
+class _Verdict:
+    """A workflow without mistakes in a sentence, and what is doubtful about it."""
+
+    summary: str
+    warnings: tuple[str, ...]
+
+
+def _check(workflow: str, sets: Sequence[str], inputs: Sequence[str]) -> _Verdict:
     from orthoflow.catalog import discover_catalog
-    from orthoflow.workflow import expand_cells, load_workflow, resolve_input_files
+    from orthoflow.workflow import doubts_about, expand_cells, load_workflow, resolve_input_files
 
     catalog = discover_catalog()
     loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
@@ -46,7 +57,8 @@ def _check(workflow: str, sets: Sequence[str], inputs: Sequence[str]) -> str:
     cells = expand_cells(loaded, catalog)
     skipped = sum(bool(cell.skip_reason) for cell in cells)
     without_data = f", {skipped} of them skipped for lack of optional data" if skipped else ""
-    return (
+    summary = (
         f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}, "
         f"{counted(len(cells), 'cell')}{without_data}"
     )
+    return _Verdict(summary=summary, warnings=doubts_about(loaded))

@@ -245,6 +245,7 @@ def _method_json(entry: MethodEntry) -> dict[str, object]:
         "result_version": method.result_version,
         "determinism": method.determinism,
         "citations": list(method.citations),
+        "metrics": list(method.metrics),
         "params": [
             {"name": name, "type": type_, "default": default, "unit": unit, "description": text}
             for name, type_, default, unit, text in _parameters(method.Params)
@@ -286,6 +287,8 @@ def _print_method(entry: MethodEntry, method: type[Method]) -> None:
     echo(f"state         {entry.state}")
     echo(f"class         {entry.spec.target}")
     echo(f"determinism   {method.determinism}, result version {method.result_version}")
+    if method.metrics:
+        echo(f"metrics       {', '.join(method.metrics)}")
     for citation in method.citations:
         echo(f"citation      {citation}")
     echo()

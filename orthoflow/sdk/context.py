@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from orthoflow_provenance.errors import UnsafeFileError
 from orthoflow_provenance.inner_files import colliding, path_below
-from orthoflow_provenance.model import Figure, Metric
+from orthoflow_provenance.model import COSTS, Figure, Metric
 
 from orthoflow.errors import CancelledStepError, ProductError
 from orthoflow.sdk.lines import is_name, one_line
 
 __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
 
+# Of every step, whatever its method.
+MEASURED_BY_THE_ENGINE: Final = tuple(COSTS)
 _MEDIA_TYPES: Final = {".png": "image/png", ".webp": "image/webp", ".svg": "image/svg+xml"}
 # Far above what a step can have to say; far below what a record or a terminal suffers from.
 _MOST_METRICS: Final = 20_000

@@ -7,6 +7,7 @@ import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any, ClassVar, Literal, Union, dataclass_transform
 
 from pydantic import BaseModel, ConfigDict
@@ -88,6 +89,9 @@ class Method:
         result_version: raised by the author whenever results change for equal inputs.
         determinism: `exact` (same bits always), `seeded` (same bits for the same seed) or
             `loose` (equal within the products' tolerances).
+        metrics: names of all metrics that it may report, with the wildcards of file names (`*`,
+            `[xy]`) where a part hangs on the data. A comparison that asks for another one is
+            refused; empty where the author declares none: then nothing is refused.
         citations: where the method comes from: DOI, title or URL.
         Params: parameters.
         In: input ports.
@@ -97,6 +101,7 @@ class Method:
     id: ClassVar[str]
     result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = ()
     citations: ClassVar[tuple[str, ...]] = ()
     Params: ClassVar[type[MethodParams]]
     In: ClassVar[type[Ports]]
@@ -119,6 +124,11 @@ class Method:
             OrthoflowError: no result is possible; one sentence says why.
         """
         raise AssertionError(f"{type(self).__name__} must implement run")
+
+    @classmethod
+    def may_report(cls, metric: str) -> bool:
+        """Whether a metric is one of those declared; True where none are."""
+        return not cls.metrics or any(fnmatchcase(metric, name) for name in cls.metrics)
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:

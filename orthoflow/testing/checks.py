@@ -85,7 +85,7 @@ def parameters_round_trip(subject: Subject) -> None:
 
 
 def outputs_are_valid(subject: Subject) -> None:
-    """Outputs have the declared types and survive storing; metrics carry units."""
+    """Outputs have the declared types and survive storing; metrics are declared, with units."""
     run = subject.witness.first.run
     for name, port in port_specs(subject.method.Out).items():
         product = run.outputs.get(name)
@@ -100,6 +100,10 @@ def outputs_are_valid(subject: Subject) -> None:
         require(digest_of(again) == run.digests[name], f"output {name} changes when stored")
     for metric in run.metrics:
         require(metric.unit, f"metric {metric.name} has no unit (`1` for counts and shares)")
+        require(
+            subject.method.may_report(metric.name),
+            f"metric {metric.name} is none of those that the method declares (`metrics`)",
+        )
 
 
 def inputs_stay_untouched(subject: Subject) -> None:

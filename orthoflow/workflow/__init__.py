@@ -12,6 +12,7 @@ from orthoflow.workflow.cells import (
     expand_cells,
 )
 from orthoflow.workflow.document import load_workflow
+from orthoflow.workflow.doubts import doubts_about
 from orthoflow.workflow.format import (
     Comparison,
     StepVariant,
@@ -49,6 +50,7 @@ __all__ = [
     "WorkflowStep",
     "check_step_names",
     "derive_seed",
+    "doubts_about",
     "expand_cells",
     "load_workflow",
     "present_inputs",

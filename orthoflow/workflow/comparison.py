@@ -5,11 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import WorkflowError
 from orthoflow.files.yaml_positions import Position, Table, Value, join
+from orthoflow.sdk.context import MEASURED_BY_THE_ENGINE
 from orthoflow.workflow.format import (
     BASELINE,
     COMPARE,
@@ -55,7 +57,7 @@ def read_compare(
             steps,
         ),
         exclude=tuple(combination for combination in combinations if combination),
-        metrics=_read_metrics(table, step_names, log),
+        metrics=_read_metrics(table, steps, step_names, log),
     )
 
 
@@ -184,15 +186,42 @@ def _complete(baseline: Mapping[str, str], steps: Sequence[DraftStep]) -> Assign
     }
 
 
-def _read_metrics(table: Table, step_names: Sequence[str], log: ProblemLog) -> tuple[str, ...]:
+def _read_metrics(
+    table: Table, steps: Sequence[DraftStep], step_names: Sequence[str], log: ProblemLog
+) -> tuple[str, ...]:
     patterns = METRICS.read(table, COMPARE.name, log) or ()
     entry = table.get(METRICS.name)
     for pattern in patterns if entry else ():
-        step = pattern.partition(".")[0]
-        if entry and not set(step) & set("*?[") and step not in step_names:
-            log.add(
-                entry.value.position,
-                join(COMPARE.name, METRICS.name),
-                f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}",
-            )
+        step, _, metric = pattern.partition(".")
+        problem = ""
+        if not _has_wildcard(step) and step not in step_names:
+            problem = f"there is no step {step} for {pattern}{did_you_mean(step, step_names)}"
+        elif not _has_wildcard(metric):
+            problem = _unknown_metric(metric, [one for one in steps if fnmatchcase(one.name, step)])
+        if entry and problem:
+            log.add(entry.value.position, join(COMPARE.name, METRICS.name), problem)
     return patterns
+
+
+def _unknown_metric(metric: str, steps: Sequence[DraftStep]) -> str:
+    """Say that no method of the steps reports a metric; empty where one does, or may."""
+    calls = [variant for step in steps for variant in step.variants]
+    methods = [variant.info.method for variant in calls if variant.info is not None]
+    if metric in MEASURED_BY_THE_ENGINE or len(methods) < len(calls) or not methods:
+        return ""
+    if any(method.may_report(metric) for method in methods):
+        return ""
+    known = dict.fromkeys(
+        name for method in methods for name in method.metrics if not _has_wildcard(name)
+    )
+    names = " and ".join(step.name for step in steps)
+    ids = ", ".join(dict.fromkeys(variant.call.method for variant in calls))
+    hint = did_you_mean(metric, [*known, *MEASURED_BY_THE_ENGINE])
+    return (
+        f"step {names} reports no metric {metric}{hint}; `orthoflow plugins show METHOD` lists "
+        f"those of {ids}"
+    )
+
+
+def _has_wildcard(text: str) -> bool:
+    return bool(set(text) & set("*?["))

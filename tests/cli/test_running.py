@@ -436,6 +436,21 @@ def test_check_names_every_problem_with_its_place(tmp_path: Path) -> None:
     answer = json.loads(orthoflow(tmp_path, "check", "studio.yaml", "--json").stdout)
     assert answer["ok"] is False
     assert [problem["line"] for problem in answer["problems"]] == [8, 9]
+    assert answer["warnings"] == []
+
+
+def test_check_warns_of_what_is_allowed_and_hardly_meant(tmp_path: Path) -> None:
+    path = write_studio(tmp_path)
+    path.write_text(
+        path.read_text(encoding="utf-8").replace("inputs:", "inputs:\n  more: {optional: true}", 1),
+        encoding="utf-8",
+    )
+    said = "no step takes the input more: wire it as inputs.more, or remove it"
+    done = orthoflow(tmp_path, "check", "studio.yaml")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"studio is fine: 2 steps, 2 cells\nwarning: {said}\n"
+    answer = json.loads(orthoflow(tmp_path, "check", "studio.yaml", "--json").stdout)
+    assert (answer["ok"], answer["warnings"]) == (True, [said])
 
 
 def test_check_looks_for_the_files(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def test_reader_and_schema_refuse_the_same_steps(
     assert list(validator.iter_errors(document))
 
 
-@pytest.mark.parametrize("metrics", ["a.rms_mm", "[]", "[a]", "['a.*', '*.wall_s']"])
+@pytest.mark.parametrize("metrics", ["a.n_points", "[]", "[a]", "['a.*', '*.wall_s']"])
 def test_reader_and_schema_agree_on_metrics(metrics: str, catalog: Catalog, tmp_path: Path) -> None:
     text = f"orthoflow: 1\nsteps: {{a: {{use: simulate.room}}}}\ncompare: {{metrics: {metrics}}}\n"
     path = tmp_path / "flow.yaml"

@@ -388,3 +388,28 @@ def test_what_is_no_workflow_at_all_is_one_problem_with_its_line(
     (problem,) = caught.value.problems
     assert problem.line == line
     assert message in problem.message
+
+
+def test_metrics_that_no_method_of_a_step_declares_are_refused(
+    write: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def asked(metrics: str) -> list[str]:
+        text = GOOD.replace('[plane.rms_mm, "*.wall_s"]', metrics)
+        write.write_text(text)
+        try:
+            load_workflow(write, catalog)
+        except InvalidWorkflowError as error:
+            return [f"{item.path}: {item.message}" for item in error.problems]
+        return []
+
+    # Where an author declares nothing, nothing is refused.
+    assert asked("[plane.rmse_mm]") == []
+    declared = {"plane.hough2d": ("rms_mm", "wall_[0-9]*_mm"), "plane.ransac": ("own_mm",)}
+    for method, metrics in declared.items():
+        monkeypatch.setattr(catalog.method(method).load(), "metrics", metrics)
+    assert asked("[plane.own_mm, plane.wall_3_mm, plane.compile_s, 'plane.x_*']") == []
+    whose = "`orthoflow plugins show METHOD` lists those of plane.hough2d, plane.ransac"
+    assert asked("[plane.rsm_mm, 'plan*.depth', orient.rsm_mm]") == [
+        f"compare.metrics: step plane reports no metric rsm_mm (did you mean rms_mm?); {whose}",
+        f"compare.metrics: step plane reports no metric depth; {whose}",
+    ]

@@ -47,6 +47,10 @@ class ColourPhotos(Method):
     id: ClassVar[str] = "colour.photos"
     result_version: ClassVar[int] = 2
     determinism = "loose"
+    metrics = (
+        "coloured_share",
+        "n_photos",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "Skarlatos and Kiparissi 2012 (orthoimages from coloured clouds)",
     )

@@ -25,7 +25,16 @@ from orthoflow.products import (
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
-from orthoflow_plugins.inspect.findings import CAPPED, check_findings, report, rms
+from orthoflow_plugins.inspect.findings import (
+    CAPPED,
+    CHECK_TABLE,
+    DISPLACEMENTS,
+    IMAGE_QUALITY,
+    check_findings,
+    of_walls,
+    report,
+    rms,
+)
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.placing import wall_of
@@ -48,6 +57,13 @@ class InspectCheckpoints(Method):
     id: ClassVar[str] = "inspect.checkpoints"
     result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "loose"
+    metrics: ClassVar[tuple[str, ...]] = (
+        *("n_points", "n_3d", "rms_3d_mm", "max_3d_mm"),
+        *(*CHECK_TABLE, *DISPLACEMENTS),
+        # Those of a class of points have its name before them.
+        *(f"*_{name}" for name in (*CHECK_TABLE, *DISPLACEMENTS)),
+        *of_walls(IMAGE_QUALITY),
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "Skarlatos and Kiparissi 2012 (direct orthoimages from point clouds, 4.5, Table 1)",
     )

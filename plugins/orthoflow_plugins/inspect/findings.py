@@ -24,6 +24,20 @@ _OUTLIERS_MOST: Final = 0.25
 _MOST_WITHOUT_CAP: Final = 0.5
 # Behind the rule in the name of a number that the cap has made.
 CAPPED: Final = "_capped"
+# What displacements, check points and an orthoimage itself add up to, as metrics.
+DISPLACEMENTS: Final = (
+    *("rmse_[xy]_mm", "rmse_[xy]_cells", "mean_[xy]_mm", "nmad_[xy]_mm", "max_[xy]_mm"),
+    *("beyond_2rmse_[xy]_share", "beyond_2rmse_any_share", "p95_mm"),
+)
+CHECK_TABLE: Final = (
+    *("n_found", "rms_mm", "sd_mm", "mean_shift_mm", "mean_shift_share"),
+    *("n_outliers_once", "n_outliers_iterated", "n_outliers_iterated_capped"),
+    *("rms_after_once_mm", "rms_after_iterated_mm", "rms_after_iterated_capped_mm"),
+)
+IMAGE_QUALITY: Final = (
+    *("completeness", "n_edges", "edge_width_cells", "mtf50_per_cell"),
+    *("filled_share", "stretch_share", "smear_share"),
+)
 # What a comparison asks of every wall; the record has the rest.
 _OF_EACH_WALL: Final = ("rmse_u_mm", "rmse_v_mm", "completeness")
 
@@ -121,6 +135,12 @@ def cap_binds(length_m: NDArray[np.float64]) -> bool:
     """Whether the iterated rule would call more of the lengths (n,) outliers if it might."""
     allowed = np.count_nonzero(_iterated(length_m, _OUTLIERS_MOST))
     return bool(np.count_nonzero(_iterated(length_m, _MOST_WITHOUT_CAP)) > allowed)
+
+
+def of_walls(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of metrics as `report` gives them: of the main wall, of each, and of all together."""
+    walls = [f"wall_[0-9]*_{name}" for name in _OF_EACH_WALL]
+    return (*names, *walls, *(f"all_{name}" for name in names))
 
 
 def rms(values: ArrayLike) -> float:

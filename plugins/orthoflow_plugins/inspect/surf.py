@@ -21,7 +21,13 @@ from orthoflow.products import (
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.inspect.figures import enlargement, vector_map
-from orthoflow_plugins.inspect.findings import displacement_findings, report
+from orthoflow_plugins.inspect.findings import (
+    DISPLACEMENTS,
+    IMAGE_QUALITY,
+    displacement_findings,
+    of_walls,
+    report,
+)
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs
 from orthoflow_plugins.inspect.patches import GreyImage
@@ -51,6 +57,12 @@ class InspectSurf(Method):
     id: ClassVar[str] = "inspect.surf"
     result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "loose"
+    metrics: ClassVar[tuple[str, ...]] = (
+        *("n_walls_inspected", "n_key_points", "n_key_points_intensity", "matched_kept_share"),
+        *("floor_n_pairs", "surf_rmse_[xy]_mm", "surf_floor_rmse_[xy]_mm"),
+        *of_walls(("n_pairs", *DISPLACEMENTS, *(f"floor_{name}" for name in DISPLACEMENTS))),
+        *IMAGE_QUALITY,
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4, Table 2, Figure 25)",
         "Bay, Ess, Tuytelaars, Van Gool 2008, Speeded-Up Robust Features (SURF)",

@@ -41,7 +41,7 @@ from orthoflow_plugins.inspect.figures import (
     depth_error_map,
     displacement_map,
 )
-from orthoflow_plugins.inspect.findings import report
+from orthoflow_plugins.inspect.findings import IMAGE_QUALITY, of_walls, report
 from orthoflow_plugins.inspect.image_quality import grey_of, quality_findings
 from orthoflow_plugins.inspect.orientation_errors import (
     PoseError,
@@ -64,6 +64,17 @@ if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 _TRACED_POINTS: Final = 4000
+# Of each wall, from its cells and from what photos painted on it.
+_OF_WALLS: Final = (
+    *("rmse_[uv]_mm", "mean_[uv]_mm", "nmad_[uv]_mm", "p99_[uv]_mm", "step_rmse_[uv]_mm"),
+    *("patch_rmse_[uv]_mm", "patch_mean_[uv]_mm", "n_patches", "displaced_share"),
+    *("depth_median_mm", "depth_nmad_mm", "depth_rmse_mm", "depth_step_rmse_mm"),
+    *("depth_within_3sigma", "colour_rmse_grey", "filled_colour_rmse_grey"),
+    *("step_colour_rmse_grey", "gross_colour_share", "ghost_colour_share", "ghost_share"),
+    *("completeness", "completeness_filled", "completeness_seen_by_both", "unseen_painted_share"),
+    *("n_traced", "far_source_share", "n_ghost_cells"),
+    *("plane_angle_deg", "plane_offset_mm", "plane_corner_max_mm"),
+)
 
 
 class InspectTruth(Method):
@@ -91,6 +102,18 @@ class InspectTruth(Method):
     id: ClassVar[str] = "inspect.truth"
     result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "loose"
+    metrics: ClassVar[tuple[str, ...]] = (
+        *of_walls(_OF_WALLS),
+        *IMAGE_QUALITY,
+        *("n_photos", "n_oriented", "n_misoriented", "pose_error_over_sigma", "pose_wall_rms_mm"),
+        *("pose_centre_max_mm", "pose_centre_median_mm", "pose_wall_max_mm"),
+        *("pose_wall_median_mm", "pose_rotation_max_deg", "pose_rotation_median_deg"),
+        *("match_wrong_share", "match_wrong_share_own_wall", "n_ties_kept", "tie_wrong_share"),
+        *("tie_error_median_cells", "true_planes", "true_planes_found", "main_found"),
+        *("worst_plane_angle_deg", "worst_plane_offset_mm", "worst_plane_corner_max_mm"),
+        *("label_precision", "label_recall", "label_f1", "label_iou"),
+        *("label_precision_mean", "label_recall_mean", "label_f1_mean", "label_iou_mean"),
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "Gruen 1985, Adaptive least squares correlation (patch matching)",
         "Hoehle and Hoehle 2009, doi:10.1016/j.isprsjprs.2009.02.003 (NMAD)",
@@ -140,6 +163,7 @@ class InspectTruth(Method):
             colour_cells_most=params.colour_cells_most,
             seen_cells_most=params.seen_cells_most,
         )
+        _warn_of_untraced(inputs.orthoimages, inputs.cameras, ctx)
         views = _views(inputs, ctx.cores)
         poses = _pose_errors(inputs, views)
         judge = _Judge(
@@ -203,7 +227,29 @@ def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
         raise MethodError(
             "there is nothing to inspect: wire orthoimages and walls, or planes (inspect.truth)"
         )
+    given = ("orthoimages", "walls", "cameras")
+    dropped = [name for name in given if getattr(inputs, name) is not None]
+    if dropped:
+        missing = [name for name in given[:2] if name not in dropped]
+        ctx.warn(
+            f"not compared with the truth: {' and '.join(dropped)}, for want of "
+            f"{' and '.join(missing)}; only the planes and their labels are"
+        )
     return inspect_planes(inputs.planes, inputs.labels, inputs.truth, ctx)
+
+
+def _warn_of_untraced(images: Orthoimages, cameras: Cameras | None, ctx: StepContext) -> None:
+    """Say which cells are not traced to their pixels, though cameras are wired."""
+    if cameras is None:
+        return
+    known = {camera.photo for camera in cameras.cameras if camera.status == "ok"}
+    unknown = dict.fromkeys(name for image in images.images for name in image.sources)
+    names = [name for name in unknown if name not in known]
+    if names:
+        ctx.warn(
+            f"displacements are not traced where {', '.join(names)} painted: the cameras have no "
+            f"oriented photo of that name"
+        )
 
 
 def _views(inputs: InspectTruth.In, cores: int) -> SceneCameras | None:

@@ -40,6 +40,16 @@ class MatchGuided(Method):
     id: ClassVar[str] = "match.guided"
     result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_ties",
+        "rejected_share",
+        "n_photos_matched",
+        "ties_per_photo_median",
+        "held_out_rmse_px_median",
+        "held_out_rmse_px_worst",
+        "sigma_px_median",
+        "n_by_hand",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.3",
         "gruen1985: Adaptive least squares correlation, S. Afr. J. Photogramm. 14(3)",

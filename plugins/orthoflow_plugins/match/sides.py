@@ -41,6 +41,11 @@ class FaceByPhotos(Method):
     id: ClassVar[str] = "face.photos"
     result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_planes_guessed",
+        "n_planes_seen",
+        "n_planes_turned",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "lowe2004: Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",
     )

@@ -35,6 +35,15 @@ class MatchSift(Method):
     id: ClassVar[str] = "match.sift"
     result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_ties",
+        "n_rejected",
+        "rejected_share",
+        "n_photos_matched",
+        "ties_per_photo_median",
+        "n_wall_key_points",
+        "n_by_hand",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.5, 3.6",
         "lowe2004: Distinctive image features, doi:10.1023/B:VISI.0000029664.99615.94",

@@ -79,6 +79,24 @@ class MosaicSeams(Method):
     id: ClassVar[str] = "mosaic.seams"
     result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_orthoimages",
+        "n_sources",
+        "none_share",
+        "painted_share",
+        "filled_share",
+        "occluded_share",
+        "no_surface_share",
+        "gain_min",
+        "gain_max",
+        "seam_share",
+        "seam_on_depth_edge_share",
+        "seam_step_rms_grey",
+        "seam_step_mean_delta_e",
+        "n_overlap_patches",
+        "overlap_u_rms_cells",
+        "overlap_v_rms_cells",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 4.4",
         "Kwatra et al. 2003, doi:10.1145/882262.882264 (graph-cut seams)",

@@ -19,7 +19,7 @@ from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, l
 from orthoflow_plugins.orient.block_adjustment import Adjusted, Trusted, adjust_block
 from orthoflow_plugins.orient.estimation import estimate_pose
 from orthoflow_plugins.orient.lenses import Refined, Sharing, lens_groups
-from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientParams
 from orthoflow_plugins.orient.photo_ties import (
     PhotoTies,
     no_features,
@@ -59,6 +59,10 @@ class OrientColmapBundle(Method):
     id: ClassVar[str] = "orient.colmap-bundle"
     result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "seeded"
+    metrics: ClassVar[tuple[str, ...]] = (
+        *ORIENTATION_METRICS,
+        *("n_photo_points", "photo_tie_rmse_px", "sigma0", "redundancy"),
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "schoenberger2016: Structure-from-motion revisited (COLMAP), doi:10.1109/CVPR.2016.445",
         "triggs2000: Bundle adjustment, a modern synthesis, doi:10.1007/3-540-44480-7_21",

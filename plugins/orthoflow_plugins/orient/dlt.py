@@ -12,7 +12,7 @@ from orthoflow.products import Cameras, Photos, Ties
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.direct_linear import Distortion, estimate_dlt
-from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientParams
 from orthoflow_plugins.orient.reporting import hand_over
 from orthoflow_plugins.orient.single_photo import each_by_itself
 
@@ -30,6 +30,7 @@ class OrientDlt(Method):
     id: ClassVar[str] = "orient.dlt"
     result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "seeded"
+    metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
         "abdelaziz1971: Direct linear transformation, doi:10.14358/PERS.81.2.103",
         "hartley1997: In defense of the eight-point algorithm, doi:10.1109/34.601246",

@@ -36,6 +36,11 @@ class OrientGiven(Method):
     id: ClassVar[str] = "orient.given"
     result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "seeded"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_photos",
+        "n_oriented",
+        "n_refused",
+    )
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(OrientParams):

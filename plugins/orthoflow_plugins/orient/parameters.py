@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import Field
 
 from orthoflow.sdk import MethodParams
 from orthoflow_plugins.orient.acceptance import GateRule
 from orthoflow_plugins.orient.estimation import EstimationRule
+
+# What every orientation reports of its photos.
+ORIENTATION_METRICS: Final = (
+    *("n_photos", "n_oriented", "n_refused", "n_ties", "n_control", "n_check", "rejected_share"),
+    *("control_rmse_px_median", "control_rmse_px_worst"),
+    *("check_rmse_px_median", "check_rmse_px_worst"),
+    *("check_rmse_mm_median", "check_rmse_mm_worst"),
+    *("sigma_wall_mm_median", "sigma_wall_mm_worst"),
+)
 
 
 class OrientParams(MethodParams):

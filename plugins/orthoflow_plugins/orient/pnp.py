@@ -12,7 +12,7 @@ from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.estimation import estimate_pose
 from orthoflow_plugins.orient.opencv_pose import estimate_by_opencv
-from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientParams
 from orthoflow_plugins.orient.reporting import hand_over
 from orthoflow_plugins.orient.single_photo import Estimator, each_by_itself
 
@@ -34,6 +34,7 @@ class OrientPnp(Method):
     id: ClassVar[str] = "orient.pnp"
     result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "seeded"
+    metrics: ClassVar[tuple[str, ...]] = ORIENTATION_METRICS
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.6, 4.3",
         "raguram2013: USAC, universal random sample consensus, doi:10.1109/TPAMI.2012.257",

@@ -46,6 +46,16 @@ class DsmBackward(Method):
     id: ClassVar[str] = "ortho.dsm-backward"
     result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_layers",
+        "painted_share",
+        "occluded_share",
+        "photo_gsd_mm",
+        "obliquity_deg",
+        "occluders_s",
+        "decoding_s",
+        "painting_s",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7, 4.4",
     )

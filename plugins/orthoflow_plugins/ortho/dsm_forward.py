@@ -39,6 +39,13 @@ class DsmForward(Method):
     id: ClassVar[str] = "ortho.dsm-forward"
     result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_layers",
+        "painted_share",
+        "filled_share",
+        "occluders_s",
+        "painting_s",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.7",
     )

@@ -46,6 +46,13 @@ class PointcloudDirect(Method):
     id: ClassVar[str] = "ortho.pointcloud-direct"
     result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "painted_share",
+        "filled_share",
+        "void_share",
+        "projection_s",
+        "filling_s",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "skarlatos2012: Direct orthophoto generation from color point clouds of complex scenes, 3",
     )

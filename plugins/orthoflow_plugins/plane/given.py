@@ -90,6 +90,14 @@ class GivenPlane(Method):
     id = "plane.given"
     result_version = 1
     determinism = "exact"
+    metrics = (
+        "n_planes",
+        "labelled_share",
+        "rms_mm",
+        "omega_deg",
+        "phi_deg",
+        "offset_m",
+    )
     citations = (
         (
             "Skarlatos, Kiparissi, Theodoridou 2012: Direct orthophoto generation from color point "

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DetectorParams
+from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.accumulators import PlanProposer
@@ -47,6 +47,7 @@ class Hough2d(Method):
     id = "plane.hough2d"
     result_version = 4
     determinism = "exact"
+    metrics = DETECTOR_METRICS
     citations = (
         (
             "Markiewicz, Podlasiak, Zawieska 2015: A New Approach to the Generation of Orthoimages "

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DetectorParams
+from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Rules
@@ -31,6 +31,7 @@ class Hough3d(Method):
     id = "plane.hough3d"
     result_version = 4
     determinism = "exact"
+    metrics = DETECTOR_METRICS
     citations = (
         (
             "Markiewicz, Podlasiak, Zawieska 2015: A New Approach to the Generation of Orthoimages "

@@ -15,7 +15,7 @@ from orthoflow.geometry import Plane
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow_plugins.plane.open3d_ransac import open3d_version
-from orthoflow_plugins.plane.parameters import DetectorParams
+from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Candidate, Family, Rules
@@ -36,6 +36,7 @@ class Open3dPatches(Method):
     id = "plane.open3d-patches"
     result_version = 4
     determinism = "loose"
+    metrics = DETECTOR_METRICS
     citations = (
         "Zhou, Park, Koltun 2018: Open3D, a modern library for 3D data, arXiv:1801.09847",
         (

@@ -14,7 +14,7 @@ from pydantic import Field
 from orthoflow.geometry import Plane
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DetectorParams
+from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Candidate, Family, Rules
@@ -46,6 +46,7 @@ class Open3dRansac(Method):
     id = "plane.open3d-ransac"
     result_version = 4
     determinism = "loose"
+    metrics = DETECTOR_METRICS
     citations = (
         "Zhou, Park, Koltun 2018: Open3D, a modern library for 3D data, arXiv:1801.09847",
         "Fischler, Bolles 1981: Random sample consensus, doi:10.1145/358669.358692",

@@ -12,6 +12,17 @@ from orthoflow.sdk import MethodParams
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Family
 
+# What every detector reports.
+DETECTOR_METRICS: Final = (
+    *("n_planes", "thinning", "labelled_share", "first_share"),
+    *("detection_s", "first_plane_s", "next_plane_s"),
+    *("rms_mm", "fit_rms_mm", "omega_deg", "phi_deg", "offset_m", "r_m"),
+    *("sigma_angle_deg", "sigma_offset_mm", "n_independent"),
+    *("skewness", "excess_kurtosis", "within_[123]_sigma"),
+    *("raw_omega_deg", "raw_phi_deg", "raw_r_m", "raw_angle_deg", "raw_offset_mm"),
+    *("thickest_mm", "thickness_mm", "thickness_width_mm", "thickness_scan_steps", "scan_step_mm"),
+)
+
 _FAMILIES: Final[Mapping[str, Family]] = {"any": "any", "vertical": "wall", "horizontal": "level"}
 
 

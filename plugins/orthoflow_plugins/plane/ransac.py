@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DetectorParams
+from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Rules
@@ -33,6 +33,7 @@ class Ransac(Method):
     id = "plane.ransac"
     result_version = 3
     determinism = "seeded"
+    metrics = (*DETECTOR_METRICS, "own_tolerance_mm")
     citations = (
         "Fischler, Bolles 1981: Random sample consensus, doi:10.1145/358669.358692",
         "Torr, Zisserman 2000: MLESAC, doi:10.1006/cviu.1999.0832 (MSAC)",

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from orthoflow.products import Planes, PointCloud, PointLabels
 from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DetectorParams
+from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import FoundPlane, Rules
@@ -51,6 +51,10 @@ class Region(Method):
     id = "plane.region"
     result_version = 3
     determinism = "exact"
+    metrics = (
+        *DETECTOR_METRICS,
+        *("n_regions", "neighbourhood_mm", "cell_mm", "normal_scatter_deg"),
+    )
     citations = (
         (
             "Markiewicz, Podlasiak, Zawieska 2015: A New Approach to the Generation of Orthoimages "

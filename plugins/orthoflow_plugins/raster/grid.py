@@ -59,6 +59,21 @@ class RasterGrid(Method):
     id: ClassVar[str] = "raster.grid"
     result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_walls",
+        "gsd_mm",
+        "n_points_inside",
+        "points_per_cell",
+        "depth_noise_mm",
+        "scan_step_mm",
+        "sigma_median_mm",
+        "void_share",
+        "measured_share",
+        "recovered_share",
+        "intensity_cosine_power",
+        "intensity_range_power",
+        "intensity_scale_spread",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "markiewicz2015: orthoimages of cultural heritage objects from TLS and images, 3.4, 4.2",
     )

@@ -30,6 +30,11 @@ class ReadCameras(Method):
     id = "read.cameras"
     result_version = 1
     determinism = "exact"
+    metrics = (
+        "n_photos",
+        "n_oriented",
+        "n_refused",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "schoenberger2016: Structure-from-motion revisited (COLMAP), doi:10.1109/CVPR.2016.445",
         "snavely2006: Photo tourism (Bundler), doi:10.1145/1141911.1141964",

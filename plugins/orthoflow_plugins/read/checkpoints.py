@@ -28,6 +28,11 @@ class ReadCheckpoints(Method):
     id = "read.checkpoints"
     result_version = 1
     determinism = "exact"
+    metrics = (
+        "n_points",
+        "n_measured",
+        "extent_[xyz]_m",
+    )
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):

@@ -38,6 +38,10 @@ class ReadOrthoimage(Method):
     id: ClassVar[str] = "read.orthoimage"
     result_version: ClassVar[int] = 1
     determinism = "exact"
+    metrics = (
+        "n_orthoimages",
+        "painted_share",
+    )
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):

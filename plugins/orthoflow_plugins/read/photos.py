@@ -41,6 +41,12 @@ class ReadPhotos(Method):
     id = "read.photos"
     result_version = 2
     determinism = "exact"
+    metrics = (
+        "n_photos",
+        "n_calibrated",
+        "n_exif_focal",
+        "megapixels",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "CIPA DC-008, Exchangeable image file format for digital still cameras (Exif)",
         "CIPA DCG-001, 35 mm equivalent focal length over the diagonal",

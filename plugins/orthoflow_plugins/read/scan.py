@@ -45,6 +45,15 @@ class ReadScan(Method):
     id = "read.scan"
     result_version = 1
     determinism = "exact"
+    metrics = (
+        "n_points",
+        "n_scans",
+        "n_stations",
+        "n_invalid",
+        "n_not_finite",
+        "n_withheld",
+        "extent_[xyz]_m",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "ASTM E2807, E57 file format for 3D imaging data exchange",
         "ASPRS LAS specification 1.4 R15",

@@ -30,6 +30,10 @@ class ReadTies(Method):
     id = "read.ties"
     result_version = 1
     determinism = "exact"
+    metrics = (
+        "n_ties",
+        "n_photos_tied",
+    )
     citations: ClassVar[tuple[str, ...]] = ()
 
     class Params(MethodParams):

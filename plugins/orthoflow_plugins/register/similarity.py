@@ -34,6 +34,14 @@ class RegisterSimilarity(Method):
     id: ClassVar[str] = "register.similarity"
     result_version: ClassVar[int] = 2
     determinism = "loose"
+    metrics = (
+        "n_pairs",
+        "sigma0_mm",
+        "rms_mm",
+        "max_mm",
+        "scale_ppm",
+        "left_out_rms_mm",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "Umeyama 1991, doi:10.1109/34.88573 (least squares of a similarity)",
         "Skarlatos and Kiparissi 2012 (4.3, seven-parameter transformation)",

@@ -64,6 +64,18 @@ class SimulateRoom(Method):
     id: ClassVar[str] = "simulate.room"
     result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "seeded"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_points",
+        "n_photos",
+        "n_true_planes",
+        "main_wall_points",
+        "outlier_share",
+        "photo_gsd_mm",
+        "photo_megapixels",
+        "photo_obliquity_max_deg",
+        "scan_step_median_mm",
+        "scan_step_p90_mm",
+    )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (the kind of room)",
     )

@@ -21,6 +21,7 @@ from orthoflow.files.sidecars import frame_json
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import TrueOrthoimage, render_frame
 from orthoflow.products import (
+    Cameras,
     Finding,
     InputFiles,
     Orthoimage,
@@ -346,6 +347,22 @@ def test_a_displaced_main_wall_has_that_offset_and_a_lost_one_is_said(
     assert lost["main_found"] == 0.0
     assert lost["true_planes_found"] == len(true) - 1
     assert "plane_angle_deg" not in lost
+
+
+def test_what_is_wired_and_not_compared_is_told(tmp_path: Path, truth: Truth) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=2, scratch=tmp_path)
+    inputs = InspectTruth.In(truth=truth, planes=truth.planes, cameras=Cameras(cameras=()))
+    InspectTruth().run(inputs, InspectTruth.Params(), context)
+    (said,) = context.warnings
+    assert said.startswith(
+        "not compared with the truth: cameras, for want of orthoimages and walls"
+    )
+    image = rendered(truth)
+    _, _, context = inspect(
+        tmp_path, truth, painted(image), walled(image), cameras=Cameras(cameras=())
+    )
+    (said,) = context.warnings
+    assert said.startswith("displacements are not traced where truth painted: the cameras have no")
 
 
 def test_nothing_to_inspect_is_refused(tmp_path: Path, truth: Truth) -> None:

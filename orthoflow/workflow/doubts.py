@@ -1,0 +1,50 @@
+"""What a workflow that is right may still not mean: inputs nobody takes, cells of three metres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from orthoflow.workflow.format import Workflow
+
+_CELL: Final = "gsd_m"
+# Cells of walls and plans: finer than any scan, coarser than anything that is drawn of a building.
+_LEAST_GSD_M: Final = 0.0001
+_MOST_GSD_M: Final = 0.5
+_MILLIMETRES: Final = 1000.0
+
+
+def doubts_about(workflow: Workflow) -> tuple[str, ...]:
+    """Say in a sentence each what is allowed and can hardly be meant."""
+    return (*_unused_inputs(workflow), *_cell_sizes(workflow))
+
+
+def _unused_inputs(workflow: Workflow) -> Iterator[str]:
+    taken = {
+        reference.name
+        for step in workflow.steps.values()
+        for references in step.inputs.values()
+        for reference in references
+        if reference.is_input
+    }
+    taken |= {step.unless for step in workflow.steps.values()}
+    for name in workflow.inputs:
+        if name not in taken:
+            yield f"no step takes the input {name}: wire it as inputs.{name}, or remove it"
+
+
+def _cell_sizes(workflow: Workflow) -> Iterator[str]:
+    for step in workflow.steps.values():
+        for variant in step.variants:
+            gsd_m = variant.params.get(_CELL)
+            if not isinstance(gsd_m, int | float) or _LEAST_GSD_M <= gsd_m <= _MOST_GSD_M:
+                continue
+            place = ".".join(part for part in (step.name, variant.name, _CELL) if part)
+            meant_m = gsd_m / _MILLIMETRES
+            hint = ""
+            if _LEAST_GSD_M <= meant_m <= _MOST_GSD_M:
+                hint = f"; {gsd_m:g} mm are written {_CELL}: {meant_m:g}"
+            yield (
+                f"{place} is {gsd_m:g} m, which can hardly be meant: cells are "
+                f"{_LEAST_GSD_M:g} to {_MOST_GSD_M:g} m wide{hint}"
+            )

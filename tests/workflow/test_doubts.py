@@ -1,0 +1,52 @@
+"""What a workflow that is right may still not mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import Catalog
+from orthoflow.workflow import doubts_about
+from tests.laboratories import GOOD, laboratory_catalog, load
+
+
+@pytest.fixture
+def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    return laboratory_catalog(monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("gsd_m", "said"),
+    [
+        (
+            "3",
+            (
+                "wall.gsd_m is 3 m, which can hardly be meant: cells are 0.0001 to 0.5 m wide; "
+                "3 mm are written gsd_m: 0.003"
+            ),
+        ),
+        (
+            "5e-6",
+            "wall.gsd_m is 5e-06 m, which can hardly be meant: cells are 0.0001 to 0.5 m wide",
+        ),
+        ("0.003", ""),
+        ("0.5", ""),
+    ],
+)
+def test_cells_that_cannot_be_meant_are_told(
+    gsd_m: str, said: str, catalog: Catalog, tmp_path: Path
+) -> None:
+    text = GOOD.replace("{gsd_m: 1}", f"{{gsd_m: {gsd_m}}}")
+    assert doubts_about(load(text, tmp_path / "flow.yaml", catalog)) == ((said,) if said else ())
+
+
+def test_inputs_that_nothing_takes_are_told(catalog: Catalog, tmp_path: Path) -> None:
+    text = GOOD.replace("{gsd_m: 1}", "{gsd_m: 0.01}")
+    more = text.replace("inputs:\n", "inputs:\n  other: {optional: true}\n")
+    assert doubts_about(load(more, tmp_path / "flow.yaml", catalog)) == (
+        "no step takes the input other: wire it as inputs.other, or remove it",
+    )
+    # One that only says whether a step runs is of use.
+    asked = more.replace("wall:   {use", "wall:   {unless: inputs.other, use")
+    assert doubts_about(load(asked, tmp_path / "flow.yaml", catalog)) == ()
