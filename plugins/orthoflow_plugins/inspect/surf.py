@@ -58,10 +58,14 @@ class InspectSurf(Method):
     result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[str, ...]] = (
-        *("n_walls_inspected", "n_key_points", "n_key_points_intensity", "matched_kept_share"),
-        *("floor_n_pairs", "surf_rmse_[xy]_mm", "surf_floor_rmse_[xy]_mm"),
-        *of_walls(("n_pairs", *DISPLACEMENTS, *(f"floor_{name}" for name in DISPLACEMENTS))),
-        *IMAGE_QUALITY,
+        "n_walls_inspected",
+        *of_walls(
+            (
+                *("n_pairs", "n_key_points", "n_key_points_intensity", "matched_kept_share"),
+                *("floor_n_pairs", "surf_rmse_[xy]_mm", "surf_floor_rmse_[xy]_mm"),
+                *(*DISPLACEMENTS, *(f"floor_{name}" for name in DISPLACEMENTS), *IMAGE_QUALITY),
+            )
+        ),
     )
     citations: ClassVar[tuple[str, ...]] = (
         "Markiewicz, Podlasiak, Zawieska 2015, doi:10.3390/rs71215869 (4.4, Table 2, Figure 25)",

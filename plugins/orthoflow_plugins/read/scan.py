@@ -18,6 +18,7 @@ from orthoflow.products import InputFiles, JsonValue, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, resolution_m
 from orthoflow_plugins.read.figures import plan_view_png, polar_view_png
+from orthoflow_plugins.read.quality import judge_quality, report_quality
 from orthoflow_plugins.read.scales import (
     LUMINANCE_CORRELATION,
     IntensityScale,
@@ -53,6 +54,11 @@ class ReadScan(Method):
         "n_not_finite",
         "n_withheld",
         "extent_[xyz]_m",
+        "thickness_mm",
+        "thickness_width_mm",
+        "thickness_scan_steps",
+        "scan_step_mm",
+        "scans_apart_mm",
     )
     citations: ClassVar[tuple[str, ...]] = (
         "ASTM E2807, E57 file format for 3D imaging data exchange",
@@ -189,6 +195,7 @@ def _finish(
         },
     )
     _report_metrics(ctx, assembly, cloud)
+    report_quality(judge_quality(assembly.offsets, assembly.array("scan")), ctx)
     return cloud
 
 

@@ -39,6 +39,7 @@ class RegisterSimilarity(Method):
         "sigma0_mm",
         "rms_mm",
         "max_mm",
+        "scale",
         "scale_ppm",
         "left_out_rms_mm",
     )

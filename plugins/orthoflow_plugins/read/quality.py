@@ -1,0 +1,298 @@
+"""How good a cloud is, before anything is made of it: thickness, scan step, scans that disagree.
+
+markiewicz2015 asks for this first (5): the depth of a cloud is often greater than the step of the
+scan, and planes, intensities and orientations are no better than that. It is measured on small
+pieces of surfaces, from whose planes relief and bow hardly differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.robust import median_deviation
+from orthoflow.sdk import StepContext
+
+# Sides of the pieces: the next where so few points lie in one that they tell nothing.
+_SIDES_M: Final = (0.1, 0.3, 1.0)
+_PIECES_MOST: Final = 300
+_PIECES_LEAST: Final = 20
+# Points of one scan that a piece must have, and that are looked at.
+_POINTS_LEAST: Final = 30
+_POINTS_MOST: Final = 4000
+# Few enough to stay in the processor's cache.
+_AT_ONCE: Final = 1 << 16
+_HASH_BITS: Final = 20
+_CUBE_BITS: Final = 21
+_GATHERED_MOST: Final = 1_500_000
+# Odd, with bits all over, so that the upper bits of a product hang on all of a number.
+_PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
+# A piece is one surface if so many of its points lie near its plane, if they scatter by less than
+# this part of its side, and if they cover it both ways.
+_SURFACE_SHARE: Final = 0.85
+_SCATTER_SIDES: Final = 0.1
+_COVER_SIDES: Final = 0.15
+_NEAR_SIGMAS: Final = 4.0
+# Of the median of n values, in standard deviations of one over the root of n.
+_MEDIAN_SIGMA: Final = 1.2533
+_SURE_SIGMAS: Final = 3.0
+# Scans nearer to each other than this agree, however little they scatter.
+_AGREE_M: Final = 0.001
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloudQuality:
+    """Medians over pieces of surfaces.
+
+    Attributes:
+        side_m: of the pieces.
+        n_pieces: how many were measured.
+        sigma_m: robust standard deviation of a scan's points about the surface: the thickness.
+        width_95_m: width that holds 95 % of them.
+        scan_step_m: from a point to the nearest one of its scan, on the surface.
+        scans_apart_m: how far scans that show the same piece lie apart there, across it; None where
+            fewer than 20 pieces are shown by two.
+        sigma_apart_m: what their scatter alone would make of that, one standard deviation.
+    """
+
+    side_m: float
+    n_pieces: int
+    sigma_m: float
+    width_95_m: float
+    scan_step_m: float
+    scans_apart_m: float | None = None
+    sigma_apart_m: float = 0.0
+
+    @property
+    def is_thick(self) -> bool:
+        """Whether the cloud is thicker than its scan step."""
+        return self.sigma_m > self.scan_step_m
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether scans lie apart by more than they scatter, and by more than chance."""
+        if self.scans_apart_m is None:
+            return False
+        limit_m = max(self.sigma_m, _AGREE_M, _SURE_SIGMAS * self.sigma_apart_m)
+        return self.scans_apart_m > limit_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Piece:
+    """What one piece says; `apart_m` is NaN where one scan shows it."""
+
+    sigma_m: float
+    width_95_m: float
+    scan_step_m: float
+    apart_m: float
+    sigma_apart_m: float
+
+
+def judge_quality(
+    offsets: Sequence[NDArray[np.float32]], scan: NDArray[np.uint16] | None
+) -> CloudQuality | None:
+    """Measure a cloud on some hundred pieces of surfaces, spread over it.
+
+    Args:
+        offsets: three arrays (n,), metres from one origin.
+        scan: (n,) number of each point's scan; None for one scan.
+
+    Returns:
+        None where too few pieces show a surface.
+    """
+    for side_m in _SIDES_M:
+        pieces = [
+            piece
+            for chosen in _indices_of_pieces(offsets, side_m)
+            if (piece := _measured(_points(offsets, chosen), _scans(scan, chosen), side_m))
+        ]
+        if len(pieces) >= _PIECES_LEAST:
+            return _summed_up(pieces, side_m)
+    return None
+
+
+def report_quality(quality: CloudQuality | None, ctx: StepContext) -> None:
+    """Report the numbers, and warn in words of a thick cloud and of scans that disagree."""
+    if quality is None:
+        return
+    sigma_mm, step_mm = 1e3 * quality.sigma_m, 1e3 * quality.scan_step_m
+    ctx.metric("thickness_mm", sigma_mm, "mm")
+    ctx.metric("thickness_width_mm", 1e3 * quality.width_95_m, "mm")
+    ctx.metric("scan_step_mm", step_mm, "mm")
+    ctx.metric("thickness_scan_steps", quality.sigma_m / quality.scan_step_m, "1")
+    if quality.is_thick:
+        ctx.warn(
+            f"the cloud is thicker than its scan step: about pieces of {1e2 * quality.side_m:.0f} "
+            f"cm of a surface its points scatter by {sigma_mm:.1f} mm (95 % within "
+            f"{1e3 * quality.width_95_m:.1f} mm), and they lie {step_mm:.1f} mm apart: planes and "
+            f"depths are no better than that; look for noise, rough surfaces and scans that were "
+            f"joined without fitting"
+        )
+    if quality.scans_apart_m is None:
+        return
+    apart_mm = 1e3 * quality.scans_apart_m
+    ctx.metric("scans_apart_mm", apart_mm, "mm")
+    if quality.disagrees:
+        ctx.warn(
+            f"the scans disagree: where two show one surface they lie {apart_mm:.1f} mm apart "
+            f"across it (median), while each scatters by {sigma_mm:.1f} mm: register them again, "
+            f"or take one at a time"
+        )
+
+
+def _indices_of_pieces(
+    offsets: Sequence[NDArray[np.float32]], side_m: float
+) -> Iterator[NDArray[np.intp]]:
+    """Indices of the points in cubes about some of them."""
+    n_points = len(offsets[0])
+    lows = tuple(axis.min() for axis in offsets)
+    seeds = np.unique(np.linspace(0, n_points - 1, 2 * _PIECES_MOST).astype(np.intp))
+    hashes = np.unique(_hash(_cubes(offsets, lows, seeds, side_m)))
+    is_asked = np.zeros(1 << _HASH_BITS, dtype=np.bool_)
+    is_asked[hashes[:: max(1, -(-len(hashes) // _PIECES_MOST))]] = True
+    found: list[NDArray[np.intp]] = []
+    for start in range(0, n_points, _AT_ONCE):
+        part = slice(start, min(start + _AT_ONCE, n_points))
+        is_inside = is_asked[_hash(_cubes(offsets, lows, part, side_m))]
+        found.append(start + np.flatnonzero(is_inside))
+    indices = np.concatenate(found)
+    # Equal hashes of other cubes are told apart by the cubes themselves.
+    x, y, z = (axis.astype(np.int64) for axis in _cubes(offsets, lows, indices, side_m))
+    groups = x + (y << _CUBE_BITS) + (z << 2 * _CUBE_BITS)
+    known = np.unique(groups)
+    # Of a dense cloud, a part of the pieces says as much.
+    known = known[:: max(1, len(indices) // _GATHERED_MOST)]
+    is_known = np.isin(groups, known)
+    indices, groups = indices[is_known], groups[is_known]
+    order = np.argsort(groups, kind="stable")
+    for group in np.split(order, np.flatnonzero(np.diff(groups[order])) + 1):
+        if len(group) >= _POINTS_LEAST:
+            yield indices[group]
+
+
+def _cubes(
+    offsets: Sequence[NDArray[np.float32]],
+    lows: tuple[np.float32, ...],
+    chosen: NDArray[np.intp] | slice,
+    side_m: float,
+) -> list[NDArray[np.uint32]]:
+    """Number of the cube along each axis, counted from the lowest point on."""
+    return [
+        ((axis[chosen] - low) * np.float32(1.0 / side_m)).astype(np.uint32)
+        for axis, low in zip(offsets, lows, strict=True)
+    ]
+
+
+def _hash(cubes: Sequence[NDArray[np.uint32]]) -> NDArray[np.uint32]:
+    x, y, z = (axis * prime for axis, prime in zip(cubes, _PRIMES, strict=True))
+    hashed: NDArray[np.uint32] = (x ^ y ^ z) >> np.uint32(32 - _HASH_BITS)
+    return hashed
+
+
+def _points(
+    offsets: Sequence[NDArray[np.float32]], chosen: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    return np.column_stack([axis[chosen] for axis in offsets]).astype(np.float64)
+
+
+def _scans(scan: NDArray[np.uint16] | None, chosen: NDArray[np.intp]) -> NDArray[np.uint16]:
+    return np.zeros(len(chosen), dtype=np.uint16) if scan is None else np.asarray(scan[chosen])
+
+
+def _measured(
+    points: NDArray[np.float64], scan: NDArray[np.uint16], side_m: float
+) -> _Piece | None:
+    """Measure one piece; None where it is no single surface."""
+    numbers, counts = np.unique(scan, return_counts=True)
+    enough = numbers[counts >= _POINTS_LEAST]
+    if not len(enough):
+        return None
+    kept = np.concatenate([np.flatnonzero(scan == one)[:_POINTS_MOST] for one in enough])
+    points, scan = points[kept], scan[kept]
+    frame = _frame(points)
+    across = (points - points.mean(axis=0)) @ frame[2]
+    main = enough[np.argmax([np.count_nonzero(scan == one) for one in enough])]
+    is_main = scan == main
+    middles = {one: float(np.median(across[scan == one])) for one in enough}
+    of_main = across[is_main] - middles[main]
+    sigma_m = median_deviation(of_main, 0.0)
+    near = np.abs(of_main) <= _NEAR_SIGMAS * max(sigma_m, 1e-6)
+    on_surface = (points[is_main] @ frame[:2].T)[near]
+    if near.mean() < _SURFACE_SHARE or sigma_m > _SCATTER_SIDES * side_m:
+        return None
+    if on_surface.std(axis=0).min() < _COVER_SIDES * side_m:
+        return None
+    step_m = _step_m(on_surface)
+    if step_m is None:
+        return None
+    other_m, other_sigma_m = _farthest(across, scan, middles, main)
+    return _Piece(
+        sigma_m=sigma_m,
+        width_95_m=float(np.diff(np.percentile(of_main, [2.5, 97.5]))[0]),
+        scan_step_m=step_m,
+        apart_m=other_m,
+        sigma_apart_m=other_sigma_m,
+    )
+
+
+def _frame(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows: two axes in the plane of most of the points (n, 3), and its normal."""
+    kept = np.ones(len(points), dtype=np.bool_)
+    axes = np.eye(3)
+    for _ in range(3):
+        chosen = points[kept]
+        centre = chosen.mean(axis=0)
+        axes = np.linalg.svd((chosen - centre).T @ (chosen - centre))[2]
+        away = (points - centre) @ axes[2]
+        away -= np.median(away)
+        kept = np.abs(away) <= 2.5 * max(median_deviation(away, 0.0), 1e-6)
+    return np.asarray(axes)
+
+
+def _farthest(
+    across: NDArray[np.float64],
+    scan: NDArray[np.uint16],
+    middles: dict[np.uint16, float],
+    main: np.uint16,
+) -> tuple[float, float]:
+    """How far the scan that lies farthest from the main one is away, and the sigma of that."""
+    others = [one for one in middles if one != main]
+    if not others:
+        return np.nan, np.nan
+    farthest = max(others, key=lambda one: abs(middles[one] - middles[main]))
+    variances = []
+    for one in (main, farthest):
+        own = across[scan == one] - middles[one]
+        variances.append((_MEDIAN_SIGMA * median_deviation(own, 0.0)) ** 2 / len(own))
+    return abs(middles[farthest] - middles[main]), float(np.sqrt(sum(variances)))
+
+
+def _step_m(on_surface: NDArray[np.float64]) -> float | None:
+    """Median distance of points (n, 2) to the nearest other one; None where all are the same."""
+    from scipy.spatial import cKDTree
+
+    distances = cKDTree(on_surface).query(on_surface, k=2)[0][:, 1]
+    apart = distances[distances > 0.0]
+    return float(np.median(apart)) if len(apart) else None
+
+
+def _summed_up(pieces: Sequence[_Piece], side_m: float) -> CloudQuality:
+    shared = [piece for piece in pieces if np.isfinite(piece.apart_m)]
+    is_shared = len(shared) >= _PIECES_LEAST
+
+    def median(values: list[float]) -> float:
+        return float(np.median(values))
+
+    return CloudQuality(
+        side_m=side_m,
+        n_pieces=len(pieces),
+        sigma_m=median([piece.sigma_m for piece in pieces]),
+        width_95_m=median([piece.width_95_m for piece in pieces]),
+        scan_step_m=median([piece.scan_step_m for piece in pieces]),
+        scans_apart_m=median([piece.apart_m for piece in shared]) if is_shared else None,
+        sigma_apart_m=median([piece.sigma_apart_m for piece in shared]) if is_shared else 0.0,
+    )
