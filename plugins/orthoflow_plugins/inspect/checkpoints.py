@@ -230,16 +230,14 @@ def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) ->
 
 def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
     """Say in words that a rule for outliers ran into its cap."""
-    ending = f"n_outliers_iterated{CAPPED}"
-    for finding in findings:
-        if finding.name.endswith(ending):
-            prefix = finding.name.removesuffix(ending)
-            ctx.warn(
-                f"{finding.name}: the iterated rule for outliers ends at {finding.value:.0f} "
-                f"points, the quarter that it may leave out, though more lie beyond twice the RMS "
-                f"of the rest: the residuals are of two kinds, which the rule cannot part; compare "
-                f"{prefix}n_outliers_once"
-            )
+    capped = [item for item in findings if item.name.endswith(f"n_outliers_iterated{CAPPED}")]
+    if capped:
+        numbers = ", ".join(f"{item.name} {item.value:.0f}" for item in capped)
+        ctx.warn(
+            f"the iterated rule for outliers ends at its cap, a quarter of the points ({numbers}), "
+            f"though more lie beyond twice the RMS of the rest: the residuals are of two kinds, "
+            f"which the rule cannot part; compare n_outliers_once"
+        )
 
 
 def _draw(pictures: Sequence[Picture], points: Sequence[ShownPoint], ctx: StepContext) -> None:

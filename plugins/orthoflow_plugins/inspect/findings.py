@@ -132,9 +132,13 @@ def outliers_iterated(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def cap_binds(length_m: NDArray[np.float64]) -> bool:
-    """Whether the iterated rule would call more of the lengths (n,) outliers if it might."""
-    allowed = np.count_nonzero(_iterated(length_m, _OUTLIERS_MOST))
-    return bool(np.count_nonzero(_iterated(length_m, _MOST_WITHOUT_CAP)) > allowed)
+    """Whether the iterated rule calls as many of the lengths (n,) outliers as it may, too few."""
+    n_most = math.floor(_OUTLIERS_MOST * len(length_m))
+    n_capped, n_all = (
+        int(np.count_nonzero(_iterated(length_m, share)))
+        for share in (_OUTLIERS_MOST, _MOST_WITHOUT_CAP)
+    )
+    return n_capped == n_most < n_all
 
 
 def of_walls(names: Sequence[str]) -> tuple[str, ...]:

@@ -67,7 +67,10 @@ class RasterGrid(Method):
         "depth_noise_mm",
         "scan_step_mm",
         "sigma_median_mm",
+        # By what causes it, too.
         "void_share",
+        "void_*_share",
+        "empty*_share",
         "measured_share",
         "recovered_share",
         "intensity_cosine_power",

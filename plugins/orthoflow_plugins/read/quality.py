@@ -275,8 +275,9 @@ def _step_m(on_surface: NDArray[np.float64]) -> float | None:
     """Median distance of points (n, 2) to the nearest other one; None where all are the same."""
     from scipy.spatial import cKDTree
 
-    distances = cKDTree(on_surface).query(on_surface, k=2)[0][:, 1]
-    apart = distances[distances > 0.0]
+    distances, _ = cKDTree(on_surface).query(on_surface, k=2)
+    apart = np.asarray(distances)[:, 1]
+    apart = apart[apart > 0.0]
     return float(np.median(apart)) if len(apart) else None
 
 

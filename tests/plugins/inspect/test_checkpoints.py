@@ -107,8 +107,11 @@ def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
     metrics, _, ctx = inspect(tmp_path, points_at(surveyed, pixels=places + off), walls, image)
     assert metrics["n_outliers_iterated_capped"] == 5
     (said,) = ctx.warnings
-    assert said.startswith("n_outliers_iterated_capped: the iterated rule for outliers ends at 5 p")
-    assert said.endswith("of two kinds, which the rule cannot part; compare n_outliers_once")
+    assert said == (
+        "the iterated rule for outliers ends at its cap, a quarter of the points "
+        "(n_outliers_iterated_capped 5), though more lie beyond twice the RMS of the rest: the "
+        "residuals are of two kinds, which the rule cannot part; compare n_outliers_once"
+    )
     off[12:] = off[:8]
     metrics, _, ctx = inspect(tmp_path, points_at(surveyed, pixels=places + off), walls, image)
     assert metrics["n_outliers_iterated"] == 0

@@ -80,6 +80,10 @@ def test_a_cap_that_binds_is_told_in_the_name() -> None:
     left = np.sort(two_kinds)[:-17]
     assert found["all_rms_after_iterated_capped_mm"] == pytest.approx(np.sqrt((left**2).mean()))
     assert "all_n_outliers_iterated" not in found
+    # More than the cap would be found, but the rule ends before it: nothing was cut off.
+    few = np.array([3.0, *np.linspace(1.0, 1.2, 17), *np.linspace(0.05, 0.1, 19)])
+    numbers = {item.name: item.value for item in check_findings(few[:, None] * [0.6, 0.8], 0.004)}
+    assert numbers["n_outliers_iterated"] == 1
 
 
 def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: Path) -> None:
