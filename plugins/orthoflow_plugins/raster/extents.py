@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Planes, PointCloud
+from orthoflow.products import Planes
+from orthoflow_plugins.raster.sampled_points import PointsInside, SampledPoints, points_in
 from orthoflow_plugins.raster.selection import area_m2, frame_of
 
 Side = Literal["left", "right", "top", "bottom"]
@@ -27,8 +28,6 @@ Side = Literal["left", "right", "top", "bottom"]
 _GROWTH_MOST_M: Final = 1.0
 _FRONT_MOST_M: Final = 0.5
 _BEHIND_MOST_M: Final = 1.0
-# More points are not read: one of every so many, spread by chance.
-_POINTS_MOST: Final = 1 << 21
 # Voxels: their number, their smallest side along the wall, in points of the sample, and in depth.
 _VOXELS_MOST: Final = 1 << 22
 _SIDE_LEAST_M: Final = 0.03
@@ -118,31 +117,6 @@ class Reach:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class SampledPoints:
-    """Some points of a cloud; offsets (n,) float32 metres from the origin as the cloud has them."""
-
-    origin: NDArray[np.float64]
-    x: NDArray[np.float32]
-    y: NDArray[np.float32]
-    z: NDArray[np.float32]
-    n_represented: float
-
-
-def sampled(cloud: PointCloud) -> SampledPoints:
-    """Take one point of every so many, so that a look at all walls is short."""
-    every = -(-len(cloud) // _POINTS_MOST)
-    index = np.arange(0, len(cloud), every)
-    if every > 1:
-        # Neither rows nor columns of a scan repeat as this does (Fibonacci hashing).
-        turn = (
-            np.arange(index.size, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-        ) >> np.uint64(32)
-        index = np.minimum(index + (turn % np.uint64(every)).astype(np.int64), len(cloud) - 1)
-    x, y, z = (np.ascontiguousarray(axis[index]) for axis in (cloud.x, cloud.y, cloud.z))
-    return SampledPoints(origin=cloud.origin, x=x, y=y, z=z, n_represented=float(every))
-
-
 def extent_of(
     points: SampledPoints, planes: Planes, index: int, reach: Reach, *, threads: int
 ) -> Extent:
@@ -156,7 +130,7 @@ def extent_of(
         threads: how many threads work.
     """
     search = _Search.of(points, planes, index, reach)
-    inside = _inside(points, search.slab, threads=threads)
+    inside = points_in(points, search.slab, threads=threads)
     surface = _surface(inside, search)
     if surface is None:
         return reach.as_set
@@ -238,6 +212,10 @@ class _Search:
             bounds=tuple(_bounds(planes, index, rectangle, (width_m, height_m))),
         )
 
+    def places_m(self, points: PointsInside) -> NDArray[np.float64]:
+        """Metres (2, n) to the right of and below the rectangle's top-left corner."""
+        return self.slab.frame.gsd_m * (points.places - self.n_beside).T
+
     @property
     def n_beside(self) -> int:
         """Cells between the frame's and the rectangle's side."""
@@ -251,25 +229,6 @@ class _Search:
             max(1, int(length_m / side_m)) for length_m in (self.height_m, self.width_m)
         )
         return slice(first, first + rows), slice(first, first + columns)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Inside:
-    """Points that are looked at.
-
-    Attributes:
-        right_m: (n,) metres to the right of the top-left corner of the points' rectangle.
-        down_m: (n,) metres below it.
-        depth_m: (n,) metres before the plane.
-        cells: (n,) cell of each point's voxel.
-        steps: (n,) its step in depth.
-    """
-
-    right_m: NDArray[np.float64]
-    down_m: NDArray[np.float64]
-    depth_m: NDArray[np.float64]
-    cells: NDArray[np.int64]
-    steps: NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,46 +248,21 @@ class _Surface:
     is_own: NDArray[np.bool_]
 
 
-def _inside(points: SampledPoints, slab: Slab, *, threads: int) -> _Inside:
-    from orthoflow.geometry.raster_kernels import BLOCK
-    from orthoflow.geometry.rastering import entries_inside, wall_from_offset
-
-    found, cells = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
-    for entries in entries_inside(points, slab, threads=threads):
-        for block, n_inside in enumerate(entries.n_inside):
-            part = slice(block * BLOCK, block * BLOCK + int(n_inside))
-            found.append(entries.points[part].astype(np.int64))
-            cells.append(entries.cells[part].astype(np.int64))
-    own = np.concatenate(found)
-    offsets_m = np.column_stack([points.x[own], points.y[own], points.z[own]]).astype(np.float64)
-    matrix = wall_from_offset(slab.frame, points.origin)
-    column, row, depth_m = (offsets_m @ matrix[:, :3].T + matrix[:, 3]).T
-    side_m = slab.frame.gsd_m
-    before_m = side_m * math.ceil(_GROWTH_MOST_M / side_m)
-    return _Inside(
-        right_m=side_m * column - before_m,
-        down_m=side_m * row - before_m,
-        depth_m=depth_m,
-        cells=np.concatenate(cells),
-        steps=np.floor((depth_m + slab.behind_m) / _DEPTH_STEP_M).astype(np.int64).clip(0),
-    )
-
-
-def _surface(inside: _Inside, search: _Search) -> _Surface | None:
+def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
     """Find the voxels that hang together with those on the plane; None without any of these."""
     from scipy import ndimage
 
     slab = search.slab
     n_steps = int((slab.front_m + slab.behind_m) / _DEPTH_STEP_M) + 2
     shape = (*slab.frame.shape, n_steps)
+    right_m, down_m = search.places_m(inside)
     is_before = np.ones(len(inside.cells), dtype=np.bool_)
     for bound in search.bounds:
         right, down, depth = bound.slopes
-        distance_m = (
-            bound.offset_m + right * inside.right_m + down * inside.down_m + depth * inside.depth_m
-        )
+        distance_m = bound.offset_m + right * right_m + down * down_m + depth * inside.depth_m
         is_before &= distance_m > bound.noise_m
-    voxels = inside.cells * n_steps + inside.steps
+    steps = np.floor((inside.depth_m + slab.behind_m) / _DEPTH_STEP_M).astype(np.int64).clip(0)
+    voxels = inside.cells * n_steps + steps
     occupied = np.zeros(math.prod(shape), dtype=np.bool_)
     occupied[voxels[is_before]] = True
     bridged = ndimage.maximum_filter1d(
@@ -376,27 +310,28 @@ def _relief_m(depth_m: NDArray[np.float64], search: _Search) -> float:
     return float(opened[-n_least]) + 0.5 * _DEPTH_STEP_M
 
 
-def _growth_m(side: Side, surface: _Surface, inside: _Inside, search: _Search) -> float:
+def _growth_m(side: Side, surface: _Surface, inside: PointsInside, search: _Search) -> float:
     """How far the wall reaches beyond a side of the rectangle of its points."""
     side_m, first = search.slab.frame.gsd_m, search.n_beside
     rows, columns = search.inside
     is_covered = surface.is_covered
+    right_m, down_m = search.places_m(inside)
     if side in {"left", "right"}:
-        is_within = (inside.down_m >= 0.0) & (inside.down_m <= search.height_m)
+        is_within = (down_m >= 0.0) & (down_m <= search.height_m)
     else:
-        is_within = (inside.right_m >= 0.0) & (inside.right_m <= search.width_m)
+        is_within = (right_m >= 0.0) & (right_m <= search.width_m)
     # Lines of cells from the rectangle outwards; the first may lie partly within it.
     lines, beyond_m, within_m = {
-        "left": (is_covered[rows, :first].T[::-1], -inside.right_m, 0.0),
+        "left": (is_covered[rows, :first].T[::-1], -right_m, 0.0),
         "right": (
             is_covered[rows, columns.stop :].T,
-            inside.right_m - search.width_m,
+            right_m - search.width_m,
             search.width_m - side_m * (columns.stop - first),
         ),
-        "top": (is_covered[:first, columns][::-1], -inside.down_m, 0.0),
+        "top": (is_covered[:first, columns][::-1], -down_m, 0.0),
         "bottom": (
             is_covered[rows.stop :, columns],
-            inside.down_m - search.height_m,
+            down_m - search.height_m,
             search.height_m - side_m * (rows.stop - first),
         ),
     }[side]

@@ -25,10 +25,12 @@ from orthoflow_plugins.raster.crops import (
     blank_outside,
     cropped,
 )
-from orthoflow_plugins.raster.extents import Extent, Reach, extent_of, sampled
+from orthoflow_plugins.raster.emptiness import Emptiness, Sight, emptiness_of
+from orthoflow_plugins.raster.extents import Extent, Reach, extent_of
 from orthoflow_plugins.raster.maps import mapped
-from orthoflow_plugins.raster.reporting import report, warn
+from orthoflow_plugins.raster.reporting import report, report_empty, warn
 from orthoflow_plugins.raster.rules import GapRule, RasterRule, Surface, SurfaceRule
+from orthoflow_plugins.raster.sampled_points import SampledPoints, sampled
 from orthoflow_plugins.raster.selection import (
     Constraint,
     Place,
@@ -220,11 +222,14 @@ class RasterGrid(Method):
         """Raster the chosen planes, one pass over the cloud or a few for each."""
         cloud, planes = inputs.cloud, inputs.planes
         cloud.require_points(3)
-        extent_of = _extents(cloud, planes, params, ctx)
+        points = sampled(cloud)
+        extent_of = _extents(points, planes, params, ctx)
         crops = _crops(planes, params, extent_of, ctx)
         slabs = _slabs(params, crops, extent_of)
         rule = _raster_rule(params, threads=ctx.cores)
         rasters: list[WallRaster] = []
+        empty: list[Emptiness] = []
+        sight = Sight(points=points, stations=cloud.stations)
         source = _intensity_source(cloud)
         if params.balance_intensity:
             cloud = balanced(cloud, list(slabs.values()), ctx)
@@ -240,6 +245,7 @@ class RasterGrid(Method):
                     allocate=partial(_allocated, ctx, k),
                 )
             )
+            empty.append(emptiness_of(rasters[-1].wall, slab, sight, threads=ctx.cores))
             outline_px = crops[index].outline_px
             if outline_px is not None:
                 blank_outside(rasters[-1].wall, outline_px)
@@ -247,6 +253,7 @@ class RasterGrid(Method):
         _require_points_near(walls, next(iter(slabs.values())))
         warn(ctx, rasters, source)
         report(ctx, rasters)
+        report_empty(ctx, walls, empty)
         return self.Out(
             walls=Walls(
                 walls=walls,
@@ -265,7 +272,7 @@ class RasterGrid(Method):
 
 
 def _extents(
-    cloud: PointCloud, planes: Planes, params: RasterGrid.Params, ctx: StepContext
+    points: SampledPoints, planes: Planes, params: RasterGrid.Params, ctx: StepContext
 ) -> ExtentOf:
     """How far the wall of each plane reaches, found when it is asked for."""
     reach = Reach(
@@ -275,7 +282,6 @@ def _extents(
     )
     if params.rectangle == "points" and reach.is_set:
         return lambda _: reach.as_set
-    points = sampled(cloud)
 
     @cache
     def extent(index: int) -> Extent:

@@ -13,11 +13,14 @@ from orthoflow.geometry.bands import count_cells
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext
+from orthoflow_plugins.raster.emptiness import Emptiness
 from orthoflow_plugins.raster.walls import WallRaster
 
 # Medians of larger walls are told from some of their rows.
 _CELLS_ASKED: Final = 1 << 26
 _LONGEST_PX: Final = 1400
+# Causes of empty cells are told in words where so many of a wall are.
+_EMPTY_WORTH_WORDS: Final = 0.1
 
 _Number = TypeVar("_Number", np.float32, np.uint32)
 
@@ -67,6 +70,39 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
         _depth_preview(walls[0]),
         f"Depth of {walls[0].name}: brighter is nearer to the viewer, grey is void.",
     )
+
+
+def report_empty(ctx: StepContext, walls: Sequence[Wall], empty: Sequence[Emptiness]) -> None:
+    """Tell why cells are empty: in numbers, and in words where it is many of a wall."""
+    sizes = np.array([wall.mask.size for wall in walls], dtype=np.float64)
+    for cause in ("behind", "hidden", "sparse", "unseen"):
+        shares = [getattr(of_wall, f"{cause}_share") for of_wall in empty]
+        ctx.metric(f"void_{cause}_share", float(sizes @ shares) / float(sizes.sum()), "1")
+    for wall, of_wall in zip(walls, empty, strict=True):
+        if wall.count.any() and of_wall.share >= _EMPTY_WORTH_WORDS:
+            ctx.warn(f"{wall.name}: {of_wall.share:.0%} of its cells are empty: {_causes(of_wall)}")
+
+
+def _causes(empty: Emptiness) -> str:
+    """Causes of empty cells in words, the largest first, with what would change them."""
+    behind = (
+        f"lie behind the buffer, about {empty.behind_m:.2g} m behind the plane (raise "
+        "buffer_behind_m if that is the wall)"
+    )
+    hidden = (
+        "are hidden by what stands before the wall (scan from another station, or raise "
+        "buffer_front_m if it is relief)"
+    )
+    told = [
+        (empty.behind_share, behind),
+        (empty.hidden_share, hidden),
+        (empty.sparse_share, "lie between the scan's points (raise gsd_m or recover_gap_cells)"),
+        (empty.unseen_share, "show nothing that was scanned: glass, or what no station sees"),
+    ]
+    told.sort(key=lambda cause: -cause[0])
+    # Tiles on the rim of a hole belong to it and to what is about it.
+    least = max(0.01, 0.1 * empty.share)
+    return "; ".join(f"{share:.0%} {words}" for share, words in told if share >= least)
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:

@@ -1,0 +1,212 @@
+"""Why cells of a wall are empty: behind the buffer, hidden, finer than the scan, or never seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import SurfaceMask, Wall
+from orthoflow_plugins.raster.sampled_points import SampledPoints, points_in
+
+# Causes are told of tiles of about this side, which hold some points of the sample each.
+_TILE_M: Final = 0.05
+# As many points of the sample as make a surface.
+_POINTS_LEAST: Final = 2
+# What lies farther behind a wall is another room or the street; what stands farther before it than
+# this hides it only where a station is known to look past.
+_BEHIND_MOST_M: Final = 4.0
+_BEFORE_MOST_M: Final = 1.0
+# Rays from the wall to the stations: side of a voxel, how many are filled, how far both ends are
+# left out, and how many tiles are asked.
+_VOXEL_M: Final = 0.1
+_VOXELS_MOST: Final = 1 << 24
+_ENDS_M: Final = 0.35
+_RAYS_MOST: Final = 4000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Emptiness:
+    """What share of a wall's cells is empty, by cause.
+
+    Attributes:
+        behind_share: what was scanned there lies behind the buffer.
+        behind_m: how far behind the plane, median; NaN where nothing does.
+        hidden_share: something stands before the wall.
+        sparse_share: points of the wall lie about the cell, but too far apart.
+        unseen_share: nothing was scanned there.
+    """
+
+    behind_share: float
+    behind_m: float
+    hidden_share: float
+    sparse_share: float
+    unseen_share: float
+
+    @property
+    def share(self) -> float:
+        """Share of all empty cells."""
+        return self.behind_share + self.hidden_share + self.sparse_share + self.unseen_share
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sight:
+    """What was scanned, and from where.
+
+    Attributes:
+        points: of the cloud.
+        stations: (k, 3) world; None where they are not known.
+    """
+
+    points: SampledPoints
+    stations: NDArray[np.float64] | None
+
+    @cached_property
+    def room(self) -> _Room:
+        """Where points are; what they hide is asked of few walls."""
+        return _Room.of(self.points)
+
+
+def emptiness_of(wall: Wall, slab: Slab, sight: Sight, *, threads: int) -> Emptiness:
+    """Tell why cells of a wall are empty.
+
+    Args:
+        wall: the wall.
+        slab: its raster and buffer.
+        sight: what was scanned.
+        threads: how many threads work.
+    """
+    points = sight.points
+    tiles = _tiles(wall, points)
+    n_void = tiles.n_void
+    reach = Slab(frame=tiles.frame, front_m=_BEFORE_MOST_M, behind_m=_BEHIND_MOST_M)
+    around = points_in(points, reach, threads=threads)
+    is_behind, is_before = around.depth_m < -slab.behind_m, around.depth_m > slab.front_m
+    n_behind = np.bincount(around.cells[is_behind], minlength=n_void.size).reshape(n_void.shape)
+    n_before = np.bincount(around.cells[is_before], minlength=n_void.size).reshape(n_void.shape)
+    is_sparse = tiles.n_measured > 0
+    is_hidden = ~is_sparse & (n_before >= _POINTS_LEAST)
+    open_tiles = np.flatnonzero((n_void > 0) & ~is_sparse & ~is_hidden)
+    if sight.stations is not None and len(sight.stations) and len(open_tiles):
+        blocked = _blocked(tiles.frame, open_tiles, sight, sight.stations)
+        is_hidden.ravel()[open_tiles] |= blocked
+    is_behind_tile = ~is_sparse & ~is_hidden & (n_behind >= _POINTS_LEAST)
+    of_tile = is_behind_tile.ravel()[around.cells] & is_behind
+    behind_m = -float(np.median(around.depth_m[of_tile])) if of_tile.any() else math.nan
+    is_unseen = ~is_sparse & ~is_hidden & ~is_behind_tile
+    behind, hidden, sparse, unseen = (
+        float(n_void[of].sum()) / wall.mask.size
+        for of in (is_behind_tile, is_hidden, is_sparse, is_unseen)
+    )
+    return Emptiness(
+        behind_share=behind,
+        behind_m=behind_m,
+        hidden_share=hidden,
+        sparse_share=sparse,
+        unseen_share=unseen,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tiles:
+    """Blocks of cells of a wall.
+
+    Attributes:
+        frame: a cell for each tile; those at the right and below may be cut off by the wall's end.
+        n_void: (rows, cols) void cells in it.
+        n_measured: (rows, cols) cells with a point.
+    """
+
+    frame: WallFrame
+    n_void: NDArray[np.int64]
+    n_measured: NDArray[np.int64]
+
+
+def _tiles(wall: Wall, points: SampledPoints) -> _Tiles:
+    frame = wall.frame
+    rows, columns = frame.shape
+    n_points = max(1.0, float(wall.count.sum(dtype=np.int64)) / points.n_represented)
+    # Three steps of the sample, were its points spread over the whole wall.
+    side_m = max(_TILE_M, 3.0 * frame.gsd_m * math.sqrt(rows * columns / n_points))
+    side = max(1, min(round(side_m / frame.gsd_m), rows, columns))
+    starts = np.arange(0, columns, side)
+    void: list[NDArray[np.int64]] = []
+    measured: list[NDArray[np.int64]] = []
+    for first in range(0, rows, side):
+        band = slice(first, first + side)
+        for cells, sums in (
+            (wall.mask[band] == SurfaceMask.VOID, void),
+            (wall.count[band] > 0, measured),
+        ):
+            sums.append(np.add.reduceat(cells.sum(axis=0, dtype=np.int64), starts))
+    return _Tiles(
+        frame=replace(frame, gsd_m=side * frame.gsd_m, width=len(starts), height=len(void)),
+        n_void=np.array(void),
+        n_measured=np.array(measured),
+    )
+
+
+def _blocked(
+    frame: WallFrame,
+    tiles: NDArray[np.int64],
+    sight: Sight,
+    stations: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Whether something stands between tiles (n,) of a wall's plane and every station."""
+    every = -(-len(tiles) // _RAYS_MOST)
+    asked = tiles[::every]
+    places = np.column_stack([asked % frame.width, asked // frame.width]).astype(np.float64) + 0.5
+    starts = frame.world_from_wall(places) - sight.points.origin
+    room = sight.room
+    is_blocked = np.ones(len(asked), dtype=np.bool_)
+    for station in np.unique(stations, axis=0):
+        ways = station - sight.points.origin - starts
+        lengths_m = np.linalg.norm(ways, axis=1)
+        faces = ways @ frame.normal_world > 0.0
+        ways /= np.maximum(lengths_m, 1e-9)[:, None]
+        is_met = ~faces
+        for along_m in np.arange(_ENDS_M, float(lengths_m.max()) - _ENDS_M, 0.5 * room.side_m):
+            going = ~is_met & (along_m < lengths_m - _ENDS_M)
+            is_met[going] = room.holds(starts[going] + along_m * ways[going])
+        is_blocked &= is_met
+    return np.repeat(is_blocked, every)[: len(tiles)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Room:
+    """Which voxels of the room hold points; places are offsets of the cloud."""
+
+    low_m: NDArray[np.float64]
+    side_m: float
+    occupied: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, points: SampledPoints) -> _Room:
+        axes = (points.x, points.y, points.z)
+        # Single points far out must not make voxels coarse.
+        low, high = np.array([np.percentile(axis, (0.1, 99.9)) for axis in axes]).T
+        low, high = low - 2.0 * _VOXEL_M, high + 2.0 * _VOXEL_M
+        side_m = max(_VOXEL_M, float(np.cbrt((high - low).prod() / _VOXELS_MOST)))
+        shape = np.ceil((high - low) / side_m).astype(np.int64) + 1
+        places = np.column_stack(
+            [(axis - start) / side_m for axis, start in zip(axes, low, strict=True)]
+        )
+        inside = ((places >= 0.0) & (places < shape)).all(axis=1)
+        voxels = np.ravel_multi_index(tuple(places[inside].astype(np.int64).T), tuple(shape))
+        # One stray point hides nothing.
+        counts = np.bincount(voxels, minlength=int(shape.prod())).reshape(tuple(shape))
+        return cls(low_m=low, side_m=side_m, occupied=counts >= _POINTS_LEAST)
+
+    def holds(self, places: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether points lie in the voxels of places (n, 3)."""
+        voxels = np.floor((places - self.low_m) / self.side_m).astype(np.int64)
+        inside = ((voxels >= 0) & (voxels < self.occupied.shape)).all(axis=1)
+        held = np.zeros(len(places), dtype=np.bool_)
+        held[inside] = self.occupied[tuple(voxels[inside].T)]
+        return held
