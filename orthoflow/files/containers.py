@@ -25,6 +25,7 @@ _ICC_MAGIC: Final = b"ICC_PROFILE\x00"
 _FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _WIDTH_TAG: Final = 0x100
 _HEIGHT_TAG: Final = 0x101
+_BITS_TAG: Final = 0x102
 _ICC_TAG: Final = 34675
 # Profiles of cameras take some kilobytes; a packed one that grows beyond this is none.
 _ICC_MOST: Final = 1 << 24
@@ -77,6 +78,19 @@ def stated_size(encoded: bytes) -> tuple[int, int] | None:
             width_px, height_px = main.number(_WIDTH_TAG), main.number(_HEIGHT_TAG)
             if width_px is not None and height_px is not None:
                 return int(width_px), int(height_px)
+    return None
+
+
+def stated_bits(encoded: bytes) -> int | None:
+    """Bits per channel as a PNG or TIFF file states them; None where it does not."""
+    match image_format(encoded):
+        case "PNG":
+            chunk = next(_png_chunks(encoded), None)
+            if chunk is not None and chunk.kind == b"IHDR" and chunk.end - chunk.start >= 9:
+                return encoded[chunk.start + 8]
+        case "TIFF":
+            bits = read_directory(encoded, most_bytes=len(encoded)).number(_BITS_TAG)
+            return None if bits is None else int(bits)
     return None
 
 

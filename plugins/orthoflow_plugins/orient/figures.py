@@ -41,6 +41,9 @@ _PHOTOS_MOST: Final = 30
 _ROW_SHARE: Final = 0.8
 _BAR_COLOUR: Final = "#9db8d2"
 _CURVE_COLOUR: Final = "#b03a2e"
+# Of the plan of photos: length of an arrow, and points of a photo's control.
+_VIEW_M: Final = 0.4
+_CONTROL_MOST: Final = 300
 _PERCENTILE: Final = 99.5
 _KINDS: Final = (TieRole.CONTROL, TieRole.CHECK)
 
@@ -131,6 +134,46 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         )
 
 
+def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
+    """Draw where the photos were taken, and the control, along the first wall and facing it.
+
+    After skarlatos2012, Figure 3. Of a floor the second view is its plan.
+
+    Args:
+        ctx: takes the picture.
+        candidates: of the photos that are ok.
+    """
+    from matplotlib.figure import Figure
+
+    walls = {wall.index: wall for candidate in candidates for wall in candidate.known}
+    if not walls:
+        return
+    first = walls[min(walls)]
+    sides = first.corners_world[[3, 1]] - first.corners_world[0]
+    axes_world = np.vstack([sides / np.linalg.norm(sides, axis=1)[:, None], first.normal])
+    origin = first.corners_world[0]
+    figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+    panels = figure.subplots(1, 2)
+    for panel, axis, label in zip(panels, (2, 1), ("before it", "down it"), strict=True):
+        shown = axes_world[[0, axis]].T
+        for wall in walls.values():
+            ring = (wall.corners_world[[0, 1, 2, 3, 0]] - origin) @ shown
+            panel.plot(*ring.T, color="#888888", linewidth=0.8)
+        for candidate in candidates:
+            _draw_position(panel, candidate, origin, shown)
+        panel.set_aspect("equal")
+        panel.set_xlabel("along the first wall [m]", fontsize=8)
+        panel.set_ylabel(f"{label} [m]", fontsize=8)
+        panel.tick_params(labelsize=7)
+    panels[1].invert_yaxis()
+    ctx.figure(
+        "positions",
+        figure,
+        "Where the oriented photos were taken and which way they look, with their control: seen "
+        "along the first wall (left) and facing it (right); of a floor the right view is its plan.",
+    )
+
+
 def draw_residuals(ctx: StepContext, photos: Sequence[PhotoResiduals]) -> None:
     """Draw histograms of the residuals of oriented photos, all together and each by itself."""
     pooled = {
@@ -141,6 +184,20 @@ def draw_residuals(ctx: StepContext, photos: Sequence[PhotoResiduals]) -> None:
     if drawn:
         _draw_pooled(ctx, drawn)
         _draw_each(ctx, photos, drawn)
+
+
+def _draw_position(
+    axes: Axes, candidate: Candidate, origin: NDArray[np.float64], shown: NDArray[np.float64]
+) -> None:
+    """Draw a photo's place, view and control onto two axes (3, 2) of the world."""
+    camera = candidate.estimate.resection.camera
+    control = (candidate.seen.points_world[candidate.control] - origin) @ shown
+    step = max(1, len(control) // _CONTROL_MOST)
+    axes.plot(*control[::step].T, ".", markersize=1.0, color="#30a040")
+    x, y = ((camera.centre_world - origin) @ shown).tolist()
+    across, down = (_VIEW_M * camera.rotation[2] @ shown).tolist()
+    axes.arrow(x, y, across, down, head_width=0.2 * _VIEW_M, color=_CURVE_COLOUR, linewidth=0.8)
+    axes.annotate(candidate.photo.name, (x, y), fontsize=5.5)
 
 
 def _figure_name(prefix: str, photo_name: str) -> str:

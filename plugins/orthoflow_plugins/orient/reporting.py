@@ -11,6 +11,7 @@ from orthoflow.products import Cameras, JsonValue, Photo, TieRole, Ties
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.orient.figures import (
     PhotoResiduals,
+    draw_positions,
     draw_residuals,
     draw_ties,
     draw_wall_errors,
@@ -44,7 +45,9 @@ def hand_over(
         status = f"Status: {oriented.camera.status}"
         draw_ties(ctx, photo, ties.pixels_photo[mine], role[mine], status)
     _measure(ctx, found)
-    draw_wall_errors(ctx, [item.candidate for item in found if item.candidate is not None])
+    candidates = [item.candidate for item in found if item.candidate is not None]
+    draw_wall_errors(ctx, candidates)
+    draw_positions(ctx, candidates)
     draw_residuals(
         ctx,
         [

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import intrinsics_for, matching_pattern, read_calibration
-from orthoflow.files.containers import image_format, is_cut_off
+from orthoflow.files.containers import image_format, is_cut_off, stated_bits
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57Image, read_e57_images
 from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
@@ -23,6 +23,13 @@ from orthoflow.products import Calibration, InputFiles, Intrinsics, Photo, Photo
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.figures import ContactSheet
 
+# What cameras call their raw photos.
+_RAW: Final = frozenset(
+    {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef"}
+    | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
+)
+# Bits per channel that orthoimages have.
+_BITS: Final = 8
 _SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"})
 _NAMED: Final = 3
 
@@ -186,6 +193,17 @@ def _sources(ctx: StepContext, files: InputFiles, panoramas: Sequence[str]) -> l
             f"{len(others)} of {len(files.paths)} files of the input {files.name} are no JPEG, "
             f"PNG or TIFF and were left out: {_names(others)}"
         )
+    developed = {Path(source.name).stem.lower() for source in sources}
+    raw = [
+        name
+        for name in others
+        if Path(name).suffix.lower() in _RAW and Path(name).stem.lower() not in developed
+    ]
+    if raw:
+        ctx.warn(
+            f"{_counted(raw)}: camera raw, which is not read: develop it to TIFF or JPEG first, "
+            "without lens corrections, so that the calibration holds"
+        )
     return sorted(sources, key=lambda source: source.name)
 
 
@@ -265,6 +283,9 @@ def _described(read: _ReadPhoto) -> str:
 
 
 def _warn(ctx: StepContext, read: Sequence[_ReadPhoto], calibration: Calibration | None) -> None:
+    deep = [item.photo.name for item in read if (stated_bits(item.photo.encoded) or 0) > _BITS]
+    if deep:
+        ctx.warn(f"{_counted(deep)}: more than {_BITS} bits per channel, of which {_BITS} are used")
     damaged = [item.photo.name for item in read if item.exif.is_damaged]
     if damaged:
         ctx.warn(f"the EXIF data of {_counted(damaged)} are damaged; what is readable was taken")

@@ -14,6 +14,7 @@ from orthoflow_plugins.orient import figures
 from orthoflow_plugins.orient.figures import (
     PhotoResiduals,
     _normal,
+    draw_positions,
     draw_residuals,
     draw_ties,
     draw_wall_errors,
@@ -149,6 +150,49 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     rgb[~seen] = (20, 40, 60)
     shown = np.array(drawings["wall_3_predicted_error"])
     np.testing.assert_array_equal(shown, rgb.repeat(8, axis=0).repeat(8, axis=1))
+
+
+# --- where photos were taken ---
+
+
+def test_photos_stand_before_the_wall_and_look_at_it(
+    drawings: dict[str, Any], tmp_path: Path
+) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    corners = np.array([[1.0, 0.0, 2.0], [1.0, 0.0, 0.0], [9.0, 0.0, 0.0], [9.0, 0.0, 2.0]])
+    wall = SimpleNamespace(index=0, corners_world=corners, normal=np.array([0.0, -1.0, 0.0]))
+    looks = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    camera = SimpleNamespace(centre_world=np.array([4.0, -3.0, 1.5]), rotation=looks)
+    points = np.array([[2.0, 0.0, 1.0], [3.0, -0.1, 0.5], [8.0, 0.0, 1.9]])
+    candidates: Any = [
+        SimpleNamespace(
+            known=(wall,),
+            estimate=SimpleNamespace(resection=SimpleNamespace(camera=camera)),
+            seen=SimpleNamespace(points_world=points),
+            control=np.array([True, True, False]),
+            photo=SimpleNamespace(name="a.jpg"),
+        )
+    ]
+    draw_positions(context, candidates)
+    above, facing = drawings["positions"].axes
+    for panel, place, control in (
+        (above, (3.0, 3.0), [[1.0, 0.0], [2.0, 0.1]]),
+        (facing, (3.0, 0.5), [[1.0, 1.0], [2.0, 1.5]]),
+    ):
+        (name,) = panel.texts
+        assert name.get_text() == "a.jpg"
+        assert name.xy == pytest.approx(place)
+        np.testing.assert_allclose(panel.lines[1].get_xydata(), control, atol=1e-12)
+    # It looks along -n: down in the view from above.
+    (arrow,) = above.patches
+    assert arrow.get_xy()[:, 1].min() < 2.65
+    assert facing.yaxis_inverted()
+
+
+def test_without_an_oriented_photo_no_places_are_drawn(tmp_path: Path) -> None:
+    context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
+    draw_positions(context, [])
+    assert not context.figures
 
 
 # --- residuals ---

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from orthoflow_plugins.read.photos import ReadPhotos
@@ -185,6 +186,31 @@ def test_other_files_are_left_out_and_counted(tmp_path: Path, read: Reader) -> N
         "4 of 5 files of the input photos are no JPEG, PNG or TIFF and were left out: "
         "a.jpg.camera, Thumbs.db, b.CR2 ..." in read.warnings
     )
+
+
+def test_raw_photos_that_nobody_developed_are_named_with_the_way_out(
+    tmp_path: Path, read: Reader
+) -> None:
+    photo = encode_jpeg(made.picture())
+    read(*made.write(tmp_path, {"a.jpg": photo, "A.CR2": b"II*\0", "b.nef": b"MM\0*"}))
+    assert (
+        "photo b.nef: camera raw, which is not read: develop it to TIFF or JPEG first, without "
+        "lens corrections, so that the calibration holds" in read.warnings
+    )
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_photos_of_sixteen_bits_are_told_to_be_used_with_eight(
+    tmp_path: Path, read: Reader, suffix: str
+) -> None:
+    picture = made.picture()
+    for name, values in (("deep", picture.astype(np.uint16) * 257), ("plain", picture)):
+        done, encoded = cv2.imencode(suffix, values)
+        assert done
+        (tmp_path / f"{name}{suffix}").write_bytes(encoded.tobytes())
+    read(tmp_path / f"deep{suffix}", tmp_path / f"plain{suffix}")
+    said = f"photo deep{suffix}: more than 8 bits per channel, of which 8 are used"
+    assert said in read.warnings
 
 
 def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: Reader) -> None:
