@@ -85,6 +85,7 @@ def room(seed: int, gap: str, chosen: argparse.Namespace) -> tuple[Photos, Walls
             "photo_layout": chosen.layout,
             "photo_gsd_m": chosen.photo_gsd_m,
             "spectral_gap": gap,
+            "spectral_inversion_share": getattr(chosen, "inverted", None),
             "textile_share": 0.33,
         }
     )

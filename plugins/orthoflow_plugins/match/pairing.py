@@ -97,6 +97,8 @@ class PhotoPairs:
         radius_px: matches were also searched so far from where a homography puts them; a wrong
             one's matches lie evenly within this.
         is_mirrored: the walls recognise the mirrored photo better; then none counts as shown.
+        n_recognised: matches that agreed before others were searched where these put them.
+        picture: what of the photo was matched.
     """
 
     features: Features
@@ -104,6 +106,8 @@ class PhotoPairs:
     pairs: tuple[Pair, ...]
     radius_px: float
     is_mirrored: bool = False
+    n_recognised: int = 0
+    picture: str = "grey"
 
     @property
     def n_verified(self) -> int:
@@ -139,13 +143,13 @@ def pair_photo(
         return first
     if seeker.n_verified_mirrored(first, walls) > first.n_verified:
         refused = tuple(replace(pair, is_shown=False, homography=None) for pair in first.pairs)
-        return replace(first, pairs=refused, is_mirrored=True)
+        return replace(first, pairs=refused, is_mirrored=True, n_recognised=first.n_verified)
     wanted = min(seeker.finest, first.scale * _cells_per_pixel(first, walls))
     if abs(math.log(wanted / first.scale)) > _LOG_SCALE_APART:
         key_points = seeker.key_points(wanted)
     second = seeker.pairs(key_points, _shown(first, walls))
     best = second if second.n_verified > first.n_verified else first
-    return _completed(best, walls, rule)
+    return replace(_completed(best, walls, rule), n_recognised=best.n_verified)
 
 
 def side_matches(

@@ -7,11 +7,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
+from orthoflow.products import JsonValue, Photo, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import FeatureRule, Features
 from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
+from orthoflow_plugins.match.mixtures import pair_in_colours
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.paper import (
@@ -28,12 +29,13 @@ class MatchSift(Method):
     """Match photos with the intensity rasters of the walls: RootSIFT, mutual, ratio test.
 
     Every photo is tried on every wall, by its strongest key points first, then by all on the walls
-    recognised; walls on which the matches do not agree roughly with a homography keep them as
-    rejected. Ties carry the surface's depth, so relief counts.
+    recognised; where its grey shows none clearly, mixtures of its colours are tried too. Walls on
+    which the matches do not agree roughly with a homography keep them as rejected. Ties carry the
+    surface's depth, so relief counts.
     """
 
     id: ClassVar[str] = "match.sift"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",
@@ -94,6 +96,11 @@ class MatchSift(Method):
             description="Matches that must agree with one homography for a wall to count as "
             "shown by a photo.",
         )
+        tries_colours: bool = Field(
+            default=True,
+            description="Whether photos whose grey shows no wall clearly are tried in mixtures of "
+            "their colours, as a laser that sees red dark may show it.",
+        )
         longest_side_max_px: int = Field(
             default=4000,
             ge=200,
@@ -135,9 +142,13 @@ class MatchSift(Method):
         pieces: list[TiePiece] = []
         notes: dict[str, JsonValue] = {}
         radii_px: list[float] = []
-        paired = one_by_one(
-            lambda photo: pair_photo(photo_grey(photo), on_walls, rule), photos.photos, ctx.cores
-        )
+
+        def pair(photo: Photo) -> PhotoPairs:
+            if params.tries_colours:
+                return pair_in_colours(photo, on_walls, rule)
+            return pair_photo(photo_grey(photo), on_walls, rule)
+
+        paired = one_by_one(pair, photos.photos, ctx.cores)
         for index, (photo, pairs) in enumerate(zip(photos.photos, paired, strict=True)):
             ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
             pieces += _pieces(index, pairs, on_walls, walls)
@@ -223,6 +234,7 @@ def _note(ctx: StepContext, name: str, pairs: PhotoPairs, walls: Walls) -> JsonV
         ctx.warn(f"photo {name}: no wall is recognised in it, so it gets no ties")
     return {
         "n_key_points": len(pairs.features),
+        "picture": pairs.picture,
         "scale": pairs.scale,
         "walls": list(shown),
         "n_matches": sum(len(pair.matches) for pair in pairs.pairs),
