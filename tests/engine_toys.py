@@ -9,7 +9,8 @@ from toy_plugin.mischief_names import MISCHIEF
 WORKS = ["add", "noise", "sign", "slow", "segfault", "abort", "eat", "hang", "stubborn", "quit",
          "leave", "raises", "refuses", "unreadable", "needs_library", "no_memory", "full_disk",
          "changes_input", "wrong_type", "wrong_out", "bad_param", "draws", "chatty", "unstorable",
-         "spawns", "spawns_and_waits", "threads", "fills_mapped", "compiles", "loads"]
+         "spawns", "spawns_and_waits", "threads", "fills_mapped", "compiles", "loads",
+         "bad_disk"]
 
 @hookimpl
 def orthoflow_kinds():
@@ -294,6 +295,11 @@ def no_memory(values, params, ctx):
 @work("exact")
 def full_disk(values, params, ctx):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(ctx.scratch / "x"))
+
+@work("exact")
+def bad_disk(values, params, ctx):
+    place = ctx.scratch / "x" if params.steps else "/elsewhere/x"
+    raise OSError(int(params.amount), os.strerror(int(params.amount)), str(place))
 
 @work("exact")
 def changes_input(values, params, ctx):

@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 FAULTS = ("full disk", "bad disk", "kill", "power loss")
+# How a disk fails; the first two also who reads.
+_BROKEN = (errno.EIO, errno.ESTALE, errno.EROFS)
 _WRITING = os.O_WRONLY | os.O_RDWR
 _REAL = {
     name: getattr(os, name)
@@ -145,7 +147,8 @@ class FaultyFiles:
         if self.count != self._operation:
             return
         if self._fault == "bad disk":
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+            number = self._rng.choice(_BROKEN[:2] if is_reading else _BROKEN)
+            raise OSError(number, os.strerror(number), str(path))
         if self._fault == "power loss":
             self._volatile.lose(self._folder, self._rng)
         os.kill(os.getpid(), signal.SIGKILL)

@@ -17,11 +17,25 @@ _REASONS = {
     errno.ENOSPC: "No space left on the disk; free some, or choose another folder",
     errno.EDQUOT: "the disk quota is used up; free some space, or choose another folder",
     errno.EFBIG: "the file would be larger than allowed here; choose another folder",
+    errno.EIO: "Input/output error, the disk or the way to it fails; choose another folder",
+    errno.ESTALE: "Stale file handle, the disk is not connected any more; connect it anew",
     errno.EROFS: "the disk is read-only; choose another folder",
     errno.EACCES: "permission is denied; choose another folder",
     errno.EPERM: "permission is denied; choose another folder",
     errno.ENOTDIR: "a file stands where a folder is needed; choose another folder",
 }
+
+# What no method is to blame for when it happens in the store.
+_BROKEN = frozenset({errno.EIO, errno.ESTALE, errno.EROFS, errno.ENODEV, errno.ENXIO})
+
+
+def is_broken(error: OSError, folder: Path) -> bool:
+    """Whether an error says that the disk on which a folder lies fails, and not that it is full."""
+    if error.errno not in _BROKEN:
+        return False
+    # Descriptors have no names.
+    named = isinstance(error.filename, str | bytes)
+    return not named or Path(os.fsdecode(error.filename)).is_relative_to(folder)
 
 
 def store_error(error: OSError, folder: Path) -> StoreError:

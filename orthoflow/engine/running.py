@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from orthoflow.engine.clock import now
-from orthoflow.engine.durability import store_error, writing_to
+from orthoflow.engine.durability import is_broken, store_error, writing_to
 from orthoflow.engine.file_digests import file_identity, file_sha256
 from orthoflow.engine.loading import LoadingMeter
 from orthoflow.engine.memory import MIB, MemorySampler, is_for_want_of_memory
@@ -130,10 +130,8 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
         return PluginError(
             f"{task.who} needs {missing}, which is missing or fails to import: {one_line(error)}"
         )
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        # No StoreError: the method wanted more than there is, and stands failed in the record.
-        kind = StepFailedError if error.errno == errno.EFBIG else DiskSpaceError
-        return kind(str(store_error(error, Path(task.store))))
+    if isinstance(error, OSError) and (refused := _disk_failure(error, Path(task.store))):
+        return refused
     if isinstance(error, ValueError) and "read-only" in one_line(error):
         return MethodError(
             f"{task.who} writes to an array that is read-only, as all its inputs are ({error}); it "
@@ -143,6 +141,14 @@ def explain_failure(task: Task, error: BaseException) -> OrthoflowError:
     if isinstance(error, SystemExit):
         said = f"tried to end the program ({one_line(error.code)})"
     return MethodError(f"{task.who} {said}")
+
+
+def _disk_failure(error: OSError, store: Path) -> OrthoflowError | None:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        # No StoreError: the method wanted more than there is, and stands failed in the record.
+        kind = StepFailedError if error.errno == errno.EFBIG else DiskSpaceError
+        return kind(str(store_error(error, store)))
+    return store_error(error, store) if is_broken(error, store) else None
 
 
 class _News:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import resource
@@ -142,6 +143,24 @@ def test_a_full_disk_in_a_method_names_the_store(world: World) -> None:
     assert result.error_message.startswith(
         f"cannot write to {world.store.folder}: No space left on the disk"
     )
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.EROFS])
+def test_a_broken_disk_is_the_stores_fault_and_the_same_command_goes_on(
+    world: World, number: int
+) -> None:
+    steps = """
+steps:
+  a: {use: make.range}
+  b: {use: work.bad_disk, in: {numbers: a.numbers}, params: {amount: %s, steps: %s}}
+"""
+    broken = world.run(steps % (number, 1), executor="inline").results["b"]
+    assert broken.error_type == "StoreError"
+    assert broken.error_message.startswith(f"cannot write to {world.store.folder}: ")
+    # What lies elsewhere is the method's own business.
+    other = world.run(steps % (number, 0), into="other", executor="inline").results["b"]
+    assert other.error_type == "MethodError"
+    assert "/elsewhere/x" in other.error_message
 
 
 CRASHES = {

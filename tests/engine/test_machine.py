@@ -369,7 +369,12 @@ def test_a_file_system_without_locks_is_said(
         (errno.EACCES, "permission is denied; choose another folder"),
         (errno.EPERM, "permission is denied; choose another folder"),
         (errno.ENOTDIR, "a file stands where a folder is needed; choose another folder"),
-        (errno.EIO, "as the kernel says"),
+        (
+            errno.EIO,
+            "Input/output error, the disk or the way to it fails; choose another folder",
+        ),
+        (errno.ESTALE, "Stale file handle, the disk is not connected any more; connect it anew"),
+        (errno.EBADMSG, "as the kernel says"),
     ],
     ids=errno.errorcode.get,
 )

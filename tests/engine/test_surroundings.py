@@ -1,0 +1,272 @@
+"""Runs where a machine is not as a desk has it: no home, odd folders, few files, a clock gone back.
+
+Root may write everywhere; where a test is about rights, it gives these up for the command.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from orthoflow.records import open_run, verify_run
+from tests.engine_world import install_toys, toy_world
+from tests.killed_runs import ROOT, run_here
+from tests.stored_runs import WORKFLOW
+
+YEAR_S = 365 * 86_400
+NOBODY = 65534
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_PR_CAPBSET_DROP = 24
+_RIGHTS_OF_ROOT = (1, 2, 3)  # to write, to read and to change what belongs to others
+
+
+@dataclass(frozen=True)
+class Desk:
+    """A folder with a workflow of toys, in which commands run as processes of their own."""
+
+    folder: Path
+
+    def __call__(
+        self,
+        *arguments: str,
+        environment: Mapping[str, str | None] | None = None,
+        before: Callable[[], object] = lambda: None,
+    ) -> tuple[int, str]:
+        """Run a command as a user without the rights of root; exit code, and what it said."""
+        changed = {**os.environ, "PYTHONPATH": self.python_path, **(environment or {})}
+
+        def prepare() -> None:
+            for capability in _RIGHTS_OF_ROOT:
+                _LIBC.prctl(_PR_CAPBSET_DROP, capability, 0, 0, 0)
+            before()
+
+        done = subprocess.run(
+            [sys.executable, "-m", "orthoflow", *arguments],
+            cwd=self.folder,
+            env={name: value for name, value in changed.items() if value is not None},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+            preexec_fn=prepare,
+        )
+        return done.returncode, done.stderr
+
+    @property
+    def python_path(self) -> str:
+        parts = (ROOT, ROOT / "plugins", ROOT / "provenance", self.folder / "site")
+        return os.pathsep.join(map(str, parts))
+
+    def run(self, name: str = "run", **more: object) -> tuple[int, str]:
+        return self("run", "toy.yaml", "-o", name, **more)  # type: ignore[arg-type]
+
+
+def desk_in(folder: Path) -> Desk:
+    folder.mkdir(parents=True)
+    install_toys(folder / "site")
+    (folder / "toy.yaml").write_text(WORKFLOW)
+    (folder / "numbers.txt").write_text("3 1 4 1 5")
+    return Desk(folder)
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    return desk_in(tmp_path / "desk")
+
+
+def check_finished(desk: Desk, name: str = "run") -> None:
+    assert verify_run(desk.folder / name).findings == ()
+    assert {cell.status for cell in open_run(desk.folder / name).cells.values()} == {"ok"}
+
+
+def check_sentence(said: str, *parts: str) -> None:
+    assert "Traceback" not in said
+    assert "orthoflow itself failed" not in said
+    assert "error: " in said
+    for part in parts:
+        assert part in said
+
+
+# Homes and folders --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("home", ["unset", "unwritable", "a file"])
+def test_no_home_is_needed(desk: Desk, home: str) -> None:
+    place = desk.folder.parent / "home"
+    if home == "unwritable":
+        place.mkdir(mode=0o500)
+    if home == "a file":
+        place.touch()
+    value = None if home == "unset" else str(place)
+    cleared = dict.fromkeys(("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "NUMBA_CACHE_DIR"))
+    environment = {"HOME": value, "MPLCONFIGDIR": None, **cleared}
+    code, said = desk.run(environment=environment)
+    assert code == 0, said
+    check_finished(desk)
+    for command in (("report", "run"), ("compare", "run", "run")):
+        code, said = desk(*command, environment=environment)
+        assert code == 0, said
+        assert "Traceback" not in said
+    assert place.exists() == (home in ("unwritable", "a file"))
+    assert not place.is_dir() or not list(place.iterdir())
+
+
+def test_a_folder_may_have_any_name_of_any_length(tmp_path: Path) -> None:
+    name = 'Стена «"Восток"», d\'été $HOME `x` %s {0} [1] *'
+    desk = desk_in(tmp_path / name / name / name / name)
+    assert len(str(desk.folder)) > 200
+    code, said = desk.run(environment={"HOME": str(desk.folder)})
+    assert code == 0, said
+    check_finished(desk)
+    for command in (
+        ("report", "run"),
+        ("verify", "run"),
+        ("export", "run", "--to", "ro-crate", "-o", "crate"),
+        ("replay", "crate", "-o", "again", "--input", f"numbers={desk.folder / 'numbers.txt'}"),
+        ("cache", "verify"),
+        ("cache", "gc"),
+    ):
+        code, said = desk(*command, environment={"HOME": str(desk.folder)})
+        assert code == 0, said
+    check_finished(desk, "again")
+
+
+# Rights -------------------------------------------------------------------------------------------
+
+
+def read_only(folder: Path) -> None:
+    for path in (folder, *folder.rglob("*")):
+        if not path.is_symlink():
+            path.chmod(path.stat().st_mode & ~0o222)
+
+
+def test_what_may_only_be_read_is_read_and_nothing_else(desk: Desk) -> None:
+    assert desk.run()[0] == 0
+    read_only(desk.folder)
+    for command in (
+        ("show", "run"),
+        ("verify", "run"),
+        ("plan", "toy.yaml"),
+        ("cache", "list"),
+    ):
+        code, said = desk(*command)
+        assert code == 0, said
+    for command in (
+        ("run", "toy.yaml", "-o", "second"),
+        ("report", "run"),
+        ("export", "run", "--to", "ro-crate", "-o", "crate"),
+        ("replay", "run", "-o", "again", "--input", "numbers=numbers.txt"),
+        ("cache", "gc"),
+        ("cache", "verify"),
+    ):
+        code, said = desk(*command)
+        # 2: where an export goes is an argument.
+        assert code in (1, 2), (command, said)
+        check_sentence(said, "ermission")
+    check_finished(desk)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+@pytest.mark.parametrize("is_open", [False, True], ids=["theirs", "shared"])
+def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
+    desk: Desk, *, is_open: bool
+) -> None:
+    assert desk.run()[0] == 0
+    store = desk.folder / ".orthoflow"
+    for path in (store, *store.rglob("*")):
+        os.chown(path, NOBODY, NOBODY)
+        path.chmod(0o777 if is_open else 0o755 if path.is_dir() else 0o644)
+    code, said = desk.run("second")
+    if is_open:
+        assert code == 0, said
+        assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
+        check_finished(desk, "second")
+    else:
+        assert code == 1, said
+        check_sentence(said, "permission is denied; choose another folder")
+    assert desk("cache", "gc")[0] == (0 if is_open else 1)
+
+
+# What a machine has too little of -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_files", [12, 20, 64])
+def test_few_open_files_are_enough_or_are_said(desk: Desk, n_files: int) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (n_files, n_files))
+
+    code, said = desk.run(before=limit)
+    if n_files == 64:
+        assert code == 0, said
+    if code != 0:
+        assert code in (1, 4), said
+        check_sentence(said)
+        assert desk.run()[0] == 0
+    check_finished(desk)
+
+
+@pytest.mark.parametrize("mib", [250, 350, 600])
+def test_too_little_memory_is_said_and_nothing_is_lost(desk: Desk, mib: int) -> None:
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (mib << 20, mib << 20))
+
+    # Each thread of OpenBLAS takes address space of its own.
+    code, said = desk.run(before=limit, environment={"OPENBLAS_NUM_THREADS": "1"})
+    if code != 0:
+        assert code in (1, 4), said
+        check_sentence(said)
+        assert desk.run()[0] == 0
+    check_finished(desk)
+
+
+# Clocks -------------------------------------------------------------------------------------------
+
+
+def test_files_from_the_future_are_taken_as_any_others(desk: Desk) -> None:
+    assert desk.run()[0] == 0
+    for path in desk.folder.rglob("*"):
+        if path.is_file():
+            state = path.stat()
+            os.utime(path, (state.st_atime + YEAR_S, state.st_mtime + YEAR_S))
+    code, said = desk.run("second")
+    assert code == 0, said
+    assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
+    for command in (("cache", "verify"), ("cache", "list"), ("cache", "gc", "--older-than", "1")):
+        assert desk(*command)[0] == 0
+    assert desk.run("third")[0] == 0
+    assert all(cell.cached_from for cell in open_run(desk.folder / "third").cells.values())
+
+
+def test_a_clock_that_goes_back_changes_dates_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every look at the clock gives a time a year before the last one."""
+    looks = iter(range(1_000))
+
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
+            return datetime(2026, 11, 23, tzinfo=UTC) - timedelta(days=365 * next(looks))
+
+    monkeypatch.setattr("orthoflow.engine.clock.datetime", Clock)
+    desk = desk_in(tmp_path / "desk")
+    monkeypatch.chdir(desk.folder)
+    with toy_world(desk.folder):
+        for name in ("first", "second"):
+            assert run_here(("run", "toy.yaml", "-o", name, "--executor", "inline")) == 0
+            check_finished(desk, name)
+        for command in (("verify", "second"), ("show", "second"), ("compare", "first", "second")):
+            assert run_here(command) == 0
+    cells = open_run(desk.folder / "second").cells.values()
+    assert all(cell.cached_from for cell in cells)
+    assert next(looks) > 4
