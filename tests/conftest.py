@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
+from tests.long_loops import IS_LONG
 
 _ROOT = Path(__file__).resolve().parents[1]
 
@@ -38,6 +40,15 @@ os.environ.setdefault(
     "NUMBA_CACHE_DIR",
     str(Path(tempfile.gettempdir()) / f"orthoflow-kernels-{os.getuid()}-{_kernels_digest()}"),
 )
+
+# The same examples on every machine, however slow it is; the long loop draws others each time.
+settings.register_profile(
+    "everywhere",
+    deadline=None,
+    derandomize=not IS_LONG,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("everywhere")
 
 # A PNG of one pixel.
 _DOT: Final = b64decode(

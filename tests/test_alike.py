@@ -76,6 +76,6 @@ def test_a_sentence_of_its_own_stays_as_it_is() -> None:
 @pytest.mark.parametrize("letter", ["a", '"', "'", "\0", "1", ".", "a.b, "])
 def test_long_texts_of_strangers_take_no_time(letter: str) -> None:
     texts = [("x", letter * (2000 // len(letter)) + str(number)) for number in range(200)]
-    started = time.perf_counter()
+    started = time.process_time()
     assert sum(item.count for item in alike(texts)) == 200
-    assert time.perf_counter() - started < 5.0  # seconds on any machine; squares would take minutes
+    assert time.process_time() - started < 20.0  # squares would take minutes

@@ -430,6 +430,7 @@ def test_a_method_is_shown_with_ports_and_parameters() -> None:
             {"port": "planes", "product": "planes"},
             {"port": "labels", "product": "labels"},
         ],
+        "metrics": [],
     }
     photos = answer("show", "read.photos")
     assert "in    calibration  files    optional\n" in photos

@@ -189,7 +189,7 @@ def test_crashes_fail_their_cells_alone(world: World) -> None:
     assert results["second@second=good"].status == "ok"
     assert results["third@second=good"].status == "ok"
     assert "string_at" in results["second@second=segfault"].log
-    assert 1.5 <= results["second@second=hang"].wall_s < 6.5
+    assert 1.5 <= results["second@second=hang"].wall_s < 30
     assert outcome.exit_code == 1
 
 

@@ -35,19 +35,19 @@ def test_ten_seconds_of_compiling_show_in_compile_s_only(world: World) -> None:
     assert result.error_message == ""
     assert result.compile_s is not None
     # What else it loads and compiles takes seconds on a busy machine.
-    assert 10.0 <= result.compile_s < 40.0
-    assert 0.2 <= metric(result, "kernel_s") <= result.wall_s < 5.0
-    assert result.cpu_s < 5.0
+    assert 10.0 <= result.compile_s < 100.0
+    assert 0.2 <= metric(result, "kernel_s") <= result.wall_s < 9.0
+    assert result.cpu_s < 9.0
 
 
 def test_loading_shows_in_compile_s_only_and_stops_no_clock_from_a_daemon(world: World) -> None:
     package = world.site / "toy_plugin"
-    (package / "heavy.py").write_text("import time\ntime.sleep(3)\n")
+    (package / "heavy.py").write_text("import time\ntime.sleep(5)\n")
     (package / "aside.py").write_text("import time\ntime.sleep(0.5)\n")
     result = world.run(STEPS.format("loads", "")).results["b"]
     assert result.compile_s is not None
-    assert result.compile_s >= 3.0
-    assert 0.5 <= metric(result, "loads_s") <= result.wall_s < 2.9
+    assert result.compile_s >= 5.0
+    assert 0.5 <= metric(result, "loads_s") <= result.wall_s < 4.9
     again = world.run(STEPS.format("loads", ""), into="inline", executor="inline", force=("b",))
     assert again.results["b"].compile_s is not None
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from orthoflow_provenance.blocks import BLOCK_BYTES, block_indices
@@ -135,7 +135,6 @@ def test_array_types_outside_the_format_are_refused(dtype: str) -> None:
         payload_digest(Given(arrays={"a": np.zeros(2, dtype=dtype)}))
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(0, 60), max_size=3).map(tuple), st.sampled_from([1, 8, 4096, 1 << 20]))
 def test_blocks_cover_an_array_once_in_c_order(shape: tuple[int, ...], itemsize: int) -> None:
     # Elements are counted instead of made: an index block is a run of a known length.

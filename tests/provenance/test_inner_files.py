@@ -79,7 +79,7 @@ def test_paths_that_lead_elsewhere_are_refused(path: str, problem: str) -> None:
     assert path_problem(path) == problem
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(NAMES, max_size=4).map("/".join))
 @example("..")
 @example("a/../../b")
@@ -96,7 +96,7 @@ def test_whatever_is_accepted_stays_below_its_folder(path: str) -> None:
     assert not any(unicodedata.category(letter) in {"Cc", "Cs"} for letter in str(made))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(NAMES, min_size=1, max_size=3).map("/".join), st.binary(max_size=20))
 def test_what_is_written_under_any_name_comes_back_or_nothing_is_written(
     tmp_path_factory: pytest.TempPathFactory, path: str, content: bytes

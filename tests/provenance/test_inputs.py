@@ -50,7 +50,7 @@ def write_embedded(folder: Path, contents: tuple[bytes, ...], name: str = "photo
     return path
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.lists(st.binary(max_size=5000), max_size=4).map(tuple))
 def test_any_files_come_back_with_their_bytes(
     tmp_path_factory: pytest.TempPathFactory, contents: tuple[bytes, ...]

@@ -34,7 +34,7 @@ NAMES = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="/"
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     arrays=st.dictionaries(NAMES, ARRAYS, max_size=4),
     metadata=st.dictionaries(

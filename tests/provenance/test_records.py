@@ -143,7 +143,7 @@ RECORD = st.builds(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(RECORD)
 def test_any_record_comes_back_as_it_was_written(
     tmp_path_factory: pytest.TempPathFactory, record: RunRecord

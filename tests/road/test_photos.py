@@ -109,7 +109,7 @@ def test_the_cloud_is_exported_by_plane_from_record_and_store(quick: Shell) -> N
         (("--to", "colmap", "--cell", "wal", "-o", "elsewhere"), "has no cell 'wal'"),
         (("--to", "laz", "--cell", "wall"), "the cell wall holds no labels of points; those"),
         (("--to", "colmap", "-o", "run"), "run exists already and is not empty"),
-        (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', 'figures', 'laz'"),
+        (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', 'figures', 'layers', 'laz'"),
     ],
     ids=["no orientations", "no such cell", "no labels", "folder in use", "no such format"],
 )

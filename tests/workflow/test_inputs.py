@@ -166,4 +166,4 @@ def test_looking_through_the_whole_machine_ends_soon(project: Path, catalog: Cat
     started = time.process_time()
     with pytest.raises(InputError, match="has more than 100000 files and folders"):
         names(project, catalog, "{files: '**/*.e57'}")
-    assert time.process_time() - started < 5.0
+    assert time.process_time() - started < 20.0

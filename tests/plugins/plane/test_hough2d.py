@@ -382,7 +382,7 @@ def test_a_perfectly_flat_wall_is_found(tmp_path: Path) -> None:
     assert abs(planes.offset[0]) == pytest.approx(2.0, abs=1e-6)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     angle_deg=st.floats(0.0, 360.0),
     distance_m=st.floats(1.0, 30.0),
