@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol, Self
 
 from orthoflow.alike import sense
 from orthoflow.cli.failures import say_error
-from orthoflow.cli.forecast import CellState, left_of_cell, left_of_run
+from orthoflow.cli.forecast import CellState, about, left_of_cell, left_of_run
 from orthoflow.cli.tables import counted, duration
 from orthoflow.engine.events import (
     CellFinished,
@@ -240,12 +240,12 @@ class LiveProgress:
             running = cell.state == "running"
             state = f"{100 * cell.done(now_s):3.0f} %" if running else cell.state
             seconds = now_s - cell.started if running else cell.wall_s
-            left = left_of_cell(cell, now_s).removeprefix("about ").removesuffix(" left")
+            left_s = cell.left_s(now_s) if running else None
             table.add_row(
                 Text(shown(address)),
                 Text(state, style=_STYLES.get(cell.state, "dim")),
                 Text(duration(seconds) if seconds else ""),
-                Text(left),
+                Text(about(left_s) if left_s is not None else ""),
                 Text(shown(cell.text)),
             )
         return table

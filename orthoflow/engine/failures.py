@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.checked_json import is_checked, with_digest
-from orthoflow.engine.durability import write_whole
+from orthoflow.engine.durability import read_whole, write_whole
 from orthoflow.errors import StoreError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.sdk.lines import one_line
@@ -54,7 +52,7 @@ class Failures:
     def sentence(self, key: str) -> str:
         """Say how the cell failed; empty when it did not, or when nobody knows any more."""
         try:
-            text = _read(self._file(key))
+            text = read_whole(self._file(key), _LARGEST_FILE)
             content = parse_json(text) if is_checked(text) else None
         except (OSError, ValueError):
             return ""
@@ -63,12 +61,3 @@ class Failures:
 
     def _file(self, key: str) -> Path:
         return self.folder / f"{key}.json"
-
-
-def _read(path: Path) -> str:
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    with os.fdopen(descriptor, "rb") as stream:
-        state = os.fstat(descriptor)
-        if not stat.S_ISREG(state.st_mode) or state.st_size > _LARGEST_FILE:
-            raise OSError(f"{path.name} is none of ours")
-        return stream.read().decode("utf-8")

@@ -7,7 +7,6 @@ import dataclasses
 import os
 import selectors
 import signal
-import stat
 import subprocess
 import sys
 import time
@@ -19,7 +18,7 @@ from typing import Final, Literal
 from pydantic import TypeAdapter
 
 from orthoflow.engine.clock import now
-from orthoflow.engine.durability import writing_to
+from orthoflow.engine.durability import read_whole, writing_to
 from orthoflow.engine.executors import COMPILED_CODE, TaskEnd, Tell
 from orthoflow.engine.keeper import END_ALL
 from orthoflow.engine.memory import GIB, MemoryGuard, oom_kills, process_memory
@@ -289,7 +288,8 @@ class LocalExecutor:
         error = run.reason
         if error is None:
             try:
-                result = result_from_json(_read_result(task.result_file), task.result_file.name)
+                text = read_whole(task.result_file, _LARGEST_RESULT)
+                result = result_from_json(text, task.result_file.name)
                 if result.key != task.key:
                     raise StoreError(f"{task.result_file.name} is not the result of this task")
                 peak = max(result.peak_rss_mib, round(run.peak_bytes / (1 << 20), 1))
@@ -347,20 +347,6 @@ def _kill_group(run: _Running) -> None:
 def _signal_group(run: _Running, number: signal.Signals) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(run.process.pid, number)
-
-
-def _read_result(path: Path) -> str:
-    """Read what a step left; it may have left anything.
-
-    Raises:
-        OSError: there is no file, or one that no step of ours writes.
-    """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    with os.fdopen(descriptor, "rb") as stream:
-        state = os.fstat(descriptor)
-        if not stat.S_ISREG(state.st_mode) or state.st_size > _LARGEST_RESULT:
-            raise OSError(f"{path.name} is not a result")
-        return stream.read().decode("utf-8")
 
 
 def _child_environment(task: Task) -> dict[str, str]:

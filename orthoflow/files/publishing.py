@@ -143,8 +143,7 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
     """
     if product.layers:
         names = {image.wall: image.name for image in product.images}
-        named = [names.get(wall, f"wall {wall}") for wall in range(max(names, default=-1) + 1)]
-        _write_layers(folder, product.layers, named, product.icc_profile, digest)
+        _write_layers(folder, product.layers, names, product.icc_profile, digest)
     for image in product.images:
         shown = image.mask == OrthoMask.PAINTED
         for rows in row_bands(shown.shape):
@@ -177,13 +176,14 @@ def publish_layers(product: Layers, folder: Path, digest: str) -> None:
 
     `n` counts the sources of a wall from 0, because names of photos need not differ in a file's.
     """
-    _write_layers(folder, product.layers, product.names, product.icc_profile, digest)
+    names = dict(enumerate(product.names))
+    _write_layers(folder, product.layers, names, product.icc_profile, digest)
 
 
 def _write_layers(
     folder: Path,
     layers: Sequence[Layer],
-    names: Sequence[str],
+    names: Mapping[int, str],
     icc_profile: bytes | None,
     digest: str,
 ) -> None:
@@ -192,7 +192,7 @@ def _write_layers(
         number = counts[layer.wall] = counts.get(layer.wall, -1) + 1
         source = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(layer.source).stem)
         stem = f"wall_{layer.wall}_layer_{number}_{source}"
-        name = names[layer.wall] if layer.wall < len(names) else f"wall {layer.wall}"
+        name = names.get(layer.wall, f"wall {layer.wall}")
         content = f"what {layer.source} shows of the wall"
         tags = raster_tags(layer.frame, digest=digest, name=name, content=content, extra={})
         write_orthoimage(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import Final
 
 import numpy as np
@@ -59,16 +60,16 @@ class View:
 
     Attributes:
         index: of the photo.
-        photo: the photo.
         grey: (height, width) of the photo.
+        colours: gives its (height, width, 3), which few photos need.
         camera: the pose.
         projections: of each wall, None where the photo does not show it.
         warped: the grey in the raster of each wall, as far as it was needed.
     """
 
     index: int
-    photo: Photo
     grey: NDArray[np.uint8]
+    colours: Callable[[], NDArray[np.uint8]]
     camera: ViewingCamera
     projections: Sequence[Projection | None]
     warped: dict[int, NDArray[np.float32]] = field(default_factory=dict)
@@ -81,7 +82,7 @@ class View:
 
     def colours_on_wall(self, projection: Projection) -> NDArray[np.float32]:
         """Give the photo's colours (rows, cols, 3) in the raster of a wall."""
-        return warp_photo(photo_rgb(self.photo), projection)
+        return warp_photo(self.colours(), projection)
 
     def posed(self, camera: ViewingCamera, walls: Sequence[Wall]) -> View:
         """Lay the photo onto the walls by another pose."""
@@ -92,8 +93,9 @@ def view_of(index: int, photo: Photo, camera: ViewingCamera, walls: Sequence[Wal
     """Lay a photo onto the walls by a pose."""
     return View(
         index=index,
-        photo=photo,
         grey=photo_grey(photo),
+        # Every round warps them to every wall again: decoded once.
+        colours=cache(partial(photo_rgb, photo)),
         camera=camera,
         projections=project_walls(camera, walls),
     )
