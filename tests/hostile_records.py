@@ -80,9 +80,18 @@ def exchange_digest(cell: h5py.Group, port: h5py.Group, digest: str) -> None:
     """Give an input of a cell another digest, and the cell the key that follows from it."""
     name = port.name.rpartition("/")[2]
     set_attribute(port, "digest", digest)
-    preimage = json.loads(read_text(cell, "key_preimage"))
-    preimage["inputs"][name] = f"files@0:{digest}"
-    text = canonical_json(preimage)
+    inputs = json.loads(read_text(cell, "key_preimage"))["inputs"]
+    rewrite_preimage(cell, inputs={**inputs, name: f"files@0:{digest}"})
+
+
+def rewrite_preimage(cell: h5py.Group, **facts: object) -> None:
+    """Let the preimage of a cell's key state other facts, and make the key anew."""
+    preimage = {**json.loads(read_text(cell, "key_preimage")), **facts}
+    exchange_preimage(cell, canonical_json(preimage))  # type: ignore[arg-type]
+
+
+def exchange_preimage(cell: h5py.Group, text: str) -> None:
+    """Give a cell any text as the preimage of its key, and the key that follows from it."""
     set_text(cell, "key_preimage", text)
     set_attribute(cell, "key", sha256_text(text))
 

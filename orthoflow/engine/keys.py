@@ -147,6 +147,16 @@ def read_preimage(text: str) -> Mapping[str, JsonValue]:
     return cast("dict[str, JsonValue]", content) if isinstance(content, dict) else {}
 
 
+def stated_versions(preimage: Mapping[str, JsonValue], name: str) -> dict[str, str]:
+    """What a preimage says under `code` or `tools`; nothing where it is no mapping.
+
+    >>> stated_versions({"tools": {"numpy": "2.1"}, "code": [1]}, "tools")
+    {'numpy': '2.1'}
+    """
+    stated = preimage.get(name)
+    return {k: str(v) for k, v in stated.items()} if isinstance(stated, dict) else {}
+
+
 def _tools(cls: type[Method]) -> dict[str, str]:
     try:
         with foreign_code(f"method {cls.id}"):

@@ -12,14 +12,12 @@ from orthoflow_provenance.compare import ArrayDifference, measure_payloads
 from orthoflow_provenance.digests import payload_digest
 from orthoflow_provenance.model import COSTS, RecordedCell, RecordedFile, RunRecord
 
-from orthoflow.engine.keys import read_preimage
+from orthoflow.engine.keys import read_preimage, stated_versions
 from orthoflow.errors import OrthoflowError
 from orthoflow.products.product import JsonValue, Payload, Product
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 
-if TYPE_CHECKING:
-    from orthoflow.engine import Store
 if TYPE_CHECKING:
     from orthoflow.catalog import Catalog
     from orthoflow.engine import Store
@@ -207,15 +205,10 @@ def _facts(cell: RecordedCell) -> CellFacts:
         result_version=cell.result_version,
         determinism=cell.determinism,
         seed=cell.seed,
-        code=_texts(preimage.get("code")),
-        tools=_texts(preimage.get("tools")),
+        code=stated_versions(preimage, "code"),
+        tools=stated_versions(preimage, "tools"),
         error=cell.error_message,
     )
-
-
-def _texts(value: JsonValue) -> dict[str, str]:
-    """A mapping of texts as a preimage has it; what a damaged one has in its place is left out."""
-    return {k: str(v) for k, v in value.items()} if isinstance(value, dict) else {}
 
 
 def _parameters(cell: RecordedCell) -> dict[str, ParameterValue]:

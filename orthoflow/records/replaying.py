@@ -7,16 +7,15 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orthoflow_provenance.model import RecordedCell
 from pydantic import ValidationError
 
 from orthoflow.engine.environment import environment
-from orthoflow.engine.keys import input_digest
+from orthoflow.engine.keys import input_digest, read_preimage, stated_versions
 from orthoflow.engine.plan import RunPlan, plan_run
 from orthoflow.errors import PluginError, RecordError, WorkflowError
-from orthoflow.files.json_texts import parse_json
 from orthoflow.records.input_files import find_inputs
 from orthoflow.records.runs import Run
 from orthoflow.records.verification import verify_run
@@ -89,7 +88,10 @@ def plan_replay(
         InvalidArgumentsError: `inputs` names no input of the workflow.
         InputError: there is nothing at a given path.
     """
-    findings = verify_run(run.path, also_published=False).findings or tuple(_inconsistencies(run))
+    findings = verify_run(run.path, also_published=False).findings or (
+        *_inconsistencies(run),
+        *_loose_ends(run),
+    )
     if findings:
         raise UnreplayableRunError(
             tuple(f"{run.path} is not as it was written: {finding}" for finding in findings)
@@ -169,7 +171,7 @@ def _inconsistencies(run: Run) -> Iterator[str]:
                 yield f"{cell.address}: {port} is not made of the files of {product.source}"
         if not cell.key_preimage:
             continue
-        preimage = _preimage(cell)
+        preimage = read_preimage(cell.key_preimage)
         stated = {
             "method": cell.method,
             "result_version": cell.result_version,
@@ -185,13 +187,20 @@ def _inconsistencies(run: Run) -> Iterator[str]:
                 yield f"{cell.address}: {name} is not what its key was made from"
 
 
-# Any: JSON, compared and never trusted.
-def _preimage(cell: RecordedCell) -> Mapping[str, Any]:
-    try:
-        content = parse_json(cell.key_preimage)
-    except ValueError:
-        content = None
-    return content if isinstance(content, dict) else {}
+def _loose_ends(run: Run) -> Iterator[str]:
+    """Find inputs of cells that neither an input of the run nor a cell before theirs gives."""
+    inputs = {entry.name for entry in run.record.inputs}
+    given: dict[str, set[str]] = {}
+    for cell in run.record.cells:
+        for port, product in cell.inputs.items():
+            owner, _, name = product.source.rpartition(".")
+            is_there = name in inputs if owner == "inputs" else owner in given
+            # What a skipped cell lacks may be just this.
+            if is_there and owner != "inputs" and cell.status != "skipped":
+                is_there = name in given[owner]
+            if not is_there:
+                yield f"{cell.address}: nothing before it gives {product.source!r}, its {port}"
+        given[cell.address] = set(cell.outputs)
 
 
 @dataclass(kw_only=True)
@@ -285,13 +294,13 @@ def _method_notes(run: Run, plan: RunPlan) -> Iterator[str]:
         facts = plan.methods.get(cell.method)
         if facts is None or not cell.key_preimage:
             continue
-        preimage = _preimage(cell)
-        if (preimage.get("code") or {}) != dict(facts.code):
+        preimage = read_preimage(cell.key_preimage)
+        if stated_versions(preimage, "code") != dict(facts.code):
             yield (
                 f"{cell.method}: its code is not that of the record, though both say result "
                 f"version {cell.result_version}"
             )
-        recorded = preimage.get("tools") or {}
+        recorded = stated_versions(preimage, "tools")
         for tool in sorted(recorded.keys() | facts.tools.keys()):
             versions = facts.tools.get(tool), recorded.get(tool)
             if versions[0] != versions[1]:

@@ -320,3 +320,114 @@ def test_what_fails_on_a_damaged_record_is_said_to_be_its_fault(
     done = finished(command[0], *[finished.folder / "first"] * len(runs))
     assert done.exit_code == 1
     assert "orthoflow itself failed" in done.output
+
+
+# What a key states besides what the cell says itself: any of it may be there, none of it is needed.
+ODD_FACTS: tuple[dict[str, object], ...] = (
+    {"tools": [1]},
+    {"tools": "x"},
+    {"tools": {"numpy": {"a": [1]}, "\x1b[2J\u202e": "\x1b[2J"}},
+    {"code": [1]},
+    {"code": {"framework": None}},
+    {"what": [[]], "v": {}},
+)
+
+
+@pytest.mark.parametrize("facts", ODD_FACTS, ids=str)
+def test_odd_facts_under_a_key_of_their_own_change_no_replay(
+    finished: Studio, folder: Path, facts: dict[str, object]
+) -> None:
+    run = hostile.changed(
+        finished.folder / "first",
+        folder / "run",
+        lambda file: hostile.rewrite_preimage(file["cells/paint"], **facts),
+    )
+    assert verify_run(run).findings == ()
+    done = finished("replay", run, "-o", "again")
+    assert done.exit_code == 0, done.output
+    assert "2 products: 2 identical" in done.stdout
+    assert not {"\x1b", "\u202e"} & set(done.output)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[1]", "[" * 50_000, f'{{"seed": {"9" * 5000}}}', '{"seed": NaN}', '{"inputs": [1]}'],
+    ids=lambda text: text[:14] or "empty",
+)
+def test_a_key_of_a_preimage_that_says_nothing_is_refused(
+    finished: Studio, folder: Path, text: str
+) -> None:
+    run = hostile.changed(
+        finished.folder / "first",
+        folder / "run",
+        lambda file: hostile.exchange_preimage(file["cells/paint"], text),
+    )
+    done = finished("replay", run, "-o", "again")
+    assert done.exit_code == 3, done.output
+    said = "key_preimage must not be empty" if not text else "inputs is not what its key was made"
+    assert said in done.stderr
+    assert not Path("again").exists()
+
+
+def add_cell_parameters(file: h5py.File, **params: object) -> None:
+    cell = file["cells/paint"]
+    hostile.rewrite_preimage(cell, params=params)
+    hostile.set_text(cell, "params", json.dumps(params))
+
+
+@pytest.mark.parametrize(
+    ("params", "refused"),
+    [
+        ({"grey": 128, "gsd_m": 0.5, "x": 1}, "parameter x: Extra inputs are not permitted"),
+        ({"grey": 10**40, "gsd_m": 0.5}, "parameter grey: Input should be less than or equal"),
+        ({"grey": "128", "gsd_m": 0.5}, "parameter grey: Input should be a valid integer"),
+        ({"grey": [[]], "gsd_m": {}}, "parameter gsd_m: Input should be a valid number"),
+    ],
+    ids=str,
+)
+def test_parameters_that_fit_their_key_and_not_their_method_are_refused(
+    finished: Studio, folder: Path, params: dict[str, object], refused: str
+) -> None:
+    run = hostile.changed(
+        finished.folder / "first", folder / "run", lambda file: add_cell_parameters(file, **params)
+    )
+    assert verify_run(run).findings == ()
+    done = finished("replay", run, "-o", "again")
+    assert done.exit_code == 3, done.output
+    assert f"cell paint: the installed paint.plain refuses the recorded {refused}" in done.stderr
+    assert not Path("again").exists()
+
+
+@pytest.mark.parametrize(
+    "source", ["nowhere.planes", "survey.nothing", "inputs.nothing", "", "...", "a\x1b[2J.planes"]
+)
+def test_a_cell_that_nothing_leads_to_is_refused(
+    finished: Studio, folder: Path, source: str
+) -> None:
+    run = hostile.changed(
+        finished.folder / "first",
+        folder / "run",
+        lambda file: hostile.set_attribute(file["cells/paint/in/planes"], "source", source),
+    )
+    done = finished("replay", run, "-o", "again")
+    assert done.exit_code == 3, done.output
+    assert f"paint: nothing before it gives {source!a}, its planes" in done.stderr
+    assert not Path("again").exists()
+
+
+def test_cells_that_lead_to_one_another_are_refused(finished: Studio, folder: Path) -> None:
+    # Every digest fits: a cell that is made of what it gives itself.
+    def close(file: h5py.File) -> None:
+        cell = file["cells/paint"]
+        given = cell["in/planes"]
+        own = cell["out"].create_group("planes")
+        for name in given.attrs:
+            own.attrs[name] = given.attrs[name]
+        hostile.set_attribute(own, "source", "")
+        hostile.set_attribute(given, "source", "paint.planes")
+
+    run = hostile.changed(finished.folder / "first", folder / "run", close)
+    assert verify_run(run).findings == ()
+    done = finished("replay", run, "-o", "again")
+    assert done.exit_code == 3, done.output
+    assert "paint: nothing before it gives 'paint.planes', its planes" in done.stderr
