@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Final
 
 import numpy as np
@@ -29,6 +30,8 @@ _AT_ONCE: Final = 1 << 16
 _HASH_BITS: Final = 20
 _CUBE_BITS: Final = 21
 _GATHERED_MOST: Final = 1_500_000
+# Points whose cube is found; of larger clouds those in some slabs of cubes.
+_LOOKED_AT_MOST: Final = 4_000_000
 # Odd, with bits all over, so that the upper bits of a product hang on all of a number.
 _PRIMES: Final = (np.uint32(2_654_435_761), np.uint32(2_246_822_519), np.uint32(3_266_489_917))
 # A piece is one surface if so many of its points lie near its plane, if they scatter by less than
@@ -150,15 +153,21 @@ def _indices_of_pieces(
     """Indices of the points in cubes about some of them."""
     n_points = len(offsets[0])
     lows = tuple(axis.min() for axis in offsets)
-    seeds = np.unique(np.linspace(0, n_points - 1, 2 * _PIECES_MOST).astype(np.intp))
-    hashes = np.unique(_hash(_cubes(offsets, lows, seeds, side_m)))
-    is_asked = np.zeros(1 << _HASH_BITS, dtype=np.bool_)
+    one_of = -(-n_points // _LOOKED_AT_MOST)
+    seeds = np.unique(np.linspace(0, n_points - 1, one_of * 2 * _PIECES_MOST).astype(np.intp))
+    cubes = _cubes(offsets, lows, seeds, side_m)
+    along = max(range(3), key=lambda axis: len(np.unique(cubes[axis])))
+    slabs = _hash(cubes[along : along + 1])
+    is_slab, is_asked = np.zeros((2, 1 << _HASH_BITS), dtype=np.bool_)
+    is_slab[np.unique(slabs)[::one_of]] = True
+    hashes = np.unique(_hash(cubes)[is_slab[slabs]])
     is_asked[hashes[:: max(1, -(-len(hashes) // _PIECES_MOST))]] = True
     found: list[NDArray[np.intp]] = []
     for start in range(0, n_points, _AT_ONCE):
         part = slice(start, min(start + _AT_ONCE, n_points))
-        is_inside = is_asked[_hash(_cubes(offsets, lows, part, side_m))]
-        found.append(start + np.flatnonzero(is_inside))
+        slabs = _hash(_cubes(offsets, lows, part, side_m, axes=(along,)))
+        chosen = start + np.flatnonzero(is_slab[slabs])
+        found.append(chosen[is_asked[_hash(_cubes(offsets, lows, chosen, side_m))]])
     indices = np.concatenate(found)
     # Equal hashes of other cubes are told apart by the cubes themselves.
     x, y, z = (axis.astype(np.int64) for axis in _cubes(offsets, lows, indices, side_m))
@@ -179,18 +188,22 @@ def _cubes(
     lows: tuple[np.float32, ...],
     chosen: NDArray[np.intp] | slice,
     side_m: float,
+    *,
+    axes: Sequence[int] = (0, 1, 2),
 ) -> list[NDArray[np.uint32]]:
-    """Number of the cube along each axis, counted from the lowest point on."""
+    """Number of the cube along axes, counted from the lowest point on."""
     return [
-        ((axis[chosen] - low) * np.float32(1.0 / side_m)).astype(np.uint32)
-        for axis, low in zip(offsets, lows, strict=True)
+        ((offsets[axis][chosen] - lows[axis]) * np.float32(1.0 / side_m)).astype(np.uint32)
+        for axis in axes
     ]
 
 
 def _hash(cubes: Sequence[NDArray[np.uint32]]) -> NDArray[np.uint32]:
-    x, y, z = (axis * prime for axis, prime in zip(cubes, _PRIMES, strict=True))
-    hashed: NDArray[np.uint32] = (x ^ y ^ z) >> np.uint32(32 - _HASH_BITS)
-    return hashed
+    """A number of 20 bits for cubes by one to three axes."""
+    mixed = reduce(
+        np.bitwise_xor, (axis * prime for axis, prime in zip(cubes, _PRIMES, strict=False))
+    )
+    return mixed >> np.uint32(32 - _HASH_BITS)
 
 
 def _points(

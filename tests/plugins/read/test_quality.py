@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.read import quality as quality_module
 from orthoflow_plugins.read.quality import CloudQuality, judge_quality, report_quality
 
 from orthoflow.sdk import StepContext
@@ -46,6 +48,27 @@ def test_thickness_and_step_are_those_of_the_scan(noise_m: float, step_m: float)
     assert quality.scan_step_m == pytest.approx(step_m, rel=0.1)
     assert quality.is_thick == (noise_m > step_m)
     assert quality.scans_apart_m is None
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_of_a_large_cloud_a_part_says_as_much(monkeypatch: pytest.MonkeyPatch, axis: int) -> None:
+    # As large as two hundred million points, in the way of looking: slabs across the longest axis.
+    monkeypatch.setattr("orthoflow_plugins.read.quality._LOOKED_AT_MOST", 4000)
+    points = np.roll(wall(step_m=0.005, noise_m=0.002), axis, axis=1)
+    looked_at = 0
+    measured = quality_module._measured
+
+    def counted(points: NDArray[np.float64], *rest: Any) -> Any:
+        nonlocal looked_at
+        looked_at += len(points)
+        return measured(points, *rest)
+
+    monkeypatch.setattr("orthoflow_plugins.read.quality._measured", counted)
+    quality = judge_quality(offsets(points), None)
+    assert quality is not None
+    assert looked_at < 0.2 * len(points)
+    assert quality.sigma_m == pytest.approx(0.002, rel=0.15)
+    assert quality.scan_step_m == pytest.approx(0.005, rel=0.1)
 
 
 @pytest.mark.parametrize("apart_m", [0.0, 0.005])
