@@ -161,15 +161,7 @@ def cameras(*viewers: ViewingCamera) -> Cameras:
             Camera(
                 photo=f"{k}.png",
                 status="ok",
-                intrinsics=Intrinsics(
-                    width=viewer.width,
-                    height=viewer.height,
-                    fx=viewer.fx,
-                    fy=viewer.fy,
-                    cx=viewer.cx,
-                    cy=viewer.cy,
-                    distortion=tuple(float(value) for value in viewer.distortion),
-                ),
+                intrinsics=Intrinsics.of(viewer),
                 rotation_camera_from_world=viewer.rotation,
                 translation_camera_from_world=viewer.translation,
             )

@@ -48,6 +48,7 @@ _SIZES: Final = ("width", "height")
 _FOCALS: Final = ("fx", "fy")
 _CENTRES: Final = ("cx", "cy")
 _DISTORTION: Final = "distortion"
+_SKEW: Final = "skew"
 _REQUIRED: Final = (*_SIZES, *_FOCALS, *_CENTRES)
 _N_DISTORTION: Final = 5
 _START: Final = Position(line=1, column=1)
@@ -97,6 +98,7 @@ def calibration_text(calibration: Calibration) -> str:
             "cx": camera.cx - HALF_PIXEL,
             "cy": camera.cy - HALF_PIXEL,
             _DISTORTION: list(camera.distortion),
+            **({_SKEW: camera.skew} if camera.skew else {}),
         }
         lines.append(f"  {json.dumps(pattern, ensure_ascii=False)}:")
         lines += [f"    {key}: {json.dumps(value)}" for key, value in values.items()]
@@ -216,7 +218,7 @@ class _Reader:
             self._add(entry.position, f"{path}: expected {', '.join(_REQUIRED)} [, {_DISTORTION}]")
             return None
         n_before = len(self.problems)
-        self._refuse_unknown(values, (*_REQUIRED, _DISTORTION), path + ".")
+        self._refuse_unknown(values, (*_REQUIRED, _DISTORTION, _SKEW), path + ".")
         given = {item.key: item for item in values}
         missing = [key for key in _REQUIRED if key not in given]
         if missing:
@@ -226,7 +228,7 @@ class _Reader:
         }
         numbers: dict[str, float] = {
             key: self._number(given[key], f"{path}.{key}", given[key].value)
-            for key in (*_FOCALS, *_CENTRES)
+            for key in (*_FOCALS, *_CENTRES, _SKEW)
             if key in given
         }
         distortion = self._distortion(given.get(_DISTORTION), path)
@@ -242,6 +244,7 @@ class _Reader:
             cx=numbers["cx"] + HALF_PIXEL,
             cy=numbers["cy"] + HALF_PIXEL,
             distortion=distortion,
+            skew=numbers.get(_SKEW) or None,
         )
         if _folds(camera):
             self._add(

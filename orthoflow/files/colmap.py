@@ -129,6 +129,11 @@ class _KeptTies:
 def _lens(camera: Camera) -> Intrinsics:
     if camera.intrinsics is None:
         raise ArgumentError(f"photo {camera.photo} is oriented, but its lens is not known")
+    if camera.intrinsics.skew:
+        raise ArgumentError(
+            f"the lens of photo {camera.photo} has a skew of {camera.intrinsics.skew:.1f} px, "
+            "which no model of COLMAP has: orient it without, by orient.pnp or skew: false"
+        )
     return camera.intrinsics
 
 

@@ -145,7 +145,7 @@ def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
     Raises:
         InputError: it cannot.
     """
-    values = (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+    values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew or 0.0, *lens.distortion)
     if not (all(map(math.isfinite, values)) and lens.fx > 0.0 and lens.fy > 0.0):
         raise damaged(path, f"the lens of {whose} is none: focal length {lens.fx:g}, {lens.fy:g}")
     if lens.width < 1 or lens.height < 1:
@@ -185,6 +185,7 @@ def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
         cy=float(matrix[1, 2]) + HALF_PIXEL,
         distortion=distortion,
         source="given",
+        skew=float(matrix[0, 1]) or None,
     )
     lens = checked_lens(lens, path, name)
     rotation = np.array(entry["R_camera_from_world"], dtype=np.float64).ravel().tolist()

@@ -32,7 +32,7 @@ from orthoflow.products import Intrinsics
 
 # A panorama's directions are x forwards, y left, z up.
 _PANORAMA_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-_UNKNOWN_TERMS: Final = ("k4", "p3", "p4", "b2")
+_UNKNOWN_TERMS: Final = ("k4", "p3", "p4")
 _SINCE: Final = "Metashape 1.2 or newer writes f, cx, cy, k1 ... for each sensor"
 
 
@@ -166,6 +166,7 @@ def _intrinsics(
         cy=0.5 * size[1] + value("cy"),
         distortion=(value("k1"), value("k2"), value("p2"), value("p1"), value("k3")),
         source="given",
+        skew=value("b2") or None,
     )
     return checked_lens(lens, path, f"sensor {label}")
 

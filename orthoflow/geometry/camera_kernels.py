@@ -11,8 +11,8 @@ from orthoflow.geometry.compiling import inlined
 
 # Layout of a camera as a flat float64 array, so that kernels take one argument:
 # 0..8 rotation rows, 9..11 translation, 12 fx, 13 fy, 14 cx, 15 cy, 16..20 k1 k2 p1 p2 k3,
-# 21 width, 22 height, 23 largest undistorted radius that is not folded back.
-CAMERA_LENGTH = 24
+# 21 width, 22 height, 23 largest undistorted radius that is not folded back, 24 skew.
+CAMERA_LENGTH = 25
 
 
 @inlined
@@ -36,7 +36,7 @@ def project_point(camera, x, y, z):  # type: ignore[no-untyped-def]  # numba inf
     p1, p2 = camera[18], camera[19]
     ad = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
     bd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
-    return camera[12] * ad + camera[14], camera[13] * bd + camera[15], zc
+    return camera[12] * ad + camera[14] + camera[24] * bd, camera[13] * bd + camera[15], zc
 
 
 def largest_radius(distortion: NDArray[np.float64], *, limit: float = 10.0) -> float:

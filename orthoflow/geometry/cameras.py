@@ -34,6 +34,7 @@ class ViewingCamera:
         distortion: (5,) float64 k1, k2, p1, p2, k3 (Brown 1971, as OpenCV).
         rotation: (3, 3) float64 camera_from_world, det +1.
         translation: (3,) float64 metres, camera_from_world.
+        skew: pixels along u per unit of y / z; 0 where rows and columns of pixels are square.
     """
 
     width: int
@@ -45,6 +46,7 @@ class ViewingCamera:
     distortion: NDArray[np.float64]
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
+    skew: float = 0.0
 
     def __post_init__(self) -> None:
         # The other way round, so that NaN does not pass.
@@ -70,7 +72,7 @@ class ViewingCamera:
                 self.translation,
                 [self.fx, self.fy, self.cx, self.cy],
                 self.distortion,
-                [self.width, self.height, largest_radius(self.distortion)],
+                [self.width, self.height, largest_radius(self.distortion), self.skew],
             ]
         )
 
@@ -107,8 +109,10 @@ class ViewingCamera:
             a, b = x / z, y / z
             r2 = a * a + b * b
             radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            bd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
             u = self.fx * (a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)) + self.cx
-            v = self.fy * (b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b) + self.cy
+            u += self.skew * bd
+            v = self.fy * bd + self.cy
             hidden = ~(z > _NEAREST_M) | (r2 > self.flat[23] ** 2)
         u[hidden] = np.nan
         v[hidden] = np.nan
@@ -127,15 +131,21 @@ class ViewingCamera:
             GeometryError: the distortion cannot be undone there, e.g. beyond the fold of the lens
                 model.
         """
-        wanted_a = (np.asarray(pixels_photo[:, 0], dtype=np.float64) - self.cx) / self.fx
-        wanted_b = (np.asarray(pixels_photo[:, 1], dtype=np.float64) - self.cy) / self.fy
-        found = undistorted(wanted_a, wanted_b, self.distortion)
+        found = undistorted(*self.bent_rays(pixels_photo.T), self.distortion)
         if found.size and not np.abs(found[2]).max() < 1e-9:
             raise GeometryError(
                 "the lens distortion cannot be undone at the border of the image: the calibration "
                 f"{self.distortion.tolist()} folds back inside it"
             )
         return np.column_stack([found[0], found[1], np.ones(found.shape[1])])
+
+    def bent_rays(
+        self, pixels_photo: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions x / z and y / z of pixels (2, n) = (u, v), as the distortion has left them."""
+        u, v = np.asarray(pixels_photo, dtype=np.float64)
+        b = (v - self.cy) / self.fy
+        return (u - self.cx - self.skew * b) / self.fx, b
 
     def rays_world(self, pixels_photo: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unit directions (n, 3) in world axes of pixels (n, 2)."""

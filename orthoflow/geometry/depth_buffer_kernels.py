@@ -71,7 +71,7 @@ def splat_points(
 
     Args:
         points: offsets from the cloud's origin.
-        camera: (24,) flat camera for these offsets.
+        camera: (25,) flat camera for these offsets.
         around: points in 3 x 3 x 3 voxels; a surface through them has 9 faces of a voxel, which
             tells the spacing of its points.
         n_least: points with fewer around them, themselves included, are outliers.

@@ -28,6 +28,7 @@ class LensFreedom:
         k1_sigma: of k1.
         k2_sigma: of k2.
         tangential_sigma: of p1 and of p2.
+        skew_sigma_px: of the skew, pixels.
     """
 
     focal_sigma: float = 0.0
@@ -36,6 +37,7 @@ class LensFreedom:
     k1_sigma: float = 0.0
     k2_sigma: float = 0.0
     tangential_sigma: float = 0.0
+    skew_sigma_px: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -57,6 +59,7 @@ class LensFreedom:
             ("k2", self.k2_sigma),
             ("p1", self.tangential_sigma),
             ("p2", self.tangential_sigma),
+            ("skew", self.skew_sigma_px),
         )
 
 
@@ -83,6 +86,7 @@ def lens_values(camera: ViewingCamera, lens: LensFreedom) -> NDArray[np.float64]
         "aspect": math.log(camera.fy / camera.fx),
         "cx": camera.cx,
         "cy": camera.cy,
+        "skew": camera.skew,
     }
     return np.array(
         [
@@ -111,6 +115,7 @@ def stepped(camera: ViewingCamera, step: NDArray[np.float64], lens: LensFreedom)
         distortion=distortion,
         rotation=left @ right,
         translation=camera.translation + step[3:6],
+        skew=camera.skew + moves.get("skew", 0.0),
     )
 
 
@@ -132,6 +137,9 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
     by_point[:, 1, 0] = camera.fy * bent.a_by_b / z
     by_point[:, 1, 1] = camera.fy * bent.b_by_b / z
     by_point[:, 1, 2] = -camera.fy * (bent.b_by_b * b + bent.a_by_b * a) / z
+    # What a step down adds along u.
+    leaning = camera.skew / camera.fy
+    by_point[:, 0] += leaning * by_point[:, 1]
     n_free = POSE_PARAMETERS + len(lens.names)
     by_parameters = np.empty((2, n_free, len(points))).transpose(2, 0, 1)
     # Derivative by a turn: -by_point times the cross product's matrix, written out.
@@ -148,10 +156,16 @@ def linearised(camera: ViewingCamera, points: NDArray[np.float64], lens: LensFre
             along, down = lens_columns[name]
             by_parameters[:, 0, column] = camera.fx * along
             by_parameters[:, 1, column] = camera.fy * down
+            if name in _COEFFICIENTS:
+                by_parameters[:, 0, column] += camera.skew * down
+        elif name == "skew":
+            by_parameters[:, 0, column], by_parameters[:, 1, column] = bd, 0.0
         else:
             by_parameters[:, :, column] = (1.0, 0.0) if name == "cx" else (0.0, 1.0)
     return Linear(
-        pixels=np.column_stack([camera.fx * ad + camera.cx, camera.fy * bd + camera.cy]),
+        pixels=np.column_stack(
+            [camera.fx * ad + camera.cx + camera.skew * bd, camera.fy * bd + camera.cy]
+        ),
         by_camera_point=by_point,
         by_parameters=by_parameters,
     )

@@ -22,6 +22,8 @@ class Lens(Protocol):
     def cx(self) -> float: ...  # noqa: D102
     @property
     def cy(self) -> float: ...  # noqa: D102
+    @property
+    def skew(self) -> float | None: ...  # noqa: D102
 
 
 def to_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
@@ -35,10 +37,10 @@ def from_opencv(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 def opencv_matrix(lens: Lens) -> NDArray[np.float64]:
-    """Camera matrix (3, 3) for OpenCV."""
+    """Camera matrix (3, 3) for OpenCV, whose own functions overlook the skew in it."""
     return np.array(
         [
-            [lens.fx, 0.0, lens.cx - HALF_PIXEL],
+            [lens.fx, lens.skew or 0.0, lens.cx - HALF_PIXEL],
             [0.0, lens.fy, lens.cy - HALF_PIXEL],
             [0.0, 0.0, 1.0],
         ]

@@ -228,7 +228,7 @@ def pixel_directions(
     camera: ViewingCamera, u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Directions (3, n) in world axes, one metre deep along the optical axis, of pixels."""
-    found = undistorted((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, camera.distortion)
+    found = undistorted(*camera.bent_rays(np.stack([u, v])), camera.distortion)
     rotation = camera.rotation
     ways = np.empty((3, len(u)))
     for axis in range(3):

@@ -27,6 +27,7 @@ class Intrinsics:
         cx: principal point in pixels; cy along v.
         distortion: k1, k2, p1, p2, k3 (Brown, as OpenCV).
         source: `calibration`, `exif`, `truth` or `estimated`.
+        skew: pixels along u per unit of y / z; None where rows and columns of pixels are square.
     """
 
     width: int
@@ -37,6 +38,7 @@ class Intrinsics:
     cy: float
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     source: str = "calibration"
+    skew: float | None = None
 
     @classmethod
     def of(cls, camera: ViewingCamera, *, source: str = "calibration") -> Self:
@@ -50,6 +52,7 @@ class Intrinsics:
             cy=camera.cy,
             distortion=tuple(camera.distortion.tolist()),
             source=source,
+            skew=camera.skew or None,
         )
 
     def posed(
@@ -73,6 +76,7 @@ class Intrinsics:
             distortion=np.array(self.distortion, dtype=np.float64),
             rotation=np.eye(3) if rotation is None else rotation,
             translation=np.zeros(3) if translation is None else translation,
+            skew=self.skew or 0.0,
         )
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from orthoflow.errors import GeometryError
+from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.geometry.compiling import interpreted
+from orthoflow.geometry.lenses import LensFreedom, linearised, stepped
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -28,6 +33,10 @@ def camera(seed: int, *, distorted: bool = True) -> ViewingCamera:
         rotation=rotation,
         translation=-rotation @ centre,
     )
+
+
+def skewed(seed: int) -> ViewingCamera:
+    return replace(camera(seed), skew=35.0)
 
 
 def points(seed: int) -> np.ndarray:
@@ -55,6 +64,50 @@ def test_the_ray_of_a_points_pixel_leads_back_to_the_point(seed: int) -> None:
     expected = scene - viewer.centre_world
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_allclose(rays, expected, atol=1e-10)
+
+
+def test_skew_moves_pixels_along_their_rows_and_rays_lead_back() -> None:
+    square, leaning = camera(1), skewed(1)
+    scene = points(1)
+    seen, moved = square.project(scene), leaning.project(scene)
+    expected = seen + np.outer((seen[:, 1] - square.cy) / square.fy, [35.0, 0.0, 0.0])
+    np.testing.assert_allclose(moved, expected, atol=1e-9)
+    assert np.ptp(moved[:, 0] - seen[:, 0]) > 5.0
+    rays = leaning.rays_world(moved[:, :2])
+    np.testing.assert_allclose(rays, square.rays_world(seen[:, :2]), atol=1e-12)
+
+
+@pytest.mark.parametrize("viewer", [camera(2), skewed(2)], ids=["square", "skewed"])
+def test_kernels_project_as_the_camera_does(viewer: ViewingCamera) -> None:
+    kernel = interpreted(project_point)
+    found = np.array([kernel(viewer.flat, *point) for point in points(2)])
+    np.testing.assert_allclose(found, viewer.project(points(2)), atol=1e-9)
+
+
+def test_derivatives_of_a_skewed_lens_are_those_of_its_projection() -> None:
+    lens = LensFreedom(
+        focal_sigma=1.0,
+        aspect_sigma=1.0,
+        centre_sigma_px=1.0,
+        k1_sigma=1.0,
+        k2_sigma=1.0,
+        tangential_sigma=1.0,
+        skew_sigma_px=1.0,
+    )
+    viewer, scene = skewed(3), points(3)
+    linear = linearised(viewer, scene, lens)
+    np.testing.assert_allclose(linear.pixels, viewer.project(scene)[:, :2], atol=1e-9)
+    for column in range(6 + len(lens.names)):
+        step = np.zeros(6 + len(lens.names))
+        step[column] = 1e-6
+        there, back = (stepped(viewer, sign * step, lens).project(scene) for sign in (1.0, -1.0))
+        slope = (there - back)[:, :2] / 2e-6
+        np.testing.assert_allclose(
+            linear.by_parameters[:, :, column], slope, rtol=1e-5, atol=1e-3, err_msg=str(column)
+        )
+    np.testing.assert_allclose(
+        linear.by_camera_point, linear.by_parameters[:, :, 3:6], err_msg="by the point"
+    )
 
 
 def test_survey_coordinates_lose_nothing_through_a_shifted_camera() -> None:

@@ -30,7 +30,9 @@ from orthoflow_plugins.inspect.findings import (
     CHECK_TABLE,
     DISPLACEMENTS,
     IMAGE_QUALITY,
+    LENGTHS,
     check_findings,
+    length_findings,
     of_walls,
     report,
     rms,
@@ -51,15 +53,16 @@ class InspectCheckpoints(Method):
     RMS, of all (`once`, the one to compare) or of what is left (`iterated`, a quarter of the points
     at most; `iterated_capped` where that is too few). Classes of points (flat, vertical ...) are
     told apart by a prefix. `x` is along u, to the right, `y` along v, down, shown - surveyed.
-    Targets are carried back into space, on the plane through the depths around them (`3d`).
+    `length_error_..._share` are relative errors of lengths between points of a wall. Targets are
+    carried back into space, on the plane through the depths around them (`3d`).
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[str, ...]] = (
         *("n_points", "n_3d", "rms_3d_mm", "max_3d_mm"),
-        *(*CHECK_TABLE, *DISPLACEMENTS),
+        *(*CHECK_TABLE, *LENGTHS, *DISPLACEMENTS),
         # Those of a class of points have its name before them.
         *(f"*_{name}" for name in (*CHECK_TABLE, *DISPLACEMENTS)),
         *of_walls(IMAGE_QUALITY),
@@ -118,8 +121,11 @@ class InspectCheckpoints(Method):
         shift_m = np.array(
             [gsd_m[points[k].wall] * (points[k].place - points[k].expected) for k in found]
         )
+        surveyed_m = np.array([gsd_m[points[k].wall] * points[k].expected for k in found])
+        walls = np.array([points[k].wall for k in found], dtype=np.int32)
         classes = [inputs.checkpoints.classes[k] for k in found]
         findings = _findings(shift_m, classes, max(gsd_m.values()))
+        findings += length_findings(surveyed_m, shift_m, walls)
         findings += _findings_in_space([points[k] for k in found], inputs.checkpoints, found)
         if inputs.orthoimages is not None:
             findings += _findings_of_images(pictures, inputs.cameras)
@@ -130,7 +136,7 @@ class InspectCheckpoints(Method):
         names = tuple(dict.fromkeys(classes))
         return self.Out(
             inspection=Inspection(
-                wall=np.array([points[k].wall for k in found], dtype=np.int32),
+                wall=walls,
                 points_world=inputs.checkpoints.points_world[found],
                 displacement_m=shift_m,
                 kind=np.array([names.index(name) for name in classes], dtype=np.uint8),

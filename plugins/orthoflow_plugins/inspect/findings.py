@@ -22,6 +22,10 @@ _AXES: Final = ("x", "y")
 _OUTLIERS_MOST: Final = 0.25
 # More than half are no outliers by any rule.
 _MOST_WITHOUT_CAP: Final = 0.5
+# Shorter lengths between check points say more of the single points than of a scale.
+_LENGTH_LEAST_SHARE: Final = 0.25
+# Of more points of a wall every so manieth takes part: their pairs are millions.
+_POINTS_MOST: Final = 1000
 # Behind the rule in the name of a number that the cap has made.
 CAPPED: Final = "_capped"
 # What displacements, check points and an orthoimage itself add up to, as metrics.
@@ -29,6 +33,7 @@ DISPLACEMENTS: Final = (
     *("rmse_[xy]_mm", "rmse_[xy]_cells", "mean_[xy]_mm", "nmad_[xy]_mm", "max_[xy]_mm"),
     *("beyond_2rmse_[xy]_share", "beyond_2rmse_any_share", "p95_mm"),
 )
+LENGTHS: Final = ("n_lengths", "length_error_rms_share", "length_error_max_share")
 CHECK_TABLE: Final = (
     *("n_found", "rms_mm", "sd_mm", "mean_shift_mm", "mean_shift_share"),
     *("n_outliers_once", "n_outliers_iterated", "n_outliers_iterated_capped"),
@@ -115,6 +120,36 @@ def check_findings(
     return table + displacement_findings(shift_m, gsd_m, -1, prefix=prefix)
 
 
+def length_findings(
+    surveyed_m: NDArray[np.float64], shift_m: NDArray[np.float64], wall: NDArray[np.int32]
+) -> list[Finding]:
+    """Sum up the relative errors of lengths between check points (markiewicz2015, 5: 0.2 %).
+
+    The lengths are those between points of one wall, from a quarter of its longest on; empty
+    without any.
+
+    Args:
+        surveyed_m: (n, 2) metres along u and v, where the points are.
+        shift_m: (n, 2) where the orthoimage shows them, less that.
+        wall: (n,) on which.
+    """
+    errors = [np.empty(0)]
+    for mine in (np.flatnonzero(wall == number) for number in np.unique(wall)):
+        chosen = mine[:: max(1, len(mine) // _POINTS_MOST)]
+        true = _lengths(surveyed_m[chosen])
+        shown = _lengths(surveyed_m[chosen] + shift_m[chosen])
+        counts = true >= max(_LENGTH_LEAST_SHARE * true.max(initial=0.0), 1e-9)
+        errors.append(np.abs(shown[counts] - true[counts]) / true[counts])
+    share = np.concatenate(errors)
+    if not len(share):
+        return []
+    values = (float(len(share)), rms(share), float(share.max()))
+    return [
+        Finding(name=name, value=value, unit="1")
+        for name, value in zip(LENGTHS, values, strict=True)
+    ]
+
+
 def outliers_at_once(length_m: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which lengths (n,) exceed twice the RMS of all."""
     beyond: NDArray[np.bool_] = length_m > 2.0 * rms(length_m)
@@ -172,6 +207,13 @@ def report(findings: Sequence[Finding], main: int, ctx: StepContext) -> None:
             ctx.metric(f"all_{finding.name}", finding.value, finding.unit)
         elif finding.wall < 0 and "[" not in finding.name:
             ctx.metric(finding.name, finding.value, finding.unit)
+
+
+def _lengths(places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths between all pairs of places (n, 2)."""
+    first, second = np.triu_indices(len(places_m), k=1)
+    lengths: NDArray[np.float64] = np.linalg.norm(places_m[first] - places_m[second], axis=1)
+    return lengths
 
 
 def _iterated(length_m: NDArray[np.float64], most_share: float) -> NDArray[np.bool_]:

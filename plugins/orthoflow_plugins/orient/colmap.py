@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import GeometryError
+from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow_plugins.orient.block import SIGMA_LEAST_M, Block, pixel_covariances
 from orthoflow_plugins.orient.lenses import Lens
@@ -154,6 +154,11 @@ def _add_observations(
 
 
 def _values(camera: ViewingCamera) -> NDArray[np.float64]:
+    if camera.skew:
+        raise MethodError(
+            f"a lens of the block has a skew of {camera.skew:.1f} px, which no model of COLMAP "
+            "has: calibrate it without, or use orient.dlt or orient.pnp"
+        )
     k1, k2, p1, p2, k3 = camera.distortion
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0])
 

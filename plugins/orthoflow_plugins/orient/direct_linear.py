@@ -40,6 +40,7 @@ Distortion = Literal["none", "k1", "k1 k2 p1 p2"]
 # Nearly free: what points with relief say of a lens outweighs these by far.
 _FREE: Final = {"focal_sigma": 1.0, "aspect_sigma": 0.5}
 _CENTRE_SHARE: Final = 0.5
+_SKEW_SHARE: Final = 0.5
 # Decentring and principal point explain each other on all but the deepest relief.
 _PINNED_CENTRE_SHARE: Final = 0.05
 _FULL: Final = "k1 k2 p1 p2"
@@ -64,14 +65,12 @@ class DirectLinear:
     """A camera found by a direct linear transform.
 
     Attributes:
-        camera: without distortion and skew.
-        skew_px: what the eleven parameters say besides: shift in u per unit of y / z.
+        camera: without distortion; with the skew.
         condition: largest over second smallest singular value of the normalised equations; on
             points of one plane it grows without bound.
     """
 
     camera: ViewingCamera
-    skew_px: float
     condition: float
 
 
@@ -126,10 +125,9 @@ def direct_linear(
         [[1 / scale_px, 0.0, shift_px[0]], [0.0, 1 / scale_px, shift_px[1]], [0.0, 0.0, 1.0]]
     )
     local = inverse_px @ matrix @ np.diag([scale_m, scale_m, scale_m, 1.0])
-    camera, skew_px = _decomposed(local, points_world - shift_m, size_px)
+    camera = _decomposed(local, points_world - shift_m, size_px)
     return DirectLinear(
         camera=camera.shifted(-shift_m),
-        skew_px=skew_px,
         condition=math.sqrt(float(values[-1]) / max(float(values[1]), 1e-300)),
     )
 
@@ -141,11 +139,13 @@ def estimate_dlt(
     rule: EstimationRule,
     *,
     distortion: Distortion,
+    keeps_skew: bool = False,
     forgets_lens: bool = False,
 ) -> Estimate | str:
     """Orient a photo by a direct linear transform of its control ties, or say why not.
 
-    With `forgets_lens` neither calibration nor EXIF helps to reject wrong ties either.
+    With `forgets_lens` neither calibration nor EXIF helps to reject wrong ties either. Without
+    `keeps_skew` the adjustment goes on from square pixels.
     """
     if forgets_lens:
         photo = replace(photo, intrinsics=None, exif_focal_px=None)
@@ -153,7 +153,8 @@ def estimate_dlt(
     if robust is None:
         return no_pose(seen)
     control = seen.take(robust.agreeing & ~is_check)
-    reason = _too_few(len(control), distortion) or _too_flat(control)
+    least = _LEAST[distortion] + keeps_skew
+    reason = _too_few(len(control), distortion, least) or _too_flat(control)
     if reason:
         return reason
     size_px = (photo.width, photo.height)
@@ -161,22 +162,25 @@ def estimate_dlt(
         linear = direct_linear(control.pixels_photo, control.points_world, size_px)
         if linear.condition > _CONDITION_MOST:
             return _flat(control, f"the equations have condition {linear.condition:.0f}")
+        camera = linear.camera if keeps_skew else replace(linear.camera, skew=0.0)
         start = Start(
-            camera=linear.camera,
-            prior=replace(linear.camera, cx=0.5 * photo.width, cy=0.5 * photo.height),
+            camera=camera,
+            prior=replace(camera, cx=0.5 * photo.width, cy=0.5 * photo.height, skew=0.0),
             agreeing=robust.agreeing,
-            freedom=_freedom(distortion, size_px),
+            freedom=_freedom(distortion, size_px, keeps_skew=keeps_skew),
             source="dlt",
-            n_least_for_lens=_LEAST[distortion],
+            n_least_for_lens=least,
         )
         estimate = adjusted(photo, seen, is_check, start, rule)
     except GeometryError as error:
         return f"{error}: use orient.pnp or orient.colmap-bundle"
-    estimate = replace(estimate, numbers={"skew_px": linear.skew_px, "condition": linear.condition})
+    skew_px = estimate.resection.camera.skew if keeps_skew else linear.camera.skew
+    estimate = replace(estimate, numbers={"skew_px": skew_px, "condition": linear.condition})
     control = seen.take(estimate.agreeing & ~is_check)
     if distortion == _FULL or len(control) < _LEAST[_FULL]:
         return estimate
-    return _with_what_is_missing(estimate, control, start, _freedom(_FULL, size_px))
+    fuller = _freedom(_FULL, size_px, keeps_skew=keeps_skew)
+    return _with_what_is_missing(estimate, control, start, fuller)
 
 
 def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[np.float64], float]:
@@ -190,8 +194,8 @@ def _normalisation(values: NDArray[np.float64], length: float) -> tuple[NDArray[
 
 def _decomposed(
     matrix: NDArray[np.float64], points: NDArray[np.float64], size_px: tuple[int, int]
-) -> tuple[ViewingCamera, float]:
-    """Take a projection matrix (3, 4) apart: camera, and its skew in pixels."""
+) -> ViewingCamera:
+    """Take a projection matrix (3, 4) apart."""
     if np.linalg.det(matrix[:, :3]) < 0.0:
         matrix = -matrix
     # RQ from QR: rows and columns in reverse order.
@@ -205,7 +209,7 @@ def _decomposed(
     if float(np.median(points @ rotation[2] + translation[2])) <= 0.0:
         raise GeometryError("a direct linear transform puts the points behind the camera")
     upper = upper / upper[2, 2]
-    camera = ViewingCamera(
+    return ViewingCamera(
         width=size_px[0],
         height=size_px[1],
         fx=float(upper[0, 0]),
@@ -215,21 +219,25 @@ def _decomposed(
         distortion=np.zeros(5),
         rotation=rotation,
         translation=translation,
+        skew=float(upper[0, 1]),
     )
-    return camera, float(upper[0, 1])
 
 
-def _freedom(distortion: Distortion, size_px: tuple[int, int]) -> LensFreedom:
+def _freedom(distortion: Distortion, size_px: tuple[int, int], *, keeps_skew: bool) -> LensFreedom:
     share = _PINNED_CENTRE_SHARE if distortion == _FULL else _CENTRE_SHARE
-    return replace(_FREEDOMS[distortion], centre_sigma_px=share * max(size_px))
+    return replace(
+        _FREEDOMS[distortion],
+        centre_sigma_px=share * max(size_px),
+        skew_sigma_px=_SKEW_SHARE * max(size_px) if keeps_skew else 0.0,
+    )
 
 
-def _too_few(n_control: int, distortion: Distortion) -> str:
-    if n_control >= _LEAST[distortion]:
+def _too_few(n_control: int, distortion: Distortion, least: int) -> str:
+    if n_control >= least:
         return ""
     return (
         f"only {n_control} control ties agree with one pose, a DLT with distortion "
-        f'"{distortion}" needs {_LEAST[distortion]}'
+        f'"{distortion}" needs {least}'
     )
 
 

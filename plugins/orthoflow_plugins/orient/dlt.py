@@ -22,9 +22,9 @@ class OrientDlt(Method):
 
     Calibration and EXIF serve only to reject wrong ties, with `prior: none` not even that. The
     linear solution starts a weighted adjustment of pose, fx, fy and principal point (and
-    distortion); of the eleven parameters the skew is recorded but not kept, since no lens of today
-    has one. Control that lies near one plane does not determine the parameters and is refused.
-    Everything is judged as in `orient.pnp`.
+    distortion); of the eleven parameters the skew is recorded but kept only when asked, since no
+    lens of today has one. Control that lies near one plane does not determine the parameters and is
+    refused. Everything is judged as in `orient.pnp`.
     """
 
     id: ClassVar[str] = "orient.dlt"
@@ -44,6 +44,11 @@ class OrientDlt(Method):
             default="none",
             description="Distortion estimated with the eleven parameters: none, k1, or "
             "k1 k2 p1 p2.",
+        )
+        skew: bool = Field(
+            default=False,
+            description="Keep the skew, the eleventh parameter: rows and columns of the camera's "
+            "pixels need not be square to each other. The way to the orthoimage knows it, too.",
         )
         prior: Literal["lens", "none"] = Field(
             default="lens",
@@ -65,7 +70,10 @@ class OrientDlt(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Orient the photos one after the other."""
         estimator = partial(
-            estimate_dlt, distortion=params.distortion, forgets_lens=params.prior == "none"
+            estimate_dlt,
+            distortion=params.distortion,
+            keeps_skew=params.skew,
+            forgets_lens=params.prior == "none",
         )
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
         return self.Out(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))

@@ -264,8 +264,8 @@ def posed(lens: ViewingCamera, pose: ViewingCamera) -> ViewingCamera:
 
 
 def undistorted_pixels(pixels: NDArray[np.float64], lens: ViewingCamera) -> NDArray[np.float64]:
-    """Pixels (n, 2) as without distortion; NaN where the lens model cannot be undone."""
-    if not lens.distortion.any():
+    """Pixels (n, 2) as without distortion and skew; NaN where the lens model cannot be undone."""
+    if not (lens.distortion.any() or lens.skew):
         return pixels
     try:
         rays = lens.rays_camera(pixels)

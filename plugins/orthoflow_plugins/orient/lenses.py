@@ -132,8 +132,7 @@ def lens_groups(
 
 def camera_rays(camera: ViewingCamera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Directions (n, 3) with z = 1 in camera axes; NaN where the distortion cannot be undone."""
-    a, b = (pixels - [camera.cx, camera.cy]).T / np.array([[camera.fx], [camera.fy]])
-    found = undistorted(a, b, camera.distortion)
+    found = undistorted(*camera.bent_rays(pixels.T), camera.distortion)
     rays = np.column_stack([found[0], found[1], np.ones(len(pixels))])
     rays[~(found[2] < _UNDONE)] = np.nan
     return rays

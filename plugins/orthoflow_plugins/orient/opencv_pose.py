@@ -84,6 +84,8 @@ def _solved(seen: SeenPoints, lens: ViewingCamera) -> ViewingCamera:
 
     if len(seen) < _LEAST:
         raise GeometryError(f"solvePnP needs {_LEAST} ties, {len(seen)} agree with one pose")
+    if lens.skew:
+        raise GeometryError(f"solvePnP knows no skew, and the lens has {lens.skew:.1f} px of it")
     # Survey coordinates would cost digits.
     middle = seen.points_world.mean(axis=0)
     # Any: the stubs want one of its many array types.

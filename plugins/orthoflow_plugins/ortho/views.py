@@ -26,7 +26,7 @@ class WallView(NamedTuple):
     """A photo's camera before a wall, in the wall's axes.
 
     Attributes:
-        camera: (24,) flat camera (see `camera_kernels`) for points (u, v, n) in metres from the
+        camera: (25,) flat camera (see `camera_kernels`) for points (u, v, n) in metres from the
             wall frame's origin.
         column: foot of the projection centre on the wall, in cell indices; 0 is the centre of
             the first cell. row likewise.

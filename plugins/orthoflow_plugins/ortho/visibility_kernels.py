@@ -77,7 +77,7 @@ def project_row(
     zu, zv, zn, tz = camera[6], camera[7], camera[8], camera[11]
     fx, fy, cx, cy = camera[12], camera[13], camera[14], camera[15]
     k1, k2, p1, p2, k3 = camera[16], camera[17], camera[18], camera[19], camera[20]
-    farthest = camera[23] * camera[23]
+    farthest, skew = camera[23] * camera[23], camera[24]
     height_m, free_m, tolerance_m = view.height_m, view.height_m - view.front_m, view.tolerance_m
     foot, down = view.column, (view.row - row) * gsd_m
     y, depths = (row + 0.5) * gsd_m, relief.depth[row]
@@ -93,7 +93,7 @@ def project_row(
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         ad = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
         bd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
-        us[k] = fx * ad + cx if (zc > 1e-9) & (r2 <= farthest) else -1.0
+        us[k] = fx * ad + cx + skew * bd if (zc > 1e-9) & (r2 <= farthest) else -1.0
         vs[k] = fy * bd + cy
         lift, across = height_m - depth, (foot - column) * gsd_m
         leaves[k] = zc * free_m / lift - tolerance_m

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,16 @@ _PLAN_SIDE_PX: Final = 640
 _PLAN_SAMPLE: Final = 250_000
 _POLAR_SIDE_PX: Final = 1200
 _POLAR_SAMPLE: Final = 2_000_000
+
+# Of the rows and columns of a scan as lines over a wall: how many of each, and their colours.
+_LINES: Final = 24
+_ROW_RGB: Final = (235, 165, 20)
+_COLUMN_RGB: Final = (20, 150, 215)
+_WALL_STEP_DEG: Final = 2.0
+_WALL_CELL_M: Final = 0.05
+_WALL_REACH_M: Final = 0.15
+# Points of a line that lie farther apart than so many usual steps are not joined.
+_BREAK_STEPS: Final = 6.0
 
 _SHEET_SIDE_PX: Final = 1200
 _CELL_PX: Final = 300
@@ -55,11 +66,7 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
     """
     if cloud.row is None or cloud.column is None or cloud.intensity is None or not len(cloud):
         return None
-    index = np.arange(0, len(cloud), max(1, len(cloud) // _POLAR_SAMPLE))
-    scan = 0
-    if cloud.scan is not None:
-        scan = int(np.bincount(cloud.scan[index]).argmax())
-        index = index[cloud.scan[index] == scan]
+    scan, index = _largest_scan(cloud)
     row, column = (array[index].astype(np.int64) for array in (cloud.row, cloud.column))
     row, column = row - row.min(), column - column.min()
     size = np.array([row.max() + 1, column.max() + 1])
@@ -78,6 +85,44 @@ def polar_view_png(cloud: PointCloud) -> bytes | None:
     upward, leftward = _ways_of_grid(cloud, scan, index, row // across, column // across)
     image = grey.reshape(rows, columns)[:: -1 if upward else 1, :: -1 if leftward else 1]
     return encode_png(np.ascontiguousarray(image))
+
+
+def scan_lines_png(cloud: PointCloud) -> bytes | None:
+    """Give a PNG of a wall in rectangular coordinates, with rows and columns of the scan as lines.
+
+    The wall is the vertical plane with most points of the scan with most points, seen squarely, up
+    is up; beside it lies what else of that scan is within 15 cm of the plane. Every so manieth row
+    is a yellow line, every so manieth column a blue one (markiewicz2015, Figure 2b): where they
+    bend, something stands before the wall. None where the cloud has no grid.
+    """
+    import cv2
+
+    if cloud.row is None or cloud.column is None or not len(cloud):
+        return None
+    scan, index = _largest_scan(cloud)
+    offsets = np.column_stack([cloud.x[index], cloud.y[index], cloud.z[index]]).astype(np.float64)
+    level = offsets @ basis_from_up(cloud.up).T
+    along, distance_m = _fullest_wall(level[:, :2])
+    station = _station(cloud, scan)
+    viewer = level.mean(axis=0) if station is None else basis_from_up(cloud.up) @ station
+    on_wall = np.abs(level[:, :2] @ [along[1], -along[0]] - distance_m) <= _WALL_REACH_M
+    # To the right of who stands where the scanner stood.
+    right = along if viewer[:2] @ [along[1], -along[0]] > distance_m else -along
+    places = np.column_stack([level[:, :2] @ right, -level[:, 2]])[on_wall]
+    low, high = np.percentile(places, [0.1, 99.9], axis=0)
+    scale = _POLAR_SIDE_PX / max(float((high - low).max()), 1e-6)
+    size = np.maximum(np.ceil((high - low) * scale).astype(int), 1)
+    pixels = np.floor((places - low) * scale).astype(np.int64)
+    shade = 1.0 if cloud.intensity is None else cloud.intensity[index][on_wall]
+    picture = np.zeros((size[1], size[0], 3), dtype=np.uint8)
+    is_inside = np.all((pixels >= 0) & (pixels < size), axis=1)
+    grey = np.rint(40.0 + 120.0 * np.broadcast_to(shade, len(pixels))).astype(np.uint8)
+    picture[pixels[is_inside, 1], pixels[is_inside, 0]] = grey[is_inside, None]
+    rows, columns = (array[index][on_wall].astype(np.int64) for array in (cloud.row, cloud.column))
+    for lines, order, colour in ((rows, columns, _ROW_RGB), (columns, rows, _COLUMN_RGB)):
+        pieces = [piece for line in _some_lines(lines, order) for piece in _unbroken(pixels[line])]
+        cv2.polylines(picture, pieces, isClosed=False, color=colour)
+    return encode_png(picture)
 
 
 class ContactSheet:
@@ -130,6 +175,53 @@ class ContactSheet:
         return encode_webp(sheet)
 
 
+def _largest_scan(cloud: PointCloud) -> tuple[int, NDArray[np.int64]]:
+    """The scan with most points, and an even sample of its points."""
+    index = np.arange(0, len(cloud), max(1, len(cloud) // _POLAR_SAMPLE))
+    if cloud.scan is None:
+        return 0, index
+    scan = int(np.bincount(cloud.scan[index]).argmax())
+    return scan, index[cloud.scan[index] == scan]
+
+
+def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
+    """Where a scan was taken from, as an offset (3,); None where the files do not say."""
+    stations = cloud.stations
+    if stations is None or scan >= len(stations) or cloud.stations_source == "view_from":
+        return None
+    station: NDArray[np.float64] = stations[scan] - cloud.origin
+    return station
+
+
+def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Direction (2,) along the vertical plane with most points (n, 2), and its distance."""
+    some = plan[:: max(1, len(plan) // _PLAN_SAMPLE)]
+    fullest, best = -1, (np.array([1.0, 0.0]), 0.0)
+    for angle in np.radians(np.arange(0.0, 180.0, _WALL_STEP_DEG)):
+        along = np.array([math.cos(angle), math.sin(angle)])
+        cells = np.floor(some @ [along[1], -along[0]] / _WALL_CELL_M).astype(np.int64)
+        counts = np.bincount(cells - cells.min())
+        if counts.max() > fullest:
+            fullest = int(counts.max())
+            best = along, (int(counts.argmax()) + int(cells.min()) + 0.5) * _WALL_CELL_M
+    return best
+
+
+def _some_lines(lines: NDArray[np.int64], order: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Points (indices) of every so manieth line of a scan, one after the other."""
+    numbers = np.unique(lines)
+    for number in numbers[:: max(1, len(numbers) // _LINES)]:
+        mine = np.flatnonzero(lines == number)
+        yield mine[np.argsort(order[mine], kind="stable")]
+
+
+def _unbroken(pixels: NDArray[np.int64]) -> list[NDArray[np.int32]]:
+    """Pieces of a line of points (n, 2) in pixels whose steps are alike."""
+    steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
+    usual = max(1.0, float(np.median(steps))) if len(steps) else 1.0
+    return np.split(pixels.astype(np.int32), np.flatnonzero(steps > _BREAK_STEPS * usual) + 1)
+
+
 def _ways_of_grid(
     cloud: PointCloud,
     scan: int,
@@ -138,11 +230,11 @@ def _ways_of_grid(
     column: NDArray[np.int64],
 ) -> tuple[bool, bool]:
     """Whether rows run upwards, and columns to the left, as the station sees its points."""
-    stations = cloud.stations
-    if stations is None or scan >= len(stations) or cloud.stations_source == "view_from":
+    station = _station(cloud, scan)
+    if station is None:
         return True, False
     offsets = np.column_stack([cloud.x[index], cloud.y[index], cloud.z[index]]).astype(np.float64)
-    rays = (offsets - (stations[scan] - cloud.origin)) @ basis_from_up(cloud.up).T
+    rays = (offsets - station) @ basis_from_up(cloud.up).T
     elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
     upward = float(np.cov(row, elevation)[0, 1]) >= 0.0
     # Mean directions of the columns: their steps turn the same way also where a panorama closes.

@@ -17,7 +17,7 @@ from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.products import InputFiles, JsonValue, PointCloud
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.assembly import COARSE_M, FINE_M, CloudAssembly, resolution_m
-from orthoflow_plugins.read.figures import plan_view_png, polar_view_png
+from orthoflow_plugins.read.figures import plan_view_png, polar_view_png, scan_lines_png
 from orthoflow_plugins.read.quality import judge_quality, report_quality
 from orthoflow_plugins.read.scales import (
     LUMINANCE_CORRELATION,
@@ -151,6 +151,10 @@ class ReadScan(Method):
         polar = polar_view_png(cloud)
         if polar is not None:
             ctx.figure("polar", polar, "Intensity over the scanner's own rows and columns.")
+        lines = scan_lines_png(cloud)
+        if lines is not None:
+            caption = "A wall seen squarely: rows of the scan yellow, columns blue."
+            ctx.figure("scan-lines", lines, caption)
         return self.Out(cloud=cloud)
 
     @classmethod

@@ -6,7 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.findings import check_findings, displacement_findings, report
+from orthoflow_plugins.inspect.findings import (
+    check_findings,
+    displacement_findings,
+    length_findings,
+    report,
+)
 
 from orthoflow.products import Finding
 from orthoflow.sdk import StepContext
@@ -67,6 +72,23 @@ def test_check_points_are_summed_up_by_lengths_and_outliers() -> None:
     assert alone["mean_shift_share"] == pytest.approx(1.0)
     still = {item.name: item.value for item in check_findings(np.zeros((3, 2)), 0.004)}
     assert still["mean_shift_share"] == 0.0
+
+
+def test_a_scale_shows_in_every_length_and_a_shift_in_none() -> None:
+    rng = np.random.default_rng(4)
+    places_m, wall = rng.uniform(0.0, 5.0, (40, 2)), np.repeat([0, 3], 20)
+    # The walls are shifted differently, so that lengths between them mean nothing.
+    shift_m = 0.002 * places_m + np.where(wall == 0, 0.01, -0.03)[:, None]
+    found = {item.name: item.value for item in length_findings(places_m, shift_m, wall)}
+    assert found["length_error_rms_share"] == pytest.approx(0.002)
+    assert found["length_error_max_share"] == pytest.approx(0.002)
+    # Short lengths do not count: of 2 x 190 pairs some are shorter than a quarter of the longest.
+    assert 250 < found["n_lengths"] < 380
+    one_off = np.zeros_like(shift_m)
+    one_off[0, 0] = 0.01
+    worst = {item.name: item.value for item in length_findings(places_m, one_off, wall)}
+    assert 0.002 < worst["length_error_max_share"] < 0.01
+    assert length_findings(places_m[:1], shift_m[:1], wall[:1]) == []
 
 
 def test_a_cap_that_binds_is_told_in_the_name() -> None:

@@ -246,16 +246,42 @@ def test_exact_points_give_the_exact_camera(shift_m: NDArray[np.float64]) -> Non
     near = found.camera.shifted(shift_m)
     for name in ("fx", "fy", "cx", "cy"):
         assert getattr(near, name) == pytest.approx(getattr(true, name), abs=0.05)
-    assert found.skew_px == pytest.approx(0.0, abs=0.05)
+    assert near.skew == pytest.approx(0.0, abs=0.05)
     np.testing.assert_allclose(near.centre_world, true.centre_world, atol=1e-4)
 
 
 def test_eleven_parameters_find_skew() -> None:
     true = camera(k1=0.0)
     points = points_in_view(true, 60, relief_m=0.3, rng=np.random.default_rng(3))
-    pixels = true.project(points)[:, :2]
-    skewed = pixels + np.outer((pixels[:, 1] - true.cy) / true.fy, [12.0, 0.0])
-    assert direct_linear(skewed, points, SIZE_PX).skew_px == pytest.approx(12.0, abs=0.05)
+    seen = replace(true, skew=12.0).project(points)[:, :2]
+    assert direct_linear(seen, points, SIZE_PX).camera.skew == pytest.approx(12.0, abs=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_skew_is_kept_when_asked(tmp_path: Path, seed: int) -> None:
+    true = replace(camera(k1=0.0), skew=60.0)
+    ties = ties_of(true, seed, noise_px=0.5)
+    kept = orient(ties, context(tmp_path), skew=True).cameras[0]
+    assert kept.status == "ok"
+    assert kept.intrinsics is not None
+    assert kept.intrinsics.skew == pytest.approx(60.0, abs=3.0)
+    # A corner is 28 px off where the skew is left out, and no pose takes up all of it.
+    assert frame_errors_px(kept.viewing(), true).max() < 1.0
+    left_out = orient(ties, context(tmp_path), sigma_wall_max_cells=100, sigma_corner_max_cells=300)
+    (other,) = left_out.cameras
+    if other.status == "ok":
+        assert other.intrinsics is not None
+        assert other.intrinsics.skew is None
+        assert frame_errors_px(other.viewing(), true).max() > 5.0
+
+
+def test_a_lens_without_skew_is_found_without_it(tmp_path: Path) -> None:
+    true = camera(k1=-0.08)
+    ties = ties_of(true, 1, noise_px=0.5)
+    found = orient(ties, context(tmp_path), skew=True, distortion="k1").cameras[0]
+    assert found.intrinsics is not None
+    assert found.intrinsics.skew == pytest.approx(0.0, abs=3.0)
+    assert frame_errors_px(found.viewing(), true).max() < 1.5
 
 
 def test_too_few_points_are_refused() -> None:

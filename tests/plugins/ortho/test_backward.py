@@ -63,6 +63,26 @@ def test_every_painted_cell_shows_its_own_place(tmp_path: Path, aside_m: float) 
     assert np.abs(places_told_by(layer)[shown]).max() <= 0.5 + 0.125
 
 
+def test_a_skewed_camera_paints_its_own_places(tmp_path: Path) -> None:
+    where = scenes.frame()
+    viewer = dataclasses.replace(scenes.camera(where), skew=80.0)
+    rows, columns = np.mgrid[: viewer.height, : viewer.width] + 0.5
+    rays = viewer.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
+    origins = np.broadcast_to(viewer.centre_world, rays.shape)
+    photo = scenes.colours(scenes.cast(where, origins, rays))
+    shape = (viewer.height, viewer.width, 3)
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=scenes.photos(photo.reshape(shape)),
+        cameras=scenes.cameras(viewer),
+        cloud=scenes.cloud(where),
+    )
+    (layer,) = run(inputs, context(tmp_path), resampling="nearest").layers
+    shown = layer.mask == LayerMask.PAINTED
+    assert shown.sum() > 40_000
+    assert np.abs(places_told_by(layer)[shown]).max() <= 0.5 + 0.125
+
+
 @pytest.mark.parametrize("aside_m", [-0.7, 0.0, 0.9])
 def test_nothing_hidden_is_painted_and_nearly_all_that_is_seen(
     tmp_path: Path, aside_m: float

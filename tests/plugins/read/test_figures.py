@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.read import figures
-from orthoflow_plugins.read.figures import ContactSheet, plan_view_png, polar_view_png
+from orthoflow_plugins.read.figures import (
+    ContactSheet,
+    plan_view_png,
+    polar_view_png,
+    scan_lines_png,
+)
 
 from orthoflow.products import PointCloud
 from tests.plane_scenes import cloud_of
@@ -140,6 +145,62 @@ def test_clouds_without_rows_or_intensity_have_no_such_view() -> None:
         names = ("row", "column") if name != "intensity" else ("intensity",)
         assert polar_view_png(replace(cloud, **dict.fromkeys(names))) is None
     assert polar_view_png(some_of(cloud, np.empty(0, dtype=np.intp))) is None
+
+
+# --- rows and columns in rectangular coordinates ---
+
+
+def wall_scan(*, station_y: float = -2.0) -> PointCloud:
+    """A wall of 4 x 2 m in y = 0 and one of 1 x 2 m beside it, scanned in 80 rows, 200 columns."""
+    row, column = (grid.ravel() for grid in np.mgrid[:80, :200])
+    x, z = 0.025 * column, 0.025 * row
+    on_main = column < 160
+    points = np.column_stack([np.minimum(x, 4.0), np.where(on_main, 0.0, -(x - 4.0)), z])
+    cloud = cloud_of(points, stations=np.array([[2.0, station_y, 1.0]]))
+    # The left half is dark.
+    intensity = np.where(x < 2.0, 0.0, 1.0).astype(np.float32)
+    rows, columns = row.astype(np.uint32), column.astype(np.uint32)
+    return replace(cloud, row=rows, column=columns, intensity=intensity)
+
+
+def test_rows_and_columns_are_lines_over_the_fullest_wall() -> None:
+    shown = pixels(scan_lines_png(wall_scan()))[..., ::-1]
+    # 3.975 m are 1200 pixels, and what is within 15 cm of the wall is drawn.
+    assert shown.shape[1] == 1200
+    assert shown.shape[0] == pytest.approx(1200 * 1.975 / 3.975, abs=8)
+    is_row = (shown == figures._ROW_RGB).all(axis=2)
+    is_column = (shown == figures._COLUMN_RGB).all(axis=2)
+    # Every third of 80 rows, every seventh of 167 columns, straight from edge to edge; the last
+    # of these lie on the other wall, one behind the other and beyond the picture.
+    full_rows = (is_row | is_column).mean(axis=1) > 0.98
+    full_columns = is_column.mean(axis=0) > 0.98
+    assert 26 <= full_rows.sum() <= 27
+    assert full_columns.sum() == 23
+    assert set(np.diff(np.flatnonzero(full_rows))) <= {22, 23}
+
+
+def test_the_wall_is_seen_from_the_station() -> None:
+    for station_y, sense in ((-2.0, 1), (2.0, -1)):
+        shown = pixels(scan_lines_png(wall_scan(station_y=station_y)))
+        is_point = (shown[..., 0] == shown[..., 2]) & (shown[..., 0] > 0)
+        columns = np.nonzero(is_point)[1]
+        bright = columns[shown[is_point][:, 0] > 100].mean()
+        assert np.sign(bright - 600) == sense
+
+
+def test_broken_lines_are_not_joined_over_gaps() -> None:
+    cloud = wall_scan()
+    kept = np.flatnonzero((cloud.column < 60) | (cloud.column > 90))
+    shown = pixels(scan_lines_png(some_of(cloud, kept)))[..., ::-1]
+    hole = shown[:, 470:660]
+    assert not (hole == figures._ROW_RGB).all(axis=2).any()
+
+
+def test_clouds_without_a_grid_have_no_lines() -> None:
+    cloud = wall_scan()
+    assert scan_lines_png(replace(cloud, row=None, column=None)) is None
+    bare = pixels(scan_lines_png(replace(cloud, intensity=None)))
+    assert bare.shape[1] == 1200
 
 
 # --- the sheet ---
