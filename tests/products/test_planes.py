@@ -152,3 +152,34 @@ def test_sides_of_their_own_are_kept_and_no_sides_leave_the_encoding_as_it_was()
 def test_sides_are_none_or_one_per_plane() -> None:
     with pytest.raises(ProductError, match="side_from must be empty or one per plane, got 1 for 2"):
         replace(two_planes(), side_from=("photos",))
+
+
+def test_a_plane_turned_round_is_the_same_plane_seen_from_behind() -> None:
+    corners = np.arange(24.0).reshape(2, 4, 3)
+    parts = np.arange(36.0).reshape(3, 4, 3)
+    planes = replace(
+        two_planes(), corners=corners, part_corners=parts, part_plane=np.array([0, 1, 0])
+    )
+    turned = planes.turned(0)
+    # n . p = d is the same plane as (-n) . p = -d.
+    np.testing.assert_array_equal(turned.normal, [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_array_equal(turned.offset, [2.0, 0.0])
+    # Top-left, bottom-left, bottom-right, top-right: from behind left and right change places.
+    np.testing.assert_array_equal(turned.corners[0], corners[0][[3, 2, 1, 0]])
+    np.testing.assert_array_equal(turned.corners[1], corners[1])
+    assert turned.part_corners is not None
+    np.testing.assert_array_equal(turned.part_corners[0], parts[0][[3, 2, 1, 0]])
+    np.testing.assert_array_equal(turned.part_corners[1], parts[1])
+    np.testing.assert_array_equal(turned.part_corners[2], parts[2][[3, 2, 1, 0]])
+    # What was given stays as it was, and turning twice turns nothing.
+    np.testing.assert_array_equal(planes.corners, np.arange(24.0).reshape(2, 4, 3))
+    again = turned.turned(0)
+    assert again.part_corners is not None
+    np.testing.assert_array_equal(again.part_corners, parts)
+    np.testing.assert_array_equal(again.offset, planes.offset)
+
+
+def test_a_plane_without_parts_turns_round_too() -> None:
+    turned = two_planes().turned(1)
+    assert turned.part_corners is None
+    np.testing.assert_array_equal(turned.normal[1], [0.0, 0.0, -1.0])

@@ -1,0 +1,91 @@
+"""Walls of a room: which slab each takes points from, and which is nearest to a point."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import ProductError
+from orthoflow.geometry import WallFrame
+from orthoflow.products import Wall, Walls
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def wall_at(x_m: float, name: str) -> Wall:
+    """2 m x 1 m at an x, seen from the east; its lower edge at z = 0, from y = 0 on."""
+    frame = WallFrame(
+        origin_world=np.array([x_m, 0.0, 1.0]),
+        u_world=np.array([0.0, 1.0, 0.0]),
+        v_world=-UP,
+        normal_world=np.array([1.0, 0.0, 0.0]),
+        gsd_m=0.5,
+        width=4,
+        height=2,
+    )
+    return Wall(
+        frame=frame,
+        plane_index=0,
+        name=name,
+        depth_m=np.zeros(frame.shape, dtype=np.float32),
+        sigma_m=np.zeros(frame.shape, dtype=np.float32),
+        count=np.ones(frame.shape, dtype=np.uint32),
+        mask=np.ones(frame.shape, dtype=np.uint8),
+    )
+
+
+def walls(*given: Wall) -> Walls:
+    return Walls(
+        walls=given, up=UP, intensity_source="none", buffer_front_m=0.3, buffer_behind_m=0.1
+    )
+
+
+def test_walls_share_a_reach_or_have_their_own() -> None:
+    room = walls(wall_at(0.0, "west"), wall_at(8.0, "east"))
+    shared = room.slab(1)
+    assert (shared.front_m, shared.behind_m) == (0.3, 0.1)
+    assert shared.frame is room.walls[1].frame
+    assert shared.n_cells == 8
+    own = replace(room, buffers_m=((0.2, 0.4), (0.05, 0.6))).slab(1)
+    assert (own.front_m, own.behind_m) == (0.05, 0.6)
+
+
+def test_a_reach_belongs_to_each_wall() -> None:
+    with pytest.raises(ProductError, match="1 walls need a buffer each or none, got 2"):
+        replace(walls(wall_at(0.0, "west")), buffers_m=((0.2, 0.4), (0.05, 0.6)))
+
+
+@pytest.mark.parametrize(
+    ("point_world", "index"),
+    [
+        ([1.0, 1.0, 0.5], 0),
+        ([7.0, 1.0, 0.5], 1),
+        # The rectangle counts, not its plane: 5 m along the one, 3 m in front of the other.
+        ([0.0, 7.0, 0.5], 2),
+    ],
+    ids=["by-the-first", "by-the-second", "beside-the-first"],
+)
+def test_the_nearest_wall_is_that_of_the_nearest_rectangle(
+    point_world: list[float], index: int
+) -> None:
+    turned = WallFrame(
+        origin_world=np.array([2.0, 10.0, 1.0]),
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=-UP,
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=0.5,
+        width=4,
+        height=2,
+    )
+    room = walls(
+        wall_at(0.0, "west"), wall_at(8.0, "east"), replace(wall_at(0.0, "north"), frame=turned)
+    )
+    points_world: NDArray[np.float64] = np.array([point_world])
+    assert room.nearest(points_world).tolist() == [index]
+
+
+def test_without_walls_no_wall_is_nearest() -> None:
+    assert walls().nearest(np.zeros((3, 3))).tolist() == [-1, -1, -1]
