@@ -180,6 +180,9 @@ def files_of(tree: Tree, path: str) -> list[str]:
         for place, folder in enumerate(folders_of(tree, path))
         for file in sorted((tree.root / folder).rglob("test_*.py"))
     ]
+    if len(name.split(".")) == 2 and (tree.root / f"tests/test_{stem}.py").is_file():
+        # Of a module beside the packages, as its tests are.
+        ranked.append(((0, 0, ""), f"tests/test_{stem}.py"))
     if kinds_of(tree, path):
         # What holds for the methods of all kinds.
         shared = sorted((tree.root / "tests/plugins").glob("test_*.py"))

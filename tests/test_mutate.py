@@ -136,6 +136,7 @@ def test_the_file_of_its_name_goes_first_and_kinds_follow_geometry(tree: mutate.
     folders = ("tests/plugins/plane", "tests/plugins")
     there = [file for folder in folders for file in (mutate.ROOT / folder).glob("test_*.py")]
     assert sorted(files) == sorted(str(file.relative_to(mutate.ROOT)) for file in there)
+    assert "tests/test_alike.py" in mutate.files_of(tree, "orthoflow/alike.py")[:2]
     folders = mutate.folders_of(tree, "orthoflow/geometry/threads.py")
     assert folders[0] == "tests/geometry"
     assert {"tests/plugins/plane", "tests/plugins/ortho"} <= set(folders)

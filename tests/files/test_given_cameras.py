@@ -348,6 +348,10 @@ def test_bundler_cameras_project_as_its_manual_says(tmp_path: Path) -> None:
         ((90, 90, 0), (1, 0, 0), (0, 0, 1)),
         ((-30, 90, 0), (-0.5, math.sqrt(0.75), 0), (0, 0, 1)),
         ((0, 60, 0), (0, math.sqrt(0.75), -0.5), (0, 0.5, math.sqrt(0.75))),
+        # Rolled about what points up in the photo, before it is pitched and headed.
+        ((0, 0, 90), (-1, 0, 0), (0, 1, 0)),
+        ((0, 90, 30), (-0.5, math.sqrt(0.75), 0), (0, 0, 1)),
+        ((90, 90, 30), (math.sqrt(0.75), 0.5, 0), (0, 0, 1)),
     ],
 )
 def test_realitycapture_angles_are_those_of_a_compass(
@@ -418,7 +422,31 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
          "images.bin: it ends too early"),
         ({"b.out": "1 0\n", "list.txt": "a.jpg\nb.jpg\n"}, "1 cameras, but the list names 2"),
         ({"b.out": "1 0\n500 0 0\n", "list.txt": "a.jpg\n"}, "it ends within camera 0"),
+        ({"b.out": "1 0\n500 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0\n", "list.txt": "a.jpg\n"},
+         "it ends within camera 0"),
+        ({"b.out": "# Bundle\n", "list.txt": "a.jpg\n"}, "b.out: it is empty"),
+        ({"b.out": "1\n", "list.txt": "a.jpg\n"}, "it states 1 cameras, but the list names 1"),
         ({"b.out": "1 0\n"}, "says nothing of names"),
+        ({"b.out": "1 0\n", "l.txt": "a.jpg", "m.txt": "a.jpg"}, "there are 2 such files"),
+        ({"b.json": "{}", "c.json": "{}"}, "b.json, c.json holds no cameras"),
+        ({f"{n}.jpg": "" for n in "abc"}, "a.jpg, b.jpg, c.jpg holds no cameras"),
+        ({f"{n}.jpg": "" for n in "abcd"}, r"a.jpg, b.jpg, c.jpg \.\.\. holds no cameras"),
+        ({"c.json": cameras_json(lambda e: e.update(width=0))}, "a.jpg is 0 x 480 pixels"),
+        ({"c.json": cameras_json(lambda e: e.update(height=0))}, "a.jpg is 640 x 0 pixels"),
+        ({"c.json": cameras_json(lambda e: e.update(K=[[1, 0, 0], [0, -2, 0], [0, 0, 1]]))},
+         "the lens of a.jpg is none: focal length 1, -2"),
+        ({"c.json": cameras_json(lambda e: e.update(K=[[0, 0, 0], [0, 2, 0], [0, 0, 1]]))},
+         "the lens of a.jpg is none: focal length 0, 2"),
+        ({"c.json": cameras_json(lambda e: e.update(K=[[1, 0, 0], [0, 2, 0]]))}, r"must be K \(3"),
+        ({"c.json": cameras_json(lambda e: e.update(distortion=[0, 0, 0, 0, math.nan]))},
+         "the lens of a.jpg is none"),
+        # A mirror is no turn.
+        ({"c.json": cameras_json(
+            lambda e: e.update(R_camera_from_world=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]))},
+         "the rotation of a.jpg is no rotation matrix"),
+        ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,0,0,0,0,0,0,0,0,0\n"},
+         "c.csv:2: the focal length of a.jpg must be positive, got 0"),
+        ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,1e-3,0,0\n"}, "c.csv:2: .* tangential"),
         ({"c.csv": "name,x,y,z\n"}, "the column alt is missing"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,0,0.1,0\n"}, "c.csv:2: .* tangential"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,zero,0,0,0,0,0,0\n"}, "c.csv:2: the parameters"),
@@ -430,6 +458,50 @@ def test_files_that_make_no_sense_end_in_one_sentence(
     with pytest.raises(InputError, match=message) as caught:
         read_given_cameras(write(tmp_path, files))
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_of_half_a_gigabyte_is_no_file_of_cameras(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.json"
+    with path.open("wb") as file:
+        file.truncate(500_000_001)
+    with pytest.raises(InputError, match=r"cameras\.json is too large for a file of cameras"):
+        read_given_cameras([path])
+
+
+@pytest.mark.parametrize("turned", [1e-5, 1e-3])
+def test_rounded_rotations_are_made_right_and_others_refused(tmp_path: Path, turned: float) -> None:
+    rotation = np.eye(3)
+    rotation[0, 1] = 2.0 * turned
+    text = cameras_json(lambda entry: entry.update(R_camera_from_world=rotation.tolist()))
+    paths = write(tmp_path, {"c.json": text})
+    if turned > 1e-4:
+        with pytest.raises(InputError, match="no rotation matrix"):
+            read_given_cameras(paths)
+        return
+    (given,) = read_given_cameras(paths)
+    assert given.rotation is not None
+    np.testing.assert_allclose(given.rotation @ given.rotation.T, np.eye(3), atol=1e-15)
+    # The nearest rotation shares the shear between both axes.
+    assert given.rotation[0, 1] == pytest.approx(turned, rel=1e-6)
+
+
+def test_lists_of_photos_may_have_blank_lines_and_capitals(tmp_path: Path) -> None:
+    files: dict[str, str | bytes] = {
+        "BUNDLE.OUT": "1 0\n0 0 0\n" + "0 0 0\n" * 4,
+        "LIST.TXT": "\nphotos/a.jpg\n\n",
+    }
+    (given,) = read_given_cameras(write(tmp_path, files))
+    assert (given.name, given.reason) == ("a.jpg", "Bundler did not orient it")
+
+
+def test_a_lens_that_says_no_size_has_its_focal_length_in_pixels_or_by_the_longer_side() -> None:
+    by_pixels = CentredLens(focal_px=700.0, radial=(0.1, 0.2, 0.3)).of_size(400, 600)
+    assert (by_pixels.fx, by_pixels.fy, by_pixels.cx, by_pixels.cy) == (700.0, 700.0, 200.0, 300.0)
+    assert by_pixels.distortion == (0.1, 0.2, 0.0, 0.0, 0.3)
+    by_side = CentredLens(focal_share=1.5, off_middle=(0.1, -0.1), radial=(0.0, 0.0, 0.0))
+    lens = by_side.of_size(400, 600)
+    assert (lens.width, lens.height, lens.fx) == (400, 600, 900.0)
+    assert (lens.cx, lens.cy) == (260.0, 240.0)
 
 
 def test_a_fisheye_of_colmap_is_said_and_not_bent(tmp_path: Path) -> None:

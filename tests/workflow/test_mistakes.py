@@ -413,3 +413,11 @@ def test_metrics_that_no_method_of_a_step_declares_are_refused(
         f"compare.metrics: step plane reports no metric rsm_mm (did you mean rms_mm?); {whose}",
         f"compare.metrics: step plane reports no metric depth; {whose}",
     ]
+
+
+def test_what_takes_from_a_step_of_an_unknown_kind_is_no_mistake_of_its_own(
+    catalog: Catalog, write: Path
+) -> None:
+    steps = "a: {use: plain.hough2d}\nb: {use: plane.hough2d, in: {cloud: a.cloud}}"
+    found = problems(with_steps(steps), write, catalog)
+    assert [path for _, _, path, _ in found] == ["steps.a.use"]
