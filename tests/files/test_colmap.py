@@ -89,16 +89,40 @@ def test_a_place_that_two_photos_see_is_one_point(tmp_path: Path) -> None:
     assert written.n_points == int((ties.role != TieRole.REJECTED).sum()) - 1
 
 
+def test_a_tie_that_was_rejected_or_of_a_refused_photo_is_not_written(tmp_path: Path) -> None:
+    cameras = oriented()
+    ties = cameras.ties
+    assert ties is not None
+    # All four photos have ties that count, but the last of them is not oriented.
+    role = np.full(len(ties.photo), TieRole.CONTROL, dtype=np.uint8)
+    residual_px = np.tile([3.0, 4.0], (len(ties.photo), 1))
+    role[0] = TieRole.REJECTED
+    kept = (ties.photo < 3) & (role == TieRole.CONTROL)
+    all_kept = replace(cameras, ties=replace(ties, role=role, residual_px=residual_px))
+    assert write_colmap_model(tmp_path, all_kept).n_points == int(kept.sum())
+    points = (tmp_path / "points3D.txt").read_text(encoding="utf-8").splitlines()[1:]
+    # Grey, and with the length of the residual as their error.
+    assert {tuple(line.split()[4:8]) for line in points} == {("128", "128", "128", "5.0")}
+    assert [line.split()[0] for line in points] == [str(n + 1) for n in range(len(points))]
+
+
 def test_without_ties_the_cameras_are_written(tmp_path: Path) -> None:
     import pycolmap
 
-    write_colmap_model(tmp_path, replace(oriented(), ties=None))
+    written = write_colmap_model(tmp_path, replace(oriented(), ties=None))
+    assert (written.n_cameras, written.n_images, written.n_points) == (1, 3, 0)
     assert pycolmap.Reconstruction(str(tmp_path)).num_images() == 3
 
 
 def test_a_name_that_colmap_would_cut_is_refused(tmp_path: Path) -> None:
     camera = replace(oriented().cameras[0], photo="north wall 1.jpg")
     with pytest.raises(ArgumentError, match=r'first space, but one is "north wall 1\.jpg"'):
+        write_colmap_model(tmp_path, Cameras(cameras=(camera,)))
+
+
+def test_an_oriented_photo_without_a_lens_is_refused(tmp_path: Path) -> None:
+    camera = replace(oriented().cameras[0], intrinsics=None)
+    with pytest.raises(ArgumentError, match="is oriented, but its lens is not known"):
         write_colmap_model(tmp_path, Cameras(cameras=(camera,)))
 
 

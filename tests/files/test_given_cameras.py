@@ -416,7 +416,16 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
         ({"cameras.txt": "1 PINHOLE 640 480 500 320 240\n", "images.txt": ""},
          "a camera PINHOLE has 4 parameters, got 3"),
         ({"cameras.txt": CAMERA, "images.txt": "# none\n"}, "the model has no images"),
+        ({"cameras.txt": "1 PINHOLE 640 480\n", "images.txt": ""}, "txt:1: expected CAMERA_ID"),
+        ({"cameras.txt": "# c\n\n" + CAMERA, "images.txt": "\n1 1 0 0 0 0 x 0 1 a.jpg\n"},
+         "images.txt:2: a pose must be numbers"),
+        ({"cameras.txt": CAMERA, "images.txt": "1 1 0 0 0 0 0 0 one a.jpg\n"},
+         "images.txt:1: CAMERA_ID must be numbers"),
         ({"cameras.bin": b"\xff" * 8, "images.bin": b""}, "more than it has bytes"),
+        ({"cameras.bin": b"\1" + b"\0" * 7 + struct.pack("<IiQQ", 7, 12, 640, 480),
+          "images.bin": b""}, "camera 7 is of the unknown model 12"),
+        ({"cameras.bin": b"\1" + b"\0" * 7 + struct.pack("<IiQQ", 7, -1, 640, 480),
+          "images.bin": b""}, "camera 7 is of the unknown model -1"),
         ({"cameras.bin": b"\1" + b"\0" * 7, "images.bin": b""}, "cameras.bin: it ends too early"),
         ({"cameras.bin": b"\0" * 8, "images.bin": b"\1" + b"\0" * 7 + b"x" * 64},
          "images.bin: it ends too early"),
@@ -502,6 +511,31 @@ def test_a_lens_that_says_no_size_has_its_focal_length_in_pixels_or_by_the_longe
     lens = by_side.of_size(400, 600)
     assert (lens.width, lens.height, lens.fx) == (400, 600, 900.0)
     assert (lens.cx, lens.cy) == (260.0, 240.0)
+
+
+@pytest.mark.parametrize("term", ["k4", "k5", "k6"])
+def test_rational_distortion_of_colmap_is_said_and_not_left_out(tmp_path: Path, term: str) -> None:
+    params = [500, 500, 320, 240, 0, 0, 0, 0, 0, *(float(term == k) for k in ("k4", "k5", "k6"))]
+    files: dict[str, str | bytes] = {
+        "cameras.txt": f"1 FULL_OPENCV {WIDTH} {HEIGHT} {words(params)}\n",
+        "images.txt": "1 1 0 0 0 0 0 0 1 a.jpg\n\n",
+    }
+    (given,) = read_given_cameras(write(tmp_path, files))
+    assert given.rotation is None
+    assert given.reason.startswith("its camera has k4, k5 or k6, which orthoflow does not take")
+
+
+def test_models_of_colmap_that_bend_otherwise_are_told_by_their_number(tmp_path: Path) -> None:
+    counts = {5: 8, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16}
+    names = ["OPENCV_FISHEYE", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE",
+             "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"]  # fmt: skip
+    cameras, images = struct.pack("<Q", len(counts)), struct.pack("<Q", len(counts))
+    for number, count in counts.items():
+        cameras += struct.pack(f"<IiQQ{count}d", number, number, WIDTH, HEIGHT, *[0.1] * count)
+        images += struct.pack("<I7dI", number, 1, 0, 0, 0, 0, 0, 0, number) + b"a\0" + bytes(8)
+    found = read_given_cameras(write(tmp_path, {"cameras.bin": cameras, "images.bin": images}))
+    said = [given.reason.partition(",")[0].removeprefix("its camera is of the ") for given in found]
+    assert said == [f"model {name}" for name in names]
 
 
 def test_a_fisheye_of_colmap_is_said_and_not_bent(tmp_path: Path) -> None:
