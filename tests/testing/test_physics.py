@@ -1,0 +1,196 @@
+"""How far beside the truth a result may lie: below each limit it passes, above it is named."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, Orthoimages, OrthoMask, Planes
+from orthoflow.testing import photographed, physics
+from orthoflow.testing.examples import example_room
+
+
+@pytest.fixture(scope="module")
+def truth() -> Planes:
+    _, planes = example_room(n_points=1000)
+    return planes
+
+
+@pytest.mark.parametrize(("angle_deg", "fits"), [(0.015, True), (0.03, False)])
+def test_planes_may_be_a_fiftieth_of_a_degree_off(
+    truth: Planes, angle_deg: float, fits: bool
+) -> None:
+    turn = math.radians(angle_deg)
+    beside = np.linalg.svd(truth.normal[0][None])[2][1]
+    normal = math.cos(turn) * truth.normal[0] + math.sin(turn) * beside
+    # Turned about the middle of the rectangle, which so stays on the plane.
+    offset = truth.corners[0].mean(axis=0) @ normal
+    found = replace(
+        truth,
+        normal=np.vstack([normal, truth.normal[1:]]),
+        offset=np.append(offset, truth.offset[1:]),
+    )
+    if fits:
+        physics._match_planes(found, truth)
+        return
+    with pytest.raises(AssertionError, match=r"plane 0 of a moved room is 0\.030 deg and 0\.00 mm"):
+        physics._match_planes(found, truth)
+
+
+@pytest.mark.parametrize(("shift_m", "fits"), [(0.0008, True), (0.0015, False)])
+def test_planes_may_be_a_millimetre_off(truth: Planes, shift_m: float, fits: bool) -> None:
+    moved = truth.offset.copy()
+    moved[1] -= shift_m
+    found = replace(truth, offset=moved)
+    if fits:
+        physics._match_planes(found, truth)
+        return
+    with pytest.raises(AssertionError, match=r"plane 1 of a moved room is 0\.000 deg and 1\.50 mm"):
+        physics._match_planes(found, truth)
+
+
+def oriented(shift_m: float) -> Any:
+    """A subject that finds both photos, shifted along the wall."""
+    found = [
+        photographed.oriented(
+            photographed.nudged(camera, (0.0, 0.0, 0.0, shift_m, 0.0, 0.0)), name=name
+        )
+        for name, camera in photographed.photographing_cameras().items()
+    ]
+    run = SimpleNamespace(outputs={"cameras": photographed.cameras(*found)})
+    return SimpleNamespace(run_on_photographs=lambda: run)
+
+
+def test_photos_may_be_oriented_a_little_beside_their_true_pose() -> None:
+    # A shift along the wall moves every pixel's place by as much: 1 mm is 0.7 mm per coordinate.
+    physics.poses_are_recovered(oriented(0.001))
+    with pytest.raises(AssertionError, match=r"a\.png is oriented 0\.99 mm beside its true pose"):
+        physics.poses_are_recovered(oriented(0.0014))
+
+
+def test_a_photo_that_is_not_oriented_is_named() -> None:
+    subject = oriented(0.0)
+    lost = replace(subject.run_on_photographs().outputs["cameras"].cameras[1], status="too few")
+    run = SimpleNamespace(outputs={"cameras": photographed.cameras(lost)})
+    with pytest.raises(AssertionError, match=r"b\.png was not oriented: too few"):
+        physics.poses_are_recovered(SimpleNamespace(run_on_photographs=lambda: run))  # type: ignore[arg-type]
+    run = SimpleNamespace(outputs={"cameras": None})
+    with pytest.raises(AssertionError, match="cameras are missing"):
+        physics.poses_are_recovered(SimpleNamespace(run_on_photographs=lambda: run))  # type: ignore[arg-type]
+
+
+def layer(
+    *, columns: float = 0.0, rows: float = 0.0, share: float = 1.0, lighter: int = 0
+) -> Layer:
+    """The wall in its true colours, shifted, in a share of its columns, and made lighter."""
+    scene = photographed.photographed_scene(0.01)
+    frame = scene.frame
+    across, down = photographed.places_of_cells(frame)
+    grey = scene.grey(across - columns * frame.gsd_m, down - rows * frame.gsd_m)
+    shown = np.broadcast_to(np.arange(frame.width) < share * frame.width, frame.shape)
+    values = np.clip(np.rint(255.0 * grey) + lighter, 0, 255).astype(np.uint8)
+    return Layer(
+        frame=frame,
+        wall=0,
+        source="a.png",
+        rgb=np.repeat(values[..., None], 3, axis=2),
+        mask=np.where(shown, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8),
+        quality=np.ones(frame.shape, dtype=np.float32),
+    )
+
+
+def judge(image: Layer) -> None:
+    scene = photographed.photographed_scene(0.01)
+    physics._check_cells(scene, image, "a.png", image.mask == LayerMask.PAINTED)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        layer(),
+        layer(columns=0.15, rows=-0.15),
+        layer(share=0.35),
+        layer(lighter=12),
+    ],
+    ids=["true", "a-little-shifted", "a-third", "a-little-lighter"],
+)
+def test_cells_that_show_their_place_pass(image: Layer) -> None:
+    judge(image)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (
+            layer(columns=0.3),
+            r"a\.png at 0\.01 m: colours lie -0\.\d\d columns and [+-]0\.0\d rows",
+        ),
+        (layer(rows=-0.3), r"colours lie [+-]0\.0\d columns and \+0\.\d\d rows beside their place"),
+        (layer(share=0.25), r"only 25% of the wall is painted"),
+        (layer(lighter=24), r"half of the colours are off by 2\d grey or more"),
+    ],
+    ids=["shifted-columns", "shifted-rows", "a-quarter", "lighter"],
+)
+def test_cells_that_show_another_place_are_told(image: Layer, message: str) -> None:
+    with pytest.raises(AssertionError, match=message):
+        judge(image)
+
+
+@pytest.mark.parametrize(("hidden", "passes"), [(0.02, True), (0.05, False)])
+def test_a_mosaic_paints_what_its_layers_show(hidden: float, passes: bool) -> None:
+    def run_on(name: str, **inputs: object) -> object:
+        gsd_m = float(name.removeprefix("mosaic"))
+        (left, right) = inputs["layers"].layers  # type: ignore[attr-defined]
+        rgb = np.where(left.mask[..., None] == LayerMask.PAINTED, left.rgb, right.rgb)
+        mask = np.full(left.frame.shape, OrthoMask.PAINTED, dtype=np.uint8)
+        mask[: round(hidden * len(mask))] = OrthoMask.OCCLUDED
+        assert left.frame.gsd_m == gsd_m
+        image = Orthoimage(
+            frame=left.frame,
+            wall=0,
+            name="wall 0",
+            rgb=rgb,
+            mask=mask,
+            source=np.zeros(mask.shape, dtype=np.int16),
+            sources=("left", "right"),
+        )
+        return SimpleNamespace(outputs={"orthoimages": Orthoimages(images=(image,))})
+
+    from orthoflow_plugins.mosaic.seams import MosaicSeams
+
+    subject: Any = SimpleNamespace(method=MosaicSeams, run_on=run_on)
+    if passes:
+        physics.mosaics_show_cells_in_place(subject)
+        return
+    with pytest.raises(AssertionError, match=r"wall 0 at 0\.006 m: 95% of the cells are painted"):
+        physics.mosaics_show_cells_in_place(subject)
+
+
+def test_the_two_halves_of_a_wall_overlap_in_its_middle_fifth() -> None:
+    left, right = physics._two_halves(photographed.photographed_scene(0.01)).layers
+    painted = [each.mask[0] == LayerMask.PAINTED for each in (left, right)]
+    assert [each.sum() for each in painted] == [180, 179]
+    assert (painted[0] & painted[1]).sum() == 59
+    assert (painted[0] | painted[1]).all()
+    np.testing.assert_array_equal(left.quality[0], painted[0])
+    assert not left.rgb[:, ~painted[0]].any()
+
+
+def test_without_a_result_there_is_nothing_in_place() -> None:
+    from orthoflow_plugins.mosaic.seams import MosaicSeams
+    from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
+
+    empty = SimpleNamespace(
+        outputs={"layers": Layers(layers=()), "orthoimages": Orthoimages(images=())}
+    )
+    ortho: Any = SimpleNamespace(method=PointcloudDirect, run_on=lambda _name, **_: empty)
+    with pytest.raises(AssertionError, match="no layer was made"):
+        physics.cells_show_their_own_place(ortho)
+    mosaic: Any = SimpleNamespace(method=MosaicSeams, run_on=lambda _name, **_: empty)
+    with pytest.raises(AssertionError, match="no orthoimage was made"):
+        physics.mosaics_show_cells_in_place(mosaic)
