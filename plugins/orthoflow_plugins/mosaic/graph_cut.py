@@ -54,7 +54,7 @@ class Blocks:
 
     @classmethod
     def over(cls, shape: tuple[int, int], side_cells: int) -> Blocks:
-        """Cut a raster into blocks with sides of about so many cells, at most."""
+        """Cut a raster into blocks with sides of about so many cells, one more at most."""
         rows, columns = (_symmetric_edges(length, side_cells) for length in shape)
         return cls(rows=rows, columns=columns)
 

@@ -1,0 +1,100 @@
+"""What graph cuts are made of: blocks, depth edges and the costs of seams."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from orthoflow_plugins.mosaic import graph_cut
+from orthoflow_plugins.mosaic.graph_cut import Blocks, CutLabels
+
+
+@pytest.mark.parametrize("length", range(1, 40))
+@pytest.mark.parametrize("part", [1, 2, 3, 7, 50])
+def test_blocks_are_the_same_from_either_end_and_about_as_large_as_wanted(
+    length: int, part: int
+) -> None:
+    edges = graph_cut._symmetric_edges(length, part)
+    sides = np.diff(edges)
+    assert (edges[0], edges[-1]) == (0, length)
+    np.testing.assert_array_equal(sides, sides[::-1])
+    assert sides.min() >= 1
+    # One more only where a middle block has to be odd or even as the side is.
+    assert sides.max() <= part + 1
+    # Not smaller than need be: one block more at most, for the middle.
+    assert len(sides) <= -(-length // part) + 1
+
+
+def test_blocks_have_rows_and_columns_of_their_own() -> None:
+    blocks = Blocks.over((6, 4), 3)
+    assert blocks.rows.tolist() == [0, 3, 6]
+    assert blocks.columns.tolist() == [0, 2, 4]
+
+
+def test_a_cell_takes_the_layer_of_its_block() -> None:
+    labels = CutLabels(
+        small=np.array([[0, 1], [2, -1]], dtype=np.int16), blocks=Blocks.over((6, 4), 3)
+    )
+    assert labels.in_rows(slice(2, 4)).tolist() == [[0, 0, 1, 1], [2, 2, -1, -1]]
+    assert labels.in_rows(slice(None)).shape == (6, 4)
+
+
+def test_a_depth_edge_is_a_step_of_more_than_three_centimetres_right_or_down() -> None:
+    depth_m = np.zeros((4, 5), dtype=np.float32)
+    depth_m[:, 3:] = 0.031
+    depth_m[2:, 0] = -0.029
+    expected = np.zeros((4, 5), dtype=np.bool_)
+    expected[:, 2] = True
+    np.testing.assert_array_equal(graph_cut.depth_edges(depth_m), expected)
+    depth_m[2:, 0] = -0.031
+    expected[1, 0] = expected[2:, 0] = True
+    np.testing.assert_array_equal(graph_cut.depth_edges(depth_m), expected)
+
+
+def scene(edges: tuple[float, float] = (0.0, 0.0)) -> graph_cut._Scene:
+    """Two layers of two cells: grey 0.2 and 0.5 in the first, 0.2 and 0.9 in the second cell."""
+    colours = np.array([[[0.2, 0.2]], [[0.5, 0.9]]], dtype=np.float32)
+    return graph_cut._Scene(
+        colours=np.repeat(colours[..., None], 3, axis=3),
+        views=np.zeros((2, 1, 2)),
+        edges=np.array([edges]),
+    )
+
+
+def cost(of: graph_cut._Scene, one: int, other: int) -> float:
+    p, q = np.array([0]), np.array([1])
+    (found,) = graph_cut._seam_cost(of, p, q, np.array([one]), np.array([other]))
+    return float(found)
+
+
+def test_a_seam_costs_what_the_layers_differ_on_both_sides_and_a_little_for_its_length() -> None:
+    assert cost(scene(), 0, 1) == pytest.approx(1000 * (0.3 + 0.7 + 0.01))
+    assert cost(scene(), 1, 0) == cost(scene(), 0, 1)
+    assert cost(scene(), 0, 0) == cost(scene(), 1, 1) == 0.0
+
+
+def test_a_depth_edge_on_either_side_makes_a_seam_dear() -> None:
+    plain = cost(scene(), 0, 1)
+    assert cost(scene(edges=(1.0, 0.0)), 0, 1) == plain + 1000
+    assert cost(scene(edges=(0.0, 1.0)), 0, 1) == plain + 1000
+    assert cost(scene(edges=(1.0, 1.0)), 0, 1) == plain + 2000
+
+
+def test_where_only_one_layer_paints_no_difference_is_seen() -> None:
+    half = scene()
+    half.views[1, 0, 0] = graph_cut._FORBIDDEN
+    assert cost(half, 0, 1) == pytest.approx(1000 * (0.7 + 0.01))
+
+
+def test_a_layer_takes_over_what_it_shows_better_for_less_than_the_seam() -> None:
+    # Both show the same; the second is the better one in the right half of a row of ten.
+    colours = np.full((2, 1, 10, 3), 0.5, dtype=np.float32)
+    views = np.zeros((2, 1, 10))
+    views[0, 0, 5:], views[1, 0, :5] = 0.1, 0.1
+    flat = graph_cut._Scene(colours=colours, views=views, edges=np.zeros((1, 10)))
+    labels = graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1)
+    assert labels.tolist() == [[0] * 5 + [1] * 5]
+    # For one cell that is better by less than the length of its two seams nothing moves.
+    views[0] = 0.0
+    views[0, 0, 4], views[1] = 0.015, 0.1
+    views[1, 0, 4] = 0.0
+    assert not graph_cut._expanded(flat, np.zeros((1, 10), dtype=np.int64), 1).any()
