@@ -371,3 +371,73 @@ def test_a_picture_that_was_taken_less_than_a_pixel_wide_says_nothing_of_its_siz
     exif = read_exif(made.jpeg(made.picture(), block))
     assert (exif.width, exif.height) == (None, 48)
     assert focal_length(exif, 64, 48).value_px == pytest.approx(36 / math.hypot(36, 24) * 80)
+
+
+TAKEN = Exif(focal_mm=30.0, focal_35mm=43.3, resolution_px_per_mm=200.0, width=4000, height=3000)
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "is_cropped"),
+    [
+        (4000, 3000, False),
+        (2000, 1500, False),
+        (3000, 4000, False),
+        (4000, 2950, False),
+        (3950, 3000, False),
+        (4000, 2900, True),
+        (3900, 3000, True),
+        # Of 40 x 31 pixels one more or less is rounding.
+        (40, 31, False),
+    ],
+)
+def test_two_percent_of_another_shape_is_a_photo_that_was_cut(
+    width: int, height: int, is_cropped: bool
+) -> None:
+    found = focal_length(TAKEN, width, height)
+    assert (found.value_px is None) is is_cropped
+    assert found.reason.startswith("the photo was cut") is is_cropped
+
+
+@pytest.mark.parametrize(("equivalent_mm", "contradicts"), [(57.0, False), (60.0, True)])
+def test_a_pitch_that_contradicts_the_equivalent_by_a_seventh_is_left(
+    equivalent_mm: float, contradicts: bool
+) -> None:
+    # 30 mm at 200 px/mm are 6000 px; over a diagonal of 5000 px that is 51.9 mm.
+    exif = dataclasses.replace(TAKEN, focal_35mm=equivalent_mm)
+    found = focal_length(exif, 4000, 3000)
+    if contradicts:
+        assert found.reason == "35 mm equivalent over the diagonal"
+        assert found.value_px == pytest.approx(equivalent_mm / DIAGONAL_MM * 5000.0)
+    else:
+        assert (found.reason, found.value_px) == ("pixel pitch of the focal plane", 6000.0)
+    # As much too short is as much a contradiction.
+    short = dataclasses.replace(TAKEN, focal_35mm=51.9**2 / equivalent_mm)
+    assert (focal_length(short, 4000, 3000).reason == found.reason) is True
+
+
+@pytest.mark.parametrize(
+    ("px_per_mm", "is_sensor"),
+    [(4000 / 1.6, True), (4000 / 1.4, False), (4000 / 125.0, True), (4000 / 135.0, False)],
+)
+def test_a_pitch_belongs_to_a_sensor_that_there_is(px_per_mm: float, is_sensor: bool) -> None:
+    exif = dataclasses.replace(TAKEN, resolution_px_per_mm=px_per_mm, focal_35mm=None)
+    found = focal_length(exif, 4000, 3000)
+    assert (found.value_px is not None) is is_sensor
+    if not is_sensor:
+        assert found.reason == (
+            "EXIF says 30 mm but neither the pixel pitch nor the 35 mm equivalent"
+        )
+
+
+@pytest.mark.parametrize(
+    ("make", "model", "camera"),
+    [
+        ("NIKON CORPORATION", "Nikon D3X", "Nikon D3X"),
+        ("Apple", "iPhone 12", "Apple iPhone 12"),
+        ("", "iPhone 12", "iPhone 12"),
+        ("Apple", "", "Apple"),
+        ("", "", ""),
+    ],
+)
+def test_a_maker_is_not_said_twice(make: str, model: str, camera: str) -> None:
+    assert Exif(make=make, model=model).camera == camera

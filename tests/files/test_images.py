@@ -1,0 +1,219 @@
+"""Pictures as bytes: colours and their order, previews that fade at rims, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from orthoflow.errors import InputError, ProductError
+from orthoflow.files import images
+
+
+def blocks(rows: int, columns: int, side: int = 8) -> NDArray[np.uint8]:
+    """Squares of random colours."""
+    rng = np.random.default_rng(3)
+    small = rng.integers(0, 256, (rows // side, columns // side, 3), dtype=np.uint8)
+    return small.repeat(side, axis=0).repeat(side, axis=1)
+
+
+def opened(encoded: bytes) -> NDArray[np.uint8]:
+    """What another program sees."""
+    return np.asarray(Image.open(io.BytesIO(encoded)))
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_colours_keep_their_order_in_a_png(channels: int) -> None:
+    image = np.random.default_rng(1).integers(0, 256, (5, 7, channels), dtype=np.uint8)
+    image = image[..., 0] if channels == 1 else image
+    encoded = images.encode_png(image)
+    np.testing.assert_array_equal(opened(encoded), image)
+    rgb = np.dstack([image] * 3) if channels == 1 else image[..., :3]
+    np.testing.assert_array_equal(images.decode_image(encoded), rgb)
+
+
+def test_red_is_red_in_every_format() -> None:
+    red = np.zeros((16, 16, 3), dtype=np.uint8)
+    red[..., 0] = 200
+    for encode in (images.encode_png, images.encode_jpeg, images.encode_webp):
+        encoded = encode(red)
+        np.testing.assert_allclose(images.decode_image(encoded), red, atol=4)
+        np.testing.assert_allclose(opened(encoded), red, atol=4)
+    grey = images.encode_webp(red[..., 0])
+    np.testing.assert_allclose(images.decode_image(grey), 200, atol=4)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((4, 4), dtype=np.uint16),
+        np.zeros((4, 4, 2), dtype=np.uint8),
+        np.zeros((4, 4, 5), dtype=np.uint8),
+        np.zeros(4, dtype=np.uint8),
+    ],
+    ids=["deep", "two-channels", "five-channels", "flat"],
+)
+def test_what_is_no_picture_is_not_encoded(image: NDArray[np.uint8]) -> None:
+    with pytest.raises(ProductError, match="an image to encode must be uint8 of shape"):
+        images.encode_png(image)
+
+
+def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None:
+    plain = images.encode_png(blocks(8, 8))
+
+    def stating(width: int, height: int) -> bytes:
+        return plain[:16] + struct.pack(">II", width, height) + plain[24:]
+
+    with pytest.raises(InputError, match=r"a\.png is too large: 16385 x 16384 pixels, at most"):
+        images.decode_image(stating(16_385, 16_384), "a.png")
+    # As many as are decoded, but they are not in the file.
+    with pytest.raises(InputError, match=r"a\.png cannot be decoded as an image \(\d+ bytes\)"):
+        images.decode_image(stating(16_384, 16_384), "a.png")
+
+
+@pytest.mark.parametrize("encoded", [b"", b"GIF89a" + bytes(40), b"\x89PNG\r\n\x1a\n"])
+def test_what_is_no_image_is_told_with_its_size(encoded: bytes) -> None:
+    with pytest.raises(InputError, match=rf"image cannot be decoded as an image \({len(encoded)} "):
+        images.decode_image(encoded)
+
+
+def test_the_first_percentile_is_black_and_the_last_one_white() -> None:
+    values = np.append(np.arange(101.0), np.nan)
+    grey = images.stretch_to_grey(values)
+    assert grey[[0, 1, 50, 99, 100, 101]].tolist() == [0, 0, 128, 255, 255, 0]
+    # Straight in between: 255 steps over 98.
+    np.testing.assert_allclose(grey[1:100], 255.0 * np.arange(99) / 98.0, atol=0.51)
+
+
+@pytest.mark.parametrize("values", [np.full((3, 4), np.nan), np.full((3, 4), 7.0)])
+def test_a_raster_of_nothing_or_of_one_value_is_black(values: NDArray[np.float64]) -> None:
+    grey = images.stretch_to_grey(values)
+    assert grey.shape == (3, 4)
+    assert not grey.any()
+
+
+def test_cells_are_grey_where_they_are_known() -> None:
+    values = np.array([[0.0, np.nan], [1.0, np.inf]])
+    grey, shown = images.grey_cells(values)((slice(0, 2), slice(0, 2)))
+    assert shown.tolist() == [[True, False], [True, False]]
+    assert grey.tolist() == [[0, 0], [255, 0]]
+    one, seen = images.grey_cells(values)((slice(1, 2), slice(0, 1)))
+    assert (one.tolist(), seen.tolist()) == ([[255]], [[True]])
+
+
+def test_rows_are_sampled_evenly_and_only_of_large_rasters(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(images, "_WHOLE_PX", 100)
+    values = np.arange(310).reshape(31, 10)
+    np.testing.assert_array_equal(images.sampled_rows(values[:10]), values[:10])
+    np.testing.assert_array_equal(images.sampled_rows(values), values[::4])
+    np.testing.assert_array_equal(images.sampled_rows(values[:30]), values[:30:3])
+
+
+def test_a_small_picture_is_its_own_preview_and_transparent_where_nothing_is_shown() -> None:
+    image = blocks(16, 24)
+    shown = np.zeros((16, 24), dtype=np.bool_)
+    shown[:, :9] = True
+    preview = opened(images.preview_png(image, shown))
+    np.testing.assert_array_equal(preview[..., :3], image)
+    np.testing.assert_array_equal(preview[..., 3], np.where(shown, 255, 0))
+    grey = opened(images.preview_png(image[..., 0], shown, longest_side_px=24))
+    np.testing.assert_array_equal(grey[..., :3], image[..., :1].repeat(3, axis=2))
+
+
+def halves() -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Squares of 4 pixels, the left half of each of them shown, what is not is black."""
+    image = blocks(64, 48, side=4)
+    shown = np.arange(48) % 4 < 2
+    shown = np.broadcast_to(shown, (64, 48))
+    return np.where(shown[..., None], image, 0), shown
+
+
+def check_halves(preview: NDArray[np.uint8]) -> None:
+    image, _ = halves()
+    assert preview.shape == (16, 12, 4)
+    # The black that is not shown does not darken what is.
+    np.testing.assert_array_equal(preview[..., :3], image[::4, ::4])
+    assert np.isin(preview[..., 3], (127, 128)).all()
+
+
+def test_a_large_picture_is_averaged_over_what_is_shown() -> None:
+    image, shown = halves()
+    check_halves(opened(images.preview_png(image, shown, longest_side_px=16)))
+
+
+@pytest.mark.parametrize("band_px", [1, 5, 1000])
+def test_a_very_large_one_is_averaged_band_by_band(
+    monkeypatch: pytest.MonkeyPatch, band_px: int
+) -> None:
+    monkeypatch.setattr(images, "_WHOLE_PX", 1000)
+    monkeypatch.setattr(images, "_BAND_PX", band_px)
+    image, shown = halves()
+    asked = []
+
+    def cells(part: images.Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        asked.append(part)
+        return image[part], shown[part]
+
+    # Squares of 64 / (2 * 16) pixels first: two, of which 32 rows are made.
+    check_halves(images._preview(shown.shape, cells, 16))
+    assert len(asked) == math.ceil(32 / band_px)
+    assert asked[0] == (slice(0, 2 * min(32, band_px)), slice(0, 48))
+
+
+def test_what_is_left_over_beyond_whole_squares_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(images, "_WHOLE_PX", 100)
+    image = np.full((41, 21), 90, dtype=np.uint8)
+    image[40:], image[:, 20:] = 0, 0
+    preview = images._preview(
+        image.shape, lambda part: (image[part], np.ones(image[part].shape, dtype=np.bool_)), 10
+    )
+    assert preview.shape == (10, 5, 4)
+    assert np.unique(preview[..., :3]).tolist() == [90]
+
+
+def test_a_pixel_of_a_preview_covers_what_it_is_averaged_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert images.cells_per_preview_px((1600, 1200)) == (1.0, 1.0)
+    assert images.cells_per_preview_px((3200, 1000)) == (2.0, 2.0)
+    assert images.cells_per_preview_px((100, 4800)) == (100 / 33, 3.0)
+    monkeypatch.setattr(images, "_WHOLE_PX", 1000)
+    # Squares of two first: 3500 x 1500, which become 1600 x 686.
+    assert images.cells_per_preview_px((7000, 3001)) == (4.375, 2 * 1500 / 686)
+    # The thinnest picture has a pixel.
+    assert images.cells_per_preview_px((16_000, 2))[0] == 10.0
+
+
+def test_an_encoded_image_is_shrunk_to_a_longest_side_and_never_enlarged() -> None:
+    image = blocks(40, 80)
+    encoded = images.encode_png(image)
+    small = images.decode_image(images.shrunk_webp(encoded, "a.png", longest_side_px=20))
+    assert small.shape == (10, 20, 3)
+    for longest_side_px in (80, 200):
+        same = images.shrunk_webp(encoded, "a.png", longest_side_px=longest_side_px)
+        assert images.decode_image(same).shape == image.shape
+    assert images.is_webp(same)
+    with pytest.raises(InputError, match=r"a\.png cannot be decoded"):
+        images.shrunk_webp(b"", "a.png", longest_side_px=20)
+
+
+def test_previews_in_webp_are_those_in_png() -> None:
+    image, shown = blocks(64, 48), np.ones((64, 48), dtype=np.bool_)
+    preview = opened(images.preview_webp(image, shown, longest_side_px=32))
+    assert preview.shape[:2] == (32, 24)
+    np.testing.assert_allclose(
+        preview[2:-2:4, 2:-2:4, :3].astype(float),
+        opened(images.preview_png(image, shown, longest_side_px=32))[2:-2:4, 2:-2:4, :3],
+        atol=40,
+    )
+    parts = images.cells_webp(
+        shown.shape, lambda part: (image[part], shown[part]), longest_side_px=32
+    )
+    assert parts == images.preview_webp(image, shown, longest_side_px=32)
+    whole = images.cells_png(shown.shape, lambda part: (image[part], shown[part]))
+    assert whole == images.preview_png(image, shown)
