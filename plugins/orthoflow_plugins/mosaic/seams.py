@@ -61,6 +61,9 @@ _COLOURS: Final = {
     "cyan": (23, 190, 207),
 }
 _TINT: Final = 0.45
+# Empty cells are told of in words where photos lack so many of a wall, and causes of so many.
+_EMPTY_WORTH_WORDS: Final = 0.1
+_CAUSE_LEAST: Final = 0.01
 
 
 class MosaicSeams(Method):
@@ -249,8 +252,31 @@ def _name(layers: Layers, wall: int) -> str:
 def _show(ctx: StepContext, image: Orthoimage) -> None:
     if not image.sources:
         ctx.warn(f"the orthoimage of {image.name} is empty: no source shows any of it")
+    else:
+        _tell_of_empty(ctx, image)
     if len(image.sources) > 1:
         ctx.figure(f"wall_{image.wall}_sources", _source_map(image), _caption(image))
+
+
+def _tell_of_empty(ctx: StepContext, image: Orthoimage) -> None:
+    """Say in words why cells show nothing, where that is for want of photos."""
+    words = {
+        OrthoMask.NONE: "lie in no photo (take one there)",
+        OrthoMask.OCCLUDED: "are hidden in every photo that looks there, or seen too flatly (take "
+        "one from another side)",
+        OrthoMask.NO_SURFACE: "have no surface (the step that rastered the wall says why)",
+    }
+    shares = {state: count_cells(image.mask, state) / image.mask.size for state in words}
+    if shares[OrthoMask.NONE] + shares[OrthoMask.OCCLUDED] < _EMPTY_WORTH_WORDS:
+        return
+    told = sorted(words, key=lambda state: -shares[state])
+    causes = "; ".join(
+        f"{shares[state]:.0%} {words[state]}" for state in told if shares[state] >= _CAUSE_LEAST
+    )
+    ctx.warn(
+        f"the orthoimage of {image.name}: {sum(shares.values()):.0%} of its cells are empty: "
+        f"{causes}"
+    )
 
 
 def _source_map(image: Orthoimage) -> bytes:

@@ -41,15 +41,19 @@ _SEEDS_LEAST: Final = 4
 _COVERED_LEAST: Final = 0.2
 # Share of the outermost points that may be stray ones.
 _STRAY_SHARE: Final = 0.02
+# So far beyond is looked too: what goes on there, as the cornices of adjoining walls and the sides
+# of furniture do, has no front within reach that a buffer could take in.
+_BEYOND_MOST_M: Final = 0.1
 # Relief that covers less than this share of the wall decides no buffer.
 _RELIEF_LEAST: Final = 5e-4
 _BEYOND_RELIEF_M: Final = 0.02
-# Which planes adjoin: angle, part of the side along which they run, how far they stand out or back.
+# Which planes adjoin: angle, and on which part of the side points of theirs lie between so far
+# and so far before the wall, or behind it. The undersides of cornices are not as deep.
 _ADJOINING_COSINE: Final = 0.7
 _BESIDE_SINE: Final = 0.9
 _BESIDE_SHARE: Final = 0.3
-_STANDING_M: Final = 0.5
-_APART_M: Final = 0.3
+_STANDING_M: Final = (0.35, 1.0)
+_BESIDE_STEP_M: Final = 0.1
 # How far within the rectangle of the points their line may lie.
 _WITHIN_M: Final = 0.1
 # Points of an adjoining surface lie within so many of its sigmas, and no farther than this.
@@ -136,10 +140,10 @@ def extent_of(
         return reach.as_set
     front_m, behind_m = reach.as_set.front_m, reach.as_set.behind_m
     if reach.front_m is None:
-        relief_m = _relief_m(surface.front_m, search)
+        relief_m = _relief_m(surface.front_m, _FRONT_MOST_M, search)
         front_m = max(front_m, min(round(relief_m + _BEYOND_RELIEF_M, 3), _FRONT_MOST_M))
     if reach.behind_m is None:
-        relief_m = _relief_m(-surface.behind_m, search)
+        relief_m = _relief_m(-surface.behind_m, _BEHIND_MOST_M, search)
         behind_m = max(behind_m, min(round(relief_m + _BEYOND_RELIEF_M, 3), _BEHIND_MOST_M))
     left, right, top, bottom = (
         _growth_m(side, surface, inside, search) for side in ("left", "right", "top", "bottom")
@@ -190,9 +194,8 @@ class _Search:
         corners = planes.corners[index]
         width_m = float(np.linalg.norm(corners[3] - corners[0]))
         height_m = float(np.linalg.norm(corners[1] - corners[0]))
-        # Found or set, farther off is no part of a wall that it could grow by.
-        front_m = _FRONT_MOST_M if reach.front_m is None else min(reach.front_m, _FRONT_MOST_M)
-        behind_m = _BEHIND_MOST_M if reach.behind_m is None else min(reach.behind_m, _BEHIND_MOST_M)
+        front_m = _searched_m(reach.front_m, _FRONT_MOST_M)
+        behind_m = _searched_m(reach.behind_m, _BEHIND_MOST_M)
         n_sampled = max(1.0, float(planes.n_points[index]) / points.n_represented)
         step_m = math.sqrt(_covered_m2(planes, index) / n_sampled)
         n_steps = (front_m + behind_m) / _DEPTH_STEP_M + 2.0
@@ -201,6 +204,8 @@ class _Search:
             min(max(_SIDE_LEAST_M, _SIDE_STEPS * step_m), 0.25 * min(width_m, height_m)),
             math.sqrt(searched_m2 * n_steps / _VOXELS_MOST),
         )
+        size_m = width_m, height_m
+        around = _Around.of(points, rectangle, size_m)
         # Whole cells of growth: a cell begins at the rectangle's corner.
         growth_m = side_m * math.ceil(_GROWTH_MOST_M / side_m)
         frame = frame_of(planes, index, gsd_m=side_m, margin_m=growth_m)
@@ -209,7 +214,7 @@ class _Search:
             width_m=width_m,
             height_m=height_m,
             seed_m=planes.tolerance_m,
-            bounds=tuple(_bounds(planes, index, rectangle, (width_m, height_m))),
+            bounds=tuple(_bounds(planes, index, rectangle, size_m, around)),
         )
 
     def places_m(self, points: PointsInside) -> NDArray[np.float64]:
@@ -294,11 +299,16 @@ def _surface(inside: PointsInside, search: _Search) -> _Surface | None:
     )
 
 
-def _relief_m(depth_m: NDArray[np.float64], search: _Search) -> float:
+def _searched_m(set_m: float | None, most_m: float) -> float:
+    """How far a wall is looked for in depth; found or set, farther off it does not grow."""
+    return most_m + _BEYOND_MOST_M if set_m is None else min(set_m, most_m)
+
+
+def _relief_m(depth_m: NDArray[np.float64], most_m: float, search: _Search) -> float:
     """How far the relief of the wall stands out where it is more than thin or tiny."""
     from scipy import ndimage
 
-    inner = np.where(np.isfinite(depth_m), depth_m, -np.inf)
+    inner = np.where(np.isfinite(depth_m) & (depth_m <= most_m), depth_m, -np.inf)
     # A floor or ceiling that nobody detected, and the sides of relief, are thin from here.
     opened = np.asarray(ndimage.minimum_filter(inner, 3, mode="constant", cval=-np.inf))
     opened = np.sort(opened[np.isfinite(opened)])
@@ -365,7 +375,7 @@ def _parts(planes: Planes, index: int) -> NDArray[np.float64]:
 
 
 def _bounds(
-    planes: Planes, index: int, rectangle: WallFrame, size_m: tuple[float, float]
+    planes: Planes, index: int, rectangle: WallFrame, size_m: tuple[float, float], around: _Around
 ) -> Iterator[_Bound]:
     """The planes that adjoin a wall along one of its sides, of several on a side the innermost."""
     found: dict[Side, _Bound] = {}
@@ -375,7 +385,7 @@ def _bounds(
         ):
             continue
         bound = _bound(planes, other, rectangle, size_m)
-        if bound is None:
+        if bound is None or not _stands(bound, size_m, around):
             continue
         before = found.get(bound.side)
         if before is None or bound.beyond_m < before.beyond_m:
@@ -406,9 +416,6 @@ def _bound(
     beyond_m = float((-line_m if is_first else line_m - size_m[axis]).min())
     if not -_WITHIN_M <= beyond_m <= _GROWTH_MOST_M:
         return None
-    placed = (_parts(planes, other) - rectangle.origin_world) @ axes.T
-    if not any(_stands(part, along, size_m[along]) for part in placed):
-        return None
     noise_m = min(_NOISE_SIGMAS * _sigma_m(planes, other), _NOISE_MOST_M)
     return _Bound(
         side=sides[0] if is_first else sides[1],
@@ -419,16 +426,54 @@ def _bound(
     )
 
 
-def _stands(part: NDArray[np.float64], along: int, length_m: float) -> bool:
-    """Whether a rectangle (4, 3), right, down, depth, runs beside a wall and stands out of it."""
-    low, high = part.min(axis=0), part.max(axis=0)
-    beside_m = min(high[along], length_m) - max(low[along], 0.0)
-    is_near = bool(low[2] <= _APART_M and high[2] >= -_APART_M)
-    return (
-        bool(beside_m >= _BESIDE_SHARE * length_m)
-        and is_near
-        and bool(max(high[2], -low[2]) >= _STANDING_M)
-    )
+@dataclass(frozen=True, kw_only=True)
+class _Around:
+    """Points beside a wall that lie clearly before or behind it, in metres of the rectangle.
+
+    Attributes:
+        places_m: (3, n) right of and below the top-left corner, and before the plane.
+    """
+
+    places_m: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, points: SampledPoints, rectangle: WallFrame, size_m: tuple[float, float]
+    ) -> _Around:
+        growth_m = _GROWTH_MOST_M
+        corner = rectangle.world_from_wall(np.array([[-growth_m, -growth_m]]) / rectangle.gsd_m)[0]
+        width_m, height_m = (length_m + 2.0 * growth_m for length_m in size_m)
+        # In 32 x 32 pieces, as any cells do: only places count.
+        gsd_m = max(width_m, height_m) / 32.0
+        frame = replace(
+            rectangle,
+            origin_world=corner,
+            gsd_m=gsd_m,
+            width=math.ceil(width_m / gsd_m),
+            height=math.ceil(height_m / gsd_m),
+        )
+        nearest_m, farthest_m = _STANDING_M
+        found = points_in(
+            points, Slab(frame=frame, front_m=farthest_m, behind_m=farthest_m), threads=1
+        )
+        chosen = np.abs(found.depth_m) > nearest_m
+        right_m, down_m = gsd_m * found.places[chosen].T - growth_m
+        return cls(places_m=np.stack([right_m, down_m, found.depth_m[chosen]]))
+
+
+def _stands(bound: _Bound, size_m: tuple[float, float], around: _Around) -> bool:
+    """Whether points of a plane run along a side of a wall, out of it or back."""
+    places_m = around.places_m
+    is_near = np.abs(bound.offset_m + bound.slopes @ places_m) <= bound.noise_m
+    along = 1 if bound.side in {"left", "right"} else 0
+    length_m = size_m[along]
+    n_steps = max(1, round(length_m / _BESIDE_STEP_M))
+    for is_there in (is_near & (places_m[2] > 0.0), is_near & (places_m[2] < 0.0)):
+        steps = np.floor(places_m[along, is_there] / length_m * n_steps).astype(np.int64)
+        steps = steps[(steps >= 0) & (steps < n_steps)]
+        if len(np.unique(steps)) >= _BESIDE_SHARE * n_steps:
+            return True
+    return False
 
 
 def _sigma_m(planes: Planes, index: int) -> float:

@@ -59,7 +59,7 @@ class RasterGrid(Method):
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 6
+    result_version: ClassVar[int] = 7
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_walls",

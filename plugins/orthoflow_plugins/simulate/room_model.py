@@ -25,6 +25,7 @@ from orthoflow_plugins.simulate.building import (
     flat_side,
     wall_side,
 )
+from orthoflow_plugins.simulate.drawn_walls import WallDrawing, WallPaints, draw_wall
 
 FLOOR_M: Final = -1.5
 CEILING_M: Final = 1.6
@@ -49,6 +50,13 @@ _OAK = Paint(
 _DARK = Paint(kind=TextureKind.PLAIN, rgb=(92, 88, 84), reflectance=0.2, contrast=0.4, seed=14)
 _OBJECT = Paint(
     kind=TextureKind.TILES, rgb=(38, 96, 160), reflectance=0.3, period_m=0.09, contrast=0.5, seed=15
+)
+# Walls that are drawn: name, ground colour, from corner to corner, and which fresco.
+_DRAWN: Final = (
+    ("main wall", (206.0, 180.0, 138.0), (-2.7, 2.7), 101),
+    ("opposite wall", (160.0, 186.0, 152.0), (-2.7, 2.7), 201),
+    ("right wall", (150.0, 170.0, 178.0), (-2.4, 2.0), 301),
+    ("left wall", (196.0, 150.0, 132.0), (-2.0, 2.4), 401),
 )
 
 
@@ -83,14 +91,23 @@ class Room:
     planes: tuple[TruePlane, ...]
 
 
-def build_room(plan: RoomPlan) -> Room:
-    """Build the room."""
+def build_room(plan: RoomPlan, rng: np.random.Generator | None = None) -> Room:
+    """Build the room.
+
+    Args:
+        plan: what it is like.
+        rng: draws the four walls from a family; without, they are as designed.
+    """
     draft = SceneDraft()
-    main, opposite, right, left = wall_sides(draft)
-    _build_main_wall(main, plan)
-    _build_opposite_wall(opposite, plan)
-    _build_right_wall(right, plan)
-    _build_left_wall(left, plan)
+    sides = wall_sides(draft)
+    if rng is None:
+        main, opposite, right, left = sides
+        _build_main_wall(main, plan)
+        _build_opposite_wall(opposite, plan)
+        _build_right_wall(right, plan)
+        _build_left_wall(left, plan)
+    else:
+        _draw_walls(sides, plan, rng)
     _build_floor_and_ceiling(draft)
     _furnish(draft, plan)
     return Room(scene=draft.finished(spectral_gap=plan.spectral_gap), planes=_clipped(draft.planes))
@@ -104,6 +121,18 @@ def wall_sides(draft: SceneDraft) -> tuple[Side, Side, Side, Side]:
         wall_side(draft, omega_deg=12.2, phi_deg=0.3, distance_m=2.7),
         wall_side(draft, omega_deg=191.7, phi_deg=-0.3, distance_m=2.7),
     )
+
+
+def _draw_walls(sides: tuple[Side, ...], plan: RoomPlan, rng: np.random.Generator) -> None:
+    for side, (name, rgb, (a0, a1), seed) in zip(sides, _DRAWN, strict=True):
+        ground = Paint(kind=TextureKind.FRESCO, rgb=rgb, reflectance=0.5, period_m=0.34, seed=seed)
+        drawing = WallDrawing(
+            full=_FULL,
+            shown=(a0, a1, FLOOR_M, CEILING_M),
+            relief=plan.relief,
+            paints=WallPaints(ground=ground, relief=_STUCCO, panel=_GILT, door=_OAK),
+        )
+        draw_wall(side, name, drawing, rng)
 
 
 def main_wall_axes() -> NDArray[np.float64]:

@@ -242,6 +242,38 @@ def test_a_wall_that_nothing_paints_is_empty_and_that_is_said(tmp_path: Path) ->
     assert (image.mask[9:] == OrthoMask.OCCLUDED).all()
 
 
+@pytest.mark.parametrize(
+    ("missing", "words"),
+    [
+        (LayerMask.OUTSIDE, "25% lie in no photo (take one there)"),
+        (LayerMask.OCCLUDED, "25% are hidden in every photo that looks there"),
+    ],
+    ids=["no photo", "hidden"],
+)
+def test_cells_that_no_photo_shows_are_told_of_with_their_cause(
+    tmp_path: Path, missing: LayerMask, words: str
+) -> None:
+    mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
+    mask[:10], mask[36:] = missing, LayerMask.NO_SURFACE
+    layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
+    ctx = scenes.context(tmp_path)
+    inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
+    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
+    (warning,) = ctx.warnings
+    assert "the orthoimage of west: 35% of its cells are empty: " + words in warning
+    assert "10% have no surface" in warning
+
+
+def test_empty_cells_of_the_raster_alone_are_not_told_of_again(tmp_path: Path) -> None:
+    mask = np.full((40, 40), LayerMask.PAINTED, dtype=np.uint8)
+    mask[:3], mask[20:] = LayerMask.OUTSIDE, LayerMask.NO_SURFACE
+    layer = smooth_layer("one", np.ones((40, 40), dtype=np.float32), mask)
+    ctx = scenes.context(tmp_path)
+    inputs = MosaicSeams.In(layers=Layers(layers=(layer,), names=("west",)))
+    MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
+    assert ctx.warnings == []
+
+
 def test_a_layer_without_paint_is_no_source_but_tells_what_is_hidden(tmp_path: Path) -> None:
     left, right = two_halves()
     blind = smooth_layer("blind", left.quality, np.full_like(left.mask, LayerMask.OCCLUDED))

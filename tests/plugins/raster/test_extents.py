@@ -205,6 +205,38 @@ def test_the_buffer_follows_a_door_that_stands_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(leaf, -0.36, atol=6.0 * NOISE_M)
 
 
+def test_the_cornice_of_an_adjoining_wall_is_no_relief_of_this_one(tmp_path: Path) -> None:
+    # Two steps, as cornices have them, run along the left wall towards the viewer, and a cupboard
+    # that is deeper than any relief stands beside the right wall.
+    beside = [
+        patch((0.08, 0.08), (0.0, 3.0), (2.7, 2.84)),
+        patch((0.0, 0.08), (0.0, 3.0), (2.7, 2.7)),
+        patch((0.15, 0.15), (0.0, 3.0), (2.84, HEIGHT_M)),
+        patch((0.08, 0.15), (0.0, 3.0), (2.84, 2.84)),
+        patch((3.7, WIDTH_M), (0.8, 0.8), (0.0, 2.0)),
+        patch((3.7, 3.7), (0.0, 0.8), (0.0, 2.0)),
+        patch((3.7, WIDTH_M), (0.0, 0.8), (2.0, 2.0)),
+    ]
+    cloud = scanned(wall(z=BESIDE_Z), CORNICE, *beside, *SIDES)
+    walls = laid(cloud, planes_of((0.0, WIDTH_M), BESIDE_Z, *ROOM), tmp_path)
+    # Of the wall's own cornice: half a step in depth, and what is added beyond the relief.
+    assert walls.slab(0).front_m == pytest.approx(0.15, abs=0.03)
+    np.testing.assert_allclose(edges_m(walls), [0.0, WIDTH_M, 0.0, HEIGHT_M], atol=CORNER_M)
+
+
+@pytest.mark.parametrize("is_set", [False, True], ids=["found", "set"])
+def test_the_underside_of_a_cornice_does_not_end_the_wall(tmp_path: Path, is_set: bool) -> None:
+    # A cornice of 0.2 m: its underside and that of the left wall's make one plane, found as such.
+    cornice = patch((0.0, WIDTH_M), (0.2, 0.2), (2.6, HEIGHT_M))
+    under = patch((0.0, WIDTH_M), (0.0, 0.2), (2.6, 2.6))
+    beside = patch((0.0, 0.2), (0.2, 3.0), (2.6, 2.6))
+    cloud = scanned(wall(z=(0.0, 2.6)), cornice, under, beside, *SIDES)
+    underside = level(2.6, (0.0, 3.0), towards=-1.0)
+    planes = planes_of((0.0, WIDTH_M), (0.0, 2.6), *ROOM, underside)
+    walls = laid(cloud, planes, tmp_path, **({"buffer_m": 0.25} if is_set else {}))
+    np.testing.assert_allclose(edges_m(walls), [0.0, WIDTH_M, 0.0, HEIGHT_M], atol=CORNER_M)
+
+
 def test_a_buffer_that_is_set_is_kept(tmp_path: Path) -> None:
     planes = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M))
     both = laid(with_door(0.36), planes, tmp_path, buffer_m=0.1).slab(0)

@@ -9,6 +9,7 @@ import pytest
 from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.geometry import UpDirection, wall_axes
+from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import PointCloud, Truth
 from orthoflow.sdk import StepContext
 from tests import scenes
@@ -191,3 +192,46 @@ def test_one_to_four_stations_give_two_scans_each(tmp_path: Path) -> None:
         assert cloud.scan is not None
         assert cloud.stations.shape == (2 * count, 3)
         np.testing.assert_array_equal(np.unique(cloud.scan), np.arange(2 * count))
+
+
+def relief_m(truth: Truth, name: str) -> np.ndarray:
+    """Depths before the plane of a wall of the surfaces that run along it, in the room."""
+    plane = truth.planes.plane(truth.planes.names.index(name))
+    scene = truth.scene
+    along = (np.abs(scene.normal @ plane.normal) > 1.0 - 1e-9) & (scene.role != SurfaceRole.OBJECT)
+    depths: np.ndarray = plane.distances_m(scene.centre[along] + scene.origin)
+    return depths[np.abs(depths) < 1.0]
+
+
+def test_drawn_walls_differ_from_seed_to_seed_and_stay_in_their_family(tmp_path: Path) -> None:
+    kinds = set()
+    for seed in range(6):
+        truth = simulate(tmp_path / str(seed), seed=seed, decoration="drawn", **COARSE).truth
+        relief = np.concatenate([relief_m(truth, f"{side} wall") for side in ("main", "left")])
+        # Millimetres of what is drawn: 0.3 m before the wall, 0.45 m behind it.
+        assert relief.max() <= 0.3001
+        assert relief.min() >= -0.4501
+        kinds.add(tuple(np.round(relief, 6)))
+    assert len(kinds) == 6
+
+
+def test_recesses_of_drawn_walls_are_true_planes(tmp_path: Path) -> None:
+    truth = simulate(tmp_path / "room", seed=3, decoration="drawn", **COARSE).truth
+    recesses = [k for k, name in enumerate(truth.planes.names) if " in " in name]
+    assert recesses
+    for index in recesses:
+        wall = truth.planes.names[index].split(" in ")[1].rsplit(" ", 1)[0]
+        depth_m = float(
+            truth.planes.plane(truth.planes.names.index(wall)).distances_m(
+                truth.planes.corners[index]
+            )[0]
+        )
+        assert any(abs(relief_m(truth, wall) - depth_m) < 1e-6)
+        assert -0.4501 <= depth_m <= -0.0499
+
+
+def test_a_seed_draws_the_same_walls_again(tmp_path: Path) -> None:
+    one = simulate(tmp_path / "one", decoration="drawn", **COARSE)
+    two = simulate(tmp_path / "two", decoration="drawn", **COARSE)
+    assert_same_points(one.cloud, two.cloud)
+    np.testing.assert_array_equal(one.truth.scene.extent, two.truth.scene.extent)
