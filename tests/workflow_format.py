@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from orthoflow.workflow.format import CALL, COMPARISON, FILE, INPUT, SHARE, STEP
+from orthoflow.workflow.format import CALL, COMPARISON, DATASET, FILE, INPUT, SHARE, STEP
 from orthoflow.workflow.shapes import Key, Section
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -21,6 +21,7 @@ COMMAND = "python tests/workflow_format.py"
 SECTIONS: dict[str, Section] = {
     "The file": FILE,
     "`inputs.<name>`: an input": INPUT,
+    "`datasets.<name>`: a dataset": DATASET,
     "`steps.<name>`: a step": STEP,
     "`steps.<name>.variants.<name>`: a method call": CALL,
     "`resources`": SHARE,
@@ -74,17 +75,21 @@ def reference() -> str:
 def keys() -> Iterator[tuple[str, Key[Any]]]:
     """Every key of every section, behind the section's heading."""
     for heading, section in SECTIONS.items():
-        for key in section.keys:
+        for key in _all_keys(section):
             yield f"{heading}: {key.name}", key
 
 
 def _table(section: Section) -> Iterator[str]:
     yield "| key | value | example | without it | meaning |"
     yield "|---|---|---|---|---|"
-    for key in section.keys:
+    for key in _all_keys(section):
         without = "refused" if key.missing else key.default
         cells = (f"`{key.name}`", key.shape.words, f"`{key.example}`", without, key.meaning)
         yield f"| {' | '.join(cells)} |"
+
+
+def _all_keys(section: Section) -> tuple[Key[Any], ...]:
+    return (*section.keys, *((section.others,) if section.others else ()))
 
 
 def main() -> int:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import click
 
 from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import json_option, workflow_arguments
+from orthoflow.cli.options import Changes, json_option, workflow_arguments
 from orthoflow.cli.tables import counted, echo, echo_json
 from orthoflow.errors import OrthoflowError
 
@@ -17,7 +16,7 @@ from orthoflow.errors import OrthoflowError
 @click.command(cls=Command)
 @workflow_arguments
 @json_option
-def check(workflow: str, sets: Sequence[str], inputs: Sequence[str], *, as_json: bool) -> int:
+def check(workflow: str, changes: Changes, *, as_json: bool) -> int:
     """Say everything that is wrong with WORKFLOW, a file or the name of a shipped one.
 
     Every problem is named in one pass, as file:line:column: path: message; input files are looked
@@ -25,11 +24,11 @@ def check(workflow: str, sets: Sequence[str], inputs: Sequence[str], *, as_json:
     wrong, with 4 when a plugin is missing.
     """
     if not as_json:
-        verdict = _check(workflow, sets, inputs)
+        verdict = _check(workflow, changes)
         echo(verdict.summary, *(f"warning: {text}" for text in verdict.warnings))
         return EXIT_GOOD
     try:
-        verdict = _check(workflow, sets, inputs)
+        verdict = _check(workflow, changes)
     except OrthoflowError as error:
         problems = [asdict(problem) for problem in getattr(error, "problems", ())]
         echo_json({"ok": False, "message": str(error), "problems": problems, "warnings": []})
@@ -47,18 +46,20 @@ class _Verdict:
     warnings: tuple[str, ...]
 
 
-def _check(workflow: str, sets: Sequence[str], inputs: Sequence[str]) -> _Verdict:
+def _check(workflow: str, changes: Changes) -> _Verdict:
     from orthoflow.catalog import discover_catalog
-    from orthoflow.workflow import doubts_about, expand_cells, load_workflow, resolve_input_files
+    from orthoflow.workflow import doubts_about, expand_cells, resolve_input_files
 
     catalog = discover_catalog()
-    loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
+    loaded = changes.load(workflow, catalog)
     resolve_input_files(loaded)
     cells = expand_cells(loaded, catalog)
     skipped = sum(bool(cell.skip_reason) for cell in cells)
     without_data = f", {skipped} of them skipped for lack of optional data" if skipped else ""
+    n_data = len(loaded.chosen_data)
+    datasets = f"{counted(n_data, 'dataset')}, " if n_data else ""
     summary = (
-        f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}, "
+        f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}, {datasets}"
         f"{counted(len(cells), 'cell')}{without_data}"
     )
     return _Verdict(summary=summary, warnings=doubts_about(loaded))

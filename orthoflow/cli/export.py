@@ -43,6 +43,11 @@ _SAID: Final = {
     help="Write a record that needs nothing beside it: with every product and input file in it; "
     "alone, or in the place of the record with --to ro-crate.",
 )
+@click.option(
+    "--split",
+    is_flag=True,
+    help="Write a run folder per dataset, whose record verifies and replays alone.",
+)
 @input_option
 @store_option
 @click.option(
@@ -64,7 +69,7 @@ _SAID: Final = {
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
     help="Where to write it, a new or empty folder; without it one in RUN of the format's name "
-    "(all-figures, embedded).",
+    "(all-figures, embedded, datasets).",
 )
 def export(run: Path, target: str | None, output: Path | None, **choices: Any) -> int:
     """Write the results of RUN, a run folder or its run.h5, for other programs.
@@ -76,6 +81,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     likewise. ro-crate: record, report and products as a Provenance Run Crate, for archives.
     --embed: run.h5 alone, which verifies and replays without any other file; what it lacks so far
     comes from the store and from the input files, looked for by content or given with --input.
+    --split: of a run on several datasets a run folder each, with record, report and products.
     """
     from orthoflow.engine.durability import whole_folder
     from orthoflow.records import open_run
@@ -83,7 +89,7 @@ def export(run: Path, target: str | None, output: Path | None, **choices: Any) -
     chosen = _Choices(**choices)
     chosen.check(target)
     opened = open_run(run)
-    name = target or "embedded"
+    name = target or ("datasets" if chosen.split else "embedded")
     # figures/ has those of the baseline already.
     folder = output or _folder_inside(opened, "all-figures" if target == "figures" else name)
     _refuse_filled(folder)
@@ -105,7 +111,7 @@ def _exported(target: str | None, run: Run, folder: Path, chosen: _Choices) -> s
         return (_export_laz if target == "laz" else _export_layers)(run, folder, chosen)
     if target == "ro-crate":
         return _export_crate(run, folder, chosen)
-    return _export_embedded(run, folder, chosen)
+    return (_export_split if chosen.split else _export_embedded)(run, folder, chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,16 +121,23 @@ class _Choices:
     cell: str | None
     license_text: str | None
     embed: bool
+    split: bool
     inputs: Sequence[str]
     store: Path
 
     def check(self, target: str | None) -> None:
         """Refuse options that do not belong to the format."""
-        if target is None and not self.embed:
+        if target is None and not self.embed and not self.split:
             raise ArgumentError(
-                "say what to write: --to colmap, csv, figures, layers, laz or ro-crate, or --embed"
+                "say what to write: --to colmap, csv, figures, layers, laz or ro-crate, or --embed "
+                "or --split"
             )
-        said = f"--to {target}" if target else "--embed"
+        said = f"--to {target}" if target else "--split" if self.split else "--embed"
+        if self.split and (target or self.embed):
+            raise ArgumentError(
+                f"--split writes records of its own, so it does not go with "
+                f"{f'--to {target}' if target else '--embed'}"
+            )
         if self.cell is not None and target not in {"colmap", "figures", "layers", "laz"}:
             raise ArgumentError(
                 f"--cell belongs to --to colmap, figures, layers or laz, not to {said}"
@@ -188,6 +201,24 @@ def _export_embedded(run: Run, folder: Path, chosen: _Choices) -> str:
         f"{record.path.name} with {counted(n_products, 'product')} and "
         f"{counted(n_files, 'input file')}, {record.path.stat().st_size:,} bytes"
     )
+
+
+def _export_split(run: Run, folder: Path, chosen: _Choices) -> str:
+    from orthoflow.engine import Store
+    from orthoflow.records import REPORT_FILE
+    from orthoflow.records.datasets import datasets_of, write_dataset
+    from orthoflow.report import write_page
+
+    names = datasets_of(run)
+    if not names:
+        raise ArgumentError(
+            f"the run {run.record.run_id} ran on no datasets, so there is nothing to split"
+        )
+    _make_empty(folder)
+    for name in names:
+        part = write_dataset(run, name, folder, Store(chosen.store))
+        write_page(part, part.folder / REPORT_FILE)
+    return f"{counted(len(names), 'run folder')}: {', '.join(names)}"
 
 
 def _embedded(run: Run, folder: Path, chosen: _Choices) -> Run:

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import click
 
 from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
-from orthoflow.cli.options import workflow_arguments
+from orthoflow.cli.options import Changes, workflow_arguments
 from orthoflow.cli.tables import echo
 
 
 @click.command(cls=Command)
 @workflow_arguments
-def graph(workflow: str, sets: Sequence[str], inputs: Sequence[str]) -> int:
+def graph(workflow: str, changes: Changes) -> int:
     """Draw WORKFLOW as a Mermaid graph, which GitHub, GitLab and many editors show."""
     from orthoflow.catalog import discover_catalog
-    from orthoflow.workflow import load_workflow
     from orthoflow.workflow.mermaid import mermaid
 
     catalog = discover_catalog()
-    loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
+    loaded = changes.load(workflow, catalog)
     echo(*mermaid(loaded, catalog).rstrip("\n").split("\n"))
     return EXIT_GOOD

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from orthoflow.catalog import Catalog
+    from orthoflow.workflow import Workflow
 
 # Any: click decorates functions as well as commands.
 _Decorated = TypeVar("_Decorated", bound=Callable[..., Any] | click.Command)
@@ -14,8 +20,58 @@ _Decorated = TypeVar("_Decorated", bound=Callable[..., Any] | click.Command)
 DEFAULT_STORE: Final = Path(".orthoflow")
 
 
-def workflow_arguments(command: _Decorated) -> _Decorated:
-    """Add the workflow and what changes it: `WORKFLOW --set --input`."""
+@dataclass(frozen=True, kw_only=True)
+class Changes:
+    """What the command line puts in the place of what a workflow file says."""
+
+    sets: tuple[str, ...]
+    inputs: tuple[str, ...]
+    datasets: str
+    only_data: tuple[str, ...]
+
+    def load(self, workflow: str, catalog: Catalog) -> Workflow:
+        """Load the workflow with these changes, see `load_workflow` for what may be wrong."""
+        from orthoflow.workflow import load_workflow
+
+        return load_workflow(
+            workflow,
+            catalog,
+            sets=self.sets,
+            inputs=self.inputs,
+            datasets=self.datasets,
+            only_data=self.only_data,
+        )
+
+
+def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
+    """Add the workflow and `changes` to it: `WORKFLOW --set --input --datasets --only-data`."""
+
+    # Any: the command's other parameters, whose types click has checked.
+    @wraps(run)
+    def command(
+        *,
+        sets: tuple[str, ...],
+        inputs: tuple[str, ...],
+        datasets: str,
+        only_data: tuple[str, ...],
+        **others: Any,
+    ) -> int:
+        changes = Changes(sets=sets, inputs=inputs, datasets=datasets, only_data=only_data)
+        return run(changes=changes, **others)
+
+    command = click.option(
+        "--only-data",
+        "only_data",
+        multiple=True,
+        metavar="NAMES",
+        help="Run on these of the datasets, with commas between their names.",
+    )(command)
+    command = click.option(
+        "--datasets",
+        default="",
+        metavar="FILE",
+        help="Run on each dataset of a CSV file: the column name, and a column per input.",
+    )(command)
     command = input_option(command)
     command = click.option(
         "--set",

@@ -11,6 +11,7 @@ import click
 from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import (
+    Changes,
     json_option,
     selection_options,
     store_option,
@@ -29,8 +30,7 @@ if TYPE_CHECKING:
 @json_option
 def plan(
     workflow: str,
-    sets: Sequence[str],
-    inputs: Sequence[str],
+    changes: Changes,
     store: Path,
     *,
     as_json: bool,
@@ -43,10 +43,10 @@ def plan(
     """
     from orthoflow.catalog import discover_catalog
     from orthoflow.engine import RunOptions, Store, plan_run
-    from orthoflow.workflow import expand_cells, load_workflow
+    from orthoflow.workflow import expand_cells
 
     catalog = discover_catalog()
-    loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
+    loaded = changes.load(workflow, catalog)
     cells = expand_cells(loaded, catalog)
     planned = plan_run(cells, loaded, catalog, Store(store), RunOptions(**selection)).cells
     if as_json:

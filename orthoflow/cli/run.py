@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ import click
 from orthoflow.cli.commands import Command, command_again, current_session
 from orthoflow.cli.failures import say_error, silence_stdout
 from orthoflow.cli.options import (
+    Changes,
     execution_options,
     output_option,
     selection_options,
@@ -40,8 +41,7 @@ if TYPE_CHECKING:
 )
 def run(
     workflow: str,
-    sets: Sequence[str],
-    inputs: Sequence[str],
+    changes: Changes,
     output: Path | None,
     store: Path,
     *,
@@ -62,11 +62,11 @@ def run(
         import orthoflow.report  # noqa: F401
         from orthoflow.catalog import discover_catalog
         from orthoflow.engine import RunOptions, Store, plan_run
-        from orthoflow.workflow import expand_cells, load_workflow
+        from orthoflow.workflow import expand_cells
 
         options = RunOptions(**choices)
         catalog = discover_catalog()
-        loaded = load_workflow(workflow, catalog, sets=sets, inputs=inputs)
+        loaded = changes.load(workflow, catalog)
         opened = Store(store)
         cells = expand_cells(loaded, catalog)
         planned = plan_run(cells, loaded, catalog, opened, options)

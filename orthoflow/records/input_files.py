@@ -19,7 +19,12 @@ from orthoflow.engine.file_digests import FileDigests
 from orthoflow.files.yaml_positions import Table, read_yaml
 from orthoflow.records.runs import Run, record_errors
 from orthoflow.workflow import Workflow, WorkflowInputSpec, resolve_input_files
-from orthoflow.workflow.inputs import override_inputs, read_input_options, read_inputs
+from orthoflow.workflow.inputs import (
+    InputOption,
+    override_inputs,
+    read_input_options,
+    read_inputs,
+)
 from orthoflow.workflow.problems import ProblemLog
 
 # A run lies in runs/<name>/ below the folder of its workflow, when nobody says otherwise.
@@ -147,16 +152,18 @@ def _places(
     extracted: Mapping[str, tuple[Path, ...]],
 ) -> dict[str, _Places]:
     log = ProblemLog(file="")
-    overridden = override_inputs(workflow.inputs, read_input_options(given, log), log)
+    specs = workflow.input_specs
+    options = _of_all_datasets(read_input_options(given, log), specs)
+    overridden = override_inputs(specs, options, log)
     log.raise_any()
-    specs = {name: spec for name, spec in overridden.items() if spec.is_given}
-    by_hand = resolve_input_files(dataclasses.replace(workflow, inputs=specs))
+    found = {name: spec for name, spec in overridden.items() if spec.is_given}
+    by_hand = resolve_input_files(dataclasses.replace(workflow, inputs=found, datasets={}))
     roots = dict.fromkeys(
         (Path(), run_folder, *run_folder.absolute().parents[: _FOLDERS_ABOVE - 1])
     )
     written = _written_specs(workflow)
     places: dict[str, _Places] = {}
-    for name, spec in workflow.inputs.items():
+    for name, spec in specs.items():
         by_name = by_hand.get(name)
         files = by_name.paths if by_name is not None else extracted.get(name)
         if files is not None:
@@ -171,6 +178,20 @@ def _places(
         ]
         places[name] = _Places(folders=tuple(dict.fromkeys((*named, *roots))))
     return places
+
+
+def _of_all_datasets(
+    options: Sequence[InputOption], specs: Mapping[str, WorkflowInputSpec]
+) -> tuple[InputOption, ...]:
+    """Let `scan=FOLDER` stand for the `scan@...` of every dataset, where there is no other scan."""
+
+    def meant(name: str) -> Sequence[str]:
+        own = [found for found in specs if found.partition("@")[0] == name]
+        return own if name not in specs and own else [name]
+
+    return tuple(
+        dataclasses.replace(option, name=name) for option in options for name in meant(option.name)
+    )
 
 
 def _written_specs(workflow: Workflow) -> Mapping[str, WorkflowInputSpec]:

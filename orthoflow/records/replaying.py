@@ -157,9 +157,9 @@ def _with_files(workflow: Workflow, paths: Mapping[str, tuple[Path, ...]]) -> Wo
             files=tuple(str(path) for path in paths.get(name, ())),
             optional=spec.optional or not paths.get(name),
         )
-        for name, spec in workflow.inputs.items()
+        for name, spec in workflow.input_specs.items()
     }
-    return dataclasses.replace(workflow, inputs=specs)
+    return workflow.with_input_specs(specs)
 
 
 def _inconsistencies(run: Run) -> Iterator[str]:

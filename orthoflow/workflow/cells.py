@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -22,7 +22,7 @@ from orthoflow.workflow.comparison import (
     combinations,
     is_excluded,
 )
-from orthoflow.workflow.format import StepVariant, Workflow, WorkflowStep
+from orthoflow.workflow.format import DATA, StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.inputs import present_inputs
 from orthoflow.workflow.methods import MethodInfo, describe_method
 from orthoflow.workflow.shapes import Reference
@@ -44,7 +44,7 @@ class CellOutput:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkflowInput:
-    """One of the workflow's inputs."""
+    """One of the workflow's inputs, by its own name: `scan`, or `scan@hall` of a dataset."""
 
     name: str
 
@@ -58,9 +58,11 @@ class Cell:
 
     Attributes:
         address: `step`, or `step@step=variant,...` with the variants that reach it in graph
-            order, and `#n` behind it for repeats 1, 2, ...
+            order, `data=name` in front where it hangs on the data, and `#n` behind it for repeats
+            1, 2, ...
         step: name of the step.
-        assignment: step -> variant for every varied step that reaches this cell, itself included.
+        assignment: step -> variant for every varied step that reaches this cell, itself included,
+            and `data` -> dataset in front.
         repeat: 0 for the first; downstream cells use the first.
         method: method id.
         params: resolved parameters, defaults included, JSON.
@@ -219,13 +221,14 @@ class _Expansion:
         """Give all cells in topological order, the first of each repeat in front of the others."""
         graph = step_graph(self.workflow.steps)
         steps_of = {name: self._relevant(graph, name) for name in self.rank}
-        check_cell_count(self.workflow, steps_of)
+        by_data = {name for name, steps in steps_of.items() if any(map(self._takes_data, steps))}
+        check_cell_count(self.workflow, steps_of, by_data)
         cells: dict[str, Cell] = {}
         for name, relevant in steps_of.items():
             step = self.workflow.steps[name]
             made: dict[frozenset[tuple[str, str]], _Node] = {}
             self.nodes[name] = made
-            for assignment in combinations(self.workflow, relevant):
+            for assignment in self._assignments(relevant, is_by_data=name in by_data):
                 try:
                     node = self._node(step, assignment)
                 except _ExcludedError:
@@ -234,6 +237,30 @@ class _Expansion:
                 if node.cell.address not in cells:
                     cells.update({cell.address: cell for cell in self._repeats(step, node.cell)})
         return tuple(cells.values())
+
+    def _takes_data(self, name: str) -> bool:
+        """Whether datasets change something of a step itself."""
+        step = self.workflow.steps[name]
+        names = {step.unless} | {
+            reference.name
+            for references in step.inputs.values()
+            for reference in references
+            if reference.is_input
+        }
+        calls = ((name, variant.name) for variant in step.variants)
+        return not (
+            names.isdisjoint(self.workflow.data_inputs)
+            and self.workflow.data_calls.isdisjoint(calls)
+        )
+
+    def _assignments(self, relevant: list[str], *, is_by_data: bool) -> Iterator[Assignment]:
+        """Give the combinations that reach a step, per dataset where it may hang on the data."""
+        if not is_by_data:
+            yield from combinations(self.workflow, relevant)
+            return
+        for dataset in self.workflow.chosen_data:
+            for assignment in combinations(self.workflow, relevant):
+                yield {DATA: dataset.name, **assignment}
 
     def _relevant(self, graph: nx.DiGraph[str], name: str) -> list[str]:
         """The steps that lie before a step and itself, in graph order."""
@@ -256,12 +283,20 @@ class _Expansion:
     def _node(self, step: WorkflowStep, full: Mapping[str, str]) -> _Node:
         variant = step.variant(full.get(step.name, ""))
         own = {step.name: variant.name} if step.is_varied else {}
+        by_data = {DATA: full[DATA]} if DATA in full else {}
+        if (step.name, variant.name) in self.workflow.data_calls:
+            own |= by_data
+            calls = self.workflow.datasets[full[DATA]].calls
+            variant = calls.get((step.name, variant.name), variant)
+        # Whether a step is needed may hang on the data too.
+        always = by_data if step.unless in self.workflow.data_inputs else {}
+        own |= always
         if is_excluded(self.workflow, own):
             raise _ExcludedError
-        if step.unless and step.unless in self.present:
+        if step.unless and self._input_name(step.unless, full) in self.present:
             cause = f"inputs.{step.unless} is given"
             cell = self._cell(step, variant, own, {}, f"not needed, because {cause}")
-            return _Node(cell=cell, dependence={}, causes=(cause,))
+            return _Node(cell=cell, dependence=always, causes=(cause,))
         choices = {
             port: self._choose(step.inputs[port], full)
             for port in self.methods[variant.method].takes
@@ -279,7 +314,7 @@ class _Expansion:
             return _Node(cell=cell, dependence=assignment)
         choice = choices[missing]
         reason = f"port {missing} stays empty, because {' and '.join(choice.causes)}"
-        dependence = dict(choice.dependence)
+        dependence = dict(choice.dependence) | always
         if not self._all_require(step, missing):
             dependence |= own
         cell = self._cell(step, variant, assignment, inputs, reason)
@@ -290,8 +325,11 @@ class _Expansion:
         causes: dict[str, None] = {}
         for reference in references:
             if reference.is_input:
-                if reference.name in self.present:
-                    return _Choice(source=WorkflowInput(name=reference.name), dependence=dependence)
+                if reference.name in self.workflow.data_inputs:
+                    dependence[DATA] = full[DATA]
+                name = self._input_name(reference.name, full)
+                if name in self.present:
+                    return _Choice(source=WorkflowInput(name=name), dependence=dependence)
                 causes[f"{reference} is not given"] = None
                 continue
             node = self._upstream(reference.source, full)
@@ -302,6 +340,11 @@ class _Expansion:
                 return _Choice(source=output, dependence=dependence)
             causes.update(dict.fromkeys(node.causes))
         return _Choice(source=None, dependence=dependence, causes=tuple(causes))
+
+    def _input_name(self, name: str, full: Mapping[str, str]) -> str:
+        """The own name of an input: that of the dataset, where it names files for it."""
+        dataset = self.workflow.datasets.get(full.get(DATA, ""))
+        return dataset.inputs[name].name if dataset and name in dataset.inputs else name
 
     def _upstream(self, step: str, full: Mapping[str, str]) -> _Node:
         made = self.nodes[step]
@@ -326,7 +369,8 @@ class _Expansion:
         inputs: Mapping[str, CellOutput | WorkflowInput],
         skip_reason: str,
     ) -> Cell:
-        ordered = dict(sorted(assignment.items(), key=lambda item: self.rank[item[0]]))
+        # Only a dataset has no rank among the steps, and it stands first.
+        ordered = dict(sorted(assignment.items(), key=lambda item: self.rank.get(item[0], -1)))
         listed = ",".join(f"{name}={chosen}" for name, chosen in ordered.items())
         return Cell(
             address=f"{step.name}@{listed}" if listed else step.name,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
@@ -16,12 +16,14 @@ from orthoflow.workflow.format import (
     BASELINE,
     COMPARE,
     COMPARISON,
+    DATA,
     DESIGN,
     EXCLUDE,
     METRICS,
     Comparison,
     Workflow,
 )
+from orthoflow.workflow.inputs import some_of
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import TEXT
 from orthoflow.workflow.steps import DraftStep
@@ -32,9 +34,13 @@ MOST_EXCLUDED: Final = 500
 
 
 def read_compare(
-    value: Value, steps: Sequence[DraftStep], step_names: Sequence[str], log: ProblemLog
+    value: Value,
+    steps: Sequence[DraftStep],
+    step_names: Sequence[str],
+    datasets: Sequence[str],
+    log: ProblemLog,
 ) -> Comparison | None:
-    """Read the section `compare` against the steps."""
+    """Read the section `compare` against the steps and the names of the datasets."""
     path = COMPARE.name
     table = COMPARISON.read(value, path, log)
     if table is None:
@@ -49,11 +55,17 @@ def read_compare(
             f"expected at most {MOST_EXCLUDED} combinations to leave out, got {len(excluded)}",
         )
         excluded = ()
-    combinations = [_read_assignment(item, here, steps, log) for here, item in excluded]
+    names = {
+        step.name: [variant.call.name for variant in step.variants]
+        for step in steps
+        if step.is_varied
+    }
+    with_data = {DATA: list(datasets), **names} if datasets else names
+    combinations = [_read_assignment(item, here, with_data, log) for here, item in excluded]
     return Comparison(
         design=design,
         baseline=_complete(
-            _read_assignment(baseline, join(path, BASELINE.name), steps, log) if baseline else {},
+            _read_assignment(baseline, join(path, BASELINE.name), names, log) if baseline else {},
             steps,
         ),
         exclude=tuple(combination for combination in combinations if combination),
@@ -74,21 +86,30 @@ def check_baseline(comparison: Comparison, position: Position, log: ProblemLog) 
             )
 
 
-def check_cell_count(workflow: Workflow, steps_of: Mapping[str, Sequence[str]]) -> None:
+def check_cell_count(
+    workflow: Workflow, steps_of: Mapping[str, Sequence[str]], by_data: Collection[str]
+) -> None:
     """Count the cells of a workflow before there are any, those that are left out included.
 
     Args:
         workflow: the workflow.
         steps_of: per step the steps that matter to it, in graph order, itself last.
+        by_data: steps that run once per dataset.
 
     Raises:
         WorkflowError: there are more than anybody can run.
     """
-    count = sum(_count_cells(workflow, steps) for steps in steps_of.values())
+    n_data = len(workflow.chosen_data)
+    count = sum(
+        _count_cells(workflow, steps) * (n_data if name in by_data else 1)
+        for name, steps in steps_of.items()
+    )
     if count > MOST_CELLS:
+        of_what = "datasets, combinations" if n_data else "combinations"
+        fewer = "fewer datasets (--only-data), fewer variants" if n_data else "fewer variants"
         raise WorkflowError(
-            f"the comparison of {workflow.name} has {count} cells (combinations of variants, and "
-            f"repeats), more than {MOST_CELLS}; use design: one-at-a-time, fewer variants or a "
+            f"the comparison of {workflow.name} has {count} cells ({of_what} of variants, and "
+            f"repeats), more than {MOST_CELLS}; use design: one-at-a-time, {fewer} or a "
             "smaller repeat"
         )
 
@@ -148,15 +169,14 @@ def is_excluded(workflow: Workflow, assignment: Mapping[str, str]) -> bool:
 
 
 def _read_assignment(
-    table: Table, path: str, steps: Sequence[DraftStep], log: ProblemLog
+    table: Table, path: str, varied: Mapping[str, Sequence[str]], log: ProblemLog
 ) -> Assignment:
-    """Read a mapping from varied steps to their variants."""
-    varied = {step.name: step for step in steps if step.is_varied}
+    """Read a mapping from varied steps, and `data`, to one of the names that each has."""
     chosen: Assignment = {}
     for entry in table:
         here = join(path, entry.key)
-        step = varied.get(entry.key)
-        if step is None:
+        known = varied.get(entry.key)
+        if known is None:
             log.add(
                 entry.position,
                 here,
@@ -165,15 +185,17 @@ def _read_assignment(
             )
             continue
         text = TEXT.read(entry.value, here, log)
-        names = [variant.call.name for variant in step.variants]
-        if text in names:
+        if text is not None and text in known:
             chosen[entry.key] = text
         elif text is not None:
+            what = (
+                "there is no dataset" if entry.key == DATA else f"step {entry.key} has no variant"
+            )
+            have = "datasets:" if entry.key == DATA else "it has"
             log.add(
                 entry.value.position,
                 here,
-                f"step {entry.key} has no variant {text}{did_you_mean(text, names)}; it has "
-                f"{', '.join(names)}",
+                f"{what} {text}{did_you_mean(text, known)}; {have} {some_of(known)}",
             )
     return chosen
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -11,8 +11,10 @@ from orthoflow.catalog import Catalog
 from orthoflow.errors import WorkflowError
 from orthoflow.files.yaml_positions import Entry, Table, read_yaml
 from orthoflow.workflow.comparison import check_baseline, read_compare
+from orthoflow.workflow.datasets import DatasetReader, choose_data
 from orthoflow.workflow.format import (
     COMPARE,
+    DATASETS,
     FILE,
     INPUTS,
     NAME,
@@ -23,8 +25,13 @@ from orthoflow.workflow.format import (
     Workflow,
     WorkflowStep,
 )
-from orthoflow.workflow.inputs import override_inputs, read_input_options, read_inputs
-from orthoflow.workflow.parameters import CallName, assign_overrides, resolve_params
+from orthoflow.workflow.inputs import (
+    check_shared_inputs,
+    override_inputs,
+    read_input_options,
+    read_inputs,
+)
+from orthoflow.workflow.parameters import CallName, Override, assign_overrides, resolve_params
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.recipes import find_workflow
 from orthoflow.workflow.shapes import check_name
@@ -40,6 +47,8 @@ def load_workflow(
     *,
     sets: Sequence[str] = (),
     inputs: Sequence[str] = (),
+    datasets: str = "",
+    only_data: Sequence[str] = (),
 ) -> Workflow:
     """Read and check a workflow.
 
@@ -48,10 +57,12 @@ def load_workflow(
         catalog: the installed plugins.
         sets: `step[.variant].param=value`, each as behind `--set`.
         inputs: `NAME=PATH`, each as behind `--input`; relative to the working directory.
+        datasets: a table in the place of the file's datasets, as behind `--datasets`.
+        only_data: names of datasets, each as behind `--only-data`.
 
     Raises:
         InvalidWorkflowError: the file has problems; the message lists all of them.
-        InvalidArgumentsError: the file is fine, `sets` or `inputs` are not.
+        InvalidArgumentsError: the file is fine, what came with it is not.
         UnusablePluginError: only plugins that the workflow needs are broken or missing.
         WorkflowError: there is no such file, or it cannot be read at all.
     """
@@ -63,8 +74,11 @@ def load_workflow(
     if table is None:
         log.raise_any()
         raise WorkflowError(f"{name_or_path} holds no workflow")
-    reader = _Reader(path=path, source=source, catalog=catalog, log=log)
-    workflow = reader.read(table, sets, inputs)
+    options = _Options(
+        sets=tuple(sets), inputs=tuple(inputs), datasets=datasets, only_data=tuple(only_data)
+    )
+    reader = _Reader(path=path, source=source, catalog=catalog, log=log, options=options)
+    workflow = reader.read(table)
     log.raise_any()
     return workflow
 
@@ -88,6 +102,16 @@ def _read_text(path: Path) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Options:
+    """What the command line says of the workflow."""
+
+    sets: tuple[str, ...]
+    inputs: tuple[str, ...]
+    datasets: str
+    only_data: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Reader:
     """Reads one document; everything wrong goes to the log."""
 
@@ -95,8 +119,9 @@ class _Reader:
     source: str
     catalog: Catalog
     log: ProblemLog
+    options: _Options
 
-    def read(self, table: Table, sets: Sequence[str], input_options: Sequence[str]) -> Workflow:
+    def read(self, table: Table) -> Workflow:
         """Read all sections; the result may be used only when the log stays empty."""
         ORTHOFLOW.read(table, "", self.log)
         section = table.get(INPUTS.name)
@@ -109,21 +134,49 @@ class _Reader:
             if isinstance(steps_entry.value, Table):
                 step_names = tuple(entry.key for entry in steps_entry.value)
         check_wiring(steps, step_names, tuple(specs), self.log)
-        compare = self._compare(table.get(COMPARE.name), steps, step_names)
-        given = read_input_options(input_options, self.log)
-        return Workflow(
+        given = read_input_options(self.options.inputs, self.log)
+        shared = tuple(option for option in given if not option.is_of_dataset)
+        specs = override_inputs(specs, shared, self.log)
+        overrides = assign_overrides(self.options.sets, steps, self.log)
+        read = {step.name: self._step(step, overrides) for step in steps}
+        datasets = DatasetReader(
+            folder=self.path.resolve().parent,
+            inputs=specs,
+            steps=steps,
+            overrides=overrides,
+            calls={
+                (step.name, variant.name): variant
+                for step in read.values()
+                for variant in step.variants
+                if variant.params
+            },
+            log=self.log,
+        ).read(table.get(DATASETS.name), self.options.datasets)
+        compare = self._compare(table.get(COMPARE.name), steps, step_names, tuple(datasets))
+        workflow = Workflow(
             name=self._name(table),
             path=self.path,
             source=self.source,
             seed=SEED.read(table, "", self.log) or 0,
-            inputs=override_inputs(specs, given, self.log),
-            steps=self._steps(steps, sets),
+            inputs=specs,
+            steps=read,
             compare=compare,
             overrides=(
-                *(f"--set {text}" for text in sets),
+                *(f"--set {text}" for text in self.options.sets),
                 *(option.without_folder for option in given),
+                *self._data_options(),
             ),
+            datasets=datasets,
+            only_data=choose_data(self.options.only_data, datasets, self.log),
         )
+        check_shared_inputs(workflow, shared, self.log)
+        own = tuple(option for option in given if option.is_of_dataset)
+        return workflow.with_input_specs(override_inputs(workflow.input_specs, own, self.log))
+
+    def _data_options(self) -> Iterator[str]:
+        if self.options.datasets:
+            yield f"--datasets {Path(self.options.datasets).name}"
+        yield from (f"--only-data {text}" for text in self.options.only_data)
 
     def _name(self, table: Table) -> str:
         if table.get(NAME.name) is not None:
@@ -132,34 +185,34 @@ class _Reader:
         return self.path.stem
 
     def _compare(
-        self, entry: Entry | None, steps: Sequence[DraftStep], step_names: Sequence[str]
+        self,
+        entry: Entry | None,
+        steps: Sequence[DraftStep],
+        step_names: Sequence[str],
+        datasets: Sequence[str],
     ) -> Comparison | None:
         if entry is None:
             return None
-        comparison = read_compare(entry.value, steps, step_names, self.log)
+        comparison = read_compare(entry.value, steps, step_names, datasets, self.log)
         if comparison is not None:
             check_baseline(comparison, entry.position, self.log)
         return comparison
 
-    def _steps(self, drafts: Sequence[DraftStep], sets: Sequence[str]) -> dict[str, WorkflowStep]:
-        overrides = assign_overrides(sets, drafts, self.log)
-        steps: dict[str, WorkflowStep] = {}
-        for draft in drafts:
-            variants = []
-            for variant in draft.variants:
-                call = CallName(step=draft.name, variant=variant.call.name)
-                params = resolve_params(variant, overrides.get(call, ()), self.log)
-                variants.append(
-                    replace(variant.call, params=params.resolved, params_set=params.as_set)
-                )
-            steps[draft.name] = WorkflowStep(
-                name=draft.name,
-                variants=tuple(variants),
-                inputs={
-                    port.name: tuple(placed.reference for placed in port.references)
-                    for port in draft.ports
-                },
-                unless=draft.unless.reference.name if draft.unless else "",
-                is_varied=draft.is_varied,
-            )
-        return steps
+    def _step(
+        self, draft: DraftStep, overrides: Mapping[CallName, tuple[Override, ...]]
+    ) -> WorkflowStep:
+        variants = []
+        for variant in draft.variants:
+            call = CallName(step=draft.name, variant=variant.call.name)
+            params = resolve_params(variant, overrides.get(call, ()), self.log)
+            variants.append(replace(variant.call, params=params.resolved, params_set=params.as_set))
+        return WorkflowStep(
+            name=draft.name,
+            variants=tuple(variants),
+            inputs={
+                port.name: tuple(placed.reference for placed in port.references)
+                for port in draft.ports
+            },
+            unless=draft.unless.reference.name if draft.unless else "",
+            is_varied=draft.is_varied,
+        )

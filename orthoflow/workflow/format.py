@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final, Literal
 
+from orthoflow.files.yaml_positions import Entry
 from orthoflow.products.product import JsonValue
+from orthoflow.workflow.dataset_files import TableOr
 from orthoflow.workflow.shapes import (
     ASSIGNMENT,
     FLAG,
@@ -30,6 +33,7 @@ from orthoflow.workflow.shapes import (
     Name,
     Named,
     OneOrMore,
+    OpenTable,
     Reference,
     Section,
     Wires,
@@ -38,6 +42,8 @@ from orthoflow.workflow.shapes import (
 
 FORMAT: Final = 1
 MOST_REPEATS: Final = 10_000
+# What datasets are called in assignments and addresses, where steps stand otherwise.
+DATA: Final = "data"
 Design = Literal["product", "one-at-a-time"]
 
 
@@ -76,6 +82,8 @@ class WorkflowInputSpec:
         folder: what relative paths start from: the workflow's folder, or the working directory
             for paths from the command line.
         is_given: named with `--input`, so it must exist even when optional.
+        said_in: the table of datasets and the line in it that name the files, `rooms.csv:3`; empty
+            for the workflow itself.
     """
 
     name: str
@@ -83,6 +91,7 @@ class WorkflowInputSpec:
     optional: bool = False
     folder: Path = Path()
     is_given: bool = False
+    said_in: str = ""
 
 
 # Steps --------------------------------------------------------------------------------------------
@@ -228,6 +237,52 @@ class WorkflowStep:
         return tuple(dict.fromkeys(names))
 
 
+# Datasets -----------------------------------------------------------------------------------------
+
+SET: Final = Key(
+    name="set",
+    shape=OpenTable(words="a mapping step.parameter: value"),
+    meaning="Parameters for this dataset alone, named as behind `--set`, which goes before them.",
+    example="{room.seed: 7, plane.ransac.tolerance_m: 0.03}",
+    default="as in the steps",
+)
+DATASET: Final = Section(
+    words="a dataset",
+    about="What hangs on the data runs once per dataset, with `data=<name>` first in its address; "
+    "all else runs once. An input that a dataset does not name is that of the workflow. Instead of "
+    "the mapping there may be a CSV file with a line per dataset: the column `name`, a column per "
+    "input, and columns such as `room.seed` for parameters; an empty place says nothing, and "
+    "relative paths start at the CSV file. `--datasets FILE` takes the place of the section, "
+    "`--only-data A,B` chooses among the names.",
+    keys=(SET,),
+    others=Key(
+        name="<input>",
+        shape=FILES.shape,
+        meaning="Files of the input of that name, which have to be there.",
+        example="data/hall/*.jpg",
+        default="the workflow's own",
+    ),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """One of the datasets that a workflow runs on.
+
+    Attributes:
+        name: name of the dataset.
+        inputs: input -> its files; that of the input `scan` has the name `scan@<dataset>`.
+        sets: parameters as written, `step.parameter` -> JSON.
+        calls: (step, variant) -> the method call with these parameters, where they change it; not
+            kept in records, whose cells say it.
+    """
+
+    name: str
+    inputs: Mapping[str, WorkflowInputSpec] = field(default_factory=dict)
+    sets: Mapping[str, JsonValue] = field(default_factory=dict)
+    calls: Mapping[tuple[str, str], StepVariant] = field(default_factory=dict)
+
+
 # The comparison -----------------------------------------------------------------------------------
 
 DESIGN: Final[Key[Design]] = Key(
@@ -325,6 +380,16 @@ STEPS: Final = Key(
     example="{cloud: {use: read.scan, in: {files: inputs.scan}}}",
     missing="a workflow needs the key steps",
 )
+NAMED_DATASETS: Final = Named(
+    words="a mapping from names to datasets", item=DATASET, empty="expected at least one dataset"
+)
+DATASETS: Final[Key[str | tuple[Entry, ...]]] = Key(
+    name="datasets",
+    shape=TableOr(NAMED_DATASETS),
+    meaning="What the workflow runs on, one after the other; the runs are one comparison.",
+    example="{hall: {scan: data/hall.e57}, stairs: {scan: data/stairs.e57}}",
+    default="the workflow runs once, on its inputs",
+)
 COMPARE: Final = Key(
     name="compare",
     shape=COMPARISON,
@@ -336,7 +401,7 @@ FILE: Final = Section(
     words="a workflow",
     about="A workflow file is YAML 1.2 and data only: no templates, no expressions, no environment "
     "variables, no tags. Every key and every name occurs once.",
-    keys=(ORTHOFLOW, NAME, SEED, INPUTS, STEPS, COMPARE),
+    keys=(ORTHOFLOW, NAME, SEED, INPUTS, DATASETS, STEPS, COMPARE),
 )
 
 
@@ -354,6 +419,8 @@ class Workflow:
         compare: what to compare; None when only the baseline runs.
         overrides: `--set ...` and `--input ...` that changed the document, in order; of files
             only the names are kept.
+        datasets: by name; empty when the workflow runs once, on its inputs.
+        only_data: names of the datasets to run on; empty for all.
     """
 
     name: str
@@ -364,6 +431,49 @@ class Workflow:
     steps: Mapping[str, WorkflowStep]
     compare: Comparison | None = None
     overrides: tuple[str, ...] = ()
+    datasets: Mapping[str, Dataset] = field(default_factory=dict)
+    only_data: tuple[str, ...] = ()
+
+    @property
+    def chosen_data(self) -> tuple[Dataset, ...]:
+        """The datasets to run on, in the order of the file."""
+        chosen = self.only_data or tuple(self.datasets)
+        return tuple(item for item in self.datasets.values() if item.name in chosen)
+
+    @cached_property
+    def data_inputs(self) -> frozenset[str]:
+        """Inputs that datasets name; of all datasets, so that a choice moves no address."""
+        return frozenset(name for item in self.datasets.values() for name in item.inputs)
+
+    @cached_property
+    def data_calls(self) -> frozenset[tuple[str, str]]:
+        """(step, variant) of the method calls whose parameters datasets change."""
+        return frozenset(call for item in self.datasets.values() for call in item.calls)
+
+    @cached_property
+    def input_specs(self) -> Mapping[str, WorkflowInputSpec]:
+        """Every input that cells may take, by its own name: `scan`, `scan@hall`."""
+        chosen = self.chosen_data
+        shared = {
+            name: spec
+            for name, spec in self.inputs.items()
+            if not chosen or any(name not in item.inputs for item in chosen)
+        }
+        return shared | {spec.name: spec for item in chosen for spec in item.inputs.values()}
+
+    def with_input_specs(self, specs: Mapping[str, WorkflowInputSpec]) -> Workflow:
+        """Put other inputs, by their own names, in the place of those that are there."""
+        return replace(
+            self,
+            inputs={name: specs.get(name, spec) for name, spec in self.inputs.items()},
+            datasets={
+                item.name: replace(
+                    item,
+                    inputs={name: specs.get(spec.name, spec) for name, spec in item.inputs.items()},
+                )
+                for item in self.datasets.values()
+            },
+        )
 
     @property
     def baseline(self) -> dict[str, str]:

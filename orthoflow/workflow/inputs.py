@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,6 +19,7 @@ from orthoflow.workflow.problems import ProblemLog
 
 # Files and folders that are looked at for one input: `/**` would go on for hours.
 MOST_LOOKED_AT: Final = 100_000
+_MOST_LISTED: Final = 12
 
 
 def read_inputs(value: Value, folder: Path, log: ProblemLog) -> dict[str, WorkflowInputSpec]:
@@ -58,6 +59,11 @@ class InputOption:
         return f"--input {self.name}={self.path}"
 
     @property
+    def is_of_dataset(self) -> bool:
+        """Whether it names the input of one dataset, as in `scan@hall`."""
+        return "@" in self.name
+
+    @property
     def without_folder(self) -> str:
         """The option as a record keeps it, which names no folder of this machine."""
         return f"--input {self.name}={Path(self.path).name}"
@@ -83,10 +89,9 @@ def override_inputs(
     for option in options:
         name = option.name
         if name not in specs:
-            known = ", ".join(specs) or "none"
             log.add_option(
                 str(option),
-                f"there is no input {name}{did_you_mean(name, specs)}; inputs: {known}",
+                f"there is no input {name}{did_you_mean(name, specs)}; inputs: {some_of(specs)}",
             )
         else:
             before = changed[name].files if changed[name].is_given else ()
@@ -94,6 +99,20 @@ def override_inputs(
                 specs[name], files=(*before, option.path), folder=Path.cwd(), is_given=True
             )
     return changed
+
+
+def check_shared_inputs(
+    workflow: Workflow, options: Sequence[InputOption], log: ProblemLog
+) -> None:
+    """Refuse files for an input of which every dataset has its own."""
+    for option in options:
+        if option.name in workflow.inputs and option.name not in workflow.input_specs:
+            example = workflow.chosen_data[0].inputs[option.name].name
+            log.add_option(
+                str(option),
+                f"every dataset has its own {option.name}; name that of one of them, as in --input "
+                f"{example}=PATH",
+            )
 
 
 def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
@@ -104,19 +123,41 @@ def resolve_input_files(workflow: Workflow) -> Mapping[str, InputFiles | None]:
 
     Raises:
         InputError: a file is missing, a folder is empty, a pattern matches nothing, or an input
-            that is not optional was given no files. An optional input may be missing unless it
-            was named on the command line.
+            that is not optional was given no files; says so of every input. An optional input may
+            be missing unless it was named on the command line or by a dataset.
     """
-    return {spec.name: _resolve(spec) for spec in workflow.inputs.values()}
+    found: dict[str, InputFiles | None] = {}
+    missing: list[str] = []
+    for spec in workflow.input_specs.values():
+        try:
+            found[spec.name] = _resolve(spec)
+        except InputError as error:
+            missing.append(str(error))
+    if missing:
+        n_more = len(missing) - _MOST_LISTED
+        more = [f"and {n_more} more inputs have no files"] if n_more > 0 else []
+        raise InputError("; ".join([*missing[:_MOST_LISTED], *more]))
+    return found
 
 
 def present_inputs(workflow: Workflow) -> frozenset[str]:
     """Names of the inputs that are there; those that are not optional always count as there."""
     return frozenset(
         spec.name
-        for spec in workflow.inputs.values()
+        for spec in workflow.input_specs.values()
         if not spec.optional or _resolve(spec) is not None
     )
+
+
+def some_of(names: Collection[str]) -> str:
+    """Name what there is, of many only the first.
+
+    >>> some_of(["scan", "photos"]), some_of([])
+    ('scan, photos', 'none')
+    """
+    first = list(names)[:_MOST_LISTED]
+    more = f" and {len(names) - len(first)} more" if len(names) > len(first) else ""
+    return f"{', '.join(first) or 'none'}{more}"
 
 
 def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:
@@ -138,7 +179,8 @@ def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:
 
 def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
     path = spec.folder / pattern
-    where = " in the working directory" if spec.is_given else f" beside the workflow ({path})"
+    beside = f"the table {spec.said_in}" if spec.said_in else "the workflow"
+    where = " in the working directory" if spec.is_given else f" beside {beside} ({path})"
     if Path(pattern).is_absolute():
         where = ""
     look = _Look(f"input {spec.name}: {pattern}{where}")

@@ -32,6 +32,8 @@ def mermaid(workflow: Workflow, catalog: Catalog) -> str:
     lines = ["flowchart LR"]
     for name, node in inputs.items():
         note = "<br/>optional" if workflow.inputs[name].optional else ""
+        if name in workflow.data_inputs:
+            note = f"<br/>of {len(workflow.chosen_data)} datasets"
         lines.append(f'    {node}[/"{name}{note}"/]')
     for name, node in steps.items():
         lines.append(f'    {node}["{_label(workflow.steps[name])}"]')

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeAlias
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
@@ -27,18 +30,20 @@ from orthoflow.workflow.methods import MethodInfo
 from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
 from orthoflow.workflow.steps import DraftStep, DraftVariant
 
+Report: TypeAlias = Callable[[str], None]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Override:
-    """One parameter of one method call, set from the command line.
+    """One parameter of one method call, set from the command line or by a dataset.
 
     Attributes:
-        option: as typed, e.g. `--set wall.gsd_m=0.005`.
+        report: takes what is wrong with it, and knows its place.
         keys: parameter name, and keys inside it when it is a mapping.
         value: JSON.
     """
 
-    option: str
+    report: Report
     keys: tuple[str, ...]
     value: JsonValue
 
@@ -57,13 +62,40 @@ def assign_overrides(
     """Find the method calls that each `--set` means; what fits nowhere goes to the log."""
     assigned: dict[CallName, list[Override]] = {}
     for text in sets:
-        option = f"--set {text}"
+        report = partial(log.add_option, f"--set {text}")
         try:
             parts, value = _parse(text)
-            for call, override in _targets(option, parts, value, steps):
+            for call, override in _targets(report, parts, value, steps):
                 assigned.setdefault(call, []).append(override)
         except ArgumentError as error:
-            log.add_option(option, str(error))
+            report(str(error))
+    return {call: tuple(overrides) for call, overrides in assigned.items()}
+
+
+def assign_settings(
+    settings: Table, path: str, steps: Sequence[DraftStep], log: ProblemLog
+) -> Mapping[CallName, tuple[Override, ...]]:
+    """Find the method calls that each `step.parameter: value` of a mapping means.
+
+    Args:
+        settings: the mapping.
+        path: what stands before its keys in problems of values; those of keys bear the key alone,
+            so that a column of a table is told of once.
+        steps: of the workflow.
+        log: takes the problems.
+    """
+    assigned: dict[CallName, list[Override]] = {}
+    for entry in settings:
+        parts = entry.key.split(".")
+        if len(parts) < 2 or not all(parts):
+            log.add(entry.position, entry.key, "expected step.parameter or step.variant.parameter")
+            continue
+        report = partial(log.add, entry.value.position, f"{path}.{entry.key}")
+        try:
+            for call, override in _targets(report, parts, plain(entry.value), steps):
+                assigned.setdefault(call, []).append(override)
+        except ArgumentError as error:
+            log.add(entry.position, entry.key, str(error))
     return {call: tuple(overrides) for call, overrides in assigned.items()}
 
 
@@ -81,13 +113,23 @@ class ResolvedParams:
 
 
 def resolve_params(
-    variant: DraftVariant, overrides: Sequence[Override], log: ProblemLog
+    variant: DraftVariant,
+    overrides: Sequence[Override],
+    log: ProblemLog,
+    blame: Report | None = None,
 ) -> ResolvedParams:
-    """Check the parameters of a method call, strictly: the text "0.003" is not a number."""
+    """Check the parameters of a method call, strictly: the text "0.003" is not a number.
+
+    Args:
+        variant: the method call.
+        overrides: put over what the file says, one after the other.
+        log: takes the problems of what the file says.
+        blame: takes these in the log's place, for a call that is fine without the overrides.
+    """
     written = plain(variant.params) if variant.params else {}
     as_set: dict[str, JsonValue] = written if isinstance(written, dict) else {}
     for override in overrides:
-        _put(as_set, override, log)
+        _put(as_set, override)
     info = variant.info
     if info is None:
         return ResolvedParams(as_set=as_set)
@@ -96,8 +138,8 @@ def resolve_params(
             params = info.method.Params.model_validate_json(json.dumps(as_set), strict=True)
             resolved = params.model_dump(mode="json")
     except ValidationError as error:
-        options = {override.keys[0]: override.option for override in overrides}
-        reporter = _Reporter(variant=variant, info=info, options=options, log=log)
+        reports = {override.keys[0]: override.report for override in overrides}
+        reporter = _Reporter(variant=variant, info=info, reports=reports, log=log, blame=blame)
         for details in error.errors(include_url=False):
             reporter.report(details)
         return ResolvedParams(as_set=as_set)
@@ -113,33 +155,35 @@ def resolve_params(
     return ResolvedParams(resolved=resolved, as_set=as_set)
 
 
-def _put(params: dict[str, JsonValue], override: Override, log: ProblemLog) -> None:
+def _put(params: dict[str, JsonValue], override: Override) -> None:
     *outer, last = override.keys
     place = params
     for key in outer:
         inner = place.setdefault(key, {})
         if not isinstance(inner, dict):
-            log.add_option(override.option, f"{key} is no mapping, so nothing in it can be set")
+            override.report(f"{key} is no mapping, so nothing in it can be set")
             return
         place = inner
-    place[last] = override.value
+    # Several calls may take the same value, and later settings go into it.
+    place[last] = deepcopy(override.value)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Reporter:
-    """Turns pydantic's errors into problems of the file or of a `--set`."""
+    """Turns pydantic's errors into problems of the file, of a `--set` or of a dataset."""
 
     variant: DraftVariant
     info: MethodInfo
-    options: Mapping[str, str]
+    reports: Mapping[str, Report]
     log: ProblemLog
+    blame: Report | None
 
     def report(self, details: ErrorDetails) -> None:
         location = details["loc"]
         message = self._message(details)
         name = str(location[0]) if location else ""
-        if name in self.options:
-            self.log.add_option(self.options[name], message)
+        if report := self.reports.get(name, self.blame):
+            report(message)
             return
         path = "".join(
             f"[{part}]" if isinstance(part, int) else f".{part}" for part in ("params", *location)
@@ -205,7 +249,7 @@ def _parse(text: str) -> tuple[list[str], JsonValue]:
 
 
 def _targets(
-    option: str, parts: list[str], value: JsonValue, steps: Sequence[DraftStep]
+    report: Report, parts: list[str], value: JsonValue, steps: Sequence[DraftStep]
 ) -> list[tuple[CallName, Override]]:
     by_name = {step.name: step for step in steps}
     step = by_name.get(parts[0])
@@ -223,7 +267,7 @@ def _targets(
             f"there is no parameter {keys[0]} in {who}{did_you_mean(keys[0], known)}; known: "
             f"{', '.join(known) or 'none'}"
         )
-    override = Override(option=option, keys=tuple(keys), value=value)
+    override = Override(report=report, keys=tuple(keys), value=value)
     return [(CallName(step=step.name, variant=variant.call.name), override) for variant in chosen]
 
 

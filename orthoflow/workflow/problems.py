@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from orthoflow.errors import ArgumentError, PluginError, WorkflowError
@@ -99,11 +99,23 @@ class ProblemLog:
         Raises:
             InvalidWorkflowError: there are so many that the file must be something else.
         """
+        problem = self._at(position, path, message)
+        if problem in self._in_file:
+            return
         if len(self._in_file) == MOST_PROBLEMS:
             message = f"more than {MOST_PROBLEMS} problems; correct those above and try again"
             self._in_file.append(self._at(position, path, message))
             self._raise()
-        self._in_file.append(self._at(position, path, message))
+        self._in_file.append(problem)
+
+    def beside(self, file: str, text: str) -> ProblemLog:
+        """Give a log of another file, whose problems are told together with those of this one."""
+        return replace(self, file=file, lines=tuple(text.splitlines()))
+
+    @property
+    def has_any(self) -> bool:
+        """Whether there is a problem."""
+        return bool(self._in_file or self._in_plugins or self._in_options)
 
     def add_plugin(self, position: Position, path: str, message: str) -> None:
         """Keep a problem of a plugin that the file needs here."""
@@ -123,12 +135,13 @@ class ProblemLog:
             InvalidArgumentsError: only command-line options have.
             UnusablePluginError: only plugins have.
         """
-        if self._in_file or self._in_plugins or self._in_options:
+        if self.has_any:
             self._raise()
 
     def _raise(self) -> NoReturn:
         in_order = sorted(
-            self._in_file + self._in_plugins, key=lambda problem: (problem.line, problem.column)
+            self._in_file + self._in_plugins,
+            key=lambda problem: (problem.file, problem.line, problem.column),
         )
         everything = tuple(in_order + self._in_options)
         if self._in_file:

@@ -17,9 +17,11 @@ from orthoflow.errors import WorkflowError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.workflow.format import (
+    DATA,
     FORMAT,
     MOST_REPEATS,
     Comparison,
+    Dataset,
     Design,
     StepVariant,
     Workflow,
@@ -46,20 +48,31 @@ def resolved_json(workflow: Workflow) -> str:
         "orthoflow": FORMAT,
         "name": workflow.name,
         "seed": workflow.seed,
-        "inputs": {
-            spec.name: {
-                "files": [Path(name).name if spec.is_given else name for name in spec.files],
-                "optional": spec.optional,
-            }
-            for spec in workflow.inputs.values()
-        },
+        "inputs": {name: _input_json(spec) for name, spec in workflow.inputs.items()},
         "steps": {step.name: _step_json(step) for step in workflow.steps.values()},
         "compare": _compare_json(workflow.compare),
         "overrides": list(workflow.overrides),
     }
+    if workflow.datasets:
+        document["datasets"] = {
+            item.name: {
+                "inputs": {name: _input_json(spec) for name, spec in item.inputs.items()},
+                "set": dict(item.sets),
+            }
+            for item in workflow.chosen_data
+        }
     return json.dumps(
         document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
     )
+
+
+def _input_json(spec: WorkflowInputSpec) -> JsonValue:
+    def recorded(name: str) -> str:
+        # A table, unlike the workflow, is not in the record with its folders.
+        is_private = spec.is_given or (spec.said_in and Path(name).is_absolute())
+        return Path(name).name if is_private else name
+
+    return {"files": [recorded(name) for name in spec.files], "optional": spec.optional}
 
 
 def workflow_from_resolved(resolved: str, source: str) -> Workflow:
@@ -105,7 +118,20 @@ def _workflow(document: Any, source: str) -> Workflow:
         steps={name: _step(name, entry) for name, entry in document["steps"].items()},
         compare=_comparison(document["compare"]),
         overrides=tuple(document["overrides"]),
+        datasets={
+            name: _dataset(name, entry) for name, entry in document.get("datasets", {}).items()
+        },
     )
+
+
+def _dataset(data: str, entry: Mapping[str, Any]) -> Dataset:
+    inputs = {
+        name: WorkflowInputSpec(
+            name=f"{name}@{data}", files=tuple(given["files"]), optional=given["optional"]
+        )
+        for name, given in entry["inputs"].items()
+    }
+    return Dataset(name=data, inputs=inputs, sets=entry["set"])
 
 
 def _step_json(step: WorkflowStep) -> dict[str, object]:
@@ -162,6 +188,11 @@ class _InputDocument(BaseModel):
     optional: bool
 
 
+class _DatasetDocument(BaseModel):
+    inputs: dict[str, _InputDocument]
+    sets: dict[str, object] = Field(alias="set")
+
+
 class _ComparisonDocument(BaseModel):
     design: Design
     baseline: dict[str, str]
@@ -178,6 +209,7 @@ class _Document(BaseModel):
     steps: dict[str, _StepDocument]
     compare: _ComparisonDocument | None
     overrides: list[str]
+    datasets: dict[str, _DatasetDocument] = {}
 
 
 def _check_types(document: object) -> None:
@@ -227,6 +259,12 @@ def _check(workflow: Workflow) -> None:
         ValueError: a value is out of range, or names what is not there.
     """
     names = [workflow.name, *workflow.inputs, *workflow.steps]
+    for dataset in workflow.datasets.values():
+        names += [dataset.name, *dataset.inputs]
+        if strangers := dataset.inputs.keys() - workflow.inputs.keys():
+            raise ValueError(f"dataset {dataset.name} names an unknown input {min(strangers)!r}")
+    if workflow.datasets and DATA in workflow.steps:
+        raise ValueError(f"a step is called {DATA} beside datasets")
     for step in workflow.steps.values():
         names += [variant.name for variant in step.variants if step.is_varied]
     for name in names:
@@ -265,5 +303,7 @@ def _check_variant(variant: StepVariant) -> None:
 def _check_comparison(workflow: Workflow, comparison: Comparison) -> None:
     for assignment in (comparison.baseline, *comparison.exclude):
         for step, variant in assignment.items():
+            if step == DATA and workflow.datasets:
+                continue
             if variant not in [item.name for item in workflow.steps[step].variants]:
                 raise ValueError(f"step {step} has no variant of the comparison")

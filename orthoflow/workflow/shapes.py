@@ -496,12 +496,14 @@ class Section:
         words: what it is.
         about: what a reader of the documentation has to know beside the keys.
         keys: all keys it may have, in the order in which they are listed.
+        others: what any other key stands for; None where there is no other.
     """
 
     words: str
     about: str
     # Any: keys of all kinds of values.
     keys: tuple[Key[Any], ...]
+    others: Key[Any] | None = None
 
     def schema(self) -> Schema:
         """An object of these keys and no others."""
@@ -510,7 +512,7 @@ class Section:
             "type": "object",
             **({"required": required} if required else {}),
             "properties": {key.name: key.schema() for key in self.keys},
-            "additionalProperties": False,
+            "additionalProperties": self.others.schema() if self.others else False,
         }
 
     def read(self, value: Value, path: str, log: ProblemLog) -> Table | None:
@@ -520,7 +522,7 @@ class Section:
             return None
         known = {key.name: key for key in self.keys}
         for entry in table:
-            if entry.key not in known:
+            if entry.key not in known and self.others is None:
                 log.add(
                     entry.position,
                     join(path, entry.key),

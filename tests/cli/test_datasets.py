@@ -1,0 +1,179 @@
+"""Datasets from the user's side: one command, many rooms, one record."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from orthoflow.records import open_run, verify_run
+from tests.workshop_runs import orthoflow
+
+ROOMS = """\
+orthoflow: 1
+name: rooms
+seed: 7
+inputs:
+  number: {optional: true}
+steps:
+  survey: {use: survey.offset, in: {files: inputs.number}}
+  other: {use: survey.offset}
+  paint: {use: paint.plain, in: {planes: survey.planes}}
+  side: {use: paint.plain, in: {planes: other.planes}}
+"""
+TABLE = "name,number\nhall,data/hall.txt\nattic,data/attic.txt\nstairs,data/stairs.txt\n"
+NUMBERS = {"hall": "1.5", "attic": "", "stairs": "2.5"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which three rooms were run, one of them with an empty file."""
+    folder = tmp_path_factory.mktemp("rooms")
+    (folder / "rooms.yaml").write_text(ROOMS)
+    (folder / "rooms.csv").write_text(TABLE)
+    (folder / "data").mkdir()
+    for name, text in NUMBERS.items():
+        (folder / "data" / f"{name}.txt").write_text(text)
+    done = orthoflow(folder, "run", "rooms.yaml", "--datasets", "rooms.csv", "-o", "first")
+    # Every root failure is that of an input.
+    assert done.returncode == 2, done.stderr
+    return folder
+
+
+def test_a_dataset_that_fails_keeps_its_place_and_the_others_go_on(folder: Path) -> None:
+    cells = open_run(folder / "first").cells
+    assert {address: cell.status for address, cell in cells.items()} == {
+        "survey@data=hall": "ok",
+        "survey@data=attic": "failed",
+        "survey@data=stairs": "ok",
+        "other": "ok",
+        "paint@data=hall": "ok",
+        "paint@data=attic": "skipped",
+        "paint@data=stairs": "ok",
+        "side": "ok",
+    }
+    assert cells["survey@data=attic"].error_message == "attic.txt is empty, expected one number"
+    assert cells["paint@data=attic"].error_message == "needs survey@data=attic, which failed"
+
+
+def test_products_lie_below_the_address_of_their_dataset(folder: Path) -> None:
+    found = {path.parent.name for path in (folder / "first" / "products").glob("*/*_ortho.tif")}
+    assert found == {"paint@data=hall", "paint@data=stairs", "side"}
+
+
+def test_the_record_of_all_datasets_verifies_and_replays(folder: Path) -> None:
+    record = open_run(folder / "first").record
+    assert {entry.name: [file.name for file in entry.files] for entry in record.inputs} == {
+        "number@hall": ["hall.txt"],
+        "number@attic": ["attic.txt"],
+        "number@stairs": ["stairs.txt"],
+    }
+    done = orthoflow(folder, "verify", "first")
+    assert done.returncode == 0, done.stdout
+    done = orthoflow(folder, "replay", "first", "-o", "again", "--json")
+    assert done.returncode == 0, done.stderr
+    products = json.loads(done.stdout)["products"]
+    assert len(products) == 6
+    assert {product["verdict"] for product in products} == {"identical"}
+
+
+@pytest.mark.parametrize("given", ["number=moved", "number@hall=moved/hall.txt"])
+def test_a_replay_takes_the_files_of_a_dataset_from_elsewhere(
+    given: str, folder: Path, tmp_path: Path
+) -> None:
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for name, text in NUMBERS.items():
+        (moved / f"{name}.txt").write_text(text)
+    (tmp_path / "run.h5").write_bytes((folder / "first" / "run.h5").read_bytes())
+    done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again")
+    assert done.returncode == 3
+    assert "input number@hall: hall.txt" in done.stderr
+    done = orthoflow(tmp_path, "replay", "run.h5", "-o", "again", "--input", given)
+    if given == "number=moved":
+        assert done.returncode == 0, done.stderr
+    else:
+        assert "input number@hall" not in done.stderr
+        assert "give it with --input number@stairs=PATH" in done.stderr
+
+
+def test_later_rows_compute_nothing_again(folder: Path) -> None:
+    (folder / "more.csv").write_text(f"{TABLE}cellar,data/cellar.txt\n")
+    (folder / "data" / "cellar.txt").write_text("3.5")
+    done = orthoflow(folder, "plan", "rooms.yaml", "--datasets", "more.csv", "--json")
+    states = {item["cell"]: item["status"] for item in json.loads(done.stdout)}
+    assert {address for address, state in states.items() if state != "cached"} == {
+        "survey@data=attic",
+        "paint@data=attic",
+        "survey@data=cellar",
+        "paint@data=cellar",
+    }
+
+
+def test_some_of_the_datasets_can_be_run_alone(folder: Path) -> None:
+    done = orthoflow(
+        folder, "run", "rooms.yaml", "--datasets", "rooms.csv", "--only-data", "stairs,hall",
+        "-o", "two",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "all 6 steps were cached" in done.stdout
+    run = open_run(folder / "two")
+    assert run.record.overrides == ("--datasets rooms.csv", "--only-data stairs,hall")
+    assert not [address for address in run.cells if "attic" in address]
+
+
+def test_check_counts_the_datasets_and_names_every_missing_file(folder: Path) -> None:
+    done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "rooms.csv")
+    assert done.stdout == "rooms is fine: 4 steps, 3 datasets, 8 cells\n"
+    (folder / "gone.csv").write_text("name,number\nhall,data/hall.txt\na,a.txt\nb,b.txt\n")
+    done = orthoflow(folder, "check", "rooms.yaml", "--datasets", "gone.csv")
+    assert done.returncode == 2
+    said = done.stderr
+    assert "input number@a: there is no file a.txt beside the table gone.csv:3 (" in said
+    assert "; input number@b: there is no file b.txt beside the table gone.csv:4 (" in said
+
+
+def test_each_dataset_becomes_a_run_folder_that_stands_alone(folder: Path, tmp_path: Path) -> None:
+    done = orthoflow(folder, "export", "first", "--split", "-o", str(tmp_path / "split"))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("3 run folders: hall, attic, stairs\n")
+    assert {path.name for path in (tmp_path / "split").iterdir()} == {"hall", "attic", "stairs"}
+    hall = open_run(tmp_path / "split" / "hall")
+    assert list(hall.cells) == ["survey@data=hall", "other", "paint@data=hall", "side"]
+    assert [entry.name for entry in hall.record.inputs] == ["number@hall"]
+    assert hall.record.status == "ok"
+    assert len(hall.orthoimages) == 2
+    assert (hall.folder / "report.html").is_file()
+    whole = open_run(folder / "first")
+    for address, cell in hall.cells.items():
+        assert cell == whole.cells[address]
+    assert open_run(tmp_path / "split" / "attic").record.status == "failed"
+    for name in ("hall", "attic"):
+        found = verify_run(tmp_path / "split" / name)
+        assert (found.findings, found.notes) == ((), ())
+    done = orthoflow(
+        tmp_path, "replay", "split/hall", "-o", "again", "--input", f"number={folder}/data"
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_ran_on_no_datasets_is_not_split(folder: Path) -> None:
+    assert orthoflow(folder, "run", "rooms.yaml", "-o", "plain").returncode == 0
+    done = orthoflow(folder, "export", "plain", "--split")
+    assert done.returncode == 2
+    assert "ran on no datasets, so there is nothing to split" in done.stderr
+    assert not (folder / "plain" / "datasets").exists()
+
+
+def test_the_graph_says_which_inputs_are_of_datasets(folder: Path) -> None:
+    done = orthoflow(folder, "graph", "rooms.yaml", "--datasets", "rooms.csv")
+    assert 'input0[/"number<br/>of 3 datasets"/]' in done.stdout
+
+
+@pytest.mark.parametrize("form", ["csv", "ro-crate"])
+def test_a_run_on_datasets_is_exported(form: str, folder: Path) -> None:
+    done = orthoflow(folder, "export", "first", "--to", form, "-o", f"as-{form}")
+    assert done.returncode == 0, done.stderr
+    texts = [path.read_text() for path in (folder / f"as-{form}").rglob("*.csv")]
+    assert any("survey@data=hall" in text for text in texts)

@@ -1,0 +1,450 @@
+"""Datasets: what a workflow and a table may say of them, and the cells they become."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import Catalog
+from orthoflow.errors import ArgumentError, InputError, OrthoflowError, WorkflowError
+from orthoflow.workflow import Cell, Workflow, expand_cells, load_workflow, resolve_input_files
+from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
+from tests.laboratories import laboratory_catalog
+
+ROOMS = """\
+orthoflow: 1
+name: rooms
+seed: 5
+inputs:
+  scan: {optional: true}
+  photos: {files: shared.jpg}
+steps:
+  shots: {use: read.photos, in: {files: inputs.photos}}
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+  room: {use: simulate.room, unless: inputs.scan}
+  plane:
+    in: {cloud: [cloud.cloud, room.cloud]}
+    variants:
+      hough2d: {use: plane.hough2d, params: {cell_m: 0.02}}
+      ransac: {use: plane.ransac, repeat: 2}
+  wall: {use: raster.grid, in: {cloud: [cloud.cloud, room.cloud], planes: plane.planes}}
+  ties: {use: match.sift, in: {photos: shots.photos, walls: wall.walls}}
+"""
+TWO = "datasets: {hall: {scan: hall.e57}, stairs: {scan: stairs.e57}}\n"
+
+
+@pytest.fixture
+def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
+    return laboratory_catalog(monkeypatch)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with the files that the rooms name."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("shared.jpg", "hall.e57", "stairs.e57", "attic.e57"):
+        (tmp_path / name).write_text(name)
+    return tmp_path
+
+
+def load(text: str, catalog: Catalog, **options: object) -> Workflow:
+    Path("rooms.yaml").write_text(text, encoding="utf-8")
+    return load_workflow("rooms.yaml", catalog, **options)  # type: ignore[arg-type]
+
+
+def cells(text: str, catalog: Catalog, **options: object) -> dict[str, Cell]:
+    found = expand_cells(load(text, catalog, **options), catalog)
+    return {cell.address: cell for cell in found}
+
+
+def table(text: str, name: str = "rooms.csv") -> str:
+    Path(name).write_text(text, encoding="utf-8")
+    return name
+
+
+def refused(text: str, catalog: Catalog, **options: object) -> str:
+    with pytest.raises(OrthoflowError) as caught:
+        load(text, catalog, **options)
+    assert caught.value.exit_code == 2
+    return str(caught.value)
+
+
+@pytest.mark.usefixtures("folder")
+def test_what_hangs_on_the_data_fans_out_and_all_else_runs_once(catalog: Catalog) -> None:
+    found = cells(ROOMS + TWO, catalog)
+    assert list(found) == [
+        "shots",
+        "cloud@data=hall",
+        "cloud@data=stairs",
+        "room@data=hall",
+        "room@data=stairs",
+        "plane@data=hall,plane=hough2d",
+        "plane@data=stairs,plane=hough2d",
+        "wall@data=hall,plane=hough2d",
+        "wall@data=stairs,plane=hough2d",
+        "ties@data=hall,plane=hough2d",
+        "ties@data=stairs,plane=hough2d",
+    ]
+    assert str(found["cloud@data=hall"].inputs["files"]) == "inputs.scan@hall"
+    assert str(found["shots"].inputs["files"]) == "inputs.photos"
+    assert list(found["wall@data=hall,plane=hough2d"].assignment) == ["data", "plane"]
+
+
+@pytest.mark.usefixtures("folder")
+def test_without_datasets_nothing_is_said_of_data(catalog: Catalog) -> None:
+    workflow = load(ROOMS, catalog)
+    assert "datasets" not in resolved_json(workflow)
+    assert not any("data" in cell.assignment for cell in expand_cells(workflow, catalog))
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_parameter_of_one_dataset_makes_its_step_hang_on_the_data(catalog: Catalog) -> None:
+    text = ROOMS + "datasets: {fine: {set: {wall.gsd_m: 0.5}}, plain: {}}\n"
+    found = cells(text, catalog)
+    assert "plane@plane=hough2d" in found
+    assert found["wall@data=fine,plane=hough2d"].params["gsd_m"] == 0.5
+    plain = found["wall@data=plain,plane=hough2d"].params
+    assert plain == cells(ROOMS, catalog)["wall@plane=hough2d"].params
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_parameter_of_one_variant_leaves_the_others_alone(catalog: Catalog) -> None:
+    text = ROOMS + ("compare: {}\ndatasets: {a: {set: {plane.hough2d.cell_m: 0.01}}, b: {}}\n")
+    found = [address for address in cells(text, catalog) if address.startswith("plane")]
+    assert found == [
+        "plane@data=a,plane=hough2d",
+        "plane@plane=ransac",
+        "plane@plane=ransac#1",
+        "plane@data=b,plane=hough2d",
+    ]
+
+
+@pytest.mark.usefixtures("folder")
+def test_the_command_line_goes_before_a_dataset_and_a_dataset_before_the_file(
+    catalog: Catalog,
+) -> None:
+    text = ROOMS + "datasets: {a: {set: {plane.hough2d.cell_m: 0.01}}, b: {}}\n"
+    of_file = cells(text, catalog)
+    assert of_file["plane@data=a,plane=hough2d"].params["cell_m"] == 0.01
+    assert of_file["plane@data=b,plane=hough2d"].params["cell_m"] == 0.02
+    typed = cells(text, catalog, sets=["plane.hough2d.cell_m=0.03"])
+    assert {typed[f"plane@data={name},plane=hough2d"].params["cell_m"] for name in "ab"} == {0.03}
+
+
+@pytest.mark.usefixtures("folder")
+def test_whether_a_step_is_needed_may_hang_on_the_data(catalog: Catalog) -> None:
+    found = cells(ROOMS + "datasets: {hall: {scan: hall.e57}, made: {}}\n", catalog)
+    assert found["room@data=hall"].skip_reason == "not needed, because inputs.scan is given"
+    assert not found["room@data=made"].skip_reason
+    assert found["cloud@data=made"].skip_reason
+    source = found["plane@data=made,plane=hough2d"].inputs["cloud"]
+    assert str(source) == "room@data=made.cloud"
+
+
+@pytest.mark.usefixtures("folder")
+def test_all_datasets_meet_every_combination_of_the_design(catalog: Catalog) -> None:
+    product = cells(ROOMS + TWO + "compare: {}\n", catalog)
+    assert "ties@data=stairs,plane=ransac" in product
+    assert "plane@data=stairs,plane=ransac#1" in product
+    single = cells(ROOMS + TWO + "compare: {design: one-at-a-time}\n", catalog)
+    assert product.keys() == single.keys()
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_combination_of_a_dataset_can_be_left_out(catalog: Catalog) -> None:
+    compare = "compare: {exclude: [{data: hall, plane: ransac}]}\n"
+    found = cells(ROOMS + TWO + compare, catalog)
+    assert "wall@data=stairs,plane=ransac" in found
+    assert not [address for address in found if "data=hall,plane=ransac" in address]
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_choice_among_the_datasets_moves_no_address(catalog: Catalog) -> None:
+    text = ROOMS + "datasets: {a: {scan: hall.e57}, b: {photos: hall.e57}}\n"
+    everything = cells(text, catalog)
+    chosen = cells(text, catalog, only_data=["b"])
+    assert set(chosen) == {address for address in everything if "data=a" not in address}
+    assert load(text, catalog, only_data=["b"]).overrides == ("--only-data b",)
+
+
+def test_files_of_datasets_that_were_not_chosen_are_not_looked_for(
+    catalog: Catalog, folder: Path
+) -> None:
+    text = ROOMS + "datasets: {hall: {scan: hall.e57}, gone: {scan: gone.e57}}\n"
+    files = resolve_input_files(load(text, catalog, only_data=["hall"]))
+    assert {name for name, found in files.items() if found} == {"photos", "scan@hall"}
+    with pytest.raises(InputError, match=r"input scan@gone: there is no file gone\.e57 beside"):
+        resolve_input_files(load(text, catalog))
+
+
+def test_paths_of_a_table_start_at_the_table(catalog: Catalog, folder: Path) -> None:
+    (folder / "survey").mkdir()
+    (folder / "survey" / "hall.e57").write_text("another")
+    named = table("name,scan\nhall,hall.e57\n", "survey/rooms.csv")
+    for workflow in (
+        load(ROOMS, catalog, datasets=named),
+        load(ROOMS + f"datasets: {named}\n", catalog),
+    ):
+        files = resolve_input_files(workflow)["scan@hall"]
+        assert files is not None
+        assert files.paths == (folder / "survey" / "hall.e57",)
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_table_says_what_the_mapping_says(catalog: Catalog) -> None:
+    named = table(
+        "\ufeffname; scan; wall.gsd_m; plane.normal\n# by hand\n\nhall;hall.e57;0.5;\n"
+        "stairs;;;[0, 0, 1]\n"
+    )
+    mapping = (
+        "datasets: {hall: {scan: hall.e57, set: {wall.gsd_m: 0.5}}, "
+        "stairs: {set: {plane.normal: [0, 0, 1]}}}\n"
+    )
+    assert cells(ROOMS, catalog, datasets=named) == cells(ROOMS + mapping, catalog)
+
+
+@pytest.mark.usefixtures("folder")
+def test_the_table_of_the_command_line_takes_the_place_of_the_section(catalog: Catalog) -> None:
+    workflow = load(ROOMS + TWO, catalog, datasets=table("name,scan\nattic,attic.e57\n"))
+    assert [item.name for item in workflow.chosen_data] == ["attic"]
+    assert workflow.overrides == ("--datasets rooms.csv",)
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_resolved_workflow_keeps_its_datasets(catalog: Catalog) -> None:
+    text = ROOMS + "datasets: {hall: {scan: hall.e57, set: {wall.gsd_m: 0.5}}, attic: {}}\n"
+    workflow = load(text, catalog, only_data=["hall"])
+    resolved = resolved_json(workflow)
+    again = workflow_from_resolved(resolved, workflow.source)
+    assert [item.name for item in again.chosen_data] == ["hall"]
+    assert again.datasets["hall"].sets == {"wall.gsd_m": 0.5}
+    assert set(again.input_specs) == {"photos", "scan@hall"}
+    assert resolved_json(again) == resolved
+
+
+@pytest.mark.usefixtures("folder")
+def test_an_input_of_one_dataset_can_be_given(catalog: Catalog) -> None:
+    workflow = load(ROOMS + TWO, catalog, inputs=["scan@hall=attic.e57"])
+    files = resolve_input_files(workflow)
+    assert files["scan@hall"].paths[0].name == "attic.e57"  # type: ignore[union-attr]
+    assert files["scan@stairs"].paths[0].name == "stairs.e57"  # type: ignore[union-attr]
+
+
+MAPPINGS = {
+    "unknown input": (
+        "datasets: {hall: {scans: a.e57}}",
+        (
+            "rooms.yaml:18:19: datasets.hall.scans: there is no input scans (did you mean scan?); "
+            "inputs: scan, photos"
+        ),
+    ),
+    "bad name": (
+        "datasets: {Hall: {}}",
+        "rooms.yaml:18:12: datasets.Hall: 'Hall' cannot be a name",
+    ),
+    "none": (
+        "datasets: {}",
+        "rooms.yaml:18:11: datasets: expected at least one dataset",
+    ),
+    "a list": (
+        "datasets: [hall]",
+        "rooms.yaml:18:11: datasets: expected a mapping, got a list",
+    ),
+    "there twice": (
+        "datasets: {a: {}, a: {}}",
+        "rooms.yaml:18:19: datasets.a: the key is there already, in line 18",
+    ),
+    "files that are none": (
+        "datasets: {hall: {scan: 5}}",
+        "rooms.yaml:18:25: datasets.hall.scan: expected a text, got 5",
+    ),
+    "unknown step": (
+        "datasets: {hall: {set: {walls.gsd_m: 1}}}",
+        "rooms.yaml:18:25: walls.gsd_m: there is no step walls (did you mean wall?)",
+    ),
+    "unknown parameter": (
+        "datasets: {hall: {set: {wall.gsd: 1}}}",
+        "rooms.yaml:18:25: wall.gsd: there is no parameter gsd in raster.grid",
+    ),
+    "no parameter": (
+        "datasets: {hall: {set: {wall: 1}}}",
+        "rooms.yaml:18:25: wall: expected step.parameter or step.variant.parameter",
+    ),
+    "value out of range": (
+        "datasets: {hall: {set: {wall.gsd_m: -1}}}",
+        (
+            "rooms.yaml:18:37: datasets.hall.set.wall.gsd_m: gsd_m: input should be greater than "
+            "0, got -1"
+        ),
+    ),
+    "parameters that disagree": (
+        "datasets: {hall: {set: {plane.hough2d.cell_m: 0.06}}}",
+        "rooms.yaml:18:24: datasets.hall.set: the parameters: cell_m 0.06 must not exceed",
+    ),
+    "no mapping inside": (
+        "datasets: {hall: {set: {plane.hough2d.cell_m.deep: 1}}}",
+        "datasets.hall.set.plane.hough2d.cell_m.deep: cell_m is no mapping, so nothing in it can",
+    ),
+    "no such table": (
+        "datasets: nowhere.csv",
+        "rooms.yaml:18:11: datasets: there is no table of datasets",
+    ),
+    "unknown dataset left out": (
+        "datasets: {hall: {}}\ncompare: {exclude: [{data: hal}]}",
+        (
+            "rooms.yaml:19:28: compare.exclude[0].data: there is no dataset hal (did you mean "
+            "hall?); datasets: hall"
+        ),
+    ),
+    "a dataset as baseline": (
+        "datasets: {hall: {}}\ncompare: {baseline: {data: hall}}",
+        "compare.baseline.data: there is no step data with variants",
+    ),
+}
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(("text", "said"), MAPPINGS.values(), ids=list(MAPPINGS))
+def test_a_mistake_of_the_section_gets_a_place_and_a_sentence(
+    text: str, said: str, catalog: Catalog
+) -> None:
+    assert said in refused(f"{ROOMS}{text}\n", catalog)
+
+
+TABLES = {
+    "unknown column": (
+        "name,scans\nhall,a\nattic,b\n",
+        "rooms.csv:1:6: scans: there is no input scans (did you mean scan?); inputs: scan, photos",
+    ),
+    "unknown parameter": (
+        "name,wall.gsd\nhall,1\nattic,1\n",
+        "rooms.csv:1:6: wall.gsd: there is no parameter gsd in raster.grid",
+    ),
+    "value out of range": (
+        "name,wall.gsd_m\nhall,1\nattic,-1\n",
+        "rooms.csv:3:7: attic.set.wall.gsd_m: gsd_m: input should be greater than 0, got -1",
+    ),
+    "value that is no YAML": (
+        "name,wall.gsd_m\nhall,[1\n",
+        "rooms.csv:2:6: wall.gsd_m: the value cannot be read as YAML; quote it",
+    ),
+    "no names": (
+        "room,scan\nhall,a\n",
+        "rooms.csv:1:1: a table of datasets needs the column name; its columns are room, scan",
+    ),
+    "a line without a name": (
+        "name,scan\n,a.e57\n",
+        "rooms.csv:2:1: name: the dataset needs a name in the column name",
+    ),
+    "a name twice": (
+        "name,scan\nhall,a\nhall,b\n",
+        "rooms.csv:3:1: name: the dataset hall is there already, in line 2; give it another name",
+    ),
+    "a bad name": (
+        "name,scan\nGreat Hall,a\n",
+        "rooms.csv:2:1: Great Hall: 'Great Hall' cannot be a name",
+    ),
+    "a column twice": (
+        "name,scan,scan\nhall,a,b\n",
+        "rooms.csv:1:11: scan: the column scan is there twice; remove one of them",
+    ),
+    "a field too many": (
+        "name,scan\nhall,a,b\n",
+        "rooms.csv:2:8: b stands in column 3, which has no name in the header",
+    ),
+    "an open quote": ('name,scan\nhall,"a\n', "rooms.csv:2:1: the line cannot be read as CSV"),
+    "nothing": ("# nothing\n", "a table of datasets begins with a line of column names, got none"),
+    "no line": ("name,scan\n", "the table rooms.csv holds no dataset"),
+    "a long line": (
+        f"name,scan\nhall,{'x' * 10_000}\n",
+        "rooms.csv:2:1: a line has at most 10000 letters, got 10005",
+    ),
+    "many columns": (
+        "name" + ",x" * 200 + "\n",
+        "rooms.csv:1:1: a table has at most 200 columns, got 201",
+    ),
+    "many datasets": (
+        "name\n" + "".join(f"r{index}\n" for index in range(10_001)),
+        "rooms.csv:10002:1: a table has at most 10000 datasets",
+    ),
+}
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(("text", "said"), TABLES.values(), ids=list(TABLES))
+def test_a_mistake_of_a_table_gets_a_place_and_a_sentence(
+    text: str, said: str, catalog: Catalog
+) -> None:
+    message = refused(ROOMS, catalog, datasets=table(text))
+    assert message.count(said) == 1
+    assert said in refused(ROOMS + "datasets: rooms.csv\n", catalog)
+
+
+def test_a_table_that_is_no_text_is_refused(catalog: Catalog, folder: Path) -> None:
+    (folder / "rooms.csv").write_bytes(b"name\nh\xe4ll\n")
+    assert "rooms.csv:2: expected UTF-8 text, got the byte 0xe4" in refused(
+        ROOMS, catalog, datasets="rooms.csv"
+    )
+    (folder / "rooms.csv").write_bytes(b"name\n" + b"x" * 4_000_000)
+    assert "rooms.csv has more than 4000000 bytes" in refused(ROOMS, catalog, datasets="rooms.csv")
+    assert refused(ROOMS, catalog, datasets=".").startswith("--datasets .: the table of datasets")
+
+
+@pytest.mark.usefixtures("folder")
+def test_options_that_do_not_fit_the_datasets_are_refused(catalog: Catalog) -> None:
+    assert refused(ROOMS + TWO, catalog, only_data=["hall,stair"]) == (
+        "--only-data hall,stair: there is no dataset stair (did you mean stairs?); datasets: "
+        "hall, stairs"
+    )
+    assert refused(ROOMS, catalog, only_data=["hall"]) == (
+        "--only-data hall: the workflow has no datasets"
+    )
+    assert refused(ROOMS + TWO, catalog, inputs=["scan=attic.e57"]) == (
+        "--input scan=attic.e57: every dataset has its own scan; name that of one of them, as in "
+        "--input scan@hall=PATH"
+    )
+    assert "there is no input scan@attic (did you mean scan@stairs?)" in refused(
+        ROOMS + TWO, catalog, inputs=["scan@attic=attic.e57"]
+    )
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_dataset_without_files_that_nobody_else_names_is_refused(catalog: Catalog) -> None:
+    text = ROOMS.replace("scan: {optional: true}", "scan: {}").replace(", unless: inputs.scan", "")
+    said = "datasets.made: the dataset names no files for the input scan, and neither does the"
+    datasets = "datasets: {hall: {scan: hall.e57}, made: {}}\n"
+    assert said in refused(text + datasets, catalog)
+    shared = load(text + datasets, catalog, inputs=["scan=attic.e57"])
+    assert set(shared.input_specs) == {"photos", "scan@hall", "scan"}
+
+
+@pytest.mark.usefixtures("folder")
+def test_a_step_cannot_be_called_data_beside_datasets(catalog: Catalog) -> None:
+    text = ROOMS.replace("shots", "data")
+    assert "data" in cells(text, catalog)
+    assert "datasets: a step is called data, which stands for the dataset" in refused(
+        text + TWO, catalog
+    )
+
+
+@pytest.mark.usefixtures("folder")
+def test_more_cells_than_anybody_can_run_are_counted_before_they_are_built(
+    catalog: Catalog,
+) -> None:
+    rows = "".join(f"r{index},hall.e57\n" for index in range(4000))
+    workflow = load(ROOMS, catalog, datasets=table(f"name,scan\n{rows}"))
+    with pytest.raises(WorkflowError, match=r"has 20001 cells .* fewer datasets \(--only-data\)"):
+        expand_cells(workflow, catalog)
+
+
+def test_a_changed_record_of_datasets_is_refused(catalog: Catalog, folder: Path) -> None:
+    resolved = resolved_json(load(ROOMS + TWO, catalog))
+    for old, new in [
+        ('"datasets":{"hall"', '"datasets":{"../hall"'),
+        ('"hall":{"inputs":{"scan"', '"hall":{"inputs":{"scans"'),
+        ('"set":{}', '"set":[]'),
+    ]:
+        assert old in resolved
+        with pytest.raises((WorkflowError, ArgumentError)):
+            workflow_from_resolved(resolved.replace(old, new, 1), "")
