@@ -1,0 +1,166 @@
+"""What is known of lenses beforehand, and which photos share one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from orthoflow_plugins.orient import lenses
+from orthoflow_plugins.orient.lenses import Refined, Sharing
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Intrinsics, Photo
+from orthoflow.testing import photographed as ms
+
+CALIBRATED = Intrinsics(
+    width=600, height=400, fx=510.0, fy=512.0, cx=303.0, cy=197.0,
+    distortion=(-0.1, 0.02, 1e-4, 2e-4, 0.0),
+)  # fmt: skip
+FREE = ("focal", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+def photo(
+    name: str = "a.jpg",
+    *,
+    exif_px: float | None = None,
+    intrinsics: Intrinsics | None = None,
+    size: tuple[int, int] = (600, 400),
+) -> Photo:
+    return Photo(
+        name=name,
+        encoded=b"",
+        width=size[0],
+        height=size[1],
+        exif_focal_px=exif_px,
+        intrinsics=intrinsics,
+    )
+
+
+def oriented(*focal_px: float) -> list[ViewingCamera]:
+    camera = ms.camera_before(ms.photographed_scene())
+    return [replace(camera, fx=focal, fy=focal) for focal in focal_px]
+
+
+def test_a_calibration_is_the_only_guess_and_nothing_of_it_is_free() -> None:
+    prior = lenses.lens_prior(photo(exif_px=500.0, intrinsics=CALIBRATED))
+    assert prior.guesses == (CALIBRATED,)
+    assert prior.freedom.names == ()
+    assert prior.source == "calibration"
+
+
+def test_exif_is_believed_to_a_twentieth_and_tried_a_little_shorter_and_longer() -> None:
+    prior = lenses.lens_prior(photo(exif_px=500.0))
+    assert [guess.fx for guess in prior.guesses] == pytest.approx([500.0, 470.0, 530.0])
+    assert prior.source == "exif"
+    for guess in prior.guesses:
+        assert (guess.fy, guess.cx, guess.cy) == (guess.fx, 300.0, 200.0)
+        assert not any(guess.distortion)
+    assert prior.freedom.names == FREE
+    # The principal point to a hundredth of the longer side.
+    assert prior.freedom.sigmas.tolist() == [0.05, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
+
+
+@pytest.mark.parametrize("size", [(600, 400), (400, 600)])
+def test_without_exif_lenses_from_wide_to_long_are_tried(size: tuple[int, int]) -> None:
+    prior = lenses.lens_prior(photo(size=size))
+    shares = [guess.fx / 600.0 for guess in prior.guesses]
+    assert shares == pytest.approx([0.6, 0.75, 0.95, 1.2, 1.6, 2.2])
+    assert {(guess.cx, guess.cy) for guess in prior.guesses} == {(size[0] / 2, size[1] / 2)}
+    assert (prior.source, prior.freedom.names) == ("none", FREE)
+    assert prior.freedom.sigmas.tolist() == [0.35, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3]
+
+
+@pytest.mark.parametrize(
+    ("sharing", "lens_of"),
+    [
+        ("per-photo", (0, 1, 2, 3, 4, 5)),
+        ("shared", (0, 0, 0, 0, 0, 1)),
+        # Two of one focal length; a third of another; two of none known; another size.
+        ("focal-group", (0, 0, 1, 2, 3, 4)),
+    ],
+)
+def test_photos_share_a_lens_by_size_and_known_focal_length(
+    sharing: Sharing, lens_of: tuple[int, ...]
+) -> None:
+    photos = [
+        photo("a", exif_px=500.0),
+        photo("b", exif_px=500.0),
+        photo("c", exif_px=700.0),
+        photo("d"),
+        photo("e"),
+        photo("f", exif_px=500.0, size=(400, 600)),
+    ]
+    groups = lenses.lens_groups(photos, oriented(*[500.0] * 6), sharing, "uncalibrated")
+    assert groups.lens_of == lens_of
+    assert len(groups.lenses) == max(lens_of) + 1
+
+
+def test_photos_of_one_calibration_share_their_lens_whatever_exif_says() -> None:
+    photos = [
+        photo("a", exif_px=500.0, intrinsics=CALIBRATED),
+        photo("b", exif_px=700.0, intrinsics=CALIBRATED),
+        photo("c", exif_px=500.0, intrinsics=replace(CALIBRATED, fx=511.0)),
+    ]
+    groups = lenses.lens_groups(photos, oriented(1.0, 1.0, 1.0), "focal-group", "uncalibrated")
+    assert groups.lens_of == (0, 0, 1)
+
+
+def test_of_photos_that_share_a_lens_the_best_known_one_tells_it() -> None:
+    photos = [photo("a"), photo("b", exif_px=520.0), photo("c", intrinsics=CALIBRATED)]
+    cameras = oriented(480.0, 500.0, 510.0)
+    for n_photos, source, focal_px in ((3, "calibration", 510.0), (2, "exif", 520.0)):
+        groups = lenses.lens_groups(photos[:n_photos], cameras[:n_photos], "shared", "uncalibrated")
+        (lens,) = groups.lenses
+        assert (lens.source, lens.prior.fx) == (source, focal_px)
+
+
+def test_of_unknown_lenses_the_photos_oriented_by_themselves_tell_the_middle() -> None:
+    photos = [photo("a"), photo("b"), photo("c")]
+    groups = lenses.lens_groups(photos, oriented(480.0, 500.0, 900.0), "shared", "uncalibrated")
+    (lens,) = groups.lenses
+    assert (lens.prior.fx, lens.prior.fy) == (500.0, 500.0)
+    assert (lens.prior.cx, lens.prior.cy) == (300.0, 200.0)
+
+
+@pytest.mark.parametrize(
+    ("refined", "exif_sigmas", "calibrated_sigmas"),
+    [
+        ("uncalibrated", [0.05, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3], []),
+        (
+            "all",
+            [0.05, 6.0, 6.0, 0.1, 0.1, 1e-3, 1e-3],
+            [0.01, 1.8, 1.8, 0.02, 0.04, 1e-3, 1e-3],
+        ),
+        ("none", [], []),
+    ],
+)
+def test_lenses_are_refined_as_asked_for(
+    refined: Refined, exif_sigmas: list[float], calibrated_sigmas: list[float]
+) -> None:
+    photos = [photo("a", exif_px=500.0), photo("b", intrinsics=CALIBRATED)]
+    groups = lenses.lens_groups(photos, oriented(500.0, 510.0), "per-photo", refined)
+    np.testing.assert_allclose(groups.lenses[0].freedom.sigmas, exif_sigmas)
+    np.testing.assert_allclose(groups.lenses[1].freedom.sigmas, calibrated_sigmas)
+
+
+def test_rays_of_pixels_come_back_through_the_lens() -> None:
+    camera = ms.camera_before(ms.photographed_scene())
+    pixels = np.array([[10.0, 20.0], [450.0, 300.0], [890.0, 600.0]])
+    rays = lenses.camera_rays(camera, pixels)
+    np.testing.assert_array_equal(rays[:, 2], 1.0)
+    world = camera.centre_world + 2.5 * rays @ camera.rotation
+    np.testing.assert_allclose(camera.project(world)[:, :2], pixels, atol=1e-6)
+
+
+def test_a_pixel_beyond_what_a_lens_bends_has_no_ray() -> None:
+    camera = replace(
+        ms.camera_before(ms.photographed_scene()), distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0])
+    )
+    # With k1 = -0.5 no ray comes out farther than 0.54 focal lengths from the axis.
+    rays = lenses.camera_rays(
+        camera,
+        np.array([[camera.cx + 0.5 * camera.fx, camera.cy], [camera.cx + camera.fx, camera.cy]]),
+    )
+    assert np.isfinite(rays[0]).all()
+    assert np.isnan(rays[1]).all()
