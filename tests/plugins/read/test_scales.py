@@ -1,0 +1,127 @@
+"""Scales of intensities and colours that no file states, or that it states wrongly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from orthoflow_plugins.read import scales
+from orthoflow_plugins.read.scales import ColourScale, IntensityScale, choose_scale, normalise
+
+STATED = "limits that the files state"
+SEEN = "range of the data"
+
+
+@pytest.mark.parametrize(
+    ("seen", "stated", "intensity_max", "scale"),
+    [
+        ((2.0, 9.0), [(0.0, 10.0)], 50.0, (0.0, 50.0, "0 to intensity_max")),
+        ((2.0, 9.0), [(0.0, 10.0)], None, (0.0, 10.0, STATED)),
+        ((2.0, 9.0), [(1.0, 8.0), (3.0, 10.0)], None, (1.0, 10.0, STATED)),
+        # A millionth beyond is rounding, more than that is another scale.
+        ((0.0, 10.000_005), [(0.0, 10.0)], None, (0.0, 10.0, STATED)),
+        ((-0.000_005, 10.0), [(0.0, 10.0)], None, (0.0, 10.0, STATED)),
+        ((0.0, 10.000_02), [(0.0, 10.0)], None, (0.0, 10.000_02, SEEN)),
+        ((-0.000_02, 10.0), [(0.0, 10.0)], None, (-0.000_02, 10.0, SEEN)),
+        ((2.0, 9.0), [(0.0, 10.0), None], None, (2.0, 9.0, SEEN)),
+        ((2.0, 9.0), [], None, (2.0, 9.0, SEEN)),
+        ((7.0, 7.0), [], None, (0.0, 7.0, "0 to the only value")),
+        ((-7.0, -7.0), [None], None, (-7.0, 0.0, "0 to the only value")),
+    ],
+)
+def test_one_scale_serves_all_scans(
+    seen: tuple[float, float],
+    stated: list[tuple[float, float] | None],
+    intensity_max: float | None,
+    scale: tuple[float, float, str],
+) -> None:
+    found = choose_scale(seen, stated, intensity_max)
+    assert (found.low, found.high, found.rule) == scale
+
+
+def test_intensities_go_from_nought_to_one_and_the_rest_is_clipped_and_counted() -> None:
+    scale = IntensityScale(low=10.0, high=30.0, rule="")
+    values = np.array([10.0, 20.0, 30.0, 5.0, 40.0, np.nan, np.inf], dtype=np.float32)
+    assert normalise(values, scale) == 3
+    np.testing.assert_array_equal(values, [0.0, 0.5, 1.0, 0.0, 1.0, 0.0, 0.0])
+    # A millionth beyond is not worth counting.
+    near = np.array([30.0 + 1e-5, 10.0 - 1e-5], dtype=np.float64).astype(np.float32)
+    assert normalise(near, scale) == 0
+    np.testing.assert_array_equal(near, [1.0, 0.0])
+
+
+def test_long_arrays_are_scaled_to_their_end() -> None:
+    values = np.full(150_000, 3.0, dtype=np.float32)
+    assert normalise(values, IntensityScale(low=1.0, high=2.0, rule="")) == 150_000
+    assert (values == 1.0).all()
+    inside = np.full(150_000, 1.5, dtype=np.float32)
+    assert normalise(inside, IntensityScale(low=1.0, high=2.0, rule=""), may_exceed=False) == 0
+    assert (inside == 0.5).all()
+
+
+def test_intensity_that_is_the_grey_of_the_colours_is_told_by_either_grey() -> None:
+    rng = np.random.default_rng(1)
+    rgb = rng.integers(0, 256, (500, 3), dtype=np.uint8)
+    luma = (rgb @ [0.299, 0.587, 0.114]).astype(np.float32)
+    mean = rgb.mean(axis=1).astype(np.float32)
+    for grey in (luma, mean, 3.0 * luma + 5.0):
+        assert scales.correlation_with_grey(grey, rgb) > scales.LUMINANCE_CORRELATION
+    noise = rng.random(500).astype(np.float32)
+    assert abs(scales.correlation_with_grey(noise, rgb)) < 0.2
+    half = luma + 0.1 * luma.std() * rng.normal(size=500).astype(np.float32)
+    assert 0.98 < scales.correlation_with_grey(half, rgb) < scales.LUMINANCE_CORRELATION
+
+
+@pytest.mark.parametrize("n_points", [99, 100])
+def test_a_hundred_points_make_a_correlation(n_points: int) -> None:
+    rgb = np.arange(n_points, dtype=np.uint8)[:, None].repeat(3, axis=1)
+    grey = np.arange(n_points, dtype=np.float32)
+    assert scales.correlation_with_grey(grey, rgb) == pytest.approx(float(n_points == 100))
+    assert scales.correlation_with_grey(np.ones(n_points, dtype=np.float32), rgb) == 0.0
+    assert scales.correlation_with_grey(grey, np.zeros((n_points, 3), dtype=np.uint8)) == 0.0
+
+
+def test_grey_is_alike_in_all_channels() -> None:
+    rgb = np.full((4, 3), 90, dtype=np.uint8)
+    assert scales.is_grey(rgb)
+    for channel in (0, 2):
+        other = rgb.copy()
+        other[2, channel] = 91
+        assert not scales.is_grey(other)
+
+
+def stored(*blocks: np.ndarray, limit: float | None = None) -> tuple[list[list[int]], str | None]:
+    count = sum(map(len, blocks))
+    into = np.zeros((count, 3), dtype=np.uint8)
+    scale = ColourScale(into, limit)
+    for block in blocks:
+        scale.add(block)
+    return into.tolist(), scale.scale
+
+
+def test_colours_are_of_the_widest_scale_that_any_block_shows() -> None:
+    unit = np.array([[0.0, 0.5, 1.0]], dtype=np.float32)
+    byte = np.array([[0.0, 128.0, 255.0]], dtype=np.float32)
+    word = np.array([[0, 128 * 257, 255 * 256]], dtype=np.uint16)
+    assert stored(unit) == ([[0, 128, 255]], "0..1")
+    assert stored(byte) == ([[0, 128, 255]], "8 bit")
+    assert stored(word) == ([[0, 128, 255]], "16 bit")
+    # Zeros and ones are full brightness until a block says that they are of 255.
+    ones = np.array([[0.0, 1.0, 1.0]], dtype=np.float32)
+    assert stored(ones) == ([[0, 255, 255]], "0..1")
+    assert stored(ones, byte) == ([[0, 1, 1], [0, 128, 255]], "8 bit")
+    # What was below 256 of 65536 is black.
+    assert stored(byte, word) == ([[0, 0, 0], [0, 128, 255]], "16 bit")
+    assert stored(word, byte) == ([[0, 128, 255], [0, 0, 0]], "16 bit")
+    assert stored(byte, unit) == ([[0, 128, 255], [0, 0, 1]], "8 bit")
+
+
+def test_whole_numbers_are_never_shares_of_one() -> None:
+    assert stored(np.array([[0, 1, 1]], dtype=np.uint8)) == ([[0, 1, 1]], "8 bit")
+    assert stored(np.array([[0, 1, 255]], dtype=np.uint16)) == ([[0, 1, 255]], "8 bit")
+    assert stored(np.array([[0, 0, 256]], dtype=np.uint16)) == ([[0, 0, 1]], "16 bit")
+
+
+@pytest.mark.parametrize("limit", [1.0, 100.0, 255.0, 65535.0])
+def test_a_stated_limit_is_full_brightness(limit: float) -> None:
+    block = np.array([[0.0, 0.4 * limit, limit], [2.0 * limit, -limit, np.nan]], dtype=np.float64)
+    assert stored(block, limit=limit) == ([[0, 102, 255], [255, 0, 0]], "stated limit")
