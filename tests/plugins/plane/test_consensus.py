@@ -1,0 +1,164 @@
+"""What consensus does between drawing and proposing: who is kept, who leans, who is crowded."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from orthoflow_plugins.plane import consensus
+from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
+from orthoflow_plugins.plane.hypotheses import Hypotheses, Scores
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def search(**changes: Any) -> Search:
+    usual: dict[str, Any] = {
+        "model": "3d",
+        "scoring": "msac",
+        "n_hypotheses": 100,
+        "find_m": 0.05,
+        "family": "wall",
+        "tilt_most_deg": 10.0,
+        "least_share": 0.1,
+    }
+    return Search(**{**usual, **changes})
+
+
+def proposer(**changes: Any) -> Any:
+    """What its methods look at of a proposer."""
+    of = search(**changes)
+    return SimpleNamespace(
+        _search=of,
+        _alike=lambda hypotheses, others: ConsensusProposer._alike(
+            SimpleNamespace(_search=of),  # type: ignore[arg-type]
+            hypotheses,
+            others,
+        ),
+    )
+
+
+def tilted(*tilts_deg: float) -> Hypotheses:
+    """Planes whose normals rise by so much above the horizon."""
+    turns = np.radians(tilts_deg)
+    return Hypotheses(
+        normals=np.column_stack([np.cos(turns), np.zeros(len(turns)), np.sin(turns)]),
+        offsets_m=np.zeros(len(turns)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("family", "leans"),
+    [
+        ("wall", [True, True, False, False, False, False]),
+        ("level", [False, False, False, False, True, True]),
+        ("any", [True] * 6),
+    ],
+)
+def test_hypotheses_may_lean_five_degrees_more_than_planes(family: str, leans: list[bool]) -> None:
+    of = proposer(family=family)
+    hypotheses = tilted(0.0, -14.9, 15.1, -74.9, 75.1, -90.0)
+    assert ConsensusProposer._leans_well(of, hypotheses, UP).tolist() == leans
+
+
+def test_of_hypotheses_much_the_same_five_are_kept() -> None:
+    same = Hypotheses(normals=np.tile(UP, (8, 1)), offsets_m=np.linspace(0.0, 0.007, 8))
+    other = Hypotheses(normals=np.tile(UP, (2, 1)), offsets_m=np.array([1.0, 1.001]))
+    ranked = np.array([3, 0, 1, 2, 4, 5, 6, 7, 9, 8])
+    kept = ConsensusProposer._distinct(proposer(), same.joined(other), ranked, 7)
+    assert kept.tolist() == [3, 0, 1, 2, 4, 9, 8]
+    # With fewer wanted, only the best of them are looked at.
+    assert ConsensusProposer._distinct(proposer(), same.joined(other), ranked, 2).tolist() == [3, 0]
+
+
+@pytest.mark.parametrize(
+    ("n_points", "value", "scoring", "is_worth_it"),
+    [
+        # 0.4 of a tenth of a hundred thousand: 4000, which is a fifth of the twenty thousand asked.
+        (810, 1.0, "msac", True),
+        (790, 1.0, "msac", False),
+        (810, -1.0, "msac", True),
+        (810, 0.0, "a-contrario", False),
+        (810, 0.1, "a-contrario", True),
+    ],
+)
+def test_a_hypothesis_is_worth_it_with_nearly_the_points_of_a_plane(
+    n_points: int, value: float, scoring: str, is_worth_it: bool
+) -> None:
+    scores = Scores(
+        value=np.array([0.0, value]),
+        tolerance_m=np.array([0.05, 0.05]),
+        n_points=np.array([0, n_points]),
+    )
+    left = SimpleNamespace(n_points=100_000, claims=np.zeros(100_000))
+    found = ConsensusProposer._is_worth_it(proposer(scoring=scoring), scores, 1, left)  # type: ignore[arg-type]
+    assert found is is_worth_it
+    # Fewer points than are asked are all asked; the share is of the whole sample.
+    few = SimpleNamespace(n_points=1000, claims=np.zeros(10_000))
+    half = Scores(value=np.ones(1), tolerance_m=np.ones(1), n_points=np.array([410]))
+    assert ConsensusProposer._is_worth_it(proposer(), half, 0, few)  # type: ignore[arg-type]
+    half = Scores(value=np.ones(1), tolerance_m=np.ones(1), n_points=np.array([390]))
+    assert not ConsensusProposer._is_worth_it(proposer(), half, 0, few)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("crowded", "is_layer"), [(0.55, True), (0.45, False)])
+def test_half_of_the_points_must_crowd_about_a_layer(crowded: float, is_layer: bool) -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1.0, 1.0, (1000, 3))
+    n_inner = round(1000 * crowded)
+    # The inner part is 0.4 of the tolerance of 5 cm.
+    points[:n_inner, 2] = rng.uniform(-0.015, 0.015, n_inner)
+    points[n_inner:, 2] = rng.uniform(0.025, 0.045, 1000 - n_inner)
+    points[n_inner::2, 2] *= -1.0
+    hypothesis = Hypotheses(normals=UP[None], offsets_m=np.array([0.0]))
+    layer = ConsensusProposer._crowded_layer(proposer(), hypothesis, points, UP)
+    assert (layer is not None) is is_layer
+    if layer is not None:
+        assert layer.offset_m == pytest.approx(0.0, abs=0.002)
+
+
+def test_a_fitted_plane_has_the_least_squared_distances() -> None:
+    rng = np.random.default_rng(2)
+    turn = math.radians(5.0)
+    normal = np.array([math.cos(turn), 0.0, math.sin(turn)])
+    points = rng.normal(size=(400, 3))
+    points -= np.outer(points @ normal - 0.7 + 0.001 * rng.normal(size=400), normal)
+    fitted = consensus._fitted(points, "3d", UP)
+    assert fitted is not None
+    assert abs(float(fitted.normals[0] @ normal)) == pytest.approx(1.0, abs=1e-6)
+    assert float(fitted.offsets_m[0] * np.sign(fitted.normals[0] @ normal)) == pytest.approx(
+        0.7, abs=1e-3
+    )
+    upright = consensus._fitted(points, "2d", UP)
+    assert upright is not None
+    assert upright.normals[0] @ UP == pytest.approx(0.0, abs=1e-12)
+    assert abs(upright.normals[0, 0]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_three_points_or_a_line_fix_no_plane() -> None:
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    assert consensus._fitted(square[:3], "3d", UP) is None
+    found = consensus._fitted(square, "3d", UP)
+    assert found is not None
+    np.testing.assert_allclose(np.abs(found.normals), [[0.0, 0.0, 1.0]])
+    upright = np.array([[0.0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 0, 3]])
+    assert consensus._fitted(upright, "2d", UP) is None
+
+
+def test_a_rejected_plane_bars_what_is_near_it_about_the_centre() -> None:
+    from orthoflow_plugins.plane.candidates import Candidate
+
+    from orthoflow.geometry import Plane
+
+    barred: list[Hypotheses] = []
+    of: Any = SimpleNamespace(
+        _centre_m=np.array([1.0, 2.0, 3.0]), _rejections=SimpleNamespace(add=barred.append)
+    )
+    plane = Plane(normal=UP, offset_m=4.5)
+    candidate = Candidate(plane=plane, family="level", votes=1.0)
+    ConsensusProposer.reject(of, candidate)
+    assert barred[0].offsets_m.tolist() == [1.5]
+    np.testing.assert_array_equal(barred[0].normals, UP[None])
