@@ -1,0 +1,205 @@
+"""A photo laid into walls by a pose: where cells appear, what hides them, what is too flat."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from orthoflow_plugins.match import warping
+from orthoflow_plugins.match.warping import Projection
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.products import Wall
+
+UP = np.array([0.0, 0.0, 1.0])
+GSD_M = 0.01
+
+
+def wall_at(y_m: float, *, width: int = 100, height: int = 80, x_m: float = -0.5) -> Wall:
+    """A wall that looks to -y, its middle at z = 0."""
+    frame = WallFrame(
+        origin_world=np.array([x_m, y_m, 0.5 * height * GSD_M]),
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=-UP,
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=GSD_M,
+        width=width,
+        height=height,
+    )
+    return Wall(
+        frame=frame,
+        plane_index=0,
+        name="wall",
+        depth_m=np.zeros(frame.shape, dtype=np.float32),
+        sigma_m=np.zeros(frame.shape, dtype=np.float32),
+        count=np.ones(frame.shape, dtype=np.uint32),
+        mask=np.ones(frame.shape, dtype=np.uint8),
+    )
+
+
+def camera_at(x_m: float = 0.0, y_m: float = -2.0, *, size: int = 800) -> ViewingCamera:
+    """Looks along y, with 400 px per radian; a wall's cell is 2 px wide 2 m away."""
+    centre = np.array([x_m, y_m, 0.0])
+    rotation = looking_at(centre, centre + np.array([0.0, 1.0, 0.0]), UP)
+    return ViewingCamera(
+        width=size,
+        height=size,
+        fx=400.0,
+        fy=400.0,
+        cx=0.5 * size,
+        cy=0.5 * size,
+        distortion=np.zeros(5),
+        rotation=rotation,
+        translation=-rotation @ centre,
+    )
+
+
+def test_cells_appear_where_their_centres_are_seen() -> None:
+    (projection,) = warping.project_walls(camera_at(), [wall_at(0.0)])
+    assert projection is not None
+    assert projection.part == (slice(0, 80), slice(0, 100))
+    assert projection.corner.tolist() == [0, 0]
+    # The middle of the wall is the middle of the photo; two pixels a cell.
+    columns, rows = np.arange(100) + 0.5, np.arange(80) + 0.5
+    np.testing.assert_allclose(projection.u[0], 400.0 + 2.0 * (columns - 50.0), atol=1e-3)
+    np.testing.assert_allclose(projection.v[:, 0], 400.0 + 2.0 * (rows - 40.0), atol=1e-3)
+    np.testing.assert_allclose(projection.distance, 2.0, atol=1e-6)
+    assert projection.pixels_per_cell == pytest.approx(2.0, abs=1e-4)
+
+
+def test_depth_brings_cells_nearer() -> None:
+    wall = wall_at(0.0)
+    raised = replace(wall, depth_m=np.full(wall.frame.shape, 1.0, dtype=np.float32))
+    (projection,) = warping.project_walls(camera_at(), [raised])
+    assert projection is not None
+    np.testing.assert_allclose(projection.distance, 1.0, atol=1e-6)
+    assert projection.pixels_per_cell == pytest.approx(4.0, abs=1e-3)
+
+
+def test_cells_without_a_surface_appear_nowhere() -> None:
+    wall = wall_at(0.0)
+    wall.depth_m[10:20, 30:50] = np.nan
+    (projection,) = warping.project_walls(camera_at(), [wall])
+    assert projection is not None
+    np.testing.assert_array_equal(np.isnan(projection.u), np.isnan(wall.depth_m))
+
+
+def test_only_the_part_in_the_photo_is_projected_and_a_little_round_it() -> None:
+    # The photo shows 1 m about its axis: columns 100 to 200 of a wall of 3 m.
+    wide = wall_at(0.0, width=300, x_m=-1.5)
+    (projection,) = warping.project_walls(camera_at(size=200), [wide])
+    assert projection is not None
+    rows, columns = projection.part
+    assert (rows.start, rows.stop) == (0, 80)
+    # Every eighth cell is asked, and one of these more is taken on both sides.
+    assert (columns.start, columns.stop) == (96, 208)
+    assert projection.corner.tolist() == [96, 0]
+    seen = np.flatnonzero(np.isfinite(projection.u[0])) + columns.start
+    assert (seen[0], seen[-1]) == (100, 199)
+
+
+@pytest.mark.parametrize(
+    ("camera", "wall"),
+    [
+        (camera_at(y_m=2.0), wall_at(0.0)),
+        (camera_at(x_m=20.0), wall_at(0.0)),
+        (camera_at(), wall_at(0.0, width=9, height=11)),
+    ],
+    ids=["from-behind", "beside", "few-cells"],
+)
+def test_walls_that_a_photo_does_not_show_have_no_projection(
+    camera: ViewingCamera, wall: Wall
+) -> None:
+    assert warping.project_walls(camera, [wall]) == [None]
+
+
+def test_a_hundred_cells_are_enough() -> None:
+    assert warping.project_walls(camera_at(), [wall_at(0.0, width=10, height=10)])[0] is not None
+
+
+@pytest.mark.parametrize(("cosine", "is_shown"), [(0.14, False), (0.16, True)])
+def test_views_flatter_than_one_in_seven_show_too_little(cosine: float, is_shown: bool) -> None:
+    # From far to the side: all cells are seen under nearly one angle.
+    away_m = 40.0
+    centre = away_m * np.array([math.sqrt(1.0 - cosine**2), -cosine, 0.0])
+    rotation = looking_at(centre, np.zeros(3), UP)
+    camera = replace(
+        camera_at(), fx=20_000.0, fy=20_000.0, rotation=rotation, translation=-rotation @ centre
+    )
+    found = warping.project_walls(camera, [wall_at(0.0, width=20, height=20, x_m=-0.1)])
+    assert (found[0] is not None) is is_shown
+
+
+def test_what_another_surface_hides_is_left_out() -> None:
+    # A screen half a metre before the left half of the wall.
+    screen = wall_at(-0.5, width=30, x_m=-0.35)
+    behind, before = warping.project_walls(camera_at(), [wall_at(0.0), screen])
+    assert behind is not None
+    assert before is not None
+    assert np.isfinite(before.u).all()
+    # Seen from 2 m it hides its place enlarged by 2 / 1.5.
+    x_m = -0.5 + GSD_M * (np.arange(100) + 0.5)
+    inside = (x_m > -0.35 * 4 / 3 + 0.03) & (x_m < -0.05 * 4 / 3 - 0.03)
+    outside = (x_m < -0.35 * 4 / 3 - 0.03) | (x_m > -0.05 * 4 / 3 + 0.03)
+    assert np.isnan(behind.u[40, inside]).all()
+    assert np.isfinite(behind.u[40, outside]).all()
+    np.testing.assert_array_equal(np.isnan(behind.u), np.isnan(behind.v))
+
+
+@pytest.mark.parametrize(("apart_cells", "is_hidden"), [(5.0, False), (7.0, True)])
+def test_six_cells_behind_a_surface_are_hidden(apart_cells: float, is_hidden: bool) -> None:
+    behind, _ = warping.project_walls(camera_at(), [wall_at(apart_cells * GSD_M), wall_at(0.0)])
+    assert behind is not None
+    assert np.isnan(behind.u[40, 50]) == is_hidden
+
+
+def flat_projection(pixels_per_cell: float, corner_px: float = 0.0) -> Projection:
+    v, u = np.meshgrid(np.arange(10) + 0.5, np.arange(12) + 0.5, indexing="ij")
+    return Projection(
+        part=(slice(0, 10), slice(0, 12)),
+        u=(corner_px + pixels_per_cell * u).astype(np.float32),
+        v=(corner_px + pixels_per_cell * v).astype(np.float32),
+        distance=np.ones((10, 12), dtype=np.float32),
+        pixels_per_cell=pixels_per_cell,
+    )
+
+
+def test_a_photo_is_resampled_at_the_cells() -> None:
+    ramp = np.arange(60, dtype=np.uint8)[None, :].repeat(60, axis=0)
+    # Pixel i has its centre at i + 0.5, and a ramp keeps between pixels.
+    warped = warping.warp_photo(ramp, flat_projection(1.0, corner_px=3.0))
+    np.testing.assert_allclose(warped[0], 3.0 + np.arange(12), atol=1e-3)
+    # OpenCV's cubic keeps a ramp to a twentieth of a step.
+    half = warping.warp_photo(ramp, flat_projection(0.5, corner_px=3.0))
+    np.testing.assert_allclose(half[0], 3.0 + 0.5 * (np.arange(12) + 0.5) - 0.5, atol=0.06)
+
+
+def test_finer_photos_are_averaged_down_to_the_cells() -> None:
+    stripes = np.tile([0, 200], 30).astype(np.uint8)[None, :].repeat(60, axis=0)
+    warped = warping.warp_photo(stripes, flat_projection(4.0))
+    np.testing.assert_allclose(warped[1:-1, 1:-1], 100.0, atol=3.0)
+
+
+def test_colours_are_resampled_as_greys_are_and_what_is_not_shown_is_unknown() -> None:
+    rng = np.random.default_rng(1)
+    picture = rng.integers(0, 256, (20, 20, 3), dtype=np.uint8)
+    projection = flat_projection(1.0)
+    projection.u[2, 3] = projection.v[2, 3] = np.nan
+    warped = warping.warp_photo(picture, projection)
+    assert warped.shape == (10, 12, 3)
+    assert np.isnan(warped[2, 3]).all()
+    assert np.isnan(warped).sum() == 3
+    for band in range(3):
+        np.testing.assert_array_equal(
+            warped[..., band], warping.warp_photo(picture[..., band].copy(), projection)
+        )
+
+
+def test_a_cell_is_as_large_as_the_median_of_its_sides() -> None:
+    projection = flat_projection(1.0)
+    assert warping._pixels_per_cell(3.0 * projection.u, 12.0 * projection.v) == pytest.approx(6.0)
+    nothing = np.full((4, 4), np.nan, dtype=np.float32)
+    assert warping._pixels_per_cell(nothing, nothing) is None
