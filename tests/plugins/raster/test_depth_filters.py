@@ -1,0 +1,139 @@
+"""What is taken out of depths: specks that hardly any cell agrees with, and noise, but no steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.raster import depth_filters
+from orthoflow_plugins.raster.depth_filters import denoised, without_specks
+
+LAYER_M = 0.1
+GSD_M = 0.01
+
+
+def specks(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    cleaned = without_specks(depth_m, gsd_m=GSD_M, layer_m=LAYER_M, threads=2)
+    is_speck = np.isnan(cleaned) & ~np.isnan(depth_m)
+    np.testing.assert_array_equal(cleaned[~is_speck], depth_m[~is_speck])
+    return is_speck
+
+
+def flat(rows: int = 40, columns: int = 40, *, noise_m: float = 0.001) -> NDArray[np.float32]:
+    return np.random.default_rng(1).normal(0.0, noise_m, (rows, columns)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("off_m", "n_cells", "is_speck"), [
+    (0.2, 1, True),
+    (0.2, 2, True),
+    (0.2, 3, False),
+    (0.09, 1, False),
+    (-0.2, 1, True),
+])  # fmt: skip
+def test_a_cell_that_fewer_than_two_around_agree_with_is_a_speck(
+    off_m: float, n_cells: int, is_speck: bool
+) -> None:
+    depth_m = flat()
+    depth_m[20, 20 : 20 + n_cells] = off_m
+    expected = np.zeros(depth_m.shape, dtype=np.bool_)
+    expected[20, 20 : 20 + n_cells] = is_speck
+    np.testing.assert_array_equal(specks(depth_m), expected)
+
+
+@pytest.mark.parametrize(("n_known", "is_speck"), [(5, False), (6, True)])
+def test_fewer_than_six_known_cells_say_nothing(n_known: int, is_speck: bool) -> None:
+    # Alone in the void, so that nothing is denser around.
+    depth_m = np.full((40, 40), np.nan, dtype=np.float32)
+    around = [(18, 18), (18, 20), (18, 22), (20, 18), (20, 22), (22, 18)][:n_known]
+    for k, (row, column) in enumerate(around):
+        depth_m[row, column] = 0.5 + 0.001 * k
+    depth_m[20, 20] = 0.0
+    assert specks(depth_m)[20, 20] == is_speck
+
+
+def test_cells_two_rows_or_columns_off_are_around_and_three_are_not() -> None:
+    depth_m = flat()
+    for row, column in ((20, 20), (22, 20), (20, 22)):
+        depth_m[row, column] = 0.3
+    assert not specks(depth_m)[20, 20]
+    apart = flat()
+    for row, column in ((20, 20), (23, 20), (20, 23)):
+        apart[row, column] = 0.3
+    assert specks(apart)[20, 20]
+
+
+def test_cells_are_sparse_where_far_fewer_are_known_than_beside() -> None:
+    is_known = np.ones((40, 60), dtype=np.bool_)
+    is_known[:, 30:] = False
+    is_known[::2, 30::2] = True  # a quarter: nine of 25, or six or four
+    sparse = depth_filters._sparse(is_known)
+    assert not sparse[:, :30].any()
+    # Nine of 25 are more than 0.35 of them, six are less.
+    inner = sparse[5:35, 35:45]
+    counts = np.array(
+        [
+            [is_known[r - 2 : r + 3, c - 2 : c + 3].sum() for c in range(35, 45)]
+            for r in range(5, 35)
+        ]
+    )
+    np.testing.assert_array_equal(inner, is_known[5:35, 35:45] & (counts < 0.35 * 25))
+    # Where nothing around is denser nothing is sparse.
+    alone = np.zeros((60, 80), dtype=np.bool_)
+    alone[::2, ::2] = True
+    assert not depth_filters._sparse(alone)[20:40, 20:60].any()
+
+
+def shadow(*, agree: int, n: int = 6) -> NDArray[np.float32]:
+    """A dense wall, a shadow 10 columns wide, and in it a cell with some around it."""
+    depth_m = flat(40, 60)
+    depth_m[:, 25:35] = np.nan
+    depth_m[20, 30] = 0.5
+    places = [(20, 28), (20, 32), (18, 30), (22, 30), (17, 28), (23, 32)][:n]
+    for k, (row, column) in enumerate(places):
+        # Those that do not agree differ from each other, too.
+        depth_m[row, column] = 0.5 if k < agree else 0.7 + 0.1 * k
+    return depth_m
+
+
+@pytest.mark.parametrize(
+    ("agree", "n", "is_speck"),
+    [(3, 6, False), (2, 6, True), (2, 3, True), (3, 3, False)],
+)
+def test_in_a_shadow_three_and_half_of_the_known_must_agree(
+    agree: int, n: int, is_speck: bool
+) -> None:
+    assert specks(shadow(agree=agree, n=n))[20, 30] == is_speck
+
+
+def test_sparse_cells_agree_but_for_a_slope_of_one_in_two() -> None:
+    for slope, is_speck in ((0.4, False), (0.8, True)):
+        depth_m = flat(40, 60, noise_m=1e-5)
+        depth_m[:, 25:35] = np.nan
+        for row, column in ((20, 30), (20, 28), (20, 32), (20, 34)):
+            depth_m[row, column] = 0.5 + slope * GSD_M * (column - 30)
+        # The farthest is four columns off.
+        assert specks(depth_m)[20, 30] == is_speck, slope
+
+
+def test_noise_is_averaged_and_a_step_stays_to_the_cell() -> None:
+    depth_m = flat(60, 60, noise_m=0.001)
+    depth_m[:, 30:] += np.float32(0.02)
+    depth_m[10:12, 10:12] = np.nan
+    smooth = denoised(depth_m, 3)
+    np.testing.assert_array_equal(np.isnan(smooth), np.isnan(depth_m))
+    left, right = smooth[5:-5, 14:29], smooth[5:-5, 31:55]
+    assert np.nanstd(left) < 0.45 * 0.001
+    assert np.nanstd(right) < 0.45 * 0.001
+    assert np.nanmean(smooth[:, 29]) == pytest.approx(0.0, abs=0.0008)
+    assert np.nanmean(smooth[:, 30]) == pytest.approx(0.02, abs=0.0008)
+    # Void pulls nothing down.
+    assert np.nanmean(smooth[9:13, 9]) == pytest.approx(0.0, abs=0.001)
+
+
+def test_depths_of_no_noise_or_no_radius_are_left_as_they_are() -> None:
+    noisy, quiet = flat(), flat(noise_m=1e-6)
+    assert denoised(noisy, 0) is noisy
+    assert denoised(quiet, 3) is quiet
+    nothing = np.full((20, 20), np.nan, dtype=np.float32)
+    assert denoised(nothing, 3) is nothing
+    assert denoised(noisy, 1) is not noisy

@@ -1,0 +1,103 @@
+"""Two runs in tables: what differs, in words, and what was only compared."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from orthoflow.records import Pair
+from orthoflow.report import differences
+from orthoflow.report.differences import Difference
+
+
+def test_only_what_differs_has_a_row_and_everything_is_counted() -> None:
+    pairs = [
+        Pair(cell="a", name="x", left=1, right=1),
+        Pair(cell="a", name="y", left=1, right=2),
+        Pair(cell="b", name="x", left=None, right=2),
+        Pair(cell="c", name="x", left=3, right=None),
+    ]
+    table = differences._table("Things", pairs, str)
+    assert (table.title, table.n_compared) == ("Things", 4)
+    assert table.rows == (
+        Difference(cell="a", name="y", left="1", right="2"),
+        Difference(cell="b", name="x", left="-", right="2"),
+        Difference(cell="c", name="x", left="3", right="-"),
+    )
+
+
+def metric(value: float, unit: str = "mm", *, is_cost: bool = False) -> Any:
+    return SimpleNamespace(value=value, unit=unit, is_cost=is_cost)
+
+
+def test_metrics_that_differ_say_by_how_much_and_costs_are_left_aside() -> None:
+    pairs: list[Any] = [
+        SimpleNamespace(cell="a", name="rms_mm", left=metric(1.5), right=metric(1.25)),
+        SimpleNamespace(cell="a", name="same_mm", left=metric(1.5), right=metric(1.5)),
+        SimpleNamespace(cell="a", name="wall_s", left=metric(9.0, "s", is_cost=True), right=None),
+        SimpleNamespace(cell="b", name="new", left=None, right=metric(3.0, "1")),
+        SimpleNamespace(cell="c", name="old", left=metric(3.0, "1"), right=None),
+    ]
+    table = differences._metric_table(pairs)
+    assert table.n_compared == 4
+    assert table.rows == (
+        Difference(cell="a", name="rms_mm", left="1.5 mm", right="1.25 mm", change="-0.25"),
+        Difference(cell="b", name="new", left="-", right="3"),
+        Difference(cell="c", name="old", left="3", right="-"),
+    )
+
+
+def test_a_product_says_how_far_each_field_lies_apart_and_why() -> None:
+    distance: Any = SimpleNamespace(
+        cell="wall",
+        port="walls",
+        type_name="walls",
+        verdict="apart",
+        reason="another encoding",
+        distances=(
+            SimpleNamespace(field="depth_m", largest=0.0123, unit="m"),
+            SimpleNamespace(field="mask", largest=None, unit="1"),
+        ),
+    )
+    row = differences._product_row(distance)
+    assert (row.name, row.verdict) == ("walls (walls)", "apart")
+    assert row.words == ("0.0123 m at most in depth_m; mask cannot be subtracted; another encoding")
+    distance.reason = ""
+    assert differences._product_row(distance).words == (
+        "0.0123 m at most in depth_m; mask cannot be subtracted"
+    )
+
+
+def test_facts_of_a_step_are_said_as_far_as_there_are_any() -> None:
+    facts: Any = SimpleNamespace(
+        status="ok",
+        method="plane.ransac",
+        result_version=3,
+        distribution="orthoflow 1.0",
+        code={"orthoflow": "0123456789abcdef"},
+        tools={"open3d": "0.19"},
+        seed=5,
+        error="",
+    )
+    assert differences._facts_text(facts) == (
+        "ok, plane.ransac result version 3, orthoflow 1.0, code of orthoflow 01234567, "
+        "open3d 0.19, seed 5"
+    )
+    facts.seed, facts.error, facts.distribution = None, "no plane", ""
+    facts.code, facts.tools = {}, {}
+    assert differences._facts_text(facts) == "ok, plane.ransac result version 3, no plane"
+
+
+def test_files_are_named_with_the_beginning_of_their_digest() -> None:
+    file: Any = SimpleNamespace(name="a.e57", sha256="0123456789abcdef")
+    assert differences._files_text([file, file]) == "a.e57 0123456789ab, a.e57 0123456789ab"
+    assert differences._files_text([]) == "not given"
+
+
+def test_a_parameter_that_was_set_says_so() -> None:
+    value: Any = SimpleNamespace(value=["\N{LATIN SMALL LETTER U WITH DIAERESIS}", 1], is_set=True)
+    assert (
+        differences._parameter_text(value) == '["\N{LATIN SMALL LETTER U WITH DIAERESIS}", 1] (set)'
+    )
+    value.is_set = False
+    assert not differences._parameter_text(value).endswith("(set)")
