@@ -17,6 +17,9 @@ _TILES: Final = 8
 _CELL_SIGMA: Final = 1.0 / np.sqrt(12.0)
 # Depths about a point that differ by more than this many cells are an edge of the relief.
 _SMOOTH_CELLS: Final = 1.0
+# Of how many cells, on an even surface, the usual spread of points is told.
+_SPREADS_MOST: Final = 100_000
+_SPREADS_LEAST: Final = 100
 # A wall whose spread in depth is unknown is taken as this accurate, in cells.
 _UNKNOWN_SIGMA_CELLS: Final = 0.5
 
@@ -191,12 +194,7 @@ def points_on_wall(wall: Wall, pixels_wall: NDArray[np.float64]) -> WallPoints:
     centre_column = np.clip(np.rint(columns).astype(np.intp), 0, width - 1)
     centre_row = np.clip(np.rint(rows).astype(np.intp), 0, height - 1)
     nearest = wall.depth_m[centre_row, centre_column].astype(np.float64)
-    steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    around_rows = np.clip(centre_row[:, None] + steps[:, 0], 0, height - 1)
-    around_columns = np.clip(centre_column[:, None] + steps[:, 1], 0, width - 1)
-    around = wall.depth_m[around_rows, around_columns].astype(np.float64)
-    around = np.where(np.isfinite(around), around, nearest[:, None])
-    spread = around.max(axis=1) - around.min(axis=1)
+    spread = _spread_about(wall, centre_row, centre_column)
     smooth = spread < _SMOOTH_CELLS * wall.frame.gsd_m
     depth = np.where(smooth, _bilinear(wall.depth_m, columns, rows), nearest)
     depth = np.where(np.isfinite(depth), depth, nearest)
@@ -213,8 +211,7 @@ def _sigma_m(
     gsd_m = wall.frame.gsd_m
     count = np.maximum(wall.count[cell].astype(np.float64), 1.0)
     spread = wall.sigma_m[cell].astype(np.float64)
-    known = wall.sigma_m[np.isfinite(wall.sigma_m)]
-    usual = float(np.median(known)) if known.size else _UNKNOWN_SIGMA_CELLS * gsd_m
+    usual = _usual_spread_m(wall)
     spread = np.where(np.isfinite(spread) & (count > 1.0), spread, usual)
     # A cell's depth is a mean or median of its points, and its content lies anywhere in the cell.
     noise = np.maximum(spread / np.sqrt(count), 0.3 * usual)
@@ -222,6 +219,36 @@ def _sigma_m(
         noise**2 + (0.5 * _CELL_SIGMA * gsd_m) ** 2 + (step_m * _CELL_SIGMA) ** 2
     )
     return sigma
+
+
+def _usual_spread_m(wall: Wall) -> float:
+    """Spread of the points of a cell, median over cells that lie on an even surface.
+
+    Where points lie farther apart than cells are wide, most cells with several points are those on
+    steps of the relief, and their spread is that of the relief.
+    """
+    gsd_m = wall.frame.gsd_m
+    rows, columns = np.nonzero(np.isfinite(wall.sigma_m))
+    every = max(1, len(rows) // _SPREADS_MOST)
+    rows, columns = rows[::every], columns[::every]
+    is_even = _spread_about(wall, rows, columns) < _SMOOTH_CELLS * gsd_m
+    if is_even.sum() < _SPREADS_LEAST:
+        return _UNKNOWN_SIGMA_CELLS * gsd_m
+    return float(np.median(wall.sigma_m[rows[is_even], columns[is_even]]))
+
+
+def _spread_about(
+    wall: Wall, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Difference (n,) of the largest and smallest depth in 3 x 3 cells about each."""
+    height, width = wall.frame.shape
+    nearest = wall.depth_m[rows, columns].astype(np.float64)
+    steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    around_rows = np.clip(rows[:, None] + steps[:, 0], 0, height - 1)
+    around_columns = np.clip(columns[:, None] + steps[:, 1], 0, width - 1)
+    around = wall.depth_m[around_rows, around_columns].astype(np.float64)
+    around = np.where(np.isfinite(around), around, nearest[:, None])
+    return np.asarray(around.max(axis=1) - around.min(axis=1))
 
 
 def _bilinear(

@@ -35,7 +35,7 @@ class MatchSift(Method):
     """
 
     id: ClassVar[str] = "match.sift"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",

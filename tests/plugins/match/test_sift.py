@@ -330,6 +330,26 @@ def test_points_on_a_smooth_wall_are_exact_and_on_an_edge_uncertain(
     assert edge.sigma_m[0] > 0.05 > smooth.sigma_m[0]
 
 
+@pytest.mark.parametrize("n_even", [0, 400], ids=["steps alone", "some elsewhere"])
+def test_where_few_cells_have_several_points_those_on_steps_decide_no_uncertainty(
+    scene: ms.TexturedWall, walls: Walls, n_even: int
+) -> None:
+    # Cells half as wide as points lie apart: several fall into one on the step, hardly elsewhere.
+    wall = walls.walls[0]
+    depth, sigma = wall.depth_m.copy(), np.full_like(wall.sigma_m, np.nan)
+    depth[:, 300:] += 0.2
+    sigma[:, 299:301] = 0.1
+    count = np.where(np.isfinite(sigma), 2, 1).astype(np.uint32)
+    rows, columns = np.divmod(np.arange(n_even), 20)
+    sigma[rows, columns], count[rows, columns] = 0.0015, 2
+    sparse = replace(wall, depth_m=depth, sigma_m=sigma, count=count)
+    flat = points_on_wall(sparse, np.array([[100.3, 80.7]]))
+    # Half a cell where nothing else is known; else a tenth of what the step holds.
+    assert flat.sigma_m[0] < (0.01 if n_even else 0.7 * ms.GSD_M)
+    edge = points_on_wall(sparse, np.array([[300.1, 80.7]]))
+    assert edge.sigma_m[0] > 0.05
+
+
 def test_twins_on_overlapping_walls_count_once() -> None:
     def piece(wall: int, shift_m: float, sigma_m: float) -> TiePiece:
         pixels = np.array([[10.0, 20.0], [30.0, 40.0]])
