@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -107,6 +108,14 @@ def test_loading_every_method_loads_no_heavy_or_slow_library() -> None:
     assert loaded.strip() == "[]"
 
 
+def test_no_run_loads_a_library_for_the_mistakes_of_a_workflow() -> None:
+    loaded = run_python(
+        "import orthoflow.engine.scheduling, orthoflow.records\n"
+        f"print([name for name in {('networkx', *HEAVY, *SLOW)!r} if name in sys.modules])"
+    )
+    assert loaded.strip() == "[]"
+
+
 @pytest.mark.parametrize("command", [["--help"], ["plugins", "list"]], ids=" ".join)
 def test_listing_commands_load_no_numerical_library(command: list[str]) -> None:
     loaded = run_python(
@@ -163,6 +172,71 @@ def test_nobody_reads_the_details_of_a_product() -> None:
         if ".details" in line
     ]
     assert not found, "\n".join(found)
+
+
+def test_no_kernel_puts_an_array_into_a_part_of_one() -> None:
+    """Numba would compile the sentence about shapes that differ: seconds in each process."""
+    found = [
+        f"{module}:{line}"
+        for module in MODULES
+        for line in _arrays_put_into_parts(ast.parse((ROOT / module).read_text()))
+    ]
+    assert not found, "\n".join(found)
+
+
+def _arrays_put_into_parts(tree: ast.Module) -> list[int]:
+    """Lines of kernels such as `part[2:] = array` and `part[2:] = array[:3]`."""
+    kernels = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        and any(
+            re.match(r"compiled|inlined|.*kernel_part", ast.unparse(how))
+            for how in node.decorator_list
+        )
+    ]
+    lines: list[int] = []
+    for kernel in kernels:
+        assigned = [node for node in ast.walk(kernel) if isinstance(node, ast.Assign)]
+        arrays = {
+            argument.arg
+            for argument in kernel.args.args
+            if argument.annotation and "NDArray" in ast.unparse(argument.annotation)
+        }
+        arrays |= {
+            ast.unparse(node.targets[0])
+            for node in assigned
+            if re.match(r"np\.(empty|zeros|ones|full)", ast.unparse(node.value))
+        }
+        lines += [
+            node.lineno
+            for node in assigned
+            if _is_part(node.targets[0])
+            and (_is_part(node.value) or ast.unparse(node.value) in arrays)
+        ]
+    return lines
+
+
+def _is_part(node: ast.expr) -> bool:
+    return isinstance(node, ast.Subscript) and any(
+        isinstance(item, ast.Slice) for item in ast.walk(node.slice)
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "is_array"),
+    [
+        ("fitted[0:3] = up", True),
+        ("fitted[:3] = up[:3]", True),
+        ("fitted[1, 4:] = made", True),
+        ("fitted[0:3] = up[0]", False),
+        ("fitted[0] = made[1]", False),
+    ],
+)
+def test_arrays_put_into_parts_are_seen(line: str, is_array: bool) -> None:
+    kernel = f"@compiled\ndef f(fitted: NDArray, up: NDArray):\n    made = np.empty(3)\n    {line}"
+    assert bool(_arrays_put_into_parts(ast.parse(kernel))) == is_array
+    assert not _arrays_put_into_parts(ast.parse(kernel.replace("@compiled\n", "")))
 
 
 def _readings_of_details(tree: ast.Module) -> list[int]:

@@ -3,6 +3,10 @@
 Numba wraps every function for callers in Python and in C. Where a scene's tables are among the
 arguments, the wrappers take as long to compile as the function itself; what only kernels call
 needs neither.
+
+Numba keeps kernels, but not its own functions: each process that compiles a kernel compiles those
+that it calls. An array put into a part of another (`part[2:] = array`) calls forty, for a sentence
+about shapes: kernels put numbers, one by one.
 """
 
 from __future__ import annotations

@@ -11,8 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-import networkx as nx
-
 from orthoflow.catalog import Catalog, did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.products.product import JsonValue
@@ -26,7 +24,7 @@ from orthoflow.workflow.format import DATA, StepVariant, Workflow, WorkflowStep
 from orthoflow.workflow.inputs import present_inputs
 from orthoflow.workflow.methods import MethodInfo, describe_method
 from orthoflow.workflow.shapes import Reference
-from orthoflow.workflow.wiring import step_graph, topological_steps
+from orthoflow.workflow.wiring import StepGraph, step_graph, topological_steps
 
 _SEED_BITS: Final = 53  # exact in every JSON reader, also those that only know doubles
 
@@ -262,9 +260,9 @@ class _Expansion:
             for assignment in combinations(self.workflow, relevant):
                 yield {DATA: dataset.name, **assignment}
 
-    def _relevant(self, graph: nx.DiGraph[str], name: str) -> list[str]:
+    def _relevant(self, graph: StepGraph, name: str) -> list[str]:
         """The steps that lie before a step and itself, in graph order."""
-        before = nx.ancestors(graph, name) | {name}
+        before = graph.before(name) | {name}
         return sorted(before, key=self.rank.__getitem__)
 
     def _repeats(self, step: WorkflowStep, cell: Cell) -> list[Cell]:
@@ -398,11 +396,9 @@ def _chosen_steps(workflow: Workflow, selection: Selection) -> set[str]:
     graph = step_graph(workflow.steps)
     chosen = set(workflow.steps)
     if selection.from_:
-        chosen &= {
-            step for name in selection.from_ for step in (name, *nx.descendants(graph, name))
-        }
+        chosen &= {step for name in selection.from_ for step in (name, *graph.after(name))}
     if selection.until:
-        chosen &= {step for name in selection.until for step in (name, *nx.ancestors(graph, name))}
+        chosen &= {step for name in selection.until for step in (name, *graph.before(name))}
     if selection.only:
         chosen &= set(selection.only)
     if not chosen:

@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
-import networkx as nx
 from pydantic import BaseModel, Field, ValidationError
 
 from orthoflow.catalog import NAME_PATTERN
@@ -29,7 +28,7 @@ from orthoflow.workflow.format import (
     WorkflowStep,
 )
 from orthoflow.workflow.shapes import Reference, seconds_in
-from orthoflow.workflow.wiring import step_graph
+from orthoflow.workflow.wiring import is_acyclic, step_graph
 
 _PLACE: Final = "the resolved workflow"
 # What every record says of a method call; a key that came later may be missing in older ones.
@@ -272,7 +271,7 @@ def _check(workflow: Workflow) -> None:
             raise ValueError(f"{name[:60]!r} cannot be a name")
     for step in workflow.steps.values():
         _check_step(workflow, step)
-    if not nx.is_directed_acyclic_graph(step_graph(workflow.steps)):
+    if not is_acyclic(step_graph(workflow.steps).sources):
         raise ValueError("its steps need each other in a circle")
     if workflow.compare is not None:
         _check_comparison(workflow, workflow.compare)

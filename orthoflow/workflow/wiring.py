@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-
-import networkx as nx
+from graphlib import CycleError, TopologicalSorter
 
 from orthoflow.catalog import did_you_mean
 from orthoflow.catalog.loading import FILES
@@ -15,21 +15,74 @@ from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import INPUTS_NAME, PlacedPort, PlacedReference
 from orthoflow.workflow.steps import DraftStep
 
+Edges = Mapping[str, Collection[str]]
 
-def step_graph(steps: Mapping[str, WorkflowStep]) -> nx.DiGraph[str]:
-    """Give the graph of steps; an edge runs from the step that makes a product to its user."""
-    graph: nx.DiGraph[str] = nx.DiGraph()
-    graph.add_nodes_from(steps)
-    for step in steps.values():
-        graph.add_edges_from((source, step.name) for source in step.upstream())
-    return graph
+
+@dataclass(frozen=True)
+class StepGraph:
+    """Which steps take products of which.
+
+    Attributes:
+        sources: step -> steps whose products it takes.
+        users: step -> steps that take its products.
+    """
+
+    sources: Edges
+    users: Edges
+
+    def before(self, name: str) -> set[str]:
+        """All that a step needs, directly or not."""
+        return _reached(self.sources, name)
+
+    def after(self, name: str) -> set[str]:
+        """All that need a step, directly or not."""
+        return _reached(self.users, name)
+
+
+def _reached(edges: Edges, start: str) -> set[str]:
+    reached: set[str] = set()
+    waiting = list(edges[start])
+    while waiting:
+        name = waiting.pop()
+        if name not in reached:
+            reached.add(name)
+            waiting.extend(edges[name])
+    return reached
+
+
+def step_graph(steps: Mapping[str, WorkflowStep]) -> StepGraph:
+    """Give the graph of steps."""
+    sources = {name: set(step.upstream()) for name, step in steps.items()}
+    users: dict[str, set[str]] = {name: set() for name in steps}
+    for name, needed in sources.items():
+        for source in needed:
+            users[source].add(name)
+    return StepGraph(sources, users)
+
+
+def is_acyclic(sources: Edges) -> bool:
+    """Whether no step needs itself, directly or through others."""
+    try:
+        TopologicalSorter(sources).prepare()
+    except CycleError:
+        return False
+    return True
 
 
 def topological_steps(steps: Mapping[str, WorkflowStep]) -> tuple[str, ...]:
     """Order steps so that each stands behind all it needs, else in the order of the file."""
-    rank = {name: index for index, name in enumerate(steps)}
-    ordered = nx.lexicographical_topological_sort(step_graph(steps), key=rank.__getitem__)
-    return tuple(str(name) for name in ordered)
+    graph, names = step_graph(steps), tuple(steps)
+    rank = {name: index for index, name in enumerate(names)}
+    n_missing = {name: len(sources) for name, sources in graph.sources.items()}
+    ready = [rank[name] for name in names if n_missing[name] == 0]
+    ordered: list[str] = []
+    while ready:
+        ordered.append(names[heapq.heappop(ready)])
+        for user in graph.users[ordered[-1]]:
+            n_missing[user] -= 1
+            if n_missing[user] == 0:
+                heapq.heappush(ready, rank[user])
+    return tuple(ordered)
 
 
 def check_wiring(
@@ -181,6 +234,13 @@ def _check_cycles(steps: Sequence[DraftStep], log: ProblemLog) -> None:
             for placed in port.references:
                 if placed.reference.source in names:
                     wires.setdefault((placed.reference.source, step.name), placed)
+    sources: dict[str, set[str]] = {}
+    for source, user in wires:
+        sources.setdefault(user, set()).add(source)
+    if is_acyclic(sources):
+        return
+    import networkx as nx  # noqa: PLC0415 - takes a quarter of a command's start, for a mistake only
+
     graph: nx.DiGraph[str] = nx.DiGraph(list(wires))
     for members in nx.strongly_connected_components(graph):
         inside = graph.subgraph(members)

@@ -28,9 +28,10 @@ def decompress_lzf(packed: NDArray[np.uint8], plain: NDArray[np.uint8]) -> int:
             count = control + 1
             if read + count > packed.size or written + count > plain.size:
                 return -1
-            plain[written : written + count] = packed[read : read + count]
-            read += count
-            written += count
+            for _ in range(count):
+                plain[written] = packed[read]
+                written += 1
+                read += 1
             continue
         count = control >> 5
         if count == 7:

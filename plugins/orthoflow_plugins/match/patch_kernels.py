@@ -92,7 +92,7 @@ def search_mixtures(
         _take_best(scores, found[i, :4])
         to = (at[0] + int(found[i, 1]), at[1] + int(found[i, 0]))
         _mixed(first, second, (at, to, reach[0]), gains)
-        found[i, 4:] = gains
+        found[i, 4], found[i, 5], found[i, 6] = gains[0], gains[1], gains[2]
 
 
 @kernel_part

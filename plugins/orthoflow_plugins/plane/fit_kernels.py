@@ -183,7 +183,9 @@ def refine_robustly(
     # only when it may have come within the tolerance of others.
     near, asked, reach_m = points, plane.copy(), np.inf
     for step in range(_STEPS_MOST):
-        turned = np.sqrt(np.sum((plane[:3] - asked[:3]) ** 2))
+        turned = np.sqrt(
+            (plane[0] - asked[0]) ** 2 + (plane[1] - asked[1]) ** 2 + (plane[2] - asked[2]) ** 2
+        )
         may_have_moved_m = turned * furthest_m + abs(plane[3] - asked[3])
         if step == 1 or may_have_moved_m + tolerance_m > reach_m:
             reach_m = _REACH * tolerance_m
@@ -194,7 +196,7 @@ def refine_robustly(
         if freedom == VERTICAL:
             _without_rise(sums, up)
         if freedom == LEVEL:
-            fitted[0:3] = up
+            fitted[0], fitted[1], fitted[2] = up[0], up[1], up[2]
         else:
             flattest(sums, fitted)
             if fitted[7] < max(_LINE_WIDTH_M**2, 1e-8 * fitted[8]):
