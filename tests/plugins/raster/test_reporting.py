@@ -1,0 +1,205 @@
+"""What is told of rastered walls: metrics by hand, warnings in full, and the picture of a depth."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.raster import reporting
+from orthoflow_plugins.raster.emptiness import Emptiness
+from orthoflow_plugins.raster.walls import WallRaster
+
+from orthoflow.files.images import decode_image
+from orthoflow.geometry import WallFrame
+from orthoflow.products import SurfaceMask, Wall
+from orthoflow.sdk import StepContext, StepEvent
+
+
+def wall(
+    count: list[list[int]], *, name: str = "wall 0", mask: list[list[int]] | None = None
+) -> Wall:
+    counts = np.array(count, dtype=np.uint32)
+    rows, columns = counts.shape
+    frame = WallFrame(
+        origin_world=np.zeros(3),
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=np.array([0.0, 0.0, -1.0]),
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=0.005,
+        width=columns,
+        height=rows,
+    )
+    states = (counts > 0).astype(np.uint8) if mask is None else np.array(mask, dtype=np.uint8)
+    return Wall(
+        frame=frame,
+        plane_index=0,
+        name=name,
+        depth_m=np.where(states == SurfaceMask.VOID, np.nan, 0.0).astype(np.float32),
+        sigma_m=np.where(counts > 1, 0.001 * counts, np.nan).astype(np.float32),
+        count=counts,
+        mask=states,
+    )
+
+
+class Listener:
+    """A context, and what it was told."""
+
+    def __init__(self, folder: Path) -> None:
+        self.warnings: list[str] = []
+        self.context = StepContext(
+            rng=np.random.default_rng(1), cores=1, scratch=folder, listen=self._listen
+        )
+
+    def _listen(self, event: StepEvent) -> None:
+        if event.kind == "warning":
+            self.warnings.append(event.text)
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        return {metric.name: metric.value for metric in self.context.metrics}
+
+
+@pytest.fixture
+def listener(tmp_path: Path) -> Listener:
+    return Listener(tmp_path)
+
+
+def test_walls_are_told_in_numbers(listener: Listener) -> None:
+    first = wall([[0, 1, 3], [5, 2, 0]], mask=[[2, 1, 1], [1, 1, 0]])
+    second = wall([[0, 0], [7, 1]])
+    reporting.report(
+        listener.context,
+        [WallRaster(wall=first, scan_step_m=0.0042), WallRaster(wall=second, scan_step_m=0.1)],
+    )
+    assert listener.metrics == {
+        "n_walls": 2.0,
+        "n_points_inside": 19.0,
+        # Of 1, 1, 2, 3, 5, 7 points; cells with a spread have 2, 3, 5 and 7 mm.
+        "points_per_cell": 2.5,
+        "scan_step_mm": pytest.approx(4.2),
+        "gsd_mm": 5.0,
+        "depth_noise_mm": 0.0,
+        "sigma_median_mm": pytest.approx(4.0),
+        "void_share": 0.3,
+        "measured_share": 0.6,
+        "recovered_share": 0.1,
+    }
+    [figure] = listener.context.figures
+    assert figure.name == "depth"
+
+
+def test_a_wall_of_single_points_has_no_spread(listener: Listener) -> None:
+    reporting.report(listener.context, [WallRaster(wall=wall([[1, 1, 0]]), scan_step_m=0.01)])
+    assert "sigma_median_mm" not in listener.metrics
+    assert listener.metrics["points_per_cell"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("laser", []),
+        ("luminance", ["the cloud has no laser intensity; the grey of its colours (Rec. 601)"]),
+        ("none", ["the cloud has neither intensity nor colour; only the depth of walls"]),
+    ],
+)
+def test_what_the_cloud_lacks_is_told(listener: Listener, source: str, said: list[str]) -> None:
+    reporting.warn(listener.context, [], source)
+    assert len(listener.warnings) == len(said)
+    for warning, beginning in zip(listener.warnings, said, strict=True):
+        assert warning.startswith(beginning)
+
+
+def test_cells_finer_than_the_scan_are_told_with_how_many_hold_a_point(listener: Listener) -> None:
+    given = [[1, 0, 2], [0, 0, 0]]
+    reporting.warn(
+        listener.context,
+        [
+            WallRaster(wall=wall([[0, 0]], name="empty"), scan_step_m=0.01),
+            WallRaster(wall=wall(given, name="coarse"), scan_step_m=0.0123),
+            WallRaster(wall=wall(given, name="just fine"), scan_step_m=0.005),
+        ],
+        "laser",
+    )
+    empty, coarse = listener.warnings
+    assert empty == "empty: no point lies within its buffer"
+    assert coarse == (
+        "coarse: cells of gsd_m = 0.005 m are finer than the scan, whose points lie about 0.012 m "
+        "apart; 33% of the cells have a point"
+    )
+
+
+def emptiness(
+    *, behind: float = 0.0, hidden: float = 0.0, sparse: float = 0.0, unseen: float = 0.0
+) -> Emptiness:
+    return Emptiness(
+        behind_share=behind,
+        behind_m=0.4321 if behind else math.nan,
+        hidden_share=hidden,
+        sparse_share=sparse,
+        unseen_share=unseen,
+    )
+
+
+def test_causes_of_empty_cells_are_weighed_by_the_size_of_their_walls(listener: Listener) -> None:
+    reporting.report_empty(
+        listener.context,
+        [wall([[1, 1, 1]]), wall([[1]])],
+        [emptiness(behind=0.04, unseen=0.05), emptiness(hidden=0.08)],
+    )
+    assert listener.metrics == pytest.approx(
+        {
+            "void_behind_share": 0.03,
+            "void_hidden_share": 0.02,
+            "void_sparse_share": 0.0,
+            "void_unseen_share": 0.0375,
+        }
+    )
+    # Less than a tenth of either is not worth words.
+    assert listener.warnings == []
+
+
+def test_many_empty_cells_are_told_with_their_causes_the_largest_first(listener: Listener) -> None:
+    reporting.report_empty(
+        listener.context,
+        [wall([[1, 1]]), wall([[0, 0]], name="no points")],
+        [emptiness(behind=0.2, hidden=0.025, sparse=0.31, unseen=0.06), emptiness(unseen=1.0)],
+    )
+    [said] = listener.warnings
+    # 60 % are empty: a cause of less than a tenth of them is left out.
+    assert said == (
+        "wall 0: 60% of its cells are empty: 31% lie between the scan's points (raise gsd_m or "
+        "recover_gap_cells); 20% lie behind the buffer, about 0.43 m behind the plane (raise "
+        "buffer_behind_m if that is the wall); 6% show nothing that was scanned: glass, or what no "
+        "station sees"
+    )
+
+
+def test_a_tenth_of_empty_cells_is_worth_words_and_a_hundredth_of_a_cause(
+    listener: Listener,
+) -> None:
+    reporting.report_empty(
+        listener.context, [wall([[1, 1]])], [emptiness(hidden=0.0901, sparse=0.0099)]
+    )
+    [said] = listener.warnings
+    assert said.startswith("wall 0: 10% of its cells are empty: 9% are hidden by what stands")
+    assert "gsd_m" not in said
+
+
+def test_a_picture_of_a_depth_is_grey_where_it_is_void_and_spreads_the_rest() -> None:
+    of = wall([[1] * 200] * 100)
+    of.depth_m[:] = np.linspace(-0.1, 0.1, 200, dtype=np.float32)
+    of.mask[:50, 100:] = SurfaceMask.VOID
+    picture = decode_image(reporting._depth_preview(of)).astype(float)
+    assert picture.shape == (100, 200, 3)
+    np.testing.assert_allclose(picture[4:46, 110:190], 128.0, atol=6.0)
+    # Viridis goes from dark violet to yellow.
+    np.testing.assert_allclose(picture[80, 2], [68, 1, 84], atol=25.0)
+    np.testing.assert_allclose(picture[80, 197], [253, 231, 37], atol=25.0)
+
+
+@pytest.mark.parametrize(("side", "shown"), [(1400, 1400), (1401, 701), (4300, 1075)])
+def test_pictures_of_large_walls_have_some_of_their_rows_and_columns(side: int, shown: int) -> None:
+    of = wall([[1] * side] * 3)
+    assert decode_image(reporting._depth_preview(of)).shape[1] == shown
