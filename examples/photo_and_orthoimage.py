@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import orthoflow
 from orthoflow.files.images import decode_image, encode_jpeg, stretch_to_grey
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Orthoimages, OrthoMask, Photos, Walls
 
 HEIGHT_PX = 360
@@ -37,7 +38,7 @@ def picture_of(run_folder: Path) -> NDArray[np.uint8]:
     assert intensity is not None
     image = orthoimages.images[0]
     shown = (image.mask == OrthoMask.PAINTED) | (image.mask == OrthoMask.FILLED)
-    ortho = np.where(shown[..., None], image.rgb, 255).astype(np.uint8)
+    ortho = np.where(shown[..., None], eight_bits(image.rgb), 255).astype(np.uint8)
     columns = [photo, np.dstack([stretch_to_grey(intensity)] * 3), ortho]
     gap = np.full((HEIGHT_PX, GAP_PX, 3), 255, dtype=np.uint8)
     row: list[NDArray[np.uint8]] = []

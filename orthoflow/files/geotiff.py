@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError, StoreError
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.levels import Colours
 
 if TYPE_CHECKING:
     from rasterio.crs import CRS
@@ -197,7 +198,7 @@ def _write_large_raster(
 
 def write_orthoimage(
     path: Path,
-    rgb: NDArray[np.uint8],
+    rgb: Colours,
     shown: NDArray[np.bool_],
     *,
     gsd_m: float,
@@ -212,7 +213,7 @@ def write_orthoimage(
 
     Args:
         path: file to write; its folder exists.
-        rgb: (rows, cols, 3).
+        rgb: (rows, cols, 3), 8 or 16 bits; the file has as many.
         shown: (rows, cols) True where the image shows something (painted or filled).
         gsd_m: side of a cell in metres.
         tags: text to keep with the image.
@@ -222,13 +223,15 @@ def write_orthoimage(
     Raises:
         StoreError: the file cannot be written.
     """
-    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or rgb.shape[:2] != shown.shape:
+    is_rgb = rgb.ndim == 3 and rgb.shape[2] == 3 and rgb.dtype in (np.uint8, np.uint16)
+    if not is_rgb or rgb.shape[:2] != shown.shape:
         raise ProductError(
-            f"{path.name} takes uint8 RGB and a mask of one size, got {rgb.dtype} of shape "
-            f"{rgb.shape} and a mask of {shown.shape}"
+            f"{path.name} takes RGB of 8 or 16 bits and a mask of one size, got {rgb.dtype} of "
+            f"shape {rgb.shape} and a mask of {shown.shape}"
         )
     image = _Image(rgb=rgb, shown=shown, tags=tags, icc_profile=icc_profile)
-    placed: dict[str, object] = {"count": 3, "dtype": "uint8"} | _placed(shown.shape, gsd_m, place)
+    placed: dict[str, object] = {"count": 3, "dtype": rgb.dtype.name}
+    placed |= _placed(shown.shape, gsd_m, place)
     if shown.size > _IN_MEMORY_CELLS:
         _write_banded(path, image, placed)
     else:
@@ -241,7 +244,7 @@ def write_orthoimage(
 class _Image:
     """What `write_orthoimage` writes."""
 
-    rgb: NDArray[np.uint8]
+    rgb: Colours
     shown: NDArray[np.bool_]
     tags: Mapping[str, str]
     icc_profile: bytes | None

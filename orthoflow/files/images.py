@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError, ProductError
 from orthoflow.files.containers import image_format, is_webp, stated_size
 from orthoflow.files.exif import without_orientation
+from orthoflow.geometry.levels import Colours, eight_bits
 
 PREVIEW_SIDE_PX: Final = 1600
 # 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
 MOST_PIXELS: Final = 1 << 28
+# How far 8 bits lie apart that are cut off, or rounded.
+_ROUNDED_LEVELS: Final = 2
 # Larger images are averaged before they are shrunk, so many rows of the result at a time.
 _WHOLE_PX: Final = 1 << 26
 _BAND_PX: Final = 64
@@ -33,7 +36,7 @@ Cells = Callable[[Part], tuple[NDArray[np.uint8], NDArray[np.bool_]]]
 
 
 def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
-    """Decode a JPEG, PNG, TIFF or WebP file into (rows, cols, 3) RGB.
+    """Decode a JPEG, PNG, TIFF or WebP file into (rows, cols, 3) RGB of 8 bits.
 
     Args:
         encoded: the file's bytes.
@@ -42,6 +45,34 @@ def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
     Raises:
         InputError: the bytes are no JPEG, PNG, TIFF or WebP, or cut off, or too many pixels.
     """
+    image = _decoded(encoded, name, is_deep=False)
+    return np.ascontiguousarray(image).astype(np.uint8, copy=False)
+
+
+def decode_levels(encoded: bytes, name: str = "image") -> Colours:
+    """Decode as `decode_image`, but into uint16 where a PNG or TIFF file has 16 bits per channel.
+
+    Raises:
+        InputError: as `decode_image`, or the 16 bits cannot be decoded faithfully.
+    """
+    plain = decode_image(encoded, name)
+    image = _decoded(encoded, name, is_deep=True)
+    if image.dtype != np.uint16:
+        return plain
+    # OpenCV 5.0 gives noise for TIFF of 16 bits that is wanted as RGB, or has separate planes, and
+    # says nothing; 8 bits go another way through libtiff.
+    deep = np.ascontiguousarray(image[..., ::-1]).astype(np.uint16, copy=False)
+    apart = np.abs(eight_bits(deep).astype(np.int16) - plain)
+    if apart.max(initial=0) > _ROUNDED_LEVELS:
+        raise InputError(
+            f"{name} has 16 bits per channel in a layout that is not decoded faithfully: save it "
+            "again as TIFF with interleaved channels, not separate planes, or as PNG"
+        )
+    return deep
+
+
+def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> NDArray[np.generic]:
+    """Decode an image: RGB of 8 bits, or BGR of its own depth."""
     import cv2
 
     if image_format(encoded) is None and not is_webp(encoded):
@@ -53,18 +84,19 @@ def decode_image(encoded: bytes, name: str = "image") -> NDArray[np.uint8]:
             "decoded; make it smaller or cut it into parts"
         )
     try:
-        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        depth = cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH if is_deep else cv2.IMREAD_COLOR_RGB
+        flags = depth | cv2.IMREAD_IGNORE_ORIENTATION
         data = np.frombuffer(without_orientation(encoded), dtype=np.uint8)
         image = cv2.imdecode(data, flags)
     except cv2.error as error:
         raise InputError(_not_an_image(encoded, name)) from error
     if image is None:
         raise InputError(_not_an_image(encoded, name))
-    return np.ascontiguousarray(image).astype(np.uint8, copy=False)
+    return np.asarray(image)
 
 
-def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """Encode (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA as PNG."""
+def encode_png(image: Colours) -> bytes:
+    """Encode (rows, cols) grey, (rows, cols, 3) RGB or (rows, cols, 4) RGBA as PNG, as deep."""
     return _encode(".png", image, [])
 
 
@@ -249,19 +281,20 @@ def _shrink(values: NDArray[Shrunk], longest_side_px: int) -> NDArray[Shrunk]:
     return np.asarray(small, dtype=values.dtype)
 
 
-def _encode(suffix: str, image: NDArray[np.uint8], options: list[int]) -> bytes:
+def _encode(suffix: str, image: Colours, options: list[int]) -> bytes:
     import cv2
 
-    if image.dtype != np.uint8 or not (
+    deepest = (np.uint8, np.uint16) if suffix == ".png" else (np.uint8,)
+    if image.dtype not in deepest or not (
         image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (3, 4))
     ):
         raise ProductError(
-            f"an image to encode must be uint8 of shape (rows, cols[, 3 or 4]), got {image.dtype} "
-            f"of shape {image.shape}"
+            f"an image to encode must be {' or '.join(level.__name__ for level in deepest)} of "
+            f"shape (rows, cols[, 3 or 4]), got {image.dtype} of shape {image.shape}"
         )
     if image.ndim == 3:
         code = cv2.COLOR_RGBA2BGRA if image.shape[2] == 4 else cv2.COLOR_RGB2BGR
-        image = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), code), dtype=np.uint8)
+        image = np.asarray(cv2.cvtColor(np.ascontiguousarray(image), code), dtype=image.dtype)
     done, encoded = cv2.imencode(suffix, np.ascontiguousarray(image), options)
     if not done:
         raise ProductError(f"an image of shape {image.shape} could not be encoded as {suffix}")

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.images import decode_image, encode_png
+from orthoflow.files.images import decode_levels, encode_png
+from orthoflow.geometry.levels import Colours
 from orthoflow.products import Intrinsics
 
 # Rows: right, down and forwards of each face, in the directions of the panorama.
@@ -69,7 +70,7 @@ class PanoramaFace:
 
     def encoded(self) -> bytes:
         """The photo as a PNG file."""
-        return encode_png(face_picture(decode_image(self.panorama, self.name), self.face))
+        return encode_png(face_picture(decode_levels(self.panorama, self.name), self.face))
 
 
 def faces_of(panorama: bytes, stem: str, width: int) -> tuple[PanoramaFace, ...]:
@@ -91,8 +92,8 @@ def face_name(stem: str, face: str) -> str:
     return f"{stem}_{face}.png"
 
 
-def face_picture(panorama: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """Look a face up in a panorama (rows, columns[, 3]), between its pixels linearly."""
+def face_picture(panorama: Colours, name: str) -> Colours:
+    """Look a face up in a panorama (rows, columns[, 3]), between its pixels linearly, as deep."""
     import cv2
 
     height, width = panorama.shape[:2]
@@ -114,4 +115,4 @@ def face_picture(panorama: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return np.asarray(looked_up, dtype=np.uint8)
+    return np.asarray(looked_up, dtype=panorama.dtype)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.calibration import write_calibration
 from orthoflow.files.geotiff import map_place, world_file_text, write_orthoimage, write_raster
-from orthoflow.files.images import cells_per_preview_px, cells_png, grey_cells, preview_png
+from orthoflow.files.images import Cells, cells_per_preview_px, cells_png, grey_cells
 from orthoflow.files.sidecars import (
     LAYER_MASK_MEANINGS,
     ORTHO_MASK_MEANINGS,
@@ -36,6 +36,7 @@ from orthoflow.files.sidecars import (
 from orthoflow.foreign_text import Value, csv_text
 from orthoflow.geometry import WallFrame, omega_phi_deg
 from orthoflow.geometry.bands import row_bands
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.geometry.opencv_border import opencv_matrix, to_opencv
 from orthoflow.products import (
     Calibration,
@@ -168,7 +169,8 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
         mask_path = folder / f"{stem}_mask.tif"
         write_raster(mask_path, image.mask, gsd_m=gsd_m, tags=mask_tags, place=place)
         _write_ortho_sidecars(folder, stem, image, {"content": content}, digest)
-        _write_preview(folder / f"{stem}.png", preview_png(image.rgb, shown), image.frame)
+        picture = cells_png(shown.shape, _cells_of(image, shown))
+        _write_preview(folder / f"{stem}.png", picture, image.frame)
 
 
 def publish_layers(product: Layers, folder: Path, digest: str) -> None:
@@ -210,6 +212,7 @@ def _write_layers(
             "source": layer.source,
             "content": content,
             "mask": mask_meanings(LAYER_MASK_MEANINGS),
+            "bits": 8 * layer.rgb.itemsize,
             "mask_counts": _counts(layer.mask),
             "dataset_mask": "255 where the mask is painted (1), else 0",
             "product_digest": digest,
@@ -317,6 +320,11 @@ def _publish_raster(
     _write_preview(stem.with_suffix(".png"), picture, wall.frame)
 
 
+def _cells_of(image: Orthoimage, shown: NDArray[np.bool_]) -> Cells:
+    """Give what previews are made of; of deep images part by part."""
+    return lambda part: (eight_bits(image.rgb[part]), shown[part])
+
+
 def _write_preview(path: Path, picture: bytes, frame: WallFrame) -> None:
     """Write the preview of a raster, and the world file that places it where the raster lies."""
     rows, columns = cells_per_preview_px(frame.shape)
@@ -333,6 +341,7 @@ def _write_ortho_sidecars(
         "wall": image.wall,
         "name": image.name,
         "sources": list(image.sources),
+        "bits": 8 * image.rgb.itemsize,
         "mask": mask_meanings(ORTHO_MASK_MEANINGS),
         "mask_counts": _counts(image.mask),
         "dataset_mask": "255 where the mask is painted (1) or filled (2), else 0",

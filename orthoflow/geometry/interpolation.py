@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.threads import in_parts
 
 # Cells take part that are so much farther than the nearest one, and all eight neighbours.
@@ -38,19 +39,19 @@ class CellValues(NamedTuple):
     Attributes:
         depth_m: float32, NaN where void.
         intensity: float32.
-        rgb: (cells, 3) uint8.
+        rgb: (cells, 3) uint8 or uint16.
     """
 
     depth_m: NDArray[np.float32]
     intensity: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
+    rgb: Colours
 
 
 def cell_values(
     depth_m: NDArray[np.float32],
     *,
     intensity: NDArray[np.float32] | None = None,
-    rgb: NDArray[np.uint8] | None = None,
+    rgb: Colours | None = None,
 ) -> CellValues:
     """Give values in the form that kernels are compiled for."""
     return CellValues(
@@ -169,7 +170,7 @@ def interpolate_cells(
         if into.rgb.size:
             for band in range(3):
                 shade = _mixed(values.rgb[:, band], lenders, n, own)
-                into.rgb[cell, band] = np.uint8(math.floor(shade + 0.5))
+                into.rgb[cell, band] = math.floor(shade + 0.5)
 
 
 @kernel_part

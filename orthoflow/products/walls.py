@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 
@@ -181,7 +182,8 @@ class Layer:
         frame: where the cells lie.
         wall: index of the wall in `Walls`.
         source: what painted it, e.g. a photo's name, or `cloud`.
-        rgb: (rows, cols, 3) uint8, 0 where not painted.
+        rgb: (rows, cols, 3) uint8, or uint16 of deep photos (all layers of a block alike), 0 where
+            not painted; `geometry.levels` has both as one.
         mask: uint8 `LayerMask`; cells of value 1 are painted.
         quality: float32, larger is better, comparable between the layers of one wall; 0 where
             not painted.
@@ -191,7 +193,7 @@ class Layer:
     frame: WallFrame
     wall: int
     source: str
-    rgb: NDArray[np.uint8]
+    rgb: Colours
     mask: NDArray[np.uint8]
     quality: NDArray[np.float32]
     filled: NDArray[np.uint8] | None = None
@@ -240,7 +242,8 @@ class Orthoimage:
         frame: where the cells lie.
         wall: index of the wall in `Walls`.
         name: label of the wall.
-        rgb: (rows, cols, 3) uint8 as the sources have them, 0 where nothing is shown.
+        rgb: (rows, cols, 3) uint8, or uint16 of deep photos, as the sources have them, 0 where
+            nothing is shown; `geometry.levels.eight_bits` gives them in 8 bits.
         mask: uint8 `OrthoMask`; painted and filled cells are shown.
         source: int16 index into `sources`, -1 where nothing painted the cell.
         sources: what painted it, e.g. photo names, or `cloud`.
@@ -249,7 +252,7 @@ class Orthoimage:
     frame: WallFrame
     wall: int
     name: str
-    rgb: NDArray[np.uint8]
+    rgb: Colours
     mask: NDArray[np.uint8]
     source: NDArray[np.int16]
     sources: tuple[str, ...]

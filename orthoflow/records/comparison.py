@@ -8,13 +8,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
+import numpy as np
 from orthoflow_provenance.compare import ArrayDifference, measure_payloads
 from orthoflow_provenance.digests import payload_digest
 from orthoflow_provenance.model import COSTS, RecordedCell, RecordedFile, RunRecord
 
 from orthoflow.engine.keys import read_preimage, stated_versions
 from orthoflow.errors import OrthoflowError
-from orthoflow.products.product import JsonValue, Payload, Product
+from orthoflow.geometry.levels import DEEPER
+from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 
@@ -399,7 +401,10 @@ def _distance(
     encodings = {side.encoding_version(address, port) for side in (left, right)}
     if len(encodings) > 1:
         ours, theirs = _common(ours, theirs)
-    limits = {name: (limit.limit, limit.unit) for name, limit in cls.tolerances.items()}
+    limits = {
+        name: (_limit(name, tolerance, ours), tolerance.unit)
+        for name, tolerance in cls.tolerances.items()
+    }
     differences = measure_payloads(ours, theirs, limits)
     beyond = [difference for difference in differences if difference.n_values]
     if not beyond:
@@ -408,6 +413,15 @@ def _distance(
     others = f"; {len(beyond) - 1} more fields differ" if len(beyond) > 1 else ""
     reason = f"{beyond[0].name}: {beyond[0].problem}{others}"
     return verdict("different", reason, _by_unit(differences))
+
+
+def _limit(name: str, tolerance: Tolerance, payload: Payload) -> float:
+    """How far values of a field may lie apart; grey levels of 16 bits count in steps of 257."""
+    is_deep = tolerance.unit == "grey" and any(
+        array.dtype == np.uint16 and path.rpartition("/")[2] == name
+        for path, array in payload.arrays.items()
+    )
+    return tolerance.limit * (DEEPER if is_deep else 1)
 
 
 def _common(left: Payload, right: Payload) -> tuple[Payload, Payload]:

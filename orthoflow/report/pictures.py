@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.files.images import Part, cells_webp, grey_cells, sampled_rows
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import count_cells
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
 from orthoflow.records import Run
@@ -153,7 +154,8 @@ def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawi
     filled = n_filled / image.mask.size
 
     def cells(part: Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        return image.rgb[part], np.isin(image.mask[part], (OrthoMask.PAINTED, OrthoMask.FILLED))
+        shows = np.isin(image.mask[part], (OrthoMask.PAINTED, OrthoMask.FILLED))
+        return eight_bits(image.rgb[part]), shows
 
     return _Drawing(
         draw=lambda side: cells_webp(image.mask.shape, cells, longest_side_px=side),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Orthoimages, OrthoMask
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from pydantic import Field
@@ -70,7 +71,7 @@ def lines_of(image, params):
 
     frame = image.frame
     shown = np.isin(image.mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
-    grey = image.rgb.mean(axis=2)
+    grey = eight_bits(image.rgb).mean(axis=2)
     # What is not shown must not look dark.
     grey = np.where(shown, grey, grey[shown].mean() if shown.any() else 0.0).astype(np.float32)
     width = 2 * max(1, round(params.width_max_m / frame.gsd_m / 2)) + 1
@@ -99,7 +100,7 @@ def drawn(image, lines):
     sides_m = frame.width * frame.gsd_m, frame.height * frame.gsd_m
     drawing = Figure(figsize=(6.0, 6.0 * sides_m[1] / sides_m[0] + 0.4), layout="constrained")
     axes = drawing.add_subplot()
-    axes.imshow(image.rgb, extent=(0.0, sides_m[0], sides_m[1], 0.0))
+    axes.imshow(eight_bits(image.rgb), extent=(0.0, sides_m[0], sides_m[1], 0.0))
     for vertices in lines:
         across_m, down_m = frame.wall_from_world(vertices)[:, :2].T * frame.gsd_m
         axes.plot(across_m, down_m, color="crimson", linewidth=1.0)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
 from orthoflow.products import Finding, Orthoimage, OrthoMask, SurfaceMask, Wall
 from orthoflow_plugins.inspect.findings import rms
@@ -273,7 +274,7 @@ def _square_errors(
 ) -> NDArray[np.float64]:
     """Mean square error (rows, cols) over the channels of the chosen cells; NaN elsewhere."""
     square = np.full(chosen.shape, np.nan)
-    difference = image.rgb[chosen].astype(np.float64) - true.rgb[chosen]
+    difference = eight_bits(image.rgb[chosen]).astype(np.float64) - true.rgb[chosen]
     square[chosen] = np.mean(difference**2, axis=1)
     return square
 
@@ -285,7 +286,7 @@ def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -
     # Two centimetres is far beyond any fair error; further off is reported as gross colour.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
     greys = np.zeros((2, *known.shape))
-    greys[0][known] = image.rgb[known] @ LUMINANCE
+    greys[0][known] = eight_bits(image.rgb[known]) @ LUMINANCE
     greys[1][known] = true.rgb[known].astype(np.float64) @ LUMINANCE
     return measure_shifts(
         GreyImage(grey=greys[0], valid=painted & known, region=(painted | filled) & known),
@@ -303,10 +304,8 @@ def _gross_colours(image: Orthoimage, true: TrueOrthoimage) -> NDArray[np.bool_]
     window = np.ones((3, 3), dtype=np.uint8)
     low = cv2.erode(np.where(missing, np.float32(np.inf), true.rgb), window)
     high = cv2.dilate(np.where(missing, np.float32(-np.inf), true.rgb), window)
-    outside: NDArray[np.bool_] = np.any(
-        (image.rgb < low - np.float32(_GROSS_GREY)) | (image.rgb > high + np.float32(_GROSS_GREY)),
-        axis=2,
-    )
+    shown, reach = eight_bits(image.rgb), np.float32(_GROSS_GREY)
+    outside: NDArray[np.bool_] = np.any((shown < low - reach) | (shown > high + reach), axis=2)
     return outside
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_webp
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Orthoimage
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def vector_map(
     import cv2
 
     scale = _scale(image)
-    grey = image.rgb.mean(axis=2, dtype=np.float32)
+    grey = eight_bits(image.rgb).mean(axis=2, dtype=np.float32)
     size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
     way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
     pale = 0.5 * np.asarray(cv2.resize(grey, size, interpolation=way)) + 100.0

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Wall
 from orthoflow_plugins.inspect.patches import GreyImage
 
@@ -48,7 +49,7 @@ _LOW, _HIGH = 0.1, 0.9
 def grey_of(image: Orthoimage) -> GreyImage:
     """The grey of what an orthoimage shows, 0 elsewhere."""
     shows = shown(image)
-    grey = np.where(shows, image.rgb @ LUMINANCE, 0.0)
+    grey = np.where(shows, eight_bits(image.rgb) @ LUMINANCE, 0.0)
     return GreyImage(grey=grey, valid=shows, region=shows)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import row_bands
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Layer, LayerMask
 from orthoflow_plugins.mosaic.graph_cut import depth_edges
 
@@ -36,7 +37,7 @@ def displacements_cells(layers: Sequence[Layer]) -> NDArray[np.float64]:
     found = []
     for row, column, first, second in (pairs[place] for place in chosen):
         part = (slice(row, row + PATCH_CELLS), slice(column, column + PATCH_CELLS))
-        patches = [_grey(layers[index].rgb[part]) for index in (first, second)]
+        patches = [_grey(eight_bits(layers[index].rgb[part])) for index in (first, second)]
         if min(float(patch.std()) for patch in patches) < _CONTRAST_LEAST_GREY:
             continue
         shift, response = cv2.phaseCorrelate(patches[0], patches[1], window)
@@ -109,11 +110,12 @@ def seam_steps(source: NDArray[np.int16], layers: Sequence[Layer]) -> SeamSteps:
         other = source[rows + (axis == 0), columns + (axis == 1)]
         for index, layer in enumerate(layers):
             chosen = (other == index) & (layer.mask[rows, columns] == LayerMask.PAINTED)
-            seconds.append(layer.rgb[rows[chosen], columns[chosen]])
+            seconds.append(eight_bits(layer.rgb[rows[chosen], columns[chosen]]))
             first = np.zeros((np.count_nonzero(chosen), 3), dtype=np.uint8)
             for owner, painter in enumerate(layers):
                 is_mine = mine[chosen] == owner
-                first[is_mine] = painter.rgb[rows[chosen][is_mine], columns[chosen][is_mine]]
+                taken = painter.rgb[rows[chosen][is_mine], columns[chosen][is_mine]]
+                first[is_mine] = eight_bits(taken)
             firsts.append(first)
     one, another = np.concatenate(firsts), np.concatenate(seconds)
     grey = (one.astype(np.float64) - another) @ _LUMINANCE

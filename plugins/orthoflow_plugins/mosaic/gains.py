@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import row_bands
+from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Layer, LayerMask
 
 # Overlaps are compared on every so manieth cell: a few thousand colours say what a gain is.
@@ -57,13 +58,13 @@ def estimate_gains(layers: Sequence[Layer]) -> NDArray[np.float64]:
 def _median_log_ratio(first: Layer, second: Layer) -> NDArray[np.float64] | None:
     """Median of log(first / second) per channel in linear light, None without an overlap."""
     both = _sampled_overlap(first.mask, second.mask)
-    one, other = (layer.rgb.reshape(-1, 3)[both] for layer in (first, second))
+    one, other = (eight_bits(layer.rgb.reshape(-1, 3)[both]) for layer in (first, second))
     usable = np.all(
         (np.minimum(one, other) >= _DARKEST) & (np.maximum(one, other) <= _BRIGHTEST), axis=1
     )
     if np.count_nonzero(usable) < _LEAST_SAMPLES:
         return None
-    light = _linear_light()
+    light = _linear_light(256)
     ratio: NDArray[np.float64] = np.median(
         np.log(light[one[usable]]) - np.log(light[other[usable]]), axis=0
     )
@@ -88,17 +89,18 @@ def _sampled_overlap(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDA
     return np.concatenate(found)
 
 
-def _linear_light() -> NDArray[np.float64]:
-    """Light of each of the 256 levels of sRGB (IEC 61966-2-1), 0..1."""
-    level = np.arange(256) / 255.0
+def _linear_light(n_levels: int) -> NDArray[np.float64]:
+    """Light of each of the levels of sRGB (IEC 61966-2-1), 0..1."""
+    level = np.arange(n_levels) / (n_levels - 1.0)
     light: NDArray[np.float64] = np.where(
         level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4
     )
     return light
 
 
-def _with_gain(rgb: NDArray[np.uint8], gain: NDArray[np.float64]) -> NDArray[np.uint8]:
-    light = np.clip(_linear_light()[:, None] * gain, 0.0, 1.0)
+def _with_gain(rgb: Colours, gain: NDArray[np.float64]) -> Colours:
+    highest = np.iinfo(rgb.dtype).max
+    light = np.clip(_linear_light(highest + 1)[:, None] * gain, 0.0, 1.0)
     level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    table = np.rint(255.0 * level).astype(np.uint8)
+    table = np.rint(float(highest) * level).astype(rgb.dtype)
     return np.stack([table[rgb[..., band], band] for band in range(3)], axis=-1)

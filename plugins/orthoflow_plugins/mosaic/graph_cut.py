@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import row_bands
+from orthoflow.geometry.levels import Colours
 from orthoflow.products import Layer, LayerMask, Wall
 
 # Cuts are made on a smaller picture of about so many cells.
@@ -120,6 +121,7 @@ def _reduced(layers: Sequence[Layer], wall: Wall | None, blocks: Blocks) -> _Sce
         [
             np.stack([_raster_means(layer.rgb[..., band], blocks) for band in range(3)], axis=-1)
             / np.maximum(share, 1e-3)[..., None]
+            / np.iinfo(layer.rgb.dtype).max
             for layer, share in zip(layers, painted, strict=True)
         ]
     )
@@ -130,7 +132,7 @@ def _reduced(layers: Sequence[Layer], wall: Wall | None, blocks: Blocks) -> _Sce
     if wall is not None:
         steps = _means(partial(_depth_edges_in, wall.depth_m), blocks)
         edges = np.where(steps > 0.0, _DEPTH_EDGE_COST, 0.0)
-    return _Scene(colours=(colours / 255.0).astype(np.float32), views=views, edges=edges)
+    return _Scene(colours=colours.astype(np.float32), views=views, edges=edges)
 
 
 def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -153,9 +155,7 @@ def _depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.boo
     return beside[rows.start - first :][: rows.stop - rows.start]
 
 
-def _raster_means(
-    raster: NDArray[np.uint8] | NDArray[np.float32], blocks: Blocks
-) -> NDArray[np.float64]:
+def _raster_means(raster: Colours | NDArray[np.float32], blocks: Blocks) -> NDArray[np.float64]:
     return _means(lambda rows: raster[rows], blocks)
 
 

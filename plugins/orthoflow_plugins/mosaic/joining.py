@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Allocate, bands_with_reach, holds_cells
+from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask, Wall
 from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
 
@@ -136,7 +137,9 @@ def joined(
     others = [layer for layer in layers if all(layer is not painter for painter in painters)]
     preferred = preferences(painters, rule, priority=priority, wall=wall) if painters else []
     shape = first.frame.shape
-    rgb = np.asarray(allocate("rgb", (*shape, 3), np.uint8), np.uint8)
+    is_deep = any(layer.rgb.dtype == np.uint16 for layer in layers)
+    level: Level = np.uint16 if is_deep else np.uint8
+    rgb: Colours = np.asarray(allocate("rgb", (*shape, 3), level), level)
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
     reach = _island_reach(island_cells_min)
@@ -147,7 +150,7 @@ def joined(
         source[rows] = choice.source[band.inner]
         for index, layer in enumerate(painters):
             is_mine = source[rows] == index
-            rgb[rows][is_mine] = layer.rgb[rows][is_mine]
+            rgb[rows][is_mine] = in_levels(layer.rgb[rows][is_mine], level)
     return Orthoimage(
         frame=first.frame,
         wall=first.wall,

@@ -16,6 +16,7 @@ from pydantic import Field
 from orthoflow.errors import MethodError
 from orthoflow.files.images import encode_webp
 from orthoflow.geometry.bands import Allocate, count_cells, holds_cells
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import (
     JsonValue,
     Layer,
@@ -288,7 +289,7 @@ def _source_map(image: Orthoimage) -> bytes:
     source = image.source[::step, ::step]
     palette = np.array(list(_COLOURS.values()), dtype=np.float64)
     tint = palette[source % len(palette)]
-    grey = image.rgb[::step, ::step].mean(axis=2, keepdims=True)
+    grey = eight_bits(image.rgb[::step, ::step]).mean(axis=2, keepdims=True)
     picture = np.where(source[..., None] >= 0, _TINT * tint + (1.0 - _TINT) * grey, 0.0)
     picture[is_seam(source)] = 255.0
     return encode_webp(np.rint(picture).astype(np.uint8))

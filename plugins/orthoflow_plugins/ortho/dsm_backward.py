@@ -19,6 +19,7 @@ from orthoflow_plugins.ortho.photos_on_walls import (
     OpenedPhoto,
     PhotosOnWalls,
     VisibilityParams,
+    level_of_all,
     oriented_photos,
     pixels_of,
     shared_profile,
@@ -98,6 +99,7 @@ class DsmBackward(Method):
         from orthoflow_plugins.ortho.surfaces import surfaces_of
 
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
+        level = level_of_all([photo for photo, _ in oriented], ctx)
         hides = params.visibility == "full"
         if not hides:
             ctx.warn("visibility none: cells that a photo cannot see are painted as well")
@@ -114,7 +116,7 @@ class DsmBackward(Method):
         for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
             ctx.progress(place / len(oriented), photo.name)
             started = ctx.clock_s()
-            pixels = pixels_of(photo, camera)
+            pixels = pixels_of(photo, camera, level)
             decoded = ctx.clock_s()
             buffer = depth_buffer_of(occluders, viewer)
             looked = ctx.clock_s()

@@ -17,6 +17,7 @@ from orthoflow_plugins.ortho.photos_on_walls import (
     OpenedPhoto,
     PhotosOnWalls,
     VisibilityParams,
+    level_of_all,
     oriented_photos,
     pixels_of,
     shared_profile,
@@ -75,6 +76,7 @@ class DsmForward(Method):
         from orthoflow_plugins.ortho.surfaces import surfaces_of
 
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
+        level = level_of_all([photo for photo, _ in oriented], ctx)
         viewers = [camera.viewing() for _, camera in oriented]
         seconds: defaultdict[str, float] = defaultdict(float)
         started = ctx.clock_s()
@@ -84,7 +86,7 @@ class DsmForward(Method):
         stack = LayerStack(inputs.walls, surfaces, ctx)
         for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
             ctx.progress(place / len(oriented), photo.name)
-            pixels = pixels_of(photo, camera)
+            pixels = pixels_of(photo, camera, level)
             started = ctx.clock_s()
             buffer = depth_buffer_of(occluders, viewer)
             looked = ctx.clock_s()

@@ -11,6 +11,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.levels import Colours, eight_bits
 from orthoflow.products import Layer, LayerMask
 
 Inpainting = Literal["between", "telea", "navier-stokes", "none"]
@@ -117,7 +118,7 @@ def inpainted(
 
 def painted_between(
     gaps: NDArray[np.int64],
-    rgb: NDArray[np.uint8],
+    rgb: Colours,
     painted: Painted,
     *,
     reach_cells: float,
@@ -127,7 +128,7 @@ def painted_between(
 
     Args:
         gaps: (n,) flat indices of cells that are not painted.
-        rgb: (rows, cols, 3) colours, written in the gaps.
+        rgb: (rows, cols, 3) colours of 8 or 16 bits, written in the gaps.
         painted: which cells are painted.
         reach_cells: gaps without a painted cell so near stay as they are.
         threads: how many threads work.
@@ -185,7 +186,7 @@ def filling_preview(rgb_before: NDArray[np.uint8], layer: Layer) -> bytes:
     is_filled = np.zeros(layer.mask.shape, dtype=bool) if layer.filled is None else layer.filled > 0
     is_shown = layer.mask == LayerMask.PAINTED
     part = _busiest_part(is_filled)
-    before, after = rgb_before[part].copy(), layer.rgb[part].copy()
+    before, after = rgb_before[part].copy(), eight_bits(layer.rgb[part]).copy()
     before[~is_shown[part] | is_filled[part]] = _VOID_RGB
     after[~is_shown[part]] = _VOID_RGB
     pair = [np.repeat(np.repeat(picture, _ZOOM, 0), _ZOOM, 1) for picture in (before, after)]

@@ -139,7 +139,7 @@ class LayerStack:
             frame=surface.frame,
             wall=wall,
             source=NO_SOURCE,
-            rgb=np.zeros((*mask.shape, 3), dtype=np.uint8),
+            rgb=np.zeros((*mask.shape, 3), dtype=self.painted[0].rgb.dtype),
             mask=mask,
             quality=np.zeros(mask.shape, dtype=np.float32),
         )

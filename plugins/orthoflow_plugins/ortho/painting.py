@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import Allocate
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
+from orthoflow.geometry.levels import Colours, level_of
 from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.ortho.painting_kernels import Canvas, hand_over
 from orthoflow_plugins.ortho.sampling import CellFootprint, Resampling, footprint_of, sample
@@ -45,19 +46,19 @@ class Painting:
 
     Attributes:
         mask: (rows, cols) uint8 `LayerMask`.
-        rgb: (rows, cols, 3) uint8, None when nothing was painted.
+        rgb: (rows, cols, 3) in the photo's bits, None when nothing was painted.
         quality: (rows, cols) float32, None when nothing was painted.
         footprints: of the tiles that were painted, by their first cell.
     """
 
     mask: NDArray[np.uint8]
-    rgb: NDArray[np.uint8] | None = None
+    rgb: Colours | None = None
     quality: NDArray[np.float32] | None = None
     footprints: dict[tuple[int, int], CellFootprint] = field(default_factory=dict)
 
 
 def paint(
-    photo: NDArray[np.uint8],
+    photo: Colours,
     view: WallView,
     surface: Surface,
     buffer: DepthBuffer,
@@ -69,7 +70,7 @@ def paint(
     """Lay a photo onto a wall.
 
     Args:
-        photo: (height, width, 3).
+        photo: (height, width, 3), 8 or 16 bits; so is what is painted.
         view: its camera before the wall.
         surface: the wall.
         buffer: what else stands before the camera.
@@ -94,7 +95,7 @@ class _Brush:
 
     def __init__(
         self,
-        photo: NDArray[np.uint8],
+        photo: Colours,
         view: WallView,
         surface: Surface,
         buffer: DepthBuffer,
@@ -177,7 +178,8 @@ class _Brush:
         with self._lock:
             painting, shape = self.painting, self._surface.frame.shape
             if painting.rgb is None or painting.quality is None:
-                painting.rgb = np.asarray(self._allocate("rgb", (*shape, 3), np.uint8), np.uint8)
+                level = level_of(self._photo)
+                painting.rgb = np.asarray(self._allocate("rgb", (*shape, 3), level), level)
                 painting.quality = np.asarray(
                     self._allocate("quality", shape, np.float32), np.float32
                 )

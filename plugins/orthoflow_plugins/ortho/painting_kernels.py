@@ -3,7 +3,8 @@
 Bilinear sampling takes three channels at once, in whole numbers. The channels of a pixel stand 21
 bits apart in one 64-bit number. Weights in 64ths of a pixel along both axes multiply to 12 bits,
 and 8 + 12 bits do not run over into the next channel: four products and three sums give three
-colours, the same ones on every machine. `cv2.remap` takes twice as long.
+colours, the same ones on every machine. `cv2.remap` takes twice as long. Channels of 16 bits do
+not fit into one number; they are mixed one by one, by weights that are not rounded.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.levels import Colours
 from orthoflow_plugins.ortho.views import OCCLUDED, PAINTED, TileVisibility
 
 _STEPS: Final = 64
@@ -113,18 +115,45 @@ def sample_bilinear(
             into[j, 2] = np.uint8((colour >> (_WEIGHT_BITS + _BLUE)) & np.uint64(255))
 
 
+@compiled
+def sample_deep(
+    photo: NDArray[np.uint16],
+    places: tuple[NDArray[np.float32], NDArray[np.float32]],
+    corner: tuple[np.float32, np.float32],
+    patch: Patch,
+    colours: NDArray[np.uint16],
+) -> None:
+    """Do as `sample_bilinear` for (rows, cols, 3) of 16 bits, which are not packed."""
+    us, vs = places
+    last_u, last_v = photo.shape[1] - 1, photo.shape[0] - 1
+    for row in range(patch.n_rows):
+        for j in range(patch.n_columns):
+            u, v = us[patch.row + row, patch.column + j], vs[patch.row + row, patch.column + j]
+            across = min(max(float(u - corner[0]), 0.0), float(last_u))
+            down = min(max(float(v - corner[1]), 0.0), float(last_v))
+            left, upper = int(across), int(down)
+            right, lower = min(left + 1, last_u), min(upper + 1, last_v)
+            across -= left
+            down -= upper
+            for channel in range(3):
+                first, last = float(photo[upper, left, channel]), float(photo[lower, left, channel])
+                above = first + (float(photo[upper, right, channel]) - first) * across
+                below = last + (float(photo[lower, right, channel]) - last) * across
+                colours[row, j, channel] = int(above + (below - above) * down + 0.5)
+
+
 class Canvas(NamedTuple):
     """A layer that is being painted.
 
     Attributes:
         mask: (rows, cols) uint8 states.
         quality: (rows, cols) float32.
-        rgb: (rows, cols, 3) uint8.
+        rgb: (rows, cols, 3) uint8 or uint16.
     """
 
     mask: NDArray[np.uint8]
     quality: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
+    rgb: Colours
 
 
 @compiled

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.files.containers import icc_profile
-from orthoflow.files.images import decode_image
+from orthoflow.files.containers import icc_profile, stated_bits
+from orthoflow.files.images import decode_image, decode_levels
+from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Camera, Cameras, Photo, Photos, PointCloud, Walls
 from orthoflow.sdk import MethodParams, Ports, StepContext
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
     from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
+
+
+_PLAIN_BITS: Final = 8
 
 
 class PhotosOnWalls(Ports):
@@ -65,13 +68,13 @@ class OpenedPhoto:
 
     Attributes:
         name: of the photo.
-        pixels: (height, width, 3) uint8.
+        pixels: (height, width, 3) uint8, or uint16 where a photo of the block is deep.
         viewer: its camera.
         buffer: what stands free before the camera.
     """
 
     name: str
-    pixels: NDArray[np.uint8]
+    pixels: Colours
     viewer: ViewingCamera
     buffer: DepthBuffer
 
@@ -98,20 +101,39 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
     return [(by_name[camera.photo], camera) for camera in posed]
 
 
-def pixels_of(photo: Photo, camera: Camera) -> NDArray[np.uint8]:
-    """Decode a photo (height, width, 3).
+def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
+    """Say in which bits photos are laid onto walls: 16 where any of them has more than 8.
+
+    The others are taken times 257 then, so that white stays white and nothing is lost.
+    """
+    plain = [photo.name for photo in photos if (stated_bits(photo.encoded) or 0) <= _PLAIN_BITS]
+    if len(plain) == len(photos):
+        return np.uint8
+    ctx.log("photos have 16 bits per channel, and so have layers and orthoimages")
+    if plain:
+        names = ", ".join(plain[:3]) + (" ..." if len(plain) > 3 else "")
+        ctx.warn(
+            f"{len(plain)} of {len(photos)} photos ({names}) have 8 bits per channel, the others "
+            "16: the orthoimages have 16, levels of 8 bits are taken times 257"
+        )
+    return np.uint16
+
+
+def pixels_of(photo: Photo, camera: Camera, level: Level) -> Colours:
+    """Decode a photo (height, width, 3) in 8 or 16 bits.
 
     Raises:
         MethodError: the camera belongs to a photo of another size.
     """
-    pixels = decode_image(photo.encoded, photo.name)
+    deep = level is np.uint16
+    pixels = (decode_levels if deep else decode_image)(photo.encoded, photo.name)
     viewing = camera.viewing()
     if pixels.shape[:2] != (viewing.height, viewing.width):
         raise MethodError(
             f"{photo.name} has {pixels.shape[1]} x {pixels.shape[0]} pixels, but its camera "
             f"{viewing.width} x {viewing.height}: wire the photos that were oriented"
         )
-    return pixels
+    return in_levels(pixels, level)
 
 
 def shared_profile(photos: Sequence[Photo], ctx: StepContext) -> bytes | None:

@@ -12,15 +12,21 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.compiling import interpreted
+from orthoflow.geometry.levels import Colours, eight_bits, sixteen_bits
 from orthoflow.geometry.opencv_border import HALF_PIXEL
-from orthoflow_plugins.ortho.painting_kernels import Patch, pack_pixels, sample_bilinear
+from orthoflow_plugins.ortho.painting_kernels import (
+    Patch,
+    pack_pixels,
+    sample_bilinear,
+    sample_deep,
+)
 from orthoflow_plugins.ortho.views import TileVisibility, WallView
 
 Resampling = Literal["nearest", "bilinear", "cubic", "lanczos"]
 
 # Lanczos reaches 4 pixels; more is cut off so that a tile's result does not depend on its crop.
 _REACH_PX: Final = 5
-# Below this a filter changes nothing that 8 bits could show.
+# Below this a filter changes nothing that 8 bits could show, or 16.
 _SIGMA_LEAST_PX: Final = 0.2
 _BASE_CELLS: Final = 4.0
 
@@ -70,26 +76,26 @@ _project: Callable[..., tuple[float, float, float]] = interpreted(project_point)
 
 
 def sample(
-    photo: NDArray[np.uint8],
+    photo: Colours,
     visible: TileVisibility,
     inner: tuple[slice, slice],
     footprint: CellFootprint,
     resampling: Resampling,
     *,
     is_filtered: bool,
-    into: NDArray[np.uint8],
-) -> NDArray[np.uint8]:
+    into: Colours,
+) -> Colours:
     """Colours (rows, cols, 3) of a tile's cells; those of cells that are not painted mean nothing.
 
     Args:
-        photo: (height, width, 3).
+        photo: (height, width, 3), 8 or 16 bits.
         visible: where the cells of the tile and those around it are in the photo; its places are
             used up.
         inner: rows and columns of `visible` that are the tile's.
         footprint: how many pixels a cell covers.
         resampling: `nearest` gives the pixel's own colour and filters nothing.
         is_filtered: average over what a cell covers where the photo is finer than the wall.
-        into: (rows, cols, 3) where to write the colours, which are given back.
+        into: (rows, cols, 3), as deep, where to write the colours, which are given back.
     """
     import cv2
 
@@ -112,26 +118,30 @@ def sample(
             sigmaY=max(sigmas[1], 1e-3),
             borderType=cv2.BORDER_REPLICATE,
         )
-        crop = np.asarray(blurred, dtype=np.uint8)
+        crop = np.asarray(blurred, dtype=crop.dtype)
     half = np.float32(HALF_PIXEL)
     centre = (corner[0] + half, corner[1] + half)
+    patch = Patch(inner[0].start, inner[1].start, into.shape[0], into.shape[1])
+    if resampling == "bilinear" and crop.dtype == np.uint16:
+        places = (visible.u, visible.v)
+        sample_deep(sixteen_bits(crop), places, centre, patch, sixteen_bits(into))
+        return into
     if resampling == "bilinear":
         packed = np.empty((crop.shape[0] + 1, crop.shape[1] + 1), dtype=np.uint64)
-        pack_pixels(crop, packed)
-        patch = Patch(inner[0].start, inner[1].start, into.shape[0], into.shape[1])
-        sample_bilinear(packed, (visible.u, visible.v), centre, patch, into)
+        pack_pixels(eight_bits(crop), packed)
+        sample_bilinear(packed, (visible.u, visible.v), centre, patch, eight_bits(into))
         return into
     return _remapped(crop, visible.u[inner], visible.v[inner], centre, resampling, into)
 
 
 def _remapped(
-    crop: NDArray[np.uint8],
+    crop: Colours,
     u: NDArray[np.float32],
     v: NDArray[np.float32],
     corner: tuple[np.float32, np.float32],
     resampling: Resampling,
-    into: NDArray[np.uint8],
-) -> NDArray[np.uint8]:
+    into: Colours,
+) -> Colours:
     """Colours at places counted from a corner; the places are used up."""
     import cv2
 
@@ -143,12 +153,12 @@ def _remapped(
     u -= corner[0]
     v -= corner[1]
     flag, border = flags[resampling], cv2.BORDER_REPLICATE
-    return np.asarray(cv2.remap(crop, u, v, flag, dst=into, borderMode=border), dtype=np.uint8)
+    return np.asarray(cv2.remap(crop, u, v, flag, dst=into, borderMode=border), dtype=into.dtype)
 
 
 def _crop(
-    photo: NDArray[np.uint8], visible: TileVisibility, *, reach: int
-) -> tuple[NDArray[np.uint8], tuple[np.float32, np.float32]]:
+    photo: Colours, visible: TileVisibility, *, reach: int
+) -> tuple[Colours, tuple[np.float32, np.float32]]:
     """The part of a photo that a tile needs, and its first column and row."""
     u_least, u_most, v_least, v_most = (math.floor(value) for value in visible.summary[:4])
     first_column, first_row = max(0, u_least - reach), max(0, v_least - reach)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import InputError
@@ -19,6 +18,7 @@ from orthoflow.files.sidecars import (
     shown_value,
     sidecar_of,
 )
+from orthoflow.geometry.levels import Colours, level_of
 from orthoflow.products import InputFiles, Orthoimage, Orthoimages, OrthoMask
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 
@@ -36,7 +36,7 @@ class ReadOrthoimage(Method):
     """
 
     id: ClassVar[str] = "read.orthoimage"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism = "exact"
     metrics = (
         "n_orthoimages",
@@ -113,7 +113,7 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
         frame=frame,
         wall=said,
         name=str(place.get("name", path.stem)),
-        rgb=np.where(shown[..., None], rgb, np.uint8(0)),
+        rgb=np.where(shown[..., None], rgb, level_of(rgb)(0)),
         mask=np.where(shown, OrthoMask.PAINTED, OrthoMask.NONE).astype(np.uint8),
         source=np.where(shown, 0, -1).astype(np.int16),
         sources=(path.name,),
@@ -135,8 +135,8 @@ def _place(path: Path, among: Sequence[Path], raster: RasterFile) -> dict[str, o
     )
 
 
-def _rgb(path: Path, raster: RasterFile) -> NDArray[np.uint8]:
-    """Colours (rows, cols, 3); a fourth band is transparency, 16 bits become 8."""
+def _rgb(path: Path, raster: RasterFile) -> Colours:
+    """Colours (rows, cols, 3) of 8 or 16 bits; a fourth band is transparency."""
     values = raster.values
     bands = values[..., None] if values.ndim == 2 else values
     if bands.shape[2] not in (1, 3, 4) or bands.dtype not in (np.uint8, np.uint16):
@@ -145,6 +145,5 @@ def _rgb(path: Path, raster: RasterFile) -> NDArray[np.uint8]:
             "of 8 or 16 bits"
         )
     colours = np.repeat(bands, 3, axis=2) if bands.shape[2] == 1 else bands[..., :3]
-    if colours.dtype == np.uint16:
-        return np.rint(colours.astype(np.float64) / 257.0).astype(np.uint8)
-    return np.ascontiguousarray(colours).astype(np.uint8)
+    level = np.uint16 if colours.dtype == np.uint16 else np.uint8
+    return np.ascontiguousarray(colours).astype(level)

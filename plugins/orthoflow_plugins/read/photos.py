@@ -17,8 +17,9 @@ from orthoflow.files.containers import image_format, is_cut_off, stated_bits
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57Image, read_e57_images
 from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
-from orthoflow.files.images import decode_image
+from orthoflow.files.images import decode_image, decode_levels
 from orthoflow.files.panoramas import PanoramaFace, faces_of
+from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Calibration, InputFiles, Intrinsics, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.figures import ContactSheet
@@ -28,8 +29,9 @@ _RAW: Final = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef"}
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
-# Bits per channel that orthoimages have.
-_BITS: Final = 8
+# Bits per channel that orthoimages can have.
+_BITS: Final = 16
+_PLAIN_BITS: Final = 8
 _SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"})
 _NAMED: Final = 3
 
@@ -175,11 +177,12 @@ def _sources(ctx: StepContext, files: InputFiles, panoramas: Sequence[str]) -> l
             sources += _inside_e57(path)
         else:
             others.append(path.name)
+    _refuse_raw(files.name, [source.name for source in sources], others)
     if not sources:
         raise InputError(
             f"the input {files.name} holds no photo, only {len(others)} other files: "
-            f"{_names(others)}; expected JPEG, PNG or TIFF (.jpg, .png, .tif), so develop raw and "
-            "HEIC photos first"
+            f"{_names(others)}; expected JPEG, PNG or TIFF (.jpg, .png, .tif), so convert HEIC "
+            "photos first"
         )
     counts = Counter(source.name for source in sources)
     twice = sorted(name for name, count in counts.items() if count > 1)
@@ -193,18 +196,27 @@ def _sources(ctx: StepContext, files: InputFiles, panoramas: Sequence[str]) -> l
             f"{len(others)} of {len(files.paths)} files of the input {files.name} are no JPEG, "
             f"PNG or TIFF and were left out: {_names(others)}"
         )
-    developed = {Path(source.name).stem.lower() for source in sources}
+    return sorted(sources, key=lambda source: source.name)
+
+
+def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -> None:
+    """Refuse camera raw that nobody has developed: what is meant to be used must not be left out.
+
+    Raises:
+        InputError: there is some, without a photo of the same name.
+    """
+    developed = {Path(name).stem.lower() for name in photos}
     raw = [
         name
         for name in others
         if Path(name).suffix.lower() in _RAW and Path(name).stem.lower() not in developed
     ]
     if raw:
-        ctx.warn(
-            f"{_counted(raw)}: camera raw, which is not read: develop it to TIFF or JPEG first, "
-            "without lens corrections, so that the calibration holds"
+        raise InputError(
+            f"the input {input_name} holds camera raw, which is not read: {_counted(raw)}; develop "
+            "to TIFF of 16 bits or JPEG first, without lens corrections, so that a calibration "
+            "holds, or name the photos without it, e.g. 'FOLDER/*.jpg'"
         )
-    return sorted(sources, key=lambda source: source.name)
 
 
 def _calibration(files: InputFiles | None) -> Calibration | None:
@@ -241,8 +253,9 @@ def _read_photo(
 ) -> _ReadPhoto:
     name, encoded = source.name, source.encoded()
     _require_whole(name, encoded)
-    image = decode_image(encoded, f"photo {name}")
-    height, width = image.shape[:2]
+    is_deep = (stated_bits(encoded) or 0) > _PLAIN_BITS
+    pixels = (decode_levels if is_deep else decode_image)(encoded, f"photo {name}")
+    height, width = pixels.shape[:2]
     exif = read_exif(encoded)
     focal = focal_length(exif, width, height)
     intrinsics = source.lens
@@ -262,13 +275,16 @@ def _read_photo(
         exif_focal_px=focal.value_px,
         intrinsics=intrinsics,
     )
-    sheet.add(name, image)
+    sheet.add(name, eight_bits(pixels))
     return _ReadPhoto(photo=photo, exif=exif, focal=focal)
 
 
 def _described(read: _ReadPhoto) -> str:
     photo, exif, focal = read.photo, read.exif, read.focal
     parts = [f"{photo.name}: {photo.width} x {photo.height}"]
+    bits = stated_bits(photo.encoded)
+    if bits is not None and bits != _PLAIN_BITS:
+        parts.append(f"{bits} bits per channel")
     if exif.camera:
         parts.append(exif.camera)
     if exif.orientation != 1:
@@ -285,7 +301,9 @@ def _described(read: _ReadPhoto) -> str:
 def _warn(ctx: StepContext, read: Sequence[_ReadPhoto], calibration: Calibration | None) -> None:
     deep = [item.photo.name for item in read if (stated_bits(item.photo.encoded) or 0) > _BITS]
     if deep:
-        ctx.warn(f"{_counted(deep)}: more than {_BITS} bits per channel, of which {_BITS} are used")
+        ctx.warn(
+            f"{_counted(deep)}: more than {_BITS} bits per channel, of which {_PLAIN_BITS} are used"
+        )
     damaged = [item.photo.name for item in read if item.exif.is_damaged]
     if damaged:
         ctx.warn(f"the EXIF data of {_counted(damaged)} are damaged; what is readable was taken")

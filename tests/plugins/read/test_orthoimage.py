@@ -120,7 +120,7 @@ def test_sixteen_bits_and_nodata_are_understood(tmp_path: Path) -> None:
     (found,) = read(tmp_path, image, place)
     assert found.mask.sum() == 19
     assert found.source[0, 0] == -1
-    assert (found.rgb[1:] == 100).all()
+    assert (found.rgb[1:] == 25700).all()
 
 
 def test_what_cannot_be_placed_says_why(tmp_path: Path) -> None:

@@ -7,10 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rasterio
 from orthoflow_plugins.read.photos import ReadPhotos
+from rasterio.transform import Affine
 
 from orthoflow.errors import CancelledStepError, InputError
-from orthoflow.files.images import decode_image, encode_jpeg, encode_png
+from orthoflow.files.images import decode_image, decode_levels, encode_jpeg, encode_png
 from orthoflow.products import InputFiles, Photo
 from orthoflow.sdk import StepContext
 from tests import photo_files as made
@@ -178,29 +180,35 @@ def test_other_files_are_left_out_and_counted(tmp_path: Path, read: Reader) -> N
         "a.jpg": photo,
         "a.jpg.camera": b"1",
         "Thumbs.db": b"\xd0\xcf",
-        "b.CR2": b"II*\0",
+        "a.CR2": b"II*\0",
         "K.txt": b"",
     }
     assert [item.name for item in read(*made.write(tmp_path, files))] == ["a.jpg"]
     assert (
         "4 of 5 files of the input photos are no JPEG, PNG or TIFF and were left out: "
-        "a.jpg.camera, Thumbs.db, b.CR2 ..." in read.warnings
+        "a.jpg.camera, Thumbs.db, a.CR2 ..." in read.warnings
     )
 
 
-def test_raw_photos_that_nobody_developed_are_named_with_the_way_out(
-    tmp_path: Path, read: Reader
+@pytest.mark.parametrize("developed", [{}, {"a.jpg": encode_jpeg(made.picture())}])
+@pytest.mark.parametrize("suffix", [".CR2", ".nef", ".arw", ".DNG"])
+def test_raw_photos_that_nobody_developed_are_refused_with_the_way_out(
+    tmp_path: Path, read: Reader, developed: dict[str, bytes], suffix: str
 ) -> None:
-    photo = encode_jpeg(made.picture())
-    read(*made.write(tmp_path, {"a.jpg": photo, "A.CR2": b"II*\0", "b.nef": b"MM\0*"}))
-    assert (
-        "photo b.nef: camera raw, which is not read: develop it to TIFF or JPEG first, without "
-        "lens corrections, so that the calibration holds" in read.warnings
+    # Beside its own JPEG a raw photo does no harm.
+    paths = made.write(tmp_path, {**developed, "A.CR2": b"II*\0", f"b{suffix}": b"MM\0*"})
+    raw = f"photo b{suffix}" if developed else rf"2 photos (A.CR2, b{suffix})"
+    with pytest.raises(InputError) as refused:
+        read(*paths)
+    assert str(refused.value) == (
+        f"the input photos holds camera raw, which is not read: {raw}; develop to TIFF of 16 bits "
+        "or JPEG first, without lens corrections, so that a calibration holds, or name the photos "
+        "without it, e.g. 'FOLDER/*.jpg'"
     )
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_photos_of_sixteen_bits_are_told_to_be_used_with_eight(
+def test_photos_of_sixteen_bits_are_kept_and_not_warned_of(
     tmp_path: Path, read: Reader, suffix: str
 ) -> None:
     picture = made.picture()
@@ -208,9 +216,36 @@ def test_photos_of_sixteen_bits_are_told_to_be_used_with_eight(
         done, encoded = cv2.imencode(suffix, values)
         assert done
         (tmp_path / f"{name}{suffix}").write_bytes(encoded.tobytes())
-    read(tmp_path / f"deep{suffix}", tmp_path / f"plain{suffix}")
-    said = f"photo deep{suffix}: more than 8 bits per channel, of which 8 are used"
-    assert said in read.warnings
+    deep, plain = read(tmp_path / f"deep{suffix}", tmp_path / f"plain{suffix}")
+    assert not any("bits" in warning for warning in read.warnings)
+    np.testing.assert_array_equal(
+        decode_levels(deep.encoded), decode_levels(plain.encoded).astype(np.uint16) * 257
+    )
+    assert decode_levels(plain.encoded).dtype == np.uint8
+
+
+def test_sixteen_bits_in_separate_planes_are_refused_where_they_decode_as_noise(
+    tmp_path: Path, read: Reader
+) -> None:
+    deep = np.random.default_rng(1).integers(0, 65536, (3, 40, 60)).astype(np.uint16)
+    for interleave in ("pixel", "band"):
+        with rasterio.open(
+            tmp_path / f"{interleave}.tif",
+            "w",
+            driver="GTiff",
+            height=40,
+            width=60,
+            count=3,
+            dtype="uint16",
+            photometric="RGB",
+            interleave=interleave,
+            transform=Affine.scale(0.5),
+        ) as file:
+            file.write(deep)
+    (photo,) = read(tmp_path / "pixel.tif")
+    np.testing.assert_array_equal(decode_levels(photo.encoded), np.moveaxis(deep, 0, 2))
+    with pytest.raises(InputError, match=r"photo band\.tif has 16 bits .* interleaved channels"):
+        read(tmp_path / "band.tif")
 
 
 def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: Reader) -> None:
@@ -218,7 +253,7 @@ def test_an_input_without_a_photo_is_refused(tmp_path: Path, read: Reader) -> No
     with pytest.raises(
         InputError,
         match=r"the input photos holds no photo, only 2 other files: a\.heic, b\.txt; expected "
-        r"JPEG, PNG or TIFF \(\.jpg, \.png, \.tif\), so develop raw and HEIC photos first",
+        r"JPEG, PNG or TIFF \(\.jpg, \.png, \.tif\), so convert HEIC photos first",
     ):
         read(*paths)
     with pytest.raises(InputError, match="the input photos names no files: expected photos"):

@@ -1,0 +1,174 @@
+"""Photos of 16 bits: what their pixels hold comes to the GeoTIFF as it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from numpy.typing import NDArray
+from orthoflow_plugins.mosaic.seams import MosaicSeams
+from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.ortho.dsm_forward import DsmForward
+
+from orthoflow.files.images import encode_png
+from orthoflow.files.publishing import publish_layers, publish_orthoimages
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.levels import sixteen_bits
+from orthoflow.products import LayerMask, Layers, Orthoimages, OrthoMask, Photos
+from orthoflow.sdk import StepContext
+from tests import ortho_scenes as scenes
+from tests.raster_scenes import context
+
+SIDE_PX = (1000, 800)
+
+
+def ramp() -> NDArray[np.uint16]:
+    """Red grows by 60 levels per column, green by 80 per row; blue is odd, in its lowest bits."""
+    rows, columns = np.mgrid[: SIDE_PX[1], : SIDE_PX[0]]
+    deep = np.dstack([60 * columns + 7, 80 * rows + 11, np.full_like(rows, 12345)])
+    return deep.astype(np.uint16)
+
+
+def deep_photos(*pictures: NDArray[np.uint16] | NDArray[np.uint8]) -> Photos:
+    plain = scenes.photos(*(np.zeros((*picture.shape[:2], 3), np.uint8) for picture in pictures))
+    return Photos(
+        photos=tuple(
+            dataclasses.replace(photo, encoded=encode_png(picture))
+            for photo, picture in zip(plain.photos, pictures, strict=True)
+        )
+    )
+
+
+def laid(ctx: StepContext, photos: Photos, *viewers: ViewingCamera, **params: object) -> Layers:
+    where = scenes.frame()
+    inputs = DsmBackward.In(
+        walls=scenes.walls(where),
+        photos=photos,
+        cameras=scenes.cameras(*viewers),
+        cloud=scenes.cloud(where),
+    )
+    return DsmBackward().run(inputs, DsmBackward.Params.model_validate(params), ctx).layers
+
+
+def joined(folder: Path, layers: Layers, **params: object) -> tuple[Orthoimages, StepContext]:
+    (folder / "mosaic").mkdir()
+    ctx = context(folder / "mosaic")
+    inputs = MosaicSeams.In(layers=layers, walls=None)
+    made = MosaicSeams().run(inputs, MosaicSeams.Params.model_validate(params), ctx)
+    return made.orthoimages, ctx
+
+
+def seen_at(viewer: ViewingCamera) -> NDArray[np.float64]:
+    """Photo places (rows, cols, 2) of the cells of the wall."""
+    rows, columns = np.mgrid[: scenes.SHAPE[0], : scenes.SHAPE[1]] + 0.5
+    places = np.column_stack([columns.ravel(), rows.ravel()])
+    depths = scenes.depth_m().ravel().astype(np.float64)
+    points = scenes.frame().world_from_wall(places, depths)
+    return viewer.project(points)[:, :2].reshape(*scenes.SHAPE, 2)
+
+
+def test_nearest_brings_the_exact_levels_into_the_geotiff(tmp_path: Path) -> None:
+    viewer = scenes.camera(scenes.frame())
+    layers = laid(context(tmp_path), deep_photos(ramp()), viewer, resampling="nearest")
+    images, _ = joined(tmp_path, layers)
+    publish_orthoimages(images, tmp_path, "sha256:0")
+    publish_layers(layers, tmp_path, "sha256:0")
+    (image,) = images.images
+    shown = image.mask == OrthoMask.PAINTED
+    u, v = np.floor(seen_at(viewer)[shown]).astype(int).T
+    for name in ("wall_0_ortho", "wall_0_layer_0_0"):
+        with rasterio.open(tmp_path / f"{name}.tif") as file:
+            assert file.dtypes == ("uint16",) * 3
+            written = np.moveaxis(file.read(), 0, 2)
+            assert (file.dataset_mask()[shown] == 255).all()
+        # The photo's own pixels, all but those between two of which a rounding decides.
+        same = (written[shown] == ramp()[v, u]).all(axis=1)
+        assert same.mean() > 0.999
+        assert np.isin(written[shown][:, 0], ramp()[0, :, 0]).all()
+        assert np.isin(written[shown][:, 1], ramp()[:, 0, 1]).all()
+        assert len(np.unique(written[..., 1])) > 256
+        assert json.loads((tmp_path / f"{name}.json").read_text())["bits"] == 16
+
+
+@pytest.mark.parametrize("resampling", ["bilinear", "cubic", "lanczos"])
+def test_between_pixels_a_ramp_stays_a_ramp(tmp_path: Path, resampling: str) -> None:
+    viewer = scenes.camera(scenes.frame())
+    (layer,) = laid(
+        context(tmp_path), deep_photos(ramp()), viewer, resampling=resampling, antialias=False
+    ).layers
+    shown = layer.mask == LayerMask.PAINTED
+    u, v = seen_at(viewer)[shown].T
+    expected = np.column_stack([60 * (u - 0.5) + 7, 80 * (v - 0.5) + 11])
+    off = np.abs(layer.rgb[shown][:, :2] - expected)
+    # Places are good to a fiftieth of a pixel; OpenCV rounds them to a thirty-second.
+    assert off.max() <= 80 * (1 / 50 if resampling == "bilinear" else 1 / 50 + 1 / 32) + 1
+    assert (layer.rgb[shown][:, 2] == 12345).mean() > 0.99
+
+
+def test_averages_over_cells_keep_sixteen_bits(tmp_path: Path) -> None:
+    where = scenes.frame()
+    viewer = scenes.camera(where, width=3000)
+    rows, columns = np.mgrid[: viewer.height, : viewer.width]
+    deep = np.dstack([20 * columns, 25 * rows, 0 * rows + 999]).astype(np.uint16)
+    (layer,) = laid(context(tmp_path), deep_photos(deep), viewer).layers
+    shown = layer.mask == LayerMask.PAINTED
+    u, v = seen_at(viewer)[shown].T
+    off = np.abs(layer.rgb[shown][:, :2] - np.column_stack([20 * (u - 0.5), 25 * (v - 0.5)]))
+    inner = (u > 30) & (v > 30) & (u < viewer.width - 30) & (v < viewer.height - 30)
+    assert off[inner].max() <= 3.0
+    assert len(np.unique(layer.rgb[shown][:, 1])) > 5000
+
+
+def test_forward_paints_the_photos_own_levels(tmp_path: Path) -> None:
+    where = scenes.frame()
+    inputs = DsmForward.In(
+        walls=scenes.walls(where),
+        photos=deep_photos(ramp()),
+        cameras=scenes.cameras(scenes.camera(where)),
+        cloud=scenes.cloud(where),
+    )
+    (layer,) = DsmForward().run(inputs, DsmForward.Params(), context(tmp_path)).layers.layers
+    assert layer.rgb.dtype == np.uint16
+    assert layer.filled is not None
+    own = (layer.mask == LayerMask.PAINTED) & (layer.filled == 0)
+    assert np.isin(layer.rgb[own][:, 0], ramp()[0, :, 0]).all()
+    filled = layer.filled > 0
+    assert filled.any()
+    # What is filled lies between its neighbours, in their levels.
+    assert (np.abs(layer.rgb[filled][:, 2].astype(int) - 12345) <= 1).all()
+
+
+def test_a_block_of_both_depths_has_sixteen_bits_and_says_so(tmp_path: Path) -> None:
+    where, ctx = scenes.frame(), context(tmp_path)
+    viewers = [scenes.camera(where, aside_m=aside) for aside in (-0.7, 0.7)]
+    plain = scenes.rendered(aside_m=0.7)
+    layers = laid(ctx, deep_photos(ramp(), plain), *viewers, resampling="nearest")
+    (tmp_path / "alone").mkdir()
+    alone = laid(context(tmp_path / "alone"), deep_photos(plain), viewers[1], resampling="nearest")
+    assert [layer.rgb.dtype for layer in layers.layers] == [np.uint16, np.uint16]
+    assert alone.layers[0].rgb.dtype == np.uint8
+    np.testing.assert_array_equal(layers.layers[1].rgb, sixteen_bits(alone.layers[0].rgb))
+    assert (
+        "1 of 2 photos (1.png) have 8 bits per channel, the others 16: the orthoimages have 16, "
+        "levels of 8 bits are taken times 257" in ctx.warnings
+    )
+    images, _ = joined(tmp_path, layers, seams="graph-cut")
+    assert images.images[0].rgb.dtype == np.uint16
+
+
+def test_gains_keep_sixteen_bits(tmp_path: Path) -> None:
+    where = scenes.frame()
+    viewers = [scenes.camera(where, aside_m=aside) for aside in (-0.3, 0.3)]
+    columns = np.broadcast_to(np.arange(SIDE_PX[0]), SIDE_PX[::-1])
+    light = np.dstack([20000 + 20 * columns] * 3).astype(np.uint16)
+    dark = (light * 0.8).astype(np.uint16)
+    layers = laid(context(tmp_path), deep_photos(light, dark), *viewers)
+    images, ctx = joined(tmp_path, layers, gains="global")
+    assert len(np.unique(images.images[0].rgb)) > 3000
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    assert metrics["gain_min"] < 0.95
+    assert metrics["gain_max"] > 1.05
