@@ -248,6 +248,7 @@ def test_orthoimages_are_told_completely(
         "wall": 7,
         "name": "north",
         "sources": ["a.jpg", "b.jpg"],
+        "bits": 8,
         "mask": {
             "0": "none: no source covers this cell",
             "1": "painted: a source shows this cell",
