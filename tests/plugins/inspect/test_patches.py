@@ -1,10 +1,13 @@
-"""Parts of pictures that are compared."""
+"""Parts of pictures that are compared, and how far they lie off each other."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.inspect import patches
 from orthoflow_plugins.inspect.patches import GreyImage
+from scipy.ndimage import gaussian_filter, shift
 
 ROWS, COLUMNS = 9, 12
 
@@ -26,3 +29,140 @@ def test_a_square_is_cut_and_is_not_valid_beyond_the_border(corner: tuple[int, i
             assert part.grey[row, column] == (whole.grey[v, u] if inside else 0.0)
             assert part.valid[row, column] == (inside and whole.valid[v, u])
     np.testing.assert_array_equal(part.region, part.valid)
+
+
+def texture(seed: int = 1, side: int = 130) -> NDArray[np.float64]:
+    smooth = gaussian_filter(np.random.default_rng(seed).normal(size=(side, side)), 1.5)
+    return np.asarray(128.0 + 30.0 * smooth / smooth.std())
+
+
+def image(grey: NDArray[np.float64], valid: NDArray[np.bool_] | None = None) -> GreyImage:
+    everywhere = np.ones(grey.shape, dtype=np.bool_)
+    return GreyImage(grey=grey, valid=everywhere if valid is None else valid, region=everywhere)
+
+
+def moved(grey: NDArray[np.float64], right: float, down: float) -> NDArray[np.float64]:
+    return np.asarray(shift(grey, (down, right), order=3, mode="nearest"))
+
+
+def test_the_fullest_tile_is_the_one_with_most_cells_that_count() -> None:
+    valid = np.zeros((5, 7), dtype=np.bool_)
+    valid[3:, 4:6] = True
+    valid[0, :2] = True
+    grey = np.arange(35.0).reshape(5, 7)
+    part = image(grey, valid).fullest_part(3)
+    np.testing.assert_array_equal(part.grey, grey[3:, 3:6])
+    np.testing.assert_array_equal(part.valid, valid[3:, 3:6])
+    assert image(grey, valid).fullest_part(7).grey.shape == (5, 7)
+
+
+@pytest.mark.parametrize("apart", [(0.0, 0.0), (1.3, -2.6), (-3.0, 3.75)])
+def test_a_displacement_is_measured_in_every_whole_patch(apart: tuple[float, float]) -> None:
+    true = texture()
+    found = patches.measure_shifts(image(moved(true, *apart)), image(true), reach_cells=5)
+    # Four by four patches of 32 cells in 130; two cells are left over.
+    centres = [[32 * c + 16.0, 32 * r + 16.0] for r in range(4) for c in range(4)]
+    assert found.centre.tolist() == centres
+    np.testing.assert_allclose(found.shift, np.tile(apart, (16, 1)), atol=0.03)
+    assert (np.abs(found.found - apart) <= 0.51).all()
+    assert (found.sigma < 0.15).all()
+    assert (found.correlation > 0.98).all()
+
+
+def test_a_brighter_image_is_displaced_alike() -> None:
+    true = texture()
+    found = patches.measure_shifts(image(moved(true, 0.4, 0.0) + 12.0), image(true), reach_cells=2)
+    np.testing.assert_allclose(found.shift.mean(axis=0), [0.4, 0.0], atol=0.02)
+
+
+@pytest.mark.parametrize(("n_columns", "is_measured"), [(13, True), (6, False)])
+def test_three_tenths_of_a_patch_must_count(n_columns: int, is_measured: bool) -> None:
+    valid = np.zeros((130, 130), dtype=np.bool_)
+    valid[:32, :n_columns] = True
+    true = texture()
+    found = patches.measure_shifts(image(true, valid), image(true), reach_cells=1)
+    assert len(found.centre) == int(is_measured)
+
+
+def test_patches_without_texture_in_both_directions_are_left_out() -> None:
+    noises = 4.0 * np.random.default_rng(3).normal(size=(2, 64, 64))
+    stripes = np.tile(128.0 + 40.0 * np.sin(np.arange(64) / 2.0), (64, 1))
+    for grey in (np.full((64, 64), 128.0), stripes):
+        one, other = (image(grey + noise) for noise in noises)
+        assert len(patches.measure_shifts(one, other, reach_cells=2).centre) == 0
+
+
+def test_what_strays_by_two_cells_from_its_start_is_left_out() -> None:
+    true = texture()
+    start = patches.unrefined(
+        np.array([[40.0, 40.0], [80.0, 40.0]]), np.array([[1.0, 0.0], [6.0, 0.0]])
+    )
+    found = patches.refine_shifts(
+        image(moved(true, 1.8, 0.0)), image(true), start, sigma_most_cells=0.5
+    )
+    assert found.centre.tolist() == [[40.0, 40.0]]
+    np.testing.assert_allclose(found.shift, [[1.8, 0.0]], atol=0.03)
+    np.testing.assert_array_equal(found.found, [[1.0, 0.0]])
+    noisy = image(true + np.random.default_rng(6).normal(size=true.shape))
+    none = patches.refine_shifts(noisy, image(true), start, sigma_most_cells=1e-4)
+    assert len(none.centre) == 0
+    empty = patches.unrefined(np.zeros((0, 2)), np.zeros((0, 2)))
+    assert patches.refine_shifts(image(true), image(true), empty, sigma_most_cells=1.0) is empty
+
+
+def test_cells_are_counted_in_whole_patches() -> None:
+    mask = np.zeros((70, 100), dtype=np.bool_)
+    mask[31:33, 63:65] = True
+    mask[64:], mask[:, 96:] = True, True
+    assert patches._patch_counts(mask).tolist() == [[0, 1, 1], [0, 1, 1]]
+
+
+def test_windows_have_their_rim_around_them() -> None:
+    values = np.arange(70 * 70).reshape(70, 70)
+    row, column = np.array([0, 1]), np.array([1, 0])
+    windows = patches._windows(values, row, column, 3)
+    assert windows.shape == (2, 38, 38)
+    np.testing.assert_array_equal(windows[0], values[:38, 32:70])
+    np.testing.assert_array_equal(windows[1], values[32:70, :38])
+
+
+@pytest.mark.parametrize("part", [0.0, 0.25, 0.8])
+def test_spline_weights_keep_straight_lines_and_their_slopes(part: float) -> None:
+    value, slope = patches._spline_weights(np.array([part]))[:, 0]
+    at = np.array([-1.0, 0.0, 1.0, 2.0])
+    assert value.sum() == pytest.approx(1.0)
+    assert value @ at == pytest.approx(part)
+    assert slope.sum() == pytest.approx(0.0, abs=1e-12)
+    assert slope @ at == pytest.approx(1.0)
+    # The slope is the derivative of the value.
+    step = 1e-6
+    after = patches._spline_weights(np.array([part + step]))[0, 0]
+    np.testing.assert_allclose(slope, (after - value) / step, atol=1e-5)
+
+
+def test_patches_correlate_by_their_weights() -> None:
+    rng = np.random.default_rng(5)
+    first, second = rng.normal(size=(2, 3, 50))
+    weight = np.ones((3, 50))
+    weight[1, 25:] = 0.0
+    second[1, :25] = 5.0 - 2.0 * first[1, :25]
+    second[2] = 3.0 * first[2] + 1.0
+    found = patches._correlations(first, second, weight)
+    assert found[0] == pytest.approx(np.corrcoef(first[0], second[0])[0, 1])
+    np.testing.assert_allclose(found[1:], [-1.0, 1.0], atol=1e-9)
+
+
+def test_smoothing_leaves_rims_out_and_holes_do_no_harm() -> None:
+    grey = np.tile(np.arange(40.0), (40, 1))
+    valid = np.ones((40, 40), dtype=np.bool_)
+    valid[20, 20] = False
+    region = np.ones((40, 40), dtype=np.bool_)
+    region[:, 30:] = False
+    smooth = patches._smoothed(GreyImage(grey=grey, valid=valid & region, region=region))
+    # A ramp stays one inside; the cell beside the rim leans over it.
+    np.testing.assert_allclose(smooth.grey[10, 5:25], grey[10, 5:25], atol=1e-6)
+    assert smooth.grey[20, 21] == pytest.approx(21.0, abs=0.2)
+    assert not smooth.valid[20, 20]
+    assert smooth.valid[20, 19]
+    assert smooth.valid[10, 28]
+    assert not smooth.valid[10, 29:].any()
