@@ -206,19 +206,20 @@ def _export_embedded(run: Run, folder: Path, chosen: _Choices) -> str:
 def _export_split(run: Run, folder: Path, chosen: _Choices) -> str:
     from orthoflow.engine import Store
     from orthoflow.records import REPORT_FILE
-    from orthoflow.records.datasets import datasets_of, write_dataset
+    from orthoflow.records.datasets import parts_of, write_part
+    from orthoflow.records.run_files import path_inside
     from orthoflow.report import write_page
 
-    names = datasets_of(run)
-    if not names:
+    parts = parts_of(run)
+    if not parts:
         raise ArgumentError(
             f"the run {run.record.run_id} ran on no datasets, so there is nothing to split"
         )
     _make_empty(folder)
-    for name in names:
-        part = write_dataset(run, name, folder, Store(chosen.store))
-        write_page(part, part.folder / REPORT_FILE)
-    return f"{counted(len(names), 'run folder')}: {', '.join(names)}"
+    for name, part in parts.items():
+        written = write_part(part, path_inside(folder, name), Store(chosen.store))
+        write_page(written, written.folder / REPORT_FILE)
+    return f"{counted(len(parts), 'run folder')}: {', '.join(parts)}"
 
 
 def _embedded(run: Run, folder: Path, chosen: _Choices) -> Run:

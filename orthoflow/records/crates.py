@@ -24,6 +24,7 @@ from orthoflow.records.crate_entities import (
     ref,
     refs,
 )
+from orthoflow.records.datasets import pages_of
 from orthoflow.records.published import METRICS_FILE, PRODUCTS_FOLDER
 from orthoflow.records.run_files import copy_files, creating, path_inside
 from orthoflow.records.runs import REPORT_FILE, Run
@@ -102,7 +103,7 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
     if record.path != folder / RECORD_FILE:
         with writing_to(folder):
             shutil.copyfile(record.path, folder / RECORD_FILE)
-    wanted = [REPORT_FILE]
+    wanted = [REPORT_FILE, *pages_of(run).values()]
     if record is run and run.path.name == RECORD_FILE:
         wanted.append(f"{RECORD_FILE}{SIGNATURE_SUFFIX}")
     wanted += [

@@ -4,97 +4,112 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from orthoflow_provenance.errors import InputFileError, RecordFormatError
-from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.model import PublishedFile, RecordedCell, RunRecord
 from orthoflow_provenance.writer import write_record
 
+from orthoflow.catalog import NAME_PATTERN
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.run_folder import RECORD_FILE, cell_file_name
 from orthoflow.engine.store import Store
-from orthoflow.errors import ArgumentError, StoreError
+from orthoflow.errors import StoreError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue
 from orthoflow.records.input_files import embedded_inputs
 from orthoflow.records.published import PRODUCTS_FOLDER
-from orthoflow.records.run_files import copy_files, path_inside
-from orthoflow.records.runs import Run
+from orthoflow.records.run_files import copy_files
+from orthoflow.records.runs import PAGES_FOLDER, Run
 from orthoflow.workflow.format import DATA
 
 _DATASETS = "datasets"
 
 
 def datasets_of(run: Run) -> tuple[str, ...]:
-    """Names of the datasets that a run has cells of, in their order; none of most runs."""
+    """Names of the datasets that a run has cells of, in their order; none of most runs.
+
+    What cannot be a name is left out: folders and pages are called after them.
+    """
     if not _resolved(run).get(_DATASETS):
         return ()
-    return tuple(
-        dict.fromkeys(cell.assignment[DATA] for cell in run.record.cells if DATA in cell.assignment)
-    )
+    named = (cell.assignment[DATA] for cell in run.record.cells if DATA in cell.assignment)
+    return tuple(name for name in dict.fromkeys(named) if re.fullmatch(NAME_PATTERN, name))
 
 
-def run_of_dataset(run: Run, name: str) -> Run:
-    """Give the part of a run that belongs to one dataset, what all share included.
+def parts_of(run: Run) -> dict[str, Run]:
+    """Give what belongs to each dataset of a run, what all share included, as a run of its own.
 
-    Its products are read from the record of the whole run.
-
-    Raises:
-        ArgumentError: the run has no such dataset.
+    Their products are read from the record of the whole run.
     """
-    if name not in datasets_of(run):
-        raise ArgumentError(f"the run {run.record.run_id} has no dataset {name}")
-    record = run.record
-    cells = tuple(cell for cell in record.cells if cell.assignment.get(DATA, name) == name)
-    folders = {f"{PRODUCTS_FOLDER}/{cell_file_name(cell.address)}" for cell in cells}
+    cells: dict[str, list[RecordedCell]] = {name: [] for name in datasets_of(run)}
+    for cell in run.record.cells:
+        for name in [cell.assignment[DATA]] if DATA in cell.assignment else cells:
+            if name in cells:
+                cells[name].append(cell)
+    published: dict[str, list[PublishedFile]] = {}
+    for file in run.record.published:
+        published.setdefault(file.path.rpartition("/")[0], []).append(file)
+    document = _resolved(run)
+    return {
+        name: dataclasses.replace(
+            run, record=_record_of(run.record, document, name, tuple(own), published)
+        )
+        for name, own in cells.items()
+    }
+
+
+def _record_of(
+    record: RunRecord,
+    document: Mapping[str, JsonValue],
+    name: str,
+    cells: tuple[RecordedCell, ...],
+    published: Mapping[str, Sequence[PublishedFile]],
+) -> RunRecord:
     taken = {product.source for cell in cells for product in cell.inputs.values()}
     environments = {cell.environment for cell in cells}
     return dataclasses.replace(
-        run,
-        record=dataclasses.replace(
-            record,
-            status="failed" if any(cell.status == "failed" for cell in cells) else "ok",
-            workflow_resolved=_resolved_of(run, name),
-            inputs=tuple(
-                entry
-                for entry in record.inputs
-                if f"inputs.{entry.name}" in taken or entry.name.partition("@")[2] in ("", name)
-            ),
-            environments=tuple(item for item in record.environments if item.id in environments),
-            cells=cells,
-            published=tuple(
-                file for file in record.published if file.path.rpartition("/")[0] in folders
-            ),
+        record,
+        status="failed" if any(cell.status == "failed" for cell in cells) else "ok",
+        workflow_resolved=_resolved_of(document, name),
+        inputs=tuple(
+            entry
+            for entry in record.inputs
+            if f"inputs.{entry.name}" in taken or entry.name.partition("@")[2] in ("", name)
+        ),
+        environments=tuple(item for item in record.environments if item.id in environments),
+        cells=cells,
+        published=tuple(
+            file
+            for cell in cells
+            for file in published.get(f"{PRODUCTS_FOLDER}/{cell_file_name(cell.address)}", ())
         ),
     )
 
 
-def write_dataset(run: Run, name: str, folder: Path, store: Store) -> Run:
+def write_part(part: Run, folder: Path, store: Store) -> Run:
     """Write one dataset of a run as a run folder, whose record verifies and replays alone.
 
     Args:
-        run: the whole run.
-        name: of the dataset.
-        folder: gets a folder of that name, with the record and the published files.
+        part: as `parts_of` gives it.
+        folder: a new folder, made by this, for the record and the published files.
         store: has the products that were embedded and are not in the run's record any more.
 
     Raises:
-        ArgumentError: the run has no such dataset.
         RecordError: the run is damaged.
         StoreError: the disk refuses.
     """
-    part = run_of_dataset(run, name)
-    target = path_inside(folder, name)
     with writing_to(folder):
-        target.mkdir(parents=True)
+        folder.mkdir(parents=True)
     sizes = {file.path: file.size_bytes for file in part.record.published}
-    copied = set(copy_files(run.folder, target, sizes, sizes))
+    copied = set(copy_files(part.folder, folder, sizes, sizes))
     record = dataclasses.replace(
         part.record,
         published=tuple(file for file in part.record.published if file.path in copied),
     )
-    path = target / RECORD_FILE
+    path = folder / RECORD_FILE
     with embedded_inputs(part, folder) as extracted:
         files = {
             file.sha256: place
@@ -102,18 +117,19 @@ def write_dataset(run: Run, name: str, folder: Path, store: Store) -> Run:
             for file, place in zip(entry.files, extracted.get(entry.name, ()), strict=False)
         }
         try:
-            with writing_to(target):
+            with writing_to(folder):
                 write_record(
-                    path, record, store.product_file, input_file=files.get, earlier=run.path
+                    path, record, store.product_file, input_file=files.get, earlier=part.path
                 )
         except (RecordFormatError, InputFileError) as error:
             raise StoreError(f"{path} cannot be written: {error}") from error
     return Run(path=path, record=record)
 
 
-def own_cells(run: Run, name: str) -> tuple[RecordedCell, ...]:
-    """The cells of one dataset alone, without those that all share."""
-    return tuple(cell for cell in run.record.cells if cell.assignment.get(DATA) == name)
+def pages_of(run: Run) -> dict[str, str]:
+    """Where the page of each dataset lies: name -> path below the run folder, if several."""
+    names = datasets_of(run)
+    return {name: f"{PAGES_FOLDER}/{name}.html" for name in names} if len(names) > 1 else {}
 
 
 def _resolved(run: Run) -> Mapping[str, JsonValue]:
@@ -124,11 +140,13 @@ def _resolved(run: Run) -> Mapping[str, JsonValue]:
     return document if isinstance(document, dict) else {}
 
 
-def _resolved_of(run: Run, name: str) -> str:
-    document = dict(_resolved(run))
+def _resolved_of(document: Mapping[str, JsonValue], name: str) -> str:
     datasets = document[_DATASETS]
-    if isinstance(datasets, dict):
-        document[_DATASETS] = {name: datasets.get(name)}
+    own = {name: datasets.get(name)} if isinstance(datasets, dict) else datasets
     return json.dumps(
-        document, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+        {**document, _DATASETS: own},
+        sort_keys=True,
+        separators=(",", ":"),
+        ensure_ascii=False,
+        allow_nan=False,
     )

@@ -21,6 +21,8 @@ from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.published import PRODUCTS_FOLDER, published_files
 
 REPORT_FILE: Final = "report.html"
+# Of a run on several datasets, a page for each.
+PAGES_FOLDER: Final = "pages"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -150,6 +150,7 @@ def _comparison(run: Run) -> Mapping[str, object]:
 
 
 def _is_baseline(assignment: Mapping[str, str], baseline: Mapping[str, str]) -> bool:
+    # A dataset is none of the baseline's steps: each has a baseline of its own.
     return bool(baseline) and all(
-        baseline.get(step) == variant for step, variant in assignment.items()
+        baseline.get(step, variant) == variant for step, variant in assignment.items()
     )

@@ -85,7 +85,7 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
     if len(combinations) < 2:
         return None
     steps = tuple(dict.fromkeys(step for one in combinations for step in one.assignment))
-    columns = _columns(combinations)
+    columns = comparison_columns(combinations)
     origins = Origins.of(runs)
     rows = [_row(one, steps, columns, origins) for one in combinations]
     return ComparisonTable(
@@ -97,7 +97,7 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
     )
 
 
-def _columns(combinations: Sequence[Combination]) -> tuple[Column, ...]:
+def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...]:
     """Metrics that the workflows ask for, else the quality metrics; the cost has its own places."""
     units: dict[tuple[str, str], str] = {}
     for cell in (cell for one in combinations for cell in one.cells):

@@ -9,7 +9,7 @@ import re
 import secrets
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -23,9 +23,11 @@ from orthoflow.errors import StoreError
 from orthoflow.foreign_text import shown
 from orthoflow.products import Cameras
 from orthoflow.records import COSTS, Run, compare_runs, figure_files
+from orthoflow.records.datasets import pages_of, parts_of
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table, environment_words
 from orthoflow.report.cursors import cursor_places
+from orthoflow.report.dataset_tables import DatasetTable, dataset_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import differences
 from orthoflow.report.figures import (
@@ -35,8 +37,9 @@ from orthoflow.report.figures import (
     figure_groups,
     write_figures,
 )
-from orthoflow.report.numbers import number_with_unit
+from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.overlays import overlays
+from orthoflow.report.paired import MetricOverDatasets, over_datasets
 from orthoflow.report.pictures import (
     Picture,
     embedded_products,
@@ -81,12 +84,17 @@ class _Section:
     figures: tuple[FigureGroup, ...]
     diagram: Markup
     citations: Mapping[str, tuple[str, ...]]
+    title: str = ""
+    whole: str = ""
+    datasets: DatasetTable | None = None
+    over: tuple[MetricOverDatasets, ...] = ()
 
 
 def write_page(run: Run, path: Path, *, go_on: str = "") -> None:
     """Write the report of one run, and its figures as PNG and SVG files into `figures/` beside it.
 
     Of a comparison these are the figures of the baseline; `write_figures` writes those of any cell.
+    A run on several datasets gets a page for each, in `pages/`, and one that leads to them.
 
     Args:
         run: the run.
@@ -100,7 +108,17 @@ def write_page(run: Run, path: Path, *, go_on: str = "") -> None:
     addresses = baseline_addresses(run)
     # Before the page is written: a record with such names gets none.
     figure_files(run, addresses)
-    write_report([run], path, go_on=go_on)
+    pages = pages_of(run)
+    parts = parts_of(run) if pages else {}
+    for folder in {(path.parent / page).parent for page in pages.values()}:
+        _make_folder(folder)
+    for name, page in pages.items():
+        target = path.parent / page
+        title = f"{run.record.name}: {name}"
+        place = _Place(folder=target.parent, title=title, whole=f"../{path.name}")
+        _write([parts[name]], target, place)
+    place = _Place(folder=path.parent, title=run.record.name, go_on=go_on, pages=pages)
+    _write([run], path, place)
     write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
 
@@ -116,16 +134,52 @@ def write_report(runs: Sequence[Run], path: Path, *, go_on: str = "") -> None:
         StoreError: the file cannot be written.
         RecordError: a record is damaged.
     """
+    title = ", ".join(dict.fromkeys(run.record.name for run in runs))
+    _write(runs, path, _Place(folder=path.parent, title=title, go_on=go_on))
+
+
+def _make_folder(folder: Path) -> None:
+    # A link would lead the pages to where nobody wants them.
+    if folder.is_symlink():
+        raise StoreError(f"{folder} is a link, so no pages are written there: remove it")
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"{folder} cannot be made: {error.strerror}") from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Place:
+    """Where a page stands among others.
+
+    Attributes:
+        folder: that the page lies in.
+        title: of the page.
+        go_on: of a run that was broken off, the command that goes on with it.
+        pages: dataset -> its own page; empty for a page that leads to none.
+        whole: the page of all datasets, for the one of a single dataset.
+    """
+
+    folder: Path
+    title: str
+    go_on: str = ""
+    pages: Mapping[str, str] = field(default_factory=dict)
+    whole: str = ""
+
+
+def _write(runs: Sequence[Run], path: Path, place: _Place) -> None:
     text = _template().render(
         sections=[
-            _section(run, f"r{index + 1}-", path.parent, share=1 / len(runs))
+            (_overview if pages_of(run) else _section)(
+                run, f"r{index + 1}-", place, share=1 / len(runs)
+            )
             for index, run in enumerate(runs)
         ],
         comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
         differences=differences(compare_runs(*runs)) if len(runs) == 2 else None,
-        title=", ".join(dict.fromkeys(run.record.name for run in runs)),
+        title=place.title,
         version=__version__,
-        go_on=go_on,
+        go_on=place.go_on,
     )
     aside = path.with_name(f".report-{secrets.token_hex(8)}")
     try:
@@ -151,6 +205,7 @@ def _template() -> jinja2.Template:
         loader=jinja2.PackageLoader("orthoflow.report"),
     )
     environment.filters["with_unit"] = number_with_unit
+    environment.filters["number"] = number
     environment.filters["environment"] = environment_words
     environment.filters["cited"] = cited
     environment.filters["breakable"] = _breakable
@@ -201,7 +256,24 @@ def _breakable(name: str) -> Markup:
     return Markup(re.sub(r"([_@,])", r"\1<wbr>", str(escape(shown(name)))))
 
 
-def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
+def _overview(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
+    """Tell of a run on several datasets, whose pictures and figures stand on pages of their own."""
+    parts = parts_of(run)
+    empty = replace(run, record=replace(run.record, cells=()))
+    return replace(
+        _section(empty, prefix, place, share=share),
+        run=run,
+        title=run.record.name,
+        limits=limits(run),
+        results=results(run),
+        diagram=Markup(run_diagram(next(iter(parts.values())))),
+        citations=citations(run),
+        datasets=dataset_table(parts, place.pages),
+        over=over_datasets(parts),
+    )
+
+
+def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     # The baseline's stand first: they are what the numbers beside them are of.
     baseline = {cell.address for cell in baseline_cells(run)}
     orthoimages = sorted(
@@ -211,7 +283,7 @@ def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
         wall_pictures(run, share=share), key=lambda picture: picture.cell not in baseline
     )
     # Files are named from where the page will lie.
-    from_page = Path(os.path.relpath(run.folder, folder))
+    from_page = Path(os.path.relpath(run.folder, place.folder))
     numbered = [
         replace(
             picture,
@@ -248,6 +320,8 @@ def _section(run: Run, prefix: str, folder: Path, *, share: float) -> _Section:
         # Built from escaped parts only, as the overlays are.
         diagram=Markup(run_diagram(run)),
         citations=citations(run),
+        title=place.title if place.whole else run.record.name,
+        whole=place.whole,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -96,6 +96,16 @@ def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
             [_orthoimage(run, address, index, image) for index, image in enumerate(product.images)],
             n_products=len(places) / share,
         )
+
+
+def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> str:
+    """Give the first orthoimage of some cells as a small picture, a data URI; empty without any."""
+    places = [place for place in embedded_products(run, "orthoimages") if place[0] in addresses]
+    for (address, _), payload in zip(places[-1:], run.payloads(places[-1:]), strict=True):
+        for index, image in enumerate(Orthoimages.from_payload(payload).images[:1]):
+            drawing = _orthoimage(run, address, index, image)
+            return data_uri(drawing.draw(longest_side_px), "image/webp")
+    return ""
 
 
 def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:

@@ -286,6 +286,13 @@ p1,1.0,2.0,3.0,target,0,10.5,20.5
 p2,-1e2,2.5,0.001,,,,
 "p, 3",0,0,0,nail,3,1,2
 """
+_ROOMS: Final = """\
+# palace
+name;scan;photos;wall.gsd_m;wall.buffer_m;plane.cell_m;wall.near
+hall;hall.e57;photos/*.jpg;0.003;;0.02;[[1, 2, 3]]
+"stairs";"stairs 2.e57";b.jpg;5e-3;0.01;;
+attic;a.laz;photos;;;;
+"""
 _POINT_LINES: Final = "A;1.5;2.5;3.5\nB;-1.5;2.5;3.25\n"
 
 
@@ -305,7 +312,7 @@ def _read_checkpoints(path: Path) -> object:
 
 
 def _workflow_files(folder: Path) -> None:
-    for name in ("photos-on-scan", "plane-methods"):
+    for name in ("photos-on-scan", "plane-methods", "plane-benchmark"):
         (folder / f"{name}.yaml").write_bytes(shipped_workflows()[name].read_bytes())
 
 
@@ -319,8 +326,13 @@ def _read_workflow(path: Path) -> object:
     return len(expand_cells(workflow, _catalog()))
 
 
+def _read_rooms(path: Path) -> object:
+    workflow = load_workflow("photos-on-scan", _catalog(), datasets=str(path))
+    return len(expand_cells(workflow, _catalog())), resolved_json(workflow)
+
+
 def _resolved_files(folder: Path) -> None:
-    for name in ("photos-on-scan", "plane-methods"):
+    for name in ("photos-on-scan", "plane-methods", "plane-benchmark"):
         workflow = load_workflow(shipped_workflows()[name], _catalog())
         (folder / f"{name}.json").write_text(resolved_json(workflow))
 
@@ -336,6 +348,11 @@ CALIBRATION = Target(
     mutate=mutate_yaml,
 )
 CHECKPOINTS = Target(seeds=_checkpoint_files, read=_read_checkpoints, mutate=mutate_text)
+ROOMS = Target(
+    seeds=lambda folder: (folder / "rooms.csv").write_text(_ROOMS),
+    read=_read_rooms,
+    mutate=mutate_text,
+)
 WORKFLOW = Target(seeds=_workflow_files, read=_read_workflow, mutate=mutate_yaml)
 RESOLVED = Target(seeds=_resolved_files, read=_read_resolved, mutate=mutate_json)
 

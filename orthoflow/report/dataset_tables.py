@@ -1,0 +1,148 @@
+"""The datasets of a run: a row each, with its picture, its numbers and what limits it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from typing import Final
+
+from orthoflow.records import Run, cell_metrics
+from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.numbers import metric_label, number
+from orthoflow.report.pictures import thumbnail
+from orthoflow.report.rankings import Value
+from orthoflow.report.summaries import QUALITY, limits
+from orthoflow.workflow.format import DATA
+
+_ORIENTED: Final = "n_oriented"
+_MOST_COLUMNS: Final = 6
+# Pictures of a page with many rooms get smaller, until they show nothing any more.
+_PICTURES_PX: Final = 2_000_000
+_LARGEST_PX: Final = 220
+_SMALLEST_PX: Final = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetRow:
+    """One dataset, as the baseline has it.
+
+    Attributes:
+        name: of the dataset.
+        page: where its own page lies, relative to this one; empty without one.
+        picture: data URI of its first orthoimage, empty without one.
+        failed: its failed cells and why they did, without those that were skipped behind them.
+        values: one per column.
+        photos: photos oriented, of how many.
+        limit: what limits it most, and how much more does.
+    """
+
+    name: str
+    page: str
+    picture: str
+    failed: tuple[str, ...]
+    values: tuple[Value, ...]
+    photos: Value
+    limit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetTable:
+    """The datasets of a run.
+
+    Attributes:
+        columns: what is measured of each: step, and metric with its unit.
+        rows: in the order of the run.
+        has_photos: some step oriented photos.
+    """
+
+    columns: tuple[tuple[str, str], ...]
+    rows: tuple[DatasetRow, ...]
+    has_photos: bool
+
+    @property
+    def n_whole(self) -> int:
+        """How many datasets are complete."""
+        return sum(not row.failed for row in self.rows)
+
+
+def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> DatasetTable:
+    """Lay the datasets of a run below each other.
+
+    Args:
+        parts: dataset -> its part of the run.
+        pages: dataset -> its own page, relative to the one that is made.
+    """
+    own = {
+        name: {cell.address for cell in part.record.cells if DATA in cell.assignment}
+        for name, part in parts.items()
+    }
+    measured = {name: _measured(part, own[name]) for name, part in parts.items()}
+    units = {key: unit for values in measured.values() for key, (_, unit) in values.items()}
+    wanted = [key for metric in QUALITY for key in units if key[1] == metric]
+    chosen = [key for key in wanted if key[1] != _ORIENTED][:_MOST_COLUMNS]
+    return DatasetTable(
+        columns=tuple((step, metric_label(metric, units[step, metric])) for step, metric in chosen),
+        rows=tuple(
+            DatasetRow(
+                name=name,
+                page=pages.get(name, ""),
+                picture=_picture(part, own[name], len(parts)),
+                failed=tuple(
+                    f"{cell.address}: {cell.error_message}"
+                    for cell in part.record.cells
+                    if cell.status == "failed"
+                ),
+                values=tuple(_value(measured[name].get(key)) for key in chosen),
+                photos=_photos(measured[name]),
+                limit=_limit(part, own[name]),
+            )
+            for name, part in parts.items()
+        ),
+        has_photos=any(key[1] == _ORIENTED for key in units),
+    )
+
+
+_Measured = Mapping[tuple[str, str], tuple[float, str]]
+
+
+def _measured(part: Run, own: AbstractSet[str]) -> _Measured:
+    """What the baseline's cells of this dataset measured: (step, metric) -> value and unit."""
+    return {
+        (row.step, row.metric): (row.value, row.unit)
+        for cell in baseline_cells(part)
+        if cell.address in own
+        for row in cell_metrics(cell)
+    }
+
+
+def _picture(part: Run, own: AbstractSet[str], n_rows: int) -> str:
+    addresses = [cell.address for cell in baseline_cells(part) if cell.address in own]
+    side_px = math.isqrt(_PICTURES_PX // n_rows)
+    return thumbnail(part, addresses, longest_side_px=min(_LARGEST_PX, max(_SMALLEST_PX, side_px)))
+
+
+def _value(measured: tuple[float, str] | None) -> Value:
+    return Value(text=number(measured[0]), sort=measured[0]) if measured else Value()
+
+
+def _limit(part: Run, own: AbstractSet[str]) -> str:
+    """What the steps of this dataset warn of; failures stand beside it."""
+    said = [
+        limit.text
+        for limit in limits(part)
+        if not own.isdisjoint(limit.cells) and not limit.text.startswith("failed: ")
+    ]
+    return f"{said[0]} (and {len(said) - 1} more)" if len(said) > 1 else "".join(said)
+
+
+def _photos(measured: _Measured) -> Value:
+    # A later step improves on an earlier one.
+    steps = [step for step, metric in measured if metric == _ORIENTED]
+    if not steps:
+        return Value()
+    oriented, _ = measured[steps[-1], _ORIENTED]
+    total = measured.get((steps[-1], "n_photos"))
+    text = f"{number(oriented)} of {number(total[0])}" if total else number(oriented)
+    return Value(text=text, sort=oriented)

@@ -1,0 +1,210 @@
+"""Methods compared over datasets: medians, and differences dataset by dataset with a rank test."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from orthoflow.geometry.robust import median_deviation
+from orthoflow.records import Run
+from orthoflow.report.combinations import Combination, Measured, combinations_of
+from orthoflow.report.comparisons import comparison_columns
+from orthoflow.report.rankings import Sense, badness
+from orthoflow.workflow.format import DATA
+
+# The datasets that decide make up at least this share of all differences.
+_DECIDING_SHARE: Final = 0.5
+_MOST_DECIDING: Final = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paired:
+    """How a method does against another one on the datasets that both have a value of.
+
+    Attributes:
+        n: datasets with both values.
+        wins: datasets on which the method is better.
+        losses: datasets on which it is worse.
+        median: median of the differences, in the metric's unit; negative where it has less. For
+            signed errors the sizes are compared, where 1 is best the factors to 1, as logarithms.
+        p: Wilcoxon's signed-rank test that the differences lie about zero, two-sided; NaN without
+            differences.
+        effect: matched-pairs rank-biserial correlation, from -1 (worse on every dataset) to 1
+            (better on every one); NaN without differences.
+        deciding: the largest differences, by dataset, which make up half of all; at most three.
+    """
+
+    n: int
+    wins: int
+    losses: int
+    median: float
+    p: float
+    effect: float
+    deciding: Mapping[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodOverDatasets:
+    """One combination of variants on all datasets.
+
+    Attributes:
+        name: the variants, `plane=ransac`; empty when nothing varies.
+        is_reference: the others are compared with it.
+        n: datasets with a value.
+        failed: datasets on which the combination failed; they have no part in any number.
+        n_absent: datasets that have no value though nothing failed, or were left out.
+        median: over the datasets; NaN without any.
+        spread: 1.4826 times the median absolute deviation from it; NaN without any.
+        paired: against the reference; None for itself, and where neither more nor less is better.
+    """
+
+    name: str
+    is_reference: bool
+    n: int
+    failed: tuple[str, ...]
+    n_absent: int
+    median: float
+    spread: float
+    paired: Paired | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricOverDatasets:
+    """One metric of one step over all datasets.
+
+    Attributes:
+        step: name of the step.
+        label: the metric with its unit.
+        sense: what makes a value good.
+        methods: the combinations, the reference first where it is the workflow's.
+    """
+
+    step: str
+    label: str
+    sense: Sense
+    methods: tuple[MethodOverDatasets, ...]
+
+
+def over_datasets(parts: Mapping[str, Run]) -> tuple[MetricOverDatasets, ...]:
+    """Compare the combinations of a run over its datasets, metric by metric.
+
+    Values of different environments are never paired.
+
+    Args:
+        parts: dataset -> its part of the run.
+    """
+    names = tuple(parts)
+    found: dict[str, dict[str, Combination]] = {}
+    for name, part in parts.items():
+        for one in combinations_of(part):
+            if one.assignment.get(DATA) == name:
+                found.setdefault(_method(one), {})[name] = one
+    every = [one for by_name in found.values() for one in by_name.values()]
+    if len(names) < 2 or not every:
+        return ()
+    reference = next((_method(one) for one in every if one.is_baseline), next(iter(found)))
+    return tuple(
+        MetricOverDatasets(
+            step=column.step,
+            label=column.label,
+            sense=column.sense,
+            methods=_methods(found, names, reference, (column.step, column.metric, column.sense)),
+        )
+        for column in comparison_columns(every)
+    )
+
+
+def _method(one: Combination) -> str:
+    pairs = (f"{step}={variant}" for step, variant in one.assignment.items() if step != DATA)
+    return ", ".join(pairs)
+
+
+def _methods(
+    found: Mapping[str, Mapping[str, Combination]],
+    names: Sequence[str],
+    reference: str,
+    column: tuple[str, str, Sense],
+) -> tuple[MethodOverDatasets, ...]:
+    step, metric, sense = column
+    measured = {
+        method: {
+            name: value
+            for name, one in by_name.items()
+            if one.failure is None and (value := one.measured(step, metric)) is not None
+        }
+        for method, by_name in found.items()
+    }
+    rows = []
+    for method, by_name in found.items():
+        values = measured[method]
+        failed = tuple(name for name, one in by_name.items() if one.failure is not None)
+        numbers = np.array([value.value for value in values.values()])
+        compared = method != reference and sense is not Sense.NEITHER
+        rows.append(
+            MethodOverDatasets(
+                name=method,
+                is_reference=method == reference,
+                n=len(values),
+                failed=failed,
+                n_absent=len(names) - len(values) - len(failed),
+                median=float(np.median(numbers)) if numbers.size else math.nan,
+                spread=median_deviation(numbers) if numbers.size else math.nan,
+                paired=_paired(values, measured[reference], sense) if compared else None,
+            )
+        )
+    return tuple(rows)
+
+
+def _paired(
+    ours: Mapping[str, Measured], theirs: Mapping[str, Measured], sense: Sense
+) -> Paired | None:
+    both = [
+        name
+        for name, value in ours.items()
+        if name in theirs and theirs[name].environment == value.environment
+    ]
+    worse = {
+        name: badness(ours[name].value, sense) - badness(theirs[name].value, sense) for name in both
+    }
+    worse = {name: value for name, value in worse.items() if math.isfinite(value)}
+    return paired_differences(worse, sense) if worse else None
+
+
+def paired_differences(worse: Mapping[str, float], sense: Sense) -> Paired:
+    """Judge differences of pairs.
+
+    Args:
+        worse: dataset -> how much worse than the reference the method is there, finite; at least
+            one.
+        sense: what makes a value good, for the sign of the differences that are told.
+    """
+    sign = -1.0 if sense is Sense.MORE else 1.0
+    differences = np.array(list(worse.values()))
+    largest = sorted(worse, key=lambda name: -abs(worse[name]))
+    total = float(np.abs(differences).sum())
+    deciding: dict[str, float] = {}
+    for name in largest[:_MOST_DECIDING] if total else ():
+        if sum(map(abs, deciding.values())) >= _DECIDING_SHARE * total:
+            break
+        deciding[name] = sign * worse[name]
+    moved = differences[differences != 0]
+    p = effect = math.nan
+    if moved.size:
+        from scipy.stats import rankdata, wilcoxon  # noqa: PLC0415 - takes half a second
+
+        ranks = rankdata(np.abs(moved))
+        effect = float((ranks[moved < 0].sum() - ranks[moved > 0].sum()) / ranks.sum())
+        p = float(wilcoxon(moved).pvalue)
+    return Paired(
+        n=len(worse),
+        wins=int((differences < 0).sum()),
+        losses=int((differences > 0).sum()),
+        median=sign * float(np.median(differences)),
+        p=p,
+        effect=effect,
+        deciding=deciding,
+    )

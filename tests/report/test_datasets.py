@@ -1,0 +1,231 @@
+"""The report of a run on several datasets: a row each, and methods compared over all of them."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import StoreError
+from orthoflow.records import RecordedCell, Run
+from orthoflow.records.datasets import datasets_of, parts_of
+from orthoflow.report import write_page, write_report
+from orthoflow.report.dataset_tables import dataset_table
+from orthoflow.report.paired import MethodOverDatasets, over_datasets, paired_differences
+from orthoflow.report.rankings import Sense
+from tests.report_runs import (
+    HeldRun,
+    cell,
+    environment,
+    given,
+    metrics,
+    orthoimages_product,
+    record,
+)
+
+# RMS of two detectors in seven rooms; None where it failed.
+RMS_MM: dict[str, tuple[float, float | None]] = {
+    "hall": (2.0, 1.0),
+    "stairs": (3.0, 1.5),
+    "attic": (4.0, None),
+    "cellar": (2.0, 2.5),
+    "tower": (9.0, 1.0),
+    "porch": (5.0, 5.0),
+    "court": (6.0, 5.9),
+}
+
+
+def room(name: str, rms_mm: tuple[float, float | None]) -> list[RecordedCell]:
+    slow, quick = rms_mm
+    return [
+        cell(f"scan@data={name}", warnings=(f"{name} is dark",)),
+        cell(
+            f"plane@data={name},plane=slow",
+            metrics=metrics(rms_mm=slow, n_oriented=5.0, n_photos=6.0),
+        ),
+        cell(f"plane@data={name},plane=quick", metrics=metrics(rms_mm=quick))
+        if quick is not None
+        else cell(f"plane@data={name},plane=quick", status="failed", error_message="no <plane>"),
+    ]
+
+
+def run_of(folder: Path, rms_mm: dict[str, tuple[float, float | None]]) -> HeldRun:
+    """A run of two detectors in some rooms, with an orthoimage of the first one."""
+    first = next(iter(rms_mm))
+    image = f"mosaic@data={first},plane=slow"
+    cells = [
+        cell("shared", metrics=metrics(rms_mm=77.0)),
+        *(one for name, values in rms_mm.items() for one in room(name, values)),
+        cell(image, outputs={"orthoimages": given("", "a", "orthoimages")}),
+    ]
+    resolved = {
+        "datasets": {name: {"inputs": {}, "set": {}} for name in rms_mm},
+        "compare": {"baseline": {"plane": "slow"}, "metrics": ["plane.rms_mm"]},
+    }
+    told = record(cells, workflow_resolved=json.dumps(resolved), status="failed")
+    products = {(image, "orthoimages"): orthoimages_product(0)}
+    return HeldRun(path=folder / "run.h5", record=told, products=products)
+
+
+@pytest.fixture
+def rooms(tmp_path: Path) -> HeldRun:
+    return run_of(tmp_path, RMS_MM)
+
+
+def methods(run: Run) -> dict[str, MethodOverDatasets]:
+    (metric,) = over_datasets(parts_of(run))
+    assert (metric.step, metric.label, metric.sense) == ("plane", "rms_mm", Sense.LESS)
+    return {method.name: method for method in metric.methods}
+
+
+def test_a_failure_is_counted_beside_and_has_no_part_in_a_number(rooms: Run) -> None:
+    quick = methods(rooms)["plane=quick"]
+    assert (quick.n, quick.failed, quick.n_absent) == (6, ("attic",), 0)
+    values = [quick for _, quick in RMS_MM.values() if quick is not None]
+    assert quick.median == np.median(values) == 2.0
+    # Deviations 1, 0.5, 0.5, 1, 3, 3.9.
+    assert quick.spread == pytest.approx(1.4826 * 1.0)
+
+
+def test_the_baseline_is_what_others_are_compared_with(rooms: Run) -> None:
+    slow = methods(rooms)["plane=slow"]
+    assert slow.is_reference
+    assert slow.paired is None
+    assert slow.median == 4.0
+
+
+def test_pairs_are_of_the_datasets_that_both_have(rooms: Run) -> None:
+    paired = methods(rooms)["plane=quick"].paired
+    assert paired is not None
+    # Differences -1, -1.5, 0.5, -8, 0, -0.1; without the zero the ranks are 3, 4, 2, 5, 1.
+    assert (paired.n, paired.wins, paired.losses) == (6, 4, 1)
+    assert paired.median == pytest.approx(-0.55)
+    assert paired.effect == pytest.approx((13 - 2) / 15)
+    # Of 32 signs of five ranks those with a sum of at most 2 are {}, {1} and {2}, on either side.
+    assert paired.p == pytest.approx(2 * 3 / 32)
+    assert paired.deciding == {"tower": -8.0}
+
+
+def test_values_of_other_environments_are_not_paired(rooms: Run) -> None:
+    cells = tuple(
+        replace(one, environment="e2") if one.address == "plane@data=tower,plane=quick" else one
+        for one in rooms.record.cells
+    )
+    both = (environment(), environment("e2", threads=4))
+    told = replace(rooms, record=replace(rooms.record, cells=cells, environments=both))
+    paired = methods(told)["plane=quick"].paired
+    assert paired is not None
+    assert (paired.n, paired.wins) == (5, 3)
+
+
+@pytest.mark.parametrize("n", [5, 8])
+def test_a_method_that_is_better_everywhere_has_the_whole_effect(n: int) -> None:
+    worse = {f"r{index}": -1.0 - index / 10 for index in range(n)}
+    paired = paired_differences(worse, Sense.LESS)
+    assert (paired.wins, paired.losses, paired.effect) == (n, 0, 1.0)
+    assert paired.p == pytest.approx(2 / 2**n)
+    opposite = paired_differences({name: -value for name, value in worse.items()}, Sense.LESS)
+    assert (opposite.wins, opposite.losses, opposite.effect) == (0, n, -1.0)
+    assert opposite.p == pytest.approx(paired.p)
+
+
+def test_methods_that_agree_everywhere_have_no_test() -> None:
+    paired = paired_differences({"a": 0.0, "b": 0.0}, Sense.LESS)
+    assert (paired.n, paired.wins, paired.losses, paired.median) == (2, 0, 0, 0.0)
+    assert math.isnan(paired.p)
+    assert math.isnan(paired.effect)
+    assert paired.deciding == {}
+
+
+def test_differences_are_told_in_the_sign_of_the_metric() -> None:
+    # Of a share more is better: 0.2 worse is 0.2 less.
+    paired = paired_differences({"a": 0.2, "b": 0.1, "c": -0.1}, Sense.MORE)
+    assert (paired.wins, paired.losses) == (1, 2)
+    assert paired.median == -0.1
+    assert paired.deciding == {"a": -0.2}
+
+
+def test_a_dataset_has_a_row_with_its_own_numbers(rooms: Run) -> None:
+    table = dataset_table(parts_of(rooms), {"hall": "pages/hall.html"})
+    assert table.columns == (("plane", "rms_mm"),)
+    assert [row.name for row in table.rows] == list(RMS_MM)
+    assert table.n_whole == 6
+    hall, attic = table.rows[0], table.rows[2]
+    assert (hall.page, hall.failed, hall.limit) == ("pages/hall.html", (), "hall is dark")
+    assert hall.values[0].text == "2"
+    assert (hall.photos.text, hall.photos.sort) == ("5 of 6", 5.0)
+    assert hall.picture.startswith("data:image/webp;base64,")
+    assert attic.failed == ("plane@data=attic,plane=quick: no <plane>",)
+    assert attic.values[0].text == "4"
+    assert (attic.page, attic.picture) == ("", "")
+
+
+def test_a_part_of_a_run_is_its_dataset_and_what_all_share(rooms: Run) -> None:
+    part = parts_of(rooms)["cellar"]
+    assert list(part.cells) == [
+        "shared",
+        "scan@data=cellar",
+        "plane@data=cellar,plane=slow",
+        "plane@data=cellar,plane=quick",
+    ]
+    assert part.record.status == "ok"
+    assert datasets_of(part) == ("cellar",)
+    assert parts_of(rooms)["attic"].record.status == "failed"
+
+
+def test_the_page_leads_to_a_page_of_each_dataset(rooms: HeldRun, tmp_path: Path) -> None:
+    write_page(rooms, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    links = re.findall(r'href="(pages/[^"]*)"', page)
+    assert links == [f"pages/{name}.html" for name in RMS_MM]
+    assert "6 of 7 datasets are complete" in page
+    assert "no &lt;plane&gt;" in page
+    for name in RMS_MM:
+        own = (tmp_path / "pages" / f"{name}.html").read_text()
+        assert f"toy &lt;run&gt;: {name}</h1>" in own
+        assert 'href="../report.html"' in own
+        others = set(RMS_MM) - {name}
+        assert not [other for other in others if f"data={other}" in own]
+
+
+def test_a_single_file_says_how_to_get_the_pages(rooms: Run, tmp_path: Path) -> None:
+    write_report([rooms], tmp_path / "one.html")
+    page = (tmp_path / "one.html").read_text()
+    assert "orthoflow export RUN --split" in page
+    assert "pages/" not in page
+    assert not (tmp_path / "pages").exists()
+
+
+def test_pages_are_not_written_through_a_link(rooms: Run, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "pages").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(StoreError, match="pages is a link, so no pages are written there"):
+        write_page(rooms, tmp_path / "report.html")
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_a_dataset_that_cannot_be_a_name_has_no_page(tmp_path: Path) -> None:
+    rooms = run_of(tmp_path, {"hall": (1.0, 2.0), "../up": (1.0, 2.0), "attic": (1.0, 2.0)})
+    assert datasets_of(rooms) == ("hall", "attic")
+    write_page(rooms, tmp_path / "report.html")
+    assert {path.name for path in (tmp_path / "pages").iterdir()} == {"hall.html", "attic.html"}
+    assert not list(tmp_path.parent.glob("up*"))
+
+
+def test_a_single_dataset_has_a_page_as_any_run(tmp_path: Path) -> None:
+    write_page(run_of(tmp_path, {"hall": (1.0, 2.0)}), tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert 'id="r1-images"' in page
+    assert "One row per dataset" not in page
+    assert not (tmp_path / "pages").exists()
+
+
+def test_a_step_called_data_makes_no_datasets(rooms: Run) -> None:
+    told = replace(rooms, record=replace(rooms.record, workflow_resolved="{}"))
+    assert datasets_of(told) == ()
+    assert parts_of(told) == {}

@@ -1,0 +1,58 @@
+"""The benchmark of plane detectors on two of its rooms: one run, one record, one page over both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from orthoflow.workflow import shipped_workflow
+from tests.road.conftest import Shell, metrics_of
+
+ROOMS = ("usual", "one-station")
+
+
+@pytest.fixture(scope="module")
+def shell(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Shell:
+    """A folder with the run `run`: two detectors in two coarse rooms."""
+    shell = Shell(tmp_path_factory.mktemp("many-rooms"), store)
+    yaml = YAML(typ="safe", pure=True)
+    document = yaml.load(shipped_workflow("plane-benchmark").read_text())
+    variants = document["steps"]["plane"]["variants"]
+    document["steps"]["plane"]["variants"] = {name: variants[name] for name in ("ransac", "region")}
+    document["compare"]["baseline"] = {"plane": "region"}
+    with (shell.folder / "quick.yaml").open("w") as stream:
+        yaml.dump(document, stream)
+    ended = shell(
+        "run", "quick.yaml", "--only-data", ",".join(ROOMS), "--set", "room.scan_step_m=0.05",
+        "--executor", "inline", "-o", "run", timeout_s=900,
+    )  # fmt: skip
+    assert ended.code == 0, ended.said
+    return shell
+
+
+@pytest.mark.parametrize("room", ROOMS)
+@pytest.mark.parametrize("detector", ["ransac", "region"])
+def test_every_detector_finds_the_main_wall_of_every_room(
+    room: str, detector: str, shell: Shell
+) -> None:
+    found = metrics_of(shell.folder / "run")
+    # A point every five centimetres, of which each is wrong by 1.5 mm.
+    assert found[f"check@data={room},plane={detector}", "plane_angle_deg"] <= 0.1
+    assert abs(found[f"check@data={room},plane={detector}", "plane_offset_mm"]) <= 3.0
+
+
+def test_the_page_compares_the_detectors_over_the_rooms(shell: Shell) -> None:
+    page = (shell.folder / "run" / "report.html").read_text()
+    assert "2 of 2 datasets are complete" in page
+    assert "Over all datasets" in page
+    assert "check: plane_angle_deg" in page
+    assert {path.stem for path in (shell.folder / "run" / "pages").iterdir()} == set(ROOMS)
+
+
+def test_each_room_is_split_off_and_verifies(shell: Shell) -> None:
+    ended = shell("export", "run", "--split", "-o", "split")
+    assert ended.code == 0, ended.said
+    for room in ROOMS:
+        assert shell("verify", f"split/{room}").code == 0
