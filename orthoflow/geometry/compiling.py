@@ -16,8 +16,9 @@ from contextlib import suppress
 from typing import Any, Final, TypeVar, cast
 
 import numba
-from numba.core import event
+from numba.core import event, types
 from numba.core.dispatcher import Dispatcher
+from numba.core.errors import TypingError
 
 from orthoflow.geometry.kept_kernels import KeptKernels
 from orthoflow.geometry.kernel_news import tell
@@ -75,7 +76,27 @@ def _kept(function: Callable[..., Any], **options: object) -> Any:
     # in each process.
     with suppress(RuntimeError):
         kernel._cache = KeptKernels(function)  # noqa: SLF001 - numba has no other door for it
+    _give_constants_no_version(kernel)
     return kernel
+
+
+def _give_constants_no_version(kernel: Any) -> None:
+    """Let kernels call one version with all whole numbers, whichever are constants.
+
+    Numba would compile one for each constant, and one for the 0 that a counter begins with, which
+    nothing calls then.
+    """
+    template_for = kernel.get_call_template
+
+    def template_for_any(args: tuple[Any, ...], kws: dict[str, Any]) -> object:
+        try:
+            named = dict(zip(kws, map(types.unliteral, kws.values()), strict=True))
+            return template_for(tuple(map(types.unliteral, args)), named)
+        except TypingError:
+            # A tuple whose members differ in type is indexed by constants alone.
+            return template_for(args, kws)
+
+    kernel.get_call_template = template_for_any
 
 
 class _Compilation(event.Listener):

@@ -87,7 +87,9 @@ def refine_plane(
         The plane, or None where fewer than three points or only a line of points support it.
     """
     row = np.append(start.normal, start.offset_m)
-    if not refine_robustly(points, row, tolerance_m, _FREEDOMS[freedom], up):
+    # Every other point of an array, or all: one kernel for both.
+    packed = np.ascontiguousarray(points)
+    if not refine_robustly(packed, row, tolerance_m, _FREEDOMS[freedom], up):
         return None
     # Twice, because Plane accepts no length that is off by more than rounding.
     normal = row[:3] / np.linalg.norm(row[:3])
