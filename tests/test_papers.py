@@ -19,6 +19,21 @@ KINDS = sorted({method_id.partition(".")[0] for method_id in discover_catalog().
 METHOD = re.compile(rf"({'|'.join(KINDS)})\.[a-z0-9-]+")
 NAMED = [code for code in CODE if METHOD.match(code)]
 
+# Rows of both papers by what they are of: method, theirs, ours, deviation.
+ROWS = {
+    f"{section}: {where}, {what}": tuple(rest)
+    for section, table in re.findall(r"^## (\w+2\d{3})\n(.*?)(?=^## |\Z)", TEXT, re.M | re.S)
+    for where, what, *rest in (
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in table.splitlines()
+        if line.startswith("|") and not line.startswith(("| where", "| ---"))
+    )
+}
+# The marks of the page's beginning, a test, a benchmark, a recipe, or a page with tables.
+SOURCE = re.compile(
+    r"[(;] ?(Q|P|O|I|PP|PW)\)|`tests/|benchmarks/|[a-z-]+\.yaml`|\]\([a-z]+\.md\)|below$"
+)
+
 
 def test_the_page_names_most_built_in_methods() -> None:
     methods = discover_catalog().methods
@@ -50,11 +65,30 @@ def test_every_workflow_named_is_shipped(code: str) -> None:
 @pytest.mark.parametrize("code", [code for code in CODE if code.startswith("orthoflow run")])
 def test_every_command_named_sets_what_its_workflow_has(code: str) -> None:
     _, _, recipe, *options = code.split()
-    steps = YAML(typ="safe").load(shipped_workflow(recipe).read_text())["steps"]
+    path = ROOT / recipe if "/" in recipe else shipped_workflow(recipe)
+    steps = YAML(typ="safe").load(path.read_text())["steps"]
     for setting in options[1::2]:
         step, parameter = setting.partition("=")[0].split(".")
         method_id = steps[step]["use"]
         assert parameter in discover_catalog().method(method_id).load().Params.model_fields
+
+
+@pytest.mark.parametrize("what", list(ROWS))
+def test_every_row_has_a_way_and_what_came_of_it_or_the_reason_why_not(what: str) -> None:
+    """A row that names no method, or a number without its command, is a promise, no audit."""
+    here, _, ours, deviation = ROWS[what]
+    if here in ("", "-"):
+        assert deviation or ours, "neither a method nor the reason why there is none"
+        return
+    assert ours not in ("", "-"), "nothing came out"
+    assert SOURCE.search(ours), "no command behind what came out"
+
+
+def test_a_row_of_less_is_found() -> None:
+    assert SOURCE.search("0.25 mm (P)")
+    assert SOURCE.search("8 of 8 (`orient.pnp`; O)")
+    assert not SOURCE.search("0.25 mm (about)")
+    assert len(ROWS) > 90
 
 
 @pytest.mark.parametrize("path", [code for code in CODE if re.match(r"(tests|benchmarks)/", code)])
