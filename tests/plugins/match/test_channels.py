@@ -1,0 +1,163 @@
+"""What of a picture is compared: evened channels, places with texture, and how much is measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.match import channels
+from orthoflow_plugins.match.channels import Channels
+from scipy.ndimage import gaussian_filter
+
+from orthoflow.geometry import WallFrame
+from orthoflow.products import Wall
+
+
+def texture(seed: int = 1, shape: tuple[int, int] = (90, 120)) -> NDArray[np.float32]:
+    smooth = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 1.5)
+    return (100.0 + 20.0 * smooth / smooth.std()).astype(np.float32)
+
+
+def wall(count: NDArray[np.uint32], depth_m: NDArray[np.float32], intensity: bool = True) -> Wall:
+    rows, columns = count.shape
+    return Wall(
+        frame=WallFrame(
+            origin_world=np.zeros(3),
+            u_world=np.array([1.0, 0.0, 0.0]),
+            v_world=np.array([0.0, 0.0, -1.0]),
+            normal_world=np.array([0.0, -1.0, 0.0]),
+            gsd_m=0.01,
+            width=columns,
+            height=rows,
+        ),
+        plane_index=0,
+        name="wall",
+        depth_m=depth_m,
+        sigma_m=np.zeros(count.shape, dtype=np.float32),
+        count=count,
+        mask=np.ones(count.shape, dtype=np.uint8),
+        intensity=np.full(count.shape, 0.5, dtype=np.float32) if intensity else None,
+    )
+
+
+def test_a_part_of_channels_is_that_part() -> None:
+    whole = channels.grey_channels(texture())
+    part = whole.part((slice(10, 20), slice(30, 50)))
+    np.testing.assert_array_equal(part.values, whole.values[10:20, 30:50])
+    np.testing.assert_array_equal(part.known, whole.known[10:20, 30:50])
+    assert part.values.flags.c_contiguous
+
+
+@pytest.mark.parametrize("content", ["grey", "gradients"])
+def test_weak_and_strong_contrast_count_alike(content: str) -> None:
+    grey = texture()
+    weaker = grey.copy()
+    weaker[:, 60:] = 100.0 + 0.25 * (weaker[:, 60:] - 100.0)
+    strong, weak = (channels.CHANNELS[content](given).values for given in (grey, weaker))
+    np.testing.assert_allclose(weak[5:-5, 5:30], strong[5:-5, 5:30], rtol=0.06, atol=0.03)
+    # Far from where the contrast changes a fourth of it makes nearly no difference.
+    ratio = np.std(weak[5:-5, 95:115]) / np.std(strong[5:-5, 95:115])
+    assert 0.8 < ratio < 1.1
+
+
+def test_gradients_have_six_directions_and_do_not_tell_light_from_dark() -> None:
+    grey = texture()
+    found, negative = (channels.gradient_channels(given) for given in (grey, 200.0 - grey))
+    assert found.values.shape == (90, 120, 6)
+    np.testing.assert_allclose(found.values, negative.values, atol=1e-4)
+    assert (found.values >= 0.0).all()
+    # Across a vertical edge the first direction is strongest, the fourth weakest.
+    edge = np.zeros((60, 60), dtype=np.float32)
+    edge[:, 30:] = 100.0
+    at_edge = channels.gradient_channels(edge).values[30, 30]
+    assert int(np.argmax(at_edge)) == 0
+    assert int(np.argmin(at_edge)) == 3
+    assert at_edge[1] == pytest.approx(at_edge[0] * np.cos(np.pi / 6), rel=1e-4)
+
+
+def test_cells_within_two_of_a_void_are_not_known() -> None:
+    grey = texture()
+    grey[40, 50] = np.nan
+    for content in ("grey", "gradients"):
+        found = channels.CHANNELS[content](grey)
+        expected = np.ones(grey.shape, dtype=np.float32)
+        expected[38:43, 48:53] = 0.0
+        np.testing.assert_array_equal(found.known, expected)
+        assert not found.values[38:43, 48:53].any()
+        assert np.isfinite(found.values).all()
+
+
+def test_colours_are_evened_out_as_one() -> None:
+    red = texture(1)
+    colours = np.stack([red, 0.1 * texture(2), np.full(red.shape, 7.0, np.float32)], axis=2)
+    values = channels.colour_channels(colours).values
+    spreads = values[10:-10, 10:-10].std(axis=(0, 1))
+    # Weak channels stay weak beside strong ones.
+    assert spreads[0] == pytest.approx(1.0, abs=0.15)
+    assert spreads[1] == pytest.approx(0.1, abs=0.03)
+    assert spreads[2] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("every", "grain"), [(1, 1.0), (2, 4.0), (3, 9.0)], ids=["all", "a-fourth", "a-ninth"]
+)
+def test_a_patch_tells_no_more_than_its_measured_cells(every: int, grain: float) -> None:
+    count = np.zeros((60, 60), dtype=np.uint32)
+    count[::every, ::every] = 5
+    depth_m = np.zeros((60, 60), dtype=np.float32)
+    found = channels.grain_of(wall(count, depth_m), 5)
+    assert np.mean(found[12:48, 12:48]) == pytest.approx(grain, rel=0.1)
+    assert found.min() >= 1.0
+    # Void does not count; where nothing is known there is nothing to share.
+    depth_m[:, 30:] = np.nan
+    assert channels.grain_of(wall(count, depth_m), 5)[30, 50] == 1.0
+
+
+def test_a_wall_without_intensity_is_no_target() -> None:
+    count, depth_m = np.ones((30, 30), dtype=np.uint32), np.zeros((30, 30), dtype=np.float32)
+    blind = channels.target_of(wall(count, depth_m, intensity=False))
+    assert blind.grey is None
+    blind.prepare("grey", 5)
+    assert blind.channels == {}
+    depth_m[3, 4] = np.nan
+    target = channels.target_of(wall(count, depth_m))
+    assert target.grey is not None
+    assert np.isnan(target.grey[3, 4])
+    target.prepare("grey", 5)
+    first = target.channels["grey"]
+    target.prepare("grey", 5)
+    assert target.channels["grey"] is first
+    assert set(target.textures) == {"grey"}
+    assert set(target.grains) == {5}
+
+
+def test_texture_is_the_weaker_direction() -> None:
+    rows, columns = np.mgrid[:60, :60].astype(np.float32)
+    everywhere = np.ones((60, 60), dtype=np.float32)
+
+    def strength(values: NDArray[np.float32]) -> float:
+        made = Channels(values=values[..., None], known=everywhere)
+        return float(channels.texture(made, half_patch_cells=5)[30, 30])
+
+    assert strength(columns) == pytest.approx(0.0, abs=1e-2)
+    assert strength(rows + columns) == pytest.approx(0.0, abs=1e-1)
+    # A saddle: Scharr's slope of one is 32; the smaller moment is that of the smaller slope.
+    waves = np.sin(columns).astype(np.float32) + 0.5 * np.sin(rows).astype(np.float32)
+    stronger = np.sin(columns).astype(np.float32) + 2.0 * np.sin(rows).astype(np.float32)
+    assert strength(stronger) == pytest.approx(4.0 * strength(waves), rel=0.02)
+
+
+def test_places_are_the_strongest_five_cells_around() -> None:
+    strength = np.zeros((40, 60), dtype=np.float32)
+    for row, column, value in ((10, 10, 3.0), (10, 12, 2.0), (10, 13, 1.5), (30, 50, 1.0)):
+        strength[row, column] = value
+    usable = np.ones((40, 60), dtype=np.bool_)
+    found = channels.textured_places(strength, usable, 10)
+    # The second lies within two cells of the first; the third does of the second only.
+    assert {tuple(place) for place in found.tolist()} == {(10, 10), (50, 30)}
+    usable[10, 10] = False
+    found = channels.textured_places(strength, usable, 10)
+    assert {tuple(place) for place in found.tolist()} == {(12, 10), (50, 30)}
+    assert channels.textured_places(strength, usable, 1).tolist() == [[12, 10]]
+    nothing = channels.textured_places(np.zeros((5, 5), np.float32), np.ones((5, 5), bool), 10)
+    assert nothing.shape == (0, 2)
