@@ -22,7 +22,9 @@ NAMED = [code for code in CODE if METHOD.match(code)]
 # Rows of both papers by what they are of: method, theirs, ours, deviation.
 ROWS = {
     f"{section}: {where}, {what}": tuple(rest)
-    for section, table in re.findall(r"^## (\w+2\d{3})\n(.*?)(?=^## |\Z)", TEXT, re.M | re.S)
+    for section, table in re.findall(
+        r"^## (\w+2\d{3})\n(.*?)(?=^## |\Z)", TEXT, re.MULTILINE | re.DOTALL
+    )
     for where, what, *rest in (
         [cell.strip() for cell in line.strip("|").split("|")]
         for line in table.splitlines()
