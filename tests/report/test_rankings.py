@@ -1,0 +1,97 @@
+"""Best and worst of a column: among its like, by the sense of its metric, within spreads."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from orthoflow.report.rankings import Sense, Value, badness, rank, sense_of
+
+
+def marks(*values: Value, sense: Sense = Sense.LESS) -> list[str]:
+    return [value.mark.name for value in rank(values, sense)]
+
+
+def of(sort: float, spread: float = math.nan, group: str = "") -> Value:
+    return Value(text=str(sort), sort=sort, spread=spread, group=group)
+
+
+def test_the_smallest_is_best_and_the_largest_is_worst() -> None:
+    assert marks(of(3.0), of(1.0), of(2.0)) == ["WORST", "BEST", "NONE"]
+    assert marks(of(3.0), of(1.0), of(2.0), sense=Sense.MORE) == ["BEST", "WORST", "NONE"]
+    # Signed errors count by their size.
+    assert marks(of(-3.0), of(1.0), of(-0.5)) == ["WORST", "NONE", "BEST"]
+
+
+def test_a_ratio_is_best_at_one_and_as_bad_at_half_as_at_double() -> None:
+    found = marks(of(0.5), of(1.1), of(2.0), of(0.0), sense=Sense.ONE)
+    assert found == ["NONE", "BEST", "NONE", "WORST"]
+
+
+def test_what_is_alike_has_neither_and_equal_bests_are_all_best() -> None:
+    assert marks(of(1.0), of(1.0)) == ["NONE", "NONE"]
+    assert marks(of(1.0), of(-1.0)) == ["NONE", "NONE"]
+    assert marks(of(1.0), of(1.0), of(2.0)) == ["BEST", "BEST", "WORST"]
+    assert marks(of(1.0)) == ["NONE"]
+    assert marks(of(1.0), of(2.0), sense=Sense.NEITHER) == ["NONE", "NONE"]
+
+
+@pytest.mark.parametrize(
+    ("best_spread", "spread", "mark"),
+    [
+        (0.3, 0.4, "NEAR"),
+        (0.3, 0.39, "WORST"),
+        (math.nan, 0.5, "NEAR"),
+        (0.5, math.nan, "NEAR"),
+        (math.nan, 0.49, "WORST"),
+        (math.nan, math.nan, "WORST"),
+    ],
+)
+def test_a_value_within_both_spreads_of_the_best_is_near_it(
+    best_spread: float, spread: float, mark: str
+) -> None:
+    # Half apart: 0.3 and 0.4 in quadrature.
+    assert marks(of(1.0, best_spread), of(1.5, spread)) == ["BEST", mark]
+
+
+def test_groups_are_ranked_apart_and_what_is_absent_is_not_ranked() -> None:
+    values = [of(1.0, group="a"), of(9.0, group="b"), of(2.0, group="a"), of(8.0, group="b")]
+    assert marks(*values) == ["BEST", "WORST", "WORST", "BEST"]
+    assert marks(of(1.0), Value(), of(math.inf), of(2.0)) == ["BEST", "NONE", "NONE", "WORST"]
+
+
+def test_a_mark_leaves_the_rest_of_a_value_as_it_was() -> None:
+    [best, _] = rank([of(1.0, 0.1, "a"), of(2.0, 0.1, "a")], Sense.LESS)
+    assert (best.text, best.sort, best.spread, best.group) == ("1.0", 1.0, 0.1, "a")
+
+
+@pytest.mark.parametrize(
+    ("metric", "sense"),
+    [
+        ("wall_error_over_sigma", Sense.ONE),
+        ("sigma0_px", Sense.NEITHER),
+        ("sigma_wall_mm", Sense.LESS),
+        ("raw_omega_deg", Sense.NEITHER),
+        ("raw_angle_deg", Sense.LESS),
+        ("compile_s", Sense.NEITHER),
+        ("wall_s", Sense.LESS),
+        ("peak_mib", Sense.LESS),
+        ("label_f1", Sense.MORE),
+        ("completeness_filled", Sense.MORE),
+        ("depth_nmad_mm", Sense.LESS),
+        ("check_rmse_px", Sense.LESS),
+        ("n_points", Sense.NEITHER),
+    ],
+)
+def test_the_first_pattern_that_fits_says_what_is_good(metric: str, sense: Sense) -> None:
+    assert sense_of(metric) is sense
+
+
+def test_badness_is_smaller_the_better_a_value_is() -> None:
+    assert badness(-2.0, Sense.LESS) == 2.0
+    assert badness(2.0, Sense.MORE) == -2.0
+    assert badness(2.0, Sense.ONE) == badness(0.5, Sense.ONE) == pytest.approx(math.log(2.0))
+    assert badness(0.0, Sense.ONE) == badness(-1.0, Sense.ONE) == math.inf
+    with pytest.raises(ValueError, match="cannot be ranked"):
+        badness(1.0, Sense.NEITHER)
