@@ -185,6 +185,9 @@ def choose_data(
         for name in (part.strip() for part in text.split(",")):
             if name in datasets:
                 chosen[name] = None
+            elif not datasets and log.has_any:
+                # Of a table that cannot be read nobody knows the names.
+                continue
             elif not datasets:
                 log.add_option(f"--only-data {text}", "the workflow has no datasets")
             else:
