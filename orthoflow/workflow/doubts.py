@@ -16,10 +16,17 @@ _MILLIMETRES: Final = 1000.0
 
 def doubts_about(workflow: Workflow) -> tuple[str, ...]:
     """Say in a sentence each what is allowed and can hardly be meant."""
-    return (*_unused_inputs(workflow), *_cell_sizes(workflow))
+    return (*_unused_inputs(workflow), *_idle_datasets(workflow), *_cell_sizes(workflow))
 
 
 def _unused_inputs(workflow: Workflow) -> Iterator[str]:
+    taken = _taken_inputs(workflow)
+    for name in workflow.inputs:
+        if name not in taken:
+            yield f"no step takes the input {name}: wire it as inputs.{name}, or remove it"
+
+
+def _taken_inputs(workflow: Workflow) -> set[str]:
     taken = {
         reference.name
         for step in workflow.steps.values()
@@ -27,24 +34,34 @@ def _unused_inputs(workflow: Workflow) -> Iterator[str]:
         for reference in references
         if reference.is_input
     }
-    taken |= {step.unless for step in workflow.steps.values()}
-    for name in workflow.inputs:
-        if name not in taken:
-            yield f"no step takes the input {name}: wire it as inputs.{name}, or remove it"
+    return taken | {step.unless for step in workflow.steps.values()}
+
+
+def _idle_datasets(workflow: Workflow) -> Iterator[str]:
+    is_idle = not workflow.data_calls and workflow.data_inputs.isdisjoint(_taken_inputs(workflow))
+    if workflow.datasets and is_idle:
+        yield "the datasets change nothing: they name no input that a step takes, and no parameter"
 
 
 def _cell_sizes(workflow: Workflow) -> Iterator[str]:
-    for step in workflow.steps.values():
-        for variant in step.variants:
-            gsd_m = variant.params.get(_CELL)
-            if not isinstance(gsd_m, int | float) or _LEAST_GSD_M <= gsd_m <= _MOST_GSD_M:
-                continue
-            place = ".".join(part for part in (step.name, variant.name, _CELL) if part)
+    calls = [
+        ("", step.name, variant) for step in workflow.steps.values() for variant in step.variants
+    ]
+    for dataset in workflow.chosen_data:
+        calls += [
+            (f" of dataset {dataset.name}", step, variant)
+            for (step, _), variant in dataset.calls.items()
+            if _CELL in {key.rpartition(".")[2] for key in dataset.sets}
+        ]
+    for whose, step, variant in calls:
+        gsd_m = variant.params.get(_CELL)
+        if isinstance(gsd_m, int | float) and not _LEAST_GSD_M <= gsd_m <= _MOST_GSD_M:
+            place = ".".join(part for part in (step, variant.name, _CELL) if part)
             meant_m = gsd_m / _MILLIMETRES
             hint = ""
             if _LEAST_GSD_M <= meant_m <= _MOST_GSD_M:
                 hint = f"; {gsd_m:g} mm are written {_CELL}: {meant_m:g}"
             yield (
-                f"{place} is {gsd_m:g} m, which can hardly be meant: cells are "
+                f"{place}{whose} is {gsd_m:g} m, which can hardly be meant: cells are "
                 f"{_LEAST_GSD_M:g} to {_MOST_GSD_M:g} m wide{hint}"
             )

@@ -8,7 +8,14 @@ import pytest
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import ArgumentError, InputError, OrthoflowError, WorkflowError
-from orthoflow.workflow import Cell, Workflow, expand_cells, load_workflow, resolve_input_files
+from orthoflow.workflow import (
+    Cell,
+    Workflow,
+    doubts_about,
+    expand_cells,
+    load_workflow,
+    resolve_input_files,
+)
 from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
 from tests.laboratories import laboratory_catalog
 
@@ -448,3 +455,15 @@ def test_a_changed_record_of_datasets_is_refused(catalog: Catalog, folder: Path)
         assert old in resolved
         with pytest.raises((WorkflowError, ArgumentError)):
             workflow_from_resolved(resolved.replace(old, new, 1), "")
+
+
+@pytest.mark.usefixtures("folder")
+def test_datasets_that_can_hardly_be_meant_are_doubted(catalog: Catalog) -> None:
+    idle = load(ROOMS + "datasets: {hall: {}, attic: {}}\n", catalog)
+    assert doubts_about(idle) == (
+        "the datasets change nothing: they name no input that a step takes, and no parameter",
+        *doubts_about(load(ROOMS, catalog)),
+    )
+    coarse = load(ROOMS + "datasets: {hall: {set: {wall.gsd_m: 3}}, attic: {}}\n", catalog)
+    (said,) = set(doubts_about(coarse)) - set(doubts_about(load(ROOMS, catalog)))
+    assert said.startswith("wall.gsd_m of dataset hall is 3 m, which can hardly be meant")
