@@ -96,6 +96,9 @@ class Run:
         """
         for address, port in places:
             self._check_embedded(address, port)
+        if not places:
+            # To open a record is to look at all of it, a page of each of many datasets too often.
+            return
         with record_errors(self.path):
             for stored in read_outputs(self.path, places):
                 yield Payload(
