@@ -1,0 +1,103 @@
+"""Processor time that each kernel takes to compile, in a run that finds none compiled.
+
+python benchmarks/compile_times.py WORKFLOW [--set STEP.PARAM=VALUE ...] [--top 25]
+
+All steps run in this process, so that numba's own functions, which it keeps nowhere, are compiled
+once; a run compiles those that a step needs in each step's process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+kernels = tempfile.TemporaryDirectory(prefix="orthoflow-compile-times-")
+os.environ["NUMBA_CACHE_DIR"] = kernels.name
+os.environ["ORTHOFLOW_KERNELS"] = kernels.name
+
+from numba.core import event  # noqa: E402 - it reads the variable
+
+from orthoflow.catalog import discover_catalog  # noqa: E402
+from orthoflow.engine import RunOptions, Store, execute, plan_run  # noqa: E402
+from orthoflow.workflow import expand_cells, load_workflow, shipped_workflow  # noqa: E402
+
+
+@dataclass
+class Compilations(event.Listener):
+    """Hears which kernels numba compiles.
+
+    Attributes:
+        cpu_s: kernel -> its own processor time, without that of kernels it calls.
+        versions: kernel -> how often it was compiled.
+    """
+
+    cpu_s: Counter[str] = field(default_factory=Counter)
+    versions: Counter[str] = field(default_factory=Counter)
+    _begun: list[tuple[float, float]] = field(default_factory=list)
+
+    def on_start(self, event: event.Event) -> None:
+        """Take the time."""
+        self._begun.append((time.thread_time(), 0.0))
+
+    def on_end(self, event: event.Event) -> None:
+        """Count what passed, and keep it from whoever needed the kernel."""
+        begun, inner_s = self._begun.pop()
+        whole_s = time.thread_time() - begun
+        if self._begun:
+            outer, outer_inner_s = self._begun[-1]
+            self._begun[-1] = (outer, outer_inner_s + whole_s)
+        function = event.data["dispatcher"].py_func
+        name = f"{function.__module__}.{function.__qualname__}"
+        self.cpu_s[name] += whole_s - inner_s
+        self.versions[name] += 1
+
+
+def run(workflow: str, sets: list[str]) -> float:
+    """Run a workflow in a store that goes away; give its processor time in seconds."""
+    before = time.process_time()
+    with tempfile.TemporaryDirectory(prefix="orthoflow-compile-times-") as folder:
+        catalog, store = discover_catalog(), Store(Path(folder) / "store")
+        path = Path(workflow) if Path(workflow).exists() else shipped_workflow(workflow)
+        loaded = load_workflow(path, catalog, sets=sets)
+        cells = expand_cells(loaded, catalog)
+        plan = plan_run(cells, loaded, catalog, store, RunOptions(executor="inline"))
+        outcome = execute(plan, Path(folder) / "run", store, lambda _: None)
+        assert outcome.exit_code == 0, "the run failed"  # noqa: S101
+    return time.process_time() - before
+
+
+def main() -> None:
+    """Run a workflow and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("workflow")
+    parser.add_argument("--set", action="append", default=[], dest="sets")
+    parser.add_argument("--top", type=int, default=25)
+    asked = parser.parse_args()
+    heard = Compilations()
+    event.register("numba:compile", heard)
+    cpu_s = run(asked.workflow, asked.sets)
+    own = {name for name in heard.cpu_s if name.startswith("numba.")}
+    rows = [
+        (name, heard.cpu_s[name], heard.versions[name]) for name in heard.cpu_s if name not in own
+    ]
+    rows += [
+        (
+            "numba's own functions",
+            sum(heard.cpu_s[n] for n in own),
+            sum(heard.versions[n] for n in own),
+        )
+    ]
+    rows.sort(key=lambda row: -row[1])
+    print(f"run {cpu_s:.1f} s of processor time, {sum(heard.cpu_s.values()):.1f} s compiling")
+    print("| kernel | versions | compile, CPU s |\n|---|---|---|")
+    for name, own_s, versions in rows[: asked.top]:
+        print(f"| {name} | {versions} | {own_s:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
