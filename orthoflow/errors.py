@@ -58,6 +58,10 @@ class DiskSpaceError(StepFailedError):
     """A step wanted more room on the disk than there was; given more, the same run goes on."""
 
 
+class ClusterError(OrthoflowError, RuntimeError):
+    """The scheduler of a run was lost, or its workers; the same command goes on."""
+
+
 class CancelledStepError(OrthoflowError, RuntimeError):
     """A step was asked to stop and did."""
 

@@ -120,12 +120,26 @@ def output_option(name: str) -> Callable[[_Decorated], _Decorated]:
 
 
 def execution_options(command: _Decorated) -> _Decorated:
-    """Add how steps run: `--jobs --executor`."""
+    """Add how steps run: `--jobs --executor --scheduler --retries`."""
+    command = click.option(
+        "--retries",
+        type=int,
+        default=2,
+        show_default=True,
+        metavar="N",
+        help="With dask: try a step again so often whose worker was lost.",
+    )(command)
+    command = click.option(
+        "--scheduler",
+        default="",
+        metavar="ADDRESS",
+        help="With dask: the cluster's scheduler, tcp://HOST:PORT; without it, N workers here.",
+    )(command)
     command = click.option(
         "--executor",
-        type=click.Choice(["local", "inline"]),
+        type=click.Choice(["local", "inline", "dask"]),
         default="local",
-        help="A process per step, or all in this one (for debugging).",
+        help="A process per step, all in this one (for debugging), or on the workers of dask.",
     )(command)
     return click.option(
         "--jobs", type=int, default=1, metavar="N", help="Steps that run at the same time."

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,7 +22,7 @@ from orthoflow.cli.options import (
     output_option,
 )
 from orthoflow.cli.tables import echo, echo_distances, echo_json
-from orthoflow.errors import CancelledStepError
+from orthoflow.errors import CancelledStepError, ClusterError
 
 if TYPE_CHECKING:
     from orthoflow.engine import RunOutcome, Store
@@ -47,10 +47,10 @@ def replay(
     inputs: Sequence[str],
     output: Path | None,
     store: Path | None,
-    jobs: int,
-    executor: Literal["local", "inline"],
     *,
     as_json: bool,
+    # Any: those fields of RunOptions that say how steps run, whose types click has checked.
+    **choices: Any,
 ) -> int:
     """Make RUN, a run folder or its run.h5, again from its record and its input files.
 
@@ -67,7 +67,7 @@ def replay(
     from orthoflow.records.input_files import embedded_inputs
     from orthoflow.records.replaying import plan_replay
 
-    options = RunOptions(jobs=jobs, executor=executor)
+    options = RunOptions(**choices)
     original = open_run(run)
     run_id = new_run_id()
     folder = output or new_run_folder(f"{original.record.name}-replay", run_id)
@@ -102,7 +102,7 @@ def _store_folder(given: Path | None, folder: Path) -> Iterator[Path]:
     is_interrupted = False
     try:
         yield fresh
-    except (CancelledStepError, KeyboardInterrupt):
+    except (CancelledStepError, ClusterError, KeyboardInterrupt):
         # What is finished serves the same command, called again.
         is_interrupted = True
         raise

@@ -6,6 +6,7 @@ import hashlib
 import os
 import platform
 import subprocess
+import sys
 from dataclasses import asdict, replace
 from functools import cache
 from importlib import metadata
@@ -37,6 +38,12 @@ def environment(threads: int) -> RecordedEnvironment:
     content = {name: value for name, value in asdict(unnamed).items() if name != "id"}
     digest = hashlib.sha256(canonical_json(content).encode()).hexdigest()
     return replace(unnamed, id=f"sha256:{digest}")
+
+
+def python_path() -> str:
+    """`PYTHONPATH` for a child process that is to import what this one would."""
+    paths = [str(Path(path).absolute()) for path in sys.path]
+    return os.pathsep.join(dict.fromkeys(paths))
 
 
 @cache

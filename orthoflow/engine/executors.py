@@ -40,11 +40,39 @@ class TaskEnd:
     result: CellResult
 
 
+@dataclass(frozen=True, kw_only=True)
+class Capacity:
+    """What may run at the same time.
+
+    Attributes:
+        n_tasks: tasks.
+        n_cores: cores of all of them.
+        cores_of_one: the most that one may have.
+        share: what one gets that asks for nothing.
+    """
+
+    n_tasks: int
+    n_cores: int
+    cores_of_one: int
+    share: int
+
+    @classmethod
+    def of_jobs(cls, jobs: int, n_cores: int) -> Capacity:
+        """So many jobs that share the cores of one machine."""
+        share = max(1, n_cores // jobs)
+        return cls(n_tasks=jobs, n_cores=n_cores, cores_of_one=n_cores, share=share)
+
+
 class Executor(Protocol):
     """Runs tasks; used from one thread.
 
     Nothing here assumes one machine: a task is JSON, its results lie in the store.
     """
+
+    @property
+    def capacity(self) -> Capacity:
+        """What may run at the same time, now."""
+        raise AssertionError("a protocol is never called")
 
     def start(self, task: Task) -> None:
         """Begin a task, or put it in line.
@@ -70,13 +98,15 @@ class Executor(Protocol):
 class InlineExecutor:
     """Runs tasks one by one in this process, for debugging: no timeout, no crash protection."""
 
-    def __init__(self, tell: Tell, is_interrupted: Callable[[], bool]) -> None:
+    def __init__(self, capacity: Capacity, tell: Tell, is_interrupted: Callable[[], bool]) -> None:
         """Make one.
 
         Args:
+            capacity: what a task may have.
             tell: gets the address of a task and what it says.
             is_interrupted: whether the user asked to stop, also while a task runs.
         """
+        self.capacity = capacity
         self._tell = tell
         self._is_interrupted = is_interrupted
         self._waiting: deque[Task] = deque()

@@ -19,7 +19,8 @@ from pydantic import TypeAdapter
 
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import read_whole, writing_to
-from orthoflow.engine.executors import COMPILED_CODE, TaskEnd, Tell
+from orthoflow.engine.environment import python_path
+from orthoflow.engine.executors import COMPILED_CODE, Capacity, TaskEnd, Tell
 from orthoflow.engine.keeper import END_ALL
 from orthoflow.engine.memory import GIB, MemoryGuard, oom_kills, process_memory
 from orthoflow.engine.process_trees import descendants
@@ -116,6 +117,7 @@ class LocalExecutor:
     Call it from the main thread: the kernel kills a child together with the thread that spawned it.
     """
 
+    capacity: Capacity
     tell: Tell
     _running: dict[str, _Running] = field(default_factory=dict)
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
@@ -353,10 +355,8 @@ def _child_environment(task: Task) -> dict[str, str]:
     """Environment variables for the process of a task."""
     variables = dict(os.environ)
     variables |= dict.fromkeys(_THREAD_VARIABLES, str(task.cores))
-    # The child imports what this process would, wherever that came from.
-    paths = [str(Path(path).absolute()) for path in sys.path]
     return variables | {
-        "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)),
+        "PYTHONPATH": python_path(),
         "PYTHONHASHSEED": "0",
         "PYTHONUNBUFFERED": "1",
         COMPILED_CODE: task.numba_folder,

@@ -30,7 +30,7 @@ from orthoflow.products.input_files import InputFiles
 from orthoflow.workflow import Workflow, check_step_names, resolve_input_files
 from orthoflow.workflow.cells import Cell, CellOutput, Selection, select_cells
 
-ExecutorName = Literal["local", "inline"]
+ExecutorName = Literal["local", "inline", "dask"]
 CellPlan = Literal["cached", "will run", "unknown yet", "skipped"]
 _MOST_NAMED: Final = 4
 _LONGEST_VALUE: Final = 40
@@ -47,7 +47,10 @@ class RunOptions:
 
     Attributes:
         jobs: cells that run at the same time; they share the cores.
-        executor: `local` (a child process per cell) or `inline` (this process, for debugging).
+        executor: `local` (a child process per cell), `inline` (this process, for debugging) or
+            `dask` (a child process per cell, on the workers of a cluster).
+        scheduler: address of dask's scheduler; empty for workers of its own, as many as `jobs`.
+        retries: so often a cell is tried again whose worker was lost.
         only: run these steps and what they need, from the store where it is there.
         from_: run these steps, what follows from them, and what all these need.
         until: run these steps and what they need.
@@ -57,6 +60,8 @@ class RunOptions:
 
     jobs: int = 1
     executor: ExecutorName = "local"
+    scheduler: str = ""
+    retries: int = 2
     only: tuple[str, ...] = ()
     from_: tuple[str, ...] = ()
     until: tuple[str, ...] = ()
@@ -68,8 +73,12 @@ class RunOptions:
             raise ArgumentError(f"--jobs must be 1 or more, got {self.jobs}")
         if self.cores is not None and self.cores < 1:
             raise ArgumentError(f"cores must be 1 or more, got {self.cores}")
-        if self.executor not in ("local", "inline"):
-            raise ArgumentError(f"--executor must be local or inline, got {self.executor}")
+        if self.executor not in ("local", "inline", "dask"):
+            raise ArgumentError(f"--executor must be local, inline or dask, got {self.executor}")
+        if self.scheduler and self.executor != "dask":
+            raise ArgumentError("--scheduler is for --executor dask")
+        if self.retries < 0:
+            raise ArgumentError(f"--retries must be 0 or more, got {self.retries}")
 
     @property
     def all_cores(self) -> int:

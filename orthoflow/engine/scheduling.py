@@ -27,13 +27,12 @@ from orthoflow.engine.events import (
     RunStarted,
     ignore,
 )
-from orthoflow.engine.executors import Executor, InlineExecutor, TaskEnd, Tell
+from orthoflow.engine.executors import Capacity, Executor, InlineExecutor, TaskEnd, Tell
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.local_executor import LocalExecutor
 from orthoflow.engine.locks import exclusive_lock, is_locked
 from orthoflow.engine.plan import (
-    ExecutorName,
     PlannedInput,
     RunPlan,
     known_inputs,
@@ -51,7 +50,14 @@ from orthoflow.engine.run_folder import (
 )
 from orthoflow.engine.store import Store
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput
-from orthoflow.errors import ArgumentError, CancelledStepError, DamageError, StoreError
+from orthoflow.errors import (
+    ArgumentError,
+    CancelledStepError,
+    ClusterError,
+    DamageError,
+    PluginError,
+    StoreError,
+)
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
 from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
@@ -129,13 +135,15 @@ def execute(
         store: where products and results go.
         listen: gets events as they happen.
         run_id: id of a new run, made up when empty; a resumed run keeps its own.
-        on_interruption: gets what there is so far before the run ends with `StoreError` or
-            `CancelledStepError`; cells that have no result are not in it.
+        on_interruption: gets what there is so far before the run ends with `StoreError`,
+            `ClusterError` or `CancelledStepError`; cells that have no result are not in it.
 
     Raises:
         ArgumentError: the run folder holds a finished run or other files, or a path is no text.
         StoreError: the disk refuses, or the run folder is in use.
         CancelledStepError: interrupted by Ctrl-C or SIGTERM.
+        ClusterError: the scheduler was lost, or does not answer.
+        PluginError: workers have other versions of a method or library, or dask is missing.
     """
     folder = Path(run_folder).absolute()
     for what, path in (("run folder", folder), ("store", store.folder)):
@@ -159,12 +167,12 @@ def execute(
                 logs=folder / LOGS,
                 run_id=journal.run_id,
             )
-            executor = _executor(plan.options.executor, _passing_on(listen), interruption)
+            executor = _executor(plan, scratch, _passing_on(listen), interruption)
             run = _Run(tasks, journal, listen)
             try:
                 with closing(executor):
                     run.go(executor, interruption)
-            except (CancelledStepError, StoreError):
+            except (CancelledStepError, ClusterError, StoreError):
                 if on_interruption is not None:
                     on_interruption(run.so_far())
                 raise
@@ -261,7 +269,9 @@ class _Run:
             known = self._known(planned.cell, ready.key) if ready.key.key in self._made else None
             if known is not None:
                 self._settle(planned.cell, known, is_cached=True)
-            elif self._has_room(planned.cell) and not self._is_held_up(planned.cell, ready.refs):
+            elif self._has_room(planned.cell, executor.capacity) and not self._is_held_up(
+                planned.cell, ready.refs
+            ):
                 self._start(planned.cell, ready, executor)
 
     def _prepare(self, cell: Cell) -> None:
@@ -342,20 +352,15 @@ class _Run:
         """Whether an equal cell runs already; its result will then serve both."""
         return any(task.key == key.key for task in self._running.values())
 
-    def _cores(self, cell: Cell) -> int:
-        everything = self._plan.options.all_cores
-        share = max(1, everything // self._plan.options.jobs)
-        return min(cell.cores or share, everything)
-
-    def _has_room(self, cell: Cell) -> bool:
+    def _has_room(self, cell: Cell, capacity: Capacity) -> bool:
         if not self._running:
             return True
         taken = sum(task.cores for task in self._running.values())
-        is_fitting = taken + self._cores(cell) <= self._plan.options.all_cores
-        return len(self._running) < self._plan.options.jobs and is_fitting
+        is_fitting = taken + _cores(cell, capacity) <= capacity.n_cores
+        return len(self._running) < capacity.n_tasks and is_fitting
 
     def _start(self, cell: Cell, ready: _Ready, executor: Executor) -> None:
-        task = self._tasks.make(cell, ready.key, ready.refs, self._cores(cell))
+        task = self._tasks.make(cell, ready.key, ready.refs, _cores(cell, executor.capacity))
         del self._waiting[cell.address]
         self._running[cell.address] = task
         self._journal.write(CellBegan(time=now(), address=cell.address, key=task.key))
@@ -434,10 +439,24 @@ def _with_warning(result: CellResult, text: str) -> CellResult:
     return dataclasses.replace(result, warnings=(*result.warnings, text))
 
 
-def _executor(name: ExecutorName, tell: Tell, interruption: _Interruption) -> Executor:
-    if name == "inline":
-        return InlineExecutor(tell, lambda: interruption.is_asked)
-    return LocalExecutor(tell)
+def _cores(cell: Cell, capacity: Capacity) -> int:
+    return min(cell.cores or capacity.share, capacity.cores_of_one)
+
+
+def _executor(plan: RunPlan, scratch: Path, tell: Tell, interruption: _Interruption) -> Executor:
+    options = plan.options
+    capacity = Capacity.of_jobs(options.jobs, options.all_cores)
+    if options.executor == "inline":
+        return InlineExecutor(capacity, tell, lambda: interruption.is_asked)
+    if options.executor == "dask":
+        try:
+            from orthoflow.engine.dask_executor import DaskExecutor  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            raise PluginError(
+                "--executor dask needs dask: pip install 'orthoflow-tls[dask]'"
+            ) from error
+        return DaskExecutor(plan, scratch, capacity, tell)
+    return LocalExecutor(capacity, tell)
 
 
 def _passing_on(listen: RunListener) -> Tell:

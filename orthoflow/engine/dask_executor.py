@@ -1,0 +1,325 @@
+"""The executor for a cluster: dask carries tasks to workers that share the store's file system.
+
+A task is the same JSON as on one machine and runs in the same guarded child process there
+(`engine.dask_worker`); its products go into the store, and dask carries nothing but its result.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import time
+import uuid
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import dask
+from distributed import Client, Future, KilledWorker, LocalCluster
+
+from orthoflow.engine.dask_worker import (
+    CANCEL_FILE,
+    Order,
+    Surroundings,
+    describe_loss,
+    look_around,
+    run_attempt,
+)
+from orthoflow.engine.durability import write_whole, writing_to
+from orthoflow.engine.executors import Capacity, TaskEnd, Tell
+from orthoflow.engine.method_versions import methods_text
+from orthoflow.engine.results import CellResult, result_from_json
+from orthoflow.engine.running import failed_result
+from orthoflow.engine.tasks import Task, write_task
+from orthoflow.errors import (
+    ArgumentError,
+    CancelledStepError,
+    ClusterError,
+    OrthoflowError,
+    PluginError,
+    StepFailedError,
+)
+from orthoflow.sdk.context import StepEvent
+from orthoflow.sdk.lines import one_line
+
+if TYPE_CHECKING:
+    from orthoflow.engine.plan import RunPlan
+
+# The resource that workers state: cores that steps may use there.
+CORES: Final = "cores"
+_PROOF_FILE: Final = "workers-see-this"
+_CONNECT_S: Final = 15.0
+# So long a run waits for a first worker, for a lost scheduler, and when all workers are gone.
+_PATIENCE_S: Final = 60.0
+_LOOK_S: Final = 2.0
+# Steps have 5 s to stop by themselves, and their workers hear of it within one.
+_STOPPING_S: Final = 20.0
+_CLOSE_S: Final = 5.0
+# File times decide what is old in a store.
+_CLOCKS_APART_S: Final = 60.0
+_DEAF_TO_INTERRUPTS: Final = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+
+
+@dataclass(kw_only=True)
+class _Running:
+    """A task, and what dask makes of it."""
+
+    task: Task
+    future: Future[str]
+
+
+class DaskExecutor:
+    """Runs tasks on the workers of a cluster, or on workers of its own."""
+
+    def __init__(self, plan: RunPlan, scratch: Path, capacity: Capacity, tell: Tell) -> None:
+        """Connect to the scheduler, and make sure that each worker can do what the plan asks.
+
+        Args:
+            plan: its options say which scheduler; its methods must be those of the workers.
+            scratch: a folder of the run in the store.
+            capacity: of the workers that it makes itself where no scheduler is given.
+            tell: gets the address of a task and what it says.
+
+        Raises:
+            ArgumentError: there is no such scheduler, no worker, or one does not see the store.
+            PluginError: dask is missing, or a worker has other versions than the plan.
+        """
+        self._tell = tell
+        self._retries = plan.options.retries
+        self._methods = methods_text(plan.methods)
+        self._running: dict[str, _Running] = {}
+        self._news: queue.SimpleQueue[tuple[str, StepEvent | None]] = queue.SimpleQueue()
+        self._topic = f"orthoflow-{uuid.uuid4().hex}"
+        self._stop_at: float | None = None
+        self._capacity = capacity
+        self._looked = self._with_workers = time.monotonic()
+        self._address = plan.options.scheduler
+        self._client = _client(self._address, capacity, plan.options.retries)
+        try:
+            self._client.subscribe_topic(self._topic, self._hear)
+            self._wait_for_workers()
+            self._look_at_workers(scratch)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def capacity(self) -> Capacity:
+        """What the workers that are there may do at the same time."""
+        return self._capacity
+
+    def start(self, task: Task) -> None:
+        """Hand a task to the scheduler.
+
+        Raises:
+            StoreError: its files cannot be written.
+        """
+        with writing_to(Path(task.folder).parent):
+            task.scratch.parent.mkdir(parents=True, exist_ok=True)
+        write_task(task)
+        name = f"{task.address}-{uuid.uuid4().hex[:12]}"
+        order = Order(
+            task_file=str(task.task_file),
+            name=name,
+            topic=self._topic,
+            retries=self._retries,
+            methods=self._methods,
+        )
+        future = self._client.submit(
+            run_attempt, order, key=name, pure=False, retries=0, resources={CORES: task.cores}
+        )
+        self._running[task.address] = _Running(task=task, future=future)
+        future.add_done_callback(lambda _, address=task.address: self._news.put((address, None)))
+
+    def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
+        """Wait up to a time for tasks to end; passes on what running tasks say meanwhile.
+
+        Raises:
+            ClusterError: the scheduler, or every worker, is gone.
+        """
+        ended: list[str] = []
+        with suppress(queue.Empty):
+            while True:
+                address, event = self._news.get(timeout=0.0 if ended else timeout_s)
+                timeout_s = 0.0
+                if event is None:
+                    ended.append(address)
+                elif address in self._running:
+                    self._tell(address, event)
+        ends = tuple(self._end(address) for address in ended if address in self._running)
+        self._watch()
+        if self._stop_at is not None and time.monotonic() > self._stop_at:
+            ends += tuple(self._give_up(address) for address in tuple(self._running))
+        return ends
+
+    def cancel(self) -> None:
+        """Ask all tasks to stop; those that nobody hears of for 20 s are given up."""
+        self._stop_at = time.monotonic() + _STOPPING_S
+        for run in self._running.values():
+            with suppress(OSError):
+                (Path(run.task.folder) / CANCEL_FILE).touch()
+
+    def close(self) -> None:
+        """Let go of whatever still runs: workers stop what nobody waits for."""
+        for run in self._running.values():
+            with suppress(Exception):
+                run.future.cancel()
+        cluster = self._client.cluster
+        # What dask says when something is gone already helps nobody.
+        with suppress(Exception):
+            self._client.close(timeout=_CLOSE_S)
+        if cluster is not None:
+            with suppress(Exception):
+                cluster.close(timeout=_CLOSE_S)
+
+    def _end(self, address: str) -> TaskEnd:
+        run = self._running[address]
+        result = self._result(run)
+        del self._running[address]
+        write_whole(Path(run.task.log), result.log.encode())
+        return TaskEnd(address=address, result=result)
+
+    def _give_up(self, address: str) -> TaskEnd:
+        run = self._running.pop(address)
+        run.future.cancel()
+        return TaskEnd(address=address, result=failed_result(run.task, _cancelled(run.task)))
+
+    def _result(self, run: _Running) -> CellResult:
+        task, future = run.task, run.future
+        if future.status in ("cancelled", "lost"):
+            if self._stop_at is not None:
+                return failed_result(task, _cancelled(task))
+            raise self._lost()
+        try:
+            return result_from_json(future.result(timeout=_PATIENCE_S), f"result of {task.address}")
+        except KilledWorker:
+            return failed_result(task, StepFailedError(describe_loss(task.who, self._retries + 1)))
+        except OrthoflowError as error:
+            return failed_result(task, error)
+        except TimeoutError as error:
+            raise self._lost() from error
+        except Exception as error:  # noqa: BLE001 - whatever befell the worker
+            said = f"{type(error).__name__}: {one_line(error)}"
+            return failed_result(
+                task, StepFailedError(f"{task.who} could not be run by its worker ({said})")
+            )
+
+    # Any: what a worker said of itself.
+    def _hear(self, event: tuple[float, Any]) -> None:
+        said = event[1]
+        with suppress(KeyError, TypeError):
+            heard = StepEvent(
+                kind=said["kind"], text=str(said["text"]), fraction=float(said["fraction"])
+            )
+            self._news.put((str(said["address"]), heard))
+
+    def _watch(self) -> None:
+        """Look every two seconds who is there."""
+        now = time.monotonic()
+        if now - self._looked < _LOOK_S:
+            return
+        self._looked = now
+        if self._client.status == "closed":
+            raise self._lost()
+        workers = self._workers() if self._client.status == "running" else {}
+        if workers:
+            self._with_workers = now
+            self._capacity = _capacity(workers)
+        elif self._running and now - self._with_workers > _PATIENCE_S:
+            raise self._lost()
+
+    def _lost(self) -> ClusterError:
+        who = f"of {self._address}" if self._address else "of this run"
+        return ClusterError(
+            f"the scheduler or all workers {who} are gone; what is finished is kept, and the same "
+            f"command with the same -o goes on, with any executor"
+        )
+
+    # Any: what the scheduler knows of its workers.
+    def _workers(self) -> Mapping[str, Any]:
+        """Address -> facts, of the workers that say how many cores they have."""
+        try:
+            known = self._client.scheduler_info(n_workers=-1)["workers"]
+        except Exception:  # noqa: BLE001 - whatever keeps it from answering: it does not
+            return {}
+        return {address: facts for address, facts in known.items() if facts["resources"].get(CORES)}
+
+    def _wait_for_workers(self) -> None:
+        while not (workers := self._workers()):
+            if time.monotonic() - self._with_workers > _PATIENCE_S:
+                raise ArgumentError(
+                    f"--scheduler {self._address}: no worker there says how many cores it has; "
+                    f"start workers with `dask worker {self._address} --resources {CORES}=N`"
+                )
+            time.sleep(0.1)
+        self._capacity = _capacity(workers)
+
+    def _look_at_workers(self, scratch: Path) -> None:
+        path, word = scratch / _PROOF_FILE, uuid.uuid4().hex
+        write_whole(path, word.encode())
+        found: Mapping[str, Surroundings | Exception] = self._client.run(
+            look_around, str(path), self._methods, workers=list(self._workers()), on_error="return"
+        )
+        for address, said in found.items():
+            if isinstance(said, Exception):
+                raise PluginError(
+                    f"worker {address} cannot run orthoflow ({type(said).__name__}: "
+                    f"{one_line(said)}); install the same version there"
+                )
+            if said.seen != word:
+                raise ArgumentError(
+                    f"worker {address} does not see the store {scratch.parent.parent} "
+                    f"({one_line(said.seen)}): give a --store on a file system that all workers "
+                    f"have at the same place"
+                )
+            if abs(said.clock_s - time.time()) > _CLOCKS_APART_S:
+                raise ArgumentError(
+                    f"the clock of worker {address} is {said.clock_s - time.time():+.0f} s off "
+                    f"this one: set both, ages of results go by them"
+                )
+            if said.misfit:
+                raise PluginError(
+                    f"worker {address}: {said.misfit}; install there what the plan has"
+                )
+
+
+def _client(address: str, capacity: Capacity, retries: int) -> Client:
+    # It tells of each lost worker, with tracebacks; what matters is said by us.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    if address:
+        try:
+            return Client(address, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise ArgumentError(
+                f"--scheduler {address}: no scheduler of dask answers there "
+                f"({one_line(error) or type(error).__name__}); expected tcp://HOST:PORT"
+            ) from error
+    with dask.config.set({"distributed.scheduler.allowed-failures": retries}):
+        cluster = LocalCluster(
+            n_workers=capacity.n_tasks,
+            threads_per_worker=1,
+            resources={CORES: capacity.share},
+            # Steps are processes of their own, whose memory is watched by us.
+            memory_limit=0,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+            preload=[_DEAF_TO_INTERRUPTS],
+        )
+    return Client(cluster, set_as_default=False)
+
+
+# Any: what the scheduler knows of its workers.
+def _capacity(workers: Mapping[str, Any]) -> Capacity:
+    cores = [int(facts["resources"][CORES]) for facts in workers.values()]
+    share = max(1, min(cores))
+    n_tasks = sum(
+        min(int(facts["nthreads"]), max(1, own // share))
+        for facts, own in zip(workers.values(), cores, strict=True)
+    )
+    return Capacity(n_tasks=n_tasks, n_cores=sum(cores), cores_of_one=max(1, *cores), share=share)
+
+
+def _cancelled(task: Task) -> CancelledStepError:
+    return CancelledStepError(f"step {task.address} was interrupted")
