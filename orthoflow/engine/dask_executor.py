@@ -303,7 +303,7 @@ def _client(address: str, capacity: Capacity, retries: int) -> Client:
             resources={CORES: capacity.share},
             # Steps are processes of their own, whose memory is watched by us.
             memory_limit=0,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
             preload=[_DEAF_TO_INTERRUPTS],
         )

@@ -29,28 +29,30 @@ def methods_text(methods: Mapping[str, MethodFacts]) -> str:
     return json.dumps({name: _facts(facts) for name, facts in methods.items()}, sort_keys=True)
 
 
-@cache
 def misfit(methods: str) -> str:
-    """Say in what the methods of this installation differ from those of a plan; empty if nowhere.
-
-    Asks another process, so that this one loads none of them.
-    """
+    """Say in what the methods installed here differ from those of a plan; empty if nowhere."""
     planned = json.loads(methods)
     try:
-        asked = subprocess.run(
-            [sys.executable, "-P", "-m", "orthoflow.engine.method_versions", *planned],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=_TIMEOUT_S,
-            env={**os.environ, "PYTHONPATH": python_path()},
-        )
-        here = json.loads(asked.stdout.rpartition("\n")[2])
+        here = json.loads(_methods_here(tuple(planned)))
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         return f"its methods cannot be loaded ({type(error).__name__})"
     return next(
         (said for name in planned if (said := _difference(name, planned[name], here[name]))), ""
     )
+
+
+@cache
+def _methods_here(names: tuple[str, ...]) -> str:
+    """Ask another process, so that this one loads none of them."""
+    asked = subprocess.run(
+        [sys.executable, "-P", "-m", "orthoflow.engine.method_versions", *names],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=_TIMEOUT_S,
+        env={**os.environ, "PYTHONPATH": python_path()},
+    )
+    return asked.stdout.rpartition("\n")[2]
 
 
 def _facts(facts: MethodFacts) -> dict[str, JsonValue]:

@@ -280,6 +280,8 @@ def _check(workflow: Workflow) -> None:
 def _check_step(workflow: Workflow, step: WorkflowStep) -> None:
     if not step.variants or not (step.is_varied or len(step.variants) == 1):
         raise ValueError(f"step {step.name} has {len(step.variants)} variants")
+    if not step.is_varied and step.variants[0].name:
+        raise ValueError(f"step {step.name} has a variant, and is said to have none")
     for variant in step.variants:
         _check_variant(variant)
     if len({variant.name for variant in step.variants}) != len(step.variants):

@@ -113,6 +113,10 @@ CHANGES: dict[str, tuple[Callable[[Any], object], str]] = {
         "is repeated 1000000000 times",
     ),
     "no variants": (lambda d: _first(d, "steps").update(variants=[]), "has 0 variants"),
+    "a hidden variant": (
+        lambda d: _first(d, "steps")["variants"][0].update(name="other"),
+        "has a variant, and is said to have none",
+    ),
     "a method that is a list": (
         lambda d: _first(d, "steps")["variants"][0].update(use=["a"]),
         r"variants\.0\.use: Input should be a valid string",

@@ -1,0 +1,289 @@
+"""On the workers of a cluster the same steps come out with the same digests, whatever is lost."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from distributed import LocalCluster
+
+from orthoflow.engine import RunOutcome, RunPlan, dask_executor, execute
+from orthoflow.engine.dask_executor import CORES, DaskExecutor
+from orthoflow.engine.dask_worker import look_around
+from orthoflow.engine.events import CellProgress, RunEvent, RunListener
+from orthoflow.engine.executors import Capacity
+from orthoflow.engine.method_versions import methods_text, misfit
+from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
+from tests.engine_world import World, has_ended, toy_world
+
+STEPS = """
+steps:
+  first: {use: make.range, params: {count: 2000}}
+  second: {use: work.slow, in: {numbers: first.numbers}, params: {steps: 20}}
+  other: {use: work.noise, in: {numbers: first.numbers}}
+  third: {use: work.noise, in: {numbers: second.numbers}}
+"""
+
+
+@contextmanager
+def cluster(n_workers: int, **resources: float) -> Iterator[LocalCluster]:
+    with LocalCluster(  # type: ignore[no-untyped-call]
+        n_workers=n_workers,
+        threads_per_worker=1,
+        resources=resources,
+        memory_limit=0,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=50,
+    ) as opened:
+        yield opened
+
+
+@dataclasses.dataclass
+class Office:
+    """The toys, a cluster whose workers have them too, and what a local run gives."""
+
+    world: World
+    cluster: LocalCluster
+    quiet: list[str]
+    n_runs: int = 0
+
+    def plan(self, *, sets: Sequence[str] = (), **options: object) -> RunPlan:
+        """Plan a run whose second step runs whatever is in the store."""
+        address = self.cluster.scheduler_address
+        return self.world.plan(
+            STEPS, sets=sets, executor="dask", scheduler=address, force=("second",), **options
+        )
+
+    def run(self, steps: str = STEPS) -> tuple[RunOutcome, list[RunEvent]]:
+        """Run on the cluster with a store that nobody used before."""
+        self.n_runs += 1
+        fresh = World(folder=self.world.folder / f"office{self.n_runs}", site=self.world.site)
+        fresh.folder.mkdir()
+        address = self.cluster.scheduler_address
+        return fresh.run(steps, executor="dask", scheduler=address), fresh.events
+
+    def killer(self) -> tuple[RunListener, set[int]]:
+        """What kills all workers as soon as the second step says something, once; and whom."""
+        killed: set[int] = set()
+
+        def listen(event: RunEvent) -> None:
+            if is_under_way(event) and not killed:
+                killed.update(worker.pid for worker in self.cluster.workers.values())
+                for process in killed:
+                    os.kill(process, signal.SIGKILL)
+
+        return listen, killed
+
+
+def is_under_way(event: RunEvent) -> bool:
+    return isinstance(event, CellProgress) and event.address == "second"
+
+
+@pytest.fixture(scope="module")
+def office(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Office]:
+    with toy_world(tmp_path_factory.mktemp("office")) as world:
+        quiet = digests(world.run(STEPS, executor="inline"))
+        with cluster(2, **{CORES: 1}) as opened:
+            yield Office(world, opened, quiet)
+
+
+def digests(outcome: RunOutcome) -> list[str]:
+    assert outcome.status == "ok", {a: r.error_message for a, r in outcome.failed.items()}
+    return [result.outputs["numbers"].digest for result in outcome.results.values()]
+
+
+def test_a_cluster_gives_the_same_digests_and_says_how_far_it_is(office: Office) -> None:
+    outcome, events = office.run()
+    assert digests(outcome) == office.quiet
+    fractions = [event.fraction for event in events if isinstance(event, CellProgress)]
+    assert max(fractions) == 1.0
+    assert any(0.0 < fraction < 1.0 for fraction in fractions)
+
+
+def test_workers_of_its_own_give_the_same_digests(office: Office) -> None:
+    assert digests(office.world.run(STEPS, into="own", executor="dask", force=("second",))) == (
+        office.quiet
+    )
+
+
+def test_steps_fail_on_workers_as_they_do_here(office: Office) -> None:
+    steps = """
+steps:
+  first: {use: make.range}
+  crash: {use: work.segfault, in: {numbers: first.numbers}}
+  late: {use: work.hang, in: {numbers: first.numbers}, timeout: 1s}
+  wrong: {use: work.raises, in: {numbers: first.numbers}}
+  last: {use: work.add, in: {numbers: wrong.numbers}}
+"""
+    outcome, _ = office.run(steps)
+    said = {address: result.error_message for address, result in outcome.results.items()}
+    assert "crashed (segmentation fault, SIGSEGV)" in said["crash"]
+    assert "ran past its timeout of 1 s and was stopped" in said["late"]
+    assert "failed unexpectedly: " in said["wrong"]
+    assert outcome.results["last"].status == "skipped"
+    assert "Traceback" in outcome.results["wrong"].traceback
+    assert outcome.results["wrong"].environment is not None
+
+
+def test_a_step_whose_worker_is_killed_runs_again(office: Office) -> None:
+    listen, killed = office.killer()
+    outcome = execute(office.plan(), office.world.folder / "killed", office.world.store, listen)
+    assert len(killed) == 2
+    assert digests(outcome) == office.quiet
+
+
+def test_a_step_that_loses_its_workers_is_given_up(office: Office) -> None:
+    listen, _ = office.killer()
+    plan = office.plan(retries=0)
+    outcome = execute(plan, office.world.folder / "lost", office.world.store, listen)
+    assert outcome.results["second"].status == "failed"
+    assert "was given up: its worker was lost" in outcome.results["second"].error_message
+    assert outcome.results["other"].status == "ok"
+
+
+def test_an_interrupted_run_stops_its_workers_and_goes_on_with_any_executor(
+    office: Office,
+) -> None:
+    asked: list[RunEvent] = []
+
+    def interrupt(event: RunEvent) -> None:
+        if is_under_way(event) and not asked:
+            asked.append(event)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    world, folder = office.world, office.world.folder / "broken-off"
+    with pytest.raises(CancelledStepError, match="the same command goes on"):
+        execute(office.plan(), folder, world.store, interrupt)
+    outcome = execute(world.plan(STEPS, force=("second",)), folder, world.store)
+    assert digests(outcome) == office.quiet
+
+
+def test_a_step_that_nobody_waits_for_is_stopped(office: Office) -> None:
+    steps: list[int] = []
+
+    def leave(event: RunEvent) -> None:
+        if is_under_way(event):
+            steps.extend(
+                int(path.parent.name)
+                for path in Path("/proc").glob("[0-9]*/cmdline")
+                if b"orthoflow.engine.child" in (told := _read(path)) and b"attempt-" in told
+            )
+            raise _GoneError
+
+    plan = office.plan(sets=["second.steps=100000"])
+    with pytest.raises(_GoneError):
+        execute(plan, office.world.folder / "left", office.world.store, leave)
+    # The step and its keeper.
+    assert len(steps) == 2
+    assert all(has_ended(process) for process in steps)
+
+
+class _GoneError(Exception):
+    """The coordinator goes without a word."""
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""
+
+
+def test_a_lost_scheduler_is_said_and_the_run_goes_on_without(
+    office: Office, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask_executor, "_PATIENCE_S", 3.0)
+    world, folder = office.world, office.world.folder / "alone"
+    with cluster(1, **{CORES: 1}) as lost:
+        plan = world.plan(
+            STEPS, executor="dask", scheduler=lost.scheduler_address, force=("second",)
+        )
+
+        def close(event: RunEvent) -> None:
+            if is_under_way(event):
+                lost.close(timeout=5)
+
+        with pytest.raises(ClusterError, match="with any executor"):
+            execute(plan, folder, world.store, close)
+    assert digests(execute(world.plan(STEPS), folder, world.store)) == office.quiet
+
+
+def test_workers_with_other_versions_are_refused_by_name(office: Office) -> None:
+    plan = office.plan()
+    for change, said in (
+        ({"result_version": 7}, "work.slow has the result version 1 there, 7 in the plan"),
+        ({"tools": {"far": "2.0"}}, "work.slow has far none there, 2.0 in the plan"),
+        ({"code": {"toy_plugin": "0"}}, "work.slow has other code there"),
+    ):
+        facts = dataclasses.replace(plan.methods["work.slow"], **change)
+        other = dataclasses.replace(plan, methods={**plan.methods, "work.slow": facts})
+        with pytest.raises(PluginError, match=f"^worker .*{said}; install there"):
+            execute(other, office.world.folder / "misfit", office.world.store)
+    assert misfit(methods_text(plan.methods)) == ""
+
+
+def test_workers_that_do_not_see_the_store_are_refused(
+    office: Office, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask_executor, "write_whole", lambda *_: None)
+    with pytest.raises(ArgumentError, match=r"does not see the store .*No such file"):
+        office.run()
+
+
+def test_what_a_worker_says_of_itself(tmp_path: Path) -> None:
+    (tmp_path / "word").write_text("hello")
+    said = look_around(str(tmp_path / "word"), "{}")
+    assert (said.seen, said.misfit) == ("hello", "")
+    assert abs(said.clock_s - time.time()) < 60
+    assert look_around(str(tmp_path), "{}").seen == "Is a directory"
+
+
+def test_a_clock_that_is_off_is_refused(office: Office, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dask_executor, "_CLOCKS_APART_S", -1.0)
+    with pytest.raises(ArgumentError, match=r"the clock of worker .* is .\d+ s off this one"):
+        office.run()
+
+
+def test_an_address_without_scheduler_is_refused(
+    office: Office, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask_executor, "_CONNECT_S", 1.0)
+    for address in ("tcp://127.0.0.1:9", "nonsense"):
+        plan = office.world.plan(STEPS, executor="dask", scheduler=address)
+        with pytest.raises(ArgumentError, match=f"--scheduler {address}: no scheduler of dask"):
+            execute(plan, office.world.folder / "nowhere", office.world.store)
+
+
+def test_workers_that_do_not_say_their_cores_get_no_work(
+    office: Office, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(dask_executor, "_PATIENCE_S", 1.0)
+    with cluster(1) as silent:
+        plan = office.world.plan(STEPS, executor="dask", scheduler=silent.scheduler_address)
+        with pytest.raises(ArgumentError, match="no worker there says how many cores it has"):
+            DaskExecutor(plan, tmp_path, Capacity.of_jobs(1, 1), lambda *_: None)
+
+
+@pytest.mark.parametrize(
+    ("workers", "expected"),
+    [
+        ([(1, 4.0)], (1, 4, 4, 4)),
+        ([(2, 4.0), (8, 16.0)], (5, 20, 16, 4)),
+        ([(1, 1.0), (1, 1.0)], (2, 2, 1, 1)),
+    ],
+)
+def test_workers_have_room_for_as_many_tasks_as_threads_and_cores(
+    workers: list[tuple[int, float]], expected: tuple[int, int, int, int]
+) -> None:
+    known = {
+        str(number): {"nthreads": n_threads, "resources": {CORES: n_cores}}
+        for number, (n_threads, n_cores) in enumerate(workers)
+    }
+    capacity = dask_executor._capacity(known)
+    assert dataclasses.astuple(capacity) == expected
