@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import signal
-import threading
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Final, Literal
 
 from orthoflow.engine.clock import now
@@ -29,6 +26,7 @@ from orthoflow.engine.events import (
 )
 from orthoflow.engine.executors import Capacity, Executor, InlineExecutor, TaskEnd, Tell
 from orthoflow.engine.failures import Failures
+from orthoflow.engine.interruptions import Interruption, watching_interruptions
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
 from orthoflow.engine.local_executor import LocalExecutor
 from orthoflow.engine.locks import exclusive_lock, is_locked
@@ -159,7 +157,7 @@ def execute(
                 run_id=journal.run_id, n_cells=len(plan.cells), is_resumed=journal.is_resumed
             )
         )
-        with _scratch(store, journal.run_id) as scratch, _watching_interruptions() as interruption:
+        with _scratch(store, journal.run_id) as scratch, watching_interruptions() as interruption:
             tasks = _TaskMaker(
                 plan=plan,
                 store=store,
@@ -206,7 +204,7 @@ class _Run:
         self._ready: dict[str, _Ready] = {}
         self._running: dict[str, Task] = {}
 
-    def go(self, executor: Executor, interruption: _Interruption) -> None:
+    def go(self, executor: Executor, interruption: Interruption) -> None:
         """Run until every cell has a result.
 
         Raises:
@@ -443,7 +441,7 @@ def _cores(cell: Cell, capacity: Capacity) -> int:
     return min(cell.cores or capacity.share, capacity.cores_of_one)
 
 
-def _executor(plan: RunPlan, scratch: Path, tell: Tell, interruption: _Interruption) -> Executor:
+def _executor(plan: RunPlan, scratch: Path, tell: Tell, interruption: Interruption) -> Executor:
     options = plan.options
     capacity = Capacity.of_jobs(options.jobs, options.all_cores)
     if options.executor == "inline":
@@ -567,40 +565,3 @@ def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
         TaskFile(path=str(path.absolute()), identity=file.identity, sha256=file.sha256)
         for path, file in zip(given.paths, given.files, strict=True)
     )
-
-
-class _Interruption:
-    """Whether the run was asked to stop.
-
-    Attributes:
-        is_asked: a signal came.
-    """
-
-    def __init__(self) -> None:
-        self.is_asked = False
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Handle the signal; a second one does not wait for anybody.
-
-        Raises:
-            KeyboardInterrupt: asked a second time.
-        """
-        if self.is_asked:
-            raise KeyboardInterrupt
-        self.is_asked = True
-
-
-@contextmanager
-def _watching_interruptions() -> Iterator[_Interruption]:
-    """Catch SIGINT and SIGTERM inside the block; only the main thread can, others never see any."""
-    interruption = _Interruption()
-    if threading.current_thread() is not threading.main_thread():
-        yield interruption
-        return
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, interruption) for number in numbers}
-    try:
-        yield interruption
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
