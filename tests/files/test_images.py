@@ -51,16 +51,24 @@ def test_red_is_red_in_every_format() -> None:
 @pytest.mark.parametrize(
     "image",
     [
-        np.zeros((4, 4), dtype=np.uint16),
+        np.zeros((4, 4), dtype=np.float32),
         np.zeros((4, 4, 2), dtype=np.uint8),
         np.zeros((4, 4, 5), dtype=np.uint8),
         np.zeros(4, dtype=np.uint8),
     ],
-    ids=["deep", "two-channels", "five-channels", "flat"],
+    ids=["shares", "two-channels", "five-channels", "flat"],
 )
 def test_what_is_no_picture_is_not_encoded(image: NDArray[np.uint8]) -> None:
-    with pytest.raises(ProductError, match="an image to encode must be uint8 of shape"):
+    with pytest.raises(ProductError, match="an image to encode must be uint8 or uint16 of shape"):
         images.encode_png(image)
+
+
+def test_sixteen_bits_are_kept_in_a_png_and_in_no_other_format() -> None:
+    deep = np.array([[0, 1, 256], [257, 40_000, 65_535]], dtype=np.uint16)
+    np.testing.assert_array_equal(opened(images.encode_png(deep)), deep)
+    for encode in (images.encode_jpeg, images.encode_webp):
+        with pytest.raises(ProductError, match="an image to encode must be uint8 of shape"):
+            encode(deep)  # type: ignore[arg-type]
 
 
 def test_a_file_that_states_more_pixels_than_anyone_has_is_not_decoded() -> None:
