@@ -244,10 +244,12 @@ def oom_kills() -> int:
 
 
 def is_for_want_of_memory(error: BaseException) -> bool:
-    """Whether an error says that memory ran out, also while a library was loaded.
+    """Whether an error says that memory ran out, also while a library or a thread was started.
 
-    The loader tells that in words only.
+    The loader and threads tell that in words only.
     """
     if isinstance(error, ImportError):
         return "failed to map segment" in str(error) or "allocate memory" in str(error)
+    if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+        return True
     return isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM

@@ -476,6 +476,7 @@ def choices(**more: Any) -> _Choices:
         "cell": None,
         "license_text": None,
         "embed": False,
+        "split": False,
         "inputs": (),
         "store": Path(),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 from pathlib import Path
@@ -15,6 +16,7 @@ from orthoflow.engine.local_executor import (
     describe_timeout,
     duration,
 )
+from orthoflow.engine.memory import is_for_want_of_memory
 from orthoflow.engine.step_logs import StepLog
 
 WHO = "method plane.mine of mine 1.0"
@@ -75,6 +77,23 @@ def test_want_of_memory_and_unknown_signals_are_told() -> None:
         "or coarser parameters"
     )
     assert "(signal 99)" in describe_exit(WHO, -99, 0, "")
+
+
+@pytest.mark.parametrize(
+    ("error", "is_memory"),
+    [
+        (MemoryError(), True),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), True),
+        (ImportError("a.so: failed to map segment from shared object"), True),
+        (RuntimeError("can't start new thread"), True),
+        (RuntimeError("no threads"), False),
+        (ImportError("no module named a"), False),
+        (OSError(errno.ENOSPC, "No space left on device"), False),
+    ],
+    ids=str,
+)
+def test_want_of_memory_is_told_from_other_errors(error: Exception, is_memory: bool) -> None:
+    assert is_for_want_of_memory(error) == is_memory
 
 
 @pytest.mark.parametrize("n_bytes", [0, 9, 10, 11, 25])
