@@ -23,6 +23,7 @@ _LINES: Final = 24
 _ROW_RGB: Final = (235, 165, 20)
 _COLUMN_RGB: Final = (20, 150, 215)
 _WALL_STEP_DEG: Final = 2.0
+_WALL_FARTHEST_M: Final = 1000.0
 _WALL_CELL_M: Final = 0.05
 _WALL_REACH_M: Final = 0.15
 # Points of a line that lie farther apart than so many usual steps are not joined.
@@ -93,7 +94,7 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     The wall is the vertical plane with most points of the scan with most points, seen squarely, up
     is up; beside it lies what else of that scan is within 15 cm of the plane. Every so manieth row
     is a yellow line, every so manieth column a blue one (markiewicz2015, Figure 2b): where they
-    bend, something stands before the wall. None where the cloud has no grid.
+    bend, something stands before the wall. None where the cloud has no grid, or no wall.
     """
     import cv2
 
@@ -106,6 +107,8 @@ def scan_lines_png(cloud: PointCloud) -> bytes | None:
     station = _station(cloud, scan)
     viewer = level.mean(axis=0) if station is None else basis_from_up(cloud.up) @ station
     on_wall = np.abs(level[:, :2] @ [along[1], -along[0]] - distance_m) <= _WALL_REACH_M
+    if not on_wall.any():
+        return None
     # To the right of who stands where the scanner stood.
     right = along if viewer[:2] @ [along[1], -along[0]] > distance_m else -along
     places = np.column_stack([level[:, :2] @ right, -level[:, 2]])[on_wall]
@@ -196,6 +199,9 @@ def _station(cloud: PointCloud, scan: int) -> NDArray[np.float64] | None:
 def _fullest_wall(plan: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Direction (2,) along the vertical plane with most points (n, 2), and its distance."""
     some = plan[:: max(1, len(plan) // _PLAN_SAMPLE)]
+    # Points of damaged files lie anywhere: the table of cells between them has to end.
+    is_near = np.all(np.abs(some - np.median(some, axis=0)) <= _WALL_FARTHEST_M, axis=1)
+    some = some[is_near] if is_near.any() else some[:1]
     fullest, best = -1, (np.array([1.0, 0.0]), 0.0)
     for angle in np.radians(np.arange(0.0, 180.0, _WALL_STEP_DEG)):
         along = np.array([math.cos(angle), math.sin(angle)])

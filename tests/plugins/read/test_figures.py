@@ -196,6 +196,17 @@ def test_broken_lines_are_not_joined_over_gaps() -> None:
     assert not (hole == figures._ROW_RGB).all(axis=2).any()
 
 
+def test_points_at_the_end_of_the_world_do_not_hide_the_wall() -> None:
+    cloud = wall_scan()
+    x = cloud.x.copy()
+    x[:3] = (1e9, -1e9, 3e8)
+    shown = pixels(scan_lines_png(replace(cloud, x=x)))
+    assert shown.any(axis=2).mean() > 0.5 * pixels(scan_lines_png(cloud)).any(axis=2).mean()
+    # Nothing but such points: a picture of some of them, and an end.
+    far = np.where(np.arange(len(x)) % 2 == 0, 1e9, -1e9).astype(np.float32)
+    assert pixels(scan_lines_png(replace(cloud, x=far))).size
+
+
 def test_clouds_without_a_grid_have_no_lines() -> None:
     cloud = wall_scan()
     assert scan_lines_png(replace(cloud, row=None, column=None)) is None
