@@ -84,7 +84,7 @@ class DaskExecutor:
 
         Raises:
             ArgumentError: there is no such scheduler, no worker, or one does not see the store.
-            PluginError: dask is missing, or a worker has other versions than the plan.
+            PluginError: a worker has other versions than the plan, or no orthoflow.
         """
         self._tell = tell
         self._retries = plan.options.retries
@@ -117,7 +117,7 @@ class DaskExecutor:
             StoreError: its files cannot be written.
         """
         with writing_to(Path(task.folder).parent):
-            task.scratch.parent.mkdir(parents=True, exist_ok=True)
+            Path(task.folder).mkdir(parents=True, exist_ok=True)
         write_task(task)
         name = f"{task.address}-{uuid.uuid4().hex[:12]}"
         order = Order(
@@ -142,7 +142,7 @@ class DaskExecutor:
         ended: list[str] = []
         with suppress(queue.Empty):
             while True:
-                address, event = self._news.get(timeout=0.0 if ended else timeout_s)
+                address, event = self._news.get(timeout=timeout_s)
                 timeout_s = 0.0
                 if event is None:
                     ended.append(address)

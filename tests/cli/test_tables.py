@@ -14,6 +14,10 @@ from orthoflow.cli import tables
 @pytest.mark.parametrize(
     ("seconds", "said"),
     [
+        (0.996, "1.00 s"),
+        (61.0, "1 min 01 s"),
+        (3599.0, "59 min 59 s"),
+        (7380.0, "2 h 03 min"),
         (0.0, "< 0.01 s"),
         (0.0099, "< 0.01 s"),
         (0.01, "0.01 s"),
@@ -36,6 +40,9 @@ def test_times_are_said_as_people_do(seconds: float, said: str) -> None:
 @pytest.mark.parametrize(
     ("n_bytes", "said"),
     [
+        (1.5 * 1024**3, "1.5 GiB"),
+        (1024**4, "1.0 TiB"),
+        (4096 * 1024**4, "4096.0 TiB"),
         (0, "0 B"),
         (1023, "1023 B"),
         (1024, "1.0 KiB"),
@@ -47,13 +54,15 @@ def test_times_are_said_as_people_do(seconds: float, said: str) -> None:
         (3000 * 1024**4, "3000.0 TiB"),
     ],
 )
-def test_bytes_are_said_in_binary_units(n_bytes: int, said: str) -> None:
+def test_bytes_are_said_in_binary_units(n_bytes: float, said: str) -> None:
     assert tables.size(n_bytes) == said
 
 
 @pytest.mark.parametrize(
     ("value", "said"),
     [
+        (-0.5, "-0.5"),
+        (float("nan"), "nan"),
         (0.0, "0"),
         (999_999_999_999_999.0, "999999999999999"),
         (1e15, "1e+15"),

@@ -32,65 +32,12 @@ from orthoflow.sdk import MethodParams, Ports
 from tests.laboratories import laboratory_catalog
 from tests.report_runs import cell, record
 
-MIB, GIB = 1 << 20, 1 << 30
-
 
 def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return capsys.readouterr().out.splitlines()
 
 
-# --- numbers ---
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"),
-    [
-        (0.0, "< 0.01 s"),
-        (0.01, "0.01 s"),
-        (0.996, "1.00 s"),
-        (1.0, "1.0 s"),
-        (59.94, "59.9 s"),
-        (59.95, "1 min 00 s"),
-        (61.0, "1 min 01 s"),
-        (3599.0, "59 min 59 s"),
-        (3599.5, "1 h 00 min"),
-        (7380.0, "2 h 03 min"),
-    ],
-)
-def test_times_are_said_as_people_do(seconds: float, said: str) -> None:
-    assert tables.duration(seconds) == said
-
-
-@pytest.mark.parametrize(
-    ("n_bytes", "said"),
-    [
-        (0, "0 B"),
-        (1023, "1023 B"),
-        (1024, "1.0 KiB"),
-        (1536, "1.5 KiB"),
-        (MIB, "1.0 MiB"),
-        (1.5 * GIB, "1.5 GiB"),
-        (1024 * GIB, "1.0 TiB"),
-        (4096 * 1024 * GIB, "4096.0 TiB"),
-    ],
-)
-def test_sizes_are_said_in_binary_units(n_bytes: float, said: str) -> None:
-    assert tables.size(n_bytes) == said
-
-
-@pytest.mark.parametrize(
-    ("value", "said"),
-    [
-        (0.0, "0"),
-        (999_999_999_999_999.0, "999999999999999"),
-        (1e15, "1e+15"),
-        (1234567.5, "1.23457e+06"),
-        (-0.5, "-0.5"),
-        (float("nan"), "nan"),
-    ],
-)
-def test_numbers_are_said_to_six_digits(value: float, said: str) -> None:
-    assert tables.number(value) == said
+# --- tables ---
 
 
 def test_columns_are_as_wide_as_what_is_in_them(capsys: pytest.CaptureFixture[str]) -> None:
