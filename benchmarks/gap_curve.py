@@ -55,10 +55,12 @@ class Outcome:
         return f"{n_oriented:3d}/{self.n_photos:<3d} {self.n_wrong:5d} {self.photo_s:6.1f} {usual}"
 
 
-def outcome(share: float, photos: Photos, walls: Walls, truth: Truth) -> Outcome:
+def outcome(
+    share: float, photos: Photos, walls: Walls, truth: Truth, *, by_structure: bool
+) -> Outcome:
     """Orient the photos of one room and compare them with the truth."""
     started = time.process_time()
-    ties = sifted(photos, walls)
+    ties = sifted(photos, walls, tries_structure=by_structure)
     spent_s = time.process_time() - started
     first = orient(OrientColmapBundle, ties, photos, **ROUGHLY)
     errors: tuple[PoseError, ...] = ()
@@ -91,6 +93,7 @@ def main() -> None:
     parser.add_argument("--gsd-m", type=float, default=0.004, help="cell of the wall")
     parser.add_argument("--photo-gsd-m", type=float, default=0.0025, help="pixel on the wall")
     parser.add_argument("--exif", action="store_true", help="without calibration")
+    parser.add_argument("--structure", action="store_true", help="with `tries_structure`")
     parser.add_argument("--share", type=float, help="the same gap in every room")
     chosen = parser.parse_args()
     chosen.layout = "quick"
@@ -101,7 +104,8 @@ def main() -> None:
         photos, walls, truth = room(seed, "easy", chosen)
         if chosen.exif:
             photos = Photos(photos=tuple(replace(each, intrinsics=None) for each in photos.photos))
-        outcomes.append(outcome(chosen.inverted, photos, walls, truth))
+        found = outcome(chosen.inverted, photos, walls, truth, by_structure=chosen.structure)
+        outcomes.append(found)
         print(f"room {seed} gap {chosen.inverted:.2f} {outcomes[-1].row()}", flush=True)
     print(f"\n{'gap':11s} oriented wrong  cpu[s] wall[mm] worst[mm]")
     for nth in range(chosen.bins):

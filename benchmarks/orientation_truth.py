@@ -129,8 +129,9 @@ def chains(photos: Photos, walls: Walls, kinds: list[str]) -> Iterator[tuple[str
                 yield f"{known} {kind} {name}", spent_s, cameras
 
 
-def sifted(photos: Photos, walls: Walls, **params: str) -> Ties:
-    inputs, chosen = MatchSift.In(photos=photos, walls=walls), MatchSift.Params(**params)
+def sifted(photos: Photos, walls: Walls, **params: str | bool) -> Ties:
+    inputs = MatchSift.In(photos=photos, walls=walls)
+    chosen = MatchSift.Params.model_validate(params)
     return MatchSift().run(inputs, chosen, context(1)).ties
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import os
+import sys
 import tempfile
 from base64 import b64decode
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Final
 
 import pytest
+from _pytest.doctest import DoctestModule
 from hypothesis import HealthCheck, settings
 
 from orthoflow.sdk import StepContext
@@ -41,6 +43,14 @@ os.environ.setdefault(
     str(Path(tempfile.gettempdir()) / f"orthoflow-kernels-{os.getuid()}-{_kernels_digest()}"),
 )
 
+# Containers set it to keep images small. Each command that a test starts would compile the sources
+# anew: 0.7 s instead of 0.5 to import what it needs.
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
+    sys.dont_write_bytecode = False
+
+# Stores that tests make begin with what others have compiled, and never in the user's cache.
+os.environ.setdefault("ORTHOFLOW_KERNELS", f"{os.environ['NUMBA_CACHE_DIR']}-of-stores")
+
 # The same examples on every machine, however slow it is; the long loop draws others each time.
 settings.register_profile(
     "everywhere",
@@ -58,6 +68,13 @@ _DOT: Final = b64decode(
 _FIGURE: Final = StepContext.figure
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
+    """Look for no examples in the docstrings of tests: there are none."""
+    collectors = yield
+    return [item for item in collectors if not isinstance(item, DoctestModule)]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

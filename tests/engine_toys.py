@@ -9,7 +9,7 @@ from toy_plugin.mischief_names import MISCHIEF
 WORKS = ["add", "noise", "sign", "slow", "segfault", "abort", "eat", "hang", "stubborn", "quit",
          "leave", "raises", "refuses", "unreadable", "needs_library", "no_memory", "full_disk",
          "changes_input", "wrong_type", "wrong_out", "bad_param", "draws", "chatty", "unstorable",
-         "spawns", "spawns_and_waits", "threads", "fills_mapped", "compiles", "loads",
+         "spawns", "spawns_and_waits", "threads", "around", "fills_mapped", "compiles", "loads",
          "bad_disk"]
 
 @hookimpl
@@ -31,13 +31,14 @@ def orthoflow_products():
 @hookimpl
 def orthoflow_methods():
     makes = [MethodSpec(id=f"make.{name}", target=f"toy_plugin.makes:{name.title()}", summary="")
-             for name in ("range", "file", "scan")]
+             for name in ("range", "file", "scan", "survey")]
     works = [MethodSpec(id=f"work.{name}", target=f"toy_plugin.works:{name}", summary="")
              for name in WORKS]
-    means = MethodSpec(id="thin.means", target="toy_plugin.works:Means", summary="")
+    thins = [MethodSpec(id=f"thin.{name}", target=f"toy_plugin.works:{name.title()}", summary="")
+             for name in ("means", "sketch")]
     mischief = [MethodSpec(id=f"work.{name}", target=f"toy_plugin.mischief:{name}", summary="")
                 for name in MISCHIEF]
-    return [*makes, *works, means, *mischief]
+    return [*makes, *works, *thins, *mischief]
 """
 
 PRODUCTS = """
@@ -132,12 +133,31 @@ class File(Method):
             return self.Out(numbers=Numbers(values=np.array(values)))
         except ValueError as error:
             raise InputError(f"{inputs.files.paths[0].name} must hold numbers: {error}") from error
+
+class Survey(Method):
+    id = "make.survey"
+
+    class Params(MethodParams):
+        pass
+
+    class In(Ports):
+        files: InputFiles
+
+    class Out(Ports):
+        scan: products.Scan
+
+    def run(self, inputs, params, ctx):
+        numbers = [float(word) for word in inputs.files.paths[0].read_text().split()]
+        values = ctx.allocate("scan", "values", (1000 * len(numbers),), np.float64)
+        values[:] = np.outer(numbers, np.sqrt(np.arange(1000.0))).ravel()
+        return self.Out(scan=products.Scan(values=values))
 """
 
 WORKS = """
 import ctypes
 import errno
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -344,6 +364,16 @@ def threads(values, params, ctx):
     return np.array([ctx.cores, *[float(os.environ[name]) for name in names]])
 
 @work("exact")
+def around(values, params, ctx):
+    # Before anything here loads one.
+    loaded = "networkx" in sys.modules
+    import networkx
+    return np.array([
+        os.getpid(), os.getppid(), os.getsid(0), loaded, float(os.environ.get("TOY_NUMBER", -1)),
+        resource.getrlimit(resource.RLIMIT_NOFILE)[0], float(ctx.cores),
+    ])
+
+@work("exact")
 def fills_mapped(values, params, ctx):
     array = ctx.allocate("numbers", "values", (8 << 20,), np.float64)
     array[:] = 1.0
@@ -364,6 +394,15 @@ class Means(Method):
 
     def run(self, inputs, params, ctx):
         return self.Out(numbers=Numbers(values=inputs.scan.values.reshape(-1, 1000).mean(axis=1)))
+
+class Sketch(Means):
+    id = "thin.sketch"
+
+    def run(self, inputs, params, ctx):
+        ctx.figure("dot", b"\\x89PNG\\r\\n\\x1a\\n0123", "a dot")
+        ctx.warn("the dot is small")
+        ctx.metric("dots", 1, "1")
+        return super().run(inputs, params, ctx)
 
 class wrong_type(Work):
     id = "work.wrong_type"

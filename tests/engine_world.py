@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -118,7 +119,12 @@ def install_toys(site: Path) -> None:
 
 
 def forget_toys() -> None:
-    """Let the next import see the plugin as it lies on the disk."""
+    """Let the next import see the plugin as it lies on the disk.
+
+    Bytecode is taken for that of a source of the same length that was rewritten within a second.
+    """
+    for path in sys.path:
+        shutil.rmtree(Path(path) / "toy_plugin" / "__pycache__", ignore_errors=True)
     for name in [name for name in sys.modules if name.partition(".")[0] == "toy_plugin"]:
         del sys.modules[name]
 

@@ -39,6 +39,9 @@ _REAL = {
         "sendfile",
         "utime",
         "link",
+        "pread",
+        "scandir",
+        "posix_fallocate",
     ]
 }
 _REAL_OPEN = io.open
@@ -51,10 +54,12 @@ class _Volatile:
     kept: Path
     dirty: set[int] = field(default_factory=set)
     names: list[tuple[Path, Callable[[], object]]] = field(default_factory=list)
+    n_kept: int = 0
 
     def keep(self, path: Path) -> Path | None:
         """Keep what stands at a path, for the case that its going was never on the disk."""
-        copy = self.kept / str(len(self.names))
+        self.n_kept += 1
+        copy = self.kept / str(self.n_kept)
         with contextlib.suppress(OSError):
             _REAL["link"](path, copy)
             return copy
@@ -111,7 +116,8 @@ class FaultyFiles:
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
-        self._volatile.kept.mkdir(exist_ok=True)
+        shutil.rmtree(self._volatile.kept, ignore_errors=True)  # of an earlier case
+        self._volatile.kept.mkdir()
         for name in _REAL:
             if hasattr(self, f"_{name}"):
                 setattr(os, name, getattr(self, f"_{name}"))
@@ -190,9 +196,9 @@ class FaultyFiles:
         raw.layer = self
         if is_writing:
             self._opened(path, raw.fileno(), is_new=is_new, is_emptied="w" in mode)
-        buffered: Any = io.BufferedWriter(raw) if is_writing else io.BufferedReader(raw)
-        if "+" in mode:
-            buffered = io.BufferedRandom(raw)
+        # Only one of them: a buffer that is dropped closes what is below it.
+        kind = io.BufferedRandom if "+" in mode else io.BufferedWriter
+        buffered: Any = kind(raw) if is_writing else io.BufferedReader(raw)
         return buffered if "b" in mode else io.TextIOWrapper(buffered, *rest, **more)
 
     def _write(self, descriptor: int, data: Any) -> int:
@@ -202,6 +208,19 @@ class FaultyFiles:
     def _pwrite(self, descriptor: int, data: Any, offset: int) -> int:
         self.step(_place_of(descriptor), "write", descriptor)
         return int(_REAL["pwrite"](descriptor, data, offset))
+
+    def _pread(self, descriptor: int, n_bytes: int, offset: int) -> bytes:
+        self.step(_place_of(descriptor), "read")
+        return bytes(_REAL["pread"](descriptor, n_bytes, offset))
+
+    def _posix_fallocate(self, descriptor: int, offset: int, n_bytes: int) -> None:
+        self.step(_place_of(descriptor), "write", descriptor)
+        _REAL["posix_fallocate"](descriptor, offset, n_bytes)
+
+    # Any: the iterator that is made here has no public name with a type.
+    def _scandir(self, path: Any = ".") -> Any:
+        self.step(_place(path), "look")
+        return _REAL["scandir"](path)
 
     def _sendfile(self, out: int, source: int, offset: int, count: int) -> int:
         self.step(_place_of(out), "write", out)

@@ -12,6 +12,7 @@ ended by itself, and `said`, what it wrote to standard error.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -132,7 +133,13 @@ def _main() -> None:
         order = json.loads(line)
         Path("events").write_text("0")
         os.ftruncate(said, 0)
-        code = run_here(order["arguments"]) if order.get("here") else run_forked(order)
+        if order.get("here"):
+            code = run_here(order["arguments"])
+            # Forks look through none of what is loaded by now, nor copy its pages for it.
+            gc.collect()
+            gc.freeze()
+        else:
+            code = run_forked(order)
         events = int(Path("events").read_text() or "0")  # empty: killed while it was written
         text = Path("said.txt").read_text(errors="replace")
         answers.write(json.dumps({"code": code, "events": events, "said": text}) + "\n")

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from orthoflow import __version__
 from orthoflow.cli.commands import Command
 from orthoflow.cli.diagnosis import Diagnosis, diagnose_libraries, diagnose_machine
 from orthoflow.cli.failures import EXIT_GOOD, EXIT_PLUGIN_MISSING
 from orthoflow.cli.options import json_option, store_option
 from orthoflow.cli.tables import counted, echo, echo_json, echo_table
+from orthoflow.version import __version__
 
 
 @click.command(cls=Command)

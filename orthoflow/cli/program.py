@@ -12,17 +12,19 @@ from typing import Any, Final, NoReturn
 
 import click
 
-from orthoflow import __version__
 from orthoflow.cli.commands import LazyCommand, LazyGroup, Session, debug_parameter
 from orthoflow.cli.failures import explain, say_error, silence_stdout
 from orthoflow.cli.tables import echo
+from orthoflow.version import __version__
 
 _SUMMARIES: Final = {
+    "new": "Write a first workflow for your own files.",
     "check": "Say everything that is wrong with a workflow file.",
     "plan": "Say which steps would run, which are cached, and why.",
     "graph": "Draw a workflow as a Mermaid graph.",
     "run": "Run a workflow; makes orthoimages, report and record.",
     "show": "Summarise a finished run.",
+    "runs": "List the runs below a folder: when, how good, in what they differ.",
     "compare": "Lay two runs side by side: what differs, and how far.",
     "report": "Write the HTML report of one or more runs.",
     "verify": "Check that a record is whole and unchanged.",

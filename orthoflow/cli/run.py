@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -55,6 +56,26 @@ def run(
     same command and the same -o. The folder of the run gets run.h5 (the record), report.html, and
     products/ with the files for other programs.
     """
+    with prepared(workflow, changes, output, store, embed=embed, **choices) as call:
+        return call.go()
+
+
+@contextmanager
+def prepared(
+    workflow: str,
+    changes: Changes,
+    output: Path | None,
+    store: Path,
+    *,
+    embed: bool,
+    # Any: the fields of RunOptions.
+    **choices: Any,
+) -> Iterator[Call]:
+    """Read and plan a workflow, and hold its store until the run is over.
+
+    Raises:
+        ArgumentError: an option is none.
+    """
     from orthoflow.cli.progress import working_on
 
     with working_on("reading the workflow, its inputs and what is stored"):
@@ -72,11 +93,11 @@ def run(
         planned = plan_run(cells, loaded, catalog, opened, options)
     # Held until the record is written, so that no `cache gc` takes what it needs.
     with opened.in_use():
-        return _Call(workflow=loaded, plan=planned, store=opened, folder=output, embed=embed).go()
+        yield Call(workflow=loaded, plan=planned, store=opened, folder=output, embed=embed)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Call:
+class Call:
     """One call of the command, ready to go."""
 
     workflow: Workflow
@@ -87,9 +108,27 @@ class _Call:
 
     def go(self) -> int:
         """Execute, record, report and say what came out."""
+        from orthoflow.errors import DiskSpaceError
+        from orthoflow.records import REPORT_FILE
+
+        made = self.make()
+        folder = made.run.folder
+        report = folder / REPORT_FILE
+        _print_failures(made.run.record.cells)
+        if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
+            say_error(f"with more room on the disk, the same command with -o {folder} goes on")
+        try:
+            _print_summary(made, report)
+        except BrokenPipeError:
+            # Nobody reads the summary any more; the exit code still says how the run went.
+            silence_stdout()
+        return made.outcome.exit_code
+
+    def make(self) -> WrittenRun:
+        """Execute, record and report."""
         from orthoflow.cli.progress import working_on
         from orthoflow.engine.run_folder import new_run_folder, new_run_id
-        from orthoflow.errors import DamageError, DiskSpaceError, StoreError
+        from orthoflow.errors import DamageError, StoreError
         from orthoflow.records import REPORT_FILE, executed_and_written, write_run
         from orthoflow.report import write_page
 
@@ -118,16 +157,7 @@ class _Call:
                     self._show_unfinished(folder, outcome)
                 raise
 
-        made = executed_and_written(lambda: self._execute(folder, run_id), write)
-        _print_failures(made.run.record.cells)
-        if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
-            say_error(f"with more room on the disk, the same command with -o {folder} goes on")
-        try:
-            _print_summary(made, report)
-        except BrokenPipeError:
-            # Nobody reads the summary any more; the exit code still says how the run went.
-            silence_stdout()
-        return made.outcome.exit_code
+        return executed_and_written(lambda: self._execute(folder, run_id), write)
 
     def _execute(self, folder: Path, run_id: str) -> RunOutcome:
         from orthoflow.cli.progress import make_progress

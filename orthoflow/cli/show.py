@@ -12,6 +12,7 @@ from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.diagnosis import LIBRARIES
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option
+from orthoflow.cli.runs import list_runs, print_runs, runs_json
 from orthoflow.cli.tables import (
     counted,
     duration,
@@ -33,9 +34,20 @@ _OWN_LIBRARIES: Final = {library.distribution for library in LIBRARIES}
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @json_option
 def show(run: Path, *, as_json: bool) -> int:
-    """Summarise RUN, a run folder or its run.h5: inputs, cells, metrics, warnings, environment."""
-    from orthoflow.records import open_run
+    """Summarise RUN, a run folder or its run.h5: inputs, cells, metrics, warnings, environment.
 
+    Of a folder that runs lie in, their table, as `orthoflow runs` has it.
+    """
+    from orthoflow.records import RECORD_FILE, open_run
+
+    if run.is_dir() and not (run / RECORD_FILE).exists():
+        found = list_runs([run])
+        if any(one.folder != run for one in found):
+            if as_json:
+                echo_json(runs_json(found))
+            else:
+                print_runs(found, n_found=len(found))
+            return EXIT_GOOD
     opened = open_run(run)
     if as_json:
         echo_json(_as_json(opened))

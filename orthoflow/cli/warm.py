@@ -41,8 +41,8 @@ def warm(workflow: str | None, *, as_json: bool) -> int:
     """Compile the kernels of all our methods, or of those in WORKFLOW, on small simulated rooms.
 
     Every store then begins with them, instead of compiling at its first run. They are kept in the
-    folder that the variable ORTHOFLOW_KERNELS names, else in the user's cache; runs only read
-    there, so that it may be a part of a container image.
+    folder that the variable ORTHOFLOW_KERNELS names, else in the user's cache. Runs leave there
+    what they compile, where they may; so it may be a read-only part of a container image.
     """
     warmed = _warm(workflow)
     if as_json:

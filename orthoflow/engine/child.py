@@ -1,7 +1,4 @@
-"""The process of one step: `python -m orthoflow.engine.child TASK PIPE PARENT`.
-
-Light imports on top: it must tie its life to the coordinator's before anything slow loads.
-"""
+"""What the process of one step does once it is forked."""
 
 from __future__ import annotations
 
@@ -12,18 +9,19 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Final
+from typing import Final, NoReturn
 
-from orthoflow.engine.keeper import fork_kept
+from orthoflow.engine.durability import write_whole
+from orthoflow.engine.results import CellResult, result_to_json
+from orthoflow.engine.running import run_task
+from orthoflow.engine.tasks import Task, read_task
+from orthoflow.errors import StoreError
 from orthoflow.foreign_text import shown
-
-if TYPE_CHECKING:
-    from orthoflow.engine.results import CellResult
-    from orthoflow.engine.tasks import Task
-    from orthoflow.sdk.context import StepEvent
+from orthoflow.sdk.context import StepEvent
 
 _OOM_SCORE: Final = "900"
 _PROGRESS_EVERY_S: Final = 0.1
@@ -88,28 +86,28 @@ def volunteer_for_oom_killer() -> None:
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE, encoding="ascii")
 
 
-def main(arguments: list[str]) -> None:
-    """Run one task and leave its result beside it."""
-    task_file, descriptor, coordinator = Path(arguments[0]), int(arguments[1]), int(arguments[2])
-    fork_kept(coordinator)
+def run_step(task_file: str, descriptor: int, at_end: Callable[[], None]) -> NoReturn:
+    """Run one task and leave its result beside it.
+
+    Args:
+        task_file: of the task.
+        descriptor: of the coordinator's pipe.
+        at_end: called when the result is there.
+    """
     volunteer_for_oom_killer()
     os.set_inheritable(descriptor, False)  # noqa: FBT003
     stop = StopRequest()
     signal.signal(signal.SIGTERM, stop)
     faulthandler.enable()
     pipe = ProgressPipe(descriptor)
-
-    from orthoflow.engine.running import run_task  # noqa: PLC0415 - after the ties above
-    from orthoflow.engine.tasks import read_task  # noqa: PLC0415
-    from orthoflow.errors import StoreError  # noqa: PLC0415
-
     try:
-        task = read_task(task_file)
+        task = read_task(Path(task_file))
     except StoreError as error:
         pipe.send({"kind": "failed", "text": str(error)})
         os._exit(1)
     result = run_task(task, pipe.listen, lambda: stop.is_set)
     _leave(task, result, pipe)
+    at_end()
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, OSError, ValueError):
             stream.flush()
@@ -118,16 +116,8 @@ def main(arguments: list[str]) -> None:
 
 
 def _leave(task: Task, result: CellResult, pipe: ProgressPipe) -> None:
-    from orthoflow.engine.durability import write_whole  # noqa: PLC0415
-    from orthoflow.engine.results import result_to_json  # noqa: PLC0415
-    from orthoflow.errors import StoreError  # noqa: PLC0415
-
     try:
         write_whole(task.result_file, result_to_json(result).encode())
     except StoreError as error:
         reason = result.error_message or str(error)
         pipe.send({"kind": "failed", "text": reason})
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

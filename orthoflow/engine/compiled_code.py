@@ -1,4 +1,4 @@
-"""Compiled kernels that a store begins with, where `orthoflow warm` has left some."""
+"""Compiled kernels that stores share: each begins with what runs of this user have compiled."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from orthoflow.engine.durability import place_folder, remove_tree
 from orthoflow.errors import StoreError
 
 VARIABLE: Final = "ORTHOFLOW_KERNELS"
+# Our own kernels (`geometry.kept_kernels`): no two of these have one name, and damage shows. What
+# a plugin keeps past them stays in its store.
+_SHARED: Final = "*.checked*.nb[ci]"
 
 
 def warm_folder() -> Path:
@@ -45,3 +48,30 @@ def begun_with_warm(folder: Path) -> Path:
         with suppress(OSError):
             remove_tree(aside)
     return folder
+
+
+def leave_for_others(folder: Path, since_ns: int) -> None:
+    """Copy what was compiled into a store's folder to where every other store begins.
+
+    Files go first that an index will name. Where the folder cannot be written, as in an image,
+    nothing is shared, and no run fails for it.
+
+    Args:
+        folder: of a store.
+        since_ns: what is older was there before, nanoseconds since 1970.
+    """
+    shared = warm_folder() / folder.name
+    with suppress(OSError):
+        # Without a home there is no cache; `warm` compiles where they shall stay.
+        if "~" in shared.parts or (shared.exists() and shared.samefile(folder)):
+            return
+        new = [path for path in folder.rglob(_SHARED) if path.stat().st_mtime_ns >= since_ns]
+        for path in sorted(new, key=lambda path: path.suffix):
+            place = shared / path.relative_to(folder)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            aside = place.with_name(f".{uuid.uuid4().hex}")
+            try:
+                shutil.copyfile(path, aside)
+                aside.replace(place)
+            finally:
+                aside.unlink(missing_ok=True)

@@ -161,6 +161,9 @@ def whole_folder(final: Path) -> Iterator[Path]:
     remove_tree(aside)
     try:
         with writing_to(final):
+            if os.path.lexists(aside):
+                # What could not be removed would be handed over with the rest: this says why.
+                shutil.rmtree(aside)
             yield aside
             sync_tree(aside)
             if final.is_dir():

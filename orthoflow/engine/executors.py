@@ -151,7 +151,7 @@ def compiled_code_in(folder: str) -> Iterator[None]:
     """Let numba keep what it compiles in a folder, in this process, for as long as a step runs."""
     before = os.environ.get(COMPILED_CODE)
     os.environ[COMPILED_CODE] = folder
-    _tell_numba()
+    tell_numba()
     try:
         yield
     finally:
@@ -159,11 +159,11 @@ def compiled_code_in(folder: str) -> Iterator[None]:
             del os.environ[COMPILED_CODE]
         else:
             os.environ[COMPILED_CODE] = before
-        _tell_numba()
+        tell_numba()
 
 
-def _tell_numba() -> None:
-    # It reads the environment once, when it is imported.
+def tell_numba() -> None:
+    """Let numba read the environment again, which it does once, when it is imported."""
     if "numba" in sys.modules:
         from numba.core import config  # noqa: PLC0415 - only where it is loaded anyway
 

@@ -7,8 +7,6 @@ import dataclasses
 import os
 import selectors
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import dataclass, field
 from functools import cache
@@ -19,32 +17,19 @@ from pydantic import TypeAdapter
 
 from orthoflow.engine.clock import now
 from orthoflow.engine.durability import read_whole, writing_to
-from orthoflow.engine.environment import python_path
-from orthoflow.engine.executors import COMPILED_CODE, Capacity, TaskEnd, Tell
+from orthoflow.engine.executors import Capacity, TaskEnd, Tell
 from orthoflow.engine.keeper import END_ALL
 from orthoflow.engine.memory import GIB, MemoryGuard, oom_kills, process_memory
 from orthoflow.engine.process_trees import descendants
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.running import failed_result
 from orthoflow.engine.step_logs import StepLog
+from orthoflow.engine.step_processes import StepProcess, start_step
 from orthoflow.engine.tasks import Task, write_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line
 
-_THREAD_VARIABLES: Final = (
-    "BLIS_NUM_THREADS",
-    "GDAL_NUM_THREADS",
-    "GOTO_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-    "RAYON_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-)
 _GRACE_S: Final = 5.0
 _READ_BYTES: Final = 1 << 16
 # So much is heard at once: a step that never stops talking must not keep us from its timeout.
@@ -78,7 +63,6 @@ class _Running:
         process: its keeper, which ends as the step has ended.
         log: what it prints.
         pipe: reading end of the progress pipe.
-        process_descriptor: becomes readable when the process ends.
         started: ISO 8601 UTC.
         clock: monotonic seconds at the start.
         oom_kills: the kernel's counter at the start.
@@ -93,10 +77,9 @@ class _Running:
     """
 
     task: Task
-    process: subprocess.Popen[bytes]
+    process: StepProcess
     log: StepLog
     pipe: int
-    process_descriptor: int
     started: str
     clock: float
     oom_kills: int
@@ -112,16 +95,14 @@ class _Running:
 
 @dataclass
 class LocalExecutor:
-    """Runs each task in a process group of its own.
-
-    Call it from the main thread: the kernel kills a child together with the thread that spawned it.
-    """
+    """Runs each task in a process group of its own."""
 
     capacity: Capacity
     tell: Tell
     _running: dict[str, _Running] = field(default_factory=dict)
     _selector: selectors.BaseSelector = field(default_factory=selectors.DefaultSelector)
     _guard: MemoryGuard = field(default_factory=MemoryGuard)
+    _unstarted: list[TaskEnd] = field(default_factory=list)
 
     def start(self, task: Task) -> None:
         """Spawn the process of a task.
@@ -136,7 +117,13 @@ class LocalExecutor:
         reading, writing = os.pipe()
         os.set_blocking(reading, False)
         try:
-            process = self._spawn(task, writing, log.descriptor)
+            process = start_step(task, writing, log.descriptor)
+        except StepFailedError as error:
+            log.close()
+            os.close(reading)
+            result = failed_result(task, error)
+            self._unstarted.append(TaskEnd(address=task.address, result=result))
+            return
         finally:
             os.close(writing)
         run = _Running(
@@ -144,24 +131,25 @@ class LocalExecutor:
             process=process,
             log=log,
             pipe=reading,
-            process_descriptor=os.pidfd_open(process.pid),
             started=now(),
             clock=time.monotonic(),
             oom_kills=oom_kills(),
         )
         self._running[task.address] = run
         self._selector.register(run.pipe, selectors.EVENT_READ, run)
-        self._selector.register(run.process_descriptor, selectors.EVENT_READ, run)
+        self._selector.register(run.process.descriptor, selectors.EVENT_READ, run)
 
     def poll(self, timeout_s: float) -> tuple[TaskEnd, ...]:
         """Wait up to a time for tasks to end; passes on what running tasks say meanwhile."""
-        for key, _ in self._selector.select(min(timeout_s, self._guard.interval_s)):
+        unstarted, self._unstarted = tuple(self._unstarted), []
+        longest_s = 0.0 if unstarted else min(timeout_s, self._guard.interval_s)
+        for key, _ in self._selector.select(longest_s):
             if key.fd == key.data.pipe:
                 self._hear(key.data)
-        ended = [run for run in self._running.values() if _has_ended(run)]
+        ended = [run for run in self._running.values() if run.process.has_ended()]
         ends = tuple(self._end(run) for run in ended)
         self._watch()
-        return ends
+        return unstarted + ends
 
     def cancel(self) -> None:
         """Ask all tasks to stop: SIGTERM, and SIGKILL when they do not within 5 s."""
@@ -173,32 +161,10 @@ class LocalExecutor:
         for run in self._running.values():
             _end_all(run)
         for run in list(self._running.values()):
-            try:
-                run.process.wait(_GRACE_S)
-            except subprocess.TimeoutExpired:
-                _kill_group(run)
+            if not run.process.wait(_GRACE_S):
+                run.process.signal_group(signal.SIGKILL)
             self._forget(run)
         self._selector.close()
-
-    def _spawn(self, task: Task, pipe: int, log: int) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [
-                sys.executable,
-                "-P",
-                "-m",
-                "orthoflow.engine.child",
-                str(task.task_file),
-                str(pipe),
-                str(os.getpid()),
-            ],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            cwd=task.scratch,
-            env=_child_environment(task),
-            pass_fds=(pipe,),
-            start_new_session=True,
-        )
 
     def _hear(self, run: _Running) -> None:
         for _ in range(_READS_AT_ONCE):
@@ -253,7 +219,7 @@ class LocalExecutor:
     def _kill(self, run: _Running) -> None:
         """Let the keeper end all that the step started; one that cannot any more goes with it."""
         if run.is_killed:
-            _kill_group(run)
+            run.process.signal_group(signal.SIGKILL)
         else:
             _end_all(run)
         run.is_killed = True
@@ -263,26 +229,25 @@ class LocalExecutor:
         if run.reason is None:
             run.reason = reason
             run.kill_at = time.monotonic() + _GRACE_S
-            _signal_group(run, signal.SIGTERM)
+            run.process.signal_group(signal.SIGTERM)
 
     def _end(self, run: _Running) -> TaskEnd:
         self._hear(run)
         # Somebody may have killed the keeper. Before it is reaped, so that its number cannot belong
         # to strangers already.
-        _kill_group(run)
-        run.process.wait()
+        run.process.signal_group(signal.SIGKILL)
         run.log.shorten()
         result = dataclasses.replace(self._result(run), log=run.log.text())
         self._forget(run)
         return TaskEnd(address=run.task.address, result=result)
 
     def _forget(self, run: _Running) -> None:
-        run.process.wait()
         run.log.close()
-        for descriptor in (run.pipe, run.process_descriptor):
+        for descriptor in (run.pipe, run.process.descriptor):
             with contextlib.suppress(KeyError):
                 self._selector.unregister(descriptor)
-            os.close(descriptor)
+        os.close(run.pipe)
+        run.process.close()
         del self._running[run.task.address]
 
     def _result(self, run: _Running) -> CellResult:
@@ -316,16 +281,11 @@ def _messages() -> TypeAdapter[StepEvent | _LastWords]:
 def _reason_of_silence(run: _Running) -> OrthoflowError:
     if run.last_words:
         return StoreError(one_line(run.last_words))
-    code = run.process.returncode
+    code = run.process.returncode or 0
     if code == -signal.SIGKILL and oom_kills() > run.oom_kills:
         return describe_memory(run.task.who, run.peak_bytes)
     tail = one_line(run.log.text().strip().rpartition("\n")[2], _LONGEST_LAST_LINE)
     return StepFailedError(describe_exit(run.task.who, code, run.peak_bytes, tail))
-
-
-def _has_ended(run: _Running) -> bool:
-    info = os.waitid(os.P_PIDFD, run.process_descriptor, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-    return info is not None
 
 
 def _memory_of_step(run: _Running) -> int:
@@ -338,32 +298,7 @@ def _memory_of_step(run: _Running) -> int:
 
 def _end_all(run: _Running) -> None:
     for number in (END_ALL, signal.SIGCONT):
-        with contextlib.suppress(ProcessLookupError):
-            run.process.send_signal(number)
-
-
-def _kill_group(run: _Running) -> None:
-    _signal_group(run, signal.SIGKILL)
-
-
-def _signal_group(run: _Running, number: signal.Signals) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(run.process.pid, number)
-
-
-def _child_environment(task: Task) -> dict[str, str]:
-    """Environment variables for the process of a task."""
-    variables = dict(os.environ)
-    variables |= dict.fromkeys(_THREAD_VARIABLES, str(task.cores))
-    return variables | {
-        "PYTHONPATH": python_path(),
-        "PYTHONHASHSEED": "0",
-        "PYTHONUNBUFFERED": "1",
-        COMPILED_CODE: task.numba_folder,
-        "MPLBACKEND": "Agg",
-        "MPLCONFIGDIR": str(Path(task.store) / "matplotlib"),
-        "TMPDIR": str(task.scratch),
-    }
+        run.process.send_signal(number)
 
 
 def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from orthoflow.engine.clock import now
-from orthoflow.engine.compiled_code import begun_with_warm
+from orthoflow.engine.compiled_code import begun_with_warm, leave_for_others
 from orthoflow.engine.durability import remove_tree, writing_to
 from orthoflow.engine.environment import environment
 from orthoflow.engine.events import (
@@ -168,7 +169,7 @@ def execute(
             executor = _executor(plan, scratch, _passing_on(listen), interruption)
             run = _Run(tasks, journal, listen)
             try:
-                with closing(executor):
+                with closing(executor), tasks.sharing_kernels():
                     run.go(executor, interruption)
             except (CancelledStepError, ClusterError, StoreError):
                 if on_interruption is not None:
@@ -541,6 +542,16 @@ class _TaskMaker:
             environment=environment(cores),
             **shared_fields(facts, MethodIdentity),
         )
+
+    @contextmanager
+    def sharing_kernels(self) -> Iterator[None]:
+        """Give stores that begin later what is compiled while the block runs."""
+        since_ns = time.time_ns()
+        try:
+            yield
+        finally:
+            for digest in {facts.compiled_digest for facts in self.plan.methods.values()}:
+                leave_for_others(self.store.numba_folder(digest), since_ns)
 
     def _input(self, cell: Cell, port: str, ref: ProductRef) -> TaskInput:
         source = cell.inputs[port]

@@ -10,6 +10,7 @@ from typing import Final
 from orthoflow.engine.durability import writing_to
 
 # Of a long log the end is kept: what went wrong stands last.
+_LOOKS: Final = 10
 _KEPT_BYTES: Final = 256 << 10
 _LARGEST_BYTES: Final = 8 << 20
 
@@ -41,6 +42,12 @@ class StepLog:
         if size <= _LARGEST_BYTES:
             return
         tail = self._tail(size)
+        # What is written between the look and the cut is lost: look again until nothing was.
+        for _ in range(_LOOKS):
+            grown = os.fstat(self.descriptor).st_size
+            if grown == size:
+                break
+            size, tail = grown, self._tail(grown)
         self._n_dropped += size - len(self._notice) - len(tail)
         self._notice = f"... ({self._n_dropped} bytes before)\n".encode()
         # A full disk costs the log, not the run.

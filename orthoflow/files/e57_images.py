@@ -72,6 +72,19 @@ def read_e57_images(path: Path) -> tuple[E57Image, ...]:
     return images
 
 
+def count_e57_images(path: Path) -> int:
+    """Count what an E57 file has of photos and panoramas, without reading them.
+
+    Raises:
+        InputError: the file is damaged.
+        PluginError: the library for E57 is missing.
+    """
+    pye57 = load_library("pye57", path)
+    with reading(path, FORMAT), pye57.E57(str(path)) as file:
+        root = file.image_file.root()
+        return int(root["images2D"].childCount()) if root.isDefined("images2D") else 0
+
+
 def _children(vector: Any) -> Iterator[Any]:
     return (vector.get(index) for index in range(vector.childCount()))
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,7 @@ def require_map_crs(crs: str) -> None:
     from rasterio.errors import CRSError
 
     try:
-        with _quiet():
+        with quiet():
             found = _map_crs(crs)
     except CRSError as error:
         raise InputError(
@@ -124,6 +125,29 @@ def require_map_crs(crs: str) -> None:
             f"{crs} is no coordinate system in metres: expected a projected one, such as "
             f"EPSG:2100, or {SITE_CRS}"
         )
+
+
+def epsg_of(map_crs: str | None) -> int | None:
+    """Give the EPSG code of a map's coordinate system; None for `site`, and for any other text.
+
+    >>> epsg_of("EPSG:25832"), epsg_of("site"), epsg_of(None)
+    (25832, None, None)
+    """
+    # GDAL takes paths and addresses for coordinate systems too, and a record may name any.
+    found = re.fullmatch(r"EPSG:([0-9]{4,6})", map_crs or "")
+    return int(found[1]) if found else None
+
+
+def epsg_wkt(epsg: int) -> str:
+    """Give the WKT of an EPSG code; empty where PROJ does not know it."""
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    try:
+        with quiet():
+            return str(CRS.from_epsg(epsg).to_wkt())
+    except CRSError:
+        return ""
 
 
 def _map_crs(crs: str) -> CRS:
@@ -329,7 +353,7 @@ def read_raster(path: Path) -> RasterFile:
     from rasterio.errors import RasterioError
 
     try:
-        with _quiet(), rasterio.open(path, driver="GTiff") as dataset:
+        with quiet(), rasterio.open(path, driver="GTiff") as dataset:
             _check_size(path, dataset)
             values = dataset.read()
             return RasterFile(
@@ -348,6 +372,80 @@ def read_raster(path: Path) -> RasterFile:
         raise InputError(
             f"{path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
         ) from error
+
+
+class RasterParts:
+    """A GeoTIFF of any size that is read part by part, at the resolution that is wanted.
+
+    Attributes:
+        shape: rows and columns.
+        gsd_m: side of a cell in metres.
+        corner_m: X and Y of the outer corner of the top-left cell.
+        bands: how many there are.
+        dtype: numpy's name of the stored type.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a file.
+
+        Raises:
+            InputError: GDAL cannot read it, or its cells are not square and upright.
+        """
+        import rasterio
+
+        self._path = path
+        with self._reading():
+            self._dataset: DatasetReader = rasterio.open(path, driver="GTiff")
+        self.shape: tuple[int, int] = (self._dataset.height, self._dataset.width)
+        self.gsd_m = _gsd_m(path, self._dataset.transform)
+        self.corner_m = (float(self._dataset.transform.c), float(self._dataset.transform.f))
+        self.bands: int = self._dataset.count
+        self.dtype: str = self._dataset.dtypes[0]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._dataset.close()
+
+    def read(
+        self, cells: tuple[float, float, float, float], shape: tuple[int, int]
+    ) -> tuple[NDArray[np.generic], NDArray[np.bool_]]:
+        """Read a part, averaged to fewer pixels.
+
+        Args:
+            cells: left, top, right and bottom of the part, in cells, fractions allowed.
+            shape: rows and columns wanted, at most as many as cells.
+
+        Returns:
+            (rows, cols[, bands]) values, and (rows, cols) True where the file shows something.
+        """
+        from rasterio.enums import Resampling
+        from rasterio.windows import Window
+
+        left, top, right, bottom = cells
+        window = Window(left, top, right - left, bottom - top)
+        average = Resampling.average
+        with self._reading():
+            read = self._dataset.read(
+                window=window, out_shape=(self.bands, *shape), resampling=average
+            )
+            shown = self._dataset.dataset_mask(window=window, out_shape=shape)
+        values = read[0] if self.bands == 1 else np.moveaxis(read, 0, 2)
+        return values, shown > 0
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        import rasterio
+        from rasterio.errors import RasterioError
+
+        try:
+            with quiet(), rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+                yield
+        except (RasterioError, OSError, UnicodeDecodeError) as error:
+            raise InputError(
+                f"{self._path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
+            ) from error
 
 
 def _check_size(path: Path, dataset: DatasetReader) -> None:
@@ -434,14 +532,14 @@ def _writing(path: Path) -> Iterator[None]:
     from rasterio.errors import RasterioError
 
     try:
-        with _quiet():
+        with quiet():
             yield
     except (RasterioError, OSError) as error:
         raise StoreError(f"{path.name} cannot be written: {error}; free some space") from error
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep GDAL's masks inside the file and rasterio's advice out of the user's terminal."""
     import rasterio
 

@@ -1,7 +1,7 @@
 """The files of a run that people open in other programs, one function per product type.
 
 Each takes the product, an existing empty folder and the product's digest, and writes the same bytes
-for the same product. The `k` in file names is the wall's position in `Walls`.
+for the same product. The `k` in file names is the place of the wall's plane in `planes.json`.
 """
 
 from __future__ import annotations
@@ -55,6 +55,7 @@ from orthoflow.products import (
     Ties,
     Wall,
     Walls,
+    plane_name,
 )
 
 PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
@@ -111,6 +112,7 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
     for index, wall in enumerate(product.walls):
         slab = product.slab(index)
         about: dict[str, JsonValue] = {
+            "wall": wall.plane_index,
             "plane_index": wall.plane_index,
             "intensity_source": product.intensity_source,
             "buffer": {"front_m": slab.front_m, "behind_m": slab.behind_m},
@@ -118,7 +120,7 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
         publish = partial(_publish_raster, wall=wall, about=about, digest=digest)
         depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
         in_metres = {"unit": "m"}
-        stem = f"wall_{index}_depth"
+        stem = f"wall_{wall.plane_index}_depth"
         publish(folder / stem, wall.depth_m, content=depth, tags=in_metres)
         if wall.percentiles_m is not None:
             for k, percent in enumerate(product.percentiles):
@@ -130,7 +132,7 @@ def publish_walls(product: Walls, folder: Path, digest: str) -> None:
                 )
         if wall.intensity is not None:
             publish(
-                folder / f"wall_{index}_intensity",
+                folder / f"wall_{wall.plane_index}_intensity",
                 wall.intensity,
                 content=f"intensity 0..1 ({product.intensity_source}); NaN = nothing",
                 tags={"unit": "1", "intensity_source": product.intensity_source},
@@ -143,13 +145,13 @@ def publish_orthoimages(product: Orthoimages, folder: Path, digest: str) -> None
     Layers that were asked for follow as `publish_layers` writes them.
     """
     if product.layers:
-        names = {image.wall: image.name for image in product.images}
-        _write_layers(folder, product.layers, names, product.icc_profile, digest)
+        called = {image.wall: (image.number, image.name) for image in product.images}
+        _write_layers(folder, product.layers, called, product.icc_profile, digest)
     for image in product.images:
         shown = image.mask == OrthoMask.PAINTED
         for rows in row_bands(shown.shape):
             shown[rows] |= image.mask[rows] == OrthoMask.FILLED
-        stem = f"wall_{image.wall}_ortho"
+        stem = f"wall_{image.number}_ortho"
         gsd_m, place = image.frame.gsd_m, map_place(image.frame)
         colours = "sRGB" if product.icc_profile is None else "ICC profile of the photos"
         content = f"orthoimage, {colours}"
@@ -178,23 +180,26 @@ def publish_layers(product: Layers, folder: Path, digest: str) -> None:
 
     `n` counts the sources of a wall from 0, because names of photos need not differ in a file's.
     """
-    names = dict(enumerate(product.names))
-    _write_layers(folder, product.layers, names, product.icc_profile, digest)
+    called = {
+        layer.wall: (product.number(layer.wall), product.name(layer.wall))
+        for layer in product.layers
+    }
+    _write_layers(folder, product.layers, called, product.icc_profile, digest)
 
 
 def _write_layers(
     folder: Path,
     layers: Sequence[Layer],
-    names: Mapping[int, str],
+    called: Mapping[int, tuple[int, str]],
     icc_profile: bytes | None,
     digest: str,
 ) -> None:
     counts: dict[int, int] = {}
     for layer in layers:
-        number = counts[layer.wall] = counts.get(layer.wall, -1) + 1
+        nth = counts[layer.wall] = counts.get(layer.wall, -1) + 1
+        number, name = called.get(layer.wall, (layer.wall, plane_name("wall", layer.wall)))
         source = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(layer.source).stem)
-        stem = f"wall_{layer.wall}_layer_{number}_{source}"
-        name = names.get(layer.wall, f"wall {layer.wall}")
+        stem = f"wall_{number}_layer_{nth}_{source}"
         content = f"what {layer.source} shows of the wall"
         tags = raster_tags(layer.frame, digest=digest, name=name, content=content, extra={})
         write_orthoimage(
@@ -207,7 +212,7 @@ def _write_layers(
             place=map_place(layer.frame),
         )
         about: dict[str, JsonValue] = {
-            "wall": layer.wall,
+            "wall": number,
             "name": name,
             "source": layer.source,
             "content": content,
@@ -227,7 +232,7 @@ def publish_ties(product: Ties, folder: Path, digest: str) -> None:
     rows: Iterator[Sequence[Value]] = (
         (
             product.photo_names[int(product.photo[index])],
-            int(product.wall[index]),
+            product.number(int(product.wall[index])),
             *(_cell(value) for value in pixels[index]),
             *(_cell(value) for value in product.points_world[index]),
             TieRole(int(product.role[index])).name.lower(),
@@ -338,7 +343,7 @@ def _write_ortho_sidecars(
     folder: Path, stem: str, image: Orthoimage, about: Mapping[str, JsonValue], digest: str
 ) -> None:
     content = frame_json(image.frame) | {
-        "wall": image.wall,
+        "wall": image.number,
         "name": image.name,
         "sources": list(image.sources),
         "bits": 8 * image.rgb.itemsize,

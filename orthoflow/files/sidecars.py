@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, InputError, StoreError
+from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.json_texts import parse_json
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import FARTHEST_M
@@ -154,6 +155,24 @@ def frame_of_raster(
         )
     except GeometryError as error:
         raise InputError(f"{name}: {error}") from error
+
+
+def placed_raster(path: Path) -> tuple[WallFrame, dict[str, object]]:
+    """Give where a published GeoTIFF lies, and the sidecar beside it that says so.
+
+    Raises:
+        InputError: one of them cannot be read.
+    """
+    content = read_sidecar(path.with_suffix(".json"))
+    with RasterParts(path) as raster:
+        frame = frame_of_raster(
+            content,
+            corner_m=raster.corner_m,
+            gsd_m=raster.gsd_m,
+            shape=raster.shape,
+            name=path.name,
+        )
+    return frame, content
 
 
 def _vector(value: object) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,6 +19,8 @@ from typing import Any, BinaryIO, Final
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 _DIGEST_BYTES: Final = 32
+# Of an index's files, in their names.
+CHECKED: Final = ".checked"
 
 
 class KeptKernels(FunctionCache):
@@ -34,13 +37,19 @@ class KeptKernels(FunctionCache):
         self._cache_file = _CheckedFiles(  # type: ignore[no-untyped-call]
             self._cache_path,
             # Another name than numba's: a version before could not read these files.
-            f"{self._impl.filename_base}.checked",
+            f"{self._impl.filename_base}{CHECKED}",
             self._impl.locator.get_source_stamp(),
         )
 
 
 class _CheckedFiles(IndexDataCacheFile):
-    """The index of a kernel's versions and the file of each, with their digests."""
+    """The index of a kernel's versions and the file of each, with their digests.
+
+    No two files ever have one name, whoever writes them: an index never names another's version.
+    """
+
+    def _data_name(self, number: int) -> str:
+        return f"{Path(self._index_path).stem}.{uuid.uuid4().hex[:12]}.nbc"
 
     def _load_index(self) -> dict[Any, str]:
         content = _checked(Path(self._index_path))

@@ -22,6 +22,7 @@ from orthoflow.products.planes import (
     SideSource,
     Spread,
     Thickness,
+    plane_name,
 )
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 from orthoflow.products.walls import (
@@ -76,4 +77,5 @@ __all__ = [
     "Truth",
     "Wall",
     "Walls",
+    "plane_name",
 ]

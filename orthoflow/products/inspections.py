@@ -23,7 +23,8 @@ class CheckPoints(Product):
         names: names of the points.
         points_world: (n, 3) float64 metres.
         classes: class of each point, e.g. `flat`, `vertical`; empty strings without one.
-        wall: (n,) int32 wall in whose orthoimage the point was measured, -1 for none.
+        wall: (n,) int32 number of the wall in whose orthoimage the point was measured, the place of
+            its plane in `planes.json`; -1 for none.
         pixels_wall: (n, 2) float64 measured (column, row), NaN where not measured.
         places_m: (n, 2) float64 measured X and Y as the orthoimage's GeoTIFF has them, metres in
             the plane of the wall, or east and north of a map; NaN where not measured so. None
@@ -130,7 +131,7 @@ class Finding:
         name: metric name, unit in the name where it has one.
         value: the number.
         unit: unit, `1` for shares and counts.
-        wall: index of the wall it speaks of, -1 for all together.
+        wall: index in `Walls` of the wall it speaks of, -1 for all together.
     """
 
     name: str
@@ -144,7 +145,7 @@ class Inspection(Product):
     """Displacements measured in orthoimages, and what they add up to.
 
     Attributes:
-        wall: (n,) int32 wall of each measured point.
+        wall: (n,) int32 index in `Walls` of the wall of each measured point.
         points_world: (n, 3) float64 metres.
         displacement_m: (n, 2) float64 metres along u and v: shown - true.
         kind: (n,) uint8 class of the point; `kinds` names them.

@@ -152,12 +152,14 @@ class TieWall:
         normal_world: unit vector (x, y, z) to the viewer; no photo is taken from behind it.
         gsd_m: side of a cell of its raster, metres; None where there is none, and then no error
             can be too large in cells.
+        plane_index: position of its plane in `Planes`; None where nobody says.
     """
 
     name: str = ""
     corners_world: tuple[tuple[float, ...], ...]
     normal_world: tuple[float, ...]
     gsd_m: float | None = None
+    plane_index: int | None = None
 
     def __post_init__(self) -> None:
         shapes = np.shape(self.corners_world), np.shape(self.normal_world)
@@ -176,6 +178,7 @@ class TieWall:
             corners_world=tuple(tuple(corner) for corner in frame.corners_world().tolist()),
             normal_world=tuple(frame.normal_world.tolist()),
             gsd_m=frame.gsd_m,
+            plane_index=wall.plane_index,
         )
 
 
@@ -207,7 +210,7 @@ class Ties(Product):
     """
 
     type_name: ClassVar[str] = "ties"
-    encoding_version: ClassVar[int] = 2
+    encoding_version: ClassVar[int] = 3
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "pixels_photo": Tolerance(limit=0.05, unit="px"),
         "points_world": Tolerance(limit=1e-4, unit="m"),
@@ -236,6 +239,11 @@ class Ties(Product):
                 f"ties of {len(self.photo_names)} photos have {len(self.search_radius_px)} search "
                 "radii, one per photo is expected, or none"
             )
+
+    def number(self, wall: int) -> int:
+        """Give the number of a wall for people: the place of its plane in `planes.json`."""
+        known = self.walls[wall].plane_index if 0 <= wall < len(self.walls) else None
+        return wall if known is None else known
 
     @classmethod
     def upgraded(cls, payload: Payload) -> Payload:

@@ -15,6 +15,8 @@ from orthoflow.geometry import Plane
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 
 SideSource = Literal["stations", "photos", "guess", "given"]
+# What a plane is called before its number: level and slope are neither floor nor ceiling nor wall.
+PlaneKind = Literal["wall", "floor", "ceiling", "level", "slope"]
 
 _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
     "stations": "stations",
@@ -24,6 +26,17 @@ _SIDE_SOURCES: Final[Mapping[str, SideSource]] = {
 }
 # That of markiewicz2015.
 _USUAL_TOLERANCE_M: Final = 0.05
+
+
+def plane_name(kind: PlaneKind, place: int) -> str:
+    """Name a plane, and the wall rastered over it, by its place in `planes.json`.
+
+    The files `wall_<place>_*` bear the same number, whatever the plane is.
+
+    >>> plane_name("floor", 3)
+    'floor 3'
+    """
+    return f"{kind} {place}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +114,7 @@ class Planes(Product):
         n_points: (k,) int64, points that support the plane.
         rms_m: (k,) float64, root mean square distance of those points.
         up: (3,) float64 unit vector of the cloud they come from.
-        names: k short labels, e.g. `wall 0`, `floor`.
+        names: k short labels as `plane_name` gives them, e.g. `wall 0`, `floor 3`.
         part_corners: (p, 4, 3) float64 rectangles of connected parts, or None.
         part_plane: (p,) int32 index of the plane a part lies on, or None.
         viewpoint: how the normals' side was chosen: `stations`, `view_from`, `given` or `guess`.

@@ -14,6 +14,7 @@ from orthoflow.errors import ProductError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.slabs import Slab
+from orthoflow.products.planes import plane_name
 from orthoflow.products.product import Array, JsonValue, Payload, Product, Tolerance
 
 # What the intensity of a wall is: of the laser; the grey of the colours instead; or there is none.
@@ -82,7 +83,7 @@ class Wall:
     def __post_init__(self) -> None:
         _check_rasters(
             self.frame,
-            f"wall {self.name}",
+            self.name,
             depth_m=self.depth_m,
             sigma_m=self.sigma_m,
             count=self.count,
@@ -143,7 +144,7 @@ class Walls(Product):
             rasters = wall.percentiles_m
             if rasters is not None and rasters.shape[2:] != (len(self.percentiles),):
                 raise ProductError(
-                    f"wall {wall.name}: percentiles_m has shape {rasters.shape}, but the walls "
+                    f"{wall.name}: percentiles_m has shape {rasters.shape}, but the walls "
                     f"have {len(self.percentiles)} percentiles"
                 )
 
@@ -216,11 +217,14 @@ class Layers(Product):
     Attributes:
         layers: grouped by wall in the order of `Walls`, then by source.
         names: name of each wall, by its index.
+        plane_indices: position of each wall's plane in `Planes`, by its index; empty where nobody
+            says, and then the index stands for it.
         icc_profile: colour profile that all sources share, or None: sRGB, or not known.
         details: what else the method says, JSON.
     """
 
     type_name: ClassVar[str] = "layers"
+    encoding_version: ClassVar[int] = 2
     embedded: ClassVar[bool] = False
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "rgb": Tolerance(limit=2, unit="grey"),
@@ -230,8 +234,18 @@ class Layers(Product):
 
     layers: tuple[Layer, ...]
     names: tuple[str, ...] = ()
+    plane_indices: tuple[int, ...] = ()
     icc_profile: bytes | None = None
     details: dict[str, JsonValue] = field(default_factory=dict)
+
+    def number(self, wall: int) -> int:
+        """Give the number of a wall for people: the place of its plane in `planes.json`."""
+        return self.plane_indices[wall] if wall < len(self.plane_indices) else wall
+
+    def name(self, wall: int) -> str:
+        """Give the name of a wall by its index."""
+        known = wall < len(self.names)
+        return self.names[wall] if known else plane_name("wall", self.number(wall))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,6 +261,7 @@ class Orthoimage:
         mask: uint8 `OrthoMask`; painted and filled cells are shown.
         source: int16 index into `sources`, -1 where nothing painted the cell.
         sources: what painted it, e.g. photo names, or `cloud`.
+        plane_index: position of the wall's plane in `Planes`; None where nobody says.
     """
 
     frame: WallFrame
@@ -256,6 +271,7 @@ class Orthoimage:
     mask: NDArray[np.uint8]
     source: NDArray[np.int16]
     sources: tuple[str, ...]
+    plane_index: int | None = None
 
     def __post_init__(self) -> None:
         _check_rasters(
@@ -265,6 +281,11 @@ class Orthoimage:
             mask=self.mask,
             source=self.source,
         )
+
+    @property
+    def number(self) -> int:
+        """Number of the wall for people: the place of its plane in `planes.json`."""
+        return self.wall if self.plane_index is None else self.plane_index
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -279,6 +300,7 @@ class Orthoimages(Product):
     """
 
     type_name: ClassVar[str] = "orthoimages"
+    encoding_version: ClassVar[int] = 2
     tolerances: ClassVar[Mapping[str, Tolerance]] = {
         "rgb": Tolerance(limit=2, unit="grey"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),

@@ -21,6 +21,8 @@ from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from orthoflow.catalog import Catalog
     from orthoflow.engine import Store
 
@@ -109,7 +111,7 @@ class ComparedMetric:
     environment: str = field(compare=False)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class RunComparison:
     """Two runs side by side; rows that say the same on both sides are among them.
 
@@ -136,6 +138,39 @@ class RunComparison:
     environment: tuple[Pair[str], ...]
     metrics: tuple[Pair[ComparedMetric], ...]
     products: tuple[ProductDistance, ...]
+
+    def __repr__(self) -> str:
+        told = [
+            f"{sum(not row.is_same for row in rows)} of {len(rows)} {name}"
+            for name, rows in (
+                ("inputs", self.inputs),
+                ("parameters", self.parameters),
+                ("metrics", self.metrics),
+            )
+        ]
+        n_products = sum(item.verdict == "different" for item in self.products)
+        told.append(f"{n_products} of {len(self.products)} products")
+        runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
+        return f"<RunComparison of {runs}: {', '.join(told)} differ>"
+
+    def metric_table(self) -> pd.DataFrame:
+        """Lay every number of both runs side by side.
+
+        Returns:
+            Columns `cell`, `metric`, `left`, `right`, `difference` (right - left; NaN where one of
+            them lacks it) and `unit`.
+        """
+        import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
+
+        rows = []
+        for row in self.metrics:
+            left, right = (
+                math.nan if side is None else side.value for side in (row.left, row.right)
+            )
+            unit = next(side.unit for side in (row.left, row.right) if side is not None)
+            rows.append((row.cell, row.name, left, right, right - left, unit))
+        columns = ["cell", "metric", "left", "right", "difference", "unit"]
+        return pd.DataFrame(rows, columns=columns)
 
 
 def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunComparison:

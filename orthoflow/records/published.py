@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
 from typing import Final
@@ -48,7 +49,9 @@ def publish_products(
     with writing_to(target):
         if target.is_symlink():
             target.unlink()
-        shutil.rmtree(target, ignore_errors=True)
+        # What cannot be removed would be published as part of this run.
+        with suppress(FileNotFoundError):
+            shutil.rmtree(target)
         target.mkdir(parents=True, exist_ok=True)
         for cell in cells:
             if cell.status == "ok":

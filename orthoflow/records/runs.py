@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from orthoflow_provenance.reader import read_outputs, read_record
 
 from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
+from orthoflow.foreign_text import shown
 from orthoflow.products.product import Payload, Product
 from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.published import PRODUCTS_FOLDER, published_files
@@ -25,7 +27,7 @@ REPORT_FILE: Final = "report.html"
 PAGES_FOLDER: Final = "pages"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Run:
     """A finished run.
 
@@ -60,7 +62,24 @@ class Run:
             )
         return self.cells[address]
 
-    def metrics(self) -> tuple[MetricRow, ...]:
+    def upstream(self, address: str) -> Iterator[RecordedCell]:
+        """Give a cell and all that it comes from, the nearest first."""
+        waiting, seen = [address], {address}
+        for name in waiting:
+            # Grows while it is walked.
+            yield self.cells[name]
+            for given in self.cells[name].inputs.values():
+                before = given.source.rpartition(".")[0]
+                if before in self.cells and before not in seen:
+                    seen.add(before)
+                    waiting.append(before)
+
+    def __repr__(self) -> str:
+        counts = Counter(cell.status for cell in self.record.cells)
+        told = ", ".join(f"{count} {status}" for status, count in counts.items())
+        return shown(f"<Run {self.record.name} in {self.folder}: {told or 'no cells'}>")
+
+    def metric_rows(self) -> tuple[MetricRow, ...]:
         """Every number of every cell, those that the engine measured included."""
         return tuple(row for cell in self.record.cells for row in cell_metrics(cell))
 

@@ -34,7 +34,7 @@ def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
         "products.csv": _products(run.record),
         "environments.csv": _environments(run.record),
     }
-    write_metrics_csv(folder / METRICS_FILE, run.metrics())
+    write_metrics_csv(folder / METRICS_FILE, run.metric_rows())
     for name, rows in tables.items():
         (folder / name).write_text(csv_text(rows), encoding="utf-8", newline="")
     return tuple(folder / name for name in (METRICS_FILE, *tables))

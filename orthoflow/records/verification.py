@@ -21,8 +21,8 @@ from orthoflow.records.runs import find_record, record_errors
 from orthoflow.records.signatures import check_signature, read_signature
 
 _FILES_NAMED: Final = 3
-_State: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
-_WRONG: Final[dict[_State, str]] = {
+PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
+_WRONG: Final[dict[PublishedState, str]] = {
     "changed": "changed since it was published",
     "unreadable": "unreadable since it was published",
     "no file": "a link, a folder or a device stands where a file was published; it was not read",
@@ -122,7 +122,7 @@ class _PublishedCheck:
 
 
 def _check_published(folder: Path, record: RunRecord) -> _PublishedCheck:
-    states = list(in_order(lambda file: _state(folder, file), record.published))
+    states = list(in_order(lambda file: published_state(folder, file), record.published))
     checked = list(zip(record.published, states, strict=True))
     missing = [file.path for file, state in checked if state == "missing"]
     changed = tuple(f"{file.path}: {_WRONG[state]}" for file, state in checked if state in _WRONG)
@@ -130,7 +130,13 @@ def _check_published(folder: Path, record: RunRecord) -> _PublishedCheck:
     return _PublishedCheck(changed=changed, notes=notes, n_same=states.count("same"))
 
 
-def _state(folder: Path, file: PublishedFile) -> _State:
+def published_state(folder: Path, file: PublishedFile) -> PublishedState:
+    """Compare a published file with the record; follows no link and opens no device.
+
+    Args:
+        folder: of the run.
+        file: what the record says of it.
+    """
     try:
         with open_below(folder, file.path) as stream:
             # A sparse file of a terabyte is told by its size.

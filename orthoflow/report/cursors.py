@@ -10,6 +10,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 
 # Depths are told to a millimetre at so many places of a wall, some 40 kB of a page.
@@ -36,7 +37,9 @@ class Placed(Protocol):
     @property
     def id(self) -> str: ...  # noqa: D102 - as `pictures.Picture` has them
     @property
-    def wall(self) -> int: ...  # noqa: D102
+    def number(self) -> int: ...  # noqa: D102
+    @property
+    def name(self) -> str: ...  # noqa: D102
     @property
     def frame(self) -> WallFrame | None: ...  # noqa: D102
     @property
@@ -78,7 +81,8 @@ def cursor_places(
         places.append(
             {
                 "id": picture.id,
-                "wall": picture.wall,
+                "wall": picture.number,
+                "name": shown(picture.name),
                 "origin": frame.origin_world.tolist(),
                 "u": frame.u_world.tolist(),
                 "v": frame.v_world.tolist(),

@@ -149,32 +149,41 @@ def magnification_for(frame: WallFrame, lengths_m: NDArray[np.float64]) -> float
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Known:
+    """A wall that drawings lie over."""
+
+    name: str
+    frame: WallFrame
+
+
+@dataclass(frozen=True, kw_only=True)
 class _Frames:
     """Finds the wall rasters behind a cell.
 
     Attributes:
         run: the run.
-        known: digest of a walls product -> frames of its walls by their index.
+        known: digest of a walls product -> pictures of its walls by their index.
         cells: digest of a walls product -> the cell whose pictures the page shows.
         marks_most: in each drawing.
     """
 
     run: Run
-    known: Mapping[str, Mapping[int, WallFrame]]
+    known: Mapping[str, Mapping[int, _Known]]
     cells: Mapping[str, str]
     marks_most: int
 
     @staticmethod
     def of(run: Run, pictures: Sequence[Picture], *, share: float) -> _Frames:
         """Take the frames from the pictures of walls."""
-        known: dict[str, dict[int, WallFrame]] = {}
+        known: dict[str, dict[int, _Known]] = {}
         cells: dict[str, str] = {}
         for picture in pictures:
             if picture.frame is None:
                 continue
             for product in run.cells[picture.cell].outputs.values():
                 if product.type_name == "walls":
-                    known.setdefault(product.digest, {})[picture.wall] = picture.frame
+                    at = _Known(name=picture.name, frame=picture.frame)
+                    known.setdefault(product.digest, {})[picture.wall] = at
                     cells[product.digest] = picture.cell
         n_walls = max((len(frames) for frames in known.values()), default=1)
         wanted = round(share * _MARKS_IN_ALL / n_walls)
@@ -185,17 +194,12 @@ class _Frames:
             marks_most=min(_MARKS_MOST, max(_MARKS_FEW, wanted)),
         )
 
-    def behind(self, address: str) -> tuple[str, Mapping[int, WallFrame]]:
-        """Address and frames of the nearest walls that went into a cell."""
-        waiting, seen = [address], {address}
-        while waiting:
-            for given in self.run.cells[waiting.pop(0)].inputs.values():
+    def behind(self, address: str) -> tuple[str, Mapping[int, _Known]]:
+        """Address, names and frames of the nearest walls that went into a cell."""
+        for cell in self.run.upstream(address):
+            for given in cell.inputs.values():
                 if given.digest in self.known:
                     return self.cells[given.digest], self.known[given.digest]
-                before = given.source.rpartition(".")[0]
-                if before in self.run.cells and before not in seen:
-                    seen.add(before)
-                    waiting.append(before)
         return "", {}
 
 
@@ -207,21 +211,21 @@ def _tie_overlays(address: str, cameras: Cameras, ties: Ties, frames: _Frames) -
         camera = by_name.get(name)
         if camera is None or camera.status != "ok":
             continue
-        for wall, frame in known.items():
+        for wall, at in known.items():
             here = (ties.photo == index) & (ties.wall == wall)
             lengths_m[here] = residuals_on_wall(
-                camera, ties.points_world[here], ties.residual_px[here], frame
+                camera, ties.points_world[here], ties.residual_px[here], at.frame
             )
     kinds = np.array([_ROLES[TieRole(role)] for role in ties.role.tolist()], dtype=np.str_)
-    for wall, frame in known.items():
+    for wall, at in known.items():
         here = np.flatnonzero((ties.wall == wall) & np.isfinite(lengths_m).all(axis=1))
         if len(here):
             vectors = Vectors(
-                pixels_wall=frame.wall_from_world(ties.points_world[here])[:, :2],
+                pixels_wall=at.frame.wall_from_world(ties.points_world[here])[:, :2],
                 lengths_m=lengths_m[here],
                 kinds=kinds[here],
             )
-            place = _Place(cell=address, walls_cell=walls_cell, wall=wall, frame=frame)
+            place = _Place(cell=address, walls_cell=walls_cell, wall=wall, known=at)
             yield _overlay(place, vectors, what="ties of", marks_most=frames.marks_most)
 
 
@@ -231,17 +235,17 @@ def _inspection_overlays(
     if not len(inspection.wall):
         return
     walls_cell, known = frames.behind(address)
-    for wall, frame in known.items():
+    for wall, at in known.items():
         here = np.flatnonzero(
             (inspection.wall == wall) & np.isfinite(inspection.displacement_m).all(axis=1)
         )
         if len(here):
             vectors = Vectors(
-                pixels_wall=frame.wall_from_world(inspection.points_world[here])[:, :2],
+                pixels_wall=at.frame.wall_from_world(inspection.points_world[here])[:, :2],
                 lengths_m=inspection.displacement_m[here],
                 kinds=np.full(len(here), "shown"),
             )
-            place = _Place(cell=address, walls_cell=walls_cell, wall=wall, frame=frame)
+            place = _Place(cell=address, walls_cell=walls_cell, wall=wall, known=at)
             what = "displacements in the orthoimage of"
             yield _overlay(place, vectors, what=what, marks_most=frames.marks_most)
 
@@ -253,11 +257,11 @@ class _Place:
     cell: str
     walls_cell: str
     wall: int
-    frame: WallFrame
+    known: _Known
 
 
 def _overlay(place: _Place, vectors: Vectors, *, what: str, marks_most: int) -> Overlay:
-    frame = place.frame
+    frame = place.known.frame
     judged = vectors.kinds != "rejected"
     magnification = magnification_for(frame, vectors.lengths_m[judged])
     shown = _spread_evenly(vectors, marks_most)
@@ -267,7 +271,7 @@ def _overlay(place: _Place, vectors: Vectors, *, what: str, marks_most: int) -> 
     caption = f"{_counts(vectors)}; vectors drawn {magnification:g} times as long" + (
         "" if len(shown.kinds) == len(vectors.kinds) else f", {len(shown.kinds)} of them shown"
     )
-    title = f"{what} wall {place.wall}, {place.cell}"
+    title = f"{what} {place.known.name}, {place.cell}"
     return Overlay(
         svg=draw_vectors(frame, shown, label=f"{title}: {caption}", magnification=magnification),
         title=title[0].upper() + title[1:],

@@ -19,7 +19,6 @@ from urllib.parse import quote
 import jinja2
 from markupsafe import Markup, escape
 
-from orthoflow import __version__
 from orthoflow.errors import StoreError
 from orthoflow.foreign_text import shown
 from orthoflow.products import Cameras
@@ -50,6 +49,7 @@ from orthoflow.report.pictures import (
 )
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
 from orthoflow.report.summaries import Answer, Limit, answers, citations, limits, results
+from orthoflow.version import __version__
 
 # Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
 _DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")

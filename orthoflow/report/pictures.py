@@ -54,6 +54,8 @@ class Picture:
         file: path of the full image relative to the run folder, or empty.
         cell: address of the cell it comes from.
         wall: index of the wall it shows, -1 for what is no raster of a wall.
+        number: of that wall for people: the place of its plane in `planes.json`.
+        name: of that wall.
         frame: where it lies in the world, None for what is no raster of a wall.
         id: name of its place on the page; empty where nothing refers to it.
         depths: of the wall, where it shows its depth.
@@ -65,6 +67,8 @@ class Picture:
     file: str = ""
     cell: str = ""
     wall: int = -1
+    number: int = -1
+    name: str = ""
     frame: WallFrame | None = None
     id: str = ""
     depths: CoarseDepths | None = None
@@ -93,7 +97,7 @@ def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         product = Orthoimages.from_payload(payload)
         yield from _drawn(
-            [_orthoimage(run, address, index, image) for index, image in enumerate(product.images)],
+            [_orthoimage(run, address, image) for image in product.images],
             n_products=len(places) / share,
         )
 
@@ -102,8 +106,8 @@ def thumbnail(run: Run, addresses: Collection[str], *, longest_side_px: int) -> 
     """Give the first orthoimage of some cells as a small picture, a data URI; empty without any."""
     places = [place for place in embedded_products(run, "orthoimages") if place[0] in addresses]
     for (address, _), payload in zip(places[-1:], run.payloads(places[-1:]), strict=True):
-        for index, image in enumerate(Orthoimages.from_payload(payload).images[:1]):
-            drawing = _orthoimage(run, address, index, image)
+        for image in Orthoimages.from_payload(payload).images[:1]:
+            drawing = _orthoimage(run, address, image)
             return data_uri(drawing.draw(longest_side_px), "image/webp")
     return ""
 
@@ -137,6 +141,8 @@ class _Drawing:
     file: str
     cell: str
     wall: int
+    number: int
+    name: str
     frame: WallFrame
     depths: CoarseDepths | None = None
 
@@ -153,12 +159,14 @@ def _drawn(drawings: Sequence[_Drawing], *, n_products: float) -> Iterator[Pictu
             file=drawing.file,
             cell=drawing.cell,
             wall=drawing.wall,
+            number=drawing.number,
+            name=drawing.name,
             frame=drawing.frame,
             depths=drawing.depths,
         )
 
 
-def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawing:
+def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
     n_filled = count_cells(image.mask, OrthoMask.FILLED)
     shown = (n_filled + count_cells(image.mask, OrthoMask.PAINTED)) / image.mask.size
     filled = n_filled / image.mask.size
@@ -176,9 +184,11 @@ def _orthoimage(run: Run, address: str, index: int, image: Orthoimage) -> _Drawi
             if filled
             else f"{frame_words(image.frame)}; {_percent(shown)} of the cells painted"
         ),
-        file=_published(run, address, f"wall_{index}_ortho.tif"),
+        file=_published(run, address, f"wall_{image.number}_ortho.tif"),
         cell=address,
         wall=image.wall,
+        number=image.number,
+        name=image.name,
         frame=image.frame,
     )
 
@@ -197,9 +207,11 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
             f"blue {1000 * limit_m:.0f} mm behind the plane, white on it, red "
             f"{1000 * limit_m:.0f} mm in front; {_percent(known)} of the cells known"
         ),
-        file=_published(run, address, f"wall_{index}_depth.tif"),
+        file=_published(run, address, f"wall_{wall.plane_index}_depth.tif"),
         cell=address,
         wall=index,
+        number=wall.plane_index,
+        name=wall.name,
         frame=wall.frame,
         depths=coarse_depths(wall.depth_m),
     )
@@ -215,9 +227,11 @@ def _intensity(
             "laser": "laser intensity",
             "luminance": "no laser intensity in the scan: grey of its colours instead",
         }.get(source, source),
-        file=_published(run, address, f"wall_{index}_intensity.tif"),
+        file=_published(run, address, f"wall_{wall.plane_index}_intensity.tif"),
         cell=address,
         wall=index,
+        number=wall.plane_index,
+        name=wall.name,
         frame=wall.frame,
     )
 

@@ -12,11 +12,11 @@ from typing import Final
 
 import jinja2
 
-from orthoflow import __version__
 from orthoflow.catalog import Catalog, did_you_mean
 from orthoflow.errors import ArgumentError
 from orthoflow.scaffold.comparing import comparison_text
 from orthoflow.scaffold.kinds import KindPorts, kind_ports
+from orthoflow.version import __version__
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 _NAME: Final = re.compile(r"[a-z][a-z0-9-]{1,31}")

@@ -123,7 +123,7 @@ def example_room(
         n_points=per_side.astype(np.int64),
         rms_m=np.full(6, 0.002),
         up=up_vector("z"),
-        names=("wall 0", "wall 1", "wall 2", "wall 3", "floor", "ceiling"),
+        names=("wall 0", "wall 1", "wall 2", "wall 3", "floor 4", "ceiling 5"),
         viewpoint="stations",
     )
     return cloud, planes

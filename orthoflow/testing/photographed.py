@@ -6,9 +6,10 @@ the truth of a cell, of a pixel and of a pose is known to the last digit.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import Final
 
 import numpy as np
@@ -207,6 +208,23 @@ def photo_of(
     scene: TexturedWall, camera: ViewingCamera, *, name: str = "a.png", calibrated: bool = True
 ) -> Photo:
     """Give what the camera sees, each pixel's centre traced; black beside the wall."""
+    return Photo(
+        name=name,
+        encoded=_picture(pickle.dumps((scene, camera))),
+        width=camera.width,
+        height=camera.height,
+        exif_focal_px=None if calibrated else 1.02 * camera.fx,
+        intrinsics=Intrinsics.of(camera) if calibrated else None,
+    )
+
+
+# Half a second each, and most tests of a method look at the same few.
+@lru_cache(maxsize=32)
+def _picture(pickled: bytes) -> bytes:
+    """Give the picture of a scene and a camera, which are pickled so that equal ones share it."""
+    scene: TexturedWall
+    camera: ViewingCamera
+    scene, camera = pickle.loads(pickled)
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = camera.rays_world(np.column_stack([columns.ravel(), rows.ravel()]))
     gsd_m = scene.frame.gsd_m
@@ -224,15 +242,7 @@ def photo_of(
         scene.grey(across, down),
         0.0,
     )
-    image = np.rint(255 * grey).astype(np.uint8).reshape(camera.height, camera.width)
-    return Photo(
-        name=name,
-        encoded=encode_png(image),
-        width=camera.width,
-        height=camera.height,
-        exif_focal_px=None if calibrated else 1.02 * camera.fx,
-        intrinsics=Intrinsics.of(camera) if calibrated else None,
-    )
+    return encode_png(np.rint(255 * grey).astype(np.uint8).reshape(camera.height, camera.width))
 
 
 def oriented(camera: ViewingCamera, *, name: str = "a.png") -> Camera:

@@ -117,7 +117,7 @@ class RecordedFigure(Figure):
         data: the bytes of the file.
     """
 
-    data: bytes
+    data: bytes = field(repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -295,7 +295,7 @@ class CellOutcome(MethodIdentity, Costs):
     log: LongText = ""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class RecordedCell(CellOutcome):
     """One cell of a run: a method applied once.
 
@@ -327,8 +327,16 @@ class RecordedCell(CellOutcome):
         default_factory=dict
     )
 
+    def __repr__(self) -> str:
+        # Logs and lists of parameters are for whoever asks for them.
+        metrics, figures = len(self.metrics), len(self.figures)
+        return (
+            f"<RecordedCell {self.address!r}: {self.method}, {self.status}, {self.wall_s:.3g} s, "
+            f"{metrics} metrics, {figures} figures>"
+        )
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class RunRecord:
     """Everything a record says except the products' arrays.
 
@@ -363,6 +371,12 @@ class RunRecord:
     environments: Annotated[tuple[RecordedEnvironment, ...], Stored.ELSEWHERE] = ()
     cells: Annotated[tuple[RecordedCell, ...], Stored.ELSEWHERE] = ()
     published: Annotated[tuple[PublishedFile, ...], Stored.ELSEWHERE] = ()
+
+    def __repr__(self) -> str:
+        return (
+            f"<RunRecord {self.run_id!r} of {self.name!r}: {self.status}, started {self.started}, "
+            f"{len(self.cells)} cells>"
+        )
 
 
 def cost_metrics(costs: Costs) -> tuple[Metric, ...]:

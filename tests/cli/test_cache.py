@@ -96,6 +96,10 @@ def test_verify_names_what_is_damaged_and_sets_it_aside(say: Said, tmp_path: Pat
     assert say(*RUN, "again")[0] == 0
 
 
+def without_bytecode(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if "__pycache__" not in path.parts}
+
+
 @pytest.mark.parametrize("command", [(*RUN, "first"), ("cache", "gc"), ("cache", "verify")])
 def test_a_folder_of_something_else_is_no_store(
     command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -103,11 +107,11 @@ def test_a_folder_of_something_else_is_no_store(
     monkeypatch.chdir(tmp_path)
     with toy_world(tmp_path):
         (tmp_path / "toy.yaml").write_text(WORKFLOW)
-        before = {path for path in tmp_path.rglob("*") if path.suffix != ".pyc"}
+        before = without_bytecode(tmp_path)
         done = CliRunner().invoke(program, [*command, "--store", "."])
     assert done.exit_code == 2
     assert done.stderr == (
         f"error: {tmp_path} is no store of orthoflow: it holds site and 1 more; name a store, or a "
         "folder that is empty or not there yet, with --store\n"
     )
-    assert {path for path in tmp_path.rglob("*") if path.suffix != ".pyc"} <= before
+    assert without_bytecode(tmp_path) <= before

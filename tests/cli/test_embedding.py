@@ -80,7 +80,7 @@ def test_every_figure_is_written_on_demand(studio: Studio) -> None:
     done = studio("export", "first", "--to", "figures")
     assert done.exit_code == 0, done.output
     assert "0 figures and the graph" in done.stdout
-    assert (studio.folder / "first" / "all-figures" / "graph.svg").is_file()
+    assert (studio.folder / "first" / "export" / "figures" / "graph.svg").is_file()
     refused = studio("export", "first", "--to", "figures", "--cell", "nowhere", "-o", "other")
     assert (refused.exit_code, "has no cell 'nowhere'" in refused.stderr) == (2, True)
 
@@ -93,7 +93,10 @@ def test_what_cannot_be_embedded_is_named(studio: Studio) -> None:
     for words, sentence in (
         (("--to", "csv", "--embed"), "writes no record"),
         (("--to", "csv", "--input", "number=n.txt"), "--input belongs to --embed"),
-        ((), "say what to write: --to colmap, csv, figures, layers, laz or ro-crate, or --embed"),
+        (
+            (),
+            "stac, ro-crate or sheet, or --embed or --split",
+        ),
     ):
         refused = studio("export", "first", *words, "-o", "other")
         assert (refused.exit_code, sentence in refused.stderr) == (2, True), refused.output

@@ -30,11 +30,13 @@ from orthoflow.errors import (
 
 HEAVY = ("numpy", "pydantic", "networkx", "rich", "ruamel", "h5py", "numba", "jinja2")
 COMMANDS = [
+    "new",
     "check",
     "plan",
     "graph",
     "run",
     "show",
+    "runs",
     "compare",
     "report",
     "verify",
@@ -125,6 +127,7 @@ def test_every_command_loads_and_takes_debug(name: str) -> None:
         "check",
         "plan",
         "show",
+        "runs",
         "compare",
         "verify",
         "replay",

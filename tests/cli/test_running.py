@@ -83,7 +83,7 @@ def test_the_record_says_what_happened(finished: tuple[Path, str, str]) -> None:
     assert {cell.environment for cell in run.record.cells} == {
         environment.id for environment in run.record.environments
     }
-    rows = {(row.cell, row.metric): row.value for row in run.metrics()}
+    rows = {(row.cell, row.metric): row.value for row in run.metric_rows()}
     assert rows["survey", "offset_m"] == -3.0
     assert rows["paint", "wall_s"] >= 0.0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from click.testing import CliRunner
 
 from orthoflow.cli import warm
 from orthoflow.cli.program import program
-from orthoflow.engine.compiled_code import VARIABLE, begun_with_warm, warm_folder
+from orthoflow.engine.compiled_code import VARIABLE, begun_with_warm, leave_for_others, warm_folder
 from tests.workshop_runs import WORKSHOP, command, workshop_environment, write_studio
 
 
@@ -80,6 +81,31 @@ def test_kernels_that_cannot_be_copied_are_compiled_instead(tmp_path: Path, kern
     folder = tmp_path / "store" / "numba" / "abc"
     assert begun_with_warm(folder) == folder
     assert (tmp_path / "store").read_bytes() == b""
+
+
+def test_what_a_run_compiles_every_later_store_begins_with(tmp_path: Path, kernels: Path) -> None:
+    folder = tmp_path / "store" / "numba" / "abc"
+    (folder / "plane_1").mkdir(parents=True)
+    for name in ("f.checked.nbi", "f.checked.1a.nbc", "strangers.1.nbc", "old.checked.2b.nbc"):
+        (folder / "plane_1" / name).write_bytes(name.encode())
+    os.utime(folder / "plane_1" / "old.checked.2b.nbc", ns=(0, 0))
+    leave_for_others(folder, 1)
+    found = {path.name: path.read_bytes() for path in (kernels / "abc" / "plane_1").iterdir()}
+    assert found == {name: name.encode() for name in ("f.checked.nbi", "f.checked.1a.nbc")}
+    other = begun_with_warm(tmp_path / "other" / "numba" / "abc")
+    assert sorted(path.name for path in other.rglob("*.nb?")) == sorted(found)
+
+
+def test_kernels_that_cannot_be_left_are_kept_by_their_store_alone(
+    tmp_path: Path, kernels: Path
+) -> None:
+    folder = tmp_path / "store" / "numba" / "abc"
+    folder.mkdir(parents=True)
+    (folder / "f.checked.nbi").write_bytes(b"code")
+    kernels.parent.mkdir(parents=True, exist_ok=True)
+    kernels.write_bytes(b"a file stands here")
+    leave_for_others(folder, 0)
+    assert kernels.read_bytes() == b"a file stands here"
 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence_with_the_way_out(

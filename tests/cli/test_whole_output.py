@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +15,10 @@ from pydantic import Field
 from orthoflow.cli import plugins as plugins_commands
 from orthoflow.cli import tables
 from orthoflow.cli.compare import _print, comparison_json
-from orthoflow.cli.export import _Choices, _make_empty, _refuse_filled
+from orthoflow.cli.export import _refuse_filled
+from orthoflow.cli.exports.choices import Choices
+from orthoflow.cli.exports.formats import FORMATS, check_choices
+from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
 from orthoflow.products import PointCloud
@@ -418,25 +422,17 @@ def test_methods_kinds_and_products_are_listed() -> None:
 # --- options of exports ---
 
 
-def choices(**more: Any) -> _Choices:
-    plain: dict[str, Any] = {
-        "cell": None,
-        "license_text": None,
-        "embed": False,
-        "split": False,
-        "inputs": (),
-        "store": Path(),
-    }
-    return _Choices(**(plain | more))
-
-
-TARGETS = ("colmap", "csv", "figures", "laz", "ro-crate", None)
+TARGETS = (*FORMATS, None)
 
 
 @pytest.mark.parametrize(
     ("option", "belongs_to", "says"),
     [
-        ({"cell": "a"}, {"colmap", "figures", "laz"}, "--cell belongs to --to colmap"),
+        (
+            {"cell": "a"},
+            {*FORMATS} - {"csv", "prov", "ro-crate", "stac"},
+            "--cell belongs to --to colmap",
+        ),
         ({"license_text": ""}, {"ro-crate"}, "--license belongs to --to ro-crate"),
         ({"embed": True}, {"ro-crate", None}, "writes no record"),
         ({"inputs": ("a=b",), "embed": True}, {"ro-crate", None}, "writes no record"),
@@ -448,21 +444,21 @@ def test_options_belong_to_formats(
     option: dict[str, Any], belongs_to: set[str | None], says: str
 ) -> None:
     for target in TARGETS:
-        chosen = choices(**option)
+        chosen = Choices(**option)
         if target in belongs_to:
-            chosen.check(target)
+            check_choices(chosen, target)
             continue
         with pytest.raises(ArgumentError) as caught:
-            chosen.check(target)
+            check_choices(chosen, target)
         is_nothing_said = target is None and not chosen.embed
         assert ("say what to write" if is_nothing_said else says) in str(caught.value)
     for target in TARGETS[:-1]:
-        choices().check(target)
+        check_choices(Choices(), target)
 
 
 def test_only_an_empty_folder_is_written_to(tmp_path: Path) -> None:
-    _make_empty(tmp_path / "deep" / "er")
-    _make_empty(tmp_path / "deep" / "er")
+    make_empty(tmp_path / "deep" / "er")
+    make_empty(tmp_path / "deep" / "er")
     assert (tmp_path / "deep" / "er").is_dir()
     (tmp_path / "file").touch()
     for taken in (tmp_path, tmp_path / "file"):
@@ -471,4 +467,12 @@ def test_only_an_empty_folder_is_written_to(tmp_path: Path) -> None:
     _refuse_filled(tmp_path / "deep" / "er")
     _refuse_filled(tmp_path / "not there")
     with pytest.raises(ArgumentError, match="cannot be made: Not a directory"):
-        _make_empty(tmp_path / "file" / "below")
+        make_empty(tmp_path / "file" / "below")
+
+
+def test_every_format_has_a_writer_and_stands_in_the_help() -> None:
+    said = CliRunner().invoke(program, ["export", "--help"]).output
+    for name, entry in FORMATS.items():
+        assert callable(entry.load())
+        assert f"  {name}: {entry.summary[:20]}" in said
+        assert entry.options <= {field.name for field in dataclasses.fields(Choices)}

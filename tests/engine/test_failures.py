@@ -391,9 +391,10 @@ def test_files_larger_than_allowed_fail_the_cell(world: World) -> None:
 def test_a_damaged_task_is_told_in_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "task.json").write_text('{"address": 5}')
     reading, writing = os.pipe()
-    child = [sys.executable, "-m", "orthoflow.engine.child", str(tmp_path / "task.json")]
+    run = "import sys; from orthoflow.engine.child import run_step as run; "
+    run += "run(sys.argv[1], int(sys.argv[2]), at_end=lambda: None)"
     done = subprocess.run(
-        [*child, str(writing), str(os.getpid())],
+        [sys.executable, "-c", run, str(tmp_path / "task.json"), str(writing)],
         pass_fds=(writing,),
         capture_output=True,
         text=True,

@@ -6,7 +6,6 @@ import json
 import os
 import random
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -174,20 +173,3 @@ def test_a_run_folder_in_use_is_refused_and_so_is_garbage_collection(world: Worl
     finally:
         process.kill()
         process.communicate()
-
-
-def test_a_step_without_its_coordinator_ends_at_once(tmp_path: Path) -> None:
-    import sys
-
-    reading, writing = os.pipe()
-    arguments = [sys.executable, "-m", "orthoflow.engine.child"]
-    process = subprocess.run(
-        [*arguments, str(tmp_path / "none.json"), str(writing), "1"],
-        pass_fds=(writing,),
-        capture_output=True,
-        check=False,
-    )
-    os.close(reading)
-    os.close(writing)
-    assert process.returncode == 1
-    assert process.stderr == b""

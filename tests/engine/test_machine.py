@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import os
 import re
+import shutil
 import time
 from importlib import metadata
 from pathlib import Path
@@ -18,6 +20,7 @@ from orthoflow.engine.durability import (
     folder_size,
     place_folder,
     store_error,
+    whole_folder,
     write_whole,
     writing_to,
 )
@@ -25,6 +28,7 @@ from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.locks import exclusive_lock, is_locked, shared_lock
 from orthoflow.engine.memory import AvailableMemory, MemoryGuard, MemorySampler, ProcessMemory
 from orthoflow.errors import InputError, StoreError
+from tests.faulty_files import FaultyFiles
 
 MIB = 1 << 20
 
@@ -419,3 +423,23 @@ def test_the_first_of_two_folders_stays(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"^cannot write to "):
         place_folder(final, final / "inside")
     assert (final / "who").read_text() == "one"
+
+
+def test_a_folder_holds_nothing_of_one_that_was_broken_off(tmp_path: Path) -> None:
+    final = tmp_path / "exports" / "csv"
+    left = tmp_path / "exports" / ".csv.unfinished" / "walls" / "old.csv"
+    operation, is_through = 0, False
+    while not is_through:
+        operation += 1
+        left.parent.mkdir(parents=True, exist_ok=True)
+        left.write_text("of another call")
+        shutil.rmtree(final, ignore_errors=True)
+        files = FaultyFiles(tmp_path, "bad disk", operation, seed=operation)
+        with files.in_place(), contextlib.suppress(StoreError), whole_folder(final) as aside:
+            aside.mkdir(exist_ok=True)
+            (aside / "new.csv").write_text("of this one")
+        is_through = files.count < operation
+        found = [path.name for path in final.rglob("*") if path.is_file()]
+        assert found in (["new.csv"], [])
+    assert found == ["new.csv"]
+    assert operation > 10

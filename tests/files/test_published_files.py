@@ -159,11 +159,12 @@ def walls() -> Walls:
 
 def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
     publishing.publish_walls(walls(), tmp_path, DIGEST)
-    files = {f"wall_0_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")}
+    files = {f"wall_2_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")}
     assert names_in(tmp_path) == files
     content = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
-    assert json_of(tmp_path / "wall_0_depth.json") == {
+    assert json_of(tmp_path / "wall_2_depth.json") == {
         **PLACED,
+        "wall": 2,
         "plane_index": 2,
         "intensity_source": "laser",
         "buffer": {"front_m": 0.3, "behind_m": 0.2},
@@ -177,15 +178,15 @@ def test_depths_alone_are_told_completely(tmp_path: Path) -> None:
         "mask_counts": {"0": 1, "1": 4, "2": 1},
         "product_digest": DIGEST,
     }
-    read = geotiff.read_raster(tmp_path / "wall_0_depth.tif")
+    read = geotiff.read_raster(tmp_path / "wall_2_depth.tif")
     np.testing.assert_array_equal(read.values, DEPTH)
     np.testing.assert_array_equal(read.shown, np.isfinite(DEPTH))
     assert read.tags == {**TAGS, "content": content, "name": "north", "unit": "m"}
     assert (read.gsd_m, read.corner_m, read.overviews, read.layout) == (0.5, (0.0, 0.0), (), "")
-    assert (tmp_path / "wall_0_depth.pgw").read_text() == WORLD_FILE
+    assert (tmp_path / "wall_2_depth.pgw").read_text() == WORLD_FILE
     # From the 1st percentile of 0, 1, 2, 3, 4, black, to the 99th, white; the void is transparent.
     grey = np.array([[0, 63, 128], [0, 192, 255]])
-    shown = picture(tmp_path / "wall_0_depth.png")
+    shown = picture(tmp_path / "wall_2_depth.png")
     np.testing.assert_allclose(shown[:, :, 0][DEPTH >= 0.0], grey[DEPTH >= 0.0], atol=1)
     np.testing.assert_array_equal(shown[:, :, 3], [[255, 255, 255], [0, 255, 255]])
 
@@ -194,26 +195,26 @@ def test_each_raster_of_a_wall_says_what_it_holds(tmp_path: Path) -> None:
     intensity = np.linspace(0.0, 1.0, 6, dtype=np.float32).reshape(2, 3)
     layered = np.stack([DEPTH, DEPTH + 1.0], axis=2)
     full = replace(wall(), intensity=intensity, percentiles_m=layered)
-    both = (full, replace(wall(), percentiles_m=layered))
+    both = (full, replace(wall(), plane_index=3, percentiles_m=layered))
     product = replace(walls(), walls=both, percentiles=(5.0, 50.0))
     publishing.publish_walls(product, tmp_path, DIGEST)
-    stems = {"wall_0_depth", "wall_0_depth_p5_0", "wall_0_depth_p50_0", "wall_0_intensity"}
-    stems |= {"wall_1_depth", "wall_1_depth_p5_0", "wall_1_depth_p50_0"}
+    stems = {"wall_2_depth", "wall_2_depth_p5_0", "wall_2_depth_p50_0", "wall_2_intensity"}
+    stems |= {"wall_3_depth", "wall_3_depth_p5_0", "wall_3_depth_p50_0"}
     suffixes = (".tif", ".json", ".png", ".pgw")
     assert names_in(tmp_path) == {f"{stem}{suffix}" for stem in stems for suffix in suffixes}
     depth = "depth in metres along the normal, positive towards the viewer; NaN = nothing"
     contents = {
-        "wall_0_depth": (DEPTH, depth),
-        "wall_0_depth_p5_0": (DEPTH, f"percentile 5.0 of the cell's points: {depth}"),
-        "wall_0_depth_p50_0": (DEPTH + 1.0, f"percentile 50.0 of the cell's points: {depth}"),
-        "wall_0_intensity": (intensity, "intensity 0..1 (laser); NaN = nothing"),
-        "wall_1_depth": (DEPTH, depth),
+        "wall_2_depth": (DEPTH, depth),
+        "wall_2_depth_p5_0": (DEPTH, f"percentile 5.0 of the cell's points: {depth}"),
+        "wall_2_depth_p50_0": (DEPTH + 1.0, f"percentile 50.0 of the cell's points: {depth}"),
+        "wall_2_intensity": (intensity, "intensity 0..1 (laser); NaN = nothing"),
+        "wall_3_depth": (DEPTH, depth),
     }
     for stem, (values, content) in contents.items():
         read = geotiff.read_raster(tmp_path / f"{stem}.tif")
         np.testing.assert_array_equal(read.values, values)
         assert read.tags["content"] == json_of(tmp_path / f"{stem}.json")["content"] == content
-    told = geotiff.read_raster(tmp_path / "wall_0_intensity.tif").tags
+    told = geotiff.read_raster(tmp_path / "wall_2_intensity.tif").tags
     assert (told["unit"], told["intensity_source"]) == ("1", "laser")
 
 

@@ -195,13 +195,13 @@ def test_percentiles_get_rasters_of_their_own(tmp_path: Path, frame: WallFrame) 
         percentiles=(5.0, 97.5),
     )
     publishing.publish_walls(product, tmp_path, DIGEST)
-    low = geotiff.read_raster(tmp_path / "wall_0_depth_p5_0.tif")
-    high = geotiff.read_raster(tmp_path / "wall_0_depth_p97_5.tif")
+    low = geotiff.read_raster(tmp_path / "wall_2_depth_p5_0.tif")
+    high = geotiff.read_raster(tmp_path / "wall_2_depth_p97_5.tif")
     np.testing.assert_array_equal(low.values, layered[:, :, 0])
     np.testing.assert_array_equal(high.values, layered[:, :, 1])
     assert high.tags["content"].startswith("percentile 97.5")
     assert (low.tags["unit"], high.tags["unit"]) == ("m", "m")
-    intensity = geotiff.read_raster(tmp_path / "wall_0_intensity.tif")
+    intensity = geotiff.read_raster(tmp_path / "wall_2_intensity.tif")
     assert (intensity.tags["unit"], intensity.tags["intensity_source"]) == ("1", "laser")
 
 
@@ -233,25 +233,25 @@ def test_publishing_twice_gives_the_same_bytes(tmp_path: Path, frame: WallFrame)
     assert set(contents[0]) == {
         *(f"wall_3_ortho{suffix}" for suffix in (".tif", ".tfw", ".json", ".png", ".pgw")),
         *(f"wall_3_ortho_mask{suffix}" for suffix in (".tif", ".json")),
-        *(f"wall_0_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")),
-        *(f"wall_0_intensity{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")),
+        *(f"wall_2_depth{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")),
+        *(f"wall_2_intensity{suffix}" for suffix in (".tif", ".json", ".png", ".pgw")),
     }
 
 
 def test_depth_keeps_its_bits_and_its_nothing(tmp_path: Path, frame: WallFrame) -> None:
     product = walls(frame, None)
     publishing.publish_walls(product, tmp_path, DIGEST)
-    read = geotiff.read_raster(tmp_path / "wall_0_depth.tif")
+    read = geotiff.read_raster(tmp_path / "wall_2_depth.tif")
     np.testing.assert_array_equal(read.values, product.walls[0].depth_m)
     np.testing.assert_array_equal(read.shown, np.isfinite(product.walls[0].depth_m))
     assert read.nodata is not None
     assert np.isnan(read.nodata)
-    sidecar = json.loads((tmp_path / "wall_0_depth.json").read_text())
+    sidecar = json.loads((tmp_path / "wall_2_depth.json").read_text())
     assert sidecar["buffer"] == {"front_m": 0.3, "behind_m": 0.2}
     assert sidecar["plane"]["normal"] == [1.0, 0.0, 0.0]
     assert sidecar["name"] == "wall 2"
     assert sidecar["intensity_source"] == "none"
-    assert not (tmp_path / "wall_0_intensity.tif").exists()
+    assert not (tmp_path / "wall_2_intensity.tif").exists()
 
 
 def test_planes_are_published_with_the_agreed_keys(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.fuzz import readers
+from tests.fuzz import readers, records
 from tests.fuzz.harness import SEED, fuzz
 
 
@@ -21,15 +21,16 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED)
     options = parser.parse_args()
     n_cases = n_findings = 0
-    _say("reader           cases  refused   peak MiB  slowest s   (case)  findings")
-    for target in options.targets or readers.NAMES:
-        name = target if ":" in target else f"tests.fuzz.readers:{target}"
+    _say("reader             cases  refused   peak MiB  slowest s   (case)  findings")
+    for target in options.targets or (*readers.NAMES, *records.NAMES):
+        module = "records" if target in records.NAMES else "readers"
+        name = target if ":" in target else f"tests.fuzz.{module}:{target}"
         folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
         outcome = fuzz(
             name, folder, seed=options.seed, budget_s=options.seconds, most_cases=options.cases
         )
         _say(
-            f"{target:14} {outcome.n_cases:7d} {outcome.n_refused:8d} {outcome.peak_mib:10.0f} "
+            f"{target:16} {outcome.n_cases:7d} {outcome.n_refused:8d} {outcome.peak_mib:10.0f} "
             f"{outcome.slowest_s:10.3f} {outcome.slowest_case:8d} {len(outcome.findings):9d}"
         )
         if outcome.findings:

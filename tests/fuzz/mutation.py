@@ -250,7 +250,7 @@ def _json_tree(content: bytes) -> str:
 def _yaml_tree(content: bytes) -> str:
     from ruamel.yaml import YAML
 
-    return json.dumps(YAML(typ="safe", pure=True).load(content))
+    return json.dumps(YAML(typ="safe", pure=True).load(content), default=str)
 
 
 # Any: a tree of JSON values, changed wherever it is.

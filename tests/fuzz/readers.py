@@ -26,6 +26,7 @@ from orthoflow.engine.run_folder import JOURNAL, CellBegan, CellEnded, Journal
 from orthoflow.engine.store import Store, list_results
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput, read_task, write_task
 from orthoflow.files.containers import icc_profile, is_cut_off
+from orthoflow.files.drawings.title_blocks import read_title_block
 from orthoflow.files.exif import focal_length, read_exif
 from orthoflow.files.geotiff import write_orthoimage
 from orthoflow.files.images import encode_webp, shrunk_webp
@@ -301,6 +302,15 @@ def _checkpoint_files(folder: Path) -> None:
     (folder / "lines.txt").write_text(_POINT_LINES)
 
 
+_TITLE_BLOCK: Final = """\
+project: Palace, western hall
+drawing: 21-017
+date: 2026-03-14
+note: |
+  Cells of 2 mm, not retouched.
+"""
+
+
 def _read_calibration(path: Path) -> object:
     photo = path.with_name("b.jpg")
     photo.write_bytes(photo_files.jpeg(photo_files.picture(), _exif()))
@@ -348,6 +358,11 @@ CALIBRATION = Target(
     mutate=mutate_yaml,
 )
 CHECKPOINTS = Target(seeds=_checkpoint_files, read=_read_checkpoints, mutate=mutate_text)
+TITLE_BLOCK = Target(
+    seeds=lambda folder: (folder / "block.yaml").write_text(_TITLE_BLOCK),
+    read=read_title_block,
+    mutate=mutate_yaml,
+)
 ROOMS = Target(
     seeds=lambda folder: (folder / "rooms.csv").write_text(_ROOMS),
     read=_read_rooms,

@@ -32,9 +32,19 @@ from tests.fuzz.harness import (
 # Address space beyond what is taken when reading begins: what asks for more gets a MemoryError.
 _ADDRESS_SPACE: Final = 4 << 30
 _MODES: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-_CHANGING: Final = frozenset(
-    {"os.mkdir", "os.remove", "os.rename", "os.rmdir", "os.link", "os.symlink", "os.truncate"}
-    | {"os.chmod", "os.chown", "shutil.rmtree", "subprocess.Popen", "os.system"}
+# Audit event -> where its arguments name what is changed, and the folders those names start at.
+_CHANGING: Final = {
+    **dict.fromkeys(("os.remove", "os.rmdir"), ((0, 1),)),
+    "os.mkdir": ((0, 2),),
+    "os.rename": ((0, 2), (1, 3)),
+    "os.link": ((1, 3),),
+    "os.symlink": ((1, 2),),
+    **dict.fromkeys(("os.truncate", "os.chmod", "os.chown", "shutil.rmtree"), ((0, None),)),
+    **dict.fromkeys(("subprocess.Popen", "os.system"), ((0, None),)),
+}
+# These change a name, not what a link of that name leads to.
+_NAMING: Final = frozenset(
+    {"os.remove", "os.rmdir", "os.mkdir", "os.rename", "os.link", "os.symlink"}
 )
 _OWN: Final = frozenset({"seeds", "case", "findings", "state", "said"})
 _STATE: Final = struct.Struct("<qqdqd")
@@ -198,12 +208,15 @@ class _Reading:
                 return
         elif event not in _CHANGING:
             return
-        for place in arguments[:2] if event in {"os.rename", "os.link"} else arguments[:1]:
-            if isinstance(place, str | bytes | os.PathLike) and not self._is_inside(place):
-                self._writes.append(f"{event} of {os.fsdecode(place)!r}")
+        for place, start in _CHANGING.get(event, ((0, None),)):
+            name = arguments[place]
+            folder = -1 if start is None else arguments[start]
+            if isinstance(name, str | bytes | os.PathLike) and not self._is_inside(
+                _whole(name, folder, is_name=event in _NAMING)
+            ):
+                self._writes.append(f"{event} of {os.fsdecode(name)!r}")
 
-    def _is_inside(self, place: Any) -> bool:
-        whole = os.path.realpath(os.fsdecode(place))
+    def _is_inside(self, whole: str) -> bool:
         allowed = (str(self._folder / "case"), "/dev/null", os.environ.get("NUMBA_CACHE_DIR"))
         return any(part and (whole == part or whole.startswith(f"{part}/")) for part in allowed)
 
@@ -214,6 +227,16 @@ class _Reading:
         slowest_s, slowest_case = self._slowest
         noted = _STATE.pack(self._case, self._n_refused, slowest_s, slowest_case, self._peak_mib)
         os.pwrite(self._state, noted, 0)
+
+
+def _whole(name: Any, folder: int, *, is_name: bool) -> str:
+    """The path of a name in a folder that is open, or in the working one (-1)."""
+    start = Path.cwd() if folder < 0 else Path(f"/proc/self/fd/{folder}")
+    path = start / os.fsdecode(name)
+    # Of `..` and what ends in a slash the last part is no name.
+    if not is_name or path.name == "..":
+        return os.path.realpath(path)
+    return str(Path(os.path.realpath(path.parent)) / path.name)
 
 
 def _told(error: BaseException) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -46,6 +47,19 @@ def _hang(path: Path) -> None:
         pass
 
 
+def _stray_by_folder(path: Path) -> None:
+    folder = os.open(path.parents[1], os.O_RDONLY)
+    os.mkdir("s", dir_fd=folder)  # as writers do who follow no link
+    os.close(folder)
+
+
+def _link(path: Path) -> None:
+    """Make and remove a link to what lies outside: both are done to the link."""
+    link = path.with_name("link")
+    link.symlink_to("../../elsewhere")
+    link.rename(link.with_name("other")).unlink()
+
+
 GOOD = Target(seeds=_seeds, read=Path.read_bytes)
 REFUSES = Target(seeds=_seeds, read=_unless_seed(_refuse))
 RAISES = Target(seeds=_seeds, read=_unless_seed(lambda path: {}[path]))
@@ -55,11 +69,15 @@ EATS = Target(seeds=_seeds, read=_unless_seed(lambda path: np.ones(20_000_000)),
 STRAYS = Target(seeds=_seeds, read=_unless_seed(lambda path: (path.parents[1] / "s").mkdir()))
 
 
+STRAYS_BY_FOLDER = Target(seeds=_seeds, read=_unless_seed(_stray_by_folder))
+LINKS = Target(seeds=_seeds, read=_link)
+
+
 def _fuzz(name: str, folder: Path, most_cases: int = 4) -> Outcome:
     return fuzz(f"tests.fuzz.test_harness:{name}", folder, budget_s=60.0, most_cases=most_cases)
 
 
-@pytest.mark.parametrize(("name", "n_refused"), [("GOOD", 0), ("REFUSES", 4)])
+@pytest.mark.parametrize(("name", "n_refused"), [("GOOD", 0), ("REFUSES", 4), ("LINKS", 0)])
 def test_reading_and_refusing_are_no_findings(name: str, n_refused: int, tmp_path: Path) -> None:
     outcome = _fuzz(name, tmp_path)
     assert (outcome.n_cases, outcome.findings) == (4, [])
@@ -75,6 +93,7 @@ def test_reading_and_refusing_are_no_findings(name: str, n_refused: int, tmp_pat
         ("HANGS", "hang", "processor time < test_harness.py"),
         ("EATS", "memory", "MiB"),
         ("STRAYS", "write", "os.mkdir"),
+        ("STRAYS_BY_FOLDER", "write", "os.mkdir"),
     ],
 )
 def test_what_a_reader_must_not_do_is_found(

@@ -215,7 +215,7 @@ def test_tables_hold_what_the_record_says(studio: Studio) -> None:
 
     done = studio("export", "first", "--to", "csv")
     assert done.exit_code == 0, done.output
-    folder = studio.folder / "first" / "csv"
+    folder = studio.folder / "first" / "export" / "csv"
 
     def table(name: str) -> list[dict[str, str]]:
         with (folder / name).open(newline="") as file:

@@ -213,9 +213,9 @@ def test_a_sparse_file_is_told_by_its_size(finished: Studio, folder: Path) -> No
     ("command", "link"),
     [
         (("report",), "figures"),
-        (("export", "--to", "csv"), "csv"),
-        (("export", "--to", "figures"), "all-figures"),
-        (("export", "--to", "ro-crate"), "ro-crate"),
+        (("export", "--to", "csv"), "export"),
+        (("export", "--to", "figures"), "export/figures"),
+        (("export", "--to", "ro-crate"), "export/ro-crate"),
         (("export", "--embed"), "embedded"),
     ],
     ids=lambda value: value if isinstance(value, str) else " ".join(value),
@@ -231,6 +231,7 @@ def test_folders_in_a_run_that_are_links_are_not_written_through(
         lambda file: hostile.add_figure(file["cells/paint"], "depth"),
     )
     shutil.rmtree(run / link, ignore_errors=True)
+    (run / link).parent.mkdir(exist_ok=True)
     (run / link).symlink_to(outside)
     done = finished(command[0], run, *command[1:])
     assert done.exit_code in (1, 2), done.output

@@ -201,14 +201,14 @@ def test_a_figure_comes_back_as_bytes(run: Run) -> None:
 
 
 def test_metrics_hold_what_the_method_and_the_engine_measured_of_good_cells_only(run: Run) -> None:
-    rows = [(row.cell, row.metric, row.value, row.unit) for row in run.metrics()]
+    rows = [(row.cell, row.metric, row.value, row.unit) for row in run.metric_rows()]
     assert rows[3:] == [
         ("plane@plane=given", "rms_mm", 2.0, "mm"),
         ("plane@plane=given", "wall_s", 1.5, "s"),
         ("plane@plane=given", "cpu_s", 1.25, "s"),
         ("plane@plane=given", "peak_rss_mib", 128.0, "MiB"),
     ]
-    assert {row.cell for row in run.metrics()} == {"cloud", "plane@plane=given"}
+    assert {row.cell for row in run.metric_rows()} == {"cloud", "plane@plane=given"}
 
 
 def test_published_files_and_metrics_lie_below_products(run: Run) -> None:

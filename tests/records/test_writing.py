@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 from dataclasses import dataclass
 from datetime import datetime, timedelta, tzinfo
@@ -18,9 +19,11 @@ from orthoflow.engine import RunOptions, RunOutcome, RunPlan, Store, execute, pl
 from orthoflow.engine.results import FigureRef
 from orthoflow.errors import StoreError
 from orthoflow.records import Run, open_run, show_unfinished, verify_run, write_run
+from orthoflow.records.published import publish_products
 from orthoflow.workflow import Workflow, expand_cells, load_workflow
 from tests import photo_files
 from tests.engine_world import toy_world
+from tests.faulty_files import FaultyFiles
 from tests.studios import open_studio
 from tests.workshop_runs import WORKSHOP, write_studio
 
@@ -252,3 +255,27 @@ def test_a_clock_that_goes_back_by_a_year_spoils_no_record(
     assert run.record.started > run.record.ended
     assert all(cell.wall_s >= 0.0 for cell in run.record.cells)
     assert verify_run(run.path).findings == ()
+
+
+def test_what_an_earlier_run_left_is_never_published(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    old = run / "products" / "old" / "walls.csv"
+    operation, is_through = 0, False
+    refusals = []
+    while not is_through:
+        operation += 1
+        old.parent.mkdir(parents=True, exist_ok=True)
+        old.write_text("of a run that was broken off")
+        files = FaultyFiles(tmp_path, "bad disk", operation, seed=operation)
+        with files.in_place():
+            try:
+                published = [file.path for file in publish_products(run, (), {})]
+            except StoreError as error:
+                refusals.append(str(error))
+            else:
+                assert published == ["products/metrics.csv"]
+        is_through = files.count < operation
+    # Its folders are listed and removed, the new one is filled and read.
+    assert len(refusals) >= 6
+    told = re.compile("Input/output|Stale file|read-only")
+    assert [said for said in refusals if not told.search(said)] == []

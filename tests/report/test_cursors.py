@@ -47,7 +47,7 @@ def frame(width: int = 4, gsd_m: float = 0.5) -> WallFrame:
 
 
 def picture(name: str, of: WallFrame | None, depths: CoarseDepths | None = None) -> Any:
-    return SimpleNamespace(id=name, wall=7, frame=of, depths=depths)
+    return SimpleNamespace(id=name, number=7, name="floor 7", frame=of, depths=depths)
 
 
 def test_an_orthoimage_has_the_depths_of_the_wall_with_its_cells() -> None:
@@ -64,6 +64,7 @@ def test_an_orthoimage_has_the_depths_of_the_wall_with_its_cells() -> None:
     assert place == {
         "id": "ortho",
         "wall": 7,
+        "name": "floor 7",
         "origin": [1.0, 2.0, 3.0],
         "u": [0.0, 1.0, 0.0],
         "v": [0.0, 0.0, -1.0],

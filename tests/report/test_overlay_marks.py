@@ -106,7 +106,16 @@ def test_magnifications_are_one_two_or_five(rms_m: float, wanted: float, found: 
 def test_ties_and_displacements_lie_over_the_wall_of_their_cell(tmp_path: Path) -> None:
     run = compared_run(tmp_path)
     pictures = [
-        Picture(uri="", title="", caption="", cell=f"wall@plane={mark}", wall=0, frame=FRAME)
+        Picture(
+            uri="",
+            title="",
+            caption="",
+            cell=f"wall@plane={mark}",
+            wall=0,
+            number=8,
+            name="wall 8",
+            frame=FRAME,
+        )
         for mark in ("fine", "coarse")
     ]
     found = list(overlays(run, pictures))
@@ -115,8 +124,8 @@ def test_ties_and_displacements_lie_over_the_wall_of_their_cell(tmp_path: Path) 
         for step in ("orient", "check")
         for mark in ("fine", "coarse")
     ]
-    assert found[0].title == "Ties of wall 0, orient@plane=fine"
-    assert found[2].title == "Displacements in the orthoimage of wall 0, check@plane=fine"
+    assert found[0].title == "Ties of wall 8, orient@plane=fine"
+    assert found[2].title == "Displacements in the orthoimage of wall 8, check@plane=fine"
     assert found[2].caption == (
         "2 shown (RMS 0.71 mm along u, 0.71 mm along v); vectors drawn 20 times as long"
     )

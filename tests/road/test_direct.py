@@ -50,7 +50,7 @@ def test_a_second_run_comes_from_the_cache_and_says_so(road: Shell) -> None:
 def test_layers_are_written_when_asked_for(road: Shell) -> None:
     ended = road("export", "run", "--to", "layers", "--store", str(road.store))
     assert ended.code == 0, ended.said
-    layer = read_raster(road.folder / "run" / "layers" / "wall_0_layer_0_cloud.tif")
+    layer = read_raster(road.folder / "run" / "export" / "layers" / "wall_0_layer_0_cloud.tif")
     # A single layer is its mosaic.
     mosaic = read_raster(road.folder / "run" / "products" / "mosaic" / "wall_0_ortho.tif")
     np.testing.assert_array_equal(layer.values[layer.shown], mosaic.values[layer.shown])

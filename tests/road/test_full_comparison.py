@@ -54,7 +54,7 @@ def test_a_failed_method_leaves_its_cells_failed_and_nothing_else(run: Run) -> N
 
 @pytest.mark.parametrize("plane", PLANES)
 def test_every_combination_has_its_accuracy(run: Run, plane: str) -> None:
-    found = {row.cell: row.value for row in run.metrics() if row.metric == "rmse_u_mm"}
+    found = {row.cell: row.value for row in run.metric_rows() if row.metric == "rmse_u_mm"}
     for orient in ORIENTATIONS:
         # Measured: 0.27 (bundle) to 0.53 mm (dlt), and 0.60 mm directly, on cells of 6 mm.
         assert found[f"check@plane={plane},orient={orient},ortho=backward"] < 1.0

@@ -75,28 +75,50 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
         np.testing.assert_allclose(centres[camera.photo], camera.viewing().centre_world, atol=1e-9)
     first = quick("export", "run", "--to", "colmap", "--cell", "first")
     assert first.code == 0, first.said
-    assert (quick.folder / "run" / "colmap" / "images.txt").is_file()
+    assert (quick.folder / "run" / "export" / "colmap" / "images.txt").is_file()
 
 
-def test_the_cloud_is_exported_by_plane_from_record_and_store(quick: Shell) -> None:
+def test_the_cloud_is_exported_from_record_and_store(quick: Shell) -> None:
     run = orthoflow.open_run(quick.folder / "run")
     cloud, labels = run.product("room", "cloud"), run.product("plane", "labels")
-    said = f": plane.laz: {len(cloud)} points on {labels.plane_index.max() + 1} planes of plane"
+    said = f": cloud.laz: {len(cloud)} points by photos, cloud of plane"
     ended = quick("export", "run", "--to", "laz", "-o", "planes")
     assert ended.code == 0, ended.said
     assert ended.out.rstrip().endswith(said)
-    read = laspy.read(quick.folder / "planes" / "plane.laz")
+    read = laspy.read(quick.folder / "planes" / "cloud.laz")
     np.testing.assert_array_equal(read["plane"], labels.plane_index)
     np.testing.assert_allclose(read.xyz, cloud.points_world(), atol=0.51e-4)
+    # What photos show is what the simulated scanner coloured, where they see it.
+    seen = np.asarray(read["photo"]) >= 0
+    assert seen.mean() > 0.3
+    rgb = np.column_stack([read.red, read.green, read.blue]) / 257.0
+    assert np.median(np.abs(rgb - cloud.rgb)[seen]) < 12.0
+    assert (rgb[~seen] == 128).all()
     # Without --embed the record only names the cloud.
     assert quick("run", "quickstart.yaml", *SMALL, "-o", "lean").code == 0
     lean = quick("export", "lean", "--to", "laz", "--store", quick.store)
     assert lean.code == 0, lean.said
-    written = (quick.folder / "lean" / "laz" / "plane.laz").read_bytes()
-    assert written == (quick.folder / "planes" / "plane.laz").read_bytes()
+    written = (quick.folder / "lean" / "export" / "laz" / "cloud.laz").read_bytes()
+    assert written == (quick.folder / "planes" / "cloud.laz").read_bytes()
     lost = quick("export", "lean", "--to", "laz", "--store", "elsewhere", "-o", "lost")
     assert lost.code == 2
     assert "neither in its record nor in the store elsewhere" in lost.said
+
+
+@pytest.mark.parametrize(
+    ("target", "file"),
+    [
+        ("gltf", "room.glb"),
+        ("tiles", "index.html"),
+        ("stac", "collection.json"),
+        ("prov", "prov.json"),
+    ],
+)
+def test_the_orthoimages_are_handed_over(quick: Shell, target: str, file: str) -> None:
+    ended = quick("export", "run", "--to", target)
+    assert ended.code == 0, ended.said
+    assert f"{target}: run/export/{target}: {file}" in ended.out
+    assert (quick.folder / "run" / "export" / target / file).is_file()
 
 
 @pytest.mark.parametrize(
@@ -109,9 +131,17 @@ def test_the_cloud_is_exported_by_plane_from_record_and_store(quick: Shell) -> N
         (("--to", "colmap", "--cell", "wal", "-o", "elsewhere"), "has no cell 'wal'"),
         (("--to", "laz", "--cell", "wall"), "the cell wall holds no labels of points; those"),
         (("--to", "colmap", "-o", "run"), "run exists already and is not empty"),
-        (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', 'figures', 'layers', 'laz'"),
+        (("--to", "dwg"), "'dwg' is not one of 'colmap', 'csv', "),
+        (("--to", "ply", "--wall", "99"), "--wall 99: the run has "),
+        (("--to", "gltf", "--wall", "99", "-o", "other"), "mosaic shows no wall 99; it shows 0"),
+        (("--to", "ply", "--box", "1,2,3"), "--box takes six numbers in metres"),
+        (("--to", "e57", "--box", "90,90,90,91,91,91"), "no point of the cloud of plane is left"),
+        (("--to", "csv", "--clean"), "--clean belongs to --to laz, ply or e57, not to --to csv"),
     ],
-    ids=["no orientations", "no such cell", "no labels", "folder in use", "no such format"],
+    ids=[
+        *("no orientations", "no such cell", "no labels", "folder in use", "no such format"),
+        *("no such wall", "no such orthoimage", "no box", "empty box", "nothing to clean"),
+    ],
 )
 def test_an_export_that_cannot_be_says_why(
     quick: Shell, arguments: tuple[str, ...], sentence: str

@@ -141,7 +141,7 @@
       const depth = known === null ? NaN : known / 1000;
       const world = [0, 1, 2].map((axis) => place.origin[axis]
         + place.gsd * (u * place.u[axis] + v * place.v[axis]) + (known === null ? 0 : depth) * place.n[axis]);
-      return { wall: place.wall, u, v, depth, world };
+      return { wall: place.wall, of: place.name, u, v, depth, world };
     };
     const words = (point) => `u ${point.u.toFixed(1)} px, v ${point.v.toFixed(1)} px, depth ${
       Number.isNaN(point.depth) ? "unknown (the plane is taken)" : `${point.depth.toFixed(3)} m`}, x ${
@@ -175,7 +175,7 @@
         update();
       });
       const told = document.createElement("span");
-      told.textContent = `wall ${point.wall}, ${words(point)}`;
+      told.textContent = `${point.of}, ${words(point)}`;
       row.append(name, told, entry.photo, entry.photoU, entry.photoV, remove);
       part.list.append(row);
       points.push(entry);

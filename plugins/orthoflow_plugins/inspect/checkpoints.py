@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -39,7 +39,7 @@ from orthoflow_plugins.inspect.findings import (
 )
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.patches import GreyImage
-from orthoflow_plugins.inspect.placing import wall_of
+from orthoflow_plugins.inspect.placing import on_walls, wall_of
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
 
@@ -58,7 +58,7 @@ class InspectCheckpoints(Method):
     """
 
     id: ClassVar[str] = "inspect.checkpoints"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[str, ...]] = (
         *("n_points", "n_3d", "rms_3d_mm", "max_3d_mm"),
@@ -118,6 +118,7 @@ class InspectCheckpoints(Method):
                 "one coordinate system (inspect.checkpoints)"
             )
         gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
+        numbers = {picture.wall: picture.image.number for picture in pictures}
         shift_m = np.array(
             [gsd_m[points[k].wall] * (points[k].place - points[k].expected) for k in found]
         )
@@ -130,7 +131,7 @@ class InspectCheckpoints(Method):
         if inputs.orthoimages is not None:
             findings += _findings_of_images(pictures, inputs.cameras)
         ctx.metric("n_points", len(points), "1")
-        report(findings, pictures[0].wall, ctx)
+        report(findings, pictures[0].wall, numbers, ctx)
         _warn_of_cap(findings, ctx)
         _draw(pictures, [points[k] for k in found], ctx)
         names = tuple(dict.fromkeys(classes))
@@ -142,7 +143,7 @@ class InspectCheckpoints(Method):
                 kind=np.array([names.index(name) for name in classes], dtype=np.uint8),
                 kinds=tuple(name or "check point" for name in names),
                 findings=tuple(findings),
-                details={"points": _table(points, inputs.checkpoints, gsd_m)},
+                details={"points": _table(points, inputs.checkpoints, gsd_m, numbers)},
             )
         )
 
@@ -157,7 +158,7 @@ def _pictures(inputs: InspectCheckpoints.In) -> list[Picture]:
                 surface=wall_of(image, inputs.walls),
                 image=image,
             )
-            for image in inputs.orthoimages.images
+            for image in on_walls(inputs.orthoimages, inputs.walls).images
         ]
     else:
         pictures = [
@@ -189,6 +190,7 @@ def _intensity_picture(index: int, wall: Wall, intensity: NDArray[np.float32]) -
             mask=known.astype(np.uint8),
             source=np.where(known, 0, -1).astype(np.int16),
             sources=("intensity",),
+            plane_index=wall.plane_index,
         ),
     )
 
@@ -255,7 +257,7 @@ def _draw(pictures: Sequence[Picture], points: Sequence[ShownPoint], ctx: StepCo
         shifts = places - np.array([point.expected for point in mine])
         times = enlargement(shifts, picture.image)
         ctx.figure(
-            f"wall_{picture.wall}_residuals",
+            f"wall_{picture.image.number}_residuals",
             vector_map(picture.image, places, shifts),
             f"{picture.image.name}: check points, shown - surveyed, {times:g} times enlarged; "
             "yellow over the median, red over twice the median.",
@@ -263,7 +265,10 @@ def _draw(pictures: Sequence[Picture], points: Sequence[ShownPoint], ctx: StepCo
 
 
 def _table(
-    points: Sequence[ShownPoint], surveyed: CheckPoints, gsd_m: dict[int, float]
+    points: Sequence[ShownPoint],
+    surveyed: CheckPoints,
+    gsd_m: Mapping[int, float],
+    numbers: Mapping[int, int],
 ) -> list[JsonValue]:
     rows: list[JsonValue] = []
     for k, point in enumerate(points):
@@ -275,7 +280,7 @@ def _table(
         if np.isfinite(point.place).all():
             shift_mm = 1e3 * gsd_m[point.wall] * (point.place - point.expected)
             row |= {
-                "wall": point.wall,
+                "wall": numbers[point.wall],
                 "u_px": round(float(point.place[0]), 3),
                 "v_px": round(float(point.place[1]), 3),
                 "x_mm": round(float(shift_mm[0]), 3),

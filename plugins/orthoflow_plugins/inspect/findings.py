@@ -7,7 +7,7 @@ outliers by two rules, and what is left.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -187,14 +187,18 @@ def rms(values: ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def report(findings: Sequence[Finding], main: int, ctx: StepContext) -> None:
+def report(
+    findings: Sequence[Finding], main: int, numbers: Mapping[int, int], ctx: StepContext
+) -> None:
     """Report the main wall by plain names, all walls with `all_`, the rest as it is called.
 
-    Displacements and completeness of the other walls are reported too, with `wall_1_` and so on.
+    Displacements and completeness of the other walls are reported too, with `wall_1_` and so on,
+    by the place of the plane in `planes.json`.
 
     Args:
         findings: of walls, and of all together (wall -1).
         main: the wall whose numbers bear plain names.
+        numbers: index of a wall -> place of its plane.
         ctx: where they go.
     """
     per_wall = {finding.name for finding in findings if finding.wall >= 0}
@@ -202,7 +206,7 @@ def report(findings: Sequence[Finding], main: int, ctx: StepContext) -> None:
         if finding.wall == main:
             ctx.metric(finding.name, finding.value, finding.unit)
         elif finding.wall >= 0 and finding.name in _OF_EACH_WALL:
-            ctx.metric(f"wall_{finding.wall}_{finding.name}", finding.value, finding.unit)
+            ctx.metric(f"wall_{numbers[finding.wall]}_{finding.name}", finding.value, finding.unit)
         elif finding.wall < 0 and finding.name in per_wall:
             ctx.metric(f"all_{finding.name}", finding.value, finding.unit)
         elif finding.wall < 0 and "[" not in finding.name:

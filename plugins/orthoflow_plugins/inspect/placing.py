@@ -11,28 +11,46 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import angle_between_deg
 from orthoflow.geometry.opencv_border import to_opencv
-from orthoflow.products import Orthoimage, SurfaceMask, Wall, Walls
+from orthoflow.products import Orthoimage, Orthoimages, SurfaceMask, Wall, Walls
 
 _SAME_DIRECTION_DEG: Final = 2.0
 
 _Value = TypeVar("_Value", bound=np.generic)
 
 
+def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
+    """Give orthoimages whose `wall` counts in these walls.
+
+    Those of other programs, and of walls rastered in another step, know the plane only.
+
+    Raises:
+        MethodError: there is no such wall.
+    """
+    places = {wall.plane_index: index for index, wall in enumerate(walls.walls)}
+    placed = []
+    for image in images.images:
+        index = image.wall if image.plane_index is None else places.get(image.plane_index, -1)
+        if not 0 <= index < len(walls.walls):
+            raise MethodError(
+                f"orthoimage {image.name} is of wall {image.number}, but the walls are "
+                f"{', '.join(str(place) for place in sorted(places)) or 'none'}: wire the walls "
+                "that the orthoimages were made from"
+            )
+        number = walls.walls[index].plane_index
+        placed.append(replace(image, wall=index, plane_index=number))
+    return replace(images, images=tuple(placed))
+
+
 def wall_of(image: Orthoimage, walls: Walls) -> Wall:
-    """Give the wall of an orthoimage; one that lies on other cells is laid onto the image's.
+    """Give the wall of one of `on_walls`; one that lies on other cells is laid onto the image's.
 
     Orthoimages of other programs have grids of their own. Each of their cells takes what the
     nearest cell of the wall holds, its depth counted from the image's own plane, and an intensity
     between those of the four nearest.
 
     Raises:
-        MethodError: there is no such wall, or it lies elsewhere.
+        MethodError: it lies elsewhere.
     """
-    if not 0 <= image.wall < len(walls.walls):
-        raise MethodError(
-            f"orthoimage {image.name} is of wall {image.wall}, but there are "
-            f"{len(walls.walls)} walls: wire the walls that the orthoimages were made from"
-        )
     wall = walls.walls[image.wall]
     return wall if wall.frame.has_cells_of(image.frame) else _laid_onto(image, wall, walls)
 
@@ -48,7 +66,7 @@ def _laid_onto(image: Orthoimage, wall: Wall, walls: Walls) -> Wall:
     slab = walls.slab(image.wall)
     if angle > _SAME_DIRECTION_DEG or not (-slab.behind_m <= aside <= slab.front_m):
         raise MethodError(
-            f"orthoimage {image.name} lies {aside:.3f} m before wall {image.wall} and "
+            f"orthoimage {image.name} lies {aside:.3f} m before {wall.name} and "
             f"{angle:.2f} deg askew: wire the walls that the orthoimages are of"
         )
     columns = np.arange(frame.width) + 0.5

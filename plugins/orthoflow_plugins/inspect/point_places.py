@@ -39,7 +39,7 @@ class ShownPoint:
 
     Attributes:
         how: how it was found, or why not.
-        wall: index of the wall, -1 outside of all.
+        wall: index of the wall in `Walls`, -1 outside of all.
         expected: (2,) column, row where the survey has it.
         place: (2,) column, row where it is shown, NaN when not found.
         point_world: (3,) metres, the shown place on the surface; NaN when not known.
@@ -57,7 +57,7 @@ class Picture:
     """What points are looked for in.
 
     Attributes:
-        wall: index of the wall.
+        wall: index of the wall in `Walls`.
         frame: the cells.
         grey: what is shown on them.
         surface: the wall on the same cells.
@@ -121,10 +121,10 @@ class PointFinder:
         return self._target(picture, expected)
 
     def _picture_of(self, world: NDArray[np.float64], wall: int | None) -> Picture | None:
-        """The picture that a point belongs to: the nearest wall whose rectangle it lies before."""
+        """The picture of the wall of a number, or of the nearest one that the point lies before."""
         best, nearest = None, np.inf
         for picture in self.pictures:
-            if wall is not None and picture.wall == wall:
+            if wall is not None and picture.image.number == wall:
                 return picture
             column, row, depth = picture.frame.wall_from_world(world[None])[0]
             inside = 0 <= column < picture.frame.width and 0 <= row < picture.frame.height

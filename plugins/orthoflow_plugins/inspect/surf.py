@@ -31,7 +31,7 @@ from orthoflow_plugins.inspect.findings import (
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs
 from orthoflow_plugins.inspect.patches import GreyImage
-from orthoflow_plugins.inspect.placing import wall_of
+from orthoflow_plugins.inspect.placing import on_walls, wall_of
 
 # The intensity is laid so far aside to see how exactly the comparison measures that.
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
@@ -55,7 +55,7 @@ class InspectSurf(Method):
     """
 
     id: ClassVar[str] = "inspect.surf"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_walls_inspected",
@@ -102,7 +102,7 @@ class InspectSurf(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Compare wall by wall, then put all together."""
-        images = inputs.orthoimages.images
+        images = on_walls(inputs.orthoimages, inputs.walls).images
         if not images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
         reason = _unfit(inputs)
@@ -125,7 +125,8 @@ class InspectSurf(Method):
         findings = [finding for item in fit for finding in item.findings()]
         if fit:
             findings += _together(fit)
-            report(findings, fit[0].image.wall, ctx)
+            numbers = {item.image.wall: item.image.number for item in fit}
+            report(findings, fit[0].image.wall, numbers, ctx)
         for item in fit:
             item.draw(ctx)
         ctx.metric("n_walls_inspected", len(fit), "1")
@@ -162,7 +163,7 @@ class _Verdict:
         """Draw the displacements (markiewicz2015, Figure 25)."""
         times = enlargement(self.pairs.shift, self.image)
         ctx.figure(
-            f"wall_{self.image.wall}_displacements",
+            f"wall_{self.image.number}_displacements",
             vector_map(self.image, self.pairs.places, self.pairs.shift),
             f"{self.image.name}: orthoimage against intensity, displacements {times:g} times "
             "enlarged; yellow over the median, red over twice the median.",
@@ -183,7 +184,7 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
 
 def _compare(image: Orthoimage, wall: Wall, cameras: Cameras | None, radius: float) -> _Verdict:
     if wall.intensity is None:
-        raise MethodError(f"wall {wall.name} has no intensity to compare with")
+        raise MethodError(f"{wall.name} has no intensity to compare with")
     known = np.isfinite(wall.intensity)
     picture = grey_of(image)
     # Laser intensities span decades; their roots look more like what a camera sees.

@@ -50,7 +50,7 @@ from orthoflow_plugins.inspect.orientation_errors import (
     pose_findings,
     tie_findings,
 )
-from orthoflow_plugins.inspect.placing import wall_of
+from orthoflow_plugins.inspect.placing import on_walls, wall_of
 from orthoflow_plugins.inspect.plane_errors import (
     found_planes,
     inspect_planes,
@@ -100,7 +100,7 @@ class InspectTruth(Method):
     """
 
     id: ClassVar[str] = "inspect.truth"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "loose"
     metrics: ClassVar[tuple[str, ...]] = (
         *of_walls(_OF_WALLS),
@@ -158,8 +158,9 @@ class InspectTruth(Method):
             return self.Out(inspection=_inspect_planes(inputs, ctx))
         if not inputs.orthoimages.images:
             raise MethodError("there is no orthoimage to inspect, at least one is needed")
+        orthoimages = on_walls(inputs.orthoimages, inputs.walls)
         rule = sampling_rule(
-            inputs.orthoimages.images,
+            orthoimages.images,
             colour_cells_most=params.colour_cells_most,
             seen_cells_most=params.seen_cells_most,
         )
@@ -176,8 +177,8 @@ class InspectTruth(Method):
         )
         verdicts: list[_Verdict] = []
         findings: list[Finding] = []
-        for place, image in enumerate(inputs.orthoimages.images):
-            ctx.progress(place / len(inputs.orthoimages.images), image.name)
+        for place, image in enumerate(orthoimages.images):
+            ctx.progress(place / len(orthoimages.images), image.name)
             verdict = judge.verdict_on(image)
             verdicts.append(verdict)
             findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
@@ -195,15 +196,14 @@ class InspectTruth(Method):
             findings += found_planes(inputs.planes, inputs.truth.planes)
         if inputs.labels is not None:
             findings += label_findings(inputs.labels, inputs.truth)
-        report(findings, inputs.orthoimages.images[0].wall, ctx)
+        numbers = {image.wall: image.number for image in orthoimages.images}
+        report(findings, orthoimages.images[0].wall, numbers, ctx)
         details: dict[str, JsonValue] = {
             "patch_cells": 32,
             "colour_share_compared": rule.colour_share,
             "seen_lattice_cells": rule.lattice_step,
         }
-        return self.Out(
-            inspection=_inspection(inputs.orthoimages, verdicts, poses, findings, details)
-        )
+        return self.Out(inspection=_inspection(orthoimages, verdicts, poses, findings, details))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -322,20 +322,20 @@ class _Judge:
 def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
     errors = verdict.errors
     ctx.figure(
-        f"wall_{image.wall}_depth_error",
+        f"wall_{image.number}_depth_error",
         depth_error_map(errors.depth_m),
         f"{image.name}: measured - true depth, blue {-DEPTH_SPAN_MM:g} mm to red "
         f"{DEPTH_SPAN_MM:g} mm.",
     )
     ctx.figure(
-        f"wall_{image.wall}_colour_error",
+        f"wall_{image.number}_colour_error",
         colour_error_map(errors.grey),
         f"{image.name}: colour error, black 0 to yellow {COLOUR_SPAN_GREY:g} grey levels.",
     )
     if verdict.sources is not None:
         length_m = np.linalg.norm(verdict.sources.displacement_m, axis=2)
         ctx.figure(
-            f"wall_{image.wall}_displacement",
+            f"wall_{image.number}_displacement",
             displacement_map(length_m / image.frame.gsd_m),
             f"{image.name}: true displacement of cells that photos painted, black 0 to yellow "
             f"{DISPLACEMENT_SPAN_CELLS:g} cells of {1e3 * image.frame.gsd_m:g} mm.",

@@ -38,7 +38,7 @@ class MatchGuided(Method):
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",

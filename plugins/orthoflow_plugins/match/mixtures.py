@@ -31,7 +31,7 @@ MIXTURES: Final[Mapping[str, tuple[float, float, float]]] = {
 
 # Measured in rooms of inverted contrast: up to 15 matches agreed on a wrong place. A mixture that
 # recognises a wall needs more, as there are several of them; from so many on, no other is tried.
-_LEAST: Final = 16
+LEAST: Final = 16
 _CLEARLY: Final = 24
 # A mixture is there to find the place, not to measure it.
 _LONGEST_SIDE_PX: Final = 2000
@@ -58,7 +58,7 @@ def pair_in_colours(
     smaller = replace(rule, longest_side_px=min(rule.longest_side_px, _LONGEST_SIDE_PX))
     for name, picture in _mixed(photo_rgb(photo)):
         tried = pair_photo(picture, walls, smaller)
-        if not tried.is_mirrored and tried.n_recognised >= max(_LEAST, best.n_recognised + 1):
+        if not tried.is_mirrored and tried.n_recognised >= max(LEAST, best.n_recognised + 1):
             best = replace(tried, picture=name)
         if best.n_recognised >= _CLEARLY:
             break

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from orthoflow.products import JsonValue, Photo, Photos, TieRole, Ties, Walls
+from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import FeatureRule, Features
 from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
-from orthoflow_plugins.match.mixtures import pair_in_colours
+from orthoflow_plugins.match.mixtures import LEAST, pair_in_colours
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
 from orthoflow_plugins.match.paper import (
@@ -24,14 +24,18 @@ from orthoflow_plugins.match.paper import (
 from orthoflow_plugins.match.pictures import photo_grey, require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
+if TYPE_CHECKING:
+    from orthoflow_plugins.match.placing import Placed
+
 
 class MatchSift(Method):
     """Match photos with the intensity rasters of the walls: RootSIFT, mutual, ratio test.
 
     Every photo is tried on every wall, by its strongest key points first, then by all on the walls
-    recognised; where its grey shows none clearly, mixtures of its colours are tried too. Walls on
-    which the matches do not agree roughly with a homography keep them as rejected. Ties carry the
-    surface's depth, so relief counts.
+    recognised; where its grey shows none clearly, mixtures of its colours are tried too, then, on
+    request, where edges run, whichever side is brighter. Walls on which the matches do not agree
+    roughly with a homography keep them as rejected. Ties carry the surface's depth, so relief
+    counts.
     """
 
     id: ClassVar[str] = "match.sift"
@@ -101,6 +105,13 @@ class MatchSift(Method):
             description="Whether photos whose grey shows no wall clearly are tried in mixtures of "
             "their colours, as a laser that sees red dark may show it.",
         )
+        tries_structure: bool = Field(
+            default=False,
+            description="Whether photos in which no key points show a wall clearly are laid on the "
+            "walls in many sizes and compared by where edges run, in colours, intensity and "
+            "relief. A photo of something else with the same pattern may win: look at the "
+            "overlays.",
+        )
         longest_side_max_px: int = Field(
             default=4000,
             ge=200,
@@ -128,6 +139,8 @@ class MatchSift(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Match every photo with every wall."""
+        from orthoflow_plugins.match.placing import PlacedWalls, placed_photo
+
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
@@ -143,17 +156,27 @@ class MatchSift(Method):
         notes: dict[str, JsonValue] = {}
         radii_px: list[float] = []
 
-        def pair(photo: Photo) -> PhotoPairs:
-            if params.tries_colours:
-                return pair_in_colours(photo, on_walls, rule)
-            return pair_photo(photo_grey(photo), on_walls, rule)
+        structures = PlacedWalls(walls=walls.walls)
 
-        paired = one_by_one(pair, photos.photos, ctx.cores)
-        for index, (photo, pairs) in enumerate(zip(photos.photos, paired, strict=True)):
+        def pair(index: int) -> tuple[PhotoPairs, Placed | None]:
+            photo = photos.photos[index]
+            if params.tries_colours:
+                pairs = pair_in_colours(photo, on_walls, rule)
+            else:
+                pairs = pair_photo(photo_grey(photo), on_walls, rule)
+            if not params.tries_structure or pairs.is_mirrored or pairs.n_recognised >= LEAST:
+                return pairs, None
+            return pairs, placed_photo(index, photo, structures)
+
+        paired = one_by_one(pair, range(len(photos.photos)), ctx.cores)
+        for index, (photo, (pairs, placed)) in enumerate(zip(photos.photos, paired, strict=True)):
             ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
-            pieces += _pieces(index, pairs, on_walls, walls)
-            notes[photo.name] = _note(ctx, photo.name, pairs, walls)
-            radii_px.append(pairs.radius_px)
+            if placed is None:
+                pieces += _pieces(index, pairs, on_walls, walls)
+            else:
+                pieces.append(placed.piece)
+            notes[photo.name] = _note(ctx, photo.name, (pairs, placed), walls)
+            radii_px.append(pairs.radius_px if placed is None else placed.radius_px)
         ties = ties_of(
             pieces,
             photos,
@@ -226,7 +249,22 @@ def _piece(
     )
 
 
-def _note(ctx: StepContext, name: str, pairs: PhotoPairs, walls: Walls) -> JsonValue:
+def _note(
+    ctx: StepContext, name: str, found: tuple[PhotoPairs, Placed | None], walls: Walls
+) -> JsonValue:
+    pairs, placed = found
+    if placed is not None:
+        ctx.warn(
+            f"photo {name}: placed by where edges run alone; where patterns repeat, that can be a "
+            f"wrong place: look at its overlay"
+        )
+        return {
+            "picture": "structure",
+            "walls": [walls.walls[placed.piece.wall].name],
+            "n_matches": len(placed.piece),
+            "n_agreeing": len(placed.piece),
+            "agreeing_share": placed.share,
+        }
     shown = [walls.walls[pair.wall].name for pair in pairs.pairs if pair.is_shown]
     if pairs.is_mirrored:
         ctx.warn(f"photo {name}: the walls show it mirrored, so it gets no ties: turn it back")

@@ -236,7 +236,7 @@ def _measured(
         )
         moved = measure(channels, _seen(view, index, content), places, search)
         n_measured += len(moved.places)
-        moved = moved.take(_agrees_around(moved))
+        moved = moved.take(agrees_around(moved))
         grain = target.grains[rule.half_patch_cells][projection.part]
         pieces.append(_piece(view.index, index, target.wall, (moved, projection), grain))
     pieces.sort(key=lambda piece: piece.wall)
@@ -266,7 +266,7 @@ def _piece(
     """Ties of one photo with one wall; residuals agree over the cells of a grain."""
     moved, projection = found
     at = moved.places + moved.shift_cells
-    pixels = np.column_stack([_between(projection.u, at), _between(projection.v, at)])
+    pixels = np.column_stack([between(projection.u, at), between(projection.v, at)])
     points = points_on_wall(wall, moved.places + projection.corner + np.float64(0.5))
     per_independent = np.sqrt(grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64))
     sigma_cells = np.hypot(moved.sigma_cells * per_independent, _SIGMA_FLOOR_CELLS)
@@ -294,7 +294,7 @@ def _refitted(seen: SeenPoints, camera: ViewingCamera) -> tuple[ViewingCamera | 
     held_out = np.zeros(len(seen), dtype=np.bool_)
     held_out[order[::_HELD_OUT]] = True
     try:
-        fitted = _fit(seen.take(~held_out), camera)
+        fitted = fitted_pose(seen.take(~held_out), camera)
     except GeometryError:
         return None, math.inf
     residuals = misfit(seen.take(held_out), fitted).residuals_px
@@ -305,7 +305,12 @@ def _refitted(seen: SeenPoints, camera: ViewingCamera) -> tuple[ViewingCamera | 
     return fitted, float(np.sqrt(np.mean(kept**2)))
 
 
-def _fit(seen: SeenPoints, camera: ViewingCamera) -> ViewingCamera:
+def fitted_pose(seen: SeenPoints, camera: ViewingCamera) -> ViewingCamera:
+    """Give the pose that points agree with, those left out that do not.
+
+    Raises:
+        GeometryError: they determine none.
+    """
     for _ in range(3):
         camera = adjust(seen, camera, soft_limit=2.0).camera
         lengths = misfit(seen, camera).normalised
@@ -322,7 +327,7 @@ def _without_misfits(pieces: list[TiePiece], camera: ViewingCamera) -> list[TieP
     if len(seen) < _LEAST:
         return pieces
     try:
-        lengths = misfit(seen, _fit(seen, camera)).normalised
+        lengths = misfit(seen, fitted_pose(seen, camera)).normalised
     except GeometryError:
         return pieces
     good = lengths <= _limit(lengths)
@@ -336,7 +341,7 @@ def _limit(lengths: NDArray[np.float64]) -> float:
     return _REJECTION * float(np.median(lengths)) / MEDIAN_LENGTH
 
 
-def _agrees_around(moved: Displacements) -> NDArray[np.bool_]:
+def agrees_around(moved: Displacements) -> NDArray[np.bool_]:
     """Displacements that agree with the median of their neighbours."""
     from scipy.spatial import cKDTree
 
@@ -377,7 +382,7 @@ def _joined(pieces: Sequence[TiePiece]) -> SeenPoints:
     )
 
 
-def _between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
+def between(raster: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Values (n,) at fractional cell indices (n, 2) = (column, row); NaN beside unknown cells."""
     height, width = raster.shape
     inside = (at >= 0.0).all(axis=1) & (at[:, 0] < width - 1) & (at[:, 1] < height - 1)

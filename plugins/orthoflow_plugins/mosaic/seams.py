@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from typing import ClassVar, Final, Literal
@@ -81,7 +81,7 @@ class MosaicSeams(Method):
     """
 
     id: ClassVar[str] = "mosaic.seams"
-    result_version: ClassVar[int] = 3
+    result_version: ClassVar[int] = 4
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_orthoimages",
@@ -152,11 +152,13 @@ class MosaicSeams(Method):
         verdicts: list[_Joined] = []
         for index, members in groupby(layers, key=lambda layer: layer.wall):
             group: tuple[Layer, ...] = tuple(members)
-            name = _name(inputs.layers, index)
+            name = inputs.layers.name(index)
             ctx.progress(index / (layers[-1].wall + 1), name)
             allocate = partial(_allocated, ctx, index)
-            verdicts.append(_join(group, name, params, _wall(inputs.walls, index), allocate))
-            _show(ctx, verdicts[-1].image)
+            verdict = _join(group, name, params, _wall(inputs.walls, index), allocate)
+            image = replace(verdict.image, plane_index=inputs.layers.number(index))
+            verdicts.append(replace(verdict, image=image))
+            _show(ctx, image)
         _report(ctx, verdicts)
         gains: dict[str, JsonValue] = {
             item.image.name: dict(item.gains) for item in verdicts if item.gains
@@ -246,17 +248,13 @@ def _wall(walls: Walls | None, index: int) -> Wall | None:
     return walls.walls[index] if walls is not None and index < len(walls.walls) else None
 
 
-def _name(layers: Layers, wall: int) -> str:
-    return layers.names[wall] if wall < len(layers.names) else f"wall {wall}"
-
-
 def _show(ctx: StepContext, image: Orthoimage) -> None:
     if not image.sources:
         ctx.warn(f"the orthoimage of {image.name} is empty: no source shows any of it")
     else:
         _tell_of_empty(ctx, image)
     if len(image.sources) > 1:
-        ctx.figure(f"wall_{image.wall}_sources", _source_map(image), _caption(image))
+        ctx.figure(f"wall_{image.number}_sources", _source_map(image), _caption(image))
 
 
 def _tell_of_empty(ctx: StepContext, image: Orthoimage) -> None:

@@ -57,7 +57,7 @@ class OrientColmapBundle(Method):
     """
 
     id: ClassVar[str] = "orient.colmap-bundle"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = (
         *ORIENTATION_METRICS,

@@ -126,9 +126,9 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         # A corner that photos hardly reach must not darken all the rest.
         median_m, high_m = np.percentile(best[shown], [50.0, 98.0])
         ctx.figure(
-            f"wall_{index}_predicted_error",
+            f"wall_{wall.number}_predicted_error",
             _error_map(best / high_m),
-            f"Predicted error of a coordinate on wall {index}, of the photo that knows each place "
+            f"Predicted error of a coordinate on {wall.name}, of the photo that knows each place "
             f"best: black 0 to yellow {1e3 * high_m:.2g} mm and more, median "
             f"{1e3 * median_m:.2g} mm; blue where no oriented photo shows the wall.",
         )

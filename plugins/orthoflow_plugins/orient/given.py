@@ -34,7 +34,7 @@ class OrientGiven(Method):
     """
 
     id: ClassVar[str] = "orient.given"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "seeded"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_photos",

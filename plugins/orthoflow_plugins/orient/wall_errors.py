@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.resection import Resection, pixels_by_point, predicted_covariances
-from orthoflow.products import Ties, TieWall
+from orthoflow.products import Ties, plane_name
 from orthoflow_plugins.orient.lenses import camera_rays
 
 _SIDE: Final = 15
@@ -25,6 +25,8 @@ class KnownWall:
 
     Attributes:
         index: of the wall.
+        number: for people: the place of its plane in `planes.json`.
+        name: for people.
         corners_world: (4, 3) metres: top-left, then counter-clockwise for the viewer.
         normal: (3,) unit vector towards the viewer.
         gsd_m: cell of its raster, or None when the ties do not say.
@@ -32,6 +34,8 @@ class KnownWall:
     """
 
     index: int
+    number: int
+    name: str
     corners_world: NDArray[np.float64]
     normal: NDArray[np.float64]
     gsd_m: float | None
@@ -63,7 +67,7 @@ def known_walls(ties: Ties, chosen: NDArray[np.bool_]) -> list[KnownWall]:
     walls = []
     for index in np.unique(ties.wall[chosen & (ties.wall >= 0)]):
         if int(index) < len(ties.walls):
-            walls.append(_described(int(index), ties.walls[int(index)]))
+            walls.append(_described(int(index), ties))
         else:
             points = ties.points_world[chosen & (ties.wall == index)]
             if len(points) >= 3:
@@ -178,9 +182,12 @@ def _seen(
     return pixels
 
 
-def _described(index: int, wall: TieWall) -> KnownWall:
+def _described(index: int, ties: Ties) -> KnownWall:
+    wall, number = ties.walls[index], ties.number(index)
     return KnownWall(
         index=index,
+        number=number,
+        name=wall.name or plane_name("wall", number),
         corners_world=np.array(wall.corners_world, dtype=np.float64),
         normal=np.array(wall.normal_world, dtype=np.float64),
         gsd_m=wall.gsd_m,
@@ -197,6 +204,8 @@ def _fitted(index: int, points: NDArray[np.float64]) -> KnownWall:
     order = np.array([[low[0], low[1]], [low[0], high[1]], high, [high[0], low[1]]])
     return KnownWall(
         index=index,
+        number=index,
+        name=plane_name("wall", index),
         corners_world=middle + order @ axes[:2],
         normal=axes[2],
         gsd_m=None,

@@ -45,7 +45,7 @@ class DsmBackward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-backward"
-    result_version: ClassVar[int] = 5
+    result_version: ClassVar[int] = 6
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_layers",

@@ -38,7 +38,7 @@ class DsmForward(Method):
     """
 
     id: ClassVar[str] = "ortho.dsm-forward"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_layers",

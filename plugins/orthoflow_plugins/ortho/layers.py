@@ -52,6 +52,7 @@ class LayerStack:
         self.surfaces = surfaces
         self.painted: list[Layer] = []
         self._names = tuple(wall.name for wall in walls.walls)
+        self._plane_indices = tuple(wall.plane_index for wall in walls.walls)
         self._ctx = ctx
         # What photos reach of walls that none has painted so far.
         self._reached: dict[int, NDArray[np.uint8]] = {}
@@ -111,7 +112,7 @@ class LayerStack:
             self._ctx.warn(f"no photo shows {names}: the orthoimage stays empty")
         layers = [*self.painted, *(self._bare_layer(wall) for wall in bare)]
         layers.sort(key=lambda layer: layer.wall)
-        return Layers(layers=tuple(layers), names=self._names)
+        return Layers(layers=tuple(layers), names=self._names, plane_indices=self._plane_indices)
 
     def count_cells(self, layers: Layers) -> CellCounts:
         """Count the cells of all walls by what the layers show of them."""

@@ -44,7 +44,7 @@ class PointcloudDirect(Method):
     """
 
     id: ClassVar[str] = "ortho.pointcloud-direct"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "painted_share",
@@ -137,7 +137,8 @@ class PointcloudDirect(Method):
         if best_preview is not None:
             ctx.figure("filling", best_preview[1], "Before and after filling; magenta is void.")
         names = tuple(wall.name for wall in inputs.walls.walls)
-        return self.Out(layers=Layers(layers=tuple(layers), names=names))
+        places = tuple(wall.plane_index for wall in inputs.walls.walls)
+        return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))
 
 
 def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:

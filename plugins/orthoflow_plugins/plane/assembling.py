@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
-from orthoflow.products import JsonValue, Planes, PointCloud, SideSource
+from orthoflow.products import JsonValue, Planes, PointCloud, SideSource, plane_name
+from orthoflow.products.planes import PlaneKind
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.candidates import Candidate, FoundPlane
 from orthoflow_plugins.plane.covariance import Stated
@@ -147,7 +148,7 @@ def assemble(
 def plane_names(
     normals: NDArray[np.float64], heights_m: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[str, ...]:
-    """Name planes by what they are: `wall 0`, `floor`, `ceiling`, `level 4`, `slope 5`.
+    """Name planes by what they are: `wall 0`, `floor 1`, `ceiling 2`, `level 4`, `slope 5`.
 
     The number is the plane's position in the product, as in the files wall_<k>_*.tif. The floor is
     the lowest level plane that is seen from above, the ceiling the highest that is seen from below.
@@ -159,17 +160,17 @@ def plane_names(
     """
     rises = normals @ up
     level = np.abs(rises) > math.cos(math.radians(LEVEL_LIMIT_DEG))
-    names = [
-        f"level {i}" if level[i] else f"wall {i}" if abs(rises[i]) < 0.5 else f"slope {i}"
+    kinds: list[PlaneKind] = [
+        "level" if level[i] else "wall" if abs(rises[i]) < 0.5 else "slope"
         for i in range(len(normals))
     ]
     seen_from_above = np.flatnonzero(level & (rises > 0.0))
     seen_from_below = np.flatnonzero(level & (rises < 0.0))
     if len(seen_from_above):
-        names[int(seen_from_above[np.argmin(heights_m[seen_from_above])])] = "floor"
+        kinds[int(seen_from_above[np.argmin(heights_m[seen_from_above])])] = "floor"
     if len(seen_from_below):
-        names[int(seen_from_below[np.argmax(heights_m[seen_from_below])])] = "ceiling"
-    return tuple(names)
+        kinds[int(seen_from_below[np.argmax(heights_m[seen_from_below])])] = "ceiling"
+    return tuple(plane_name(kind, place) for place, kind in enumerate(kinds))
 
 
 def rectangle_m(

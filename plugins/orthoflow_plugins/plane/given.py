@@ -88,7 +88,7 @@ class GivenPlane(Method):
     """
 
     id = "plane.given"
-    result_version = 1
+    result_version = 2
     determinism = "exact"
     metrics = (
         "n_planes",

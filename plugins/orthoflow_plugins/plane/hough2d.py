@@ -45,7 +45,7 @@ class Hough2d(Method):
     """
 
     id = "plane.hough2d"
-    result_version = 4
+    result_version = 5
     determinism = "exact"
     metrics = DETECTOR_METRICS
     citations = (

@@ -29,7 +29,7 @@ class Hough3d(Method):
     """
 
     id = "plane.hough3d"
-    result_version = 4
+    result_version = 5
     determinism = "exact"
     metrics = DETECTOR_METRICS
     citations = (

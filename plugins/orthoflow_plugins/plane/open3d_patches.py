@@ -34,7 +34,7 @@ class Open3dPatches(Method):
     """
 
     id = "plane.open3d-patches"
-    result_version = 4
+    result_version = 5
     determinism = "loose"
     metrics = DETECTOR_METRICS
     citations = (

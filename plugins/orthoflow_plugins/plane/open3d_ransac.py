@@ -44,7 +44,7 @@ class Open3dRansac(Method):
     """
 
     id = "plane.open3d-ransac"
-    result_version = 4
+    result_version = 5
     determinism = "loose"
     metrics = DETECTOR_METRICS
     citations = (

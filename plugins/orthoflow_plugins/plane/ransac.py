@@ -31,7 +31,7 @@ class Ransac(Method):
     """
 
     id = "plane.ransac"
-    result_version = 3
+    result_version = 4
     determinism = "seeded"
     metrics = (*DETECTOR_METRICS, "own_tolerance_mm")
     citations = (

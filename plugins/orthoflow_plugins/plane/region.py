@@ -49,7 +49,7 @@ class Region(Method):
     """
 
     id = "plane.region"
-    result_version = 3
+    result_version = 4
     determinism = "exact"
     metrics = (
         *DETECTOR_METRICS,

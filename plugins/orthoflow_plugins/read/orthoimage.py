@@ -32,11 +32,12 @@ class ReadOrthoimage(Method):
     (`wall.tif`, `wall.json`), with `origin_world`, `u_world`, `v_world`, `normal_world` as beside
     every raster that orthoflow writes: a copy of `wall_0_intensity.json` will do. Files of
     orthoflow itself need none. X and Y of the GeoTIFF count from that origin, so another size,
-    cell size or part of the wall is no obstacle. `wall` in the JSON file says which wall it is of.
+    cell size or part of the wall is no obstacle. `wall` in the JSON file says which wall
+    it is of: the place of its plane in `planes.json`, which names of files have too.
     """
 
     id: ClassVar[str] = "read.orthoimage"
-    result_version: ClassVar[int] = 2
+    result_version: ClassVar[int] = 3
     determinism = "exact"
     metrics = (
         "n_orthoimages",
@@ -48,7 +49,10 @@ class ReadOrthoimage(Method):
         """What the files do not say themselves."""
 
         wall: int = Field(
-            0, ge=0, description="Wall that images are of whose JSON file does not say it."
+            0,
+            ge=0,
+            description="Wall that images are of whose JSON file does not say it: the place of its "
+            "plane in planes.json, as in the names of the files.",
         )
 
     class In(Ports):
@@ -117,6 +121,7 @@ def _read(path: Path, among: Sequence[Path], wall: int) -> Orthoimage:
         mask=np.where(shown, OrthoMask.PAINTED, OrthoMask.NONE).astype(np.uint8),
         source=np.where(shown, 0, -1).astype(np.int16),
         sources=(path.name,),
+        plane_index=said,
     )
 
 

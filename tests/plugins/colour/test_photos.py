@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from orthoflow_plugins.colour import photos as module
 from orthoflow_plugins.colour.photos import ColourPhotos
 
 from orthoflow.errors import MethodError
+from orthoflow.files.clouds import photo_colours as module
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.products import Cameras, Photos, PointCloud
 from tests import ortho_scenes

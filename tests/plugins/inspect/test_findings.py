@@ -119,10 +119,10 @@ def test_the_main_wall_has_plain_names_and_others_say_whose_they_are(tmp_path: P
         of("p99_mm", 4.0, 1), of("p99_mm", 5.0, 0),
         of("n_photos", 6.0, -1), of("n_points[a]", 7.0, -1),
     ]  # fmt: skip
-    report(findings, 1, ctx)
+    report(findings, 1, {0: 3, 1: 8}, ctx)
     assert {metric.name: metric.value for metric in ctx.metrics} == {
         "rmse_u_mm": 1.0,
-        "wall_0_rmse_u_mm": 2.0,
+        "wall_3_rmse_u_mm": 2.0,
         "all_rmse_u_mm": 3.0,
         "p99_mm": 4.0,
         "n_photos": 6.0,

@@ -166,3 +166,31 @@ def test_smoothing_leaves_rims_out_and_holes_do_no_harm() -> None:
     assert smooth.valid[20, 19]
     assert smooth.valid[10, 28]
     assert not smooth.valid[10, 29:].any()
+
+
+@pytest.mark.parametrize(
+    ("steps", "moved_by"),
+    [
+        ([0.5, 0.0021, 0.0019, 0.1], 0.504),  # the first of at most 0.002 is the last
+        ([0.8, 0.001], 0.501),  # half a cell at most is moved at once
+        ([0.0099] * 12, 12 * 0.0099),  # hardly converged
+        ([0.0101] * 12, None),  # not converged
+        ([0.5] * 3 + [0.49, 0.0], 1.99),
+        ([0.5] * 4 + [0.0], None),  # two cells from its start
+    ],
+    ids=str,
+)
+def test_least_squares_move_until_they_hardly_do(
+    steps: list[float], moved_by: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = iter(steps)
+
+    def step(_design: object, rest: NDArray[np.float64], _weight: object) -> object:
+        n = len(rest)
+        return np.tile([next(left), 0.0], (n, 1)), np.full((n, 2), 0.01)
+
+    monkeypatch.setattr(patches, "_normal_step", step)
+    start = patches.unrefined(np.array([[64.0, 64.0]]), np.array([[1.0, 2.0]]))
+    found = patches.refine_shifts(image(texture()), image(texture()), start, sigma_most_cells=0.5)
+    expected = [] if moved_by is None else [[1.0 + moved_by, 2.0]]
+    np.testing.assert_allclose(found.shift, np.reshape(expected, (-1, 2)), atol=1e-12)

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.placing import wall_of
+from orthoflow_plugins.inspect.placing import on_walls, wall_of
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import frame_over
-from orthoflow.products import SurfaceMask, Walls
+from orthoflow.products import Orthoimages, SurfaceMask, Walls
 from tests import inspect_scenes, scenes
 from tests.inspect_scenes import BUFFER_M, image_of
 
@@ -37,10 +37,27 @@ def test_a_wall_on_the_image_s_own_cells_is_taken_as_it_is() -> None:
     walls = slanted()
     image = image_of(np.full(walls.walls[0].frame.shape, 100.0))
     assert wall_of(image, walls) is walls.walls[0]
-    with pytest.raises(MethodError, match="is of wall 1, but there are 1 walls"):
-        wall_of(replace(image, wall=1), walls)
+
+
+def test_an_image_is_of_the_wall_of_its_plane() -> None:
+    wall = slanted().walls[0]
+    walls = replace(slanted(), walls=(replace(wall, plane_index=3), replace(wall, plane_index=8)))
+    image = image_of(np.full(wall.frame.shape, 100.0))
+
+    def placed(**changed: int | None) -> tuple[int, int | None]:
+        (found,) = on_walls(Orthoimages(images=(replace(image, **changed),)), walls).images
+        return found.wall, found.plane_index
+
+    # The plane decides, also where the image counts walls in another way.
+    assert placed(wall=8, plane_index=8) == (1, 8)
+    assert placed(wall=0, plane_index=8) == (1, 8)
+    assert placed(wall=0, plane_index=None) == (0, 3)
+    with pytest.raises(MethodError, match="is of wall 2, but the walls are 3, 8: wire"):
+        placed(wall=2, plane_index=None)
+    with pytest.raises(MethodError, match="is of wall 1, but the walls are 3, 8: wire"):
+        placed(wall=1, plane_index=1)
     with pytest.raises(MethodError, match="is of wall -1"):
-        wall_of(replace(image, wall=-1), walls)
+        placed(wall=-1, plane_index=None)
 
 
 def test_cells_take_what_the_nearest_cell_of_the_wall_holds() -> None:

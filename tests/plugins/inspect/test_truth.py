@@ -291,12 +291,12 @@ def test_what_cannot_be_compared_is_refused_in_one_sentence(tmp_path: Path, trut
             wall,
             labels=PointLabels(plane_index=np.zeros(3, dtype=np.int16)),
         )
-    with pytest.raises(MethodError, match="is of wall 4, but there are 1 walls"):
-        inspect(tmp_path, truth, replace(ortho, wall=4), wall)
+    with pytest.raises(MethodError, match="is of wall 4, but the walls are 0"):
+        inspect(tmp_path, truth, replace(ortho, plane_index=4), wall)
     aside = replace(
         image.frame, origin_world=image.frame.origin_world - 0.5 * image.frame.normal_world
     )
-    with pytest.raises(MethodError, match=r"lies 0\.500 m before wall 0 and 0\.00 deg askew"):
+    with pytest.raises(MethodError, match=r"lies 0\.500 m before .* and 0\.00 deg askew"):
         inspect(tmp_path, truth, ortho, replace(wall, frame=aside))
     empty = InspectTruth.In(
         orthoimages=Orthoimages(images=()),
@@ -381,9 +381,9 @@ def test_every_wall_tells_its_displacement(tmp_path: Path) -> None:
             (0, "plane_angle_deg", 4.0),
         )
     ]
-    report(findings, 2, context)
+    report(findings, 2, {0: 1, 2: 5}, context)
     assert {metric.name: metric.value for metric in context.metrics} == {
         "rmse_u_mm": 1.0,
-        "wall_0_rmse_u_mm": 2.0,
+        "wall_1_rmse_u_mm": 2.0,
         "all_rmse_u_mm": 3.0,
     }

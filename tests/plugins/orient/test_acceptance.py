@@ -19,6 +19,7 @@ from orthoflow_plugins.orient.acceptance import (
     warnings_for,
 )
 from orthoflow_plugins.orient.wall_errors import KnownWall, WallError
+from scipy import optimize, stats
 
 from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Photo
@@ -26,6 +27,8 @@ from orthoflow.products import Photo
 N_TIES = 100
 WALL = KnownWall(
     index=0,
+    number=0,
+    name="plane 0",
     corners_world=np.array(
         [[-1.0, 2.0, 1.0], [-1.0, 2.0, -1.0], [1.0, 2.0, -1.0], [1.0, 2.0, 1.0]]
     ),
@@ -213,6 +216,25 @@ def test_withheld_ties_that_agree_by_chance_say_nothing() -> None:
     pixels[good.is_check] = (100.0, 100.0)
     assert "by chance" in gated(pixels=pixels, search_radius_px=20.0)
     assert "by chance" not in gated(search_radius_px=20.0)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.35, 0.6, 1.0])
+def test_one_wrong_pose_in_a_hundred_thousand_may_look_right(share: float) -> None:
+    # Six of twenty agree so closely that this share of the limit of three holds them all.
+    is_check = candidate().is_check
+    agreeing = candidate().estimate.agreeing.copy()
+    agreeing[is_check] = np.arange(20) < 6
+    length = 0.999 * 3.0 * share
+    # Residuals of half a pixel are so long.
+    radius_px = 3.0 * share * 0.5 / length
+    # Four shares are tried, each with the chance of so many of twenty, or more.
+    by_chance = optimize.brentq(lambda p: 4.0 * stats.binom.sf(5, 20, p) - 1e-5, 1e-4, 0.5)
+    searched_px = math.sqrt(math.pi * radius_px**2 / by_chance) / 2.0
+    for factor, is_fine in ((1.02, True), (0.98, False)):
+        lengths = np.where(agreeing, length, 8.0)
+        search_radius_px = factor * searched_px
+        reason = gated(agreeing=agreeing, normalised=lengths, search_radius_px=search_radius_px)
+        assert ("by chance" not in reason) == is_fine
 
 
 def in_quarter(quarter: int, n: int) -> np.ndarray:

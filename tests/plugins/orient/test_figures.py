@@ -122,8 +122,8 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
 ) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     corners = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [9.0, 0.0, 2.0]])
-    wall = SimpleNamespace(index=3, corners_world=corners)
-    hidden = SimpleNamespace(index=5, corners_world=corners)
+    wall = SimpleNamespace(index=3, number=8, name="floor 8", corners_world=corners)
+    hidden = SimpleNamespace(index=5, number=9, name="wall 9", corners_world=corners)
     shape = (20, 90)
     rng = np.random.default_rng(0)
     first, second = rng.uniform(0.001, 0.01, (2, *shape))
@@ -140,7 +140,7 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     ]
     draw_wall_errors(context, candidates)
     # Nobody sees the other wall.
-    assert list(drawings) == ["wall_3_predicted_error"]
+    assert list(drawings) == ["wall_8_predicted_error"]
     best = np.minimum(first, np.where(np.isnan(second), np.inf, second))
     seen = np.isfinite(best)
     assert not seen.all()
@@ -148,7 +148,7 @@ def test_the_map_of_a_wall_shows_the_photo_that_knows_each_place_best(
     grey = np.rint(255.0 * np.minimum(np.where(seen, best, 0.0) / high, 1.0)).astype(np.uint8)
     rgb = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[:, :, ::-1].copy()
     rgb[~seen] = (20, 40, 60)
-    shown = np.array(drawings["wall_3_predicted_error"])
+    shown = np.array(drawings["wall_8_predicted_error"])
     np.testing.assert_array_equal(shown, rgb.repeat(8, axis=0).repeat(8, axis=1))
 
 

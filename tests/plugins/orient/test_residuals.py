@@ -7,7 +7,6 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from orthoflow_plugins.orient.residuals import residual_rows
-from scipy import stats
 
 UNITS = {"px": 1.0, "mm": 2.5, "cell": 0.5}
 
@@ -36,6 +35,8 @@ def test_numbers_are_those_of_their_definition() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_chance_of_a_mean_is_that_of_students_test(seed: int) -> None:
+    from scipy import stats  # slow to import
+
     values = np.random.default_rng(seed).normal(0.2, 1.0, (40, 2))
     found = rows(values)
     for axis, column in zip("uv", values.T, strict=True):

@@ -136,6 +136,15 @@ def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None
     followed = are_hidden(view, relief, np.argwhere(asked))
     assert 200 < followed.sum() < 0.5 * len(followed)
     np.testing.assert_array_equal(visible.mask[asked] == OCCLUDED, followed)
+    painted = visible.mask == PAINTED
+    assert visible.summary[4] == painted.sum()
+    # Places are float32, their bounds are not.
+    for values, (least, most) in (
+        (visible.u, visible.summary[:2]),
+        (visible.v, visible.summary[2:4]),
+    ):
+        assert least - 1e-3 <= values[painted].min()
+        assert values[painted].max() <= most + 1e-3
 
 
 def test_without_visibility_only_void_and_the_frame_of_the_photo_count() -> None:

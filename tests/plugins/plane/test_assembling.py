@@ -38,12 +38,12 @@ def test_planes_are_named_by_inclination_and_the_lowest_and_highest_level_apart(
     normals = np.array([leaning(rise) for rise in rises])
     heights = np.array([0.0, 0.0, 0.0, -9.0, 1.0, 0.5, 2.0, 2.5, 9.0, 0.0])
     assert plane_names(normals, heights, UP) == (
-        "wall 0", "wall 1", "slope 2", "slope 3", "level 4", "floor", "level 6", "ceiling",
+        "wall 0", "wall 1", "slope 2", "slope 3", "level 4", "floor 5", "level 6", "ceiling 7",
         "slope 8", "wall 9",
     )  # fmt: skip
     # Nothing is seen from below: no ceiling.
-    assert plane_names(normals[4:6], heights[4:6], UP) == ("level 0", "floor")
-    assert plane_names(normals[6:8], heights[6:8], UP) == ("level 0", "ceiling")
+    assert plane_names(normals[4:6], heights[4:6], UP) == ("level 0", "floor 1")
+    assert plane_names(normals[6:8], heights[6:8], UP) == ("level 0", "ceiling 1")
 
 
 def test_corners_run_from_the_top_left_counter_clockwise() -> None:

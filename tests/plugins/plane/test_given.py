@@ -89,7 +89,7 @@ def test_by_default_the_plane_is_horizontal_below_the_scene(tmp_path: Path) -> N
     # The front wall leans outwards by 1 cm.
     np.testing.assert_allclose(low[:2], [-3.0, -2.0], atol=0.02)
     np.testing.assert_allclose(high[:2], [3.0, 2.0], atol=0.02)
-    assert out.planes.names == ("floor",)
+    assert out.planes.names == ("floor 0",)
 
 
 def test_a_horizontal_plane_lies_at_the_height_given(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_several_planes_are_those_that_each_alone_would_be(tmp_path: Path) -> No
     singles = [lay(cloud, tmp_path / str(k), **stated) for k, stated in enumerate(TRIPLES)]
     # By the number of their points, as everywhere: the floor has more.
     assert both.planes.n_points[0] > both.planes.n_points[1]
-    assert both.planes.names == ("floor", "wall 1")
+    assert both.planes.names == ("floor 0", "wall 1")
     for place, alone in zip((1, 0), singles, strict=True):
         for name in ("normal", "offset", "corners"):
             np.testing.assert_array_equal(

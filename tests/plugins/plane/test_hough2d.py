@@ -64,8 +64,9 @@ def test_planes_are_ordered_by_support_and_named_by_position(room: Hough2d.Out) 
     planes = room.planes
     assert (np.diff(planes.n_points) <= 0).all()
     assert planes.names[0] == "wall 0"
-    assert {"floor", "ceiling"} < set(planes.names)
-    floor, ceiling = planes.names.index("floor"), planes.names.index("ceiling")
+    kinds = [name.split()[0] for name in planes.names]
+    assert list(planes.names) == [f"{kind} {place}" for place, kind in enumerate(kinds)]
+    floor, ceiling = kinds.index("floor"), kinds.index("ceiling")
     assert planes.normal[floor] @ planes.up > 0.99 > -0.99 > planes.normal[ceiling] @ planes.up
     assert [name for name in planes.names if name.startswith("level")] == [
         f"level {nearest(planes, ROOM[6].normal, np.array(ROOM[6].centre))}"
@@ -220,7 +221,7 @@ def test_raw_coordinates_with_one_vote_per_cell_are_refused() -> None:
 
 def test_floor_and_ceiling_alone_leave_no_smeared_wall(tmp_path: Path) -> None:
     planes = detect(cloud_of(sampled(ROOM[4:6])), tmp_path).planes
-    assert sorted(planes.names) == ["ceiling", "floor"]
+    assert sorted(planes.names) == ["ceiling 1", "floor 0"]
 
 
 def test_the_vertical_constraint_finds_walls_only(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def test_other_ways_to_vote_find_the_same_room(options: dict[str, Any], tmp_path
 
 def test_floor_and_ceiling_are_found_once_each(tmp_path: Path) -> None:
     planes = detect(cloud_of(sampled(ROOM[4:6])), tmp_path, stop_unclassified_share=0.0).planes
-    assert sorted(planes.names) == ["ceiling", "floor"]
+    assert sorted(planes.names) == ["ceiling 1", "floor 0"]
 
 
 @pytest.mark.parametrize("slope_deg", [15.0, 30.0, 45.0, 70.0])

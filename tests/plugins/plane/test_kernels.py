@@ -232,6 +232,26 @@ def test_all_planes_at_once_sum_the_points_that_they_own(seed: int) -> None:
         assert (apart <= 2 * STEPS_PER_TOLERANCE * n_fit).all()
 
 
+def test_distances_of_whole_steps_are_summed_without_rounding() -> None:
+    rng = np.random.default_rng(0)
+    # Halves and quarters of a metre, and of tolerances that are such: exact in float32.
+    fit_m, inner_m, find_m = 0.5, 0.25, 1.0
+    cells = np.repeat(rng.integers(0, 6, N_POINTS), rng.integers(1, 5, N_POINTS))[:N_POINTS]
+    heights_m = rng.choice([-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75], N_POINTS)
+    points = points_of(np.column_stack([cells % 3 + 0.5, cells // 3 + 0.5, heights_m]))
+    slabs = np.array([[0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    bounds = np.array([[find_m, 0.0, 3.0, 0.0, 2.0]])
+    rasters = np.array([[0.0, 0.0, 1.0, 2, 3, 0, fit_m, inner_m]])
+    counts, sums = np.zeros((6, 3), dtype=np.int32), np.zeros((6, 2), dtype=np.int64)
+    sum_assigned(points, slabs, bounds, rasters, counts, sums, (1, 0))
+    for cell in range(6):
+        mine = heights_m[cells == cell]
+        within = [mine[np.abs(mine) <= tolerance] for tolerance in (find_m, inner_m, fit_m)]
+        np.testing.assert_array_equal(counts[cell], [len(some) for some in within])
+        steps = (within[2] / fit_m * STEPS_PER_TOLERANCE).astype(int)
+        np.testing.assert_array_equal(sums[cell], [steps.sum(), (steps**2).sum()])
+
+
 def test_one_of_so_many_blocks_is_summed_wherever_a_part_begins() -> None:
     rng = np.random.default_rng(0)
     n_blocks = 300

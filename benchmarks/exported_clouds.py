@@ -1,0 +1,103 @@
+"""How long an export of a cloud takes and how much memory it needs, by number of points.
+
+`python benchmarks/exported_clouds.py --points 50` writes 50 million points of a simulated room as
+LAZ, PLY or E57, each in a process of its own, and prints seconds and the largest memory of each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.files.clouds.e57 import write_e57
+from orthoflow.files.clouds.las import write_laz
+from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
+from orthoflow.files.clouds.ply import write_ply
+from orthoflow.products import PointCloud
+
+WRITERS = {"laz": write_laz, "ply": write_ply, "e57": write_e57}
+ROOM_M = (12.0, 8.0, 4.0)
+
+
+def mapped_room(folder: Path, n_points: int) -> PointCloud:
+    """Points on six walls with 1 mm of noise, in files that are mapped as those of a store are."""
+    random = np.random.default_rng(7)
+    arrays = {
+        axis: np.memmap(folder / axis, dtype=np.float32, mode="w+", shape=(n_points,))
+        for axis in "xyz"
+    }
+    intensity = np.memmap(folder / "i", dtype=np.float32, mode="w+", shape=(n_points,))
+    for first in range(0, n_points, 1 << 20):
+        part = slice(first, min(n_points, first + (1 << 20)))
+        count = part.stop - part.start
+        points = random.random((count, 3)) * ROOM_M
+        axis = random.integers(0, 3, count)
+        side = random.integers(0, 2, count) * np.array(ROOM_M)[axis]
+        points[np.arange(count), axis] = side + random.normal(0.0, 0.001, count)
+        for name, values in zip("xyz", points.T, strict=True):
+            arrays[name][part] = values
+        intensity[part] = random.random(count)
+    return PointCloud(
+        origin=np.array([500_000.0, 4_000_000.0, 100.0]),
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity=intensity,
+        **arrays,
+    )
+
+
+def export(name: str, folder: Path, n_points: int) -> None:
+    """Open the room's files, write them, print what it took."""
+    names = {"x": "x", "y": "y", "z": "z", "intensity": "i"}
+    arrays = {
+        field: np.memmap(folder / file, dtype=np.float32, mode="r", shape=(n_points,))
+        for field, file in names.items()
+    }
+    cloud = PointCloud(
+        origin=np.array([500_000.0, 4_000_000.0, 100.0]), up=np.array([0.0, 0.0, 1.0]), **arrays
+    )
+    before, first = time.perf_counter(), time.process_time()
+    dressed = DressedCloud(
+        cloud=cloud, colouring="intensity", neighbourhoods=neighbourhoods_of(cloud)
+    )
+    looked = time.perf_counter() - before
+    path = folder / f"cloud.{name}"
+    WRITERS[name](path, dressed)
+    lines = Path("/proc/self/status").read_text().splitlines()
+    # getrusage would tell the largest of the process that started this one.
+    (largest,) = [int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")]
+    print(
+        f"{name}: {n_points / 1e6:g} M points, {time.perf_counter() - before:.0f} s "
+        f"({looked:.0f} s for normals), processor {time.process_time() - first:.0f} s, largest "
+        f"memory {largest:.0f} MiB with the mapped cloud of {16 * n_points / 2**20:.0f} MiB, "
+        f"{path.stat().st_size / 1e6:.0f} MB",
+        flush=True,
+    )
+    path.unlink()
+
+
+def main() -> None:
+    """Write the room once per format."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--points", type=float, default=50.0, help="millions of points")
+    parser.add_argument("--format", choices=WRITERS, help="only this one")
+    given = parser.parse_args()
+    n_points = int(1e6 * given.points)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        mapped_room(folder, n_points)
+        for target in [given.format] if given.format else WRITERS:
+            worker = multiprocessing.get_context("spawn").Process(
+                target=export, args=(target, folder, n_points)
+            )
+            worker.start()
+            worker.join()
+
+
+if __name__ == "__main__":
+    main()

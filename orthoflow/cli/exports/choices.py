@@ -1,0 +1,50 @@
+"""The options of `orthoflow export` that belong to some formats only."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from orthoflow.files.clouds.dressing import Colouring
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """The options that belong to some formats only; what nobody gave is None, False or empty.
+
+    Attributes:
+        cell: address of the cell that is meant.
+        license_text: of a crate.
+        scale: of sheets, n of 1 : n.
+        paper: of sheets.
+        grid_m: distance of the crosses on sheets, 0 for none.
+        title_block: file with what an office writes on its sheets.
+        beside: rasters that sheets show beside the orthoimage.
+        embed: with every product and input.
+        split: a record per dataset.
+        inputs: input files, `NAME=PATH`.
+        store: where products are that the record only names.
+        colour: what the colours of points show.
+        wall: number of the only wall that is meant.
+        box: corners of the only part that is meant, as text.
+        clean: without gross outliers.
+    """
+
+    cell: str | None = None
+    license_text: str | None = None
+    scale: int | None = None
+    paper: str | None = None
+    grid_m: float | None = None
+    title_block: Path | None = None
+    beside: tuple[str, ...] = ()
+    embed: bool = False
+    split: bool = False
+    inputs: Sequence[str] = ()
+    store: Path = Path()
+    colour: Colouring | None = None
+    wall: int | None = None
+    box: str | None = None
+    clean: bool = False

@@ -1,0 +1,249 @@
+"""Exports of the registered cloud: chosen, coloured, and written by the writer of the format."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.cli.exports.products import (
+    branch_of,
+    last_product,
+    make_empty,
+    output_of,
+    product_of,
+    wanted_wall,
+)
+from orthoflow.cli.tables import counted
+from orthoflow.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from orthoflow.cli.exports.choices import Choices
+    from orthoflow.files.clouds.dressing import Colouring, DressedCloud
+    from orthoflow.files.clouds.photo_colours import PointColours
+    from orthoflow.geometry.cameras import ViewingCamera
+    from orthoflow.geometry.slabs import Slab
+    from orthoflow.products import Photo, Planes, PointCloud, PointLabels, Walls
+    from orthoflow.records import Run
+
+
+def export_laz(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `cloud.laz` and what it holds as `cloud.json`."""
+    from orthoflow.files.clouds.las import write_laz
+
+    return _export(run, folder, chosen, ("cloud.laz", write_laz))
+
+
+def export_ply(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `cloud.ply` and what it holds as `cloud.json`."""
+    from orthoflow.files.clouds.ply import write_ply
+
+    return _export(run, folder, chosen, ("cloud.ply", write_ply))
+
+
+def export_e57(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `cloud.e57` and what it holds as `cloud.json`."""
+    from orthoflow.files.clouds.e57 import write_e57
+
+    return _export(run, folder, chosen, ("cloud.e57", write_e57))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """What a run has of its cloud.
+
+    Attributes:
+        address: the cell that labelled it, else that gave it.
+        digest: of the cloud.
+        oriented: photos with their cameras; empty where nobody asked for their colours.
+        can_show: the colourings that there is something for, the best first.
+    """
+
+    address: str
+    digest: str
+    cloud: PointCloud
+    planes: Planes | None
+    labels: PointLabels | None
+    walls: Walls | None
+    oriented: Sequence[tuple[Photo, ViewingCamera]]
+    can_show: Sequence[Colouring]
+
+
+def _export(
+    run: Run,
+    folder: Path,
+    chosen: Choices,
+    target: tuple[str, Callable[[Path, DressedCloud], int]],
+) -> str:
+    from orthoflow.files.clouds.description import describe_cloud
+    from orthoflow.files.clouds.dressing import DressedCloud
+    from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
+
+    name, write = target
+    found = _found(run, chosen)
+    colouring = chosen.colour or found.can_show[0]
+    if colouring not in found.can_show:
+        raise ArgumentError(
+            f"--colour {colouring}: the run has nothing for it ({found.address}); it has what is "
+            f"needed for {', '.join(found.can_show)}"
+        )
+    wall, wall_plane = _wall(found.walls, chosen.wall)
+    box_world = _box(chosen.box)
+    make_empty(folder)
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        dressed = DressedCloud(
+            cloud=found.cloud,
+            colouring=colouring,
+            neighbourhoods=neighbourhoods_of(found.cloud),
+            planes=found.planes,
+            labels=found.labels,
+            photo_colours=_photo_colours(found, Path(scratch)) if colouring == "photos" else None,
+            photo_names=tuple(photo.name for photo, _ in found.oriented),
+            wall=wall,
+            wall_plane=wall_plane,
+            box_world=box_world,
+            is_cleaned=chosen.clean,
+            crs_wkt=_crs_wkt(found.walls),
+            name=found.digest,
+        )
+        n_written = write(folder / name, dressed)
+        if n_written == 0:
+            raise ArgumentError(
+                f"no point of the cloud of {found.address} is left: choose another --wall or --box"
+            )
+        describe_cloud(folder / "cloud.json", dressed, name, n_written)
+    of_all = "" if n_written == len(found.cloud) else f" of {len(found.cloud)}"
+    return f"{name}: {counted(n_written, 'point')}{of_all} by {colouring}, cloud of {found.address}"
+
+
+def _found(run: Run, chosen: Choices) -> _Found:
+    from orthoflow.products import Planes, PointCloud, PointLabels, Walls
+
+    is_labelled = chosen.cell is not None or any(
+        output.type_name == "labels"
+        for cell in run.cells.values()
+        for output in cell.outputs.values()
+    )
+    address, port = output_of(run, "labels" if is_labelled else "cloud", chosen.cell)
+    cells, recorded = branch_of(run, address), run.cell(address)
+    digest = recorded.outputs[port].digest
+    labels = planes = None
+    if is_labelled:
+        taken = [item.digest for item in recorded.inputs.values() if item.type_name == "cloud"]
+        if len(taken) != 1:
+            raise ArgumentError(
+                f"the cell {address} labels no cloud of its own: it takes {len(taken)} clouds"
+            )
+        labels = product_of(run, digest, PointLabels, chosen.store)
+        digest = taken[0]
+        planes = last_product(run, {address: recorded}, Planes, chosen.store)
+    cloud = product_of(run, digest, PointCloud, chosen.store)
+    if len(cloud) == 0:
+        raise ArgumentError(f"the cloud of {address} has no points, so there is nothing to write")
+    if labels is not None and len(labels.plane_index) != len(cloud):
+        raise ArgumentError(
+            f"the labels are of {len(labels.plane_index)} points, but the cloud has {len(cloud)}"
+        )
+    oriented = _oriented(run, cells, chosen) if chosen.colour in {None, "photos"} else ()
+    has = {
+        "photos": bool(oriented),
+        "rgb": cloud.rgb is not None,
+        "intensity": cloud.intensity is not None,
+        "plane": labels is not None,
+        "deviation": planes is not None or chosen.wall is not None,
+    }
+    can_show: list[Any] = [name for name, is_there in has.items() if is_there]
+    if not can_show:
+        raise ArgumentError(f"the cloud of {address} has no colours, intensities or planes to show")
+    return _Found(
+        address=address,
+        digest=digest,
+        cloud=cloud,
+        planes=planes,
+        labels=labels,
+        walls=last_product(run, cells, Walls, chosen.store),
+        oriented=oriented,
+        can_show=can_show,
+    )
+
+
+def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
+    """Photos and cameras of the last cell of a branch that oriented any."""
+    from orthoflow.products import Cameras, Photos
+
+    makers = {
+        address: cell
+        for address, cell in cells.items()
+        if any(output.type_name == "cameras" for output in cell.outputs.values())
+    }
+    if not makers:
+        return ()
+    address, cell = list(makers.items())[-1]
+    taken = [item.digest for item in cell.inputs.values() if item.type_name == "photos"]
+    cameras = last_product(run, {address: cell}, Cameras, chosen.store)
+    if not taken or cameras is None:
+        return ()
+    photos = product_of(run, taken[0], Photos, chosen.store)
+    known = {camera.photo: camera for camera in cameras.cameras if camera.status == "ok"}
+    return tuple(
+        (photo, known[photo.name].viewing()) for photo in photos.photos if photo.name in known
+    )
+
+
+def _photo_colours(found: _Found, scratch: Path) -> PointColours:
+    """Colours in files that are mapped, so that memory does not follow the points."""
+    from orthoflow.files.clouds.photo_colours import UNSEEN_GREY, PointColours, colour_points
+
+    n_points = len(found.cloud)
+
+    def mapped(name: str, kind: type[np.generic], *more: int) -> NDArray[Any]:
+        return np.memmap(scratch / name, dtype=kind, mode="w+", shape=(n_points, *more))
+
+    photo = mapped("photo", np.int16)
+    photo[:] = -1
+    rgb = mapped("rgb", np.uint8, 3)
+    rgb[:] = UNSEEN_GREY
+    colours = PointColours(rgb=rgb, best=mapped("best", np.float32), photo=photo)
+    colour_points(found.cloud, found.oriented, colours)
+    return colours
+
+
+def _wall(walls: Walls | None, number: int | None) -> tuple[Slab | None, int]:
+    if number is None:
+        return None, -1
+    slabs: dict[int, Slab] = {}
+    if walls is not None:
+        slabs = {wall.plane_index: walls.slab(at) for at, wall in enumerate(walls.walls)}
+    return wanted_wall(number, slabs, "the run", "has"), number
+
+
+def _box(text: str | None) -> NDArray[np.float64] | None:
+    if text is None:
+        return None
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 6 or not all(math.isfinite(value) for value in values):
+        raise ArgumentError(
+            f"--box takes six numbers in metres with commas between, X,Y,Z of two corners, got "
+            f"{text!r}"
+        )
+    corners = np.array(values).reshape(2, 3)
+    return np.sort(corners, axis=0)
+
+
+def _crs_wkt(walls: Walls | None) -> str:
+    """What the workflow said of the scan's coordinates (`crs` of `raster.grid`)."""
+    from orthoflow.files.geotiff import epsg_of, epsg_wkt
+
+    if walls is None:
+        return ""
+    known = {epsg_of(wall.frame.map_crs) for wall in walls.walls} - {None}
+    return "".join(epsg_wkt(code) for code in known if code) if len(known) == 1 else ""

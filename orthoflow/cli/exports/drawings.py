@@ -1,0 +1,226 @@
+"""Exports that draw: sheets, CAD files, vectors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from orthoflow.cli.exports.products import make_empty, wanted_wall
+from orthoflow.cli.tables import counted
+from orthoflow.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from orthoflow.cli.exports.choices import Choices
+    from orthoflow.files.drawings.papers import Paper, Part, View
+    from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines
+    from orthoflow.files.drawings.sheet_contents import SheetText, WallDrawing
+    from orthoflow.files.drawings.title_blocks import TitleBlock
+    from orthoflow.records import Run
+    from orthoflow.records.wall_results import RoomResults, WallResult
+
+_DEFAULT_PAPER: Final = "A3"
+_GRID_MM: Final = 20.0
+
+
+def export_sheets(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `wall_<k>_sheet_<n>.pdf`, and `wall_<k>_index.pdf` where a wall takes several."""
+    from orthoflow.files.drawings.papers import fitting_scale, paper_of
+    from orthoflow.files.drawings.title_blocks import TitleBlock, read_title_block
+    from orthoflow.records.wall_results import content_digest, room_results
+
+    paper = paper_of(chosen.paper or _DEFAULT_PAPER)
+    block = read_title_block(chosen.title_block) if chosen.title_block else TitleBlock()
+    results = room_results(run, chosen.cell)
+    walls = _chosen_walls(results, chosen)
+    scale = chosen.scale or fitting_scale([_size_m(wall) for wall in walls], paper)
+    digest = content_digest(run)
+    drawings = [
+        _drawing(results, wall, chosen, scale, _sheet_text(run, wall, block, digest))
+        for wall in walls
+    ]
+    make_empty(folder)
+    counts = [
+        _write_wall(folder, drawing, wall, paper)
+        for drawing, wall in zip(drawings, walls, strict=True)
+    ]
+    return f"{counted(sum(counts), 'sheet')} of {counted(len(walls), 'wall')} at 1:{scale}"
+
+
+def _chosen_walls(results: RoomResults, chosen: Choices) -> Sequence[WallResult]:
+    if chosen.wall is None:
+        return results.walls
+    numbered = {wall.number: wall for wall in results.walls}
+    return [wanted_wall(chosen.wall, numbered, results.address, "shows")]
+
+
+def _size_m(wall: WallResult) -> tuple[float, float]:
+    return wall.frame.width * wall.frame.gsd_m, wall.frame.height * wall.frame.gsd_m
+
+
+def _drawing(
+    results: RoomResults, wall: WallResult, chosen: Choices, scale: int, text: SheetText
+) -> WallDrawing:
+    from orthoflow.files.drawings.key_plans import key_plan
+    from orthoflow.files.drawings.papers import nice_step
+    from orthoflow.files.drawings.printed_pictures import stretch_of
+    from orthoflow.files.drawings.sheet_contents import WallDrawing
+    from orthoflow.files.drawings.sheets import axes_of
+
+    kinds = _kinds(wall, chosen)
+    grid_m = nice_step(1e-3 * _GRID_MM * scale) if chosen.grid_m is None else chosen.grid_m
+    if 0.0 < grid_m < 2e-3 * scale:
+        raise ArgumentError(
+            f"--grid {grid_m:g} puts crosses closer than 2 mm at 1:{scale}: take at least "
+            f"{2e-3 * scale:g}, or 0 for none"
+        )
+    planes = results.planes
+    return WallDrawing(
+        number=wall.number,
+        rasters={kind: wall.rasters[kind] for kind in kinds},
+        axes=axes_of(wall.frame, None if planes is None else planes.up),
+        plan=None if planes is None else key_plan(planes, wall.frame),
+        text=text,
+        scale=scale,
+        grid_m=grid_m if math.isfinite(grid_m) else 0.0,
+        interval_m=stretch_of(wall.rasters["depth"]).interval if "depth" in kinds else 0.0,
+    )
+
+
+def _kinds(wall: WallResult, chosen: Choices) -> list[str]:
+    """What is shown of a wall: its orthoimage, or else what the scan shows, and what is asked."""
+    first = next(kind for kind in ("ortho", "intensity", "depth") if kind in wall.rasters)
+    for kind in chosen.beside:
+        if kind not in wall.rasters:
+            raise ArgumentError(
+                f"--beside {kind}: the run has no {kind} of wall {wall.number}, only "
+                f"{', '.join(wall.rasters)}"
+            )
+    return list(dict.fromkeys((first, *chosen.beside)))
+
+
+def _sheet_text(run: Run, wall: WallResult, block: TitleBlock, digest: str) -> SheetText:
+    from orthoflow.files.drawings.sheet_contents import SheetText
+
+    notes = [f"accuracy: {'; '.join(wall.accuracy)}" if wall.accuracy else "accuracy: not measured"]
+    if wall.colours:
+        notes.append(wall.colours)
+    notes.append(f"cells of {1e3 * wall.frame.gsd_m:g} mm")
+    return SheetText(
+        name=wall.name,
+        block=block,
+        notes=tuple(notes),
+        digest=digest,
+        run=f"run {run.record.run_id} of {run.record.name}, {run.record.created_by}",
+    )
+
+
+def _write_wall(folder: Path, drawing: WallDrawing, wall: WallResult, paper: Paper) -> int:
+    """Write the sheets of a wall, and give how many there are besides the index."""
+    from orthoflow.files.drawings.papers import fitting_scale, placed_views
+    from orthoflow.files.drawings.sheet_contents import Sheet
+    from orthoflow.files.drawings.sheets import write_sheet
+
+    kinds = tuple(drawing.rasters)
+    way, views = placed_views(
+        kinds, _size_m(wall), paper, scale=drawing.scale, grid_m=drawing.grid_m
+    )
+    for number, shown in enumerate(views, start=1):
+        sheet = Sheet(
+            paper=way,
+            views=shown,
+            number=number,
+            count=len(views),
+            numbered=_numbered(views, shown[0].kind),
+        )
+        write_sheet(folder / f"wall_{drawing.number}_sheet_{number}.pdf", drawing, sheet)
+    numbered = _numbered(views, kinds[0])
+    if numbered:
+        # As large as one sheet takes; its scale is as true as that of the others.
+        scale = fitting_scale([_size_m(wall)], paper)
+        small = replace(drawing, scale=scale, grid_m=0.0)
+        way, ((view,),) = placed_views(kinds[:1], _size_m(wall), paper, scale=scale, grid_m=0.0)
+        index = Sheet(paper=way, views=(view,), number=0, count=len(views), numbered=numbered)
+        write_sheet(folder / f"wall_{drawing.number}_index.pdf", small, index)
+    return len(views)
+
+
+def _numbered(views: Sequence[tuple[View, ...]], kind: str) -> tuple[tuple[int, Part], ...]:
+    """What of a wall is on which of the sheets of one picture; empty where it is not cut."""
+    parts = tuple(
+        (number, sheet[0].part)
+        for number, sheet in enumerate(views, start=1)
+        if sheet[0].kind == kind
+    )
+    return parts if len(parts) > 1 else ()
+
+
+def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `wall_<k>.dxf` and `room.dxf`, and the pictures that they refer to."""
+    from orthoflow.files.drawings.cad_pictures import write_cad_picture
+    from orthoflow.files.drawings.dxf import write_room_dxf, write_wall_dxf
+    from orthoflow.records.wall_results import room_results
+
+    results = room_results(run, chosen.cell)
+    walls = _chosen_walls(results, chosen)
+    lines = _lines(results)
+    make_empty(folder)
+    drawn = []
+    for wall in walls:
+        image = f"wall_{wall.number}_ortho.png" if "ortho" in wall.rasters else ""
+        if image:
+            write_cad_picture(wall.rasters["ortho"], folder / image)
+        drawn.append(_drawn(wall, image))
+        write_wall_dxf(folder / f"wall_{wall.number}.dxf", drawn[-1], lines)
+    if lines is None:
+        return counted(len(walls), "wall")
+    write_room_dxf(folder / "room.dxf", drawn, lines)
+    return f"{counted(len(walls), 'wall')}, and the room: {_said(lines)}"
+
+
+def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `wall_<k>.geojson` and `room.geojson`."""
+    from orthoflow.files.drawings.geojson import write_room_geojson, write_wall_geojson
+    from orthoflow.records.wall_results import room_results
+
+    results = room_results(run, chosen.cell)
+    walls = _chosen_walls(results, chosen)
+    lines = _lines(results)
+    make_empty(folder)
+    for wall in walls:
+        write_wall_geojson(folder / f"wall_{wall.number}.geojson", _drawn(wall, ""), lines)
+    if lines is None:
+        return counted(len(walls), "wall")
+    crs = next((wall.frame.map_crs for wall in results.walls if wall.frame.map_crs), None)
+    write_room_geojson(folder / "room.geojson", lines, crs)
+    return f"{counted(len(walls), 'wall')}, and the room: {_said(lines)}"
+
+
+def _lines(results: RoomResults) -> RoomLines | None:
+    from orthoflow.files.drawings.room_lines import room_lines
+
+    if results.planes is None:
+        return None
+    return room_lines(results.planes, results.checkpoints, results.inspections)
+
+
+def _drawn(wall: WallResult, image: str) -> DrawnWall:
+    from orthoflow.files.drawings.room_lines import DrawnWall
+
+    return DrawnWall(
+        number=wall.number,
+        name=wall.name,
+        plane_index=wall.plane_index,
+        frame=wall.frame,
+        image=image,
+    )
+
+
+def _said(lines: RoomLines) -> str:
+    return (
+        f"{counted(len(lines.surfaces), 'plane')}, {counted(len(lines.edges), 'edge')}, "
+        f"{counted(len(lines.corners), 'corner')}"
+    )

@@ -1,0 +1,180 @@
+"""The formats of `orthoflow export`: one entry each, which help and refusals follow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+from orthoflow.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from orthoflow.cli.exports.choices import Choices
+    from orthoflow.records import Run
+
+
+class Writer(Protocol):
+    """Writes a format."""
+
+    def __call__(self, run: Run, folder: Path, chosen: Choices, /) -> str:
+        """Make a folder with `make_empty` once all is there, fill it, and say what was written."""
+        raise AssertionError("a protocol is never called")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format:
+    """One format of `--to`.
+
+    Attributes:
+        writer: import string `module:function` below `orthoflow.cli.exports`, of a `Writer`.
+        summary: what it holds, for the help.
+        options: the fields of `Choices` that belong to it.
+    """
+
+    writer: str
+    summary: str
+    options: frozenset[str] = frozenset()
+
+    def load(self) -> Writer:
+        """Import the module and give the function."""
+        module_name, _, function = self.writer.partition(":")
+        writer: Writer = getattr(import_module(f"{__package__}.{module_name}"), function)
+        return writer
+
+
+_CLOUD_OPTIONS: Final = frozenset({"cell", "colour", "wall", "box", "clean"})
+
+FORMATS: Final[Mapping[str, Format]] = {
+    "colmap": Format(
+        writer="results:export_colmap",
+        summary="the oriented photos with their lenses and ties as a text model that COLMAP opens",
+        options=frozenset({"cell"}),
+    ),
+    "csv": Format(
+        writer="results:export_csv",
+        summary="tables of cells, metrics, parameters, inputs, products and environments",
+    ),
+    "dxf": Format(
+        writer="drawings:export_dxf",
+        summary="each wall in its own coordinates with its orthoimage to scale, and the room in "
+        "space: planes, where they meet, outline, check points",
+        options=frozenset({"cell", "wall"}),
+    ),
+    "figures": Format(
+        writer="results:export_figures",
+        summary="every figure as PNG or SVG",
+        options=frozenset({"cell"}),
+    ),
+    "geojson": Format(
+        writer="drawings:export_geojson",
+        summary="outlines of walls and lines in which planes meet, from above and in the "
+        "coordinates of each wall",
+        options=frozenset({"cell", "wall"}),
+    ),
+    "layers": Format(
+        writer="results:export_layers",
+        summary="what each photo shows of each wall by itself, as GeoTIFFs, from the store unless "
+        "the run was made with --embed",
+        options=frozenset({"cell"}),
+    ),
+    "laz": Format(
+        writer="clouds:export_laz",
+        summary="the registered cloud as LAZ 1.4 with colours, normals, plane, deviation from it "
+        "and scan of each point",
+        options=_CLOUD_OPTIONS,
+    ),
+    "ply": Format(
+        writer="clouds:export_ply",
+        summary="the same as binary PLY with double coordinates",
+        options=_CLOUD_OPTIONS,
+    ),
+    "e57": Format(
+        writer="clouds:export_e57",
+        summary="the same as E57, a scan each with its pose",
+        options=_CLOUD_OPTIONS,
+    ),
+    "gltf": Format(
+        writer="viewers:export_gltf",
+        summary="the walls of the room with their orthoimages as a model that browsers open, "
+        "room.glb",
+        options=frozenset({"cell", "wall"}),
+    ),
+    "tiles": Format(
+        writer="viewers:export_tiles",
+        summary="each orthoimage as Deep Zoom tiles, with a page that measures on them without a "
+        "server",
+        options=frozenset({"cell", "wall"}),
+    ),
+    "prov": Format(
+        writer="statements:export_prov",
+        summary="W3C PROV-JSON: which products came of which, by which method of which software",
+    ),
+    "stac": Format(
+        writer="statements:export_stac",
+        summary="the orthoimages with a STAC item beside each, and a collection",
+    ),
+    "ro-crate": Format(
+        writer="results:export_crate",
+        summary="record, report and products as a Provenance Run Crate, for archives",
+        options=frozenset({"license_text"}),
+    ),
+    "sheet": Format(
+        writer="drawings:export_sheets",
+        summary="each wall on paper in exact scale, as PDF, with coordinates, title block, "
+        "accuracy and the seal of the record",
+        options=frozenset({"cell", "scale", "paper", "wall", "grid_m", "title_block", "beside"}),
+    ),
+}
+
+# Of the options that belong to formats, how they are written. `embed` and `inputs` are apart.
+FLAGS: Final = {
+    "cell": "--cell",
+    "license_text": "--license",
+    "colour": "--colour",
+    "wall": "--wall",
+    "box": "--box",
+    "clean": "--clean",
+    "scale": "--scale",
+    "paper": "--paper",
+    "grid_m": "--grid",
+    "title_block": "--title-block",
+    "beside": "--beside",
+}
+
+
+def check_choices(chosen: Choices, target: str | None) -> None:
+    """Refuse options that do not belong to the format.
+
+    Raises:
+        ArgumentError: one does not, or no format is named.
+    """
+    if target is None and not chosen.embed and not chosen.split:
+        raise ArgumentError(
+            f"say what to write: --to {listed(tuple(FORMATS))}, or --embed or --split"
+        )
+    said = f"--to {target}" if target else "--split" if chosen.split else "--embed"
+    if chosen.split and (target or chosen.embed):
+        raise ArgumentError(
+            f"--split writes records of its own, so it does not go with "
+            f"{f'--to {target}' if target else '--embed'}"
+        )
+    taken = FORMATS[target].options if target else ()
+    for name, flag in FLAGS.items():
+        if _is_given(getattr(chosen, name)) and name not in taken:
+            owners = [owner for owner, entry in FORMATS.items() if name in entry.options]
+            raise ArgumentError(f"{flag} belongs to --to {listed(owners)}, not to {said}")
+    if chosen.embed and target not in {None, "ro-crate"}:
+        raise ArgumentError(f"{said} writes no record, so nothing can be embedded with --embed")
+    if chosen.inputs and not chosen.embed:
+        raise ArgumentError(f"--input belongs to --embed, not to {said}")
+
+
+def listed(names: Sequence[str]) -> str:
+    """Give names as a sentence has them: `a, b or c`."""
+    return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def _is_given(value: object) -> bool:
+    return value is not None and value is not False and value != ()

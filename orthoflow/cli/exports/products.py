@@ -1,0 +1,135 @@
+"""What an export takes from a run: products by type or digest, and an empty folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from orthoflow.errors import ArgumentError, StoreError
+
+if TYPE_CHECKING:
+    from orthoflow.products import Product
+    from orthoflow.records import RecordedCell, Run
+
+    ProductT = TypeVar("ProductT", bound=Product)
+
+_Wall = TypeVar("_Wall")
+
+# What a product type is called where a cell has none, and where a run has none.
+_SAID: Final = {
+    "cameras": ("orientations", "has oriented no photos"),
+    "layers": ("layers", "has laid nothing onto walls"),
+    "cloud": ("clouds", "has read no cloud"),
+    "orthoimages": ("orthoimages", "has made no orthoimages"),
+    "labels": ("labels of points", "has found no planes"),
+}
+
+
+def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> ProductT:
+    """A product from the record, or from the store where the record only names it.
+
+    Raises:
+        ArgumentError: it is in neither.
+    """
+    from orthoflow.engine.store import Store
+
+    for address, recorded in run.cells.items():
+        for port, output in recorded.outputs.items():
+            if output.digest == digest and output.embedded:
+                return cls.from_payload(run.payload(address, port))
+    try:
+        return Store(store).get_product(digest, cls)
+    except StoreError as error:
+        raise ArgumentError(
+            f"the {cls.type_name} of this run is neither in its record nor in the store {store} "
+            f"({error}): name its store with --store, or run the workflow again with --embed"
+        ) from error
+
+
+def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
+    """The wanted cell, or the last one, that gives a product of a type, and the port.
+
+    Raises:
+        ArgumentError: there is none, or the cell gives none.
+    """
+    named, missing = _SAID[type_name]
+    found = {
+        address: port
+        for address, recorded in run.cells.items()
+        for port, output in recorded.outputs.items()
+        if output.type_name == type_name
+    }
+    if cell is not None:
+        run.cell(cell)
+        if cell not in found:
+            raise ArgumentError(
+                f"the cell {cell} holds no {named}; those of this run: {', '.join(found) or 'none'}"
+            )
+        return cell, found[cell]
+    if not found:
+        raise ArgumentError(f"the run {run.record.run_id} {missing}")
+    last = list(found)[-1]
+    return last, found[last]
+
+
+def wanted_wall(number: int, known: Mapping[int, _Wall], who: str, does: str) -> _Wall:
+    """The wall of a number, which is the place of its plane in `planes.json`, as files have it.
+
+    Args:
+        number: as `--wall` gives it.
+        known: number -> wall.
+        who: what has these walls.
+        does: `shows`, `has`.
+
+    Raises:
+        ArgumentError: there is no such wall.
+    """
+    if number not in known:
+        raise ArgumentError(
+            f"--wall {number}: {who} {does} no wall {number}; it {does} "
+            f"{', '.join(str(name) for name in known) or 'none'}"
+        )
+    return known[number]
+
+
+def make_empty(folder: Path) -> None:
+    """Make a folder, and what it lies in.
+
+    Raises:
+        ArgumentError: something is in the way.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ArgumentError(f"{folder} cannot be made: {error.strerror}") from error
+
+
+def branch_of(run: Run, address: str) -> dict[str, RecordedCell]:
+    """The cells of the same variants, dataset and repeat as one cell, as far as they have them."""
+    chosen = run.cell(address)
+    return {
+        name: cell
+        for name, cell in run.cells.items()
+        if cell.repeat in {0, chosen.repeat}
+        and all(
+            chosen.assignment.get(key, value) == value for key, value in cell.assignment.items()
+        )
+    }
+
+
+def last_product(
+    run: Run, cells: Mapping[str, RecordedCell], cls: type[ProductT], store: Path
+) -> ProductT | None:
+    """The product of a type that the last of some cells gave; None where none did.
+
+    Raises:
+        ArgumentError: it is neither in the record nor in the store.
+    """
+    found = [
+        output.digest
+        for cell in cells.values()
+        for output in cell.outputs.values()
+        if output.type_name == cls.type_name
+    ]
+    return product_of(run, found[-1], cls, store) if found else None

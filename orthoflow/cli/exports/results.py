@@ -1,0 +1,81 @@
+"""Exports of results as they are: photos, tables, figures, layers, crates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orthoflow.cli.exports.products import make_empty, output_of, product_of
+from orthoflow.cli.tables import counted
+
+if TYPE_CHECKING:
+    from orthoflow.cli.exports.choices import Choices
+    from orthoflow.records import Run
+
+
+def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write the orientations of a cell."""
+    from orthoflow.files.colmap import write_colmap_model
+    from orthoflow.products import Cameras
+
+    address, port = output_of(run, "cameras", chosen.cell)
+    cameras = Cameras.from_payload(run.payload(address, port))
+    make_empty(folder)
+    model = write_colmap_model(folder, cameras)
+    return (
+        f"{counted(model.n_images, 'photo')}, {counted(model.n_cameras, 'camera')}, "
+        f"{counted(model.n_points, 'point')} of {address}"
+    )
+
+
+def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
+    """Write all tables."""
+    from orthoflow.records.spreadsheets import write_csv_tables
+
+    make_empty(folder)
+    return ", ".join(path.name for path in write_csv_tables(run, folder))
+
+
+def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write the figures of all cells, or of one."""
+    from orthoflow.records import figure_files
+    from orthoflow.report import write_figures
+
+    addresses = run.cells if chosen.cell is None else (run.cell(chosen.cell).address,)
+    # Refused before a folder is made for them.
+    figure_files(run, addresses)
+    make_empty(folder)
+    return f"{counted(write_figures(run, folder, addresses), 'figure')} and the graph"
+
+
+def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write a crate, with an embedded record if wanted."""
+    from orthoflow.records.crates import NO_LICENSE, write_crate
+
+    make_empty(folder)
+    license_text = chosen.license_text or NO_LICENSE
+    record = embedded(run, folder, chosen) if chosen.embed else None
+    files = write_crate(run, folder, license_text=license_text, record=record)
+    return f"{counted(len(files), 'file')}, described in {files[0].name}"
+
+
+def export_layers(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write the layers of a cell."""
+    from orthoflow.files.publishing import publish_layers
+    from orthoflow.products import Layers
+
+    address, port = output_of(run, "layers", chosen.cell)
+    digest = run.cell(address).outputs[port].digest
+    layers = product_of(run, digest, Layers, chosen.store)
+    make_empty(folder)
+    publish_layers(layers, folder, digest)
+    return f"{counted(len(layers.layers), 'layer')} of {address}"
+
+
+def embedded(run: Run, folder: Path, chosen: Choices) -> Run:
+    """Write a record with every product and input file in it; gives it opened."""
+    from orthoflow.engine import Store
+    from orthoflow.records import RECORD_FILE
+    from orthoflow.records.writing import write_embedded
+
+    return write_embedded(run, folder / RECORD_FILE, Store(chosen.store), chosen.inputs)

@@ -1,0 +1,68 @@
+"""Exports to look at: the room as a textured model, orthoimages as tiles with a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orthoflow.cli.exports.products import (
+    branch_of,
+    last_product,
+    make_empty,
+    output_of,
+    wanted_wall,
+)
+from orthoflow.cli.tables import counted
+from orthoflow.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from orthoflow.cli.exports.choices import Choices
+    from orthoflow.files.ortho_files import OrthoFile
+    from orthoflow.records import Run
+
+
+def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `room.glb`."""
+    from orthoflow.files.gltf import write_room
+    from orthoflow.products import Planes
+
+    address, orthos = _orthos(run, chosen)
+    planes = last_product(run, branch_of(run, address), Planes, chosen.store)
+    if planes is None:
+        raise ArgumentError(
+            f"the orthoimages of {address} come of no planes of this run, so nothing says which "
+            "way is up"
+        )
+    make_empty(folder)
+    write_room(folder / "room.glb", orthos, planes.up)
+    return f"room.glb: {counted(len(orthos), 'wall')} of {address}"
+
+
+def export_tiles(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write the tiles of each orthoimage, and `index.html`."""
+    from orthoflow.files.tiles.pyramid import write_tiles
+    from orthoflow.files.tiles.viewer import PAGE, write_viewer
+
+    address, orthos = _orthos(run, chosen)
+    images = {f"wall_{ortho.wall}_ortho": ortho for ortho in orthos}
+    make_empty(folder)
+    n_tiles = sum(write_tiles(folder, name, ortho) for name, ortho in images.items())
+    write_viewer(folder, images)
+    return f"{PAGE}: {counted(len(orthos), 'wall')} in {counted(n_tiles, 'tile')} of {address}"
+
+
+def _orthos(run: Run, chosen: Choices) -> tuple[str, tuple[OrthoFile, ...]]:
+    """The published orthoimages of the wanted cell, or the last one that gave any."""
+    from orthoflow.files.ortho_files import ortho_files
+
+    address, _ = output_of(run, "orthoimages", chosen.cell)
+    found = ortho_files(run.files.get(address, ()))
+    if not found:
+        raise ArgumentError(
+            f"no orthoimages of {address} lie below {run.products_folder}: give the run folder as "
+            "the run left it"
+        )
+    if chosen.wall is not None:
+        numbered = {ortho.wall: ortho for ortho in found}
+        found = (wanted_wall(chosen.wall, numbered, address, "shows"),)
+    return address, found

@@ -1,0 +1,67 @@
+"""`orthoflow.run`: the command `run` as a function."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from orthoflow.cli.options import DEFAULT_STORE, Changes
+from orthoflow.cli.run import prepared
+
+if TYPE_CHECKING:
+    from orthoflow.report.notebooks import OpenedRun
+
+
+def run(
+    workflow: str | Path,
+    *,
+    # Any: whatever a parameter may be.
+    set: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, str | Path | Sequence[str | Path]] | None = None,
+    datasets: str | Path = "",
+    only_data: Sequence[str] = (),
+    output: str | Path | None = None,
+    store: str | Path = DEFAULT_STORE,
+    **options: Any,
+) -> OpenedRun:
+    """Run a workflow, as `orthoflow run` does, and open what came out.
+
+    Progress goes to standard error as the command's does. A step that fails leaves a run whose
+    `record.status` is `failed`; results that are stored are not computed again.
+
+    Args:
+        workflow: a file, or the name of a shipped one.
+        set: parameters by `step.parameter` or `step.variant.parameter`.
+        inputs: files by name of the input.
+        datasets: a table of datasets.
+        only_data: of these datasets only.
+        output: folder of the run; `runs/<name>-<run id>` without one.
+        store: folder of stored results.
+        **options: the command's `jobs`, `executor`, `only`, `from_`, `until`, `force`, `scheduler`,
+            `retries` and `embed`.
+
+    Raises:
+        WorkflowError: something is wrong with the workflow, or with what was set; says all of it.
+        InputError: files are missing.
+        ArgumentError: the folder holds a finished run, or an option is none.
+    """
+    given = [
+        f"{name}={path}"
+        for name, value in (inputs or {}).items()
+        for path in ([value] if isinstance(value, str | Path) else value)
+    ]
+    changes = Changes(
+        sets=tuple(f"{name}={json.dumps(value)}" for name, value in (set or {}).items()),
+        inputs=tuple(given),
+        datasets=str(datasets),
+        only_data=tuple(only_data),
+    )
+    embed = bool(options.pop("embed", False))
+    folder = None if output is None else Path(output)
+    with prepared(str(workflow), changes, folder, Path(store), embed=embed, **options) as call:
+        made = call.make()
+    from orthoflow.report.notebooks import open_run
+
+    return open_run(made.run.path)

@@ -1,0 +1,94 @@
+"""`orthoflow new`: write a first workflow for one's own files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from orthoflow.cli.commands import Command
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import json_option
+from orthoflow.cli.tables import echo, echo_folded, echo_json
+
+if TYPE_CHECKING:
+    from orthoflow.workflow.drafting import Draft, Recipe
+
+_RECIPES: Final = ("photos-on-scan", "direct", "plan")
+
+
+@click.command(cls=Command)
+@click.argument(
+    "files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("workflow.yaml"),
+    show_default=True,
+    metavar="FILE",
+    help="Workflow file to write; one that is there stays as it is.",
+)
+@click.option(
+    "--recipe",
+    type=click.Choice(_RECIPES),
+    help="Shipped recipe to follow.  [default: photos-on-scan where there are photos, else direct]",
+)
+@json_option
+def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json: bool) -> int:
+    """Look at each FILE, or what lies in a folder, and write a commented workflow for them.
+
+    Scans, photos, a calibration, check points, ties measured by hand, cameras of other programs
+    and their orthoimages are told by their content. The workflow is a shipped recipe that names
+    them; it is yours to change.
+    """
+    from orthoflow.cli.progress import working_on
+    from orthoflow.errors import ArgumentError
+
+    if output.exists():
+        raise ArgumentError(f"{output} is there already: choose another name with -o")
+    with working_on("looking at the files"):
+        from orthoflow.workflow.drafting import draft_workflow
+        from orthoflow.workflow.recognising import recognised
+
+        draft = draft_workflow(recognised(files), output, recipe)
+    _write(output, draft.text)
+    if as_json:
+        echo_json(
+            {
+                "file": str(output),
+                "recipe": draft.recipe,
+                "inputs": dict(draft.inputs),
+                "left_out": list(draft.left_out),
+            }
+        )
+    else:
+        _print(draft, output)
+    return EXIT_GOOD
+
+
+def _write(output: Path, text: str) -> None:
+    """Write the file, unless one came into being meanwhile."""
+    from orthoflow.errors import ArgumentError
+
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with output.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+    except OSError as error:
+        raise ArgumentError(f"{output} cannot be written: {error.strerror}") from error
+
+
+def _print(draft: Draft, output: Path) -> None:
+    for name, said in draft.inputs.items():
+        echo(f"{name}: {said}")
+    for said in draft.left_out:
+        echo_folded(f"not used: {said}")
+    echo(
+        f"wrote {output}, after the recipe {draft.recipe}",
+        "",
+        f"next: orthoflow check {output}",
+        f"      orthoflow run {output} --set wall.gsd_m=0.02    # a coarse first look",
+    )

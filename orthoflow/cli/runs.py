@@ -1,0 +1,259 @@
+"""`orthoflow runs`: a table of the runs below some folders."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import operator
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from orthoflow.cli.commands import Command
+from orthoflow.cli.failures import EXIT_GOOD
+from orthoflow.cli.options import json_option
+from orthoflow.cli.tables import counted, echo, echo_folded, echo_json, echo_table, number
+
+if TYPE_CHECKING:
+    from orthoflow.report.browsing import RunSummary
+
+_STATES: Final = ("ok", "failed", "unfinished", "damaged")
+_COLUMNS: Final = ("folder", "started", "workflow", "status")
+# As many numbers stand beside the rest on a wide terminal.
+_METRICS_MOST: Final = 4
+_LONGEST_FACT: Final = 40
+_FACTS_MOST: Final = 4
+# What a record says may be of any length.
+_LONGEST_NAME: Final = 60
+_LONGEST_REASON: Final = 1000
+_CONDITION: Final = re.compile(
+    r"\s*(.+?)\s*(<=|>=|!=|=|<|>)\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
+)
+_SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "=": operator.eq,
+    "!=": operator.ne,
+}
+
+
+@click.command(cls=Command)
+@click.argument("folders", metavar="[FOLDER ...]", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--workflow", "workflows", metavar="NAME", multiple=True, help="Only its runs.")
+@click.option(
+    "--status", "states", type=click.Choice(_STATES), multiple=True, help="Only such runs."
+)
+@click.option(
+    "--where",
+    metavar="'METRIC > X'",
+    multiple=True,
+    help="Only runs of which it holds: < <= > >= = !=, of a metric, step.metric or parameter.",
+)
+@click.option(
+    "--sort",
+    metavar="COLUMN",
+    default="started",
+    show_default=True,
+    help="Order: folder, started, workflow, status, or a metric; -COLUMN for the other end first.",
+)
+@click.option(
+    "--metric", "metrics", metavar="NAME", multiple=True, help="Show this number.  [default: some]"
+)
+@click.option("--csv", "as_csv", is_flag=True, help="Print CSV, with every metric and parameter.")
+@json_option
+def runs(
+    folders: tuple[Path, ...],
+    where: tuple[str, ...],
+    *,
+    as_csv: bool,
+    as_json: bool,
+    sort: str,
+    metrics: tuple[str, ...],
+    **only: tuple[str, ...],
+) -> int:
+    """List the runs in and below each FOLDER, by default the working directory.
+
+    A row says when a run was made, with which workflow, how it ended, how good its baseline is
+    (of several datasets, the median), and which parameters and inputs differ from those of other
+    runs of the workflow. Runs without a record, and records that cannot be read, say why.
+    """
+    if as_csv and as_json:
+        raise click.UsageError("--csv and --json exclude each other")
+    found = list_runs(folders or (Path(),))
+    kept = _sorted(_filtered(found, where, **only), sort)
+    if as_json:
+        echo_json(runs_json(kept))
+    elif as_csv:
+        _print_csv(kept)
+    else:
+        print_runs(kept, n_found=len(found), metrics=metrics)
+    return EXIT_GOOD
+
+
+def list_runs(folders: Sequence[Path]) -> list[RunSummary]:
+    """Sum up all runs in and below some folders, the oldest first."""
+    from orthoflow.cli.progress import working_on
+
+    with working_on("reading the records"):
+        from orthoflow.report.browsing import run_folders, summaries
+
+        return _sorted(list(summaries(run_folders(folders))), "started")
+
+
+def runs_json(kept: Sequence[RunSummary]) -> list[dict[str, object]]:
+    """Give runs as JSON, with every metric and parameter, and in what they differ."""
+    from orthoflow.report.browsing import differing_facts
+
+    facts = differing_facts(kept)
+    return [_row_json(run, facts[run.folder]) for run in kept]
+
+
+def print_runs(kept: Sequence[RunSummary], *, n_found: int, metrics: Sequence[str] = ()) -> None:
+    """Print a table of runs, what went wrong in them, and how many there are."""
+    from orthoflow.report.browsing import differing_facts, key_metrics
+
+    names = list(metrics) or key_metrics(kept, most=_METRICS_MOST)
+    _require_known(names, kept)
+    facts = differing_facts(kept)
+    echo_table(
+        (*_COLUMNS, *names, "differs in"),
+        [
+            (
+                str(run.folder),
+                run.started[:16].replace("T", " "),
+                run.workflow[:_LONGEST_NAME],
+                run.state,
+                *(number(run.metrics[name]) if name in run.metrics else "" for name in names),
+                _facts_text(facts[run.folder]),
+            )
+            for run in kept
+        ],
+    )
+    for run in kept:
+        if run.reason:
+            echo_folded(f"{run.folder} {run.state}: {run.reason[:_LONGEST_REASON]}")
+    n_left_out = n_found - len(kept)
+    echo(counted(len(kept), "run") + (f", {n_left_out} others left out" if n_left_out else ""))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Condition:
+    """One `--where`: a name, a sign and a number."""
+
+    name: str
+    holds: Callable[[float, float], bool]
+    limit: float
+
+    @classmethod
+    def of(cls, text: str) -> _Condition:
+        match = _CONDITION.fullmatch(text)
+        if match is None:
+            raise click.UsageError(
+                f"--where {text!r} is no condition: expected a name, one of "
+                f"{' '.join(_SIGNS)} and a number, e.g. --where 'rmse_u_mm < 2'"
+            )
+        return cls(name=match[1], holds=_SIGNS[match[2]], limit=float(match[3]))
+
+    def is_met_by(self, run: RunSummary) -> bool:
+        value = run.metrics.get(self.name, run.facts.get(self.name))
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return False
+        return self.holds(float(value), self.limit)
+
+
+def _filtered(
+    found: Sequence[RunSummary],
+    where: Sequence[str],
+    *,
+    workflows: Sequence[str],
+    states: Sequence[str],
+) -> list[RunSummary]:
+    conditions = [_Condition.of(text) for text in where]
+    _require_known([condition.name for condition in conditions], found)
+    return [
+        run
+        for run in found
+        if (not workflows or run.workflow in workflows)
+        and (not states or run.state in states)
+        and all(condition.is_met_by(run) for condition in conditions)
+    ]
+
+
+def _sorted(kept: Sequence[RunSummary], key: str) -> list[RunSummary]:
+    """Order runs; those that lack the number stand last, whichever end is first."""
+    name = key.removeprefix("-")
+    if name in _COLUMNS:
+        attribute = "state" if name == "status" else name
+        text = operator.attrgetter(attribute)
+        return sorted(kept, key=lambda run: (str(text(run)), str(run.folder)), reverse=key != name)
+    _require_known([name], kept)
+    sign = -1.0 if key != name else 1.0
+    return sorted(
+        kept, key=lambda run: (name not in run.metrics, sign * run.metrics.get(name, 0.0))
+    )
+
+
+def _require_known(names: Sequence[str], found: Sequence[RunSummary]) -> None:
+    known = {name for run in found for name in (*run.metrics, *run.facts)}
+    if not known:
+        return
+    for name in names:
+        if name not in known:
+            from orthoflow.catalog import nearest
+
+            near = nearest(name, known)
+            hint = f"did you mean {near!r}?" if near else "--json has the names of all"
+            raise click.UsageError(f"no run has a metric or parameter {name!r}; {hint}")
+
+
+def _facts_text(facts: Mapping[str, object]) -> str:
+    """Say in what a run differs, as far as a line bears it."""
+    said = []
+    for name, value in facts.items():
+        text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        if name.startswith("input ") and isinstance(value, list):
+            text = ", ".join(map(str, value)) or "not given"
+        cut = text if len(text) <= _LONGEST_FACT else f"{text[:_LONGEST_FACT]}..."
+        said.append(f"{name}={cut}")
+    more = f" and {len(said) - _FACTS_MOST} more" if len(said) > _FACTS_MOST else ""
+    return ", ".join(said[:_FACTS_MOST]) + more
+
+
+def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, object]:
+    values = dataclasses.asdict(run) | {"folder": str(run.folder)}
+    values["status"] = values.pop("state")
+    return values | {"differs": dict(differs)}
+
+
+def _print_csv(kept: Sequence[RunSummary]) -> None:
+    from orthoflow.foreign_text import csv_text
+
+    metrics = list(dict.fromkeys(name for run in kept for name in run.metrics if "." in name))
+    facts = list(dict.fromkeys(name for run in kept for name in run.facts))
+    header = [*_COLUMNS, "run_id", "reason", *metrics, *facts]
+    rows = [
+        [
+            str(run.folder),
+            run.started,
+            run.workflow,
+            run.state,
+            run.run_id,
+            run.reason,
+            *(run.metrics.get(name) for name in metrics),
+            *(_cell(run.facts.get(name)) for name in facts),
+        ]
+        for run in kept
+    ]
+    echo(*csv_text([header, *rows]).splitlines())
+
+
+def _cell(value: object) -> str | int | float | None:
+    if value is None or isinstance(value, str | int | float):
+        return value
+    return json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,1 @@
+"""Clouds as files for other programs: what each point has, its colour, a writer per format."""

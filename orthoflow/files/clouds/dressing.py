@@ -1,0 +1,279 @@
+"""Points ready to be written, piece by piece: chosen, coloured, with plane and normal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final, Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.files.clouds.colours import (
+    deviation_colours,
+    grey_range,
+    greys,
+    plane_colour,
+    plane_colours,
+    round_scale_m,
+    sampled_pieces,
+)
+from orthoflow.files.clouds.neighbourhoods import Neighbourhoods, offsets_of
+from orthoflow.files.clouds.photo_colours import PointColours
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Planes, PointCloud, PointLabels
+
+Colouring: TypeAlias = Literal["photos", "rgb", "intensity", "plane", "deviation"]
+COLOURINGS: Final[tuple[str, ...]] = get_args(Colouring)
+# Points at once: ten of their copies take some hundred megabytes.
+BLOCK: Final = 1 << 20
+_SCALE_PERCENT: Final = 99.0
+_NOTHING: Final = np.zeros(0, dtype=np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points:
+    """Some points with all that is written of them; None is not known of this cloud.
+
+    Attributes:
+        world: (n, 3) float64 metres.
+        rgb: (n, 3) uint8.
+        normal: (n, 3) float32 unit vectors towards the viewer, 0 0 0 where there is no surface.
+        intensity: (n,) float32, 0..1.
+        scan: (n,) uint16.
+        plane: (n,) int16, -1 for none.
+        deviation_m: (n,) float32 from the plane, positive towards the viewer; NaN without one.
+        photo: (n,) int16 which photo gave the colour, -1 for none.
+    """
+
+    world: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    normal: NDArray[np.float32]
+    intensity: NDArray[np.float32] | None = None
+    scan: NDArray[np.uint16] | None = None
+    plane: NDArray[np.int16] | None = None
+    deviation_m: NDArray[np.float32] | None = None
+    photo: NDArray[np.int16] | None = None
+
+    def __len__(self) -> int:
+        return len(self.world)
+
+    # Any: each has a type of its own.
+    def fields(self) -> dict[str, NDArray[Any]]:
+        """What is known besides place, colour and normal, as files call it."""
+        every = {
+            "intensity": self.intensity,
+            "scan": self.scan,
+            "plane": self.plane,
+            "deviation": self.deviation_m,
+            "photo": self.photo,
+        }
+        return {name: values for name, values in every.items() if values is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DressedCloud:
+    """A cloud and what it is dressed in.
+
+    Attributes:
+        cloud: the points.
+        colouring: what their colours show.
+        neighbourhoods: of the cloud.
+        planes: None where the run found none; then there are no deviations.
+        labels: of the cloud's points, likewise.
+        photo_colours: for the colouring `photos`.
+        photo_names: of these, by their numbers.
+        wall: only points over this raster, as far before and behind it as it reaches; deviations
+            are then those from its plane.
+        wall_plane: number of the plane of that wall.
+        box_world: (2, 3) only points between these corners.
+        is_cleaned: without points that are alone.
+        crs_wkt: coordinate system of the world, as WKT; empty where nobody said.
+        name: what the cloud is called in files.
+    """
+
+    cloud: PointCloud
+    colouring: Colouring
+    neighbourhoods: Neighbourhoods
+    planes: Planes | None = None
+    labels: PointLabels | None = None
+    photo_colours: PointColours | None = None
+    photo_names: tuple[str, ...] = ()
+    wall: Slab | None = None
+    wall_plane: int = -1
+    box_world: NDArray[np.float64] | None = None
+    is_cleaned: bool = False
+    crs_wkt: str = ""
+    name: str = "cloud"
+
+    @cached_property
+    def scale_m(self) -> float:
+        """Deviation that has the full colour: what 99 of 100 points keep, rounded up to 1-2-5.
+
+        Told from short pieces all over the cloud, of the points in them that are written.
+        """
+        found = [
+            deviations[self._chosen(piece, None)]
+            for piece in sampled_pieces(len(self.cloud))
+            if (deviations := self._deviations(piece)) is not None
+        ]
+        values = np.abs(np.concatenate(found or [_NOTHING]))
+        known = values[np.isfinite(values)]
+        return round_scale_m(float(np.percentile(known, _SCALE_PERCENT)) if len(known) else 0.0)
+
+    @cached_property
+    def scans(self) -> tuple[int, ...]:
+        """Numbers of the scans that have points, cropping aside."""
+        found: set[int] = set()
+        if self.cloud.scan is None:
+            return (0,)
+        for part in self._parts():
+            found.update(np.unique(self.cloud.scan[part]).tolist())
+        return tuple(sorted(found))
+
+    def station(self, scan: int) -> NDArray[np.float64] | None:
+        """Where a scan was taken from (3,), None where the files did not say it of each scan."""
+        cloud = self.cloud
+        if cloud.stations is None or cloud.stations_source != "file":
+            return None
+        highest = 0 if cloud.scan is None else self.scans[-1]
+        if len(cloud.stations) <= highest:
+            return None
+        return np.asarray(cloud.stations[scan], dtype=np.float64)
+
+    def bounds_world(self, scan: int | None = None) -> NDArray[np.float64] | None:
+        """Smallest and largest coordinates (2, 3) of the chosen points; None without any."""
+        found = [
+            (world.min(axis=0), world.max(axis=0))
+            for part in self._parts()
+            if (chosen := self._chosen(part, scan)).any()
+            for world in (self.cloud.points_world(part)[chosen],)
+        ]
+        if not found:
+            return None
+        return np.array(
+            [np.min([low for low, _ in found], axis=0), np.max([high for _, high in found], axis=0)]
+        )
+
+    def blocks(self, scan: int | None = None) -> Iterator[Points]:
+        """Give the chosen points in their order, of all scans or of one."""
+        for part in self._parts():
+            chosen = self._chosen(part, scan)
+            if chosen.any():
+                yield self._dressed(part, chosen)
+
+    def _parts(self) -> Iterator[slice]:
+        for first in range(0, len(self.cloud), BLOCK):
+            yield slice(first, min(first + BLOCK, len(self.cloud)))
+
+    def _chosen(self, part: slice, scan: int | None) -> NDArray[np.bool_]:
+        chosen = np.ones(part.stop - part.start, dtype=np.bool_)
+        if scan is not None and self.cloud.scan is not None:
+            chosen &= np.asarray(self.cloud.scan[part]) == scan
+            if not chosen.any():
+                return chosen
+        if self.wall is not None or self.box_world is not None:
+            world = self.cloud.points_world(part)
+            if self.box_world is not None:
+                low, high = self.box_world
+                chosen &= np.all((world >= low) & (world <= high), axis=1)
+            if self.wall is not None:
+                frame = self.wall.frame
+                column, row, depth = frame.wall_from_world(world).T
+                chosen &= (column >= 0) & (column <= frame.width)
+                chosen &= (row >= 0) & (row <= frame.height)
+                chosen &= (depth <= self.wall.front_m) & (depth >= -self.wall.behind_m)
+        if self.is_cleaned:
+            near = self.neighbourhoods
+            chosen &= ~near.alone[near.places(offsets_of(self.cloud, part))]
+        return chosen
+
+    def _dressed(self, part: slice, chosen: NDArray[np.bool_]) -> Points:
+        cloud = self.cloud
+        world = cloud.points_world(part)[chosen]
+        plane = None if self.labels is None else np.asarray(self.labels.plane_index[part])
+        deviation_m = self._deviations(part)
+        photos = self.photo_colours
+        photo = None if photos is None or photos.photo is None else np.asarray(photos.photo[part])
+        scan = None if cloud.scan is None else np.asarray(cloud.scan[part])[chosen]
+        plane = None if plane is None else plane[chosen]
+        places = self.neighbourhoods.places(offsets_of(cloud, part)[chosen])
+        normal = self.neighbourhoods.normals[places]
+        return Points(
+            world=world,
+            rgb=self._colours(part)[chosen],
+            normal=normal * self._signs(world, normal, scan, plane)[:, None],
+            intensity=None
+            if cloud.intensity is None
+            else np.clip(np.asarray(cloud.intensity[part]), 0.0, 1.0)[chosen],
+            scan=scan,
+            plane=plane,
+            deviation_m=None if deviation_m is None else deviation_m[chosen],
+            photo=None if photo is None else photo[chosen],
+        )
+
+    def _deviations(self, part: slice) -> NDArray[np.float32] | None:
+        """Signed distances (n,) from the wall's plane, else from the plane that has the point."""
+        if self.wall is not None:
+            plane = self.wall.frame.plane
+            distances = self.cloud.points_world(part) @ plane.normal - plane.offset_m
+            return np.asarray(distances, dtype=np.float32)
+        if self.planes is None or self.labels is None:
+            return None
+        index = np.asarray(self.labels.plane_index[part])
+        known = (index >= 0) & (index < len(self.planes))
+        deviation = np.full(len(index), np.nan, dtype=np.float32)
+        own = index[known]
+        world = self.cloud.points_world(part)[known]
+        along = np.einsum("ij,ij->i", world, self.planes.normal[own])
+        deviation[known] = along - self.planes.offset[own]
+        return deviation
+
+    def _colours(self, part: slice) -> NDArray[np.uint8]:
+        cloud = self.cloud
+        if self.photo_colours is not None:
+            return np.asarray(self.photo_colours.rgb[part])
+        if self.colouring == "rgb" and cloud.rgb is not None:
+            return np.asarray(cloud.rgb[part])
+        if self.colouring == "deviation":
+            deviation_m = self._deviations(part)
+            if deviation_m is not None:
+                return deviation_colours(deviation_m, self.scale_m)
+        low, high = self._grey_range
+        grey = np.clip((greys(cloud, part) - low) / max(high - low, 1e-6), 0.0, 1.0)
+        if self.colouring == "plane" and self.labels is not None:
+            return plane_colours(np.asarray(self.labels.plane_index[part]), self._palette, grey)
+        return np.repeat(np.rint(255.0 * grey).astype(np.uint8)[:, None], 3, axis=1)
+
+    def _signs(
+        self,
+        world: NDArray[np.float64],
+        normal: NDArray[np.float32],
+        scan: NDArray[np.uint16] | None,
+        plane: NDArray[np.int16] | None,
+    ) -> NDArray[np.float32]:
+        """1 or -1 (n,): normals point to the scanner, else where the plane's does, else up."""
+        stations = self.cloud.stations
+        towards = np.broadcast_to(self.cloud.up, world.shape)
+        if self.station(0) is not None and stations is not None:
+            towards = (
+                stations[np.zeros(len(world), dtype=np.int64) if scan is None else scan] - world
+            )
+        elif stations is not None and len(stations) == 1:
+            towards = stations[0] - world
+        elif plane is not None and self.planes is not None:
+            normals = np.vstack([self.planes.normal, self.cloud.up])
+            towards = normals[plane]
+        along = np.einsum("ij,ij->i", towards, normal)
+        return np.where(along < 0.0, -1.0, 1.0).astype(np.float32)
+
+    @cached_property
+    def _grey_range(self) -> tuple[float, float]:
+        return grey_range(self.cloud)
+
+    @cached_property
+    def _palette(self) -> NDArray[np.float64]:
+        # int16 has no more.
+        highest = -1 if self.labels is None else int(self.labels.plane_index.max(initial=-1))
+        return np.array([plane_colour(k) for k in range(-1, highest + 1)], dtype=np.float64)

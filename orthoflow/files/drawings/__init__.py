@@ -1,0 +1,1 @@
+"""Drawings of walls and rooms: sheets in scale, CAD files and vectors."""

@@ -1,0 +1,105 @@
+"""Outlines and lines of a room as GeoJSON, for GIS programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of
+from orthoflow.files.sidecars import write_text
+from orthoflow.geometry.adjoining import Edge
+from orthoflow.products import JsonValue
+
+_Feature: TypeAlias = dict[str, JsonValue]
+_DIGITS: Final = 6
+
+
+def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
+    """Write a wall in the coordinates of its GeoTIFF: raster, rectangle, parts, edges, points."""
+    own: dict[str, JsonValue] = {"wall": wall.number, "name": wall.name}
+    features = [_polygon(wall.place_m(wall.frame.corners_world()), {"kind": "frame", **own})]
+    if lines is not None:
+        if wall.plane_index is not None:
+            corners = lines.planes.corners[wall.plane_index]
+            features.append(_polygon(wall.place_m(corners), {"kind": "rectangle", **own}))
+            features += [
+                _polygon(wall.place_m(part), {"kind": "part", **own})
+                for part in lines.surfaces[wall.plane_index].rectangles_world
+            ]
+        features += [
+            _feature("LineString", wall.place_m(edge.ends_world), _about(edge, lines))
+            for edge in edges_of(lines, wall.plane_index)
+        ]
+        if lines.checkpoints is not None:
+            near = np.flatnonzero(wall.near(lines.checkpoints.points_world))
+            places = wall.place_m(lines.checkpoints.points_world[near])
+            features += _points([lines.checkpoints.names[index] for index in near], places)
+    _write(path, features, wall.frame.map_crs)
+
+
+def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> None:
+    """Write a room in the coordinates of its scan: planes, edges, corners, outline, points."""
+    features = [
+        _polygon(corners, {"kind": "rectangle", "plane": index, "name": lines.planes.names[index]})
+        for index, corners in enumerate(lines.planes.corners)
+    ]
+    features += [
+        _feature("LineString", edge.ends_world, _about(edge, lines)) for edge in lines.edges
+    ]
+    features += [
+        _feature("Point", corner.point_world, {"kind": "corner", "planes": list(corner.planes)})
+        for corner in lines.corners
+    ]
+    outline = lines.outline
+    for points, is_closed in zip(outline.chains_world, outline.closed, strict=True):
+        about: Mapping[str, JsonValue] = {"kind": "outline", "floor_m": outline.floor_m}
+        features.append(
+            _polygon(points, about) if is_closed else _feature("LineString", points, about)
+        )
+    if lines.checkpoints is not None:
+        features += _points(lines.checkpoints.names, lines.checkpoints.points_world)
+    _write(path, features, map_crs)
+
+
+def _about(edge: Edge, lines: RoomLines) -> Mapping[str, JsonValue]:
+    return {
+        "kind": "edge",
+        "planes": [edge.first, edge.second],
+        "names": [lines.planes.names[edge.first], lines.planes.names[edge.second]],
+        "length_m": round(edge.length_m, _DIGITS),
+    }
+
+
+def _points(names: Iterable[str], places: NDArray[np.float64]) -> list[_Feature]:
+    return [
+        _feature("Point", place, {"kind": "check point", "name": name})
+        for name, place in zip(names, places, strict=True)
+    ]
+
+
+def _polygon(corners: NDArray[np.float64], about: Mapping[str, JsonValue]) -> _Feature:
+    """A ring that ends where it begins, as the format wants it."""
+    return _feature("Polygon", np.vstack([corners, corners[:1]])[None], about)
+
+
+def _feature(
+    kind: str, coordinates: NDArray[np.float64], about: Mapping[str, JsonValue]
+) -> _Feature:
+    places: JsonValue = np.round(coordinates, _DIGITS).tolist()
+    geometry: dict[str, JsonValue] = {"type": kind, "coordinates": places}
+    return {"type": "Feature", "properties": dict(about), "geometry": geometry}
+
+
+def _write(path: Path, features: list[_Feature], map_crs: str | None) -> None:
+    content: dict[str, JsonValue] = {"type": "FeatureCollection", "name": path.stem}
+    if map_crs is not None and map_crs.startswith("EPSG:"):
+        # Not of RFC 7946, which knows degrees only, but what GIS programs read.
+        name = f"urn:ogc:def:crs:EPSG::{map_crs.removeprefix('EPSG:')}"
+        content["crs"] = {"type": "name", "properties": {"name": name}}
+    content["features"] = list(features)
+    write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")

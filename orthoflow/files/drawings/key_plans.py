@@ -1,0 +1,98 @@
+"""A room from above, small, with one wall marked: which wall does a sheet show?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.adjoining import Surface
+from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame
+from orthoflow.geometry.outlines import RoomOutline, room_outline
+from orthoflow.products import Planes
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyPlan:
+    """Lines of a plan, in metres to the right and upwards, around a place near all of them.
+
+    Attributes:
+        walls: (w, 2, 2) upright rectangles from above.
+        outlines: of the room, (n, 2) each; closed ones end where they begin.
+        marked: (n, 2) the wall that is meant: two ends, or the four corners of a level plane.
+        arrow: (2, 2) from the viewer to the wall; None for level planes.
+        up_label: what the upwards direction of the plan is: `N` in a map, else an axis.
+    """
+
+    walls: NDArray[np.float64]
+    outlines: tuple[NDArray[np.float64], ...]
+    marked: NDArray[np.float64]
+    arrow: NDArray[np.float64] | None
+    up_label: str
+
+
+def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
+    """Planes with the rectangles of their parts, or of all their points where there are none."""
+    found = []
+    for index in range(len(planes)):
+        rectangles = planes.corners[index][None]
+        if planes.part_corners is not None and planes.part_plane is not None:
+            own = planes.part_corners[planes.part_plane == index]
+            rectangles = own if len(own) else rectangles
+        found.append(Surface(plane=planes.plane(index), rectangles_world=rectangles))
+    return tuple(found)
+
+
+def outline_of(planes: Planes) -> RoomOutline:
+    """The outline of the room that planes bound."""
+    return room_outline(
+        [planes.plane(index) for index in range(len(planes))], planes.corners, planes.up
+    )
+
+
+def key_plan(planes: Planes, frame: WallFrame, outlines: Sequence[RoomOutline] = ()) -> KeyPlan:
+    """Draw planes from above, and mark where a raster lies.
+
+    Args:
+        planes: of the room.
+        frame: of the raster.
+        outlines: the outline, if it is known already.
+    """
+    outline = outlines[0] if outlines else outline_of(planes)
+    basis = basis_from_up(planes.up)
+    corners = frame.corners_world()
+    near = corners.mean(axis=0)
+
+    def seen(points_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray((points_world - near) @ basis[:2].T)
+
+    upright = np.abs(planes.normal @ planes.up) < math.sin(math.radians(LEVEL_LIMIT_DEG))
+    walls = [
+        seen(np.array([quad[:2].mean(axis=0), quad[2:].mean(axis=0)]))
+        for quad in planes.corners[upright]
+    ]
+    is_level = abs(float(frame.normal_world @ planes.up)) > math.cos(math.radians(60.0))
+    marked = corners if is_level else np.array([corners[:2].mean(axis=0), corners[2:].mean(axis=0)])
+    arrow = None
+    if not is_level:
+        length_m = 0.25 * float(np.linalg.norm(corners[3] - corners[0]))
+        middle = seen(near[None])[0]
+        towards = seen((near + frame.normal_world)[None])[0] - middle
+        towards /= np.linalg.norm(towards)
+        arrow = np.array([middle + length_m * towards, middle + 0.1 * length_m * towards])
+    is_map = frame.map_crs is not None and frame.map_crs != "site"
+    axis = int(np.argmax(np.abs(basis[1])))
+    return KeyPlan(
+        walls=np.array(walls).reshape(-1, 2, 2),
+        outlines=tuple(
+            seen(np.vstack([chain, chain[:1]]) if is_closed else chain)
+            for chain, is_closed in zip(outline.chains_world, outline.closed, strict=True)
+        ),
+        marked=seen(marked),
+        arrow=arrow,
+        up_label="N" if is_map else f"{'-' if basis[1][axis] < 0 else ''}{'xyz'[axis]}",
+    )

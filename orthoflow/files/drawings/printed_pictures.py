@@ -1,0 +1,180 @@
+"""Rasters of walls as pictures for paper: no finer than print shows, in bounded memory."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.files.drawings.papers import Part, nice_step
+from orthoflow.files.geotiff import RasterParts
+from orthoflow.files.images import encode_png
+from orthoflow.geometry.levels import eight_bits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from orthoflow.geometry.levels import Colours
+
+PRINT_DPI: Final = 400.0
+_MM_PER_INCH: Final = 25.4
+# Cells that are read at a time.
+_BAND_CELLS: Final = 1 << 24
+# Up to this many pixels a picture is kept as it is; beyond, a sheet would be too large to send.
+_LOSSLESS_PX: Final = 8_000_000
+_JPEG_QUALITY: Final = 95
+_CONTOUR_PITCH_MM: Final = 0.5
+_SHORTEST_CONTOUR_MM: Final = 6.0
+_OVERVIEW_PX: Final = 1000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """Values that become black and white, and the interval of contours between them."""
+
+    low: float
+    high: float
+
+    @property
+    def interval(self) -> float:
+        """Distance of contours, a round number, about ten over the range; at least 1 mm."""
+        return nice_step(max((self.high - self.low) / 12.0, 1e-3))
+
+
+def write_picture(raster: Path, part: Part, path: Path, *, scale: int) -> tuple[int, int]:
+    """Write a part of a wall's raster as a picture, white where it shows nothing.
+
+    Cells are kept as they are where print shows them, else averaged to 400 pixels per inch.
+
+    Args:
+        raster: GeoTIFF of one band, which is stretched to grey, or of three.
+        part: of the raster.
+        path: file to write without its suffix, which says the format: PNG, or JPEG when large.
+        scale: n of 1 : n.
+
+    Returns:
+        Rows and columns of the picture.
+    """
+    with RasterParts(raster) as source:
+        cells = np.array([part.left_m, part.top_m, part.right_m, part.bottom_m]) / source.gsd_m
+        cells = np.clip(cells, 0.0, [*source.shape[::-1], *source.shape[::-1]])
+        shape = _printed_shape(part, cells, scale)
+        stretch = stretch_of(raster) if source.bands == 1 else None
+        picture = np.full((*shape, 3), 255, dtype=np.uint8)
+        for rows, values, shown in _bands(source, cells, shape):
+            colours = _grey(values, stretch) if stretch else eight_bits(cast("Colours", values))
+            picture[rows][shown] = colours[shown]
+    _write_encoded(path, picture)
+    return shape
+
+
+def picture_file(path: Path) -> Path:
+    """The file that `write_picture` wrote, with its suffix."""
+    jpeg = path.with_suffix(".jpg")
+    return jpeg if jpeg.exists() else path.with_suffix(".png")
+
+
+def stretch_of(raster: Path) -> Stretch:
+    """Values of one band that stand for black and white: its 2nd and 98th percentile."""
+    with RasterParts(raster) as source:
+        rows, columns = source.shape
+        shape = (min(rows, _OVERVIEW_PX), min(columns, _OVERVIEW_PX))
+        values, shown = source.read((0.0, 0.0, float(columns), float(rows)), shape)
+    known = values[shown & np.isfinite(values)].astype(np.float64)
+    if not known.size:
+        return Stretch(low=0.0, high=1.0)
+    low, high = (float(value) for value in np.percentile(known, (2.0, 98.0)))
+    return Stretch(low=low, high=max(high, low + 1e-6))
+
+
+def contours(
+    raster: Path, part: Part, *, scale: int, interval_m: float
+) -> list[tuple[float, NDArray[np.float64]]]:
+    """Contours of a depth raster, each a level in metres and a line.
+
+    Lines are (n, 2) metres on the wall, to the right and down from the corner of the raster.
+    Levels are half an interval from the plane, and an interval apart: on the plane itself, noise
+    would be all that they draw. Depths are averaged over half a millimetre of paper; lines shorter
+    than six are left out.
+    """
+    from contourpy import contour_generator
+
+    with RasterParts(raster) as source:
+        box = np.array([part.left_m, part.top_m, part.right_m, part.bottom_m]) / source.gsd_m
+        pitch_m = max(source.gsd_m, 1e-3 * _CONTOUR_PITCH_MM * scale)
+        columns, rows = (max(2, round(edge / pitch_m)) for edge in part.size_m)
+        limits = np.clip(np.round(box), 0, [*source.shape[::-1], *source.shape[::-1]])
+        left, top, right, bottom = (float(edge) for edge in limits)
+        shape = (min(rows, int(bottom - top)), min(columns, int(right - left)))
+        if min(shape) < 2:
+            return []
+        depths, shown = source.read((left, top, right, bottom), shape)
+        gsd_m = source.gsd_m
+    known = shown & np.isfinite(depths)
+    if not known.any():
+        return []
+    x = gsd_m * (left + (np.arange(shape[1]) + 0.5) * (right - left) / shape[1])
+    y = gsd_m * (top + (np.arange(shape[0]) + 0.5) * (bottom - top) / shape[0])
+    generator = contour_generator(x, y, np.ma.array(depths.astype(np.float64), mask=~known))
+    low, high = (
+        math.floor(float(edge) / interval_m) for edge in np.percentile(depths[known], (1.0, 99.0))
+    )
+    found = []
+    for step in range(low, high + 1):
+        level = (step + 0.5) * interval_m
+        for line in generator.lines(level):
+            points = np.asarray(line, dtype=np.float64)
+            length_m = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+            if 1e3 * length_m / scale >= _SHORTEST_CONTOUR_MM:
+                found.append((level, points))
+    return found
+
+
+def _printed_shape(part: Part, cells: NDArray[np.float64], scale: int) -> tuple[int, int]:
+    n_cells = (cells[3] - cells[1], cells[2] - cells[0])
+    inches = (1e3 * edge / scale / _MM_PER_INCH for edge in part.size_m[::-1])
+    rows, columns = (
+        max(1, min(math.ceil(count - 1e-6), math.ceil(edge * PRINT_DPI)))
+        for count, edge in zip(n_cells, inches, strict=True)
+    )
+    return rows, columns
+
+
+def _bands(
+    source: RasterParts, cells: NDArray[np.float64], shape: tuple[int, int]
+) -> Iterator[tuple[slice, NDArray[np.generic], NDArray[np.bool_]]]:
+    left, top, right, bottom = (float(edge) for edge in cells)
+    per_row = (bottom - top) / shape[0]
+    count = max(1, int(_BAND_CELLS / max(1.0, (right - left) * per_row)))
+    for first in range(0, shape[0], count):
+        last = min(shape[0], first + count)
+        box = (left, top + first * per_row, right, top + last * per_row)
+        values, shown = source.read(box, (last - first, shape[1]))
+        yield slice(first, last), values, shown
+
+
+def _grey(values: NDArray[np.generic], stretch: Stretch) -> NDArray[np.uint8]:
+    shares = (values.astype(np.float32) - stretch.low) / (stretch.high - stretch.low)
+    grey = np.nan_to_num(255.0 * np.clip(shares, 0.0, 1.0), nan=255.0).astype(np.uint8)
+    return np.repeat(grey[:, :, None], 3, axis=2)
+
+
+def _write_encoded(path: Path, picture: NDArray[np.uint8]) -> None:
+    import cv2
+
+    if picture.shape[0] * picture.shape[1] <= _LOSSLESS_PX:
+        path.with_suffix(".png").write_bytes(encode_png(picture))
+        return
+    # Turned in place: a copy of an A0 sheet would be 750 MB.
+    for row in picture:
+        row[:] = row[:, ::-1].copy()
+    options = [
+        *(cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY),
+        *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+    ]
+    _, encoded = cv2.imencode(".jpg", picture, options)
+    path.with_suffix(".jpg").write_bytes(encoded.tobytes())

@@ -1,0 +1,1 @@
+"""Orthoimages as tiles, and a page that shows them without a server."""

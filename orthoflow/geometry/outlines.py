@@ -1,0 +1,267 @@
+"""The outline of a room: its walls in plan, joined at their corners, and as faces in space."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.adjoining import line_of
+from orthoflow.geometry.directions import basis_from_up
+from orthoflow.geometry.frames import LEVEL_LIMIT_DEG
+from orthoflow.geometry.planes import Plane
+
+# How far a wall's points may end before the corner that it makes with the next.
+_JOINED_M: Final = 1.0
+# Walls as near before one another, facing the same way, are one wall with relief.
+_RELIEF_M: Final = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoomOutline:
+    """What a room is bounded by.
+
+    Attributes:
+        walls: indices of the planes that bound it and join another, in the order of the chains.
+        chains_world: outlines at the height of the floor, (n, 3) metres each; walls that follow
+            one another share a point.
+        closed: for each chain whether its last point joins its first.
+        faces_world: (w, 4, 3) metres, faces of `walls` from floor to ceiling: top left, bottom
+            left, bottom right, top right as the viewer sees them.
+        floor_m: height of the floor along up, or of the lowest wall where no floor was found.
+    """
+
+    walls: tuple[int, ...]
+    chains_world: tuple[NDArray[np.float64], ...]
+    closed: tuple[bool, ...]
+    faces_world: NDArray[np.float64]
+    floor_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Wall:
+    """A wall in plan.
+
+    Attributes:
+        index: of its plane.
+        plane: it.
+        corners: (4, 3) of its rectangle, top left first, counter-clockwise for the viewer.
+        ends: (2, 2) left and right end in plan.
+    """
+
+    index: int
+    plane: Plane
+    corners: NDArray[np.float64]
+    ends: NDArray[np.float64]
+
+    @property
+    def length_m(self) -> float:
+        return float(np.linalg.norm(self.ends[1] - self.ends[0]))
+
+
+# A wall, by its place in the list, and its end: 0 left, 1 right.
+_End = tuple[int, int]
+
+
+def room_outline(
+    planes: Sequence[Plane], corners_world: NDArray[np.float64], up: NDArray[np.float64]
+) -> RoomOutline:
+    """Join the walls of a room to its outline.
+
+    Of walls with relief the first of their planes counts. A wall ends where its line crosses
+    that of the next, if its points come within a metre of there; else where its points end.
+
+    Args:
+        planes: planes, the normals into the room, those of most points first.
+        corners_world: (k, 4, 3) metres, rectangles of their points, top left first,
+            counter-clockwise for the viewer.
+        up: (3,) unit vector.
+    """
+    basis = basis_from_up(up)
+    floor, ceiling = (_level(planes, corners_world, sign * up) for sign in (1.0, -1.0))
+    walls = _bounding(planes, corners_world, basis)
+    joints = _joints(walls)
+    lowest = min((float((wall.corners @ up).min()) for wall in walls), default=0.0)
+    floor_m = lowest if floor is None else float((corners_world[floor] @ up).mean())
+    levels = [None if k is None else planes[k] for k in (ceiling, floor)]
+    chains = _chains(len(walls), joints)
+    joined = [place for chain, _ in chains for place, _ in chain]
+    faces = [_face(walls, place, joints, levels) for place in joined]
+    return RoomOutline(
+        walls=tuple(walls[place].index for place in joined),
+        chains_world=tuple(
+            _chain_points(walls, chain, joints, basis, floor_m) for chain, _ in chains
+        ),
+        closed=tuple(is_closed for _, is_closed in chains),
+        faces_world=np.array(faces).reshape(-1, 4, 3),
+        floor_m=floor_m,
+    )
+
+
+def _level(
+    planes: Sequence[Plane], corners: NDArray[np.float64], up: NDArray[np.float64]
+) -> int | None:
+    """The largest level plane that faces a direction."""
+    limit = math.cos(math.radians(LEVEL_LIMIT_DEG))
+    areas = {
+        k: float(np.linalg.norm(np.cross(quad[1] - quad[0], quad[3] - quad[0])))
+        for k, (plane, quad) in enumerate(zip(planes, corners, strict=True))
+        if float(plane.normal @ up) > limit
+    }
+    return max(areas, key=areas.__getitem__, default=None)
+
+
+def _bounding(
+    planes: Sequence[Plane], corners: NDArray[np.float64], basis: NDArray[np.float64]
+) -> list[_Wall]:
+    """The walls, without those that are relief on one before them."""
+    limit = math.sin(math.radians(LEVEL_LIMIT_DEG))
+    upright = [
+        _Wall(
+            index=k,
+            plane=plane,
+            corners=quad,
+            ends=np.array([quad[:2].mean(axis=0), quad[2:].mean(axis=0)]) @ basis[:2].T,
+        )
+        for k, (plane, quad) in enumerate(zip(planes, corners, strict=True))
+        if abs(float(plane.normal @ basis[2])) < limit
+    ]
+    kept: list[_Wall] = []
+    for wall in upright:
+        if not any(_is_relief(wall, larger) for larger in kept):
+            kept.append(wall)
+    return kept
+
+
+def _is_relief(wall: _Wall, larger: _Wall) -> bool:
+    """Whether a wall lies before or behind most of a larger one and faces the same way."""
+    if float(wall.plane.normal @ larger.plane.normal) < math.cos(math.radians(LEVEL_LIMIT_DEG)):
+        return False
+    middle = wall.corners.mean(axis=0)
+    along = (larger.ends[1] - larger.ends[0]) / larger.length_m
+    places = np.clip((wall.ends - larger.ends[0]) @ along, 0.0, larger.length_m)
+    overlap_m = float(np.ptp(places))
+    return (
+        abs(float(larger.plane.distances_m(middle[None])[0])) < _RELIEF_M
+        and overlap_m > 0.5 * wall.length_m
+    )
+
+
+def _joints(walls: Sequence[_Wall]) -> dict[_End, _End]:
+    """Ends of walls that meet, each with one other, the nearest first."""
+    candidates: list[tuple[float, _End, _End]] = []
+    for (i, first), (j, second) in combinations(enumerate(walls), 2):
+        crossing = _crossing(first, second)
+        if crossing is None:
+            continue
+        for here, there in product((0, 1), repeat=2):
+            gaps = (
+                float(np.linalg.norm(crossing - first.ends[here])),
+                float(np.linalg.norm(crossing - second.ends[there])),
+            )
+            limits = (min(_JOINED_M, 0.5 * wall.length_m) for wall in (first, second))
+            if all(gap <= limit for gap, limit in zip(gaps, limits, strict=True)):
+                candidates.append((sum(gaps), (i, here), (j, there)))
+    joints: dict[_End, _End] = {}
+    for _, one, other in sorted(candidates):
+        if one not in joints and other not in joints:
+            joints[one], joints[other] = other, one
+    return joints
+
+
+def _crossing(first: _Wall, second: _Wall) -> NDArray[np.float64] | None:
+    """Where two walls' lines cross in plan."""
+    along = [wall.ends[1] - wall.ends[0] for wall in (first, second)]
+    matrix = np.column_stack([along[0], -along[1]])
+    size = first.length_m * second.length_m
+    if size == 0.0 or abs(float(np.linalg.det(matrix))) < 0.3 * size:
+        return None
+    return np.asarray(
+        first.ends[0] + np.linalg.solve(matrix, second.ends[0] - first.ends[0])[0] * along[0]
+    )
+
+
+def _chains(count: int, joints: dict[_End, _End]) -> list[tuple[list[_End], bool]]:
+    """Walls that follow one another, each with the end at which it is entered; whether closed."""
+    left = set(range(count))
+    chains: list[tuple[list[_End], bool]] = []
+    # From free ends first, so that what is not closed is walked from its beginning.
+    free = [(k, side) for k, side in product(range(count), (0, 1)) if (k, side) not in joints]
+    for start in [*free, *((k, 0) for k in range(count))]:
+        if start[0] not in left:
+            continue
+        chain: list[_End] = []
+        entered: _End | None = start
+        while entered is not None and entered[0] in left:
+            left.remove(entered[0])
+            chain.append(entered)
+            entered = joints.get((entered[0], 1 - entered[1]))
+        if len(chain) > 1:
+            chains.append((chain, entered == start and len(chain) > 2))
+    return chains
+
+
+def _chain_points(
+    walls: Sequence[_Wall],
+    chain: Sequence[_End],
+    joints: dict[_End, _End],
+    basis: NDArray[np.float64],
+    floor_m: float,
+) -> NDArray[np.float64]:
+    points = []
+    for place, side in chain:
+        points.append(_corner_in_plan(walls, (place, side), joints))
+    last = (chain[-1][0], 1 - chain[-1][1])
+    if joints.get(last) != chain[0]:
+        points.append(_corner_in_plan(walls, last, joints))
+    heights = np.full((len(points), 1), floor_m)
+    return np.asarray(np.hstack([np.array(points), heights]) @ basis)
+
+
+def _corner_in_plan(
+    walls: Sequence[_Wall], end: _End, joints: dict[_End, _End]
+) -> NDArray[np.float64]:
+    own = walls[end[0]]
+    other = joints.get(end)
+    crossing = None if other is None else _crossing(own, walls[other[0]])
+    return own.ends[end[1]] if crossing is None else crossing
+
+
+def _face(
+    walls: Sequence[_Wall], place: int, joints: dict[_End, _End], levels: Sequence[Plane | None]
+) -> NDArray[np.float64]:
+    """Corners (4, 3) of a wall between its neighbours, ceiling and floor."""
+    own = walls[place]
+    sides = []
+    for side, (top, bottom) in enumerate(((0, 1), (3, 2))):
+        line = (own.corners[top], own.corners[bottom] - own.corners[top])
+        other = joints.get((place, side))
+        met = None if other is None else line_of(own.plane, walls[other[0]].plane)
+        if met is not None:
+            line = met
+        sides.append(
+            [
+                _on_line(line, level, own.corners[k])
+                for level, k in zip(levels, (top, bottom), strict=True)
+            ]
+        )
+    (top_left, bottom_left), (top_right, bottom_right) = sides
+    return np.array([top_left, bottom_left, bottom_right, top_right])
+
+
+def _on_line(
+    line: tuple[NDArray[np.float64], NDArray[np.float64]],
+    level: Plane | None,
+    near: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Where a line meets floor or ceiling; without one, the place on it nearest to a point."""
+    point, direction = line
+    if level is None:
+        return np.asarray(point + (near - point) @ direction / (direction @ direction) * direction)
+    share = (level.offset_m - level.normal @ point) / (level.normal @ direction)
+    return np.asarray(point + share * direction)

@@ -1,0 +1,204 @@
+"""Orthoimages of a run as a STAC collection: an item beside each GeoTIFF, links relative.
+
+STAC 1.1.0 with the extensions projection 2.0.0 and file 2.1.0. Only rasters in a map are on Earth;
+those in the plane of a wall are items without a geometry, as STAC allows.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from orthoflow.errors import ArgumentError
+from orthoflow.files.raster_places import RasterPlace, place_of
+from orthoflow.files.sidecars import read_sidecar
+from orthoflow.foreign_text import shown
+from orthoflow.products import JsonValue
+from orthoflow.records.published import PRODUCTS_FOLDER
+from orthoflow.records.run_files import copy_files, creating
+from orthoflow.records.runs import Run
+
+COLLECTION_FILE: Final = "collection.json"
+_VERSION: Final = "1.1.0"
+_PROJECTION: Final = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
+_FILE: Final = "https://stac-extensions.github.io/file/v2.1.0/schema.json"
+_GEOTIFF: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
+_ORTHO: Final = "_ortho.tif"
+# Beside an orthoimage, by the end of its name: key, media type, roles.
+_BESIDE: Final = {
+    "_ortho.tif": ("image", _GEOTIFF, ["data"]),
+    "_ortho_mask.tif": ("mask", "image/tiff; application=geotiff", ["metadata"]),
+    "_ortho.png": ("preview", "image/png", ["thumbnail"]),
+    "_ortho.json": ("placing", "application/json", ["metadata"]),
+}
+_EVERYWHERE: Final = (-180.0, -90.0, 180.0, 90.0)
+# Sizes that sha2-256 has in a multihash: its code and 32 bytes.
+_MULTIHASH: Final = "1220"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ortho:
+    """One orthoimage that was copied.
+
+    Attributes:
+        path: below the folder of the export.
+        address: of the cell that made it.
+        place: where it lies.
+    """
+
+    path: PurePosixPath
+    address: str
+    place: RasterPlace
+
+    @property
+    def item_path(self) -> PurePosixPath:
+        """The file of its item; `wall_0_ortho.json` says already where the wall is."""
+        return self.path.with_name(f"{self.path.stem}.item.json")
+
+
+def write_stac(run: Run, folder: Path) -> int:
+    """Copy the orthoimages of a run and write items and a collection; gives how many there are.
+
+    Args:
+        run: the run, with its published files.
+        folder: existing, empty.
+
+    Raises:
+        ArgumentError: the run published no orthoimage, or they are gone.
+        RecordError: a published file is not what it was.
+        StoreError: the disk refuses.
+    """
+    known = {file.path: file for file in run.record.published}
+    inside = {
+        f"{PRODUCTS_FOLDER}/{path.parent.name}/{path.name}": address
+        for address, files in run.files.items()
+        for path in files
+        # A repeat shows the same, and # would begin a fragment in a link.
+        if run.cells[address].repeat == 0 and path.name.endswith(tuple(_BESIDE))
+    }
+    copied = copy_files(
+        run.folder, folder, inside, {path: file.size_bytes for path, file in known.items()}
+    )
+    orthos = [
+        _Ortho(path=PurePosixPath(path), address=inside[path], place=place_of(folder / path))
+        for path in copied
+        if path.endswith(_ORTHO)
+    ]
+    if not orthos:
+        raise ArgumentError(
+            f"the run {run.record.run_id} has no orthoimages among its published files, so there "
+            "is nothing to describe"
+        )
+    for ortho in orthos:
+        beside = [path for path in copied if _is_beside(PurePosixPath(path), ortho)]
+        item = _item(run, folder, ortho, beside)
+        _write(folder, ortho.item_path, item)
+    _write(folder, PurePosixPath(COLLECTION_FILE), _collection(run, orthos))
+    return len(orthos)
+
+
+def _is_beside(path: PurePosixPath, ortho: _Ortho) -> bool:
+    stem = ortho.path.name.removesuffix(_ORTHO)
+    return path.parent == ortho.path.parent and path.name in {stem + end for end in _BESIDE}
+
+
+def _item(run: Run, folder: Path, ortho: _Ortho, beside: list[str]) -> dict[str, JsonValue]:
+    place, sidecar = ortho.place, read_sidecar(folder / ortho.path.with_suffix(".json"))
+    outline: list[JsonValue] = [list(corner) for corner in ortho.place.outline_lonlat]
+    geometry: JsonValue = {"type": "Polygon", "coordinates": [outline]} if outline else None
+    cell = run.cells[ortho.address]
+    up = "/".join([".."] * (len(ortho.item_path.parts) - 1)) or "."
+    collection = f"{up}/{COLLECTION_FILE}"
+    item: dict[str, JsonValue] = {
+        "type": "Feature",
+        "stac_version": _VERSION,
+        "stac_extensions": [_PROJECTION, _FILE],
+        "id": _item_id(ortho),
+        "collection": run.record.run_id,
+        "geometry": geometry,
+        "properties": {
+            "datetime": cell.ended or run.record.ended,
+            "title": f"{sidecar.get('name', 'wall')}, {ortho.address}",
+            "gsd": sidecar.get("gsd_m", place.transform[0]),  # type: ignore[dict-item]
+            "processing_digest": sidecar.get("product_digest"),  # type: ignore[dict-item]
+            "proj:code": None if place.epsg is None else f"EPSG:{place.epsg}",
+            "proj:wkt2": place.wkt2 or None,
+            "proj:shape": list(place.shape),
+            "proj:transform": list(place.transform),
+            "proj:bbox": list(place.bounds),
+        },
+        "links": [
+            {"rel": "root", "href": collection, "type": "application/json"},
+            {"rel": "parent", "href": collection, "type": "application/json"},
+            {"rel": "collection", "href": collection, "type": "application/json"},
+        ],
+        "assets": {
+            key: entry
+            for path in beside
+            for key, entry in (_asset(run, PurePosixPath(path), ortho),)
+        },
+    }
+    if place.outline_lonlat:
+        item["bbox"] = list(_bbox([place]))
+    return item
+
+
+def _asset(run: Run, path: PurePosixPath, ortho: _Ortho) -> tuple[str, dict[str, JsonValue]]:
+    stem = ortho.path.name.removesuffix(_ORTHO)
+    key, media_type, roles = _BESIDE[path.name.removeprefix(stem)]
+    entry: dict[str, JsonValue] = {"href": f"./{path.name}", "type": media_type, "roles": [*roles]}
+    for file in run.record.published:
+        if file.path == str(path):
+            entry["file:size"] = file.size_bytes
+            entry["file:checksum"] = f"{_MULTIHASH}{file.sha256}"
+    return key, entry
+
+
+def _collection(run: Run, orthos: list[_Ortho]) -> dict[str, JsonValue]:
+    record = run.record
+    on_earth = [ortho.place for ortho in orthos if ortho.place.outline_lonlat]
+    text = f"Orthoimages of the run {record.run_id} of the workflow {record.name}."
+    if len(on_earth) < len(orthos):
+        text += (
+            " Those without a geometry lie in the plane of their wall: their coordinate system is "
+            "none on Earth, and the extent of the collection says nothing of them."
+        )
+    bbox: list[JsonValue] = list(_bbox(on_earth) if on_earth else _EVERYWHERE)
+    items: list[JsonValue] = [
+        {"rel": "item", "href": f"./{ortho.item_path}", "type": "application/geo+json"}
+        for ortho in orthos
+    ]
+    root: JsonValue = {"rel": "root", "href": f"./{COLLECTION_FILE}", "type": "application/json"}
+    return {
+        "type": "Collection",
+        "stac_version": _VERSION,
+        "stac_extensions": [],
+        "id": record.run_id,
+        "title": record.name,
+        "description": text,
+        "license": "other",
+        "providers": [{"name": record.created_by, "roles": ["processor"]}],
+        "extent": {
+            "spatial": {"bbox": [bbox]},
+            "temporal": {"interval": [[record.started or None, record.ended or None]]},
+        },
+        "links": [root, *items],
+    }
+
+
+def _bbox(places: list[RasterPlace]) -> tuple[float, float, float, float]:
+    lon, lat = zip(*(corner for place in places for corner in place.outline_lonlat), strict=True)
+    return min(lon), min(lat), max(lon), max(lat)
+
+
+def _item_id(ortho: _Ortho) -> str:
+    return f"{shown(ortho.address)}.{ortho.path.stem}"
+
+
+def _write(folder: Path, path: PurePosixPath, content: Mapping[str, JsonValue]) -> None:
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    with creating(folder, str(path)) as stream:
+        stream.write(text.encode())

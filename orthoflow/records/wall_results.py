@@ -1,0 +1,274 @@
+"""What a run gives of each wall, by its published files: for drawings, at any size."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from orthoflow_provenance.model import RecordedCell
+from orthoflow_provenance.reader import open_record
+
+from orthoflow.errors import ArgumentError, RecordError
+from orthoflow.files.geotiff import RasterParts
+from orthoflow.files.sidecars import placed_raster, read_sidecar
+from orthoflow.geometry import WallFrame
+from orthoflow.products import CheckPoints, Inspection, Planes
+from orthoflow.records.published import published_files
+from orthoflow.records.runs import Run, record_errors
+from orthoflow.records.verification import published_state
+
+_RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
+# Of the accuracy that inspections found, what a drawing says: names of two numbers, and of what.
+_ACCURACY: Final = (
+    ("rmse_x_mm", "rmse_y_mm", "RMSE x {} mm, y {} mm"),
+    ("rmse_u_mm", "rmse_v_mm", "RMSE x {} mm, y {} mm"),
+    ("patch_rmse_u_mm", "patch_rmse_v_mm", "of patches RMSE x {} mm, y {} mm"),
+    ("rms_3d_mm", "max_3d_mm", "in space RMS {} mm, largest {} mm"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallResult:
+    """What a run gives of one wall.
+
+    Attributes:
+        number: of the wall, as its files have it.
+        name: what the run calls it.
+        plane_index: its plane's place in `planes.json`, or None where nothing says it.
+        frame: where the largest of its rasters lies.
+        rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, those that are there.
+        accuracy: sentences of the inspections of this wall, and its plane's noise.
+        colours: what was done to the colours of the photos; empty without an orthoimage.
+    """
+
+    number: int
+    name: str
+    plane_index: int | None
+    frame: WallFrame
+    rasters: dict[str, Path]
+    accuracy: tuple[str, ...]
+    colours: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoomResults:
+    """What a run gives of a room.
+
+    Attributes:
+        address: cell that gave the pictures.
+        walls: those with a raster, by number.
+        planes: all planes, None where the record has none.
+        checkpoints: surveyed points, None without.
+        inspections: address -> displacements found in these pictures; its walls are numbers here.
+    """
+
+    address: str
+    walls: tuple[WallResult, ...]
+    planes: Planes | None
+    checkpoints: CheckPoints | None
+    inspections: dict[str, Inspection]
+
+
+def content_digest(run: Run) -> str:
+    """The digest that seals the record of a run, 64 hexadecimal digits."""
+    with record_errors(run.path), open_record(run.path) as opened:
+        return opened.content_sha256
+
+
+def room_results(run: Run, cell: str | None = None) -> RoomResults:
+    """Gather what a run gives of its walls.
+
+    Args:
+        run: a finished run, whose published files are beside its record as it names them.
+        cell: address of the cell whose orthoimages, or else rasters of walls, are meant; without
+            it the last one that gave orthoimages, or else walls.
+
+    Raises:
+        ArgumentError: there is no such cell, or nothing to draw.
+        RecordError: a published file is not what the record says.
+    """
+    address = _pictured(run, cell)
+    upstream = tuple(cell.address for cell in run.upstream(address))
+    files: dict[int, dict[str, Path]] = {}
+    # What lies behind is looked at first, so that what the chosen cell itself gave counts.
+    for name in reversed(upstream):
+        if {"orthoimages", "walls"} & {out.type_name for out in run.cells[name].outputs.values()}:
+            for path in published_files(run.folder, name):
+                if found := _RASTER.fullmatch(path.name):
+                    files.setdefault(int(found[1]), {})[found[2]] = path
+    if not files:
+        raise ArgumentError(
+            f"no rasters of walls lie beside {run.path}, below {run.products_folder}: give the "
+            "run folder as the run left it"
+        )
+    planes = _upstream_product(run, upstream, "planes")
+    points = _upstream_product(run, (*upstream, *run.cells), "checkpoints")
+    # Rasters are made in the order of the planes, so places in `Walls` are places among them.
+    numbers = sorted(number for number, found in files.items() if "depth" in found)
+    inspections = {
+        name: _numbered(inspection, numbers or sorted(files))
+        for name, inspection in _inspections(run, address)
+    }
+    kept = Planes.from_payload(run.payload(*planes)) if planes else None
+    colours = _colours(run.cells[address])
+    return RoomResults(
+        address=address,
+        walls=tuple(
+            _wall_result(run, number, files[number], kept, inspections, colours)
+            for number in sorted(files)
+        ),
+        planes=kept,
+        checkpoints=CheckPoints.from_payload(run.payload(*points)) if points else None,
+        inspections=inspections,
+    )
+
+
+def _pictured(run: Run, cell: str | None) -> str:
+    found = {
+        name: [
+            address
+            for address, recorded in run.cells.items()
+            if any(output.type_name == name for output in recorded.outputs.values())
+        ]
+        for name in ("orthoimages", "walls")
+    }
+    if cell is None:
+        if not found["orthoimages"] and not found["walls"]:
+            raise ArgumentError(f"the run {run.record.run_id} has no orthoimages and no walls")
+        return (found["orthoimages"] or found["walls"])[-1]
+    run.cell(cell)
+    everything = [*found["orthoimages"], *found["walls"]]
+    if cell not in everything:
+        raise ArgumentError(
+            f"the cell {cell} holds no orthoimages or walls; those of this run: "
+            f"{', '.join(everything) or 'none'}"
+        )
+    return cell
+
+
+def _upstream_product(
+    run: Run, addresses: tuple[str, ...], type_name: str
+) -> tuple[str, str] | None:
+    """Address and port of the first product of a type that the record holds."""
+    for address in addresses:
+        for port, output in run.cells[address].outputs.items():
+            if output.type_name == type_name and output.embedded:
+                return address, port
+    return None
+
+
+def _inspections(run: Run, address: str) -> Iterator[tuple[str, Inspection]]:
+    shown = {output.digest for output in run.cells[address].outputs.values()}
+    for name, recorded in run.cells.items():
+        if shown & {item.digest for item in recorded.inputs.values()}:
+            for port, output in recorded.outputs.items():
+                if output.type_name == "inspection" and output.embedded:
+                    yield name, Inspection.from_payload(run.payload(name, port))
+
+
+def _numbered(inspection: Inspection, numbers: list[int]) -> Inspection:
+    """Give an inspection with numbers of walls in the place of places in `Walls`."""
+    number_of = dict(enumerate(numbers))
+    walls = [number_of.get(place, -1) for place in inspection.wall.tolist()]
+    return replace(
+        inspection,
+        wall=np.array(walls, dtype=np.int32),
+        findings=tuple(
+            replace(item, wall=number_of.get(item.wall, -1)) for item in inspection.findings
+        ),
+    )
+
+
+def _wall_result(
+    run: Run,
+    number: int,
+    rasters: dict[str, Path],
+    planes: Planes | None,
+    inspections: dict[str, Inspection],
+    colours: str,
+) -> WallResult:
+    for path in rasters.values():
+        _check_unchanged(run, path)
+        _check_unchanged(run, path.with_suffix(".json"))
+    first = rasters[next(kind for kind in ("ortho", "depth", "intensity") if kind in rasters)]
+    for kind, path in rasters.items():
+        _check_kind(kind, path)
+    frame, content = placed_raster(first)
+    about = read_sidecar(rasters["depth"].with_suffix(".json")) if "depth" in rasters else {}
+    index = about.get("plane_index", number)
+    known = planes is not None and isinstance(index, int) and 0 <= index < len(planes)
+    plane_index = index if known and isinstance(index, int) else None
+    said = list(_accuracy(inspections, number))
+    if planes is not None and plane_index is not None:
+        rms_mm = 1e3 * float(planes.rms_m[plane_index])
+        said.append(
+            f"plane fitted to {int(planes.n_points[plane_index]):,} points, RMS {rms_mm:.1f} mm"
+        )
+    return WallResult(
+        number=number,
+        name=str(content.get("name") or f"wall {number}"),
+        plane_index=plane_index,
+        frame=frame,
+        rasters=rasters,
+        accuracy=tuple(said),
+        colours=colours if "ortho" in rasters else "",
+    )
+
+
+def _check_kind(kind: str, path: Path) -> None:
+    """Refuse a raster that does not hold what its name says."""
+    with RasterParts(path) as raster:
+        found = (raster.bands, raster.dtype)
+    wanted = ((3, "uint8"), (3, "uint16")) if kind == "ortho" else ((1, "float32"),)
+    if found not in wanted:
+        raise RecordError(
+            f"{path} must have {wanted[0][0]} bands of {' or '.join(name for _, name in wanted)}, "
+            f"got {found[0]} of {found[1]}"
+        )
+
+
+def _check_unchanged(run: Run, path: Path) -> None:
+    """Refuse a published file that is not as the record says: a drawing would lie about it."""
+    name = path.relative_to(run.folder).as_posix()
+    expected = {file.path: file for file in run.record.published}.get(name)
+    if expected is None:
+        raise RecordError(
+            f"{path} is not named in the record of the run, so nothing vouches for it"
+        )
+    state = published_state(run.folder, expected)
+    if state == "changed":
+        raise RecordError(
+            f"{path} was changed after the run: the record says that it has the digest "
+            f"{expected.sha256}"
+        )
+    if state != "same":
+        raise RecordError(f"{path} cannot be read: {state}")
+
+
+def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[str]:
+    for address, inspection in inspections.items():
+        own = {item.name: item.value for item in inspection.findings if item.wall == wall}
+        everywhere = {item.name: item.value for item in inspection.findings if item.wall < 0}
+        for values, whose in ((own, ""), (everywhere, " (all walls)")):
+            said = [
+                text.format(f"{values[first]:.1f}", f"{values[second]:.1f}")
+                for first, second, text in _ACCURACY
+                if first in values and second in values
+            ]
+            if said:
+                yield f"{address}: {'; '.join(said)}{whose}"
+                break
+
+
+def _colours(cell: RecordedCell) -> str:
+    """What the record says was done to the photos' colours."""
+    gains = cell.params.get("gains")
+    if gains is None:
+        return f"colours as {cell.method} gave them"
+    if gains == "none":
+        return "colours untouched: as photos or scan have them"
+    return f"colours balanced between photos (gains: {gains})"

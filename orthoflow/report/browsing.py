@@ -1,0 +1,183 @@
+"""Many runs at a glance: which lie below some folders, what came out, and in what they differ."""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal, TypeAlias
+
+from orthoflow.engine.run_folder import JOURNAL
+from orthoflow.errors import ArgumentError, OrthoflowError
+from orthoflow.files.json_texts import parse_json
+from orthoflow.products import JsonValue
+from orthoflow.records import RECORD_FILE, Run, cell_metrics, open_run
+from orthoflow.records.datasets import parts_of
+from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.summaries import QUALITY
+
+RunState: TypeAlias = Literal["ok", "failed", "unfinished", "damaged"]
+
+# Runs lie in runs/, sorted into folders at most; deeper lies something else.
+_DEEPEST: Final = 6
+# Folders of a run, and of what is no run: to look into them costs time and finds nothing.
+_NO_RUNS: Final = frozenset({"products", "logs", "pages", "node_modules", "__pycache__"})
+_FIRST_LINE_BYTES: Final = 1 << 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """What a table of runs says of one.
+
+    Attributes:
+        folder: of the run, as its finder named it.
+        state: `ok`; `failed`, some cell did; `unfinished`, there is no record yet; `damaged`, the
+            record cannot be read.
+        reason: what failed, first, or why it cannot be read; empty where all is well.
+        workflow: name of the workflow.
+        run_id: of the run.
+        started: ISO 8601 UTC; empty where nothing says it.
+        metrics: numbers of the baseline by `step.metric`, and by `metric` alone as the last step
+            has it; of several datasets the median.
+        facts: what may differ between runs, as JSON: parameters by `cell.parameter`, `seed`,
+            `orthoflow` (its version), and inputs by `input <name>`.
+    """
+
+    folder: Path
+    state: RunState
+    reason: str = ""
+    workflow: str = ""
+    run_id: str = ""
+    started: str = ""
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    facts: Mapping[str, JsonValue] = field(default_factory=dict)
+
+
+def run_folders(folders: Sequence[Path]) -> list[Path]:
+    """Find the run folders in and below some folders, sorted; no link is followed.
+
+    Raises:
+        ArgumentError: one of them is no folder.
+    """
+    found: dict[Path, None] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise ArgumentError(f"{folder} is no folder: give folders that runs lie in")
+        found.update(dict.fromkeys(_below(folder)))
+    return list(found)
+
+
+def summaries(folders: Iterable[Path]) -> Iterator[RunSummary]:
+    """Sum up run folders one after the other; what cannot be read is told, not raised."""
+    for folder in folders:
+        yield _summary(folder)
+
+
+def differing_facts(runs: Sequence[RunSummary]) -> dict[Path, dict[str, JsonValue]]:
+    """What of its facts tells each run from others of the same workflow, by its folder.
+
+    A fact that some of them lack differs only where two others disagree on it.
+    """
+    values: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        for name, value in run.facts.items():
+            values.setdefault((run.workflow, name), set()).add(json.dumps(value, sort_keys=True))
+    return {
+        run.folder: {
+            name: value for name, value in run.facts.items() if len(values[run.workflow, name]) > 1
+        }
+        for run in runs
+    }
+
+
+def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
+    """Names of the numbers that say how good some runs are, those of most of them first."""
+    counts = dict.fromkeys(QUALITY, 0)
+    for run in runs:
+        for name in counts:
+            counts[name] += name in run.metrics
+    told = [name for name, count in counts.items() if count]
+    chosen = sorted(told, key=lambda name: -counts[name])[:most]
+    return [name for name in told if name in chosen]
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    for place, folders, files in os.walk(folder):
+        if RECORD_FILE in files or JOURNAL in files:
+            folders.clear()
+            yield Path(place)
+            continue
+        depth = len(Path(place).relative_to(folder).parts)
+        folders[:] = sorted(
+            name
+            for name in folders
+            if depth < _DEEPEST and name not in _NO_RUNS and not name.startswith(".")
+        )
+
+
+def _summary(folder: Path) -> RunSummary:
+    if not (folder / RECORD_FILE).exists():
+        return _unfinished(folder)
+    try:
+        return _of_run(folder, open_run(folder))
+    except OrthoflowError as error:
+        return RunSummary(folder=folder, state="damaged", reason=str(error))
+    except Exception as error:  # noqa: BLE001 - a record may hold anything; the others shall be told
+        reason = f"the record is not as one was written: {type(error).__name__}: {error}"
+        return RunSummary(folder=folder, state="damaged", reason=reason)
+
+
+def _of_run(folder: Path, run: Run) -> RunSummary:
+    record = run.record
+    failed = next((cell for cell in record.cells if cell.status == "failed"), None)
+    facts: dict[str, JsonValue] = {"seed": record.seed, "orthoflow": record.created_by}
+    for given in record.inputs:
+        facts[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
+    for cell in record.cells:
+        if cell.repeat == 0 and cell.status != "skipped":
+            facts |= {f"{cell.address}.{name}": value for name, value in cell.params.items()}
+    return RunSummary(
+        folder=folder,
+        state=record.status,
+        reason="" if failed is None else f"{failed.address}: {failed.error_message}",
+        workflow=record.name,
+        run_id=record.run_id,
+        started=record.started,
+        metrics=_metrics(run),
+        facts=facts,
+    )
+
+
+def _metrics(run: Run) -> dict[str, float]:
+    """Numbers of the baseline; of several datasets the median of those that have one."""
+    values: dict[str, list[float]] = {}
+    for part in parts_of(run).values() or (run,):
+        own: dict[str, float] = {}
+        for cell in baseline_cells(part):
+            for row in cell_metrics(cell):
+                own |= {f"{row.step}.{row.metric}": row.value, row.metric: row.value}
+        for name, value in own.items():
+            values.setdefault(name, []).append(value)
+    return {name: statistics.median(found) for name, found in values.items()}
+
+
+def _unfinished(folder: Path) -> RunSummary:
+    """What the first line of the journal says of a run without a record."""
+    try:
+        with (folder / JOURNAL).open("rb") as journal:
+            first = parse_json(journal.readline(_FIRST_LINE_BYTES).decode("utf-8"))
+    except (OSError, ValueError) as error:
+        reason = f"it has no {RECORD_FILE}, and its journal cannot be read: {error}"
+        return RunSummary(folder=folder, state="damaged", reason=reason)
+    said = first if isinstance(first, dict) else {}
+    return RunSummary(
+        folder=folder,
+        state="unfinished",
+        reason=f"goes on with the same command and -o {folder}, if it does not run just now",
+        workflow=str(said.get("workflow", "")),
+        run_id=str(said.get("run_id", "")),
+        started=str(said.get("time", "")),
+    )

@@ -1,0 +1,270 @@
+"""A finished run for people at a Python prompt or in a notebook: tables, pictures, arrays."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import ArgumentError, PluginError
+from orthoflow.foreign_text import shown
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.levels import Colours, eight_bits
+from orthoflow.products import Orthoimage, Orthoimages, OrthoMask
+from orthoflow.records import (
+    RecordedFigure,
+    Run,
+    RunComparison,
+    cell_metrics,
+    compare_runs,
+)
+from orthoflow.records import open_run as open_plain_run
+from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.pictures import embedded_products, thumbnail
+from orthoflow.report.summaries import answers
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_THUMBNAIL_PX: Final = 320
+_SHOWN: Final = (OrthoMask.PAINTED, OrthoMask.FILLED)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class OpenedRun(Run):
+    """A finished run; `Run` has what programs need, and here is what people want to see."""
+
+    def metrics(self) -> pd.DataFrame:
+        """Every number of every cell, a row each.
+
+        Returns:
+            Columns `cell`, `step`, `method`, one per step that varies (`data` for datasets; the
+            variant, missing where the cell does not have it), `repeat`, `metric`, `value`, `unit`.
+        """
+        import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
+
+        varied = list(
+            dict.fromkeys(step for cell in self.cells.values() for step in cell.assignment)
+        )
+        rows = [
+            (
+                cell.address,
+                cell.step,
+                cell.method,
+                *(cell.assignment.get(step) for step in varied),
+                cell.repeat,
+                row.metric,
+                row.value,
+                row.unit,
+            )
+            for cell in self.record.cells
+            for row in cell_metrics(cell)
+        ]
+        # A step may be called as a column is.
+        columns = ["cell", "step", "method", *(f"{step}=" for step in varied)]
+        return pd.DataFrame(rows, columns=[*columns, "repeat", "metric", "value", "unit"])
+
+    @cached_property
+    def figures(self) -> Figures:
+        """All pictures of the methods, by `cell/name`; a notebook shows them."""
+        return Figures(
+            {
+                f"{cell.address}/{figure.name}": figure
+                for cell in self.record.cells
+                for figure in cell.figures
+            }
+        )
+
+    def orthoimage(self, number: int | None = None, *, cell: str | None = None) -> WallImage:
+        """Give the orthoimage of a wall as an array with its frame.
+
+        Args:
+            number: of the wall, as in the names of its files; None for the first one.
+            cell: address of the cell that made it; None for that of the baseline.
+
+        Raises:
+            ArgumentError: the run has no such orthoimage; says which there are.
+        """
+        places = dict(embedded_products(self, "orthoimages"))
+        baseline = [one.address for one in baseline_cells(self) if one.address in places]
+        chosen = cell or next(iter([*baseline, *places]), "")
+        if chosen not in places:
+            raise ArgumentError(
+                f"the run {self.record.run_id} has no orthoimages of {cell or 'any cell'}; cells "
+                f"with some: {', '.join(places) or 'none'}"
+            )
+        images = Orthoimages.from_payload(self.payload(chosen, places[chosen])).images
+        found = [image for image in images if number is None or image.number == number]
+        if not found:
+            numbers = ", ".join(str(image.number) for image in images)
+            raise ArgumentError(f"{chosen} has no orthoimage of wall {number}; walls: {numbers}")
+        image = found[0]
+        name = f"wall_{image.number}_ortho.tif"
+        files = [file for file in self.files.get(chosen, ()) if file.name == name]
+        return WallImage(image=image, cell=chosen, file=files[0] if files else None)
+
+    def compare(self, other: str | Path | Run) -> RunComparison:
+        """Lay this run beside another one, see `RunComparison`.
+
+        Raises:
+            ArgumentError: there is no such run.
+            RecordError: a record is damaged.
+        """
+        return compare_runs(self, other if isinstance(other, Run) else open_plain_run(other))
+
+    def _repr_html_(self) -> str:
+        record = self.record
+        made = {cell.address for cell in baseline_cells(self)}
+        picture = thumbnail(self, made, longest_side_px=_THUMBNAIL_PX)
+        rows = "".join(
+            f"<tr><td>{_html(one.what)}</td><td>{_html(one.value)}</td><td>{_html(one.cell)}</td></tr>"
+            for one in answers(self)
+        )
+        counts = _html(repr(self))
+        return (
+            f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>{counts}</p>"
+            + (f'<img alt="first orthoimage" src="{picture}">' if picture else "")
+            + (f"<table>{rows}</table>" if rows else "")
+            + "</div>"
+        )
+
+
+def open_run(path: str | Path) -> OpenedRun:
+    """Open a finished run.
+
+    Args:
+        path: a run folder, or the `run.h5` in it.
+
+    Raises:
+        ArgumentError: nothing is there, or the folder holds no finished run.
+        RecordError: the record is damaged, no record at all, or of a newer format.
+    """
+    plain = open_plain_run(path)
+    return OpenedRun(path=plain.path, record=plain.record)
+
+
+class Figures(Mapping[str, RecordedFigure]):
+    """Pictures by name."""
+
+    def __init__(self, figures: Mapping[str, RecordedFigure]) -> None:
+        self._figures = dict(figures)
+
+    def __getitem__(self, name: str) -> ShownFigure:
+        figure = self._figures[name]
+        return ShownFigure(**vars(figure))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._figures)
+
+    def __len__(self) -> int:
+        return len(self._figures)
+
+    def __repr__(self) -> str:
+        return "\n".join(f"{name}: {shown(one.caption)}" for name, one in self._figures.items())
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownFigure(RecordedFigure):
+    """A picture that a notebook shows."""
+
+    def save(self, path: str | Path) -> None:
+        """Write the picture's bytes to a file."""
+        Path(path).write_bytes(self.data)
+
+    def _repr_html_(self) -> str:
+        return _picture(self.data, self.media_type, self.caption)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class WallImage:
+    """An orthoimage as an array: `numpy.asarray(it)` is `rgb`.
+
+    Attributes:
+        image: the product with colours, mask, sources and frame.
+        cell: address of the cell that made it.
+        file: its GeoTIFF, None where the run's files are not beside the record.
+    """
+
+    image: Orthoimage
+    cell: str
+    file: Path | None
+
+    @property
+    def rgb(self) -> Colours:
+        """(rows, columns, 3) uint8, or uint16 of deep photos; 0 where nothing is shown."""
+        return self.image.rgb
+
+    @property
+    def is_shown(self) -> NDArray[np.bool_]:
+        """(rows, columns), where a photo, or its neighbours, gave a colour."""
+        return np.isin(self.image.mask, _SHOWN)
+
+    @property
+    def frame(self) -> WallFrame:
+        """Where the cells lie: `frame.world_from_wall` gives metres."""
+        return self.image.frame
+
+    def to_xarray(self) -> Any:  # Any: of a library that need not be there
+        """Give an `xarray.DataArray` with metres along the wall, y upwards, as the GeoTIFF has.
+
+        Raises:
+            PluginError: xarray is not installed.
+        """
+        try:
+            import xarray  # noqa: PLC0415 - optional
+        except ImportError as error:
+            raise PluginError("to_xarray needs xarray: pip install xarray") from error
+        frame = self.frame
+        left, top = frame.raster_corner_m
+        return xarray.DataArray(
+            self.rgb,
+            dims=("y", "x", "band"),
+            coords={
+                "y": top - frame.gsd_m * (np.arange(frame.height) + 0.5),
+                "x": left + frame.gsd_m * (np.arange(frame.width) + 0.5),
+                "band": ["red", "green", "blue"],
+            },
+            name=self.image.name,
+            attrs={"unit": "m", "gsd_m": frame.gsd_m},
+        )
+
+    def __array__(
+        self, dtype: np.dtype[Any] | None = None, *, copy: bool | None = None
+    ) -> NDArray[Any]:
+        return np.array(self.rgb, dtype=dtype, copy=copy)
+
+    def __repr__(self) -> str:
+        frame = self.frame
+        return (
+            f"<WallImage {shown(self.image.name)} of {shown(self.cell)}: {frame.height} rows, "
+            f"{frame.width} columns of {1e3 * frame.gsd_m:g} mm>"
+        )
+
+    def _repr_html_(self) -> str:
+        from orthoflow.files.images import cells_webp  # noqa: PLC0415 - only pictures need it
+
+        picture = cells_webp(
+            self.image.mask.shape,
+            lambda part: (eight_bits(self.rgb[part]), np.isin(self.image.mask[part], _SHOWN)),
+            longest_side_px=2 * _THUMBNAIL_PX,
+        )
+        return _picture(picture, "image/webp", repr(self))
+
+
+def _picture(data: bytes, media_type: str, caption: str) -> str:
+    uri = f"data:{media_type};base64,{base64.b64encode(data).decode('ascii')}"
+    return (
+        f'<figure><img src="{escape(uri)}" alt="{_html(caption)}" style="max-width:100%">'
+        f"<figcaption>{_html(caption)}</figcaption></figure>"
+    )
+
+
+def _html(text: str) -> str:
+    return escape(shown(text))

@@ -1,0 +1,223 @@
+"""A first workflow for somebody's own files: a shipped recipe that names them, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal, TypeAlias
+
+from orthoflow.errors import InputError
+from orthoflow.files.points.formats import TEXT
+from orthoflow.workflow.recipes import shipped_workflow
+from orthoflow.workflow.recognising import PHOTO_SUFFIXES, FileKind, Recognised
+
+Recipe: TypeAlias = Literal["photos-on-scan", "direct", "plan"]
+
+# What stands in for a scan where there is none.
+_STAND_INS: Final = ("room", "check")
+_PLAIN: Final = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
+_INPUT: Final = re.compile(r"  (\w+): \{.*?\}( *#.*)?")
+_MOST_LISTED: Final = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draft:
+    """A workflow to be written.
+
+    Attributes:
+        recipe: name of the shipped one that it follows.
+        text: of the file.
+        inputs: what each input holds, in words.
+        left_out: files that no input takes, and why.
+    """
+
+    recipe: Recipe
+    text: str
+    inputs: Mapping[str, str]
+    left_out: Sequence[str]
+
+
+def draft_workflow(found: Sequence[Recognised], target: Path, recipe: Recipe | None) -> Draft:
+    """Write the workflow that fits some files.
+
+    Args:
+        found: what the files are.
+        target: where the workflow will lie; paths in it start there.
+        recipe: the one that it shall follow, or None: photos on the scan where there are photos,
+            the scan's own colours otherwise.
+
+    Raises:
+        InputError: there is no scan, or no photo where the recipe needs some.
+    """
+    by_kind: dict[FileKind, list[Recognised]] = {}
+    for item in found:
+        by_kind.setdefault(item.kind, []).append(item)
+    scans = by_kind.get("scan", [])
+    if not scans:
+        others = "; ".join(f"{item.path.name}: {item.said}" for item in found[:_MOST_LISTED])
+        raise InputError(
+            "there is no scan among the files, and a workflow needs one (E57, LAS, LAZ, PLY, PCD, "
+            f"PTX or text); found {others or 'nothing'}"
+        )
+    own_formats = [scan for scan in scans if scan.path.suffix.lower() not in TEXT.suffixes]
+    if own_formats and len(own_formats) < len(scans):
+        # Notes hold numbers too.
+        by_kind["unknown"] = [
+            *by_kind.get("unknown", []),
+            *(
+                replace(scan, said="text, left out beside scans of other formats")
+                for scan in scans
+                if scan not in own_formats
+            ),
+        ]
+        scans = by_kind["scan"] = own_formats
+    own_photos = [scan for scan in scans if scan.n_photos]
+    has_photos = bool(by_kind.get("photos") or own_photos)
+    chosen: Recipe = recipe or ("photos-on-scan" if has_photos else "direct")
+    if chosen == "photos-on-scan" and not has_photos:
+        raise InputError("photos-on-scan needs photos, and there are none among the files")
+    if own_photos and "photos" not in by_kind:
+        # Photos that a scanner took lie in its file, with their poses.
+        inside = [replace(scan, said="the photos in it") for scan in own_photos]
+        by_kind["photos"] = inside
+        if len(inside) == 1:
+            by_kind.setdefault("cameras", [replace(inside[0], said="the poses of its photos")])
+    return _Drafting(by_kind=by_kind, target=target, recipe=chosen).draft()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Drafting:
+    """The text, from the recipe's."""
+
+    by_kind: Mapping[FileKind, Sequence[Recognised]]
+    target: Path
+    recipe: Recipe
+
+    def draft(self) -> Draft:
+        """Give the recipe with its inputs filled in, and a heading of its own."""
+        shipped = shipped_workflow(self.recipe).read_text(encoding="utf-8")
+        start, inputs, steps = re.split(r"^(?=orthoflow:|steps:)", shipped, flags=re.MULTILINE)
+        taken, left_out = self._assigned(inputs)
+        lines = []
+        for line in inputs.splitlines():
+            match = _INPUT.fullmatch(line)
+            files = taken.get(match[1], ()) if match else ()
+            lines.append(self._input_line(match[1], files) if match and files else line)
+        told = {name: _told(files) for name, files in taken.items() if files}
+        name = re.sub(r"[^A-Za-z0-9_-]+", "-", self.target.stem).strip("-") or self.recipe
+        body = re.sub(r"^name: .*$", f"name: {name}", "\n".join(lines), flags=re.MULTILINE)
+        text = f"{self._heading(start, told, left_out)}{body}\n{_without_stand_ins(steps)}"
+        return Draft(recipe=self.recipe, text=text, inputs=told, left_out=left_out)
+
+    def _assigned(self, inputs: str) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
+        """Which input takes which files, and what is left over."""
+        names = [match[1] for line in inputs.splitlines() if (match := _INPUT.fullmatch(line))]
+        taken: dict[str, Sequence[Recognised]] = {}
+        left_out = []
+        for kind, items in self.by_kind.items():
+            takes_many = kind in ("scan", "photos", "other")
+            if kind == "unknown":
+                reasons: dict[str, list[str]] = {}
+                for item in items:
+                    reasons.setdefault(item.said, []).append(item.path.name)
+                left_out += [f"{_some(each)}: {reason}" for reason, each in reasons.items()]
+            elif kind not in names:
+                left_out += [
+                    f"{item.path.name}: {item.said}; {self.recipe} has no input for it"
+                    for item in items
+                ]
+            elif len(items) > 1 and not takes_many:
+                each = ", ".join(item.path.name for item in items)
+                left_out.append(f"{each}: {kind} may be one of them only; name it under inputs")
+            else:
+                taken[kind] = items
+        return taken, left_out
+
+    def _input_line(self, name: str, items: Sequence[Recognised]) -> str:
+        paths = _folders_of_photos(items) if name == "photos" else [item.path for item in items]
+        places = [_yaml(self._place(path)) for path in paths]
+        if name == "other":
+            places += [_yaml(self._place(path.with_suffix(".json"))) for path in paths]
+        if len(places) == 1:
+            return f"  {name}: {{files: {places[0]}}}  # {_told(items)}"
+        listed = "\n".join(f"      - {place}" for place in places)
+        return f"  {name}:  # {_told(items)}\n    files:\n{listed}"
+
+    def _place(self, path: Path) -> str:
+        """A path as the workflow names it: from its folder."""
+        relative = os.path.relpath(path.resolve(), self.target.resolve().parent)
+        return Path(relative).as_posix()
+
+    def _heading(self, start: str, told: Mapping[str, str], left_out: Sequence[str]) -> str:
+        said = [f"# Made by `orthoflow new` from the recipe {self.recipe}.yaml."]
+        said += [f"#   {name}: {text}" for name, text in told.items()]
+        said += [f"# Not used: {text}" for text in left_out[:_MOST_LISTED]]
+        run = json.dumps(self.target.name)[1:-1]
+        said += [
+            "#",
+            f"#   orthoflow check {run}       is anything wrong with it?",
+            f"#   orthoflow plan {run}        what would run",
+            f"#   orthoflow run {run} --set wall.gsd_m=0.02    a coarse first look; then without",
+            "#",
+            "# What follows are the recipe's own words.",
+            "#",
+        ]
+        return "\n".join(said) + "\n" + start
+
+
+def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
+    """Paths of photos; a folder stands for all that lie in it."""
+    paths = [item.path for item in items]
+    places: dict[Path, None] = {}
+    for path in paths:
+        inside = [p for p in path.parent.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES]
+        whole = path.suffix.lower() in PHOTO_SUFFIXES and set(inside) <= set(paths)
+        # A folder among whose files are scans would bring these along.
+        whole = whole and len(inside) > 1 and _holds_only(path.parent, PHOTO_SUFFIXES)
+        places[path.parent if whole else path] = None
+    return list(places)
+
+
+def _holds_only(folder: Path, suffixes: Sequence[str]) -> bool:
+    return all(path.suffix.lower() in suffixes for path in folder.iterdir() if path.is_file())
+
+
+def _told(items: Sequence[Recognised]) -> str:
+    """What some files are, in one line."""
+    if len(items) == 1:
+        return f"{_word(items[0].path.name)}, {items[0].said}"
+    n_photos = sum(item.n_photos for item in items)
+    if n_photos == len(items):
+        return f"{n_photos} photos"
+    return f"{len(items)} files: {_some([item.path.name for item in items])}"
+
+
+def _some(names: Sequence[str]) -> str:
+    """Name the first of some files."""
+    return ", ".join(map(_word, names[:4])) + (" ..." if len(names) > 4 else "")
+
+
+def _word(name: str) -> str:
+    """A file's name within a comment, where a line end would end it."""
+    return json.dumps(name, ensure_ascii=False)[1:-1]
+
+
+def _yaml(text: str) -> str:
+    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)
+
+
+def _without_stand_ins(steps: str) -> str:
+    """Take the simulated room out of the steps, and what only it is inspected with."""
+    blocks = re.split(r"^(?=  \w+:)", steps, flags=re.MULTILINE)
+    has_room = any(block.startswith("  room:") for block in blocks)
+    kept = [
+        block
+        for block in blocks
+        if not (has_room and block.partition(":")[0].strip() in _STAND_INS)
+    ]
+    text = "".join(kept).replace(", room.cloud]", "]")
+    return re.sub(r"\[([\w.]+)\]", r"\1", text)

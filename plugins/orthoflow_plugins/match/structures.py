@@ -1,0 +1,319 @@
+"""Structure of photos and walls: where edges run, whichever side of them is brighter.
+
+A laser sees another colour than a camera: contrast may be weaker, gone or inverted, another one on
+each material. Edges stay where they are, and so does the line they run along (modulo 180 degrees);
+steps of the relief are edges of the wall, too. A photo is laid on the wall in many sizes; each time
+nine overlapping parts of it are correlated over the whole wall and may slip a little against each
+other, as perspective has it. What their sum stands out by from all other places of the wall at that
+size tells places of different sizes apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.robust import NMAD_FACTOR
+from orthoflow.products import Wall
+from orthoflow_plugins.match.channels import Channels
+from orthoflow_plugins.match.pictures import filled_smoothly
+
+# The shorter side of a wall has so many cells, unless it is rastered more coarsely.
+_CELLS: Final = 200.0
+# Widths on the wall that are tried, as shares of the wall's shorter side: the longer side of a
+# photo from the first, its shorter side up to the second.
+_SIZES: Final = (0.2, 1.6)
+_STEP: Final = 1.1
+_PART_MOST_CELLS: Final = 250
+_PART_LEAST_CELLS: Final = 16
+# How far a part may slip, as a share of the photo's width.
+_SLIP_SHARE: Final = 0.03
+# A step of the relief of so much counts as a step from black to white.
+_STEP_M: Final = 0.5
+_KNOWN_LEAST: Final = 0.8
+_NOISE_SIGMA_CELLS: Final = 1.0
+_EVEN_SIGMA_CELLS: Final = 12.0
+_POOL_SIGMA_CELLS: Final = 1.5
+_BROAD_SIGMA_CELLS: Final = 15.0
+_STRONGEST: Final = 3.0
+# Parts that lie mostly beside the wall must not win by what little they show.
+_ENERGY_LEAST: Final = 0.25
+# Longer side to which a photo is shrunk first: no size needs more.
+_PHOTO_SIDE_PX: Final = 1200
+# Another place begins so far off, as a share of the photo's width, or at such another size (log).
+_ELSEWHERE: Final = (0.25, 0.25)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WallStructure:
+    """A wall's structure, ready to be correlated with.
+
+    Attributes:
+        wall: in cells of this size.
+        channels: its structure.
+        spectra: (c, ...) complex64 of the channels.
+        energy: likewise, of their squares' sum.
+        padded: rows and columns that the spectra were computed with.
+    """
+
+    wall: Wall
+    channels: Channels
+    spectra: NDArray[np.complex64]
+    energy: NDArray[np.complex64]
+    padded: tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where a photo may lie on a wall.
+
+    Attributes:
+        centre_m: (2,) float64 metres right and down from the corner of the wall's raster.
+        width_m: of the photo on the wall, roughly.
+        lead: by how many robust deviations it stands out from other places at its size.
+        parts_photo: (9, 2) float64 centres of the photo's parts, shares of its width and height.
+        parts_m: (9, 2) float64 where each of them was found, as `centre_m`.
+    """
+
+    centre_m: NDArray[np.float64]
+    width_m: float
+    lead: float
+    parts_photo: NDArray[np.float64]
+    parts_m: NDArray[np.float64]
+
+
+def wall_structure(wall: Wall) -> WallStructure | None:
+    """Prepare a wall; None where it shows nothing."""
+    from scipy import fft
+
+    if wall.intensity is None or not np.isfinite(wall.intensity).any():
+        return None
+    factor = max(1, round(min(wall.frame.shape) / _CELLS))
+    coarse = _coarser(wall, factor)
+    if min(coarse.frame.shape) < 2 * _PART_LEAST_CELLS or coarse.intensity is None:
+        return None
+    known = np.isfinite(coarse.depth_m) & np.isfinite(coarse.intensity)
+    relief = coarse.depth_m / np.float32(_STEP_M)
+    channels = structure_of(np.stack([coarse.intensity, relief], axis=-1), known)
+    shape = coarse.frame.shape
+    padded = tuple(int(fft.next_fast_len(length + _PART_MOST_CELLS, real=True)) for length in shape)
+    layers = np.moveaxis(channels.values, -1, 0)
+    energy = np.einsum("cij,cij->ij", layers, layers)
+    return WallStructure(
+        wall=coarse,
+        channels=channels,
+        spectra=np.asarray(fft.rfft2(layers, padded), dtype=np.complex64),
+        energy=np.asarray(fft.rfft2(energy, padded), dtype=np.complex64),
+        padded=(padded[0], padded[1]),
+    )
+
+
+def structure_of(layers: NDArray[np.float32], known: NDArray[np.bool_]) -> Channels:
+    """Give the structure of a picture (rows, cols, layers), NaN or not known where void."""
+    import cv2
+
+    soft = []
+    for layer in np.moveaxis(layers, 2, 0):
+        filled = filled_smoothly(np.where(known, layer, np.float32(np.nan)))
+        blurred = cv2.GaussianBlur(filled, (0, 0), _NOISE_SIGMA_CELLS)
+        soft.append(np.asarray(blurred, dtype=np.float32))
+    safe = cv2.erode(known.astype(np.uint8), np.ones((3, 3), dtype=np.uint8)).astype(np.float32)
+    values = np.moveaxis(_channels(soft, safe), 0, -1)
+    return Channels(values=np.ascontiguousarray(values), known=safe)
+
+
+def _coarser(wall: Wall, factor: int) -> Wall:
+    """Join factor x factor cells of a wall: its intensity's mean, 0 to 1, and one of its depths."""
+    import cv2
+
+    assert wall.intensity is not None  # noqa: S101 - asked before
+    height, width = (max(1, length // factor) for length in wall.frame.shape)
+    known = np.isfinite(wall.depth_m) & np.isfinite(wall.intensity)
+    low, high = np.percentile(wall.intensity[np.isfinite(wall.intensity)], (1.0, 99.0))
+    scaled = np.clip((wall.intensity - low) / max(float(high - low), 1e-9), 0.0, 1.0)
+    grey = np.rint(255.0 * filled_smoothly(np.where(known, scaled, np.nan))).astype(np.uint8)
+    # Cells hold single points of a scan, and their speckle is no structure.
+    grey = np.asarray(cv2.medianBlur(grey, 3), dtype=np.uint8)
+    cells = (slice(0, height * factor), slice(0, width * factor))
+
+    def mean(values: NDArray[np.generic]) -> NDArray[np.float32]:
+        part = values[cells].astype(np.float32)
+        return np.asarray(
+            cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32
+        )
+
+    one = slice(factor // 2, None, factor)
+    depth = wall.depth_m[one, one][:height, :width].copy()
+    depth[mean(known) < _KNOWN_LEAST] = np.nan
+    return replace(
+        wall,
+        frame=replace(wall.frame, gsd_m=wall.frame.gsd_m * factor, width=width, height=height),
+        depth_m=depth,
+        sigma_m=wall.sigma_m[one, one][:height, :width].copy(),
+        count=wall.count[one, one][:height, :width].copy(),
+        mask=wall.mask[one, one][:height, :width].copy(),
+        intensity=mean(grey) / np.float32(255.0),
+        rgb=None,
+        rgb_mask=None,
+        percentiles_m=None,
+    )
+
+
+def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -> list[Place]:
+    """Give the places of a wall that a photo may show, the likeliest first.
+
+    Args:
+        rgb: (height, width, 3) of the photo, taken roughly upright.
+        wall: the wall.
+        n_most: at most so many.
+    """
+    import cv2
+
+    shrink = min(1.0, _PHOTO_SIDE_PX / max(rgb.shape[:2]))
+    small = cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    found = []
+    for width in _widths_cells(rgb.shape, wall.wall.frame.shape):
+        height = round(width * rgb.shape[0] / rgb.shape[1])
+        picture = cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA)
+        found.append(_best_at(picture.astype(np.float32) / np.float32(255.0), wall))
+    places: list[Place] = []
+    for place in sorted(found, key=lambda each: -each.lead):
+        if len(places) < n_most and all(_is_elsewhere(place, other) for other in places):
+            places.append(place)
+    return places
+
+
+def _widths_cells(photo: Sequence[int], wall: tuple[int, int]) -> list[int]:
+    """Widths in cells that a photo is tried at."""
+    height, width = photo[0], photo[1]
+    least = _SIZES[0] * min(wall) * width / max(height, width)
+    # Each part has half of the photo's sides.
+    most = min(
+        _SIZES[1] * min(wall) * width / min(height, width),
+        2.0 * (_PART_MOST_CELLS - 1) * width / max(height, width),
+    )
+    least = max(least, 2.0 * _PART_LEAST_CELLS * width / min(height, width))
+    count = max(0, math.floor(math.log(max(most / least, 1e-9)) / math.log(_STEP)) + 1)
+    return [round(least * _STEP**nth) for nth in range(count)]
+
+
+def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
+    """Best place of a photo of a given size in cells."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    structure = structure_of(picture, np.ones((height, width), dtype=np.bool_))
+    channels = np.ascontiguousarray(np.moveaxis(structure.values, -1, 0))
+    side = (height // 2, width // 2)
+    slip = max(1, int(_SLIP_SHARE * width))
+    corners = [
+        (top, left)
+        for top in (0, (height - side[0]) // 2, height - side[0])
+        for left in (0, (width - side[1]) // 2, width - side[1])
+    ]
+    maps = [
+        _part_map(channels[:, top : top + side[0], left : left + side[1]], wall)
+        for top, left in corners
+    ]
+    kernel = np.ones((2 * slip + 1, 2 * slip + 1), dtype=np.uint8)
+    total = np.zeros(wall.padded, dtype=np.float32)
+    for part, corner in zip(maps, corners, strict=True):
+        total += np.roll(cv2.dilate(part, kernel), (-corner[0], -corner[1]), (0, 1))
+    # Where the photo's corner is when its centre is on the wall.
+    rows, columns = (
+        np.arange(n) - m // 2 for n, m in zip(wall.wall.frame.shape, (height, width), strict=True)
+    )
+    scores = total[np.ix_(rows % wall.padded[0], columns % wall.padded[1])]
+    usual = float(np.median(scores))
+    spread = NMAD_FACTOR * float(np.median(np.abs(scores - usual)))
+    row, column = np.unravel_index(int(scores.argmax()), scores.shape)
+    at = (int(rows[row]), int(columns[column]))
+    half = 0.5 * np.array([side[1], side[0]])
+    found = np.array(
+        [
+            _slipped(part, (at[0] + corner[0], at[1] + corner[1]), slip) + half
+            for part, corner in zip(maps, corners, strict=True)
+        ]
+    )
+    middles = np.array([[left, top] for top, left in corners]) + half
+    return Place(
+        centre_m=wall.wall.frame.gsd_m
+        * (np.array([at[1], at[0]]) + 0.5 * np.array([width, height])),
+        width_m=wall.wall.frame.gsd_m * width,
+        lead=(float(scores.max()) - usual) / max(spread, 1e-9),
+        parts_photo=middles / [width, height],
+        parts_m=wall.wall.frame.gsd_m * found,
+    )
+
+
+def _part_map(part: NDArray[np.float32], wall: WallStructure) -> NDArray[np.float32]:
+    """Correlation of a part of a photo with the wall, at every place of its corner (wrapped)."""
+    from scipy import fft
+
+    own = float(np.einsum("cij,cij->", part, part))
+    box = fft.rfft2(np.ones(part.shape[1:], dtype=np.float32), wall.padded)
+    under = fft.irfft2(wall.energy * np.conj(box), wall.padded)
+    spectrum = np.einsum("cij,cij->ij", wall.spectra, np.conj(fft.rfft2(part, wall.padded)))
+    cross = fft.irfft2(spectrum, wall.padded)
+    norm = np.sqrt(max(own, 1e-9) * np.maximum(under, max(_ENERGY_LEAST * own, 1e-9)))
+    return np.asarray(cross / norm, dtype=np.float32)
+
+
+def _slipped(part: NDArray[np.float32], at: tuple[int, int], slip: int) -> NDArray[np.float64]:
+    """Best (column, row) of a part's corner, at most slipped so far from a place."""
+    steps = np.arange(-slip, slip + 1)
+    rows, columns = at[0] + steps, at[1] + steps
+    near = part[np.ix_(rows % part.shape[0], columns % part.shape[1])]
+    row, column = np.unravel_index(int(near.argmax()), near.shape)
+    return np.array([columns[column], rows[row]], dtype=np.float64)
+
+
+def _is_elsewhere(place: Place, other: Place) -> bool:
+    apart_m = float(np.hypot(*(place.centre_m - other.centre_m)))
+    return (
+        apart_m > _ELSEWHERE[0] * other.width_m
+        or abs(math.log(place.width_m / other.width_m)) > _ELSEWHERE[1]
+    )
+
+
+def _channels(
+    layers: Sequence[NDArray[np.float32]], known: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Channels (5, rows, cols) of the line that edges run along, of all layers together.
+
+    Doubled and fourfold angles of the gradient and its strength, evened out locally: the first
+    terms of a histogram of directions modulo 180 degrees.
+    """
+    import cv2
+
+    def blurred(values: NDArray[np.floating], sigma: float) -> NDArray[np.float32]:
+        single = np.ascontiguousarray(values, dtype=np.float32)
+        return np.asarray(cv2.GaussianBlur(single, (0, 0), sigma), dtype=np.float32)
+
+    squared = np.zeros(known.shape, dtype=np.complex64)
+    for layer in layers:
+        across = cv2.Scharr(layer, cv2.CV_32F, 1, 0)
+        down = cv2.Scharr(layer, cv2.CV_32F, 0, 1)
+        squared += (across + 1j * down) ** 2
+    size = np.abs(squared)
+    doubled = squared / np.maximum(size, 1e-20)
+    strength = np.sqrt(size) * known
+    local = blurred(strength, _EVEN_SIGMA_CELLS)
+    local /= np.maximum(blurred(known, _EVEN_SIGMA_CELLS), 1e-3)
+    floor = 0.2 * float(np.median(local[known > 0.0])) if (known > 0.0).any() else 1.0
+    strength = np.minimum(strength / (local + max(floor, 1e-9)), _STRONGEST) * known
+    fourfold = doubled * doubled
+    share = np.maximum(blurred(known, _BROAD_SIGMA_CELLS), 1e-3)
+    values = []
+    for part in (doubled.real, doubled.imag, fourfold.real, fourfold.imag, np.ones_like(known)):
+        pooled = blurred(part * strength, _POOL_SIGMA_CELLS)
+        values.append((pooled - blurred(pooled * known, _BROAD_SIGMA_CELLS) / share) * known)
+    channels = np.stack(values)
+    length = np.sqrt(np.einsum("cij,cij->ij", channels, channels))
+    usual = float(np.median(length[known > 0.0])) if (known > 0.0).any() else 1.0
+    return np.asarray(channels / (length + 0.3 * usual + 1e-9), dtype=np.float32)

@@ -1,0 +1,305 @@
+"""Sheets, CAD files and vectors of a run, measured as other programs see them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import ezdxf
+import numpy as np
+import pdfplumber
+import pytest
+from click.testing import CliRunner, Result
+from PIL import Image
+
+from orthoflow.cli.program import program
+from orthoflow.records import open_run
+from orthoflow.records.wall_results import content_digest, room_results
+from tests.drawing_runs import (
+    GAP_M,
+    GSD_M,
+    SIZE_M,
+    WALL,
+    box_planes,
+    box_points,
+    wall_frame,
+    write_drawing_run,
+)
+
+MM = 25.4 / 72.0
+WIDE_M, HIGH_M = SIZE_M[0] - 2 * GAP_M, SIZE_M[2] - 2 * GAP_M
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_drawing_run(tmp_path_factory.mktemp("drawn") / "run")
+
+
+def export(run: Path, target: str, folder: Path, *more: object) -> Result:
+    words = ["export", str(run), "--to", target, "-o", str(folder), *map(str, more)]
+    return CliRunner().invoke(program, words)
+
+
+@pytest.fixture(scope="module")
+def sheet(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[pdfplumber.page.Page]:
+    """The only sheet of the wall at 1:50, with its depth beside it."""
+    folder = tmp_path_factory.mktemp("sheet")
+    block = folder / "block.yaml"
+    block.write_text("project: Sala Łukowa\ndrawing: 21-017\n", encoding="utf-8")
+    more = ("--scale", 50, "--beside", "depth", "--title-block", block, "--grid", 0.5)
+    done = export(run, "sheet", folder / "out", *more)
+    assert done.exit_code == 0, done.output
+    assert [path.name for path in (folder / "out").iterdir()] == [f"wall_{WALL}_sheet_1.pdf"]
+    with pdfplumber.open(folder / "out" / f"wall_{WALL}_sheet_1.pdf") as pdf:
+        (page,) = pdf.pages
+        yield page
+
+
+def test_a_metre_is_twenty_millimetres_at_one_to_fifty(sheet: pdfplumber.page.Page) -> None:
+    bar = [box for box in sheet.rects if box["height"] * MM == pytest.approx(2.0, abs=1e-3)]
+    assert len(bar) >= 3
+    for segment in bar:
+        assert segment["width"] * MM == pytest.approx(20.00, abs=0.005)
+
+
+def test_pictures_lie_on_the_paper_as_they_do_on_the_wall(sheet: pdfplumber.page.Page) -> None:
+    ortho, depth = sheet.images
+    for picture in (ortho, depth):
+        assert (picture["x1"] - picture["x0"]) * MM == pytest.approx(WIDE_M * 20, abs=0.01)
+        assert (picture["bottom"] - picture["top"]) * MM == pytest.approx(HIGH_M * 20, abs=0.01)
+    assert ortho["srcsize"] == (380, 230)
+    # The mark of X = 2 m below the picture, and that of height 101 m beside it.
+    marks = [line for line in sheet.lines if abs(line["x1"] - line["x0"]) < 1e-6]
+    below = [m for m in marks if m["top"] == pytest.approx(ortho["bottom"], abs=0.01)]
+    places = sorted((mark["x0"] - ortho["x0"]) * MM for mark in below)[:8]
+    np.testing.assert_allclose(places, np.arange(8) * 10.0, atol=0.01)
+    level = [line for line in sheet.lines if abs(line["top"] - line["bottom"]) < 1e-6]
+    beside = [m for m in level if m["x1"] == pytest.approx(ortho["x0"], abs=0.01)]
+    heights = sorted((ortho["bottom"] - mark["top"]) * MM for mark in beside)
+    # The lowest cell of the wall is 0.1 m over the floor, at 100.1 m.
+    np.testing.assert_allclose(heights, (np.arange(100.5, 102.5, 0.5) - 100.1) * 20, atol=0.01)
+
+
+def test_a_sheet_says_what_the_record_says(run: Path, sheet: pdfplumber.page.Page) -> None:
+    text = " ".join(sheet.extract_text().split())
+    for said in (
+        *("Sala Łukowa", "scale 1:50", "21-017", "wall 2", "sheet 1 of 1"),
+        "check: RMSE x 0.7 mm, y 1.4 mm",
+        "plane fitted to 4,000 points, RMS 2.0 mm",
+        "colours untouched",
+        "grid 0.5 m",
+        # Letters that stand upright come from below.
+        *("0.101", "3.5"),
+    ):
+        assert said in text, said
+    digest = content_digest(open_run(run))
+    letters = "".join(character["text"] for character in sheet.chars)
+    assert all(digest[k : k + 16] in letters for k in (0, 16, 32, 48))
+
+
+def test_the_step_of_the_wall_is_a_contour(sheet: pdfplumber.page.Page) -> None:
+    # 40 mm over the plane on the right half.
+    _, depth = sheet.images
+    middle = 0.5 * (depth["x0"] + depth["x1"])
+    drawn = [
+        line
+        for line in (*sheet.curves, *sheet.lines)
+        if line["stroking_color"] == pytest.approx((0.8, 0.25, 0.05))
+    ]
+    assert drawn
+    # A sample of the contours is half a millimetre of paper.
+    assert all(abs(line["x0"] - middle) * MM < 0.5 for line in drawn)
+    assert max(line["height"] for line in drawn) * MM > 0.95 * HIGH_M * 20
+
+
+def test_a_wall_that_does_not_fit_takes_several_sheets_and_an_index(
+    run: Path, tmp_path: Path
+) -> None:
+    done = export(run, "sheet", tmp_path / "out", "--scale", 10, "--paper", "A4")
+    assert done.exit_code == 0, done.output
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    count = len(names) - 1
+    sheets = [f"wall_{WALL}_sheet_{number}.pdf" for number in range(1, count + 1)]
+    assert names == sorted([*sheets, f"wall_{WALL}_index.pdf"])
+    areas = 0.0
+    for name in sheets:
+        with pdfplumber.open(tmp_path / "out" / name) as pdf:
+            (picture,) = pdf.pages[0].images
+            areas += picture["width"] * picture["height"] * MM * MM
+            assert f"of {count}" in pdf.pages[0].extract_text()
+    assert areas == pytest.approx(WIDE_M * HIGH_M * 1e4, rel=1e-5)
+    with pdfplumber.open(tmp_path / "out" / f"wall_{WALL}_index.pdf") as pdf:
+        assert f"index of {count} sheets" in pdf.pages[0].extract_text()
+        assert "scale 1:25" in pdf.pages[0].extract_text()
+
+
+def test_balanced_colours_are_said(tmp_path: Path) -> None:
+    run = write_drawing_run(tmp_path / "run", gains="global")
+    (wall,) = room_results(open_run(run)).walls
+    assert wall.colours == "colours balanced between photos (gains: global)"
+    assert wall.plane_index == WALL
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--wall", 0), "--wall 0: mosaic shows no wall 0; it shows 2"),
+        (("--paper", "B7"), "--paper must be A0"),
+        (("--grid", "0.01"), "--grid 0.01 puts crosses closer than 2 mm at 1:"),
+        (("--cell", "plane"), "the cell plane holds no orthoimages or walls; those of this run:"),
+        (("--cell", "none"), "has no cell 'none'"),
+        (("--title-block", "missing.yaml"), "missing.yaml cannot be read"),
+    ],
+    ids=["wall", "paper", "grid", "cell", "no-cell", "title-block"],
+)
+def test_what_cannot_be_drawn_is_refused_and_nothing_is_written(
+    run: Path, tmp_path: Path, more: tuple[object, ...], said: str
+) -> None:
+    done = export(run, "sheet", tmp_path / "out", *more)
+    assert done.exit_code == 2
+    assert said in done.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_of_sheets_belong_to_sheets(run: Path, tmp_path: Path) -> None:
+    done = export(run, "dxf", tmp_path / "out", "--scale", 50)
+    assert (done.exit_code, "--scale belongs to --to sheet" in done.output) == (2, True)
+
+
+def test_a_changed_picture_is_not_drawn(tmp_path: Path) -> None:
+    run = write_drawing_run(tmp_path / "run")
+    image = run / "products" / "mosaic" / f"wall_{WALL}_ortho.tif"
+    image.write_bytes(image.read_bytes()[:-1] + b"x")
+    for target in ("sheet", "dxf", "geojson"):
+        done = export(run, target, tmp_path / target)
+        assert done.exit_code == 3, done.output
+        assert "was changed after the run" in " ".join(done.output.split())
+        assert not (tmp_path / target).exists()
+
+
+@pytest.fixture(scope="module")
+def drawn(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dxf") / "out"
+    done = export(run, "dxf", folder)
+    assert done.exit_code == 0, done.output
+    assert "1 wall, and the room: 6 planes, 12 edges, 8 corners" in done.output
+    return folder
+
+
+@pytest.mark.parametrize("name", [f"wall_{WALL}.dxf", "room.dxf"])
+def test_cad_files_have_no_errors_and_name_their_pictures_beside_them(
+    drawn: Path, name: str
+) -> None:
+    document = ezdxf.readfile(drawn / name)
+    audit = document.audit()
+    assert (audit.errors, audit.fixes) == ([], [])
+    assert document.units == ezdxf.units.M
+    (definition,) = document.objects.query("IMAGEDEF")
+    assert definition.dxf.filename == f"wall_{WALL}_ortho.png"
+    assert (drawn / definition.dxf.filename).is_file()
+
+
+def test_the_picture_lies_on_its_wall_to_scale(drawn: Path) -> None:
+    space = ezdxf.readfile(drawn / f"wall_{WALL}.dxf").modelspace()
+    (image,) = space.query("IMAGE")
+    assert tuple(image.dxf.insert)[:2] == pytest.approx((0.0, -HIGH_M), abs=1e-9)
+    assert tuple(image.dxf.u_pixel) == pytest.approx((GSD_M, 0.0, 0.0), abs=1e-12)
+    assert tuple(image.dxf.v_pixel) == pytest.approx((0.0, GSD_M, 0.0), abs=1e-12)
+    picture = np.asarray(Image.open(drawn / f"wall_{WALL}_ortho.png"))
+    assert picture.shape == (230, 380, 4)
+    # The ten rightmost columns show nothing; red grows to the right, green downwards.
+    assert (picture[:, -10:, 3] == 0).all()
+    assert (picture[:, :-10, 3] == 255).all()
+    np.testing.assert_array_equal(picture[7, :370, 0], np.arange(370) // 2)
+    np.testing.assert_array_equal(picture[:, 9, 1], np.arange(230))
+
+
+def test_a_wall_has_its_edges_points_and_residuals_in_metres(drawn: Path) -> None:
+    space = ezdxf.readfile(drawn / f"wall_{WALL}.dxf").modelspace()
+    edges = [
+        np.array([line.dxf.start, line.dxf.end])[:, :2]
+        for line in space.query('LINE[layer=="EDGES"]')
+    ]
+    # 10 cm outside the rectangle of points on all four sides.
+    sides = sorted(
+        round(float(value), 6)
+        for edge in edges
+        for value in (edge[0] if np.ptp(edge[:, 0]) < 1e-6 else edge[0][::-1])[:1]
+    )
+    assert sides == pytest.approx(sorted([-GAP_M, WIDE_M + GAP_M, GAP_M, -HIGH_M - GAP_M]))
+    points = [tuple(point.dxf.location)[:2] for point in space.query("POINT")]
+    assert points == [pytest.approx((1.0, -1.0)), pytest.approx((2.0, -1.0))]
+    shifts = [
+        np.array(line.dxf.end - line.dxf.start)[:2]
+        for line in space.query('LINE[layer=="RESIDUALS"]')
+    ]
+    (said,) = [
+        text.dxf.text
+        for text in space.query('TEXT[layer=="RESIDUALS"]')
+        if "enlarged" in text.dxf.text
+    ]
+    times = float(said.split(", ")[2].split()[0])
+    # To the right, and down, which is -Y.
+    np.testing.assert_allclose(shifts, times * np.array([[0.001, 0.0], [0.0, -0.002]]), atol=1e-9)
+
+
+def test_the_room_has_each_wall_in_its_place(drawn: Path) -> None:
+    document = ezdxf.readfile(drawn / "room.dxf")
+    space = document.modelspace()
+    frame = wall_frame(box_planes())
+    (image,) = space.query("IMAGE")
+    corner = np.array(image.dxf.insert)
+    right = corner + 380 * np.array(image.dxf.u_pixel)
+    top = corner + 230 * np.array(image.dxf.v_pixel)
+    top_left, bottom_left, bottom_right, _ = frame.corners_world()
+    for found, expected in ((corner, bottom_left), (right, bottom_right), (top, top_left)):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+    ucs = document.ucs.get(f"wall_{WALL}").ucs()
+    place = np.array(tuple(ucs.to_wcs((1.0, -0.5, 0.25))))
+    expected = frame.world_from_wall(np.array([[100.0, 50.0]]), 0.25)[0]
+    np.testing.assert_allclose(place, expected, atol=1e-6)
+    faces = space.query("3DFACE")
+    assert len(faces) == 4
+    (outline,) = space.query("LWPOLYLINE")
+    assert outline.closed
+    assert outline.dxf.elevation == pytest.approx(100.0)
+    x, y, _ = SIZE_M
+    corners = box_points(np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]], dtype=float))
+    drawn_at = np.array([point[:2] for point in outline.get_points()])
+    for point in corners:
+        assert np.linalg.norm(drawn_at - point[:2], axis=1).min() < 1e-6
+    assert len(space.query('LINE[layer=="EDGES"]')) == 12
+    assert len(space.query('POINT[layer=="CORNERS"]')) == 8
+
+
+def test_names_from_a_record_are_harmless_in_drawings(drawn: Path) -> None:
+    texts = [
+        text.dxf.text for text in ezdxf.readfile(drawn / "room.dxf").modelspace().query("TEXT")
+    ]
+    assert "P2\\x1b]0;" in texts
+    assert b"\x1b" not in (drawn / "room.dxf").read_bytes()
+
+
+def test_vectors_are_geojson_of_rings_and_lines(run: Path, tmp_path: Path) -> None:
+    done = export(run, "geojson", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    room = json.loads((tmp_path / "out" / "room.geojson").read_text())
+    kinds = [feature["properties"]["kind"] for feature in room["features"]]
+    counts = {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}
+    assert counts == {"rectangle": 6, "edge": 12, "corner": 8, "outline": 1, "check point": 2}
+    (outline,) = [f for f in room["features"] if f["properties"]["kind"] == "outline"]
+    ring = np.array(outline["geometry"]["coordinates"][0])
+    assert len(ring) == 5
+    np.testing.assert_array_equal(ring[0], ring[-1])
+    x, y = ring[:-1, 0], ring[:-1, 1]
+    area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+    # Coordinates of 5e6 m multiplied: to a part in 1e9 of 2e13.
+    assert area == pytest.approx(SIZE_M[0] * SIZE_M[1], abs=0.02)
+    wall = json.loads((tmp_path / "out" / f"wall_{WALL}.geojson").read_text())
+    (frame,) = [f for f in wall["features"] if f["properties"]["kind"] == "frame"]
+    corners = np.array(frame["geometry"]["coordinates"][0])
+    expected = [[0, 0], [0, -HIGH_M], [WIDE_M, -HIGH_M], [WIDE_M, 0], [0, 0]]
+    np.testing.assert_allclose(corners, expected, atol=1e-6)
+    edges = [f for f in wall["features"] if f["properties"]["kind"] == "edge"]
+    assert sorted(f["properties"]["planes"] for f in edges) == [[0, 2], [1, 2], [2, 3], [2, 5]]

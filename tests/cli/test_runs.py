@@ -1,0 +1,177 @@
+"""A table of runs: which lie below a folder, in what they differ, and which can be read."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from pathlib import Path
+
+import h5py
+import pytest
+from click.testing import CliRunner, Result
+from orthoflow_provenance.model import RecordedFile, RecordedInput
+from orthoflow_provenance.writer import write_record
+
+from orthoflow.cli.program import program
+from tests.hostile_records import reseal, set_attribute
+from tests.report_runs import cell, metrics, record
+
+
+def asked(*arguments: object) -> Result:
+    return CliRunner().invoke(program, [str(argument) for argument in arguments])
+
+
+def said(*arguments: object) -> str:
+    result = asked(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def write(folder: Path, hour: int, cell_m: float, rmse_u_mm: float, **more: object) -> Path:
+    folder.mkdir(parents=True)
+    scan = RecordedFile(name="hall.laz", size_bytes=3, sha256="a" * 64)
+    cells = [
+        cell("plane", metrics=metrics(rms_mm=9.0), params={"cell_m": cell_m, "tries": 3}),
+        cell("check", metrics=metrics(rmse_u_mm=rmse_u_mm, rms_mm=2.0)),
+    ]
+    wanted: dict[str, object] = {
+        "name": "hall",
+        "started": f"2026-01-02T{hour:02}:04:05Z",
+        "inputs": (RecordedInput(name="scan", files=(scan,)),),
+    }
+    made = record(cells, **{**wanted, **more})
+    write_record(folder / "run.h5", made, lambda _digest: None)
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Three good runs of one workflow in two folders, one of another, and one that goes on."""
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "runs" / "a", 9, 0.02, 1.5)
+    write(tmp_path / "runs" / "b", 8, 0.05, 2.5)
+    write(tmp_path / "deep" / "er" / "c", 10, 0.02, 0.5)
+    write(tmp_path / "runs" / "other", 7, 0.5, 4.0, name="court")
+    going = tmp_path / "runs" / "going"
+    going.mkdir()
+    began = {"event": "run", "time": "2026-01-02T11:00:00Z", "run_id": "x", "workflow": "hall"}
+    (going / "journal.jsonl").write_text(json.dumps(began) + "\n")
+    return tmp_path
+
+
+def folders(*arguments: object) -> list[str]:
+    return [row["folder"] for row in json.loads(said("runs", *arguments, "--json"))]
+
+
+def test_the_table_says_when_how_good_and_in_what_runs_differ(runs: Path) -> None:
+    lines = said("runs").splitlines()
+    rows = [line.split(maxsplit=7) for line in lines[1:6]]
+    assert lines[0].split() == (
+        ["folder", "started", "workflow", "status", "rmse_u_mm", "rms_mm", "differs", "in"]
+    )
+    assert [row[0] for row in rows] == [
+        "runs/other", "runs/b", "runs/a", "deep/er/c", "runs/going",
+    ]  # fmt: skip
+    assert rows[1] == [
+        "runs/b",
+        "2026-01-02",
+        "08:04",
+        "hall",
+        "ok",
+        "2.5",
+        "2",
+        "plane.cell_m=0.05",
+    ]
+    # Of the other workflow there is one run: nothing that it differs from.
+    assert rows[0] == ["runs/other", "2026-01-02", "07:04", "court", "ok", "4", "2"]
+    assert rows[4] == ["runs/going", "2026-01-02", "11:00", "hall", "unfinished"]
+    assert lines[6].startswith("runs/going unfinished: goes on with the same command and -o ")
+    assert lines[-1] == "5 runs"
+
+
+def test_runs_are_chosen_and_ordered(runs: Path) -> None:
+    assert folders("--workflow", "court") == ["runs/other"]
+    assert folders("--status", "unfinished", "--status", "failed") == ["runs/going"]
+    assert folders("--where", "rmse_u_mm<=2.5", "--where", "plane.cell_m=0.02") == [
+        "runs/a", "deep/er/c",
+    ]  # fmt: skip
+    assert folders("--sort", "rmse_u_mm")[:4] == ["deep/er/c", "runs/a", "runs/b", "runs/other"]
+    # Those without the number stand last at either end.
+    assert folders("--sort", "-check.rmse_u_mm") == [
+        "runs/other", "runs/b", "runs/a", "deep/er/c", "runs/going",
+    ]  # fmt: skip
+    assert folders("deep", "deep/er") == ["deep/er/c"]
+    assert "1 run, 4 others left out" in said("runs", "--workflow", "court")
+
+
+def test_json_and_csv_have_every_number(runs: Path) -> None:
+    (row,) = json.loads(said("runs", "deep", "--json"))
+    # A later step has the plain name.
+    assert row["metrics"]["rms_mm"] == row["metrics"]["check.rms_mm"] == 2.0
+    assert row["metrics"]["plane.rms_mm"] == 9.0
+    assert row["facts"]["plane.tries"] == 3
+    assert row["facts"]["input scan"] == ["hall.laz aaaaaaaa"]
+    assert (row["status"], row["started"]) == ("ok", "2026-01-02T10:04:05Z")
+    assert row["differs"] == {}
+    table = list(csv.DictReader(io.StringIO(said("runs", "--csv"))))
+    by_folder = {line["folder"]: line for line in table}
+    assert float(by_folder["runs/b"]["plane.cell_m"]) == 0.05
+    assert float(by_folder["runs/b"]["check.rmse_u_mm"]) == 2.5
+    assert by_folder["runs/going"]["check.rmse_u_mm"] == ""
+
+
+def test_a_folder_of_runs_is_shown_as_their_table(runs: Path) -> None:
+    assert said("show", "runs") == said("runs", "runs")
+    assert json.loads(said("show", "runs", "--json")) == json.loads(said("runs", "runs", "--json"))
+    assert said("show", "runs/a").startswith("hall, run r1: 2 cells")
+    assert asked("show", "runs/going").exit_code == 2
+
+
+def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
+    (runs / "torn").mkdir()
+    (runs / "torn" / "run.h5").write_bytes((runs / "runs/a/run.h5").read_bytes()[:2000])
+    hostile = write(runs / "hostile", 12, 0.02, 1.0)
+    reseal(hostile / "run.h5", lambda file: set_attribute(file, "name", "\x1b[2Jred"))
+    linked = write(runs / "linked", 13, 0.02, 1.0)
+    with h5py.File(linked / "run.h5", "r+") as file:
+        file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
+    (runs / "pipe").mkdir()
+    os.mkfifo(runs / "pipe" / "run.h5")
+    rows = {row["folder"]: row for row in json.loads(said("runs", "--json"))}
+    assert {name for name, row in rows.items() if row["status"] == "damaged"} == {
+        "torn", "linked", "pipe",
+    }  # fmt: skip
+    assert rows["torn"]["reason"].startswith("torn/run.h5 cannot be read, the file is damaged")
+    assert all(rows[name]["reason"] for name in ("linked", "pipe"))
+    assert rows["hostile"]["workflow"] == "\x1b[2Jred"
+    assert "\x1b" not in said("runs")
+    assert "torn damaged: torn/run.h5 cannot be read" in said("runs")
+
+
+def test_links_are_not_followed(runs: Path) -> None:
+    (runs / "deep" / "loop").symlink_to(runs)
+    assert folders("deep") == ["deep/er/c"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("nowhere",), "nowhere is no folder: give folders that runs lie in"),
+        (("--where", "rmse_u_mm"), "is no condition: expected a name, one of < <= > >= = !="),
+        (("--where", "rmse_u_mm < 2 mm"), "is no condition"),
+        (("--where", "rmse_u < 2"), "no run has a metric or parameter 'rmse_u'; did you mean"),
+        (("--sort", "zzz"), "no run has a metric or parameter 'zzz'; --json has the names"),
+        (("--metric", "zzz"), "no run has a metric or parameter 'zzz'"),
+        (("--csv", "--json"), "--csv and --json exclude each other"),
+    ],
+)
+def test_mistakes_get_a_sentence(runs: Path, arguments: tuple[str, ...], sentence: str) -> None:
+    result = asked("runs", *arguments)
+    assert result.exit_code == 2
+    assert sentence in result.output
+
+
+def test_without_runs_it_says_so(tmp_path: Path) -> None:
+    assert said("runs", tmp_path) == "0 runs\n"

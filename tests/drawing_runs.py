@@ -1,0 +1,225 @@
+"""A run on a box room with one photographed wall, written as runs are, for drawings of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from orthoflow_provenance.model import PublishedFile, RecordedProduct
+from orthoflow_provenance.writer import write_record
+
+from orthoflow.engine.file_digests import file_sha256
+from orthoflow.files.publishing import publish_orthoimages, publish_planes, publish_walls
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.frames import frame_over
+from orthoflow.products import (
+    CheckPoints,
+    Inspection,
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    Planes,
+    Wall,
+    Walls,
+)
+from orthoflow.products.inspections import Finding
+from orthoflow.products.product import Product
+from tests.provenance_records import ProductShelf
+from tests.report_runs import cell, record
+
+# As far from the origin as survey coordinates are, and turned.
+CORNER = np.array([4.0e5, 5.0e6, 100.0])
+SIZE_M = (4.0, 3.0, 2.5)
+_ANGLE = np.radians(20.0)
+AXES = np.array(
+    [
+        [np.cos(_ANGLE), np.sin(_ANGLE), 0.0],
+        [-np.sin(_ANGLE), np.cos(_ANGLE), 0.0],
+        [0.0, 0.0, 1.0],
+    ]
+)
+# How far the points of a plane stay from the edges of the room.
+GAP_M = 0.1
+# The photographed wall is the third of the planes: numbers are not places among walls.
+WALL = 2
+GSD_M = 0.01
+
+
+def box_points(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World points (n, 3) of places (n, 3) in the box, metres from its lowest corner."""
+    return CORNER + places @ AXES
+
+
+def box_planes() -> Planes:
+    """The six planes of the box: floor, ceiling, then walls, the third of all along y = 3 m."""
+    x, y, z = SIZE_M
+    quads = [
+        ([0, y, 0], [0, 0, 0], [x, 0, 0], [x, y, 0]),
+        ([0, 0, z], [0, y, z], [x, y, z], [x, 0, z]),
+        ([0, y, z], [0, y, 0], [x, y, 0], [x, y, z]),
+        ([x, y, z], [x, y, 0], [x, 0, 0], [x, 0, z]),
+        ([x, 0, z], [x, 0, 0], [0, 0, 0], [0, 0, z]),
+        ([0, 0, z], [0, 0, 0], [0, y, 0], [0, y, z]),
+    ]
+    whole = np.array(quads, dtype=np.float64)
+    inwards = np.array([[0, 0, 1], [0, 0, -1], [0, -1, 0], [-1, 0, 0], [0, 1, 0], [1, 0, 0]])
+    middle = whole.mean(axis=1, keepdims=True)
+    seen = whole - GAP_M * np.sign(np.round(whole - middle, 9))
+    normal = inwards @ AXES
+    corners = np.array([box_points(quad) for quad in seen])
+    return Planes(
+        normal=normal,
+        offset=np.einsum("ki,ki->k", normal, corners.mean(axis=1)),
+        corners=corners,
+        covariance=np.zeros((6, 4, 4)),
+        n_points=np.arange(6000, 0, -1000, dtype=np.int64),
+        rms_m=np.full(6, 0.002),
+        up=np.array([0.0, 0.0, 1.0]),
+        names=("floor 0", "ceiling 1", "wall 2", "wall 3", "wall 4", "wall 5"),
+    )
+
+
+def wall_frame(planes: Planes) -> WallFrame:
+    """Cells over the photographed wall's rectangle: 3.8 x 2.3 m."""
+    return frame_over(planes.corners[WALL], planes.normal[WALL], gsd_m=GSD_M)
+
+
+def write_drawing_run(folder: Path, *, gains: str = "none") -> Path:
+    """Write `run.h5` and `products/` of planes, one wall, its orthoimage and its inspection."""
+    folder.mkdir(parents=True)
+    planes = box_planes()
+    frame = wall_frame(planes)
+    products = {
+        "plane": planes,
+        "wall": Walls(
+            walls=(_wall(frame),),
+            up=planes.up.copy(),
+            intensity_source="laser",
+            buffer_front_m=0.3,
+            buffer_behind_m=0.3,
+        ),
+        "mosaic": Orthoimages(images=(_image(frame),)),
+        "check": _inspection(frame),
+        "points": _checkpoints(frame),
+    }
+    shelf = ProductShelf(folder)
+    given = {step: _recorded(shelf, product) for step, product in products.items()}
+    taken = {
+        "wall": {"planes": "plane"},
+        "mosaic": {"walls": "wall"},
+        "check": {"orthoimages": "mosaic", "checkpoints": "points"},
+    }
+    cells = [
+        cell(
+            step,
+            params={"gains": gains} if step == "mosaic" else {},
+            environment="",
+            inputs={
+                port: _given_by(given[source], f"{source}.{port}")
+                for port, source in taken.get(step, {}).items()
+            },
+            outputs={given[step].type_name: given[step]},
+        )
+        for step in ("points", "plane", "wall", "mosaic", "check")
+    ]
+    for step, publish in (
+        ("plane", lambda into, digest: publish_planes(planes, into, digest)),
+        ("wall", lambda into, digest: publish_walls(products["wall"], into, digest)),
+        ("mosaic", lambda into, digest: publish_orthoimages(products["mosaic"], into, digest)),
+    ):
+        into = folder / "products" / step
+        into.mkdir(parents=True)
+        publish(into, given[step].digest)
+    files = sorted(path for path in (folder / "products").rglob("*") if path.is_file())
+    published = tuple(
+        PublishedFile(
+            path=path.relative_to(folder).as_posix(),
+            size_bytes=path.stat().st_size,
+            sha256=file_sha256(path),
+        )
+        for path in files
+    )
+    made = record(cells, name="box", published=published, environments=())
+    write_record(folder / "run.h5", made, shelf.find)
+    return folder
+
+
+def _recorded(shelf: ProductShelf, product: Product) -> RecordedProduct:
+    payload = product.to_payload()
+    return RecordedProduct(
+        type_name=payload.type_name,
+        encoding_version=payload.encoding_version,
+        digest=shelf.put(payload),  # type: ignore[arg-type] # a payload like any
+        embedded=True,
+    )
+
+
+def _given_by(product: RecordedProduct, source: str) -> RecordedProduct:
+    return RecordedProduct(
+        type_name=product.type_name,
+        encoding_version=product.encoding_version,
+        digest=product.digest,
+        source=source,
+    )
+
+
+def _wall(frame: WallFrame) -> Wall:
+    """A wall with a step: 40 mm before the plane on the right half."""
+    depth = np.zeros(frame.shape, dtype=np.float32)
+    depth[:, frame.width // 2 :] = 0.04
+    return Wall(
+        frame=frame,
+        name=f"wall {WALL}",
+        plane_index=WALL,
+        depth_m=depth,
+        intensity=np.full(frame.shape, 0.5, dtype=np.float32),
+        sigma_m=np.full(frame.shape, 0.001, dtype=np.float32),
+        count=np.ones(frame.shape, dtype=np.uint32),
+        mask=np.ones(frame.shape, dtype=np.uint8),
+    )
+
+
+def _image(frame: WallFrame) -> Orthoimage:
+    """Red grows to the right, green downwards; the ten rightmost columns show nothing."""
+    rows, columns = np.indices(frame.shape)
+    mask = np.full(frame.shape, OrthoMask.PAINTED, dtype=np.uint8)
+    mask[:, -10:] = OrthoMask.NONE
+    rgb = np.stack([columns // 2, rows, np.full(frame.shape, 128)], axis=2).astype(np.uint8)
+    rgb[:, -10:] = 0
+    return Orthoimage(
+        frame=frame,
+        wall=0,
+        name=f"wall {WALL}",
+        rgb=rgb,
+        mask=mask,
+        source=np.where(mask == OrthoMask.PAINTED, 0, -1).astype(np.int16),
+        sources=("a.jpg",),
+        plane_index=WALL,
+    )
+
+
+def _inspection(frame: WallFrame) -> Inspection:
+    """Two residuals: 1 mm to the right, 2 mm down."""
+    return Inspection(
+        wall=np.zeros(2, dtype=np.int32),
+        points_world=frame.world_from_wall(np.array([[100.0, 100.0], [200.0, 100.0]])),
+        displacement_m=np.array([[0.001, 0.0], [0.0, 0.002]]),
+        kind=np.zeros(2, dtype=np.uint8),
+        kinds=("check point",),
+        findings=(
+            Finding(name="rmse_x_mm", value=0.71, unit="mm", wall=0),
+            Finding(name="rmse_y_mm", value=1.41, unit="mm", wall=0),
+        ),
+    )
+
+
+def _checkpoints(frame: WallFrame) -> CheckPoints:
+    places = np.array([[100.0, 100.0], [200.0, 100.0]])
+    return CheckPoints(
+        names=("P1", "P2\x1b]0;"),
+        points_world=frame.world_from_wall(places),
+        classes=("", ""),
+        wall=np.full(2, -1, dtype=np.int32),
+        pixels_wall=np.full((2, 2), np.nan),
+    )

@@ -1,0 +1,194 @@
+"""Steps are forked from servers that have libraries loaded, one per process that runs workflows."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.engine_world import World, has_ended, start_coordinator, toy_world
+
+STEPS = "steps:\n  first: {use: make.range}\n"
+AROUND = STEPS + "  second: {use: work.around, in: {numbers: first.numbers}}\n"
+SLOW = STEPS + ("  second: {use: work.slow, in: {numbers: first.numbers}, params: {steps: 2000}}\n")
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+@dataclass(frozen=True)
+class Around:
+    """What a step has found around it."""
+
+    pid: int
+    keeper: int
+    session: int
+    has_library: bool
+    number: int
+    file_limit: int
+    cores: int
+
+
+_numbers = itertools.count()
+
+
+def around(world: World) -> Around:
+    """Run a step anew that looks around itself."""
+    outcome = world.run(AROUND, sets=[f"second.steps={next(_numbers)}"])
+    assert outcome.results["second"].error_message == ""
+    return Around(*(int(value) for value in world.values(outcome, "second")))
+
+
+def servers() -> list[int]:
+    """Fork servers that this process has started and that live."""
+    me, found = str(os.getpid()), []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            arguments = path.read_bytes().split(b"\0")
+            parent = (path.parent / "stat").read_text().rpartition(")")[2].split()[1]
+        except OSError:
+            continue
+        if b"orthoflow.engine.fork_server" in arguments and parent == me:
+            found.append(int(path.parent.name))
+    return found
+
+
+def test_the_next_run_finds_the_server_and_libraries_that_steps_loaded(world: World) -> None:
+    first = around(world)
+    before = servers()
+    second = around(world)
+    assert servers() == before
+    assert second.pid != first.pid
+    # A step is alone in its session with what it starts, and its keeper leads that.
+    assert second.session == second.keeper != os.getsid(0)
+    for _ in range(100):
+        if around(world).has_library:
+            break
+    else:
+        pytest.fail("no step ever found the library that those before it had loaded")
+
+
+def test_steps_have_what_the_coordinator_has_when_they_start(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    around(world)
+    monkeypatch.setenv("TOY_NUMBER", "12")
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (500, before[1]))
+    try:
+        found = around(world)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert (found.number, found.file_limit) == (12, 500)
+    monkeypatch.delenv("TOY_NUMBER")
+    assert around(world).number == -1
+
+
+def test_what_libraries_read_when_they_are_loaded_takes_a_server_of_its_own(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    around(world)
+    before = servers()
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
+    around(world)
+    assert len(servers()) == len(before) + 1
+
+
+def test_a_killed_server_is_replaced(world: World) -> None:
+    around(world)
+    for server in servers():
+        os.kill(server, signal.SIGKILL)
+        has_ended(server)
+    around(world)
+    assert servers()
+
+
+def test_a_copy_of_the_process_has_servers_of_its_own(world: World) -> None:
+    around(world)
+    ours = servers()
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            around(world)
+            status = 0 if servers() and not set(servers()) & set(ours) else 2
+        finally:
+            os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert servers() == ours
+    around(world)
+
+
+def test_a_server_dies_with_the_process_that_started_it(world: World) -> None:
+    process = start_coordinator(world, SLOW, "run")
+    of_process = f"/proc/{process.pid}/task/{process.pid}/children"
+    deadline = time.monotonic() + 60
+    while not (children := Path(of_process).read_text().split()):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.kill()
+    process.communicate()
+    assert all(has_ended(int(child)) for child in children)
+
+
+def test_a_server_without_the_process_that_started_it_ends_at_once() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        done = subprocess.run(
+            [sys.executable, "-m", "orthoflow.engine.fork_server", str(theirs.fileno()), "1"],
+            pass_fds=(theirs.fileno(),),
+            capture_output=True,
+            check=False,
+            timeout=60,
+        )
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+
+
+def test_a_step_that_gets_no_process_fails_alone(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.engine.step_processes.sys.executable", "/bin/false")
+    monkeypatch.setenv("OMP_TEST", "another server")
+    outcome = world.run(STEPS)
+    assert outcome.results["first"].error_message == (
+        "no process could be started for method make.range of toy-plugin 1.0: the machine has too "
+        "little memory or allows too few processes"
+    )
+
+
+def test_an_environment_may_be_larger_than_a_socket_takes(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(10):
+        monkeypatch.setenv(f"TOY_FILLER_{number}", "x" * 100_000)
+    monkeypatch.setenv("TOY_NUMBER", "31")
+    assert around(world).number == 31
+
+
+def test_a_fork_that_fails_costs_no_other_step(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    around(world)
+    before = servers()
+
+    def refuse(server: object, request: int, pipe: int, log: int) -> None:
+        raise ChildProcessError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("orthoflow.engine.step_processes._Server.fork", refuse)
+        outcome = world.run(AROUND, sets=[f"second.steps={next(_numbers)}"])
+    assert outcome.results["second"].error_message.startswith("no process could be started for")
+    assert servers() == before

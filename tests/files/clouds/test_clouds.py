@@ -1,0 +1,315 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pye57
+import pytest
+from plyfile import PlyData
+from rasterio.crs import CRS
+
+from orthoflow.files.clouds import dressing
+from orthoflow.files.clouds.colours import plane_colour
+from orthoflow.files.clouds.description import describe_cloud
+from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.files.clouds.e57 import write_e57
+from orthoflow.files.clouds.las import write_laz
+from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
+from orthoflow.files.clouds.photo_colours import PointColours, colour_points
+from orthoflow.files.clouds.ply import write_ply
+from orthoflow.files.geotiff import epsg_of, epsg_wkt
+from orthoflow.files.images import encode_png
+from orthoflow.geometry.frames import frame_over
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Intrinsics, Photo, Planes, PointCloud, PointLabels
+
+ORIGIN = np.array([500_000.0, 4_000_000.0, 100.0])
+# A corner: the wall x = 0, seen from x > 0, and the floor z = 0, seen from above; two scans.
+N_SIDE = 60
+STATIONS = ORIGIN + np.array([[2.0, 1.0, 1.5], [1.0, 2.0, 1.0]])
+DEVIATION_M = 0.004
+
+
+def corner() -> PointCloud:
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.05, 2.0, N_SIDE)] * 2))
+    zero = np.full(len(a), DEVIATION_M)
+    points = np.vstack([np.column_stack([zero, a, b]), np.column_stack([a, b, zero])])
+    n_points = len(points)
+    x, y, z = points.T.astype(np.float32)
+    return PointCloud(
+        origin=ORIGIN,
+        x=np.ascontiguousarray(x),
+        y=np.ascontiguousarray(y),
+        z=np.ascontiguousarray(z),
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity=np.linspace(0.0, 1.0, n_points, dtype=np.float32),
+        rgb=(np.arange(3 * n_points) % 251).astype(np.uint8).reshape(-1, 3),
+        scan=(np.arange(n_points) % 2).astype(np.uint16),
+        stations=STATIONS,
+        stations_source="file",
+    )
+
+
+def planes() -> Planes:
+    normal = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    wall = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 2.0, 2.0]])
+    return Planes(
+        normal=normal,
+        offset=normal @ ORIGIN,
+        corners=ORIGIN + np.array([wall, wall[:, [2, 1, 0]]]),
+        covariance=np.zeros((2, 4, 4)),
+        n_points=np.array([1, 1]),
+        rms_m=np.zeros(2),
+        up=np.array([0.0, 0.0, 1.0]),
+        names=("wall 0", "floor"),
+    )
+
+
+def labels(cloud: PointCloud) -> PointLabels:
+    index = np.repeat(np.array([0, 1], np.int16), N_SIDE**2)
+    index[::7] = -1
+    assert len(index) == len(cloud)
+    return PointLabels(plane_index=index)
+
+
+def dressed(**more: Any) -> DressedCloud:
+    cloud = more.pop("cloud", None) or corner()
+    plain: dict[str, Any] = {
+        "cloud": cloud,
+        "colouring": "rgb",
+        "neighbourhoods": neighbourhoods_of(cloud),
+        "planes": planes(),
+        "labels": labels(cloud) if len(cloud) == 2 * N_SIDE**2 else None,
+    }
+    return DressedCloud(**(plain | more))
+
+
+@dataclasses.dataclass
+class Read:
+    """What another program read."""
+
+    world: np.ndarray
+    rgb: np.ndarray
+    normal: np.ndarray
+    fields: dict[str, np.ndarray]
+
+
+def read_laz(path: Path) -> Read:
+    found = laspy.read(path)
+    names = ("plane", "deviation", "photo")
+    extra = {n: np.asarray(found[n]) for n in names if n in found.point_format.dimension_names}
+    extra["scan"] = np.asarray(found.point_source_id)
+    extra["intensity"] = np.asarray(found.intensity) / 65535.0
+    rgb = np.column_stack([found.red, found.green, found.blue]) / 257.0
+    normal = np.column_stack([found["NormalX"], found["NormalY"], found["NormalZ"]])
+    return Read(found.xyz, rgb, normal, extra)
+
+
+def read_ply(path: Path) -> Read:
+    found = PlyData.read(path)["vertex"]
+    names = [p.name for p in found.properties]
+
+    def three(*wanted: str) -> np.ndarray:
+        return np.column_stack([found[name] for name in wanted])
+
+    extra = {n: np.asarray(found[n]) for n in names[9:]}
+    return Read(three("x", "y", "z"), three("red", "green", "blue"), three("nx", "ny", "nz"), extra)
+
+
+def read_e57(path: Path) -> Read:
+    with pye57.E57(str(path)) as file:
+        scans = [file.read_scan(k, intensity=True, colors=True) for k in range(file.scan_count)]
+        sizes = [len(scan["cartesianX"]) for scan in scans]
+
+    def three(prefix: str, *ends: str) -> np.ndarray:
+        return np.vstack([np.column_stack([s[prefix + end] for end in ends]) for s in scans])
+
+    extra = {"scan": np.repeat(np.arange(len(scans)), sizes)}
+    extra["intensity"] = np.concatenate([scan["intensity"] for scan in scans])
+    rgb = three("color", "Red", "Green", "Blue")
+    return Read(three("cartesian", "X", "Y", "Z"), rgb, np.zeros((0, 3)), extra)
+
+
+FORMATS = {
+    "laz": (write_laz, read_laz),
+    "ply": (write_ply, read_ply),
+    "e57": (write_e57, read_e57),
+}
+Write = Callable[[Path, DressedCloud], int]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("block", [1 << 20, 1000], ids=["at once", "in blocks"])
+def test_another_program_reads_every_point_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, block: int
+) -> None:
+    monkeypatch.setattr(dressing, "BLOCK", block)
+    write, read = FORMATS[name]
+    cloud = corner()
+    assert write(tmp_path / "a", dressed()) == len(cloud)
+    found = read(tmp_path / "a")
+    assert cloud.scan is not None
+    assert cloud.rgb is not None
+    assert cloud.intensity is not None
+    # E57 has scan after scan.
+    order = np.argsort(cloud.scan, kind="stable") if name == "e57" else np.arange(len(cloud))
+    # LAZ keeps tenths of a millimetre, doubles of 4e6 m nanometres.
+    limit_m = 0.51e-4 if name == "laz" else 2e-9
+    np.testing.assert_allclose(found.world, cloud.points_world()[order], atol=limit_m, rtol=0)
+    np.testing.assert_array_equal(np.rint(found.rgb), cloud.rgb[order])
+    np.testing.assert_array_equal(found.fields["scan"], cloud.scan[order])
+    np.testing.assert_allclose(found.fields["intensity"], cloud.intensity[order], atol=1e-5)
+    if name == "e57":
+        return
+    np.testing.assert_array_equal(found.fields["plane"], labels(cloud).plane_index)
+    on_plane = labels(cloud).plane_index >= 0
+    np.testing.assert_array_equal(np.isfinite(found.fields["deviation"]), on_plane)
+    np.testing.assert_allclose(found.fields["deviation"][on_plane], DEVIATION_M, atol=1e-6)
+    # Away from the edge, where two surfaces meet, normals are those of wall and floor.
+    away = (cloud.x + cloud.z > 0.5) & (cloud.y > 0.0)
+    is_wall = np.arange(len(cloud)) < N_SIDE**2
+    truth = np.where(is_wall[:, None], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(found.normal[away], truth[away], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_same_cloud_gives_the_same_bytes(tmp_path: Path, name: str) -> None:
+    for path in (tmp_path / "a", tmp_path / "b"):
+        FORMATS[name][0](path, dressed())
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_e57_keeps_a_pose_per_scan_and_fields_as_extensions(tmp_path: Path) -> None:
+    write_e57(tmp_path / "a.e57", dressed(crs_wkt="PROJCS[x]"))
+    with pye57.E57(str(tmp_path / "a.e57")) as file:
+        assert file.root["coordinateMetadata"].value() == "PROJCS[x]"
+        headers = [file.get_header(k) for k in range(file.scan_count)]
+        np.testing.assert_allclose([h.translation for h in headers], STATIONS)
+        assert {"nor:normalX", "orthoflow:plane", "orthoflow:deviation"} <= set(
+            headers[0].point_fields
+        )
+    without = dataclasses.replace(corner(), stations=None, stations_source=None)
+    write_e57(tmp_path / "b.e57", dressed(cloud=without))
+    with pye57.E57(str(tmp_path / "b.e57")) as file:
+        np.testing.assert_allclose(file.get_header(0).translation, ORIGIN)
+
+
+def test_a_known_coordinate_system_is_in_the_file(tmp_path: Path) -> None:
+    wkt = epsg_wkt(25832)
+    write_laz(tmp_path / "a.laz", dressed(crs_wkt=wkt))
+    with laspy.open(tmp_path / "a.laz") as file:
+        (vlr,) = [v for v in file.header.vlrs if v.record_id == 2112]
+        assert CRS.from_wkt(vlr.string).to_epsg() == 25832
+        np.testing.assert_array_equal(file.header.offsets, ORIGIN)
+    write_ply(tmp_path / "a.ply", dressed(crs_wkt=wkt))
+    assert any("25832" in line for line in PlyData.read(tmp_path / "a.ply").comments)
+    assert [epsg_of(name) for name in ("site", "http://a/b", "EPSG:1", None)] == [None] * 4
+
+
+def test_colours_show_what_was_asked_for(tmp_path: Path) -> None:
+    cloud = corner()
+    write_laz(tmp_path / "a.laz", dressed(colouring="intensity"))
+    grey = read_laz(tmp_path / "a.laz").rgb
+    assert (grey[:, 0] == grey[:, 1]).all()
+    assert (np.diff(grey[:, 0]) >= 0).all()
+    assert (grey[0, 0], grey[-1, 0]) == (0, 255)
+    write_laz(tmp_path / "b.laz", dressed(colouring="plane"))
+    by_plane = read_laz(tmp_path / "b.laz").rgb
+    for plane in (-1, 0, 1):
+        mine = by_plane[labels(cloud).plane_index == plane]
+        shade = mine.max(axis=1) / max(plane_colour(plane))
+        # Rounded to whole steps of 255.
+        np.testing.assert_allclose(mine, shade[:, None] * plane_colour(plane), atol=1.0)
+        assert shade.min() >= 0.39
+    dress = dressed(colouring="deviation")
+    assert dress.scale_m == 0.005
+    write_laz(tmp_path / "c.laz", dress)
+    by_distance = read_laz(tmp_path / "c.laz").rgb
+    on_plane = labels(cloud).plane_index >= 0
+    # 4 of 5 mm: four fifths of the way from white to red.
+    assert set(map(tuple, np.rint(by_distance[on_plane]).tolist())) == {(192, 69, 84)}
+    assert set(map(tuple, np.rint(by_distance[~on_plane]).tolist())) == {(128, 128, 128)}
+    describe_cloud(tmp_path / "c.json", dress, "c.laz", len(cloud))
+    said = json.loads((tmp_path / "c.json").read_text())
+    assert said["colour_scale"]["+0.005"] == [178, 24, 43]
+    assert said["scans"][1] == {"scan": 1, "station_world": STATIONS[1].tolist()}
+
+
+def test_only_what_is_asked_for_is_written(tmp_path: Path) -> None:
+    cloud = corner()
+    frame = frame_over(planes().corners[0], planes().normal[0], gsd_m=0.01)
+    slab = Slab(frame=frame, front_m=0.1, behind_m=0.05)
+    n_wall = write_laz(tmp_path / "a.laz", dressed(wall=slab, wall_plane=0))
+    found = read_laz(tmp_path / "a.laz")
+    expected = (cloud.x <= 0.1) & (cloud.z > 0) & (cloud.y <= 2.0)
+    assert n_wall == np.count_nonzero(expected)
+    # The floor, up to 2 m from the plane of the wall, is not written and sets no scale.
+    assert dressed(wall=slab, wall_plane=0).scale_m == 0.1
+    # Of points on no plane as well, and of those of the floor beside the wall.
+    np.testing.assert_allclose(found.fields["deviation"], cloud.x[expected], atol=1e-6)
+    box = ORIGIN + np.array([[0.5, 0.5, -1.0], [1.0, 1.5, 1.0]])
+    write_ply(tmp_path / "a.ply", dressed(box_world=box))
+    inside = read_ply(tmp_path / "a.ply").world
+    assert ((inside >= box[0]) & (inside <= box[1])).all()
+    expected = np.all((cloud.points_world() >= box[0]) & (cloud.points_world() <= box[1]), axis=1)
+    assert len(inside) == np.count_nonzero(expected)
+    assert write_laz(tmp_path / "none.laz", dressed(box_world=box + 100.0)) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cleaning_takes_the_outliers_and_nothing_else(tmp_path: Path, seed: int) -> None:
+    cloud = corner()
+    random = np.random.default_rng(seed)
+    far = random.uniform([0.6, 0.6, 0.6], [3.0, 3.0, 3.0], (12, 3)).astype(np.float32)
+    far[0] = 4000.0
+    spoilt = PointCloud(
+        origin=ORIGIN,
+        x=np.append(cloud.x, far[:, 0]),
+        y=np.append(cloud.y, far[:, 1]),
+        z=np.append(cloud.z, far[:, 2]),
+        up=cloud.up,
+        intensity=np.ones(len(cloud) + 12, np.float32),
+    )
+    plain = dressed(cloud=spoilt, colouring="intensity", planes=None)
+    assert write_laz(tmp_path / "a.laz", plain) == len(spoilt)
+    clean = dataclasses.replace(plain, is_cleaned=True)
+    assert write_laz(tmp_path / "b.laz", clean) == len(cloud)
+    np.testing.assert_allclose(
+        read_laz(tmp_path / "b.laz").world, cloud.points_world(), atol=0.51e-4
+    )
+
+
+def test_a_photo_colours_only_what_it_sees() -> None:
+    """A board before the wall hides its middle: those points stay grey and have no photo."""
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1.0, 1.0, 161)] * 2))
+    wall = np.column_stack([a, b, np.full(len(a), 4.0)])
+    board = np.column_stack([0.25 * a, 0.25 * b, np.full(len(a), 2.0)])
+    x, y, z = (np.ascontiguousarray(v) for v in np.vstack([wall, board]).T.astype(np.float32))
+    cloud = PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=np.array([0.0, -1.0, 0.0]))
+    inner = Intrinsics(width=400, height=400, fx=600.0, fy=600.0, cx=200.0, cy=200.0)
+    picture = np.zeros((400, 400, 3), np.uint8)
+    picture[:, :200], picture[:, 200:] = (200, 40, 40), (40, 40, 200)
+    photo = Photo(name="a.png", encoded=encode_png(picture), width=400, height=400)
+    n_points = len(cloud)
+    colours = PointColours(
+        rgb=np.full((n_points, 3), 128, np.uint8),
+        best=np.zeros(n_points, np.float32),
+        photo=np.full(n_points, -1, np.int16),
+    )
+    colour_points(cloud, [(photo, inner.posed())], colours)
+    assert colours.photo is not None
+    n_wall = len(wall)
+    # The board, 0.25 m at 2 m, hides 0.5 m at 4 m.
+    hidden = np.maximum(np.abs(a), np.abs(b)) < 0.47
+    shown = np.maximum(np.abs(a), np.abs(b)) > 0.53
+    assert (colours.photo[:n_wall][hidden] == -1).all()
+    assert (colours.rgb[:n_wall][hidden] == 128).all()
+    assert (colours.photo[:n_wall][shown] == 0).all()
+    left = shown & (a < -0.02)
+    assert (colours.rgb[:n_wall][left] == (200, 40, 40)).all()
+    assert (colours.photo[n_wall:] == 0).all()

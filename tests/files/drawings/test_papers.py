@@ -1,0 +1,91 @@
+"""Paper, scale, and how a wall is cut into sheets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import ArgumentError
+from orthoflow.files.drawings.papers import (
+    LABELS_MM,
+    MARGIN_MM,
+    MOST_SHEETS,
+    fitting_scale,
+    nice_step,
+    paper_of,
+    placed_views,
+)
+
+A3 = paper_of("A3")
+
+
+def test_papers_are_those_of_the_standard_or_given() -> None:
+    assert (paper_of("a1").width_mm, paper_of("A1").height_mm) == (841.0, 594.0)
+    assert (paper_of("700x500.5").width_mm, paper_of("700x500.5").height_mm) == (700.0, 500.5)
+
+
+@pytest.mark.parametrize("text", ["A9", "letter", "70x500", "700x50000", "700", "1e3x500", ""])
+def test_other_papers_are_refused(text: str) -> None:
+    with pytest.raises(ArgumentError, match="--paper must be A0, A1, A2, A3, A4, or width x"):
+        paper_of(text)
+
+
+def test_the_scale_is_the_largest_at_which_all_walls_fit() -> None:
+    wide, high = A3.area_mm
+    # At 1:50 exactly as large as the area.
+    size = (wide * 50 / 1e3, high * 50 / 1e3)
+    assert fitting_scale([size, (1.0, 1.0)], A3) == 50
+    assert fitting_scale([(size[0] + 0.001, size[1])], A3) == 100
+    # Upright: what is high fits onto paper that is turned.
+    assert fitting_scale([(0.5, 7.0)], A3) == 20
+
+
+@pytest.mark.parametrize("kinds", [("ortho",), ("ortho", "depth")])
+@pytest.mark.parametrize("size_m", [(12.0, 4.0), (3.3, 17.1), (30.01, 20.02)])
+@pytest.mark.parametrize("grid_m", [0.0, 0.7, 1.0])
+def test_sheets_cover_a_wall_once_and_stay_on_the_paper(
+    kinds: tuple[str, ...], size_m: tuple[float, float], grid_m: float
+) -> None:
+    paper, sheets = placed_views(kinds, size_m, A3, scale=20, grid_m=grid_m)
+    for kind in kinds:
+        views = [view for sheet in sheets for view in sheet if view.kind == kind]
+        area = sum(np.prod(view.part.size_m) for view in views)
+        assert area == pytest.approx(size_m[0] * size_m[1], rel=1e-12)
+        assert max(view.part.right_m for view in views) == size_m[0]
+        assert max(view.part.bottom_m for view in views) == size_m[1]
+        for view in views:
+            if grid_m:
+                for cut in (view.part.left_m, view.part.top_m):
+                    assert cut / grid_m == pytest.approx(round(cut / grid_m), abs=1e-9)
+            wide, high = (1e3 * edge / 20 for edge in view.part.size_m)
+            left, bottom = view.corner_mm
+            assert left >= MARGIN_MM + LABELS_MM - 1e-6
+            assert bottom >= MARGIN_MM + LABELS_MM - 1e-6
+            column = paper.width_mm - MARGIN_MM - paper.column_mm
+            assert left + wide <= column - LABELS_MM + 1e-2
+            assert bottom + high <= paper.height_mm - MARGIN_MM - LABELS_MM + 1e-2
+
+
+def test_pictures_stand_beside_each_other_where_both_fit() -> None:
+    _, sheets = placed_views(("ortho", "depth"), (4.0, 3.0), A3, scale=50, grid_m=1.0)
+    ((ortho, depth),) = sheets
+    assert depth.corner_mm[0] == pytest.approx(ortho.corner_mm[0] + 80.0 + 2 * LABELS_MM)
+    assert depth.corner_mm[1] == ortho.corner_mm[1]
+    _, sheets = placed_views(("ortho", "depth"), (11.0, 3.0), A3, scale=50, grid_m=1.0)
+    ((ortho, depth),) = sheets
+    assert depth.corner_mm[1] == pytest.approx(ortho.corner_mm[1] - 60.0 - 2 * LABELS_MM)
+
+
+def test_the_paper_is_turned_where_that_saves_sheets() -> None:
+    paper, sheets = placed_views(("ortho",), (3.0, 7.0), A3, scale=20, grid_m=1.0)
+    assert (paper.width_mm, len(sheets)) == (297.0, 1)
+
+
+def test_too_many_sheets_are_refused_before_any_is_laid_out() -> None:
+    with pytest.raises(ArgumentError, match=f"at most {MOST_SHEETS} are drawn: take a larger"):
+        placed_views(("ortho",), (1e8, 1e8), A3, scale=1, grid_m=0.0)
+
+
+def test_round_steps() -> None:
+    steps = [nice_step(least) for least in (0.011, 0.02, 0.021, 0.4, 1.0, 70.0)]
+    np.testing.assert_allclose(steps, [0.02, 0.02, 0.05, 0.5, 1.0, 100.0], rtol=1e-12)

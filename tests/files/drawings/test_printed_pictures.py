@@ -1,0 +1,117 @@
+"""Rasters as pictures for paper: native where print shows it, averaged where not, and contours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthoflow.files.drawings.papers import Part
+from orthoflow.files.drawings.printed_pictures import (
+    contours,
+    picture_file,
+    stretch_of,
+    write_picture,
+)
+from orthoflow.files.geotiff import RasterParts, write_orthoimage, write_raster
+from orthoflow.files.images import decode_image
+
+WHOLE = Part(left_m=0.0, top_m=0.0, right_m=1.0, bottom_m=0.5)
+
+
+def ramp(rows: int, columns: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    down, right = np.indices((rows, columns))
+    return np.stack([right * 255 // columns, down * 255 // rows, 0 * right], axis=2).astype("u1")
+
+
+def test_cells_are_kept_as_they_are_where_print_shows_them(tmp_path: Path) -> None:
+    rgb = ramp(50, 100)
+    shown = np.ones((50, 100), dtype=np.bool_)
+    shown[:5] = False
+    write_orthoimage(tmp_path / "a.tif", rgb, shown, gsd_m=0.01, tags={})
+    assert write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=20) == (50, 100)
+    picture = decode_image(picture_file(tmp_path / "p").read_bytes())
+    np.testing.assert_array_equal(picture[5:], rgb[5:])
+    assert (picture[:5] == 255).all()
+
+
+def test_a_part_has_the_cells_of_its_place(tmp_path: Path) -> None:
+    rgb = ramp(50, 100)
+    write_orthoimage(tmp_path / "a.tif", rgb, np.ones((50, 100), np.bool_), gsd_m=0.01, tags={})
+    part = Part(left_m=0.2, top_m=0.1, right_m=0.5, bottom_m=0.3)
+    assert write_picture(tmp_path / "a.tif", part, tmp_path / "p", scale=20) == (20, 30)
+    picture = decode_image(picture_file(tmp_path / "p").read_bytes())
+    np.testing.assert_array_equal(picture, rgb[10:30, 20:50])
+
+
+def test_finer_cells_than_print_shows_are_averaged_to_400_per_inch(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    rgb = rng.integers(0, 256, (1000, 2000, 3), dtype=np.uint8)
+    shown = np.ones((1000, 2000), np.bool_)
+    write_orthoimage(tmp_path / "a.tif", rgb, shown, gsd_m=0.0005, tags={})
+    # 1 m at 1:50 is 20 mm: 0.787 inches, 315 pixels of 6.35 cells.
+    shape = write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=50)
+    assert shape == (158, 315)
+    picture = decode_image(picture_file(tmp_path / "p").read_bytes())
+    # The mean of 40 independent cells is 40 times less wild, and as bright.
+    assert picture.mean() == pytest.approx(rgb.mean(), abs=1.0)
+    assert picture.std() < rgb.std() / 3
+
+
+def test_large_pictures_are_jpeg_with_the_colours_they_had(tmp_path: Path) -> None:
+    rgb = np.empty((3000, 4000, 3), dtype=np.uint8)
+    rgb[:, :2000], rgb[:, 2000:] = (200, 40, 90), (10, 220, 30)
+    shown = np.ones((3000, 4000), np.bool_)
+    write_orthoimage(tmp_path / "a.tif", rgb, shown, gsd_m=0.01, tags={})
+    part = Part(left_m=0.0, top_m=0.0, right_m=40.0, bottom_m=30.0)
+    write_picture(tmp_path / "a.tif", part, tmp_path / "p", scale=50)
+    assert picture_file(tmp_path / "p").suffix == ".jpg"
+    picture = decode_image(picture_file(tmp_path / "p").read_bytes()).astype(int)
+    assert picture.shape == (3000, 4000, 3)
+    # No chroma is thinned out: beside the edge too colours are right to JPEG's rounding.
+    assert np.abs(picture[:, :1990] - (200, 40, 90)).max() <= 3
+    assert np.abs(picture[:, 2010:] - (10, 220, 30)).max() <= 3
+
+
+def test_grey_is_stretched_and_nothing_is_white(tmp_path: Path) -> None:
+    values = np.tile(np.linspace(0.0, 1.0, 101, dtype=np.float32)[:100], (50, 1))
+    values[:, :10] = np.nan
+    write_raster(tmp_path / "a.tif", values, gsd_m=0.01, tags={})
+    stretch = stretch_of(tmp_path / "a.tif")
+    low, high = np.nanpercentile(values, (2, 98))
+    assert (stretch.low, stretch.high) == (pytest.approx(low), pytest.approx(high))
+    write_picture(tmp_path / "a.tif", WHOLE, tmp_path / "p", scale=20)
+    picture = decode_image(picture_file(tmp_path / "p").read_bytes())
+    assert (picture[:, :10] == 255).all()
+    assert (picture[:, 11] == 0).all()
+    assert (np.diff(picture[0, 10:, 0].astype(int)) >= 0).all()
+
+
+def test_contours_of_a_slope_are_where_it_has_their_depth(tmp_path: Path) -> None:
+    # Depth grows by 0.2 m over a metre to the right.
+    slope = 0.2 * (np.arange(200, dtype=np.float32) + 0.5) / 200.0
+    write_raster(tmp_path / "a.tif", np.tile(slope, (100, 1)), gsd_m=0.005, tags={})
+    found = contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.05)
+    assert [level for level, _ in found] == pytest.approx([0.025, 0.075, 0.125, 0.175])
+    for level, points in found:
+        # float32 depths of 0.2 m are known to 1e-8 m.
+        np.testing.assert_allclose(points[:, 0], level / 0.2, atol=1e-6)
+        assert np.ptp(points[:, 1]) == pytest.approx(0.495, abs=1e-9)
+
+
+def test_a_flat_wall_has_no_contours(tmp_path: Path) -> None:
+    noise = np.random.default_rng(2).normal(0.0, 0.002, (100, 200)).astype(np.float32)
+    write_raster(tmp_path / "a.tif", noise, gsd_m=0.005, tags={})
+    assert contours(tmp_path / "a.tif", WHOLE, scale=10, interval_m=0.05) == []
+
+
+def test_parts_of_a_raster_read_as_the_whole_does(tmp_path: Path) -> None:
+    values = np.random.default_rng(3).normal(size=(700, 900)).astype(np.float32)
+    values[::7] = np.nan
+    write_raster(tmp_path / "a.tif", values, gsd_m=0.01, tags={})
+    with RasterParts(tmp_path / "a.tif") as source:
+        assert (source.shape, source.gsd_m, source.bands) == ((700, 900), 0.01, 1)
+        part, shown = source.read((100.0, 200.0, 400.0, 250.0), (50, 300))
+    np.testing.assert_array_equal(part, values[200:250, 100:400])
+    np.testing.assert_array_equal(shown, np.isfinite(values[200:250, 100:400]))

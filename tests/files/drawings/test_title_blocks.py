@@ -1,0 +1,54 @@
+"""The title block of a sheet, and what is wrong with one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from orthoflow.errors import InputError
+from orthoflow.files.drawings.title_blocks import FIELDS, TitleBlock, read_title_block
+
+
+def read(folder: Path, text: str) -> TitleBlock:
+    path = folder / "block.yaml"
+    path.write_text(text, encoding="utf-8")
+    return read_title_block(path)
+
+
+def test_every_field_is_read_as_text(tmp_path: Path) -> None:
+    text = "".join(f"{name}: Ł {name}\n" for name in FIELDS)
+    assert read(tmp_path, text) == TitleBlock(**{name: f"Ł {name}" for name in FIELDS})
+    block = read(tmp_path, "date: 2026-03-14\ndrawing: 17\n")
+    assert (block.date, block.drawing, block.project) == ("2026-03-14", "17", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("projct: a\n", "block.yaml:1:1: projct: no field of a title block; did you mean project?"),
+        ("a: 1\nzzz: b\n", "block.yaml:1:1: a: no field of a title block; there are project, ti"),
+        ("title: [1]\n", "block.yaml:1:1: title: expected a text, got a list"),
+        ("title:\n", "title: expected a text, got nothing"),
+        ("- a\n", "block.yaml:1:1: expected fields of a title block such as project, got a list"),
+        ("", "the title block is empty"),
+        ("title: a\ntitle: b\n", "the key is there already, in line 1; remove one of them"),
+        (f"note: {'a' * 301}\n", "note: has 301 letters, at most 300 fit on a sheet"),
+        ("title: [", "block.yaml:"),
+        ("a" * 100_001, "block.yaml has 100001 bytes, a title block at most 100000"),
+    ],
+    ids=["misspelt", "unknown", "list", "null", "no-table", "empty", "twice", "long", "cut", "big"],
+)
+def test_what_is_wrong_is_said_in_one_sentence(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, text)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_are_none_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"missing.yaml cannot be read: No such file"):
+        read_title_block(tmp_path / "missing.yaml")
+    (tmp_path / "latin.yaml").write_bytes(b"title: \xe9\n")
+    with pytest.raises(InputError, match="is no UTF-8 text"):
+        read_title_block(tmp_path / "latin.yaml")

@@ -1,0 +1,134 @@
+"""What a run gives at a Python prompt and in a notebook."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_provenance.model import RecordedFigure
+from orthoflow_provenance.writer import write_record
+
+import orthoflow
+from orthoflow.errors import ArgumentError, OrthoflowError, WorkflowError
+from orthoflow.products import Orthoimages
+from orthoflow.report.notebooks import OpenedRun
+from tests.provenance_records import write_sample
+from tests.report_runs import cell, compared_resolved, metrics, record
+from tests.report_runs import orthoimages_product as images_of
+
+PNG = b"\x89PNG\r\n\x1a\n" + bytes(200_000)
+
+
+class Painted(OpenedRun):
+    """A run whose orthoimages are held here instead of in a record."""
+
+    def payload(self, address: str, port: str):  # type: ignore[no-untyped-def]
+        assert port == "orthoimages"
+        (image,) = images_of(0).images
+        both = (replace(image, plane_index=3), replace(image, plane_index=8, name="floor 8"))
+        return Orthoimages(images=both).to_payload()
+
+    def payloads(self, places):  # type: ignore[no-untyped-def]
+        return (self.payload(*place) for place in places)
+
+
+def opened(folder: Path) -> OpenedRun:
+    figure = RecordedFigure(name="plan", caption="a <plan>", media_type="image/png", data=PNG)
+    cells = [
+        cell("scan", metrics=metrics(n_points=7.0), figures=(figure,), log="long " * 10_000),
+        cell("plane@plane=fine", metrics=metrics(rms_mm=1.0)),
+        cell("plane@plane=fine#1", metrics=metrics(rms_mm=1.5)),
+        cell("plane@plane=coarse", metrics=metrics(rms_mm=4.0)),
+    ]
+    made = record(cells, name="hall\x1b[2J", workflow_resolved=compared_resolved())
+    write_record(folder / "run.h5", made, lambda _digest: None)
+    return orthoflow.open_run(folder)
+
+
+def test_a_run_fits_into_a_line_and_html_into_a_screen(tmp_path: Path) -> None:
+    run = opened(tmp_path)
+    assert repr(run) == f"<Run hall\\x1b[2J in {tmp_path}: 4 ok>"
+    assert len(repr(run.cells["scan"])) < 200
+    assert len(repr(run.record)) < 200
+    assert len(repr(run.figures["scan/plan"])) < 200
+    html = run._repr_html_()
+    assert len(html) < 5_000
+    assert "points to their plane, RMS" in html
+    assert "\x1b" not in html
+
+
+def test_metrics_are_a_row_each_with_the_variants_beside(tmp_path: Path) -> None:
+    table = opened(tmp_path).metrics()
+    rms = table[table.metric == "rms_mm"]
+    assert list(table.columns) == [
+        "cell", "step", "method", "plane=", "repeat", "metric", "value", "unit",
+    ]  # fmt: skip
+    assert list(zip(rms["plane="], rms.repeat, rms.value, rms.unit, strict=True)) == [
+        ("fine", 0, 1.0, "mm"), ("fine", 1, 1.5, "mm"), ("coarse", 0, 4.0, "mm"),
+    ]  # fmt: skip
+    assert rms.groupby("plane=").value.mean().to_dict() == {"coarse": 4.0, "fine": 1.25}
+    assert table[table.step == "scan"]["plane="].isna().all()
+
+
+def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:
+    figures = opened(tmp_path).figures
+    assert list(figures) == ["scan/plan"]
+    assert repr(figures) == "scan/plan: a <plan>"
+    figure = figures["scan/plan"]
+    assert "a &lt;plan&gt;" in figure._repr_html_()
+    assert 'src="data:image/png;base64,iVBORw0KGgo' in figure._repr_html_()
+    figure.save(tmp_path / "plan.png")
+    assert (tmp_path / "plan.png").read_bytes() == PNG
+
+
+def test_an_orthoimage_is_an_array_by_its_wall_s_number(tmp_path: Path) -> None:
+    from tests.report_runs import given
+
+    made = cell("mosaic", outputs={"orthoimages": given("", "7", "orthoimages")})
+    run = Painted(path=tmp_path / "run.h5", record=record([made]))
+    (expected,) = images_of(0).images
+    image = run.orthoimage(8)
+    np.testing.assert_array_equal(np.asarray(image), expected.rgb)
+    np.testing.assert_array_equal(image.is_shown, np.isin(expected.mask, (1, 2)))
+    assert image.frame.has_cells_of(expected.frame)
+    assert repr(image).startswith("<WallImage floor 8 of mosaic: ")
+    assert image._repr_html_().startswith('<figure><img src="data:image/webp;base64,')
+    assert run.orthoimage().image.number == 3
+    assert image.file is None
+    with pytest.raises(ArgumentError, match="mosaic has no orthoimage of wall 0; walls: 3, 8"):
+        run.orthoimage(0)
+    with pytest.raises(ArgumentError, match="no orthoimages of first; cells with some: mosaic"):
+        run.orthoimage(cell="first")
+
+
+def test_runs_are_compared_as_a_table(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    first = opened(tmp_path / "a")
+    other = record([cell("scan", metrics=metrics(n_points=9.0))], run_id="r2")
+    write_record(tmp_path / "b" / "run.h5", other, lambda _digest: None)
+    comparison = first.compare(tmp_path / "b")
+    assert repr(comparison).startswith("<RunComparison of 'r1' and 'r2': 0 of 0 inputs, ")
+    table = comparison.metric_table().set_index(["cell", "metric"])
+    assert tuple(table.loc[("scan", "n_points")]) == (7.0, 9.0, 2.0, "1")
+    assert np.isnan(table.loc[("plane@plane=coarse", "rms_mm")].difference)
+
+
+def test_records_of_the_command_line_open_too(tmp_path: Path) -> None:
+    path, _, _ = write_sample(tmp_path)
+    assert "court-yard" in orthoflow.open_run(path)._repr_html_()
+
+
+def test_what_is_wrong_with_a_workflow_is_raised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(
+        OrthoflowError, match=r"there is no parameter gsd in raster\.grid \(did you"
+    ):
+        orthoflow.run("direct.yaml", set={"wall.gsd": 1})
+    with pytest.raises(WorkflowError, match="did you mean direct"):
+        orthoflow.run("dirct.yaml")
+    assert not (tmp_path / "runs").exists()

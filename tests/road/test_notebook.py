@@ -1,0 +1,48 @@
+"""The notebook in `examples/`: executed as a reader would, in an empty folder."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+import orthoflow
+from tests.road.conftest import CHECKOUT, ROOT
+
+NOTEBOOK = ROOT / "examples" / "runs.ipynb"
+
+
+@pytest.mark.filterwarnings("default")  # of the notebook's own machinery
+def test_the_notebook_runs_and_shows_what_it_promises(
+    tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nbclient = pytest.importorskip("nbclient", reason="the extra `test` has nbclient")
+    pytest.importorskip("ipykernel", reason="the extra `test` has ipykernel")
+    import nbformat
+
+    monkeypatch.setenv("PYTHONPATH", ":".join(CHECKOUT))
+    # A reader's store has compiled kernels from the second run on.
+    (tmp_path / ".orthoflow").mkdir()
+    (tmp_path / ".orthoflow" / "numba").symlink_to(store / "numba")
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells)
+    client = nbclient.NotebookClient(
+        notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}
+    )
+    client.execute()
+    shown = [
+        output.data
+        for cell in notebook.cells
+        for output in cell.get("outputs", ())
+        if output.output_type == "execute_result"
+    ]
+    assert "first orthoimage" in shown[0]["text/html"]
+    assert "completeness" in shown[1]["text/html"]
+    assert "data:image/webp" in shown[2]["text/html"]
+    assert shown[-2]["text/plain"].startswith("<RunComparison of ")
+    runs = [orthoflow.open_run(tmp_path / "runs" / name) for name in ("first", "second")]
+    assert [run.record.status for run in runs] == ["ok", "ok"]
+    # The room was not simulated twice.
+    assert runs[1].cells["room"].cached_from == runs[0].record.run_id
+    shutil.rmtree(tmp_path / "runs")

@@ -1,0 +1,31 @@
+"""What a scientific project shows at its door agrees with the program."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+import orthoflow
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_the_citation_is_of_this_version_and_has_what_its_format_wants() -> None:
+    told = YAML(typ="safe").load(ROOT / "CITATION.cff")
+    assert told["version"] == orthoflow.__version__
+    assert {"cff-version", "message", "title", "authors", "license"} <= set(told)
+    dois = [entry["doi"] for entry in told["references"] if "doi" in entry]
+    # As the methods themselves ask for it.
+    source = (ROOT / "plugins/orthoflow_plugins/inspect/surf.py").read_text()
+    assert dois
+    assert all(f"doi:{doi.split('/')[0]}" in source for doi in dois)
+
+
+@pytest.mark.parametrize("name", ["CONTRIBUTING.md", "README.md"])
+def test_files_that_are_named_are_there(name: str) -> None:
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", (ROOT / name).read_text())
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []

@@ -1,0 +1,147 @@
+"""First workflows for one's own files: each names what was found, and is fine as it is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from orthoflow.catalog import discover_catalog
+from orthoflow.cli.program import program
+from orthoflow.workflow import load_workflow, resolve_input_files
+
+CALIBRATION = """cameras:
+  "*": {width: 40, height: 30, fx: 50, fy: 50, cx: 20, cy: 15, distortion: [0, 0, 0, 0, 0]}
+"""
+TIES = "photo,u_px,v_px,x,y,z\na.jpg,1,2,3,4,5\n"
+POINTS = "name,x,y,z\nP1,1,2,3\nP2,2,2,3\n"
+
+
+def asked(*arguments: object) -> Result:
+    return CliRunner().invoke(program, [str(argument) for argument in arguments])
+
+
+def said(*arguments: object) -> str:
+    result = asked(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def write_scan(path: Path) -> Path:
+    cloud = laspy.LasData(laspy.LasHeader(point_format=2, version="1.2"))
+    cloud.x = cloud.y = cloud.z = np.arange(500.0)
+    cloud.write(str(path))
+    return path
+
+
+def write_photos(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    for index in range(count):
+        cv2.imwrite(str(folder / f"{chr(97 + index)}.jpg"), np.zeros((30, 40, 3), np.uint8))
+    return folder
+
+
+@pytest.fixture
+def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder as a surveyor has it, with a name that is a pattern and needs quotes."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "the [old] hall"
+    folder.mkdir()
+    write_scan(folder / "hall.las")
+    write_photos(folder / "photos", 3)
+    (folder / "calibration.yaml").write_text(CALIBRATION)
+    (folder / "checks.csv").write_text(POINTS)
+    (folder / "ties.csv").write_text(TIES)
+    (folder / "notes.txt").write_text("1 2 3\n4 5 6\n")
+    (folder / "plan.dwg").write_bytes(b"AC1027")
+    return folder
+
+
+def inputs_of(workflow: Path) -> dict[str, list[str]]:
+    loaded = load_workflow(workflow, discover_catalog())
+    found = resolve_input_files(loaded)
+    return {name: [path.name for path in files.paths] for name, files in found.items() if files}
+
+
+def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
+    out = said("new", data, "-o", "jobs/hall 1.yaml")
+    assert said("check", "jobs/hall 1.yaml").startswith("hall-1 is fine: 20 steps")
+    assert inputs_of(Path("jobs/hall 1.yaml")) == {
+        "scan": ["hall.las"],
+        "photos": ["a.jpg", "b.jpg", "c.jpg"],
+        "calibration": ["calibration.yaml"],
+        "checkpoints": ["checks.csv"],
+        "ties": ["ties.csv"],
+    }
+    text = Path("jobs/hall 1.yaml").read_text()
+    assert 'photos: {files: "../the [old] hall/photos"}  # 3 photos' in text
+    assert "scan: hall.las, LAS/LAZ, 500 points, intensity, colours" in out
+    assert "calibration: calibration.yaml, a calibration of *" in out
+    assert "checkpoints: checks.csv, 2 surveyed points" in out
+    assert "ties: ties.csv, 1 tie" in out
+    assert "not used: notes.txt: text, left out beside scans of other formats" in out
+    assert "not used: plan.dwg: no method reads such files" in out
+    assert "next: orthoflow check jobs/hall 1.yaml" in out
+
+
+def test_a_scan_alone_is_painted_from_its_own_colours_without_a_stand_in(data: Path) -> None:
+    out = json.loads(said("new", data / "hall.las", data / "checks.csv", "--json"))
+    assert (out["file"], out["recipe"], out["left_out"]) == ("workflow.yaml", "direct", [])
+    text = Path("workflow.yaml").read_text()
+    assert "room" not in text.partition("\nsteps:")[2]
+    # No step waits for a simulated room, none is skipped.
+    assert said("check", "workflow.yaml") == "workflow is fine: 7 steps, 7 cells\n"
+
+
+def test_a_plan_is_made_when_it_is_asked_for(data: Path) -> None:
+    said("new", data / "hall.las", "-o", "plan.yaml", "--recipe", "plan")
+    assert "check" in said("check", "plan.yaml") or "plan is fine" in said("check", "plan.yaml")
+    assert inputs_of(Path("plan.yaml")) == {"scan": ["hall.las"]}
+
+
+def test_several_scans_and_two_tables_of_points(data: Path) -> None:
+    write_scan(data / "second.las")
+    (data / "more.csv").write_text(POINTS)
+    out = said("new", data, "-o", "w.yaml")
+    assert inputs_of(Path("w.yaml"))["scan"] == ["hall.las", "second.las"]
+    # Which one is to be checked with only the surveyor knows.
+    assert "checkpoints" not in inputs_of(Path("w.yaml"))
+    assert "not used: checks.csv, more.csv: checkpoints may be one of them only" in out
+
+
+def test_a_table_of_coordinates_is_a_scan_and_no_list_of_points(tmp_path: Path) -> None:
+    table = tmp_path / "cloud.csv"
+    rows = np.column_stack([np.arange(50) + 0.125, np.zeros(50), np.ones(50), np.full(50, 0.5)])
+    table.write_text("\n".join(",".join(f"{value:.3f}" for value in row) for row in rows))
+    out = said("new", table, "-o", tmp_path / "w.yaml")
+    assert out.startswith("scan: cloud.csv, text, ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("nowhere",), "nowhere does not exist: give scans, photos, and folders with them"),
+        (("photos",), "there is no scan among the files, and a workflow needs one (E57, LAS"),
+        (("hall.las", "--recipe", "photos-on-scan"), "photos-on-scan needs photos, and there are"),
+        (
+            ("hall.las", "-o", "notes.txt"),
+            "notes.txt is there already: choose another name with -o",
+        ),
+        (("torn.las",), "torn.las"),
+    ],
+)
+def test_mistakes_get_a_sentence_and_no_file(
+    data: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], sentence: str
+) -> None:
+    monkeypatch.chdir(data)
+    (data / "torn.las").write_bytes((data / "hall.las").read_bytes()[:100])
+    result = asked("new", *arguments)
+    assert result.exit_code == 2
+    assert sentence in result.output
+    assert not (data / "workflow.yaml").exists()
+    assert (data / "notes.txt").read_text() == "1 2 3\n4 5 6\n"
