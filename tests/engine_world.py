@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -12,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import PathDistribution
+from importlib.util import cache_from_source
 from pathlib import Path
 
 from orthoflow.catalog import Catalog, discover_catalog
@@ -124,7 +124,8 @@ def forget_toys() -> None:
     Bytecode is taken for that of a source of the same length that was rewritten within a second.
     """
     for path in sys.path:
-        shutil.rmtree(Path(path) / "toy_plugin" / "__pycache__", ignore_errors=True)
+        for source in (Path(path) / "toy_plugin").glob("*.py"):
+            Path(cache_from_source(str(source))).unlink(missing_ok=True)
     for name in [name for name in sys.modules if name.partition(".")[0] == "toy_plugin"]:
         del sys.modules[name]
 

@@ -23,6 +23,7 @@ from orthoflow.engine.events import (
     RunStarted,
 )
 from orthoflow.foreign_text import shown
+from orthoflow.geometry.threads import start_beside
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -315,12 +316,12 @@ class _Clock:
         self._every_s = every_s
         self._last = time.monotonic()
         self._is_over = threading.Event()
-        self._thread = threading.Thread(target=self._go, daemon=True)
+        self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Begin to watch."""
         self.reset()
-        self._thread.start()
+        self._thread = start_beside(self._go)
 
     def reset(self) -> None:
         """Hear that something was said."""
@@ -329,7 +330,8 @@ class _Clock:
     def stop(self) -> None:
         """End; nothing is said after that."""
         self._is_over.set()
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
 
     def _go(self) -> None:
         wait_s = self._every_s

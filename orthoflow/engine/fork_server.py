@@ -27,6 +27,7 @@ from typing import Final
 from orthoflow.engine.child import run_step
 from orthoflow.engine.executors import tell_numba
 from orthoflow.engine.keeper import fork_kept
+from orthoflow.geometry.threads import address_space
 
 # One per message: pid of the keeper, then its end as `os.waitstatus_to_exitcode` has it.
 NUMBER: Final = struct.Struct("=i")
@@ -217,6 +218,9 @@ def _move_to(request: StepRequest) -> None:
 
 def _load(name: str) -> None:
     """Load a library as well as it can be; steps say what is wrong with it."""
+    if address_space() is not None:
+        # Some crash where they get too little, and all steps with this process.
+        return
     with suppress(Exception):
         importlib.import_module(name)
     gc.freeze()

@@ -19,7 +19,7 @@ from orthoflow.engine.clock import now
 from orthoflow.engine.durability import read_whole, writing_to
 from orthoflow.engine.executors import Capacity, TaskEnd, Tell
 from orthoflow.engine.keeper import END_ALL
-from orthoflow.engine.memory import GIB, MemoryGuard, oom_kills, process_memory
+from orthoflow.engine.memory import GIB, MIB, MemoryGuard, oom_kills, process_memory
 from orthoflow.engine.process_trees import descendants
 from orthoflow.engine.results import CellResult, result_from_json
 from orthoflow.engine.running import failed_result
@@ -27,6 +27,7 @@ from orthoflow.engine.step_logs import StepLog
 from orthoflow.engine.step_processes import StepProcess, start_step
 from orthoflow.engine.tasks import Task, write_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
+from orthoflow.geometry.threads import address_space
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line
 
@@ -315,7 +316,9 @@ def describe_exit(who: str, code: int, n_bytes: int, tail: str) -> str:
         return f"{who} ended its process without a result (exit status {code}){last}"
     name = _signal_name(-code)
     if -code in _CRASHES:
-        return f"{who} crashed ({_CRASHES[signal.Signals(-code)]}, {name})"
+        limit = address_space()
+        room = f"; a process may take {limit / MIB:.0f} MiB of memory here" if limit else ""
+        return f"{who} crashed ({_CRASHES[signal.Signals(-code)]}, {name}){room}"
     return f"{who} was killed from outside ({name}) while it held {n_bytes / GIB:.1f} GiB of memory"
 
 

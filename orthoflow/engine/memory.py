@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from orthoflow.engine.process_trees import descendants
+from orthoflow.geometry.threads import start_beside
 
 MIB: Final = 1 << 20
 GIB: Final = 1 << 30
@@ -91,14 +92,14 @@ class MemorySampler:
 
     def __init__(self) -> None:
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._sample, name="memory", daemon=True)
+        self._thread: threading.Thread | None = None
         self._peak_anonymous = 0
         self._peak_files = 0
         self._peak_resident = 0
 
     def __enter__(self) -> Self:
         self._note()
-        self._thread.start()
+        self._thread = start_beside(self._sample)
         return self
 
     def __exit__(
@@ -108,7 +109,8 @@ class MemorySampler:
         trace: TracebackType | None,
     ) -> None:
         self._stop.set()
-        self._thread.join()
+        if self._thread is not None:
+            self._thread.join()
         self._note()
 
     @property

@@ -8,13 +8,37 @@ from __future__ import annotations
 
 import itertools
 import os
+import resource
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TypeVar
+from threading import Thread
+from typing import Final, TypeVar
 
+_ROOM_FOR_THREADS: Final = 2 << 30
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
+
+
+def address_space() -> int | None:
+    """Bytes of memory that this process may ask for (`ulimit -v`); None without such a limit."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def has_room_for_threads() -> bool:
+    """Whether threads may be started: one that finds no memory then is waited for without end."""
+    limit = address_space()
+    return limit is None or limit >= _ROOM_FOR_THREADS
+
+
+def start_beside(work: Callable[[], object]) -> Thread | None:
+    """Start what need not be done in a thread of its own; None where there is no room for it."""
+    if not has_room_for_threads():
+        return None
+    thread = Thread(target=work, daemon=True)
+    thread.start()
+    return thread
 
 
 def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = None) -> None:
@@ -24,8 +48,9 @@ def in_threads(tasks: Sequence[Callable[[], None]], *, threads: int | None = Non
         tasks: what to run.
         threads: so many at once; None for all of them.
     """
-    if len(tasks) == 1:
-        tasks[0]()
+    if len(tasks) == 1 or not has_room_for_threads():
+        for task in tasks:
+            task()
         return
     with ThreadPoolExecutor(len(tasks) if threads is None else max(1, threads)) as pool:
         for future in [pool.submit(task) for task in tasks]:
@@ -36,6 +61,9 @@ def in_order(
     function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int | None = None
 ) -> Iterator[_Result]:
     """Give a function's results item by item, so many computed at once; None: one per processor."""
+    if not has_room_for_threads():
+        yield from map(function, items)
+        return
     with ThreadPoolExecutor(os.cpu_count() if threads is None else max(1, threads)) as pool:
         yield from pool.map(function, items)
 

@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthoflow.geometry.threads import even_parts, in_order, in_runs, in_threads
+from orthoflow.geometry import threads
+from orthoflow.geometry.threads import (
+    even_parts,
+    in_order,
+    in_runs,
+    in_threads,
+    start_beside,
+)
 
 WAIT_S = 20.0
 
@@ -115,3 +122,23 @@ def test_runs_have_one_length_but_for_the_last(
     seen: list[tuple[int, int]] = []
     in_runs(lambda *run: seen.append(run), n_items, n_per_run=4, threads=threads)
     assert sorted(seen) == runs
+
+
+def test_no_thread_is_started_where_memory_is_limited_to_little(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """CPython waits without end for a thread that finds no memory at its beginning."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a thread was started")
+
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    monkeypatch.setattr(threads, "address_space", lambda: 250 << 20)
+    done: list[int] = []
+    in_threads([partial(done.append, index) for index in range(4)])
+    assert done == [0, 1, 2, 3]
+    assert list(in_order(abs, [-2, 1, -3])) == [2, 1, 3]
+    assert start_beside(done.clear) is None
+    monkeypatch.setattr(threads, "address_space", lambda: 8 << 30)
+    with pytest.raises(AssertionError, match="a thread was started"):
+        start_beside(done.clear)

@@ -11,7 +11,6 @@ import contextlib
 import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from threading import Thread
 from typing import Final, Protocol
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import angle_between_deg, basis_from_up, omega_phi_deg
+from orthoflow.geometry.threads import start_beside
 from orthoflow.products import Planes, PointCloud, PointLabels, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import Assembly, RawPlane, assemble, warn_of_guesses
@@ -230,7 +230,7 @@ def _found(
     """Prepare a cloud, and find, fit and label its planes; reports how long that takes."""
     rules = rules_of(params)
     moments_s = [ctx.clock_s()]
-    Thread(target=_load_charts, daemon=True).start()
+    start_beside(_load_charts)
     ctx.progress(0.0, "preparing the points")
 
     def prepared(points: PointCloud) -> PreparedCloud:
