@@ -18,6 +18,8 @@ from orthoflow.files.containers import image_format, is_webp, stated_size
 from orthoflow.files.exif import without_orientation
 from orthoflow.geometry.levels import Colours, eight_bits
 
+# What photos end in; another file holds none, or one that must be converted first.
+PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff")
 PREVIEW_SIDE_PX: Final = 1600
 # 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
 MOST_PIXELS: Final = 1 << 28

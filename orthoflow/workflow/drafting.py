@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 from orthoflow.errors import InputError
+from orthoflow.files.images import PHOTO_SUFFIXES
 from orthoflow.files.points.formats import TEXT
 from orthoflow.workflow.recipes import shipped_workflow
-from orthoflow.workflow.recognising import PHOTO_SUFFIXES, FileKind, Recognised
+from orthoflow.workflow.recognising import FileKind, Recognised
 
 Recipe: TypeAlias = Literal["photos-on-scan", "direct", "plan"]
 

@@ -13,6 +13,7 @@ from orthoflow.files.calibration import read_calibration
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import count_e57_images
+from orthoflow.files.images import PHOTO_SUFFIXES
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 
@@ -20,7 +21,6 @@ FileKind: TypeAlias = Literal[
     "scan", "photos", "calibration", "checkpoints", "ties", "cameras", "other", "unknown"
 ]
 
-PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff")
 _RASTERS: Final = (".tif", ".tiff")
 _YAML: Final = (".yaml", ".yml")
 _CAMERAS: Final = (".xml", ".out", ".json")

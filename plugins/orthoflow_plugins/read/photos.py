@@ -17,7 +17,7 @@ from orthoflow.files.containers import image_format, is_cut_off, stated_bits
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57Image, read_e57_images
 from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
-from orthoflow.files.images import decode_image, decode_levels
+from orthoflow.files.images import PHOTO_SUFFIXES, decode_image, decode_levels
 from orthoflow.files.panoramas import PanoramaFace, faces_of
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Calibration, InputFiles, Intrinsics, Photo, Photos
@@ -32,7 +32,6 @@ _RAW: Final = frozenset(
 # Bits per channel that orthoimages can have.
 _BITS: Final = 16
 _PLAIN_BITS: Final = 8
-_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff"})
 _NAMED: Final = 3
 
 
@@ -168,7 +167,7 @@ def _sources(ctx: StepContext, files: InputFiles, panoramas: Sequence[str]) -> l
         raise InputError(f"the input {files.name} names no files: expected photos")
     sources, others = [], []
     for path in files.paths:
-        is_photo = path.suffix.lower() in _SUFFIXES
+        is_photo = path.suffix.lower() in PHOTO_SUFFIXES
         if is_photo and any(fnmatchcase(path.name, pattern) for pattern in panoramas):
             sources += _of_panorama(path)
         elif is_photo:
