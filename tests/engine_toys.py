@@ -156,6 +156,7 @@ class Survey(Method):
 WORKS = """
 import ctypes
 import errno
+import gc
 import os
 import resource
 import signal
@@ -248,6 +249,8 @@ def loads(values, params, ctx):
     from toy_plugin import heavy
 
     ctx.metric("loads_s", ctx.clock_s() - started, "s")
+    searched = [item for item in gc.get_objects() if type(item).__name__ == "Loaded"]
+    ctx.metric("n_searched", len(searched), "1")
     return values
 
 @work("exact")

@@ -105,7 +105,7 @@ def run_step(task_file: str, descriptor: int, at_end: Callable[[], None]) -> NoR
     except StoreError as error:
         pipe.send({"kind": "failed", "text": str(error)})
         os._exit(1)
-    result = run_task(task, pipe.listen, lambda: stop.is_set)
+    result = run_task(task, pipe.listen, lambda: stop.is_set, has_own_process=True)
     _leave(task, result, pipe)
     at_end()
     for stream in (sys.stdout, sys.stderr):

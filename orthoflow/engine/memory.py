@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,8 @@ class MemorySampler:
 
     Attributes:
         peak_mib: largest own memory; at least what the kernel's high-water mark proves.
+        processor_s: processor seconds that the samples took so far. They grow with the clock, so a
+            step that compiles for minutes would seem to compute longer.
     """
 
     def __init__(self) -> None:
@@ -96,6 +99,7 @@ class MemorySampler:
         self._peak_anonymous = 0
         self._peak_files = 0
         self._peak_resident = 0
+        self.processor_s = 0.0
 
     def __enter__(self) -> Self:
         self._note()
@@ -126,6 +130,7 @@ class MemorySampler:
     def _sample(self) -> None:
         while not self._stop.wait(_SAMPLE_S):
             self._note()
+            self.processor_s = time.thread_time()
 
     def _note(self) -> None:
         memory = process_memory()

@@ -61,17 +61,25 @@ _LONGEST_TRACE: Final = 64 << 10
 Listener = Callable[[StepEvent], None]
 
 
-def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> CellResult:
+def run_task(
+    task: Task,
+    listen: Listener,
+    is_cancelled: Callable[[], bool],
+    *,
+    has_own_process: bool = False,
+) -> CellResult:
     """Run a task to its end; every failure becomes a failed result, never an exception.
 
     Args:
         task: what to run; its folder exists.
         listen: gets progress, log lines and warnings.
         is_cancelled: asks whether to stop.
+        has_own_process: whether this process ends with the task.
     """
     started = now()
-    sampler, meter, news = MemorySampler(), LoadingMeter(), _News(listen)
-    call = _Call(task, news.listen, is_cancelled, meter)
+    sampler, news = MemorySampler(), _News(listen)
+    meter = LoadingMeter(sets_aside=has_own_process)
+    call = _Call(task, news.listen, is_cancelled, meter, sampler)
     try:
         with sampler, meter, heard_by(news.compiling):
             result = call.run()
@@ -86,7 +94,7 @@ def run_task(task: Task, listen: Listener, is_cancelled: Callable[[], bool]) -> 
         started=started,
         ended=now(),
         warnings=tuple(call.warnings),
-        **shared_fields(call.costs(sampler), Costs),
+        **shared_fields(call.costs(), Costs),
     )
 
 
@@ -178,9 +186,11 @@ class _Call:
         listen: Listener,
         is_cancelled: Callable[[], bool],
         meter: LoadingMeter,
+        sampler: MemorySampler,
     ) -> None:
         self.task = task
         self._meter = meter
+        self._sampler = sampler
         self._wall_s = self._processor_s = 0.0
         self._stored_mib: float | None = None
         self._store = Store(Path(task.store), workspace=Path(task.folder))
@@ -199,12 +209,12 @@ class _Call:
     def warnings(self) -> list[str]:
         return self._context.warnings
 
-    def costs(self, sampler: MemorySampler) -> Costs:
+    def costs(self) -> Costs:
         """What the call took so far."""
         return Costs(
             wall_s=self._wall_s,
             cpu_s=self._processor_s,
-            peak_rss_mib=sampler.peak_mib,
+            peak_rss_mib=self._sampler.peak_mib,
             stored_mib=self._stored_mib,
             compile_s=round(self._meter.total_s, 4),
         )
@@ -235,10 +245,11 @@ class _Call:
         return result
 
     def _cpu_s(self) -> float:
-        """Processor seconds of this process and its children so far, but for loading."""
+        """Processor seconds of this process and its children, without loading and samples."""
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
         children_s = children.ru_utime + children.ru_stime
-        return time.process_time() + children_s - self._meter.processor_s
+        others_s = self._meter.processor_s + self._sampler.processor_s
+        return time.process_time() + children_s - others_s
 
     def _read(self, given: TaskInput) -> Product | InputFiles:
         if given.input_name:

@@ -11,8 +11,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from orthoflow.engine import loading
+from orthoflow.engine import loading, running
 from orthoflow.engine.loading import LoadingMeter
+from orthoflow.engine.memory import MemorySampler
 from orthoflow.engine.results import CellResult
 from tests.engine_world import World, toy_world
 
@@ -50,6 +51,46 @@ def test_loading_shows_in_compile_s_only_and_stops_no_clock_from_a_daemon(world:
     assert 0.5 <= metric(result, "loads_s") <= result.wall_s < 4.9
     again = world.run(STEPS.format("loads", ""), into="inline", executor="inline", force=("b",))
     assert again.results["b"].compile_s is not None
+
+
+def test_looking_at_the_memory_is_in_no_processor_time(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step that compiles for minutes is looked at thousands of times."""
+
+    class Laborious(MemorySampler):
+        def _note(self) -> None:
+            super()._note()
+            end_s = time.thread_time() + 0.05
+            while time.thread_time() < end_s:
+                pass
+            looks.append(self)
+
+    looks: list[MemorySampler] = []
+    monkeypatch.setattr(running, "MemorySampler", Laborious)
+    steps = STEPS.format("slow", ", params: {steps: 30}")
+    result = world.run(steps, executor="inline").results["b"]
+    assert looks[-1].processor_s > 0.15
+    assert result.cpu_s < looks[-1].processor_s / 2
+
+
+def test_no_search_for_garbage_looks_at_what_a_step_has_loaded(world: World) -> None:
+    """Else what a method states of its speed hangs on who has loaded its libraries."""
+    package = world.site / "toy_plugin"
+    (package / "aside.py").write_text("")
+    (package / "heavy.py").write_text(
+        "import time\n"
+        "class Loaded: pass\n"
+        "objects = [Loaded() for _ in range(1000)]\n"
+        "end_s = time.thread_time() + 0.5\n"
+        "while time.thread_time() < end_s: pass\n"
+    )
+    result = world.run(STEPS.format("loads", "")).results["b"]
+    assert metric(result, "n_searched") == 0
+    # A program that orthoflow is a part of keeps its garbage collected.
+    into = {"into": "inline", "executor": "inline", "force": ("b",)}
+    here = world.run(STEPS.format("loads", ""), **into).results["b"]
+    assert metric(here, "n_searched") == 1000
 
 
 def test_a_deterministic_method_is_repeated_to_be_timed(world: World) -> None:

@@ -1,0 +1,107 @@
+"""How far the times of a comparison move when it is measured again.
+
+    python benchmarks/repeated_times.py FOLDER [--recipe plane-methods] [--step plane] [--runs 2]
+
+`orthoflow run RECIPE` into `FOLDER/1` with a new store and nothing compiled, then into `FOLDER/2`,
+`FOLDER/3` ... with the step forced; runs that are there already are taken as they are. Each run is
+laid beside the one before it: every `*_s` of the step's cells but `compile_s`, where one of the two
+exceeds 0.2 s. Printed are those that differ by more than 30 %, and for each time in which order it
+puts the variants, medians of their repeats, and whether that is the order of before. On a machine
+that does other things too, only `cpu_s` says something of the methods: the load is printed beside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+
+from orthoflow.records import open_run
+
+LEAST_S = 0.2
+FURTHEST = 1.3
+
+Times = Mapping[tuple[str, str], float]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--recipe", default="plane-methods")
+    parser.add_argument("--step", default="plane")
+    parser.add_argument("--runs", type=int, default=2)
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    runs = [
+        measured(options.folder, f"{options.recipe}.yaml", options.step, number)
+        for number in range(1, options.runs + 1)
+    ]
+    for number, (before, after) in enumerate(pairwise(runs), start=1):
+        print(f"\nruns {number} and {number + 1}")
+        print_pairs(before, after)
+        print_orders(before, after)
+
+
+def measured(folder: Path, recipe: str, step: str, number: int) -> Times:
+    """Run a recipe, or take the run that is there; its seconds by cell and name."""
+    target = folder / str(number)
+    if not (target / "run.h5").is_file():
+        command = [sys.executable, "-m", "orthoflow", "run", recipe, "-o", str(target)]
+        command += ["--store", str(folder / "store"), *(["--force", step] if number > 1 else [])]
+        # Kernels that earlier runs of this user compiled are not taken over.
+        variables = {**os.environ, "ORTHOFLOW_KERNELS": str(folder.resolve() / "kernels")}
+        before = os.getloadavg()[0]
+        subprocess.run(command, check=True, env=variables, stdout=subprocess.DEVNULL)
+        loads = {"before": before, "at its end, of 15 minutes": os.getloadavg()[2]}
+        (folder / f"load_{number}.json").write_text(json.dumps(loads))
+    if (loads_file := folder / f"load_{number}.json").is_file():
+        print(f"run {number}: load {json.loads(loads_file.read_text())}")
+    return {
+        (row.cell, row.metric): row.value
+        for row in open_run(target).metric_rows()
+        if row.step == step and row.metric.endswith("_s") and row.metric != "compile_s"
+    }
+
+
+def print_pairs(before: Times, after: Times) -> None:
+    """Print what moved by more than it may, and how many of each time did."""
+    compared: defaultdict[str, list[bool]] = defaultdict(list)
+    for (cell, name), first in before.items():
+        second = after.get((cell, name), first)
+        if max(first, second) <= LEAST_S:
+            continue
+        is_beyond = max(first, second) > FURTHEST * min(first, second)
+        compared[name].append(is_beyond)
+        if is_beyond:
+            print(f"{cell:32s} {name:14s} {first:8.2f} {second:8.2f} s  x {second / first:.2f}")
+    for name, beyond in compared.items():
+        print(f"{name}: {sum(beyond)} of {len(beyond)} moved by more than {FURTHEST - 1:.0%}")
+
+
+def print_orders(before: Times, after: Times) -> None:
+    """Print the variants from the quickest to the slowest, by each time."""
+    for name in dict.fromkeys(name for _, name in before):
+        orders = [order(times, name) for times in (before, after)]
+        print(f"{name}: {'the same order' if orders[0] == orders[1] else 'another order'}")
+        for one in orders if orders[0] != orders[1] else orders[:1]:
+            print(f"  {' < '.join(one)}")
+
+
+def order(times: Times, name: str) -> list[str]:
+    """Variants by the median of their repeats."""
+    of: defaultdict[str, list[float]] = defaultdict(list)
+    for (cell, metric), value in times.items():
+        if metric == name:
+            of[cell.partition("#")[0].partition("=")[2]].append(value)
+    return sorted(of, key=lambda variant: statistics.median(of[variant]))
+
+
+if __name__ == "__main__":
+    main()
