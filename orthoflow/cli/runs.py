@@ -250,7 +250,8 @@ def _print_csv(kept: Sequence[RunSummary]) -> None:
         ]
         for run in kept
     ]
-    echo(*csv_text([header, *rows]).splitlines())
+    # At these line ends alone: what other letters end stands within cells.
+    echo(*csv_text([header, *rows]).removesuffix("\n").split("\n"))
 
 
 def _cell(value: object) -> str | int | float | None:

@@ -252,6 +252,13 @@ def _lacked_room(lines: Sequence[JournalLine]) -> bool:
 
 
 def _check_folder(folder: Path) -> None:
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.is_symlink() or not (path.is_file() or path.is_dir()):
+            what = "a link" if path.is_symlink() else "a pipe or a device"
+            raise ArgumentError(
+                f"{folder} holds {what}, {path.name}, as no run makes them; choose another folder "
+                "with -o"
+            )
     if (folder / RECORD_FILE).exists():
         lines: list[JournalLine] = []
         with suppress(OSError, ValueError):
@@ -260,11 +267,6 @@ def _check_folder(folder: Path) -> None:
             raise _is_finished(folder)
     if not folder.is_dir():
         return
-    if link := next((path for path in folder.iterdir() if path.is_symlink()), None):
-        raise ArgumentError(
-            f"{folder} holds a link, {link.name}, as no run makes them; choose another folder with "
-            "-o"
-        )
     if not (folder / JOURNAL).exists() and any(folder.iterdir()):
         raise ArgumentError(
             f"{folder} is not empty and holds no unfinished run; choose another folder with -o"

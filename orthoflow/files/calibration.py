@@ -24,6 +24,7 @@ from typing import Final
 import numpy as np
 
 from orthoflow.errors import GeometryError, InputError
+from orthoflow.files.regular_files import text_of_file
 from orthoflow.files.sidecars import write_text
 from orthoflow.files.yaml_positions import (
     Dialect,
@@ -155,7 +156,7 @@ def _text_of(path: Path) -> str:
                 f"{path.name} has {path.stat().st_size} bytes, a calibration file at most "
                 f"{MOST_BYTES}: give photos of one camera one entry, by a pattern"
             )
-        return path.read_text(encoding="utf-8-sig")
+        return text_of_file(path)
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path.name} is no UTF-8 text: expected a calibration file (YAML)"

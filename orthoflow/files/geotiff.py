@@ -44,6 +44,9 @@ TILE_PX: Final = 512
 # Larger images are not laid out in memory, but in a file beside the one to write.
 _IN_MEMORY_CELLS: Final = 1 << 26
 _CACHE_BYTES: Final = 1 << 27
+# What a small file may state: no honest packing comes near, deflate has at most 1032 to 1.
+_LARGEST_RATIO: Final = 1100
+_ALWAYS_ALLOWED_VALUES: Final = 64 << 20
 
 
 _COG_OPTIONS: Final[dict[str, object]] = {
@@ -354,6 +357,7 @@ def read_raster(path: Path) -> RasterFile:
 
     try:
         with quiet(), rasterio.open(path, driver="GTiff") as dataset:
+            check_header(path, dataset)
             _check_size(path, dataset)
             values = dataset.read()
             return RasterFile(
@@ -389,13 +393,15 @@ class RasterParts:
         """Open a file.
 
         Raises:
-            InputError: GDAL cannot read it, or its cells are not square and upright.
+            InputError: GDAL cannot read it, its cells are not square and upright, or there are more
+                than the file can hold.
         """
         import rasterio
 
         self._path = path
         with self._reading():
             self._dataset: DatasetReader = rasterio.open(path, driver="GTiff")
+            check_header(path, self._dataset)
         self.shape: tuple[int, int] = (self._dataset.height, self._dataset.width)
         self.gsd_m = _gsd_m(path, self._dataset.transform)
         self.corner_m = (float(self._dataset.transform.c), float(self._dataset.transform.f))
@@ -446,6 +452,27 @@ class RasterParts:
             raise InputError(
                 f"{self._path} cannot be read as a GeoTIFF: {error}; expected a whole TIFF file"
             ) from error
+
+
+def check_header(path: Path, dataset: DatasetReader) -> None:
+    """Refuse a file that names others, or that says it holds more than any file of its size.
+
+    Raises:
+        InputError: it does.
+    """
+    # GDAL takes what is to be shown at smaller scales from there, also out of the network.
+    if dataset.tags(ns="OVERVIEWS"):
+        raise InputError(
+            f"{path.name} names another file for its overviews: expected a TIFF file that needs "
+            "nothing beside it"
+        )
+    declared = dataset.width * dataset.height * dataset.count
+    stored = path.stat().st_size
+    if declared > max(_ALWAYS_ALLOWED_VALUES, _LARGEST_RATIO * stored):
+        raise InputError(
+            f"{path.name} says it has {dataset.width} x {dataset.height} cells in "
+            f"{dataset.count} bands, but {stored} bytes cannot hold as many: export it again"
+        )
 
 
 def _check_size(path: Path, dataset: DatasetReader) -> None:
@@ -540,9 +567,14 @@ def _writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep GDAL's masks inside the file and rasterio's advice out of the user's terminal."""
+    """Keep GDAL to the file itself, and rasterio's advice out of the user's terminal.
+
+    Masks are written into it. Overviews, masks and metadata that lie beside a file are not looked
+    for: no digest is taken of them, and they may name any other file, also in the network.
+    """
     import rasterio
 
-    with warnings.catch_warnings(), rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+    alone = rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")
+    with warnings.catch_warnings(), alone:
         warnings.simplefilter("ignore")
         yield

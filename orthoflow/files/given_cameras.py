@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
+from orthoflow.files.regular_files import text_of_file
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 
@@ -92,7 +93,7 @@ def text_of(path: Path) -> str:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path.name} is too large for a file of cameras")
-        return path.read_text(encoding="utf-8-sig")
+        return text_of_file(path)
     except UnicodeDecodeError as error:
         raise InputError(f"{path.name} is no UTF-8 text: expected a file of cameras") from error
     except OSError as error:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from orthoflow.errors import InputError
-from orthoflow.files.geotiff import quiet
+from orthoflow.files.geotiff import check_header, quiet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,8 @@ def place_of(path: Path) -> RasterPlace:
     """Read the header of a GeoTIFF.
 
     Raises:
-        InputError: the file is no GeoTIFF that GDAL can read.
+        InputError: the file is no GeoTIFF that GDAL can read, or says what no file of its size can
+            hold.
     """
     import rasterio
     from rasterio.errors import RasterioError
@@ -45,6 +46,7 @@ def place_of(path: Path) -> RasterPlace:
 
     try:
         with quiet(), rasterio.open(path, driver="GTiff") as dataset:
+            check_header(path, dataset)
             epsg = dataset.crs.to_epsg() if dataset.crs else None
             left, bottom, right, top = dataset.bounds
             outline: tuple[tuple[float, float], ...] = ()

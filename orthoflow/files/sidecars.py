@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.json_texts import parse_json
+from orthoflow.files.regular_files import text_of_file
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import JsonValue, LayerMask, OrthoMask, SurfaceMask
@@ -81,7 +82,7 @@ def read_sidecar(path: Path) -> dict[str, object]:
                 f"{path.name} has {path.stat().st_size} bytes, more than {MOST_SIDECAR_BYTES}: "
                 "expected a JSON object with origin_world, u_world ..."
             )
-        text = path.read_text(encoding="utf-8")
+        text = text_of_file(path)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path.name} cannot be read: {error}") from error
     return sidecar_of(text, path.name)

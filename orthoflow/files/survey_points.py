@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import ClassVar, Final, TypeVar
 
 from orthoflow.errors import InputError
+from orthoflow.files.regular_files import text_of_file
 from orthoflow.files.sidecars import MOST_WALLS
 
 _MEASURED: Final = ("wall", "u_px", "v_px")
@@ -131,7 +132,7 @@ def _text_of(path: Path, form: _Form) -> str:
             raise InputError(
                 f"{path.name} is too large for a list of {form.content}: expected a CSV file"
             )
-        return path.read_text(encoding="utf-8-sig")
+        return text_of_file(path)
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path.name} is no UTF-8 text: expected a CSV file with the columns "

@@ -112,8 +112,7 @@ def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:
         for file in files
     ]
     wanted.append(f"{PRODUCTS_FOLDER}/{METRICS_FILE}")
-    sizes = {file.path: file.size_bytes for file in run.record.published}
-    return [RECORD_FILE, *copy_files(run.folder, folder, wanted, sizes)]
+    return [RECORD_FILE, *copy_files(run.folder, folder, wanted, run.record.published)]
 
 
 def crate_metadata(

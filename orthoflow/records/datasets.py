@@ -103,11 +103,11 @@ def write_part(part: Run, folder: Path, store: Store) -> Run:
     """
     with writing_to(folder):
         folder.mkdir(parents=True)
-    sizes = {file.path: file.size_bytes for file in part.record.published}
-    copied = set(copy_files(part.folder, folder, sizes, sizes))
+    published = part.record.published
+    copied = set(copy_files(part.folder, folder, [file.path for file in published], published))
     record = dataclasses.replace(
         part.record,
-        published=tuple(file for file in part.record.published if file.path in copied),
+        published=tuple(file for file in published if file.path in copied),
     )
     path = folder / RECORD_FILE
     with embedded_inputs(part, folder) as extracted:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -18,7 +20,7 @@ from orthoflow_provenance.inner_files import (
     path_below,
     path_problem,
 )
-from orthoflow_provenance.model import FIGURE_SUFFIXES, RecordedFigure
+from orthoflow_provenance.model import FIGURE_SUFFIXES, PublishedFile, RecordedFigure
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.run_folder import cell_file_name
@@ -88,7 +90,7 @@ def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]
 
 
 def copy_files(
-    source: Path, target: Path, paths: Iterable[str], sizes: Mapping[str, int]
+    source: Path, target: Path, paths: Iterable[str], published: Iterable[PublishedFile]
 ) -> tuple[str, ...]:
     """Copy regular files that lie below one folder to below another.
 
@@ -96,22 +98,27 @@ def copy_files(
         source: the folder that they lie below.
         target: existing folder.
         paths: below both.
-        sizes: bytes of those of which it is known.
+        published: what the record says of those that it names.
 
     Returns:
         Those that were there.
 
     Raises:
-        RecordError: a link or a device stands in the place of a file, or it has another size.
+        RecordError: a link or a device stands in the place of a file, or it is not what the
+            record says.
         StoreError: the disk refuses.
     """
     copied: list[str] = []
+    known = {file.path: file for file in published}
     for path in paths:
         try:
             with open_below(source, path) as stream:
-                _check_size(source / path, os.fstat(stream.fileno()), sizes.get(path))
+                expected = known.get(path)
+                _check_size(source / path, os.fstat(stream.fileno()), expected)
                 with creating(target, path) as copy:
                     shutil.copyfileobj(stream, copy, 1 << 20)
+                    stream.seek(0)
+                    _check_digest(source / path, stream, expected)
         except (FileNotFoundError, NotADirectoryError):
             continue
         except UnsafeFileError as error:
@@ -134,10 +141,19 @@ def creating(folder: Path, path: str) -> Iterator[BinaryIO]:
         raise StoreError(f"cannot write to {folder}: {error}") from error
 
 
-def _check_size(path: Path, found: os.stat_result, expected: int | None) -> None:
-    if expected is not None and found.st_size != expected:
+def _check_digest(path: Path, stream: BufferedReader, expected: PublishedFile | None) -> None:
+    if expected and hashlib.file_digest(stream, "sha256").hexdigest() != expected.sha256:
         raise RecordError(
-            f"{path} has {found.st_size} bytes, but was published with {expected}: it was changed"
+            f"{path} was changed after the run: the record says that it has the digest "
+            f"{expected.sha256}"
+        )
+
+
+def _check_size(path: Path, found: os.stat_result, expected: PublishedFile | None) -> None:
+    if expected is not None and found.st_size != expected.size_bytes:
+        raise RecordError(
+            f"{path} has {found.st_size} bytes, but was published with {expected.size_bytes}: it "
+            "was changed"
         )
     # A hole of a terabyte would fill the disk.
     if found.st_size > _ALWAYS_COPIED_BYTES and found.st_size > 8 * 512 * found.st_blocks:

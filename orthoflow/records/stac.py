@@ -71,7 +71,6 @@ def write_stac(run: Run, folder: Path) -> int:
         RecordError: a published file is not what it was.
         StoreError: the disk refuses.
     """
-    known = {file.path: file for file in run.record.published}
     inside = {
         f"{PRODUCTS_FOLDER}/{path.parent.name}/{path.name}": address
         for address, files in run.files.items()
@@ -79,9 +78,7 @@ def write_stac(run: Run, folder: Path) -> int:
         # A repeat shows the same, and # would begin a fragment in a link.
         if run.cells[address].repeat == 0 and path.name.endswith(tuple(_BESIDE))
     }
-    copied = copy_files(
-        run.folder, folder, inside, {path: file.size_bytes for path, file in known.items()}
-    )
+    copied = copy_files(run.folder, folder, inside, run.record.published)
     orthos = [
         _Ortho(path=PurePosixPath(path), address=inside[path], place=place_of(folder / path))
         for path in copied

@@ -17,7 +17,7 @@ from orthoflow_provenance.verify import verify_record
 from orthoflow.errors import RecordError
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.published import PRODUCTS_FOLDER
-from orthoflow.records.runs import find_record, record_errors
+from orthoflow.records.runs import Run, find_record, record_errors
 from orthoflow.records.signatures import check_signature, read_signature
 
 _FILES_NAMED: Final = 3
@@ -150,6 +150,33 @@ def published_state(folder: Path, file: PublishedFile) -> PublishedState:
     except OSError:
         return "unreadable"
     return "same" if digest == file.sha256 else "changed"
+
+
+def require_unchanged(run: Run, *paths: Path) -> None:
+    """Refuse published files that are not as the record says: what is made of them would lie.
+
+    Args:
+        run: the run.
+        paths: below its folder.
+
+    Raises:
+        RecordError: one was changed, is a link or a device, or is not in the record.
+    """
+    known = {file.path: file for file in run.record.published}
+    for path in paths:
+        expected = known.get(path.relative_to(run.folder).as_posix())
+        if expected is None:
+            raise RecordError(
+                f"{path} is not named in the record of the run, so nothing vouches for it"
+            )
+        state = published_state(run.folder, expected)
+        if state == "changed":
+            raise RecordError(
+                f"{path} was changed after the run: the record says that it has the digest "
+                f"{expected.sha256}"
+            )
+        if state != "same":
+            raise RecordError(f"{path} cannot be read: {state}")
 
 
 def _missing_note(missing: list[str], n_published: int) -> str:

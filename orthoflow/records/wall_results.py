@@ -19,7 +19,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.products import CheckPoints, Inspection, Planes
 from orthoflow.records.published import published_files
 from orthoflow.records.runs import Run, record_errors
-from orthoflow.records.verification import published_state
+from orthoflow.records.verification import require_unchanged
 
 _RASTER: Final = re.compile(r"(?:[a-z]+_)?wall_(\d{1,5})_(ortho|depth|intensity)\.tif")
 # Of the accuracy that inspections found, what a drawing says: names of two numbers, and of what.
@@ -192,8 +192,7 @@ def _wall_result(
     colours: str,
 ) -> WallResult:
     for path in rasters.values():
-        _check_unchanged(run, path)
-        _check_unchanged(run, path.with_suffix(".json"))
+        require_unchanged(run, path, path.with_suffix(".json"))
     first = rasters[next(kind for kind in ("ortho", "depth", "intensity") if kind in rasters)]
     for kind, path in rasters.items():
         _check_kind(kind, path)
@@ -229,24 +228,6 @@ def _check_kind(kind: str, path: Path) -> None:
             f"{path} must have {wanted[0][0]} bands of {' or '.join(name for _, name in wanted)}, "
             f"got {found[0]} of {found[1]}"
         )
-
-
-def _check_unchanged(run: Run, path: Path) -> None:
-    """Refuse a published file that is not as the record says: a drawing would lie about it."""
-    name = path.relative_to(run.folder).as_posix()
-    expected = {file.path: file for file in run.record.published}.get(name)
-    if expected is None:
-        raise RecordError(
-            f"{path} is not named in the record of the run, so nothing vouches for it"
-        )
-    state = published_state(run.folder, expected)
-    if state == "changed":
-        raise RecordError(
-            f"{path} was changed after the run: the record says that it has the digest "
-            f"{expected.sha256}"
-        )
-    if state != "same":
-        raise RecordError(f"{path} cannot be read: {state}")
 
 
 def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[str]:

@@ -13,6 +13,7 @@ from typing import Final, Literal, TypeAlias
 from orthoflow.engine.run_folder import JOURNAL
 from orthoflow.errors import ArgumentError, OrthoflowError
 from orthoflow.files.json_texts import parse_json
+from orthoflow.files.regular_files import open_file
 from orthoflow.products import JsonValue
 from orthoflow.records import RECORD_FILE, Run, cell_metrics, open_run
 from orthoflow.records.datasets import parts_of
@@ -167,7 +168,7 @@ def _metrics(run: Run) -> dict[str, float]:
 def _unfinished(folder: Path) -> RunSummary:
     """What the first line of the journal says of a run without a record."""
     try:
-        with (folder / JOURNAL).open("rb") as journal:
+        with open_file(folder / JOURNAL) as journal:
             first = parse_json(journal.readline(_FIRST_LINE_BYTES).decode("utf-8"))
     except (OSError, ValueError) as error:
         reason = f"it has no {RECORD_FILE}, and its journal cannot be read: {error}"

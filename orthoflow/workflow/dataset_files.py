@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final, Generic
 
 from orthoflow.errors import WorkflowError
+from orthoflow.files.regular_files import open_file
 from orthoflow.files.yaml_positions import Entry, Position, Table, Text, Value, read_yaml
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import TEXT, Found, Schema, Shape
@@ -53,7 +54,7 @@ def read_text(path: Path) -> str:
         WorkflowError: there is no such file, or it cannot be a table of datasets.
     """
     try:
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             content = stream.read(MOST_BYTES + 1)
     except OSError as error:
         raise WorkflowError(

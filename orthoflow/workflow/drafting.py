@@ -144,9 +144,9 @@ class _Drafting:
         if name == "other":
             places += [_yaml(self._place(path.with_suffix(".json"))) for path in paths]
         if len(places) == 1:
-            return f"  {name}: {{files: {places[0]}}}  # {_told(items)}"
+            return f"  {name}: {{files: {places[0]}}}  # {_seen(_told(items))}"
         listed = "\n".join(f"      - {place}" for place in places)
-        return f"  {name}:  # {_told(items)}\n    files:\n{listed}"
+        return f"  {name}:  # {_seen(_told(items))}\n    files:\n{listed}"
 
     def _place(self, path: Path) -> str:
         """A path as the workflow names it: from its folder."""
@@ -167,7 +167,7 @@ class _Drafting:
             "# What follows are the recipe's own words.",
             "#",
         ]
-        return "\n".join(said) + "\n" + start
+        return "\n".join(map(_seen, said)) + "\n" + start
 
 
 def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
@@ -208,7 +208,15 @@ def _word(name: str) -> str:
 
 
 def _yaml(text: str) -> str:
-    return text if _PLAIN.fullmatch(text) else json.dumps(text, ensure_ascii=False)
+    return text if _PLAIN.fullmatch(text) else _seen(json.dumps(text, ensure_ascii=False))
+
+
+def _seen(text: str) -> str:
+    """Write every letter that has no shape as YAML has it: some of them end lines and comments."""
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")
+        for letter in text
+    )
 
 
 def _without_stand_ins(steps: str) -> str:

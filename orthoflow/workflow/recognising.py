@@ -16,6 +16,7 @@ from orthoflow.files.e57_images import count_e57_images
 from orthoflow.files.images import PHOTO_SUFFIXES
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
+from orthoflow.sdk.lines import text_of_path
 
 FileKind: TypeAlias = Literal[
     "scan", "photos", "calibration", "checkpoints", "ties", "cameras", "other", "unknown"
@@ -80,6 +81,10 @@ def _in_folder(folder: Path, depth: int) -> Iterator[Recognised]:
 
 
 def _file(path: Path) -> Recognised:
+    if not path.is_file():
+        return Recognised(kind="unknown", path=path, said="a pipe or a device")
+    if text_of_path(path) is None:
+        return Recognised(kind="unknown", path=path, said="its path is no UTF-8: rename it")
     suffix = path.suffix.lower()
     if suffix in _RASTERS and path.with_suffix(".json").is_file():
         return Recognised(kind="other", path=path, said="an orthoimage with its frame beside it")

@@ -150,6 +150,32 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     assert "torn damaged: torn/run.h5 cannot be read" in said("runs")
 
 
+def test_a_pipe_in_the_place_of_a_journal_is_not_waited_for(runs: Path) -> None:
+    folder = runs / "runs" / "pipe"
+    folder.mkdir()
+    os.mkfifo(folder / "journal.jsonl")
+    reason = "runs/pipe damaged: it has no run.h5, and its journal cannot be read: "
+    for command in ("runs", "show"):
+        table = said(command, "runs")
+        assert reason in table
+        assert "it is a folder, a pipe or a device" in table
+
+
+@pytest.mark.parametrize("end", ["\u2028", "\u2029", "\x85", "\x0b", "\x0c", "\x1c", "\r", "\n"])
+def test_no_letter_in_a_name_begins_a_row_of_its_own(runs: Path, end: str) -> None:
+    set_name = f"court{end}=HYPERLINK(1)"
+    reseal(
+        runs / "runs" / "other" / "run.h5",
+        lambda file: set_attribute(file, "name", set_name),
+    )
+    rows = list(csv.reader(io.StringIO(said("runs", "--csv", "runs"), newline="")))
+    assert [row[0] for row in rows] == [
+        "folder",
+        *(f"runs/{name}" for name in ("other", *"ba", "going")),
+    ]
+    assert rows[1][2].endswith("=HYPERLINK(1)")
+
+
 def test_links_are_not_followed(runs: Path) -> None:
     (runs / "deep" / "loop").symlink_to(runs)
     assert folders("deep") == ["deep/er/c"]

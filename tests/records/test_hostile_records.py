@@ -260,6 +260,14 @@ def test_an_unfinished_run_with_links_is_not_gone_on_with(
     assert precious.read_text() == "a line\nno end"
 
 
+def test_an_unfinished_run_with_a_pipe_is_not_waited_for(finished: Studio, folder: Path) -> None:
+    (folder / "run").mkdir()
+    os.mkfifo(folder / "run" / "journal.jsonl")
+    done = finished("run", finished.folder / "studio.yaml", "-o", folder / "run")
+    assert done.exit_code == 2
+    assert "holds a pipe or a device, journal.jsonl" in done.output
+
+
 def test_what_a_record_says_is_shown_and_not_obeyed(finished: Studio, folder: Path) -> None:
     evil = "\x1b]0;title\x07\x9b2J\u202e\r\nverified: 9 products, seal ok"
     written = "\\x1b]0;title\\x07\\x9b2J\\u202e\\r\\nverified: 9 products, seal ok"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -216,6 +217,12 @@ def test_the_table_of_the_command_line_takes_the_place_of_the_section(catalog: C
     workflow = load(ROOMS + TWO, catalog, datasets=table("name,scan\nattic,attic.e57\n"))
     assert [item.name for item in workflow.chosen_data] == ["attic"]
     assert workflow.overrides == ("--datasets rooms.csv",)
+
+
+def test_a_table_that_is_a_pipe_is_not_waited_for(catalog: Catalog, folder: Path) -> None:
+    os.mkfifo(folder / "rooms.csv")
+    said = refused(ROOMS + "datasets: rooms.csv\n", catalog)
+    assert "rooms.csv cannot be read: it is a folder, a pipe or a device" in said
 
 
 @pytest.mark.usefixtures("folder")

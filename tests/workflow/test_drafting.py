@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from click.testing import CliRunner, Result
 
 from orthoflow.catalog import discover_catalog
 from orthoflow.cli.program import program
+from orthoflow.foreign_text import shown
 from orthoflow.workflow import load_workflow, resolve_input_files
 
 CALIBRATION = """cameras:
@@ -145,3 +147,52 @@ def test_mistakes_get_a_sentence_and_no_file(
     assert sentence in result.output
     assert not (data / "workflow.yaml").exists()
     assert (data / "notes.txt").read_text() == "1 2 3\n4 5 6\n"
+
+
+ODD = (
+    "\u2028steps: []",
+    "\x85name: evil",
+    "\u202egpj",
+    "\x7f\x9b2J",
+    "\n# x",
+    "\ufffe",
+    "\U000e0001",
+    '"#',
+)
+
+
+@pytest.mark.parametrize("odd", ODD, ids=ascii)
+def test_no_name_of_a_file_says_more_than_that_it_is_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, odd: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    data = tmp_path / "data"
+    data.mkdir()
+    write_scan(data / f"hall{odd}.las")
+    (data / f"left{odd}.doc").touch()
+    write_photos(data / f"photos{odd}", 2)
+    told = said("new", "data")
+    assert told == shown(told, keep="\n")
+    text = Path("workflow.yaml").read_text(encoding="utf-8")
+    assert all(line.isprintable() for line in text.split("\n"))
+    workflow = load_workflow(Path("workflow.yaml"), discover_catalog())
+    assert workflow.name == "workflow"
+    files = resolve_input_files(workflow)
+    assert files["scan"] is not None
+    assert [path.name for path in files["scan"].paths] == [f"hall{odd}.las"]
+
+
+def test_a_path_that_is_no_text_is_left_out(data: Path) -> None:
+    bad = os.fsdecode(os.fsencode(data) + b"/\xff.las")
+    write_scan(data / "b.las").rename(bad)
+    assert "not used: \\udcff.las: its path is no UTF-8: rename it" in said("new", data)
+    assert "udcff" not in Path("workflow.yaml").read_text().partition("What follows")[2]
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a.yaml", "a.csv", "cameras.json", "a.las", "z.jpg"])
+def test_what_is_no_file_is_not_waited_for(data: Path, name: str) -> None:
+    os.mkfifo(data / "photos" / name)
+    zero = data.parent / f"link-{name}"
+    zero.symlink_to("/dev/zero")
+    told = said("new", data / "hall.las", data / "photos" / name, zero)
+    assert f"not used: {name}, link-{name}: a pipe or a device" in told

@@ -142,9 +142,11 @@ def _write_wall(folder: Path, drawing: WallDrawing, wall: WallResult, paper: Pap
         # As large as one sheet takes; its scale is as true as that of the others.
         scale = fitting_scale([_size_m(wall)], paper)
         small = replace(drawing, scale=scale, grid_m=0.0)
-        way, ((view,),) = placed_views(kinds[:1], _size_m(wall), paper, scale=scale, grid_m=0.0)
-        index = Sheet(paper=way, views=(view,), number=0, count=len(views), numbered=numbered)
-        write_sheet(folder / f"wall_{drawing.number}_index.pdf", small, index)
+        way, whole = placed_views(kinds[:1], _size_m(wall), paper, scale=scale, grid_m=0.0)
+        index = Sheet(paper=way, views=whole[0], number=0, count=len(views), numbered=numbered)
+        # Of what no usual scale gets onto one sheet there is none.
+        if len(whole) == 1:
+            write_sheet(folder / f"wall_{drawing.number}_index.pdf", small, index)
     return len(views)
 
 

@@ -54,9 +54,13 @@ def export_tiles(run: Run, folder: Path, chosen: Choices) -> str:
 def _orthos(run: Run, chosen: Choices) -> tuple[str, tuple[OrthoFile, ...]]:
     """The published orthoimages of the wanted cell, or the last one that gave any."""
     from orthoflow.files.ortho_files import ortho_files
+    from orthoflow.records.verification import require_unchanged
 
     address, _ = output_of(run, "orthoimages", chosen.cell)
-    found = ortho_files(run.files.get(address, ()))
+    paths = [path for path in run.files.get(address, ()) if path.name.endswith("_ortho.tif")]
+    for path in paths:
+        require_unchanged(run, path, path.with_suffix(".json"))
+    found = ortho_files(paths)
     if not found:
         raise ArgumentError(
             f"no orthoimages of {address} lie below {run.products_folder}: give the run folder as "

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.errors import InputError
+from orthoflow.files.regular_files import text_of_file
 from orthoflow.files.yaml_positions import (
     Dialect,
     Position,
@@ -122,7 +123,7 @@ def _text_of(path: Path) -> str:
             raise InputError(
                 f"{path.name} has {path.stat().st_size} bytes, a title block at most {MOST_BYTES}"
             )
-        return path.read_text(encoding="utf-8-sig")
+        return text_of_file(path)
     except UnicodeDecodeError as error:
         raise InputError(f"{path.name} is no UTF-8 text: expected a title block (YAML)") from error
     except OSError as error:

@@ -1,0 +1,168 @@
+"""What lies beside a record is as the record says and nothing else, whatever is made of it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from click.testing import CliRunner, Result
+from orthoflow_provenance.encoding import read_table, write_table
+from orthoflow_provenance.layout import PUBLISHED
+
+from orthoflow.cli.program import program
+from orthoflow.engine.file_digests import file_sha256
+from orthoflow.files.geotiff import RasterParts
+from tests import hostile_records as hostile
+from tests.drawing_runs import WALL, write_drawing_run
+
+ORTHO = Path("products", "mosaic", f"wall_{WALL}_ortho.tif")
+DRAWN = ("sheet", "dxf", "geojson")
+PICTURED = (*DRAWN, "gltf", "tiles", "stac")
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_drawing_run(tmp_path_factory.mktemp("drawn") / "run")
+
+
+@pytest.fixture
+def run(drawn: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(drawn, tmp_path / "run"))
+
+
+def export(run: Path, target: str, *more: str) -> Result:
+    words = ["export", str(run), "--to", target, "-o", str(run.parent / target), *more]
+    return CliRunner().invoke(program, words)
+
+
+def check_refused(run: Path, target: str, code: int, *said: str) -> None:
+    done = export(run, target)
+    assert done.exit_code == code, (target, done.output)
+    for part in said:
+        assert part in " ".join(done.output.split()), target
+    assert [path.name for path in run.parent.iterdir()] == [run.name]
+
+
+def publish_again(run: Path) -> None:
+    """Let the record name the published files as they are now."""
+
+    def name(file: h5py.File) -> None:
+        rows = [
+            (path, (run / path).stat().st_size, file_sha256(run / path))
+            for path, _, _ in read_table(file, PUBLISHED, hostile.PATHS)
+        ]
+        del file[PUBLISHED]
+        write_table(file, PUBLISHED, hostile.PATHS, rows)
+
+    hostile.reseal(run / "run.h5", name)
+
+
+def exchange_ortho(run: Path, width: int, height: int, gsd_m: float = 0.01, **tags: str) -> None:
+    """Write an orthoimage of empty cells, which take no room, in the place of the true one."""
+    placed = Affine(gsd_m, 0.0, 0.0, 0.0, -gsd_m, 0.0)
+    shape = {"width": width, "height": height, "count": 3, "dtype": "uint8"}
+    layout = {"tiled": True, "blockxsize": 4096, "blockysize": 4096, "compress": "DEFLATE"}
+    (run / ORTHO).unlink()
+    with rasterio.open(
+        run / ORTHO, "w", "GTiff", transform=placed, SPARSE_OK=True, **shape, **layout
+    ) as raster:
+        raster.update_tags(ns="OVERVIEWS", **tags)
+    publish_again(run)
+
+
+@pytest.mark.parametrize(("width", "height"), [(100_000, 100_000), (1_000_000, 30)])
+def test_a_small_file_that_says_it_is_huge_costs_nothing(
+    run: Path, width: int, height: int
+) -> None:
+    exchange_ortho(run, width, height)
+    assert (run / ORTHO).stat().st_size < 50_000
+    for target in PICTURED:
+        check_refused(run, target, 2, f"says it has {width} x {height} cells", "cannot hold")
+
+
+def test_a_picture_that_names_another_file_is_refused(run: Path) -> None:
+    exchange_ortho(run, 600, 400, OVERVIEW_FILE="/vsicurl/http://127.0.0.1:9/a.tif")
+    for target in PICTURED:
+        check_refused(run, target, 2, "names another file for its overviews")
+
+
+def test_pictures_that_were_changed_are_not_handed_on(run: Path) -> None:
+    content = (run / ORTHO).read_bytes()
+    (run / ORTHO).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    for target in (*PICTURED, "ro-crate"):
+        check_refused(run, target, 3, "was changed after the run")
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+
+
+@pytest.mark.parametrize("put", [pipe, device, folder])
+@pytest.mark.parametrize("suffix", [".tif", ".json"])
+def test_what_stands_in_the_place_of_a_picture_is_not_read(
+    run: Path, suffix: str, put: Callable[[Path], None]
+) -> None:
+    place = (run / ORTHO).with_suffix(suffix)
+    place.unlink()
+    put(place)
+    for target in PICTURED:
+        done = export(run, target)
+        assert done.exit_code in ((0, 2, 3) if suffix == ".tif" else (2, 3)), (target, done.output)
+        assert "itself failed" not in done.output
+    made = {path for path in run.parent.rglob("*") if not path.is_relative_to(run)}
+    assert not [path for path in made if path.is_symlink() or path.name == place.name]
+
+
+def test_what_lies_beside_a_picture_shows_nothing_of_itself(run: Path) -> None:
+    """GDAL would take overviews and masks from there, and whatever files these name."""
+    exchange_ortho(run, 600, 400)
+    other = run.parent / "other.tif"
+    shutil.copy(run / ORTHO, other)
+    with rasterio.open(other, "r+") as raster:
+        raster.write(np.full((3, 400, 600), 222, np.uint8))
+    overviews = f'<Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">{other}</MDI></Metadata>'
+    beside = {
+        ".ovr": other.read_bytes(),
+        ".msk": other.read_bytes(),
+        ".aux.xml": f"<PAMDataset>{overviews}</PAMDataset>".encode(),
+    }
+    for suffix, content in beside.items():
+        path = Path(f"{run / ORTHO}{suffix}")
+        path.write_bytes(content)
+        with RasterParts(run / ORTHO) as raster:
+            # Smaller than the cells, so that overviews are looked for.
+            values, shown = raster.read((0.0, 0.0, 600.0, 400.0), (40, 60))
+        assert (int(values.max()), bool(shown.all())) == (0, True), suffix
+        path.unlink()
+
+
+def test_a_title_block_that_is_no_file_is_refused_at_once(run: Path, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        done = export(run, "sheet", "--title-block", str(path))
+        assert done.exit_code == 2
+        assert f"{path.name} cannot be read: it is a folder, a pipe or a device" in done.output
+
+
+def test_a_wall_that_no_usual_scale_gets_onto_one_sheet_has_no_index(run: Path) -> None:
+    exchange_ortho(run, 4096, 4, gsd_m=20.0)
+    done = export(run, "sheet", "--paper", "200x200", "--scale", "20000")
+    assert done.exit_code == 0, done.output
+    names = {path.name for path in (run.parent / "sheet").iterdir()}
+    assert len(names) > 10
+    assert f"wall_{WALL}_index.pdf" not in names
