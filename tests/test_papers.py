@@ -18,6 +18,13 @@ CODE = sorted(set(re.findall(r"`([^`]+)`", TEXT)))
 KINDS = sorted({method_id.partition(".")[0] for method_id in discover_catalog().methods})
 METHOD = re.compile(rf"({'|'.join(KINDS)})\.[a-z0-9-]+")
 NAMED = [code for code in CODE if METHOD.match(code)]
+FIGURES = sorted(
+    {
+        name
+        for names in re.findall(r"figures? ((?:`[^`]+`(?:, )?)+)", TEXT)
+        for name in re.findall(r"`([^` ]+)`", names)
+    }
+)
 
 # Rows of both papers by what they are of: method, theirs, ours, deviation.
 ROWS = {
@@ -57,6 +64,13 @@ def test_every_parameter_named_exists_and_takes_the_value(code: str) -> None:
     assert name in params.model_fields
     if value:
         params.model_validate({name: YAML(typ="safe").load(value)})
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_every_figure_named_is_drawn_by_a_method(figure: str) -> None:
+    name = re.escape(figure.removesuffix("_...")).replace("_0_", r"_\{[^}]+\}_")
+    sources = (ROOT / "plugins" / "orthoflow_plugins").rglob("*.py")
+    assert any(re.search(rf'"{name}"', source.read_text()) for source in sources)
 
 
 @pytest.mark.parametrize("code", [code for code in CODE if re.fullmatch(r"[a-z-]+\.yaml", code)])
