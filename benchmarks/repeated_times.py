@@ -6,8 +6,8 @@
 `FOLDER/3` ... with the step forced; runs that are there already are taken as they are. Each run is
 laid beside the one before it: every `*_s` of the step's cells but `compile_s`, where one of the two
 exceeds 0.2 s. Printed are those that differ by more than 30 %, and for each time in which order it
-puts the variants, medians of their repeats, and whether that is the order of before. On a machine
-that does other things too, only `cpu_s` says something of the methods: the load is printed beside.
+puts the variants, medians of their repeats, and which of them change places. On a machine that does
+other things too, only `cpu_s` says something of the methods: the load is printed beside.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Mapping
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 from orthoflow.records import open_run
@@ -86,21 +86,35 @@ def print_pairs(before: Times, after: Times) -> None:
 
 
 def print_orders(before: Times, after: Times) -> None:
-    """Print the variants from the quickest to the slowest, by each time."""
+    """Print the variants from the quickest to the slowest, and which changed places, how far."""
     for name in dict.fromkeys(name for _, name in before):
-        orders = [order(times, name) for times in (before, after)]
-        print(f"{name}: {'the same order' if orders[0] == orders[1] else 'another order'}")
-        for one in orders if orders[0] != orders[1] else orders[:1]:
-            print(f"  {' < '.join(one)}")
+        first, second = medians(before, name), medians(after, name)
+        print(f"{name}: {' < '.join(sorted(first, key=lambda one: first[one]))}")
+        swaps = {
+            pair: max(apart(first, pair), apart(second, pair))
+            for pair in combinations(sorted(first.keys() & second.keys()), 2)
+            if (first[pair[0]] < first[pair[1]]) != (second[pair[0]] < second[pair[1]])
+        }
+        if swaps:
+            furthest = max(swaps, key=lambda pair: swaps[pair])
+            print(
+                f"  {len(swaps)} pairs change places; furthest apart of them, x "
+                f"{swaps[furthest]:.2f}: {' and '.join(furthest)}"
+            )
 
 
-def order(times: Times, name: str) -> list[str]:
-    """Variants by the median of their repeats."""
+def medians(times: Times, name: str) -> dict[str, float]:
+    """Variant -> median over its repeats."""
     of: defaultdict[str, list[float]] = defaultdict(list)
     for (cell, metric), value in times.items():
         if metric == name:
             of[cell.partition("#")[0].partition("=")[2]].append(value)
-    return sorted(of, key=lambda variant: statistics.median(of[variant]))
+    return {variant: statistics.median(values) for variant, values in of.items()}
+
+
+def apart(values: Mapping[str, float], pair: tuple[str, str]) -> float:
+    """The larger of two over the smaller."""
+    return max(values[one] for one in pair) / min(values[one] for one in pair)
 
 
 if __name__ == "__main__":
