@@ -6,6 +6,8 @@ import re
 
 MISCHIEF = """
 import os
+import resource
+import socket
 import subprocess
 import sys
 import threading
@@ -126,6 +128,48 @@ def replaces_log(values, params, ctx):
 def stops(values, params, ctx):
     # Its keeper with it, which leaves nobody to obey.
     os.killpg(0, 19)
+
+def _parent_of(number):
+    with open(f"/proc/{number}/stat") as file:
+        return int(file.read().rpartition(")")[2].split()[1])
+
+@work("exact")
+def kills_keeper(values, params, ctx):
+    os.kill(os.getppid(), 9)
+    time.sleep(600)
+
+@work("exact")
+def kills_server(values, params, ctx):
+    os.kill(_parent_of(os.getppid()), 9)
+    time.sleep(600)
+
+@work("exact")
+def stops_server(values, params, ctx):
+    os.kill(_parent_of(os.getppid()), 19)
+    return values
+
+@work("exact")
+def opens_nothing_more(values, params, ctx):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+    return values
+
+@work("exact")
+def writes_nothing_more(values, params, ctx):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    return values
+
+@work("exact")
+def floods_all_sockets(values, params, ctx):
+    for number in range(3, 64):
+        if _name(number).startswith("socket:"):
+            with socket.socket(fileno=os.dup(number)) as one:
+                one.setblocking(False)
+                for content in [b"os sys numba", b"\\xff" * 5000, b""] * 1000:
+                    try:
+                        one.send(content)
+                    except OSError:
+                        pass
+    return values
 
 @work("exact")
 def goes_on_writing(values, params, ctx):

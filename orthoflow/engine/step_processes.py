@@ -18,6 +18,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -67,6 +68,7 @@ _READ_AT_LOADING: Final = (
 # These differ from store to store and are told to each step.
 _READ_LATER: Final = (COMPILED_CODE, "MPLCONFIGDIR", "PYTHONPATH")
 _START_S: Final = 120.0
+_SILENT_S: Final = 30.0
 _LIMITS: Final = tuple(
     getattr(resource, name) for name in dir(resource) if name.startswith("RLIMIT_")
 )
@@ -85,6 +87,11 @@ class StepProcess:
         self._told = told
         self.pid = pid
         self.returncode: int | None = None
+        self._silent_since: float | None = None
+        # Its number is its own until `close`, whether it lives or not.
+        self._process: int | None = None
+        with contextlib.suppress(OSError):
+            self._process = os.pidfd_open(pid)
 
     @property
     def descriptor(self) -> int:
@@ -101,7 +108,15 @@ class StepProcess:
             told = _hear(self._told)
             # When the server is killed, it takes its keepers with it.
             self.returncode = -signal.SIGKILL if told is None else told
+        elif self._process is not None and _is_readable(self._process, 0):
+            self._wait_for_word()
         return self.returncode is not None
+
+    def _wait_for_word(self) -> None:
+        """Give up a server that stands still, and does not tell how the keeper has ended."""
+        self._silent_since = self._silent_since or time.monotonic()
+        if self.returncode is None and time.monotonic() - self._silent_since > _SILENT_S:
+            self.returncode = -signal.SIGKILL
 
     def send_signal(self, number: signal.Signals) -> None:
         """Send a signal to the keeper alone."""
@@ -116,6 +131,8 @@ class StepProcess:
     def close(self) -> None:
         """Let the server reap it: its number may belong to others from now on."""
         self._told.close()
+        if self._process is not None:
+            os.close(self._process)
 
 
 def start_step(task: Task, pipe: int, log: int) -> StepProcess:
@@ -274,7 +291,7 @@ def _read_at_loading(variables: Mapping[str, str]) -> frozenset[tuple[str, str]]
     )
 
 
-def _is_readable(source: socket.socket, timeout_s: float) -> bool:
+def _is_readable(source: socket.socket | int, timeout_s: float) -> bool:
     waiting = select.poll()
     waiting.register(source, select.POLLIN)
     return bool(waiting.poll(round(timeout_s * 1000)))

@@ -99,6 +99,32 @@ def test_a_step_that_stands_still_with_its_keeper_is_killed(
     assert "ran past its timeout of 2 s" in stopped.error_message
 
 
+@pytest.mark.parametrize("name", ["kills_keeper", "kills_server"])
+def test_a_step_that_kills_what_keeps_it_ends_and_the_run_goes_on(world: World, name: str) -> None:
+    result = result_of(all_of(world, name), name)
+    assert result.error_message.startswith(f"{WHO.format(name)} was killed from outside (SIGKILL)")
+    assert result_of(all_of(world, "closes_all", into="next"), "closes_all").error_message == ""
+
+
+def test_a_server_that_stands_still_is_given_up(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.engine.step_processes._SILENT_S", 0.2)
+    monkeypatch.setattr("orthoflow.engine.step_processes._START_S", 5.0)
+    assert result_of(all_of(world, "stops_server"), "stops_server").error_message == ""
+    assert result_of(all_of(world, "closes_all", into="next"), "closes_all").error_message == ""
+
+
+def test_limits_and_floods_of_a_step_are_its_own(world: World) -> None:
+    outcome = all_of(world, "opens_nothing_more", "writes_nothing_more", "floods_all_sockets")
+    said = result_of(outcome, "opens_nothing_more").error_message
+    assert said.endswith("Too many open files")
+    said = result_of(outcome, "writes_nothing_more").error_message
+    assert "the file would be larger than allowed here" in said
+    assert result_of(outcome, "floods_all_sockets").error_message == ""
+    assert result_of(all_of(world, "closes_all", into="next"), "closes_all").error_message == ""
+
+
 def test_a_step_says_that_an_interrupt_was_its_own(world: World) -> None:
     result = result_of(all_of(world, "raises_interrupt"), "raises_interrupt")
     assert result.error_message == (
