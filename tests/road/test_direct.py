@@ -16,7 +16,7 @@ from tests.long_loops import IS_LONG
 from tests.road.conftest import Shell, metrics_of
 
 SHIFT_M = (634512.347, 486215.781, 112.193)
-SMALL = ("--set", "room.scan_step_m=0.008", "--set", "wall.gsd_m=0.012")
+SMALL = ("--set", "room.scan_step_m=0.012", "--set", "wall.gsd_m=0.018")
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +79,9 @@ def test_the_main_wall_and_its_orthoimage_agree_with_the_truth(road: Shell) -> N
     metrics = metrics_of(road.folder / "run")
     assert metrics["check", "plane_angle_deg"] <= 0.02
     assert metrics["check", "plane_offset_mm"] <= 1.0
-    # A third of a 12 mm cell: the scan step is 8 mm, each cell shows one point.
-    assert metrics["check", "rmse_u_mm"] <= 4.0
-    assert metrics["check", "rmse_v_mm"] <= 4.0
+    # A third of an 18 mm cell: the scan step is 12 mm, each cell shows one point.
+    assert metrics["check", "rmse_u_mm"] <= 6.0
+    assert metrics["check", "rmse_v_mm"] <= 6.0
 
 
 def test_a_finished_run_folder_is_refused(road: Shell) -> None:
@@ -111,7 +111,7 @@ def test_survey_coordinates_change_nothing_but_the_origin(road: Shell) -> None:
     shift = "[" + ", ".join(map(str, SHIFT_M)) + "]"
     ended = road(
         *("run", "direct.yaml", "--until", "mosaic", *SMALL, "-o", "shifted"),
-        *("--set", f"room.shift_world_m={shift}"),
+        *("--set", f"room.shift_world_m={shift}", "--executor", "inline"),
     )
     assert ended.code == 0, ended.said
     here, there = planes_of(road.folder / "run")[0], planes_of(road.folder / "shifted")[0]
@@ -154,7 +154,7 @@ def _change_one_byte(record: Path, what: str) -> None:
 @pytest.mark.slow
 def test_the_decorated_hall_gives_its_main_wall(shell: Shell, shared_data: Path) -> None:
     scan = shared_data / "heritage-hall-west-wall" / "west_wall.laz"
-    options = ("--set", "wall.gsd_m=0.01", "--set", "wall.buffer_m=0.45")
+    options = ("--set=wall.gsd_m=0.01", "--set=wall.buffer_m=0.45", "--executor=inline")
     ended = shell("run", "direct.yaml", "--input", f"scan={scan}", *options, "-o", "run")
     assert ended.code == 0, ended.said
     main = planes_of(shell.folder / "run")[0]
@@ -215,7 +215,7 @@ def test_every_other_scan_goes_through_or_ends_with_a_sentence(
     defaults = ("--set", "wall.gsd_m=0.02") if "wall.gsd_m" not in str(options) else ()
     ended = shell(
         "run", "direct.yaml", "--input", f"scan={shared_data / scan}", *defaults, *options,
-        "-o", "run",
+        "--executor", "inline", "-o", "run",
     )  # fmt: skip
     assert "Traceback" not in ended.said
     if ended.code == 0:
