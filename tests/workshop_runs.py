@@ -8,6 +8,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from tests.forked_commands import run_command
+
 WORKSHOP = Path(__file__).resolve().parent / "workshop"
 
 STUDIO = """\
@@ -45,6 +47,8 @@ def orthoflow(
     folder: Path, *arguments: str, plugins: Sequence[Path] = ()
 ) -> subprocess.CompletedProcess[str]:
     """Run a command in a folder and wait for its end; `plugins` are installed besides."""
+    if not plugins:
+        return run_command(folder, arguments, workshop_environment())
     return subprocess.run(
         command(*arguments),
         cwd=folder,

@@ -16,6 +16,7 @@ import pytest
 from orthoflow.catalog import discover_catalog
 from orthoflow.engine.keys import compiled_digest
 from orthoflow.engine.store import Store
+from tests.forked_commands import run_command
 
 ROOT = Path(__file__).resolve().parents[2]
 STRANGER = ROOT / "tests" / "third_party" / "orthoflow-stranger"
@@ -66,16 +67,20 @@ class Shell:
         return name
 
     def __call__(self, *arguments: object, timeout_s: float = 300) -> Ended:
-        completed = subprocess.run(
-            self.command(*arguments),
-            cwd=self.folder,
-            env=self.variables(),
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-            check=False,
-            stdin=subprocess.DEVNULL,
-        )
+        command = self.command(*arguments)
+        if arguments[0] == "run":
+            completed = subprocess.run(
+                command,
+                cwd=self.folder,
+                env=self.variables(),
+                capture_output=True,
+                text=True,
+                timeout=timeout_s,
+                check=False,
+                stdin=subprocess.DEVNULL,
+            )
+        else:
+            completed = run_command(self.folder, command[3:], self.variables(), timeout_s)
         return Ended(completed.returncode, completed.stdout, completed.stderr)
 
 
