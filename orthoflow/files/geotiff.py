@@ -46,6 +46,7 @@ _IN_MEMORY_CELLS: Final = 1 << 26
 _CACHE_BYTES: Final = 1 << 27
 # What a small file may state: no honest packing comes near, deflate has at most 1032 to 1.
 _LARGEST_RATIO: Final = 1100
+_SIDES_M: Final = (1e-6, 1e6)
 _ALWAYS_ALLOWED_VALUES: Final = 64 << 20
 
 
@@ -500,6 +501,9 @@ def _gsd_m(path: Path, transform: Affine) -> float:
             f"{transform.to_gdal()}): export it again as metres in the plane of the wall, X to "
             "the right, Y upwards"
         )
+    low, high = _SIDES_M
+    if not low <= side <= high:
+        raise InputError(f"{path.name} has cells of {side:g} m, expected {low:g} to {high:g} m")
     return side
 
 

@@ -87,6 +87,13 @@ def test_a_small_file_that_says_it_is_huge_costs_nothing(
         check_refused(run, target, 2, f"says it has {width} x {height} cells", "cannot hold")
 
 
+@pytest.mark.parametrize("gsd_m", [1e-300, 1e300])
+def test_cells_of_no_size_that_a_wall_has_are_refused(run: Path, gsd_m: float) -> None:
+    exchange_ortho(run, 60, 40, gsd_m=gsd_m)
+    for target in ("sheet", "dxf", "geojson", "gltf", "tiles"):
+        check_refused(run, target, 2, f"has cells of {gsd_m:g} m, expected 1e-06 to 1e+06 m")
+
+
 def test_a_picture_that_names_another_file_is_refused(run: Path) -> None:
     exchange_ortho(run, 600, 400, OVERVIEW_FILE="/vsicurl/http://127.0.0.1:9/a.tif")
     for target in PICTURED:
