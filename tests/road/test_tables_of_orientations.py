@@ -69,5 +69,6 @@ def test_a_looser_threshold_keeps_more_wrong_ties(
     found = metrics_of(shell.folder / "run")
     rejected = [found[f"orient@orient=sigma{n}", "rejected_share"] for n in (2, 3, 4, 6, 9)]
     assert rejected == sorted(rejected, reverse=True)
-    wrong = {n: found[f"check@orient=sigma{n}", "tie_wrong_share"] for n in (2, 9)}
-    assert wrong[2] < wrong[9]
+    # In this coarse room two standard deviations leave no photo.
+    wrong = {n: found[f"check@orient=sigma{n}", "tie_wrong_share"] for n in (3, 9)}
+    assert wrong[3] < wrong[9]
