@@ -70,6 +70,7 @@ def test_the_orientation_is_exported_to_colmap(quick: Shell) -> None:
     cameras = orthoflow.open_run(quick.folder / "run").product("orient", "cameras").cameras
     ended = quick("export", "run", "--to", "colmap", "-o", "model")
     assert ended.code == 0, ended.said
+    assert "note: the orientations of orient; --cell takes others: first" in ended.said
     assert ended.out.startswith(f"colmap: model: {len(cameras)} photos, 1 camera, ")
     assert ended.out.rstrip().endswith(" of orient")
     scene = pycolmap.Reconstruction(str(quick.folder / "model"))
@@ -105,7 +106,7 @@ def test_the_cloud_is_exported_from_record_and_store(quick: Shell) -> None:
     assert written == (quick.folder / "planes" / "cloud.laz").read_bytes()
     lost = quick("export", "lean", "--to", "laz", "--store", "elsewhere", "-o", "lost")
     assert lost.code == 2
-    assert "neither in its record nor in the store elsewhere" in lost.said
+    assert "neither its record nor the store elsewhere" in lost.said
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from orthoflow.cli.failures import say_error
 from orthoflow.errors import ArgumentError, StoreError
 
 if TYPE_CHECKING:
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     ProductT = TypeVar("ProductT", bound=Product)
 
 _Wall = TypeVar("_Wall")
+
+_MOST_NAMED: Final = 5
 
 # What a product type is called where a cell has none, and where a run has none.
 _SAID: Final = {
@@ -42,13 +45,15 @@ def product_of(run: Run, digest: str, cls: type[ProductT], store: Path) -> Produ
         return Store(store).get_product(digest, cls)
     except StoreError as error:
         raise ArgumentError(
-            f"the {cls.type_name} of this run is neither in its record nor in the store {store} "
+            f"neither its record nor the store {store} holds the {cls.type_name} of this run "
             f"({error}): name its store with --store, or run the workflow again with --embed"
         ) from error
 
 
 def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
     """The wanted cell, or the last one, that gives a product of a type, and the port.
+
+    Where others give one too, it is said which is taken.
 
     Raises:
         ArgumentError: there is none, or the cell gives none.
@@ -69,7 +74,11 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
         return cell, found[cell]
     if not found:
         raise ArgumentError(f"the run {run.record.run_id} {missing}")
-    last = list(found)[-1]
+    *others, last = found
+    if others:
+        rest = f" and {len(others) - _MOST_NAMED} more" if len(others) > _MOST_NAMED else ""
+        first = ", ".join(others[:_MOST_NAMED])
+        say_error(f"note: the {named} of {last}; --cell takes others: {first}{rest}")
     return last, found[last]
 
 
