@@ -14,6 +14,7 @@ import os
 import random
 import shutil
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +23,8 @@ from typing import Any
 FAULTS = ("full disk", "bad disk", "kill", "power loss")
 # How a disk fails; the first two also who reads.
 _BROKEN = (errno.EIO, errno.ESTALE, errno.EROFS)
+_READING = ("read", "look")
+_FREEING = ("unlink", "rmdir")
 _WRITING = os.O_WRONLY | os.O_RDWR
 _REAL = {
     name: getattr(os, name)
@@ -73,8 +76,10 @@ class _Volatile:
     def lose(self, folder: Path, rng: random.Random) -> None:
         """Take back a random part of it: the latest names, and the bytes of any file."""
         for path in [path for path in folder.rglob("*") if path.is_file()]:
-            if path.stat().st_ino in self.dirty and rng.random() < 0.7:
-                os.truncate(path, rng.choice((0, path.stat().st_size // 2)))
+            # What a thread has begun already may still rename a file.
+            with contextlib.suppress(FileNotFoundError):
+                if path.stat().st_ino in self.dirty and rng.random() < 0.7:
+                    os.truncate(path, rng.choice((0, path.stat().st_size // 2)))
         for _, undo in reversed(self.names[rng.randint(0, len(self.names)) :]):
             with contextlib.suppress(OSError):
                 undo()
@@ -113,6 +118,8 @@ class FaultyFiles:
         self._operation = operation
         self._rng = random.Random(seed)
         self._volatile = _Volatile(folder / ".kept")
+        # Threads count one after the other, and none goes on while the power is lost.
+        self._lock = threading.RLock()
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
@@ -139,12 +146,14 @@ class FaultyFiles:
         """
         if not path.is_relative_to(self._folder) or self._folder in (path, path.parent):
             return
-        is_reading = what in ("read", "look")
-        is_freeing = what in ("unlink", "rmdir")
-        if is_reading and self._fault != "bad disk":
+        if what in _READING and self._fault != "bad disk":
             return
-        if is_freeing and self._fault == "full disk":
+        if what in _FREEING and self._fault == "full disk":
             return
+        with self._lock:
+            self._befall(path, what, descriptor)
+
+    def _befall(self, path: Path, what: str, descriptor: int) -> None:
         self.count += 1
         if what == "write" and descriptor >= 0:
             self._volatile.dirty.add(os.fstat(descriptor).st_ino)
@@ -153,7 +162,7 @@ class FaultyFiles:
         if self.count != self._operation:
             return
         if self._fault == "bad disk":
-            number = self._rng.choice(_BROKEN[:2] if is_reading else _BROKEN)
+            number = self._rng.choice(_BROKEN[:2] if what in _READING else _BROKEN)
             raise OSError(number, os.strerror(number), str(path))
         if self._fault == "power loss":
             self._volatile.lose(self._folder, self._rng)
