@@ -1,8 +1,8 @@
 """Mutations of the source that tests should notice: `python tests/mutate.py --seed 1`.
 
 Draws places of the source by a seed, changes one after the other, runs the tests of the changed
-module and says what lives. Exit code 0 when nine of ten were killed, else 1; 2 when the tests fail
-before anything is changed.
+module and says what lives. Exit code 0 when nine of ten were killed, else 1; 2 when pytest itself
+does not run.
 
 A place is a line with something to mutate. What is done to it:
 
@@ -22,16 +22,22 @@ assertions of what cannot happen, version numbers of results, what changes speed
 division) and how often a search goes on at most: one that has converged moves no more.
 
 The tests of `orthoflow/engine/x.py` are those in `tests/engine`, of a plugin's module those of its
-kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it. Doctests
-and a file of the module's own name go first, then those that name the module; the first failure
-ends a run. The conformance suite takes part for modules of kinds, its golden results last: they
-hold what a method gives, too, but a killer that knows why a number is right says more. A run that
-takes far longer than without a mutation is stopped, which kills the mutation as well.
+kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it. Doctests,
+a file of the module's own name and files that name the module go first, in a run of their own that
+has little to collect; then the conformance suite for modules of kinds, its golden results last
+(they hold what a method gives, too, but a killer that knows why a number is right says more); then
+the other files. The first failure ends a run.
+
+A test kills a mutation only when it passes without it: whatever failed is run once more on the
+source as it is. What fails there as well is left out from then on. A run that takes too long
+(`--timeout`) kills where the same run, without the mutation, takes less than a third of that; else,
+and where `--budget` is spent, the mutation counts as alive.
 
 All this happens in copies of the tree, kept in the temporary folder (`--work`) between runs for the
 sake of compiled kernels. Numba's cache does not notice that a kernel which another one calls has
-changed. So a run gets a copy of the cache, hard links, without what the changed module and the
-modules that import it compiled.
+changed. So a run gets a copy of the cache, hard links, without what could differ: the kernels of
+the changed module and of all that take kernels or constants from it, if only by way of others
+(`Tree.kernels_with`).
 """
 
 from __future__ import annotations
@@ -39,8 +45,8 @@ from __future__ import annotations
 import argparse
 import ast
 import hashlib
+import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -48,9 +54,9 @@ import sys
 import tempfile
 import threading
 import time
-import xml.etree.ElementTree as ET
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -72,8 +78,12 @@ COPIED: Final = (
     *("benchmarks", "pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE"),
 )
 KILLED_SHARE: Final = 0.9
+_COMPILING: Final = "orthoflow.geometry.compiling"
+# What is computed when a module is loaded.
+_COMPUTED: Final = (ast.Assign, ast.AnnAssign, ast.If, ast.For)
 # Exit codes of pytest.
-_MISUSED: Final = 4
+_PASSED: Final = 0
+_FAILED: Final = 1
 _NOTHING_FOUND: Final = 5
 
 
@@ -88,11 +98,13 @@ class Tree:
         root: of the checkout.
         modules: dotted name -> path from the root.
         imports: dotted name -> names of modules that it imports, anywhere in its text.
+        frozen: dotted name -> names of modules of which kernels or constants of it are made.
     """
 
     root: Path
     modules: dict[str, str]
     imports: dict[str, frozenset[str]]
+    frozen: dict[str, frozenset[str]]
 
     @classmethod
     def of(cls, root: Path) -> Tree:
@@ -103,11 +115,13 @@ class Tree:
                 parts = path.relative_to(root / parent).with_suffix("").parts
                 name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
                 modules[name] = str(path.relative_to(root))
-        imports = {
-            name: frozenset(_imported(ast.parse((root / path).read_bytes())) & modules.keys())
-            for name, path in modules.items()
-        }
-        return cls(root=root, modules=modules, imports=imports)
+        texts = {name: ast.parse((root / path).read_bytes()) for name, path in modules.items()}
+        return cls(
+            root=root,
+            modules=modules,
+            imports={n: frozenset(_imported(text) & modules.keys()) for n, text in texts.items()},
+            frozen={n: frozenset(_frozen(text) & modules.keys()) for n, text in texts.items()},
+        )
 
     def name(self, path: str) -> str:
         """The dotted name of a module's path."""
@@ -115,11 +129,54 @@ class Tree:
 
     def importers(self, name: str) -> set[str]:
         """Give the modules that import a module, also by way of others, and itself."""
-        found, new = {name}, {name}
-        while new:
-            new = {other for other, all_of in self.imports.items() if all_of & new} - found
-            found |= new
-        return found
+        return _reached(name, self.imports)
+
+    def kernels_with(self, name: str) -> list[str]:
+        """Give the paths of modules whose compiled kernels may differ when a module does."""
+        paths = [self.modules[other] for other in _reached(name, self.frozen)]
+        return sorted(path for path in paths if _compiles(self.root / path))
+
+
+def _reached(name: str, edges: Mapping[str, frozenset[str]]) -> set[str]:
+    found, new = {name}, {name}
+    while new:
+        new = {other for other, all_of in edges.items() if all_of & new} - found
+        found |= new
+    return found
+
+
+def _frozen(tree: ast.Module) -> set[str]:
+    """Names of modules that kernels and constants of a module are made of.
+
+    Numba freezes what a kernel finds in its module: kernels, numbers, tables. So this follows the
+    names in compiled functions, and in whatever is computed when a module is loaded.
+    """
+    sources = _sources_of_names(tree)
+    used = {name for item in tree.body if isinstance(item, _COMPUTED) for name in _names(item)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            decorators = {name for item in node.decorator_list for name in _names(item)}
+            if any(_COMPILING in sources.get(name, ()) for name in decorators):
+                used |= _names(node)
+    return {module for name in used for module in sources.get(name, ())}
+
+
+def _sources_of_names(tree: ast.Module) -> dict[str, set[str]]:
+    """Name in a module -> the modules that it may come from."""
+    sources: dict[str, set[str]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                sources[(alias.asname or alias.name).partition(".")[0]] = {alias.name}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                places = {node.module, f"{node.module}.{alias.name}"}
+                sources[alias.asname or alias.name] = places
+    return sources
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
 
 
 def _imported(tree: ast.Module) -> set[str]:
@@ -162,8 +219,8 @@ def _kind_modules(names: set[str]) -> set[str]:
     return {name for name in names if name.startswith("orthoflow_plugins.") and name.count(".") > 1}
 
 
-def files_of(tree: Tree, path: str) -> list[str]:
-    """Give the files of tests of a module, those that know most of it first."""
+def files_of(tree: Tree, path: str) -> tuple[list[str], list[str]]:
+    """Give the files of tests of a module, first those that name it, then the others."""
     name = tree.name(path)
     stem = Path(path).stem
 
@@ -189,7 +246,10 @@ def files_of(tree: Tree, path: str) -> list[str]:
         ranked += [((4, 0, file.name), str(file.relative_to(tree.root))) for file in shared]
     if ">>> " in (tree.root / path).read_text(encoding="utf-8"):
         ranked.append(((-1, 0, ""), path))
-    return list(dict.fromkeys(file for _, file in sorted(ranked)))
+    near = [file for (rank, *_), file in sorted(ranked) if rank <= 1]
+    return list(dict.fromkeys(near)), list(
+        dict.fromkeys(file for _, file in sorted(ranked) if file not in near)
+    )
 
 
 def kinds_of(tree: Tree, path: str) -> list[str]:
@@ -219,12 +279,13 @@ class Worker:
 
     Attributes:
         folder: what it has for itself.
-        least_timeout_s: how long any run may take.
+        timeout_s: how long a run may take.
+        budget_s: how long a mutation may take; it is not begun another run with after that.
     """
 
     folder: Path
-    least_timeout_s: float
-    _usual_s: dict[str, float] = field(default_factory=dict)
+    timeout_s: float
+    budget_s: float
     _broken: list[str] = field(default_factory=list)
     _stamp: int = 0
 
@@ -233,8 +294,13 @@ class Worker:
         """The copy."""
         return self.folder / "tree"
 
+    @property
+    def _kernels(self) -> Path:
+        return self.folder / "kernels"
+
     def prepare(self, source: Path) -> None:
         """Copy the tree afresh; times of files stay, by which kernels are known."""
+        before = _sources(self.tree)
         if self.tree.exists():
             shutil.rmtree(self.tree)
         self.tree.mkdir(parents=True)
@@ -248,63 +314,76 @@ class Worker:
         shared, beside = self.folder / "shared", source.parent / "shared"
         if beside.is_dir() and not shared.exists():
             shared.symlink_to(beside)
-
-    def first_problem(self, folders: Sequence[str]) -> str:
-        """Run folders of tests without a mutation, to know how long they take."""
-        for folder in folders:
-            if folder in self._usual_s:
-                continue
-            began = time.monotonic()
-            report = self.folder / "report.xml"
-            done = self._pytest([folder, f"--junitxml={report}"], self._kernels, 3600.0)
-            self._usual_s[folder] = time.monotonic() - began
-            if done is None or done.returncode not in (0, 1, _NOTHING_FOUND):
-                return f"{folder} does not run: {'' if done is None else done.stdout[-2000:]}"
-            if done.returncode == 1:
-                failed = _failed(report)
-                sys.stderr.write(f"not counted, fail without a mutation: {', '.join(failed)}\n")
-                self._broken += failed
-        return ""
+        now, tree = _sources(self.tree), Tree.of(self.tree)
+        for name, path in tree.modules.items():
+            if before.get(path) != now[path]:
+                _forget(self._kernels, self.tree, tree.kernels_with(name))
 
     def verdict(self, mutation: Mutation, tree: Tree) -> Verdict:
         """Try a mutation."""
         began = time.monotonic()
+        killer = ""
+        for arguments in _runs(mutation, tree):
+            if time.monotonic() - began > self.budget_s:
+                break
+            if killer := self._killer(arguments, mutation, tree):
+                break
+        return Verdict(mutation=mutation, killer=killer, seconds=time.monotonic() - began)
+
+    def _killer(self, arguments: Sequence[str], mutation: Mutation, tree: Tree) -> str:
+        """What fails in a run with a mutation and passes without it; else an empty text."""
+        while True:
+            with self._mutated(mutation, tree) as kernels:
+                done = self._pytest([*arguments, "-x"], kernels, self.timeout_s)
+            if done is None:
+                again = self._pytest([*arguments, "-x"], self._kernels, self.timeout_s / 3)
+                is_slower = again is not None and again.returncode == _PASSED
+                return f"timeout of {self.timeout_s:.0f} s" if is_slower else ""
+            if done.returncode in (_PASSED, _NOTHING_FOUND):
+                return ""
+            failed = self._last_failed()
+            again = self._pytest(failed or [*arguments, "-x"], self._kernels, 3600.0)
+            if again is not None and again.returncode == _PASSED:
+                return failed[0] if failed else f"pytest: {done.stdout.strip()[-200:]}"
+            broken = self._last_failed()
+            if again is None or not set(broken) - set(self._broken):
+                raise RuntimeError(f"pytest does not run: {'' if again is None else again.stdout}")
+            sys.stderr.write(f"not counted, fail without a mutation: {', '.join(broken)}\n")
+            self._broken += broken
+
+    @contextmanager
+    def _mutated(self, mutation: Mutation, tree: Tree) -> Iterator[Path]:
+        """Change the copy for a while; gives the folder of kernels to use meanwhile."""
         target = self.tree / mutation.path
         before = target.stat()
         source = target.read_bytes()
-        kernels = self._kernels_without(mutation, tree)
+        hanging = tree.kernels_with(tree.name(mutation.path))
+        kernels = self.folder / "kernels-mutated" if hanging else self._kernels
+        if hanging:
+            shutil.rmtree(kernels, ignore_errors=True)
+            self._kernels.mkdir(exist_ok=True)
+            shutil.copytree(self._kernels, kernels, copy_function=os.link)
+            _forget(kernels, self.tree, hanging)
         try:
             target.write_bytes(mutation.applied(source))
             # Interpreters know compiled modules by whole seconds and size.
             self._stamp += 10
             os.utime(target, (before.st_atime, before.st_mtime + self._stamp))
-            killer = self._killer(mutation, tree, kernels)
+            yield kernels
         finally:
             target.write_bytes(source)
             os.utime(target, ns=(before.st_atime_ns, before.st_mtime_ns))
-            if kernels != self._kernels:
-                shutil.rmtree(kernels, ignore_errors=True)
-        return Verdict(mutation=mutation, killer=killer, seconds=time.monotonic() - began)
+            if hanging:
+                # What else was compiled meanwhile is the same without the mutation.
+                _forget(kernels, self.tree, hanging)
+                for file in kernels.glob("*/*.nb[ci]"):
+                    kept = self._kernels / file.relative_to(kernels)
+                    kept.parent.mkdir(exist_ok=True)
+                    file.replace(kept)
 
-    def _killer(self, mutation: Mutation, tree: Tree, kernels: Path) -> str:
-        usual_s = sum(self._usual_s.get(folder, 0.0) for folder in folders_of(tree, mutation.path))
-        timeout_s = self.least_timeout_s + 3.0 * usual_s
-        runs = [["-x", *files_of(tree, mutation.path)]]
-        if kinds := kinds_of(tree, mutation.path):
-            named = " or ".join(f"{kind}." for kind in kinds)
-            runs += [
-                ["-x", "tests/testing/test_conformance.py", "-k", f"({named}) and {which}"]
-                for which in ("not golden", "golden")
-            ]
-        for arguments in runs:
-            done = self._pytest(arguments, kernels, timeout_s)
-            if done is None:
-                return f"timeout of {timeout_s:.0f} s"
-            if done.returncode == _MISUSED:
-                raise RuntimeError(f"pytest does not take its arguments: {done.stdout[-500:]}")
-            if done.returncode not in (0, _NOTHING_FOUND):
-                return _named_failure(done.stdout)
-        return ""
+    def _last_failed(self) -> list[str]:
+        found = self.folder / "cache/v/cache/lastfailed"
+        return list(json.loads(found.read_text())) if found.is_file() else []
 
     def _pytest(
         self, arguments: Sequence[str], kernels: Path, timeout_s: float
@@ -312,18 +391,25 @@ class Worker:
         """Run pytest on the copy; None when it took too long, with all its processes gone."""
         parts = [str(self.tree / parent) for parent in PACKAGES]
         scratch = self.folder / "tmp"
-        shutil.rmtree(scratch, ignore_errors=True)
+        for left in (scratch, self.folder / "cache"):
+            shutil.rmtree(left, ignore_errors=True)
         scratch.mkdir(parents=True)
         environment = {
             **os.environ,
             "PYTHONPATH": os.pathsep.join(parts),
             "NUMBA_CACHE_DIR": str(kernels),
+            # Those in stores are in a folder per state of the code.
+            "ORTHOFLOW_KERNELS": str(self.folder / "kernels-of-stores"),
             "MPLBACKEND": "Agg",
             "TMPDIR": str(scratch),
         }
-        deselected = [part for name in self._broken for part in ("--deselect", name)]
+        # Of a file that cannot be collected nothing can be left out.
+        deselected = [
+            f"--deselect={name}" if "::" in name else f"--ignore={name}" for name in self._broken
+        ]
         command = [
-            *(sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider"),
+            *(sys.executable, "-m", "pytest", "-q", "-n", "0"),
+            *("-o", f"cache_dir={self.folder / 'cache'}"),
             *(*deselected, *arguments),
         ]
         with subprocess.Popen(
@@ -343,58 +429,41 @@ class Worker:
                 return None
         return subprocess.CompletedProcess(command, process.returncode, said, "")
 
-    @property
-    def _kernels(self) -> Path:
-        """The folder of compiled kernels of the tree as it is."""
-        return self.folder / f"kernels-{_kernel_state(self.tree)}"
 
-    def _kernels_without(self, mutation: Mutation, tree: Tree) -> Path:
-        """Give a cache without what hangs on a module; the usual one where nothing does."""
-        importers = tree.importers(tree.name(mutation.path))
-        hanging = [
-            path for name in importers if _compiles(tree.root / (path := tree.modules[name]))
-        ]
-        if not hanging or not self._kernels.is_dir():
-            return self._kernels
-        other = self.folder / "kernels-mutated"
-        shutil.rmtree(other, ignore_errors=True)
-        shutil.copytree(self._kernels, other, copy_function=os.link)
-        for path in hanging:
-            # Numba names folders after the module's folder and its digest, files after the module.
-            parent = (self.tree / path).parent
-            digest = hashlib.sha1(str(parent).encode()).hexdigest()
-            for file in (other / f"{parent.name}_{digest}").glob(f"{Path(path).stem}.*"):
-                file.unlink()
-        return other
+def _runs(mutation: Mutation, tree: Tree) -> Iterator[list[str]]:
+    """Give the arguments of pytest, one run after the other, of the tests of a module."""
+    near, others = files_of(tree, mutation.path)
+    if near:
+        yield near
+    if kinds := kinds_of(tree, mutation.path):
+        named = " or ".join(f"{kind}." for kind in kinds)
+        for which in ("not golden", "golden"):
+            yield ["tests/testing/test_conformance.py", "-k", f"({named}) and {which}"]
+    if others:
+        yield others
+
+
+def _sources(root: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for parent, package in PACKAGES.items()
+        for path in (root / parent / package).rglob("*.py")
+    }
+
+
+def _forget(kernels: Path, root: Path, paths: Sequence[str]) -> None:
+    """Remove what was compiled of modules."""
+    for path in paths:
+        # Numba names folders after the module's folder and its digest, files after the module.
+        parent = (root / path).parent
+        digest = hashlib.sha1(str(parent).encode()).hexdigest()
+        for file in (kernels / f"{parent.name}_{digest}").glob(f"{Path(path).stem}.*"):
+            file.unlink()
 
 
 @cache
 def _compiles(path: Path) -> bool:
     return b"orthoflow.geometry.compiling" in path.read_bytes() or path.stem == "compiling"
-
-
-def _kernel_state(root: Path) -> str:
-    """Digest of all modules that compile something: callers do not know of what they call."""
-    digest = hashlib.sha256()
-    for parent, package in PACKAGES.items():
-        for path in sorted((root / parent / package).rglob("*.py")):
-            if _compiles(path):
-                digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-def _failed(report: Path) -> list[str]:
-    found = []
-    for case in ET.parse(report).iter("testcase"):
-        if case.find("failure") is not None or case.find("error") is not None:
-            file = case.get("classname", "").replace(".", "/") + ".py"
-            found.append(f"{file}::{case.get('name')}")
-    return found
-
-
-def _named_failure(said: str) -> str:
-    found = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", said, flags=re.MULTILINE)
-    return found[1] if found else (said.strip().splitlines() or ["pytest died"])[-1]
 
 
 def _shared_out(mutations: Sequence[Mutation], tree: Tree, n_workers: int) -> list[list[Mutation]]:
@@ -414,13 +483,13 @@ def run(
     work: Path,
     n_workers: int,
     timeout_s: float,
-    is_checked: bool,
+    budget_s: float,
     tell: Callable[[Verdict], None],
 ) -> list[Verdict]:
     """Try mutations and give their verdicts.
 
     Raises:
-        RuntimeError: tests do not run without any mutation.
+        RuntimeError: pytest does not run.
     """
     tree = Tree.of(ROOT)
     verdicts: list[Verdict] = []
@@ -428,15 +497,11 @@ def run(
     lock = threading.Lock()
 
     def work_off(number: int, share: Sequence[Mutation]) -> None:
-        worker = Worker(folder=work / f"worker-{number}", least_timeout_s=timeout_s)
+        worker = Worker(folder=work / f"worker-{number}", timeout_s=timeout_s, budget_s=budget_s)
         worker.prepare(ROOT)
         # Which tests there are is asked of the copy: the checkout may go on.
         tree = Tree.of(worker.tree)
         for mutation in share:
-            folders = folders_of(tree, mutation.path) if is_checked else []
-            if problem := worker.first_problem(folders):
-                problems.append(problem)
-                return
             try:
                 verdict = worker.verdict(mutation, tree)
             except RuntimeError as error:
@@ -476,15 +541,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=40, help="number of places")
     parser.add_argument("--only", nargs="*", default=[], help="beginnings of paths")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    parser.add_argument("--timeout", type=float, default=150.0, help="seconds, least of a run")
+    parser.add_argument("--timeout", type=float, default=600.0, help="seconds, of a run")
+    parser.add_argument("--budget", type=float, default=1800.0, help="seconds, of a mutation")
     parser.add_argument(
         "--work",
         type=Path,
         default=Path(tempfile.gettempdir())
         / f"orthoflow-mutate-{hashlib.sha256(str(ROOT).encode()).hexdigest()[:8]}",
-    )
-    parser.add_argument(
-        "--unchecked", action="store_true", help="do not run the tests without mutations first"
     )
     parser.add_argument("--list", action="store_true", help="print what is drawn, run nothing")
     given = parser.parse_args(arguments)
@@ -499,7 +562,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             work=given.work,
             n_workers=given.jobs,
             timeout_s=given.timeout,
-            is_checked=not given.unchecked,
+            budget_s=given.budget,
             tell=_print,
         )
     except RuntimeError as error:

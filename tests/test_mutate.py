@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import ast
+import json
+import subprocess
 import textwrap
 from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
@@ -131,12 +135,12 @@ def test_a_modules_tests_are_in_the_folder_of_its_name(
 
 
 def test_the_file_of_its_name_goes_first_and_kinds_follow_geometry(tree: mutate.Tree) -> None:
-    files = mutate.files_of(tree, "plugins/orthoflow_plugins/plane/hough3d.py")
-    assert files[0] == "tests/plugins/plane/test_hough3d.py"
+    near, others = mutate.files_of(tree, "plugins/orthoflow_plugins/plane/hough3d.py")
+    assert near[0] == "tests/plugins/plane/test_hough3d.py"
     folders = ("tests/plugins/plane", "tests/plugins")
     there = [file for folder in folders for file in (mutate.ROOT / folder).glob("test_*.py")]
-    assert sorted(files) == sorted(str(file.relative_to(mutate.ROOT)) for file in there)
-    assert "tests/test_alike.py" in mutate.files_of(tree, "orthoflow/alike.py")[:2]
+    assert sorted(near + others) == sorted(str(file.relative_to(mutate.ROOT)) for file in there)
+    assert "tests/test_alike.py" in mutate.files_of(tree, "orthoflow/alike.py")[0][:2]
     folders = mutate.folders_of(tree, "orthoflow/geometry/threads.py")
     assert folders[0] == "tests/geometry"
     assert {"tests/plugins/plane", "tests/plugins/ortho"} <= set(folders)
@@ -145,3 +149,110 @@ def test_the_file_of_its_name_goes_first_and_kinds_follow_geometry(tree: mutate.
 def test_importers_are_found_by_way_of_others(tree: mutate.Tree) -> None:
     assert "orthoflow.engine.child" in tree.importers("orthoflow.errors")
     assert tree.importers("orthoflow.__main__") == {"orthoflow.__main__"}
+
+
+def test_kernels_hang_on_what_they_and_constants_are_made_of(tmp_path: Path) -> None:
+    package = tmp_path / "orthoflow"
+    texts = {
+        "compiling": "",
+        "errors": "class Error(Exception): ...",
+        "scale": "SIGMA = 1.4826",
+        "limits": "from orthoflow.scale import SIGMA\nMOST = 3 * SIGMA",
+        "inner": "from orthoflow.geometry.compiling import compiled\n@compiled\ndef inner(): ...",
+        "outer": """
+from orthoflow.errors import Error
+from orthoflow.geometry.compiling import compiled
+from orthoflow.inner import inner
+from orthoflow.limits import MOST as MOST_SIGMAS
+
+@compiled
+def outer():
+    return inner() + MOST_SIGMAS
+
+def checked():
+    raise Error
+""",
+    }
+    (package / "geometry").mkdir(parents=True)
+    for name, text in texts.items():
+        folder = package / "geometry" if name == "compiling" else package
+        (folder / f"{name}.py").write_text(text)
+    tree = mutate.Tree.of(tmp_path)
+    inner, outer = "orthoflow/inner.py", "orthoflow/outer.py"
+    assert tree.kernels_with("orthoflow.scale") == [outer]
+    assert tree.kernels_with("orthoflow.inner") == [inner, outer]
+    assert tree.kernels_with("orthoflow.outer") == [outer]
+    assert tree.kernels_with("orthoflow.errors") == []
+    every = ["orthoflow/geometry/compiling.py", inner, outer]
+    assert tree.kernels_with("orthoflow.geometry.compiling") == every
+
+
+SOURCE = b"SMALL = 1\nLARGE = 2\n"
+MUTATION = next(
+    item for item in mutations_of(SOURCE, "orthoflow/sizes.py") if item.change == "2 -> 3"
+)
+TESTS = """
+from orthoflow import sizes
+
+
+def test_that_fails_on_this_machine():
+    assert not sizes
+
+
+def test_sizes():
+    assert sizes.LARGE == 2
+"""
+
+
+@pytest.fixture
+def worker(tmp_path: Path) -> mutate.Worker:
+    """Of a tree with one module and one file of tests."""
+    root = tmp_path / "tree"
+    (root / "orthoflow").mkdir(parents=True)
+    (root / "tests/sizes").mkdir(parents=True)
+    (root / "pyproject.toml").write_text("[tool.pytest.ini_options]\naddopts = ['-p', 'no:dash']\n")
+    (root / "orthoflow/__init__.py").touch()
+    (root / "orthoflow/sizes.py").write_bytes(SOURCE)
+    (root / "tests/sizes/test_sizes.py").write_text(TESTS)
+    return mutate.Worker(folder=tmp_path, timeout_s=90.0, budget_s=600.0)
+
+
+def test_a_mutation_is_killed_by_a_test_that_passes_without_it(worker: mutate.Worker) -> None:
+    verdict = worker.verdict(MUTATION, mutate.Tree.of(worker.tree))
+    assert verdict.killer == "tests/sizes/test_sizes.py::test_sizes"
+    assert (worker.tree / "orthoflow/sizes.py").read_bytes() == SOURCE
+
+
+@pytest.mark.parametrize(
+    ("mutated", "unmutated", "killer"),
+    [
+        ((0, []), (0, []), ""),
+        ((1, ["a.py::test_b"]), (0, []), "a.py::test_b"),
+        ((1, ["a.py::test_b"]), (1, ["a.py::test_b"]), ""),
+        ((None, []), (0, []), "timeout of 90 s"),
+        ((None, []), (None, []), ""),
+        ((-11, []), (0, []), "pytest: it says"),
+    ],
+    ids=["passes", "fails", "fails-anyway", "hangs", "takes-as-long-anyway", "crashes"],
+)
+def test_what_a_run_without_the_mutation_does_not_tell_apart_kills_nothing(
+    worker: mutate.Worker,
+    monkeypatch: pytest.MonkeyPatch,
+    mutated: tuple[int | None, list[str]],
+    unmutated: tuple[int | None, list[str]],
+    killer: str,
+) -> None:
+    def run(
+        self: mutate.Worker, arguments: Sequence[str], _: Path, __: float
+    ) -> subprocess.CompletedProcess[str] | None:
+        is_mutated = (self.tree / "orthoflow/sizes.py").read_bytes() != SOURCE
+        code, failed = mutated if is_mutated else unmutated
+        if set(failed) <= set(self._broken):
+            code, failed = (0, []) if failed else (code, failed)
+        cache = self.folder / "cache/v/cache"
+        cache.mkdir(parents=True, exist_ok=True)
+        (cache / "lastfailed").write_text(json.dumps(dict.fromkeys(failed, True)))
+        return None if code is None else subprocess.CompletedProcess(arguments, code, "it says", "")
+
+    monkeypatch.setattr(mutate.Worker, "_pytest", run)
+    assert worker.verdict(MUTATION, mutate.Tree.of(worker.tree)).killer == killer
