@@ -16,6 +16,12 @@ Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 _BAND_CELLS: Final = 1 << 24
 
 
+def in_memory(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+    """Give a zeroed array of a raster that is small enough; an `Allocate`."""
+    del name
+    return np.zeros(shape, dtype=dtype)
+
+
 def row_bands(shape: tuple[int, ...], *, multiple: int = 1) -> Iterator[slice]:
     """Cut a raster into bands of rows.
 

@@ -16,7 +16,7 @@ from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.frames import WallFrame
 from orthoflow.geometry.point_kernels import Offsets, read_only
 from orthoflow.geometry.raster_kernels import BLOCK, WINNER, Entries, Target, project_points
-from orthoflow.geometry.slabs import OffsetPoints, Slab
+from orthoflow.geometry.slabs import BOXED_POINTS, OffsetPoints, Slab
 from orthoflow.geometry.threads import in_parts, in_threads
 
 # 2^20 points: their entries (16 MB) stay in the processor's cache between the passes, and threads
@@ -40,10 +40,19 @@ def wall_from_offset(frame: WallFrame, origin: NDArray[np.float64]) -> NDArray[n
     return np.column_stack([axes, axes @ (origin - frame.origin_world) + 0.0])
 
 
-def entries_inside(points: OffsetPoints, slab: Slab, *, threads: int) -> Iterator[Entries]:
+def entries_inside(
+    points: OffsetPoints, slab: Slab, *, threads: int, rows: slice | None = None
+) -> Iterator[Entries]:
     """Give the points inside a slab, chunk by chunk, in their order.
 
-    The yielded arrays are overwritten by the next chunk.
+    The yielded arrays are overwritten by the next chunk. Blocks of points whose box lies beside
+    the slab are not read.
+
+    Args:
+        points: of the cloud.
+        slab: of the wall.
+        threads: how many threads work.
+        rows: of the raster that are asked for; points in others may be left out. None for all.
     """
     frame = slab.frame
     target = Target(
@@ -54,15 +63,46 @@ def entries_inside(points: OffsetPoints, slab: Slab, *, threads: int) -> Iterato
         width=frame.width,
     )
     x, y, z = read_only(points.x, points.y, points.z)
-    size = min(_CHUNK, max(1, x.size))
-    buffers = _empty_entries(size)
-    for first in range(0, x.size, size):
-        part = slice(first, min(first + size, x.size))
+    buffers = _empty_entries(min(_CHUNK, max(1, x.size)))
+    for first, end in _runs(points, target, rows):
+        part = slice(first, end)
         n_blocks = -(-(part.stop - part.start) // BLOCK)
         entries = buffers._replace(n_inside=buffers.n_inside[:n_blocks])
         chunk = Offsets(x[part], y[part], z[part])
         in_parts(partial(project_points, chunk, first, target, entries), n_blocks, threads=threads)
         yield entries
+
+
+def _runs(points: OffsetPoints, target: Target, rows: slice | None) -> Iterator[tuple[int, int]]:
+    """First point and the one after the last of chunks that may hold points inside."""
+    n_points, boxes_m = points.x.size, points.boxes_m
+    if boxes_m is None:
+        edges = np.array([[0, n_points]])
+    else:
+        may_hold = _may_hold_points(boxes_m.astype(np.float64), target, rows)
+        steps = np.diff(np.concatenate([[False], may_hold, [False]]).astype(np.int8))
+        ends = np.column_stack([np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)])
+        edges = np.minimum(ends * BOXED_POINTS, n_points)
+    for begin, end in edges.tolist():
+        for first in range(begin, end, _CHUNK):
+            yield first, min(first + _CHUNK, end)
+
+
+def _may_hold_points(
+    boxes_m: NDArray[np.float64], target: Target, rows: slice | None
+) -> NDArray[np.bool_]:
+    """Which boxes (n, 2, 3) meet a slab, or may: they stand askew to it."""
+    axes = target.wall_from_offset[:, :3]
+    middles = boxes_m.mean(axis=1) @ axes.T + target.wall_from_offset[:, 3]
+    halves = 0.5 * (boxes_m[:, 1] - boxes_m[:, 0]) @ np.abs(axes).T
+    first_row, end_row = (0, target.height) if rows is None else (rows.start, rows.stop)
+    low = np.array([0.0, first_row, target.behind_m])
+    high = np.array([target.width, end_row, target.front_m])
+    # What is lost by rounding is far less.
+    slack = 1e-9 * (np.abs(middles) + halves) + 1e-6
+    meets = (middles + halves >= low - slack) & (middles - halves <= high + slack)
+    found: NDArray[np.bool_] = meets.all(axis=1)
+    return found
 
 
 def share_cells(threads: int, *passes: Callable[[int, int], None]) -> None:

@@ -1,14 +1,18 @@
-"""The points of a cloud and the slab around a wall's plane in which they count."""
+"""The points of a cloud, block by block, and the slab around a wall's plane in which they count."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.frames import WallFrame
+from orthoflow.geometry.threads import in_parts
+
+# Coordinates come at the speed of memory, or of the disk, which two threads keep busy.
+_BOXING_THREADS: Final = 2
 
 
 class OffsetPoints(Protocol):
@@ -30,6 +34,33 @@ class OffsetPoints(Protocol):
     def z(self) -> NDArray[np.float32]:
         """(n,) metres from the origin along z."""
 
+    @property
+    def boxes_m(self) -> NDArray[np.float32] | None:
+        """What `block_boxes_m` gives of these points; None for too few to be worth it."""
+
+
+# Points of a box: their coordinates stay in the processor's cache while it is found.
+BOXED_POINTS: Final = 1 << 16
+
+
+def block_boxes_m(points: OffsetPoints) -> NDArray[np.float32]:
+    """Boxes (blocks, 2, 3) of `BOXED_POINTS` points each: lowest and highest offsets, metres.
+
+    A scan comes in order, so that the points of a block lie together, and a pass over one wall
+    need not read those of the others.
+    """
+    n_blocks = -(-len(points.x) // BOXED_POINTS)
+    boxes_m = np.empty((n_blocks, 2, 3), dtype=np.float32)
+
+    def find(first: int, end: int) -> None:
+        for block in range(first, end):
+            part = slice(block * BOXED_POINTS, (block + 1) * BOXED_POINTS)
+            for axis, values in enumerate((points.x, points.y, points.z)):
+                boxes_m[block, :, axis] = values[part].min(), values[part].max()
+
+    in_parts(find, n_blocks, threads=_BOXING_THREADS)
+    return boxes_m
+
 
 @dataclass(frozen=True, kw_only=True)
 class Slab:
@@ -49,3 +80,10 @@ class Slab:
     def n_cells(self) -> int:
         """Number of cells."""
         return self.frame.width * self.frame.height
+
+    def over(self, rows: slice) -> Slab:
+        """Give the slab over some rows of the raster."""
+        frame = self.frame
+        corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
+        part = replace(frame, origin_world=corner, height=rows.stop - rows.start)
+        return replace(self, frame=part)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from functools import cached_property
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
+from orthoflow.geometry.slabs import BOXED_POINTS, block_boxes_m
 from orthoflow.products.product import JsonValue, Product, Tolerance
+
+# A cloud with fewer blocks is passed over as a whole.
+_BLOCKS_LEAST: Final = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +92,14 @@ class PointCloud(Product):
 
     def __len__(self) -> int:
         return len(self.x)
+
+    @cached_property
+    def boxes_m(self) -> NDArray[np.float32] | None:
+        """Boxes (blocks, 2, 3) of the points as they follow each other; None for a few blocks.
+
+        Found when somebody asks for them first, by one pass over the points.
+        """
+        return block_boxes_m(self) if len(self) > _BLOCKS_LEAST * BOXED_POINTS else None
 
     def points_world(self, index: NDArray[np.int64] | slice = slice(None)) -> NDArray[np.float64]:
         """World points (m, 3) float64 of a selection; a copy, so keep selections small."""

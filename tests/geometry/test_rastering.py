@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from orthoflow.geometry import frame_over
+from orthoflow.geometry import frame_over, rastering
+from orthoflow.geometry import raster_kernels as kernels
 from orthoflow.geometry.narrow_gaps import narrow_gaps
+from orthoflow.geometry.point_kernels import Offsets
 from orthoflow.geometry.raster_kernels import NO_POINT
 from orthoflow.geometry.rastering import topmost_points, values_of_winners, wall_from_offset
 from orthoflow.geometry.slabs import Slab
@@ -118,6 +120,50 @@ def test_both_ends_of_the_buffer_are_inside() -> None:
         scenes.cloud_of(points), slab_of(wall, front_m=0.25, behind_m=0.5), threads=1
     )
     assert np.flatnonzero(winners["point"] != NO_POINT).tolist() == [0, 2]
+
+
+def test_blocks_beside_a_wall_are_not_read_and_nothing_else_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wall = scenes.leaning_wall(shape=(60, 80))
+    some = random_cloud(wall, n_points=1_100_000, seed=2)
+    # As a scanner goes: along the wall, and then along what lies beside it.
+    order = np.argsort(some.x, kind="stable")
+    cloud = replace(some, **{axis: getattr(some, axis)[order] for axis in "xyz"})
+    frame = slab_of(wall).frame
+    part = Slab(frame=replace(frame, width=8), front_m=0.15, behind_m=0.15)
+    read = {}
+
+    def project_points(offsets: Offsets, first: int, *rest: object) -> None:
+        read[first] = offsets.x.size
+        kernels.project_points(offsets, first, *rest)
+
+    monkeypatch.setattr(rastering, "project_points", project_points)
+    assert cloud.boxes_m is not None
+    found = [topmost_points(cloud, part, threads=2)]
+    assert sum(read.values()) < 0.3 * len(cloud)
+    monkeypatch.setattr(PointCloud, "boxes_m", None)
+    found.append(topmost_points(replace(cloud), part, threads=2))
+    np.testing.assert_array_equal(*found)
+    assert (found[0]["point"] != NO_POINT).mean() > 0.9
+
+
+def test_only_what_may_lie_in_some_rows_is_read() -> None:
+    wall = scenes.upright_wall(shape=(60, 80))
+    some = random_cloud(wall, n_points=1_100_000, seed=2)
+    order = np.argsort(some.z, kind="stable")
+    cloud = replace(some, **{axis: getattr(some, axis)[order] for axis in "xyz"})
+    slab, rows = slab_of(wall), slice(20, 30)
+    counts = []
+    for asked in (None, rows):
+        count = np.zeros(slab.n_cells, dtype=np.uint32)
+        for entries in rastering.entries_inside(cloud, slab, threads=2, rows=asked):
+            for block, n_inside in enumerate(entries.n_inside):
+                first = block * kernels.BLOCK
+                np.add.at(count, entries.cells[first : first + n_inside], 1)
+        counts.append(count.reshape(60, 80))
+    np.testing.assert_array_equal(counts[1][rows], counts[0][rows])
+    assert counts[1].sum() < 0.4 * counts[0].sum()
 
 
 def opened_void(is_void: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from orthoflow.geometry.bands import Allocate, Band, bands_with_reach, count_cells, in_memory
+from orthoflow.geometry.levels import level_of
 from orthoflow.products import Layer, LayerMask, Layers
 from orthoflow.sdk import Determinism, Method, Ports, StepContext
 from orthoflow_plugins.ortho.layers import LayerStack
@@ -25,7 +28,11 @@ from orthoflow_plugins.ortho.photos_on_walls import (
 
 if TYPE_CHECKING:
     from orthoflow.geometry.cameras import ViewingCamera
+    from orthoflow_plugins.ortho.forward_kernels import Catch
     from orthoflow_plugins.ortho.surfaces import Surface
+
+# Larger layers are coloured in bands of so many cells: some 600 MB.
+_BAND_CELLS: Final = 1 << 24
 
 
 class DsmForward(Method):
@@ -92,8 +99,8 @@ class DsmForward(Method):
             looked = ctx.clock_s()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
             with stack.painting_from(photo.name):
-                for index, surface in enumerate(surfaces):
-                    layer = _layer(opened, surface, index, params, threads=ctx.cores)
+                for index in range(len(surfaces)):
+                    layer = _layer(opened, stack, index, params, threads=ctx.cores)
                     if layer is not None:
                         stack.add(layer)
             seconds["occluders_s"] += looked - started
@@ -104,31 +111,101 @@ class DsmForward(Method):
         return self.Out(layers=replace(layers, icc_profile=profile))
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Thrown:
+    """A photo whose pixels were thrown onto a wall.
+
+    Attributes:
+        photo: the photo.
+        surface: the wall.
+        catch: which pixel each cell took.
+        border_px: quality falls to 0 over this distance from the image border.
+        gap_cells: how wide gaps are filled.
+        threads: how many threads work.
+    """
+
+    photo: OpenedPhoto
+    surface: Surface
+    catch: Catch
+    border_px: float
+    gap_cells: int
+    threads: int
+
+
 def _layer(
-    photo: OpenedPhoto, surface: Surface, wall: int, params: DsmForward.Params, *, threads: int
+    photo: OpenedPhoto, stack: LayerStack, wall: int, params: DsmForward.Params, *, threads: int
 ) -> Layer | None:
     """Throw a photo onto one wall; None where no pixel meets it."""
-    from orthoflow.geometry.narrow_gaps import narrow_gaps
-    from orthoflow_plugins.ortho.filling import Painted, painted_between
-    from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch, throw_pixels
+    from orthoflow_plugins.ortho.forward_kernels import throw_pixels
     from orthoflow_plugins.ortho.surfaces import is_before, view_of
 
+    surface = stack.surfaces[wall]
     view = view_of(photo.viewer, surface, params, is_exact=True)
     if not is_before(view, surface):
         return None
     shape = surface.frame.shape
-    catch = Catch(
-        pixel=np.full(shape, NO_PIXEL, dtype=np.int32),
-        square=np.full(shape, np.inf, dtype=np.float32),
-    )
-    relief = surface.relief
-    if not throw_pixels(view, relief, photo.buffer, _ray_lattice(photo.viewer, surface), catch):
+    is_large = math.prod(shape) > _BAND_CELLS
+    catch = _empty_catch(shape, stack.scratch(wall) if is_large else in_memory)
+    lattice = _ray_lattice(photo.viewer, surface)
+    if not throw_pixels(view, surface.relief, photo.buffer, lattice, catch):
         return None
-    is_painted = catch.pixel != NO_PIXEL
-    seen, quality = _seen(photo.viewer, surface, border_px=view.border_px)
-    gaps = narrow_gaps(is_painted, params.fill_gap_cells, threads=threads)
-    gaps = gaps[~np.isnan(relief.depth.ravel()[gaps]) & seen.ravel()[gaps]]
-    rgb = photo.pixels.reshape(-1, 3)[np.maximum(catch.pixel, 0).ravel()].reshape(*shape, 3)
+    level, new = level_of(photo.pixels), stack.allocator(wall) if is_large else in_memory
+    layer = Layer(
+        frame=surface.frame,
+        wall=wall,
+        source=photo.name,
+        rgb=np.asarray(new("rgb", (*shape, 3), level), level),
+        mask=np.asarray(new("mask", shape, np.uint8), np.uint8),
+        quality=np.asarray(new("quality", shape, np.float32), np.float32),
+        filled=np.asarray(new("filled", shape, np.uint8), np.uint8),
+    )
+    thrown = _Thrown(
+        photo=photo,
+        surface=surface,
+        catch=catch,
+        border_px=view.border_px,
+        gap_cells=params.fill_gap_cells,
+        threads=threads,
+    )
+    # Whether a gap is narrow hangs on cells two discs away, and its colour on those one farther.
+    reach_rows = 2 * params.fill_gap_cells + 2
+    for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach_rows):
+        _lay_band(thrown, band, layer)
+    return layer
+
+
+def _empty_catch(shape: tuple[int, int], allocate: Allocate) -> Catch:
+    from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL, Catch
+
+    # Kernels know plain arrays only, not mapped files.
+    catch = Catch(
+        pixel=np.asarray(allocate("pixel", shape, np.int32), np.int32).view(np.ndarray),
+        square=np.asarray(allocate("square", shape, np.float32), np.float32).view(np.ndarray),
+    )
+    catch.pixel.fill(NO_PIXEL)
+    catch.square.fill(np.inf)
+    return catch
+
+
+def _lay_band(thrown: _Thrown, band: Band, layer: Layer) -> None:
+    """Colour some rows of a layer with the pixels that they took, and the gaps between them."""
+    from orthoflow.geometry.narrow_gaps import narrow_gaps
+    from orthoflow_plugins.ortho.filling import Painted, painted_between
+    from orthoflow_plugins.ortho.forward_kernels import NO_PIXEL
+
+    around, inner = band.around, band.inner
+    pixel, depth_m = thrown.catch.pixel[around], thrown.surface.relief.depth[around]
+    width = thrown.surface.frame.width
+    is_painted = pixel != NO_PIXEL
+    seen, quality = _seen(
+        thrown.photo.viewer, thrown.surface, band.rows, border_px=thrown.border_px
+    )
+    gaps = narrow_gaps(is_painted, thrown.gap_cells, threads=thrown.threads)
+    gaps = gaps[(gaps >= inner.start * width) & (gaps < inner.stop * width)]
+    is_seen = seen.ravel()[gaps - inner.start * width]
+    gaps = gaps[is_seen & ~np.isnan(depth_m.ravel()[gaps])]
+    rgb = thrown.photo.pixels.reshape(-1, 3)[np.maximum(pixel, 0).ravel()]
+    rgb = rgb.reshape(*pixel.shape, 3)
     rgb[~is_painted] = 0
     is_filled = painted_between(
         gaps,
@@ -137,27 +214,22 @@ def _layer(
             places=np.where(is_painted.reshape(-1, 1), np.float32(0.0), np.float32(np.nan)).repeat(
                 2, axis=1
             ),
-            depth_m=relief.depth.reshape(-1),
+            depth_m=depth_m.reshape(-1),
             # A gap takes what is painted about it, whatever surface it is of.
             layer_m=np.inf,
         ),
-        reach_cells=params.fill_gap_cells,
-        threads=threads,
-    )
-    filled = is_filled.astype(np.uint8)
-    is_shown = is_painted | is_filled
+        reach_cells=thrown.gap_cells,
+        threads=thrown.threads,
+    )[inner]
+    is_shown = is_painted[inner] | is_filled
     mask = np.where(seen, LayerMask.OCCLUDED, LayerMask.OUTSIDE)
-    mask[np.isnan(relief.depth)] = LayerMask.NO_SURFACE
+    mask[np.isnan(depth_m[inner])] = LayerMask.NO_SURFACE
     mask[is_shown] = LayerMask.PAINTED
-    return Layer(
-        frame=surface.frame,
-        wall=wall,
-        source=photo.name,
-        rgb=rgb,
-        mask=mask.astype(np.uint8),
-        quality=np.where(is_shown, quality, np.float32(0.0)),
-        filled=filled,
-    )
+    layer.rgb[band.rows] = rgb[inner]
+    layer.mask[band.rows] = mask
+    layer.quality[band.rows] = np.where(is_shown, quality, np.float32(0.0))
+    if layer.filled is not None:
+        layer.filled[band.rows] = is_filled
 
 
 def _ray_lattice(viewer: ViewingCamera, surface: Surface) -> NDArray[np.float64]:
@@ -192,16 +264,16 @@ def _stretched(rays: NDArray[np.float64], size_px: int, axis: int) -> NDArray[np
 
 
 def _seen(
-    viewer: ViewingCamera, surface: Surface, *, border_px: float
+    viewer: ViewingCamera, surface: Surface, rows: slice, *, border_px: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-    """Which cells lie in the photo, and how many of its pixels each covers."""
-    frame, depth = surface.frame, surface.relief.depth
-    seen = np.zeros(frame.shape, dtype=np.bool_)
-    quality = np.zeros(frame.shape, dtype=np.float32)
+    """Which cells of some rows lie in the photo, and how many of its pixels each covers."""
+    frame, depth = surface.frame, surface.relief.depth[rows]
+    seen = np.zeros(depth.shape, dtype=np.bool_)
+    quality = np.zeros(depth.shape, dtype=np.float32)
     columns = np.arange(frame.width) + 0.5
     area_px = viewer.fx * viewer.fy * frame.gsd_m**2
-    for row in range(frame.height):
-        places = np.column_stack([columns, np.full(frame.width, row + 0.5)])
+    for row in range(len(depth)):
+        places = np.column_stack([columns, np.full(frame.width, rows.start + row + 0.5)])
         points = frame.world_from_wall(places, depth[row].astype(np.float64))
         u, v, distance = viewer.project(points).T
         towards = viewer.centre_world - points
@@ -219,7 +291,7 @@ def _report(ctx: StepContext, stack: LayerStack, layers: Layers, seconds: dict[s
     n_filled = sum(
         int(np.count_nonzero(layer.filled)) for layer in stack.painted if layer.filled is not None
     )
-    n_shown = sum(int(np.count_nonzero(layer.mask == LayerMask.PAINTED)) for layer in stack.painted)
+    n_shown = sum(count_cells(layer.mask, LayerMask.PAINTED) for layer in stack.painted)
     ctx.metric("n_layers", len(stack.painted), "1")
     ctx.metric("painted_share", counts.n_painted / max(1, counts.n_surface), "1")
     ctx.metric("filled_share", n_filled / max(1, n_shown), "1")

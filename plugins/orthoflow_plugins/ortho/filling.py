@@ -5,6 +5,7 @@ After skarlatos2012, section 3; the picture is the pair of its Figure 5.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -18,6 +19,10 @@ Inpainting = Literal["between", "telea", "navier-stokes", "none"]
 VoidLimits = tuple[int, int, int]
 
 _WINDOWS: Final = (3, 5, 7)
+# Around a painted cell beside a gap it is asked where in its cell its point lies.
+_BESIDE_CELLS: Final = 2
+# Fronts of OpenCV go on through gap after gap; what is farther does not show in 8 bits.
+_FRONT_CELLS: Final = 64
 # Of the picture: side of the part that is shown, how much larger it is, and what void is.
 _SIDE_CELLS: Final = 240
 _ZOOM: Final = 3
@@ -39,6 +44,14 @@ class Painted:
     places: NDArray[np.float32]
     depth_m: NDArray[np.float32]
     layer_m: float
+
+
+def reach_rows(inpainting: Inpainting, radius_px: float) -> int:
+    """How many rows away a cell may lie that decides how a gap is filled."""
+    if inpainting == "none":
+        return 0
+    reach = max(_WINDOWS) // 2 + math.ceil(radius_px) + 1 + _BESIDE_CELLS
+    return reach if inpainting == "between" else reach + _FRONT_CELLS
 
 
 def fillable_gaps(is_void: NDArray[np.bool_], limits: VoidLimits) -> NDArray[np.bool_]:
@@ -174,33 +187,30 @@ def _inpainted_once(
     )
 
 
-def filling_preview(rgb_before: NDArray[np.uint8], layer: Layer) -> bytes:
-    """PNG of the part of a layer where most was filled: left before, right after, enlarged.
-
-    Args:
-        rgb_before: (rows, cols, 3) colours before filling.
-        layer: the layer after it.
-    """
+def filling_preview(layer: Layer) -> bytes:
+    """PNG of the part of a layer where most was filled: left before, right after, enlarged."""
     import cv2
 
-    is_filled = np.zeros(layer.mask.shape, dtype=bool) if layer.filled is None else layer.filled > 0
-    is_shown = layer.mask == LayerMask.PAINTED
-    part = _busiest_part(is_filled)
-    before, after = rgb_before[part].copy(), eight_bits(layer.rgb[part]).copy()
-    before[~is_shown[part] | is_filled[part]] = _VOID_RGB
-    after[~is_shown[part]] = _VOID_RGB
+    filled = np.zeros((1, 1), dtype=np.uint8) if layer.filled is None else layer.filled
+    part = _busiest_part(np.broadcast_to(filled, layer.mask.shape))
+    is_shown, after = layer.mask[part] == LayerMask.PAINTED, eight_bits(layer.rgb[part]).copy()
+    after[~is_shown] = _VOID_RGB
+    # What was filled was void before, and the rest is as it was.
+    before = after.copy()
+    if layer.filled is not None:
+        before[layer.filled[part] > 0] = _VOID_RGB
     pair = [np.repeat(np.repeat(picture, _ZOOM, 0), _ZOOM, 1) for picture in (before, after)]
     gutter = np.full((pair[0].shape[0], _GUTTER_PX, 3), 255, dtype=np.uint8)
     picture = np.hstack([pair[0], gutter, pair[1]])
     return bytes(cv2.imencode(".png", picture[..., ::-1])[1])
 
 
-def _busiest_part(is_filled: NDArray[np.bool_]) -> tuple[slice, slice]:
+def _busiest_part(filled: NDArray[np.uint8]) -> tuple[slice, slice]:
     """The tile of `_SIDE_CELLS` with the most filled cells; the first one among equals."""
-    rows, columns = is_filled.shape
+    rows, columns = filled.shape
     tiles = [
         (slice(row, row + _SIDE_CELLS), slice(column, column + _SIDE_CELLS))
         for row in range(0, rows, _SIDE_CELLS)
         for column in range(0, columns, _SIDE_CELLS)
     ]
-    return max(tiles, key=lambda tile: np.count_nonzero(is_filled[tile]))
+    return max(tiles, key=lambda tile: np.count_nonzero(filled[tile]))

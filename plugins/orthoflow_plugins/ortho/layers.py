@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Allocate, count_known, row_bands
+from orthoflow.geometry.levels import Level
 from orthoflow.products import Layer, LayerMask, Layers, Walls
 from orthoflow.sdk import StepContext
 
@@ -63,6 +65,14 @@ class LayerStack:
 
         def allocate(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
             return self._ctx.allocate("layers", f"{prefix}.{name}", shape, dtype)
+
+        return allocate
+
+    def scratch(self, wall: int) -> Allocate:
+        """Give what gives arrays, in files, that are done with before the next layer of a wall."""
+
+        def allocate(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+            return self._ctx.allocate("layers", f"{wall}.scratch.{name}", shape, dtype)
 
         return allocate
 
@@ -130,17 +140,20 @@ class LayerStack:
     def _bare_layer(self, wall: int) -> Layer:
         """The layer of a wall that no photo paints."""
         surface = self.surfaces[wall]
+        shape = surface.frame.shape
+        new = partial(self._ctx.allocate, "layers")
         mask = self._reached.get(wall)
         if mask is None:
-            depth = surface.relief.depth
-            mask = np.full(depth.shape, LayerMask.OUTSIDE, dtype=np.uint8)
-            for rows in row_bands(depth.shape):
-                mask[rows][np.isnan(depth[rows])] = LayerMask.NO_SURFACE
+            mask = np.asarray(new(f"{wall}.bare.mask", shape, np.uint8), np.uint8)
+            for rows in row_bands(shape):
+                is_void = np.isnan(surface.relief.depth[rows])
+                mask[rows] = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE)
+        level: Level = np.uint16 if self.painted[0].rgb.dtype == np.uint16 else np.uint8
         return Layer(
             frame=surface.frame,
             wall=wall,
             source=NO_SOURCE,
-            rgb=np.zeros((*mask.shape, 3), dtype=self.painted[0].rgb.dtype),
+            rgb=np.asarray(new(f"{wall}.bare.rgb", (*shape, 3), level), level),
             mask=mask,
-            quality=np.zeros(mask.shape, dtype=np.float32),
+            quality=np.asarray(new(f"{wall}.bare.quality", shape, np.float32), np.float32),
         )

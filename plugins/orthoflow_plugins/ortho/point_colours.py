@@ -25,6 +25,8 @@ Colouring = Literal["topmost", "centre", "gaussian", "median"]
 # Standard deviation of the Gauss in cells: a point in the corner of its cell counts a seventh.
 _SIGMA_CELLS: Final = 0.36
 _NO_COLOUR: Final = 999
+# The median sorts so many points at once.
+_POINTS_AT_ONCE: Final = 1 << 24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +95,8 @@ def colours_of(
     if rule.colouring == "gaussian":
         rgb[has_point] = _weighted_means(cloud, values, slab, floors_m, rule)[has_point]
     elif rule.colouring == "median":
-        _lay_medians(rgb, cloud, values, slab, floors_m, rule)
+        for cells in _in_parts(winners["n_points"]):
+            _lay_medians(rgb, cells, cloud, values, slab, floors_m, rule)
     else:
         rgb[:] = values_of_winners(winners, values, 0, threads=rule.threads)
     places = places_of_winners(cloud, slab, winners, threads=rule.threads)
@@ -135,13 +138,24 @@ class _TopPoints:
 
 
 def _on_top(
-    cloud: PointCloud, slab: Slab, floors_m: NDArray[np.float32], *, threads: int
+    cloud: PointCloud,
+    slab: Slab,
+    floors_m: NDArray[np.float32],
+    *,
+    threads: int,
+    wanted: slice | None = None,
 ) -> Iterator[_TopPoints]:
+    """Give the points on the topmost surface, of all cells or of those that are wanted."""
     from orthoflow.geometry.rastering import entries_inside
 
-    for entries in entries_inside(cloud, slab, threads=threads):
+    width = slab.frame.width
+    wanted = wanted or slice(0, slab.n_cells)
+    rows = slice(wanted.start // width, -(-wanted.stop // width))
+    for entries in entries_inside(cloud, slab, threads=threads, rows=rows):
         slots = _slots(entries)
-        slots = slots[entries.depths_m[slots] >= floors_m[entries.cells[slots]]]
+        cells = entries.cells[slots]
+        is_wanted = (cells >= wanted.start) & (cells < wanted.stop)
+        slots = slots[is_wanted & (entries.depths_m[slots] >= floors_m[cells])]
         yield _TopPoints(
             entries.cells[slots],
             entries.depths_m[slots],
@@ -176,16 +190,30 @@ def _weighted_means(
     return np.asarray(np.rint(means), dtype=np.uint8)
 
 
+def _in_parts(n_points: NDArray[np.uint32]) -> Iterator[slice]:
+    """Cut cells into parts with at most so many points each, or one cell."""
+    totals = np.cumsum(n_points, dtype=np.int64)
+    first = n_before = 0
+    while first < n_points.size:
+        end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
+        end = max(first + 1, end)
+        yield slice(first, end)
+        first, n_before = end, int(totals[end - 1])
+
+
 def _lay_medians(
     rgb: NDArray[np.uint8],
+    wanted: slice,
     cloud: PointCloud,
     values: NDArray[np.uint8],
     slab: Slab,
     floors_m: NDArray[np.float32],
     rule: ColourRule,
 ) -> None:
-    """Write the median colour, channel by channel, of each cell's highest points into `rgb`."""
-    chunks = list(_on_top(cloud, slab, floors_m, threads=rule.threads))
+    """Write the median colour, channel by channel, of the highest points of cells into `rgb`."""
+    chunks = list(_on_top(cloud, slab, floors_m, threads=rule.threads, wanted=wanted))
+    if not chunks:
+        return
     cells = np.concatenate([chunk.cells for chunk in chunks])
     depths_m = np.concatenate([chunk.depths_m for chunk in chunks])
     points = np.concatenate([chunk.points for chunk in chunks])

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.bands import (
+    Band,
+    bands_with_reach,
+    count_cells,
+    holds_cells,
+    in_memory,
+)
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Layer, LayerMask, Layers, PointCloud, Wall, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
@@ -21,8 +28,13 @@ from orthoflow_plugins.ortho.filling import (
     filling_preview,
     inpainted,
     painted_between,
+    reach_rows,
 )
 from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, colours_of
+
+# Larger walls are painted in bands of so many cells: some 1.5 GB.
+_BAND_CELLS: Final = 1 << 24
+_POINTS_AT_ONCE: Final = 1 << 22
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,14 +136,19 @@ class PointcloudDirect(Method):
         best_preview: tuple[int, bytes] | None = None
         for k, wall in enumerate(inputs.walls.walls):
             ctx.progress(k / len(inputs.walls.walls), wall.name)
-            started = ctx.clock_s()
-            projection = _project(inputs.cloud, colours, inputs.walls.slab(k), rule)
-            projected = ctx.clock_s()
-            layers.append(_filled(projection, wall, k, params, threads=ctx.cores))
-            seconds += (projected - started, ctx.clock_s() - projected)
+            layers.append(_empty_layer(wall, k, ctx))
+            slab, reach = inputs.walls.slab(k), reach_rows(params.inpaint, params.inpaint_radius_px)
+            for band in bands_with_reach(
+                wall.frame.shape, cells_most=_BAND_CELLS, reach_rows=reach
+            ):
+                started = ctx.clock_s()
+                projection = _project(inputs.cloud, colours, slab.over(band.around), rule)
+                projected = ctx.clock_s()
+                _fill(projection, layers[-1], band, params, threads=ctx.cores)
+                seconds += (projected - started, ctx.clock_s() - projected)
             n_filled = _n_filled(layers[-1])
             if best_preview is None or n_filled > best_preview[0]:
-                best_preview = (n_filled, filling_preview(projection.rgb, layers[-1]))
+                best_preview = (n_filled, filling_preview(layers[-1]))
         _require_paint(layers)
         _report(ctx, layers, seconds)
         if best_preview is not None:
@@ -151,8 +168,31 @@ def _colours(cloud: PointCloud, ctx: StepContext) -> NDArray[np.uint8]:
             "give a coloured scan, or paint the walls from photos"
         )
     ctx.warn("the cloud has no colours: its intensity is painted as grey")
-    grey: NDArray[np.uint8] = np.rint(255.0 * np.clip(cloud.intensity, 0, 1)).astype(np.uint8)
-    return grey[:, np.newaxis]
+    n_points = len(cloud)
+    grey = np.asarray(ctx.allocate("layers", "grey", (n_points, 1), np.uint8), np.uint8)
+    for first in range(0, n_points, _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        grey[part, 0] = np.rint(255.0 * np.clip(cloud.intensity[part], 0, 1))
+    return grey
+
+
+def _empty_layer(wall: Wall, index: int, ctx: StepContext) -> Layer:
+    shape = wall.frame.shape
+
+    def new(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+        if wall.mask.size <= _BAND_CELLS:
+            return in_memory(name, shape, dtype)
+        return ctx.allocate("layers", f"{index}.{name}", shape, dtype)
+
+    return Layer(
+        frame=wall.frame,
+        wall=index,
+        source="cloud",
+        rgb=np.asarray(new("rgb", (*shape, 3), np.uint8), np.uint8),
+        mask=np.asarray(new("mask", shape, np.uint8), np.uint8),
+        quality=np.asarray(new("quality", shape, np.float32), np.float32),
+        filled=np.asarray(new("filled", shape, np.uint8), np.uint8),
+    )
 
 
 def _project(
@@ -168,14 +208,15 @@ def _project(
     )
 
 
-def _filled(
+def _fill(
     projection: _Projection,
-    wall: Wall,
-    index: int,
+    layer: Layer,
+    band: Band,
     params: PointcloudDirect.Params,
     *,
     threads: int,
-) -> Layer:
+) -> None:
+    """Fill the gaps of some rows, and write these into the layer of the wall."""
     is_void = projection.is_void
     rgb, is_filled = projection.rgb.copy(), np.zeros_like(is_void)
     if params.inpaint != "none" and not is_void.all():
@@ -201,15 +242,12 @@ def _filled(
     # filled cell is worth less than any painted one.
     quality = np.where(is_void, np.float32(0.0), 1.0 - projection.distance_cells / np.sqrt(2.0))
     quality[is_filled] = 0.25
-    return Layer(
-        frame=wall.frame,
-        wall=index,
-        source="cloud",
-        rgb=rgb,
-        mask=np.where(shown, LayerMask.PAINTED, LayerMask.NO_SURFACE).astype(np.uint8),
-        quality=quality.astype(np.float32),
-        filled=is_filled.astype(np.uint8),
-    )
+    inner = band.inner
+    layer.rgb[band.rows] = rgb[inner]
+    layer.mask[band.rows] = np.where(shown[inner], LayerMask.PAINTED, LayerMask.NO_SURFACE)
+    layer.quality[band.rows] = quality[inner]
+    if layer.filled is not None:
+        layer.filled[band.rows] = is_filled[inner]
 
 
 def _n_filled(layer: Layer) -> int:
@@ -217,7 +255,7 @@ def _n_filled(layer: Layer) -> int:
 
 
 def _require_paint(layers: list[Layer]) -> None:
-    if not any((layer.mask == LayerMask.PAINTED).any() for layer in layers):
+    if not any(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers):
         raise MethodError(
             "no point of the cloud lies within the buffer of a wall: the walls were not made from "
             "this cloud, or wall.buffer_m is too small"
@@ -226,7 +264,7 @@ def _require_paint(layers: list[Layer]) -> None:
 
 def _report(ctx: StepContext, layers: list[Layer], seconds: NDArray[np.float64]) -> None:
     n_cells = sum(layer.mask.size for layer in layers)
-    n_shown = sum(int(np.count_nonzero(layer.mask == LayerMask.PAINTED)) for layer in layers)
+    n_shown = sum(count_cells(layer.mask, LayerMask.PAINTED) for layer in layers)
     n_filled = sum(_n_filled(layer) for layer in layers)
     ctx.metric("projection_s", seconds[0], "s")
     ctx.metric("filling_s", seconds[1], "s")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.bands import Allocate
+from orthoflow.geometry.bands import Allocate, in_memory
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_noise import depth_noise_m
 from orthoflow.geometry.threads import in_parts
@@ -123,7 +123,7 @@ def relief_of(wall: Wall, *, threads: int, allocate: Allocate | None = None) -> 
     """
     relief = transparent_relief_of(wall, threads=threads)
     step_m = max(1e-6, _largest_m(relief) / _STEPS)
-    given = (allocate or _in_memory)("occluding", relief.depth.shape, np.int16)
+    given = (allocate or in_memory)("occluding", relief.depth.shape, np.int16)
     occluding = np.asarray(given, np.int16)
     fine_tops = np.empty_like(relief.fine_bottoms)
     edge_m = _EDGE_CELLS * wall.frame.gsd_m
@@ -139,11 +139,6 @@ def relief_of(wall: Wall, *, threads: int, allocate: Allocate | None = None) -> 
         fine_tops=_highest_of_four(fine_tops),
         highest_m=float(tops.max(initial=NOTHING_M)),
     )
-
-
-def _in_memory(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-    del name
-    return np.empty(shape, dtype=dtype)
 
 
 def transparent_relief_of(wall: Wall, *, threads: int) -> Relief:

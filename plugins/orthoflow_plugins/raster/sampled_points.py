@@ -35,6 +35,10 @@ class SampledPoints:
     z: NDArray[np.float32]
     n_represented: float
 
+    @property
+    def boxes_m(self) -> None:
+        """No boxes: what is drawn from the whole cloud lies everywhere."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointsInside:

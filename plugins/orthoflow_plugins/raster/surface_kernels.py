@@ -111,6 +111,7 @@ def add_moments(entries: Entries, moments: NDArray[np.float64], owners: int, own
 @compiled
 def sort_into_cells(
     entries: Entries,
+    first_cell: int,
     cursors: NDArray[np.int64],
     sorted_m: NDArray[np.float32],
     owners: int,
@@ -120,7 +121,8 @@ def sort_into_cells(
 
     Args:
         entries: one chunk.
-        cursors: (cells,) where the cell's next depth goes; moved on.
+        first_cell: the first of the cells that are asked for; points in others are passed over.
+        cursors: (cells asked for,) where the cell's next depth goes; moved on.
         sorted_m: (points inside,) depths grouped by cell.
         owners: a power of two, how many threads share the cells.
         owner: whose cells to visit.
@@ -129,10 +131,11 @@ def sort_into_cells(
         first = block * BLOCK
         for k in range(first, first + entries.n_inside[block]):
             cell = entries.cells[k]
-            if not is_own(cell, owners, owner):
+            place = cell - first_cell
+            if not (0 <= place < cursors.size and is_own(cell, owners, owner)):
                 continue
-            sorted_m[cursors[cell]] = entries.depths_m[k]
-            cursors[cell] += 1
+            sorted_m[cursors[place]] = entries.depths_m[k]
+            cursors[place] += 1
 
 
 @compiled

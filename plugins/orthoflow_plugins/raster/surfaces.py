@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -31,6 +31,8 @@ from orthoflow_plugins.raster.rules import SurfaceRule
 
 # What is made of cells for a moment is made of so many.
 CELLS_AT_ONCE: Final = 1 << 20
+# The depths of so many points are sorted at once: 256 MB.
+_POINTS_AT_ONCE: Final = 1 << 26
 # A net of triangles has at most so many, and is laid over so many rows at once.
 _VERTICES_MOST: Final = 2_000_000
 _ROWS_AT_ONCE: Final = 256
@@ -279,53 +281,81 @@ def _spread_m(n_points: NDArray[np.uint32], moments: NDArray[np.float64]) -> NDA
     return sigma_m
 
 
-def _grouped_m(
+@dataclass(frozen=True, kw_only=True)
+class _Group:
+    """The depths of all points inside some neighbouring cells, cell after cell.
+
+    Attributes:
+        cells: which of the raster.
+        depths_m: (points,) float32.
+        ends: (cells,) where the depths of the next cell begin.
+    """
+
+    cells: slice
+    depths_m: NDArray[np.float32]
+    ends: NDArray[np.int64]
+
+
+def _grouped(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], *, threads: int
-) -> NDArray[np.float32]:
-    """The depths of all points inside, those of a cell beside each other, cell after cell."""
-    ends = np.cumsum(count, dtype=np.int64)
-    cursors = ends - count
-    grouped_m = np.empty(int(ends[-1]), dtype=np.float32)
-    for entries in entries_inside(cloud, slab, threads=threads):
-        share_cells(threads, partial(kernels.sort_into_cells, entries, cursors, grouped_m))
-    return grouped_m
+) -> Iterator[_Group]:
+    """Sort the depths of all points inside by cells, so many points at once."""
+    width = slab.frame.width
+    totals = np.cumsum(count, dtype=np.int64)
+    first = n_before = 0
+    while first < count.size:
+        # At least one cell, however many points it has.
+        end = int(np.searchsorted(totals, n_before + _POINTS_AT_ONCE, side="right"))
+        end = max(first + 1, end)
+        ends = totals[first:end] - n_before
+        cursors = ends - count[first:end]
+        depths_m = np.empty(int(ends[-1]), dtype=np.float32)
+        rows = slice(first // width, -(-end // width))
+        for entries in entries_inside(cloud, slab, threads=threads, rows=rows):
+            share_cells(
+                threads, partial(kernels.sort_into_cells, entries, first, cursors, depths_m)
+            )
+        yield _Group(cells=slice(first, end), depths_m=depths_m, ends=ends)
+        first, n_before = end, int(totals[end - 1])
 
 
 def _medians_m(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], rule: SurfaceRule
 ) -> NDArray[np.float32]:
-    grouped_m = _grouped_m(cloud, slab, count, threads=rule.threads)
-    return _sorted_medians_m(grouped_m, count, rule)
-
-
-def _sorted_medians_m(
-    grouped_m: NDArray[np.float32], count: NDArray[np.uint32], rule: SurfaceRule
-) -> NDArray[np.float32]:
-    """Medians of the cells' best supported layers; sorts the depths of each cell in place."""
+    """Medians (cells,) of the cells' best supported layers."""
     medians_m = np.empty(count.size, dtype=np.float32)
-    ends = np.cumsum(count, dtype=np.int64)
-    task = partial(kernels.median_depths, ends, grouped_m, rule.layer_m, medians_m)
-    in_parts(task, count.size, threads=rule.threads)
+    for group in _grouped(cloud, slab, count, threads=rule.threads):
+        _sort_depths(group, medians_m[group.cells], rule)
     return medians_m
+
+
+def _sort_depths(group: _Group, medians_m: NDArray[np.float32], rule: SurfaceRule) -> None:
+    """Sort the depths of each cell in place, and set the medians of their best layers."""
+    task = partial(kernels.median_depths, group.ends, group.depths_m, rule.layer_m, medians_m)
+    in_parts(task, medians_m.size, threads=rule.threads)
 
 
 def _percentiles_m(
     cloud: PointCloud, slab: Slab, count: NDArray[np.uint32], rule: SurfaceRule
 ) -> NDArray[np.float32]:
     """Percentiles (cells, k) of all points of a cell, linear between two of them as numpy's."""
-    grouped_m = _grouped_m(cloud, slab, count, threads=rule.threads)
-    _sorted_medians_m(grouped_m, count, rule)
-    measured = np.flatnonzero(count)
-    n_points = count[measured].astype(np.int64)
-    first = (np.cumsum(count, dtype=np.int64) - count)[measured]
     percentiles_m = np.full((count.size, len(rule.percentiles)), np.nan, dtype=np.float32)
-    for k, percent in enumerate(rule.percentiles):
-        place = (n_points - 1) * (percent / 100.0)
-        lower = np.floor(place).astype(np.int64)
-        upper = np.minimum(lower + 1, n_points - 1)
-        share = place - lower
-        low_m, high_m = grouped_m[first + lower], grouped_m[first + upper]
-        percentiles_m[measured, k] = low_m + share * (high_m - low_m)
+    for group in _grouped(cloud, slab, count, threads=rule.threads):
+        into = percentiles_m[group.cells]
+        _sort_depths(group, np.empty(len(into), dtype=np.float32), rule)
+        for begin in range(0, len(into), CELLS_AT_ONCE):
+            part = slice(begin, begin + CELLS_AT_ONCE)
+            n_points = count[group.cells][part].astype(np.int64)
+            first = group.ends[part] - n_points
+            measured = np.flatnonzero(n_points)
+            n_points, first = n_points[measured], first[measured]
+            for k, percent in enumerate(rule.percentiles):
+                place = (n_points - 1) * (percent / 100.0)
+                lower = np.floor(place).astype(np.int64)
+                upper = np.minimum(lower + 1, n_points - 1)
+                share = place - lower
+                low_m, high_m = group.depths_m[first + lower], group.depths_m[first + upper]
+                into[part][measured, k] = low_m + share * (high_m - low_m)
     return percentiles_m
 
 

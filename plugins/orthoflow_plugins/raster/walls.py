@@ -180,10 +180,7 @@ def _rastered_in_bands(
     frame, width = slab.frame, slab.frame.width
     kept = [field.name for field in fields(CellSurface) if field.name != "places"]
     for band in bands_with_reach(frame.shape, cells_most=_BAND_CELLS, reach_rows=rule.reach_rows):
-        corner = frame.origin_world + band.around.start * frame.gsd_m * frame.v_world
-        height = band.around.stop - band.around.start
-        part = replace(frame, origin_world=corner, height=height)
-        raster = _rastered(cloud, replace(slab, frame=part), rule)
+        raster = _rastered(cloud, slab.over(band.around), rule)
         cells = slice(band.rows.start * width, band.rows.stop * width)
         inner = slice(band.inner.start * width, band.inner.stop * width)
         arrays = {"mask": raster.mask} | {name: getattr(raster.surface, name) for name in kept}

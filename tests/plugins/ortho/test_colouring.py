@@ -16,7 +16,9 @@ from tests.plugins.ortho.test_direct import bare_walls
 N_TOP = 3
 
 
-def painted(folder: Path, colouring: str, cores: int = 2) -> tuple[Layer, dict[int, list[int]]]:
+def painted(
+    folder: Path, colouring: str, cores: int = 2, inpaint: str = "none"
+) -> tuple[Layer, dict[int, list[int]]]:
     """A wall with two layers of random colours, and its points by cell."""
     known = scenes.leaning_wall(shape=(20, 30))
     rng = np.random.default_rng(8)
@@ -26,7 +28,7 @@ def painted(folder: Path, colouring: str, cores: int = 2) -> tuple[Layer, dict[i
     rgb = rng.integers(0, 256, (n_points, 3), dtype=np.uint8)
     cloud = scenes.cloud_of(known.world(*places.T, depths_m), rgb=rgb)
     chosen = PointcloudDirect.Params.model_validate(
-        {"colouring": colouring, "n_top": N_TOP, "inpaint": "none"}
+        {"colouring": colouring, "n_top": N_TOP, "inpaint": inpaint}
     )
     inputs = PointcloudDirect.In(walls=bare_walls(known), cloud=cloud)
     ctx = scenes.context(folder, cores=cores)
@@ -70,7 +72,26 @@ def test_colours_follow_their_rule(tmp_path: Path, colouring: str) -> None:
 
 @pytest.mark.parametrize("colouring", ["centre", "gaussian", "median"])
 def test_threads_do_not_show_in_colours(tmp_path: Path, colouring: str) -> None:
+    (tmp_path / "two").mkdir()
     one, _ = painted(tmp_path, colouring, cores=1)
-    two, _ = painted(tmp_path, colouring, cores=2)
+    two, _ = painted(tmp_path / "two", colouring, cores=2)
     np.testing.assert_array_equal(one.rgb, two.rgb)
     np.testing.assert_array_equal(one.quality, two.quality)
+
+
+@pytest.mark.parametrize("inpaint", ["between", "telea", "none"])
+@pytest.mark.parametrize("colouring", ["topmost", "centre", "gaussian", "median"])
+def test_bands_do_not_show_in_colours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, colouring: str, inpaint: str
+) -> None:
+    (tmp_path / "banded").mkdir()
+    whole, _ = painted(tmp_path, colouring, inpaint=inpaint)
+    # Fronts of this wall are short.
+    monkeypatch.setattr("orthoflow_plugins.ortho.filling._FRONT_CELLS", 2)
+    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct._BAND_CELLS", 30 * 24)
+    monkeypatch.setattr("orthoflow_plugins.ortho.point_colours._POINTS_AT_ONCE", 100)
+    banded, _ = painted(tmp_path / "banded", colouring, inpaint=inpaint)
+    for name in ("rgb", "mask", "filled"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name), err_msg=name)
+    # Places are counted from the band's own corner: the last digit of float32.
+    np.testing.assert_allclose(whole.quality, banded.quality, atol=1e-6)

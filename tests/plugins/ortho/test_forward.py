@@ -9,6 +9,7 @@ from tempfile import mkdtemp
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.ortho import dsm_forward
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.dsm_forward import DsmForward
 
@@ -88,6 +89,7 @@ def test_quality_and_reach_are_those_of_the_backward_projection(tmp_path: Path) 
 def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -> None:
     where = scenes.frame()
     given = inputs(aside_m=0.0, width=300, cloud=None)
+    (tmp_path / "closed").mkdir()
     ctx = context(tmp_path)
     holed = thrown(given, ctx, fill_gap_cells=0)
     assert any("no cloud is wired" in warning for warning in ctx.warnings)
@@ -97,11 +99,23 @@ def test_a_coarse_photo_leaves_gaps_that_are_filled_and_marked(tmp_path: Path) -
     gsd = 2.0 / (1.5 * 300)
     painted = np.mean(holed.mask == LayerMask.PAINTED)
     assert painted <= 1.1 * (where.gsd_m / gsd) ** 2
-    closed = thrown(given, context(tmp_path), fill_gap_cells=2)
+    closed = thrown(given, context(tmp_path / "closed"), fill_gap_cells=2)
     assert closed.filled is not None
     assert np.mean(closed.mask == LayerMask.PAINTED) > 0.97
     is_old = (closed.mask == LayerMask.PAINTED) & (closed.filled == 0)
     np.testing.assert_array_equal(is_old, holed.mask == LayerMask.PAINTED)
+
+
+def test_bands_do_not_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = inputs(aside_m=0.0, width=300, cloud=None)
+    layers = []
+    for n_cells in (1 << 24, 25 * scenes.SHAPE[1]):
+        monkeypatch.setattr(dsm_forward, "_BAND_CELLS", n_cells)
+        folder = tmp_path / str(n_cells)
+        folder.mkdir()
+        layers.append(thrown(given, context(folder), fill_gap_cells=3))
+    for name in ("rgb", "mask", "quality", "filled"):
+        np.testing.assert_array_equal(*(getattr(layer, name) for layer in layers), err_msg=name)
 
 
 def test_a_camera_behind_the_wall_is_refused(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import mmap
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from orthoflow_plugins.mosaic import gains
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
+from orthoflow_plugins.ortho.dsm_forward import DsmForward
+from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.files import geotiff, images, publishing
@@ -21,6 +24,7 @@ from orthoflow.geometry import bands
 from orthoflow.geometry.bands import count_cells, count_known, holds_cells
 from orthoflow.products import Layer, LayerMask, Layers, Walls
 from tests import inspect_scenes, ortho_scenes, raster_scenes
+from tests.plugins.ortho.test_direct import bare_walls
 from tests.raster_scenes import context
 
 BAND_CELLS = 1 << 17
@@ -38,6 +42,8 @@ def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("orthoflow_plugins.mosaic.agreement._ROWS_AT_ONCE", 64)
     monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.mosaic.seams._LONGEST_PX", 100)
+    monkeypatch.setattr("orthoflow_plugins.ortho.dsm_forward._BAND_CELLS", BAND_CELLS)
+    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct._BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 2 * BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.reporting._CELLS_ASKED", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.reporting._LONGEST_PX", 100)
@@ -82,17 +88,61 @@ def large_inputs(folder: Path) -> DsmBackward.In:
     )
 
 
+@pytest.mark.parametrize("method", [DsmBackward, DsmForward])
 @pytest.mark.usefixtures("small_bands")
-def test_layers_are_painted_and_reported_without_memory_per_cell(tmp_path: Path) -> None:
-    inputs = large_inputs(tmp_path)
+def test_layers_are_painted_and_reported_without_memory_per_cell(
+    tmp_path: Path, method: type[DsmBackward | DsmForward]
+) -> None:
+    given = large_inputs(tmp_path)
+    inputs = method.In(walls=given.walls, photos=given.photos, cameras=given.cameras)
     n_cells = inputs.walls.walls[0].mask.size
-    DsmBackward().run(inputs, DsmBackward.Params(), context(tmp_path))  # compiled and loaded
+    method().run(inputs, method.Params(), context(tmp_path))  # compiled and loaded
     with peak_bytes() as peak:
-        layers = DsmBackward().run(inputs, DsmBackward.Params(), context(tmp_path)).layers
-        # A layer holds eight bytes per cell, what hides cells two more.
+        layers = method().run(inputs, method.Params(), context(tmp_path)).layers
+        # A layer holds eight bytes per cell, what hides cells two more, and forward eight besides.
         assert peak() < 2.0 * n_cells, peak()
     assert len(layers.layers) == 2
     assert all(holds_cells(layer.mask, LayerMask.PAINTED) for layer in layers.layers)
+
+
+@pytest.mark.usefixtures("small_bands")
+def test_walls_are_painted_from_a_cloud_without_memory_per_cell(tmp_path: Path) -> None:
+    known = raster_scenes.leaning_wall(shape=(4000, 1000))
+    places = np.random.default_rng(7).uniform([0, 0], [1000, 4000], (80_000, 2))
+    points = known.world(*places.T, np.zeros(len(places)))
+    intensity = places[:, 0].astype(np.float32) / 1000.0
+    cloud = raster_scenes.cloud_of(points, intensity=intensity)
+    (wall,) = bare_walls(known).walls
+    blank = {name: mapped(tmp_path / name, getattr(wall, name)) for name in ("mask", "depth_m")}
+    walls = dataclasses.replace(bare_walls(known), walls=(dataclasses.replace(wall, **blank),))
+    inputs = PointcloudDirect.In(walls=walls, cloud=cloud)
+    with peak_bytes() as peak:
+        (layer,) = (
+            PointcloudDirect()
+            .run(inputs, PointcloudDirect.Params(), context(tmp_path))
+            .layers.layers
+        )
+        # A layer holds nine bytes per cell, and the winners of a wall sixteen.
+        assert peak() < 4.0 * wall.mask.size, peak()
+    assert holds_cells(layer.mask, LayerMask.PAINTED)
+
+
+def test_a_wall_that_no_photo_paints_lies_in_files(tmp_path: Path) -> None:
+    given = large_inputs(tmp_path)
+    (wall,) = given.walls.walls
+    away = dataclasses.replace(
+        wall.frame,
+        origin_world=wall.frame.origin_world + 60.0 * wall.frame.u_world,
+    )
+    both = (wall, dataclasses.replace(wall, frame=away, name="away"))
+    walls = dataclasses.replace(given.walls, walls=both)
+    inputs = DsmBackward.In(walls=walls, photos=given.photos, cameras=given.cameras)
+    layers = DsmBackward().run(inputs, DsmBackward.Params(), context(tmp_path)).layers.layers
+    bare = layers[-1]
+    assert (bare.source, bare.wall) == ("no photo", 1)
+    for name in ("rgb", "mask", "quality"):
+        assert isinstance(getattr(bare, name).base, np.memmap | mmap.mmap), name
+    assert not bare.rgb.any()
 
 
 def test_what_photos_reach_of_a_wall_that_none_paints_adds_up(tmp_path: Path) -> None:

@@ -170,6 +170,21 @@ def test_percentiles_are_numpys(tmp_path: Path) -> None:
     assert walls.percentiles == (0, 10, 50, 97.5)
 
 
+def test_depths_sorted_a_few_at_a_time_give_the_same_medians_and_percentiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = scenes.leaning_wall(shape=(40, 60))
+    cloud, *_ = scattered(known, per_cell=5.0, noise_m=NOISE_M)
+    found = []
+    for n_points, n_cells in ((1 << 26, 1 << 20), (700, 50)):
+        monkeypatch.setattr("orthoflow_plugins.raster.surfaces._POINTS_AT_ONCE", n_points)
+        monkeypatch.setattr("orthoflow_plugins.raster.surfaces.CELLS_AT_ONCE", n_cells)
+        ctx = scenes.context(tmp_path)
+        found.append(rastered(cloud, known, ctx, percentiles=[5, 50]).walls[0])
+    for name in ("depth_m", "percentiles_m", "count", "intensity"):
+        np.testing.assert_array_equal(*(getattr(wall, name) for wall in found), err_msg=name)
+
+
 def test_the_buffer_is_three_tolerances_of_the_planes_unless_set(tmp_path: Path) -> None:
     known = scenes.leaning_wall(shape=(40, 60))
     cloud, _, _ = scattered(known, per_cell=1.0)
