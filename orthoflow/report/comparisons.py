@@ -6,12 +6,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from string import ascii_uppercase
+from typing import Final
 
 from orthoflow.records import COSTS, RecordedEnvironment, Run, cell_metrics
 from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics
-from orthoflow.report.numbers import metric_label, number, number_with_spread
-from orthoflow.report.rankings import Sense, Value, rank, sense_of
+from orthoflow.report.metric_words import label_in_words
+from orthoflow.report.numbers import number, number_with_spread
+from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
 from orthoflow.report.summaries import QUALITY
+
+_NOTHING: Final = "-"
+_NAMED: Final = 3  # numbers that a combination is best in
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +26,7 @@ class Column:
     Attributes:
         step: name of the step.
         metric: name of the metric.
-        label: the metric with its unit.
+        label: what the metric is, in words, with its unit.
         sense: what makes a value good.
     """
 
@@ -29,6 +34,11 @@ class Column:
     metric: str
     label: str
     sense: Sense
+
+    @property
+    def is_key(self) -> bool:
+        """It says how good the products are, and stands in tables for a first look."""
+        return self.metric in QUALITY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +67,31 @@ class Row:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Standing:
+    """How often a combination leads among the others.
+
+    Attributes:
+        name: its variants, behind the run where there are several.
+        is_baseline: the workflow calls it its baseline.
+        is_failed: it did not come to its end.
+        n_best: numbers in which it is clearly best.
+        n_near: numbers in which it is among the best, and no difference is shown.
+        n_worst: numbers in which it is worst.
+        best_in: what it is clearly best in, at most three.
+        time: seconds of the cells that the variants have a part in.
+    """
+
+    name: str
+    is_baseline: bool
+    is_failed: bool
+    n_best: int
+    n_near: int
+    n_worst: int
+    best_in: tuple[str, ...]
+    time: Value
+
+
+@dataclass(frozen=True, kw_only=True)
 class ComparisonTable:
     """Combinations beside each other.
 
@@ -73,6 +108,39 @@ class ComparisonTable:
     rows: tuple[Row, ...]
     shows_runs: bool
     groups: Mapping[str, str]
+
+    @property
+    def n_judged(self) -> int:
+        """How many of the columns have a good side, time and memory included."""
+        return sum(column.sense is not Sense.NEITHER for column in self.columns) + 2
+
+    @property
+    def glance(self) -> tuple[Standing, ...]:
+        """How often each combination leads; the one that is best most often first."""
+        labels = [*(f"{one.step}: {one.label}" for one in self.columns), "time", "memory"]
+        found = []
+        for row in self.rows:
+            values = (*row.values, row.time, row.memory)
+            marks = [value.mark for value in values]
+            best = [label for label, mark in zip(labels, marks, strict=True) if mark is Mark.BEST]
+            variants = ", ".join(
+                f"{step}={chosen}"
+                for step, chosen in zip(self.steps, row.variants, strict=True)
+                if chosen != _NOTHING
+            )
+            found.append(
+                Standing(
+                    name=f"{row.run}: {variants}" if self.shows_runs else variants,
+                    is_baseline=row.is_baseline,
+                    is_failed=bool(row.failure),
+                    n_best=len(best),
+                    n_near=marks.count(Mark.NEAR),
+                    n_worst=marks.count(Mark.WORST),
+                    best_in=(*best[:_NAMED], *(["..."] if len(best) > _NAMED else [])),
+                    time=row.time,
+                )
+            )
+        return tuple(sorted(found, key=lambda one: (one.is_failed, -one.n_best, one.n_worst)))
 
 
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
@@ -113,7 +181,7 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
         Column(
             step=step,
             metric=metric,
-            label=metric_label(metric, units[step, metric]),
+            label=label_in_words(metric, units[step, metric]),
             sense=sense_of(metric),
         )
         for step, metric in wanted
@@ -145,7 +213,7 @@ def _row(
     )
     return Row(
         run=_run_label(one.run),
-        variants=tuple(one.assignment.get(step, "-") for step in steps),
+        variants=tuple(one.assignment.get(step, _NOTHING) for step in steps),
         is_baseline=one.is_baseline,
         failure=f"{failed.address}: {failed.error_message}" if failed else "",
         values=tuple(
@@ -201,11 +269,15 @@ def _remark(one: Combination) -> str:
 
 def _ranked(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
     by_column = [
-        rank([row.values[index] for row in rows], column.sense)
+        rank(
+            [row.values[index] for row in rows],
+            column.sense,
+            is_cost=column.metric.endswith(("_s", "_mib")),
+        )
         for index, column in enumerate(columns)
     ]
-    times = rank([row.time for row in rows], Sense.LESS)
-    memories = rank([row.memory for row in rows], Sense.LESS)
+    times = rank([row.time for row in rows], Sense.LESS, is_cost=True)
+    memories = rank([row.memory for row in rows], Sense.LESS, is_cost=True)
     return tuple(
         replace(
             row,

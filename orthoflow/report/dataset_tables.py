@@ -10,7 +10,8 @@ from typing import Final
 
 from orthoflow.records import Run, cell_metrics
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.numbers import metric_label, number
+from orthoflow.report.metric_words import label_in_words
+from orthoflow.report.numbers import number
 from orthoflow.report.pictures import thumbnail
 from orthoflow.report.rankings import Value
 from orthoflow.report.summaries import QUALITY, limits
@@ -83,7 +84,9 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     wanted = [key for metric in QUALITY for key in units if key[1] == metric]
     chosen = [key for key in wanted if key[1] != _ORIENTED][:_MOST_COLUMNS]
     return DatasetTable(
-        columns=tuple((step, metric_label(metric, units[step, metric])) for step, metric in chosen),
+        columns=tuple(
+            (step, label_in_words(metric, units[step, metric])) for step, metric in chosen
+        ),
         rows=tuple(
             DatasetRow(
                 name=name,

@@ -11,12 +11,13 @@ from orthoflow.foreign_text import shown
 from orthoflow.records import RecordedCell, Run
 from orthoflow.report.numbers import seconds_in_words
 
-_BOX_WIDTH: Final = 190
+_BOX_WIDTH: Final = 220
 _BOX_HEIGHT: Final = 46
-_GAP_X: Final = 60
-_GAP_Y: Final = 16
+_GAP: Final = 18  # between boxes of one level
+_GAP_LEVELS: Final = 44
+_ABREAST_MOST: Final = 5  # boxes of a level that a page holds side by side, at letters one can read
 _CELLS_MOST: Final = 24
-_LETTERS: Final = 25  # that fit a box at this size
+_LETTERS: Final = 30  # that fit a box at this size
 
 # On white paper; the page brings its own for light and dark.
 _STYLE: Final = (
@@ -34,7 +35,9 @@ class _Place:
 
 
 def run_diagram(run: Run, *, stands_alone: bool = False) -> str:
-    """Draw the cells of a run that ran or should have, left to right, as an `<svg>` element.
+    """Draw the cells of a run that ran or should have as an `<svg>` element.
+
+    They go downwards where a page holds the widest level, else from left to right.
 
     With more cells than a reader can follow, cells of a step become one box.
 
@@ -43,11 +46,15 @@ def run_diagram(run: Run, *, stands_alone: bool = False) -> str:
         stands_alone: give the text of an SVG file; on the page its style sheet colours the parts.
     """
     boxes = _boxes(run)
-    places = _lay_out({name: box.before for name, box in boxes.items()})
+    levels = _levels({name: box.before for name, box in boxes.items()})
+    is_down = max((len(names) for names in levels), default=0) <= _ABREAST_MOST
+    places = _lay_out(levels, is_down=is_down)
     width = max(place.x for place in places.values()) + _BOX_WIDTH + 2 if places else 0
     height = max(place.y for place in places.values()) + _BOX_HEIGHT + 2 if places else 0
     arrows = [
-        _arrow(places[before], places[name]) for name, box in boxes.items() for before in box.before
+        _arrow(places[before], places[name], is_down=is_down)
+        for name, box in boxes.items()
+        for before in box.before
     ]
     drawn = [_draw(box, places[name]) for name, box in boxes.items()]
     alone = f' xmlns="http://www.w3.org/2000/svg" height="{height:.0f}"' if stands_alone else ""
@@ -116,29 +123,45 @@ def _state(cells: Sequence[RecordedCell]) -> str:
     return "cached" if all(cell.cached_from for cell in cells if cell.status == "ok") else "ok"
 
 
-def _lay_out(sources: Mapping[str, tuple[str, ...]]) -> dict[str, _Place]:
-    # Cells come in graph order, so each one's sources have their column already.
-    columns: dict[str, int] = {}
-    filled: dict[int, int] = {}
+def _levels(sources: Mapping[str, tuple[str, ...]]) -> list[list[str]]:
+    """Sort boxes into levels: each behind all that it takes from."""
+    # Cells come in graph order, so each one's sources have their level already.
+    level: dict[str, int] = {}
+    found: list[list[str]] = []
+    for name, befores in sources.items():
+        level[name] = max((level[before] + 1 for before in befores), default=0)
+        if level[name] == len(found):
+            found.append([])
+        found[level[name]].append(name)
+    return found
+
+
+def _lay_out(levels: Sequence[Sequence[str]], *, is_down: bool) -> dict[str, _Place]:
+    widest = max((len(names) for names in levels), default=0)
     places: dict[str, _Place] = {}
-    for address, befores in sources.items():
-        column = max((columns[before] + 1 for before in befores), default=0)
-        row = filled.get(column, 0)
-        columns[address], filled[column] = column, row + 1
-        places[address] = _Place(
-            x=1 + column * (_BOX_WIDTH + _GAP_X), y=1 + row * (_BOX_HEIGHT + _GAP_Y)
-        )
+    for depth, names in enumerate(levels):
+        for index, name in enumerate(names):
+            if is_down:
+                beside = index + 0.5 * (widest - len(names))
+                x, y = beside * (_BOX_WIDTH + _GAP), depth * (_BOX_HEIGHT + _GAP_LEVELS)
+            else:
+                x, y = depth * (_BOX_WIDTH + _GAP_LEVELS), index * (_BOX_HEIGHT + _GAP)
+            places[name] = _Place(x=1 + x, y=1 + y)
     return places
 
 
-def _arrow(start: _Place, end: _Place) -> str:
-    x0, y0 = start.x + _BOX_WIDTH, start.y + _BOX_HEIGHT / 2
-    x1, y1 = end.x, end.y + _BOX_HEIGHT / 2
-    bend = max(30.0, (x1 - x0) / 2)
-    return (
-        f'<path class="arrow" d="M{x0:.0f},{y0:.0f} C{x0 + bend:.0f},{y0:.0f} '
-        f'{x1 - bend:.0f},{y1:.0f} {x1:.0f},{y1:.0f}"/>'
-    )
+def _arrow(start: _Place, end: _Place, *, is_down: bool) -> str:
+    if is_down:
+        x0, y0 = start.x + _BOX_WIDTH / 2, start.y + _BOX_HEIGHT
+        x1, y1 = end.x + _BOX_WIDTH / 2, end.y
+        bend = max(20.0, (y1 - y0) / 2)
+        ways = f"{x0:.0f},{y0 + bend:.0f} {x1:.0f},{y1 - bend:.0f}"
+    else:
+        x0, y0 = start.x + _BOX_WIDTH, start.y + _BOX_HEIGHT / 2
+        x1, y1 = end.x, end.y + _BOX_HEIGHT / 2
+        bend = max(30.0, (x1 - x0) / 2)
+        ways = f"{x0 + bend:.0f},{y0:.0f} {x1 - bend:.0f},{y1:.0f}"
+    return f'<path class="arrow" d="M{x0:.0f},{y0:.0f} C{ways} {x1:.0f},{y1:.0f}"/>'
 
 
 def _draw(box: _Box, place: _Place) -> str:

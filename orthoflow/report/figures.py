@@ -17,7 +17,9 @@ from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.pictures import Picture, data_uri
 
 FIGURES_FOLDER: Final = "figures"
-_BYTES_MOST: Final = 10_500_000  # of all figures on a page; a third more in base64
+_BYTES_MOST: Final = 3_900_000  # of all figures on a page; a third more in base64
+# What the baseline may take of it as it is, before the others share the rest.
+_BASELINE_SHARE: Final = 0.7
 _SIDES_PX: Final = (700, 480, 340, 240)
 _SMALL_BYTES: Final = 20_000  # not worth drawing anew
 
@@ -31,15 +33,21 @@ class FigureGroup:
     pictures: tuple[Picture, ...]
 
 
-def figure_groups(run: Run, *, share: float = 1.0) -> tuple[FigureGroup, ...]:
+def figure_groups(
+    run: Run, *, share: float = 1.0, with_files: bool = False
+) -> tuple[FigureGroup, ...]:
     """The figures of every cell, repeats of random methods left out; equal ones once.
 
-    When they are too many for a page, the large ones are drawn smaller.
+    When they are too many for a page, the large ones are drawn smaller, those of the baseline last.
 
     Args:
         run: the run.
         share: which part of a page's bytes they may take.
+        with_files: those of `baseline_addresses` lie in `FIGURES_FOLDER` beside the page.
     """
+    main = set(baseline_addresses(run))
+    named = figure_files(run, main) if with_files else {}
+    files = {id(figure): path for path, figure in named.items()}
     chosen: dict[tuple[str, str], RecordedFigure] = {}
     seen: set[bytes] = set()
     for address, cell in run.cells.items():
@@ -47,7 +55,14 @@ def figure_groups(run: Run, *, share: float = 1.0) -> tuple[FigureGroup, ...]:
             if figure.data not in seen:
                 seen.add(figure.data)
                 chosen[address, figure.name] = figure
-    fitted = dict(zip(chosen, _fitted(tuple(chosen.values()), share * _BYTES_MOST), strict=True))
+    fitted: dict[tuple[str, str], RecordedFigure] = {}
+    left = share * _BYTES_MOST
+    others_want = sum(len(one.data) for (owner, _), one in chosen.items() if owner not in main)
+    for is_main in (True, False):
+        part = {key: one for key, one in chosen.items() if (key[0] in main) is is_main}
+        most = max(_BASELINE_SHARE * left, left - others_want) if is_main else left
+        fitted |= dict(zip(part, _fitted(tuple(part.values()), most), strict=True))
+        left -= sum(len(fitted[key].data) for key in part)
     groups = []
     for address, cell in run.cells.items():
         pictures = tuple(
@@ -55,9 +70,14 @@ def figure_groups(run: Run, *, share: float = 1.0) -> tuple[FigureGroup, ...]:
                 uri=data_uri(figure.data, figure.media_type),
                 title=figure.name.replace("_", " "),
                 caption=figure.caption,
+                file=(
+                    f"{FIGURES_FOLDER}/{files[id(chosen[owner, name])]}"
+                    if id(chosen[owner, name]) in files
+                    else ""
+                ),
                 cell=address,
             )
-            for (owner, _), figure in fitted.items()
+            for (owner, name), figure in fitted.items()
             if owner == address
         )
         if pictures:

@@ -50,15 +50,6 @@ def number_with_spread(value: float, spread: float) -> str:
     return f"{value:.{decimals}f} ± {spread:.{decimals}f}"
 
 
-def metric_label(name: str, unit: str) -> str:
-    """Give a metric's name with its unit, once.
-
-    >>> metric_label("rms_mm", "mm"), metric_label("skewness", "1"), metric_label("spread", "mm")
-    ('rms_mm', 'skewness', 'spread (mm)')
-    """
-    return name if unit == "1" or name.endswith(f"_{unit.lower()}") else f"{name} ({unit})"
-
-
 def seconds_in_words(seconds: float) -> str:
     """Print a time.
 

@@ -18,7 +18,7 @@ from orthoflow.report.pictures import Picture, embedded_products
 
 _MARKS_MOST: Final = 600  # in one drawing
 _MARKS_FEW: Final = 50
-_MARKS_IN_ALL: Final = 20_000  # on a page, about 130 bytes each
+_MARKS_IN_ALL: Final = 12_000  # on a page, about 130 bytes each
 # Drawn length of a vector of RMS length, as a share of the drawing's longer side.
 _RMS_SHARE: Final = 0.025
 _STEP_M: Final = 1e-3  # for derivatives; photos change by about a pixel over it

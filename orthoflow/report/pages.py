@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -22,11 +22,12 @@ from markupsafe import Markup, escape
 from orthoflow.errors import StoreError
 from orthoflow.foreign_text import shown
 from orthoflow.products import Cameras
-from orthoflow.records import COSTS, Run, compare_runs, figure_files
+from orthoflow.records import COSTS, RecordedCell, Run, compare_runs, figure_files
 from orthoflow.records.datasets import pages_of, parts_of
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.comparisons import ComparisonTable, comparison_table, environment_words
 from orthoflow.report.cursors import cursor_places
+from orthoflow.report.curves import Curve, curves, curves_over
 from orthoflow.report.dataset_tables import DatasetTable, dataset_table
 from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import differences
@@ -37,10 +38,14 @@ from orthoflow.report.figures import (
     figure_groups,
     write_figures,
 )
+from orthoflow.report.legends import depth_gradient
+from orthoflow.report.metric_words import metric_words
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.overlays import overlays
 from orthoflow.report.paired import MetricOverDatasets, over_datasets
+from orthoflow.report.photo_plans import PhotoPlan, photo_plan
 from orthoflow.report.pictures import (
+    DIVERGING,
     Picture,
     embedded_products,
     orthoimage_pictures,
@@ -49,6 +54,7 @@ from orthoflow.report.pictures import (
 )
 from orthoflow.report.plane_tables import PlaneTable, plane_tables
 from orthoflow.report.summaries import Answer, Limit, answers, citations, limits, results
+from orthoflow.report.ways import Way, improved_on, ways
 from orthoflow.version import __version__
 
 # Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
@@ -63,6 +69,30 @@ class _Ground:
     title: str
     caption: str
     ground: str
+    cell: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """What methods made that stands in one place of the page."""
+
+    cells: tuple[RecordedCell, ...] = ()
+    orthoimages: tuple[Picture, ...] = ()
+    walls: tuple[Picture, ...] = ()
+    overlays: tuple[_Ground, ...] = ()
+    planes: tuple[PlaneTable, ...] = ()
+    figures: tuple[FigureGroup, ...] = ()
+
+    def of(self, addresses: Collection[str]) -> _Part:
+        """What some cells have a part in."""
+        return _Part(
+            cells=tuple(one for one in self.cells if one.address in addresses),
+            orthoimages=tuple(one for one in self.orthoimages if one.cell in addresses),
+            walls=tuple(one for one in self.walls if one.cell in addresses),
+            overlays=tuple(one for one in self.overlays if one.cell in addresses),
+            planes=tuple(one for one in self.planes if one.cell in addresses),
+            figures=tuple(one for one in self.figures if one.cell in addresses),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,14 +105,14 @@ class _Section:
     limits: tuple[Limit, ...]
     results: Mapping[str, tuple[str, ...]]
     comparison: ComparisonTable | None
-    orthoimages: tuple[Picture, ...]
-    walls: tuple[Picture, ...]
+    curves: tuple[Curve, ...]
+    main: _Part
+    earlier: frozenset[str]
+    ways: tuple[tuple[Way, _Part], ...]
     sliders: list[dict[str, object]]
     places: list[dict[str, object]]
     photos: tuple[str, ...]
-    overlays: tuple[_Ground, ...]
-    planes: tuple[PlaneTable, ...]
-    figures: tuple[FigureGroup, ...]
+    plan: PhotoPlan | None
     diagram: Markup
     citations: Mapping[str, tuple[str, ...]]
     title: str = ""
@@ -118,7 +148,9 @@ def write_page(run: Run, path: Path, *, go_on: str = "") -> None:
         title = f"{run.record.name}: {name}"
         place = _Place(folder=target.parent, title=title, whole=f"../{path.name}")
         _write([parts[name]], target, place)
-    place = _Place(folder=path.parent, title=run.record.name, go_on=go_on, pages=pages)
+    place = _Place(
+        folder=path.parent, title=run.record.name, go_on=go_on, pages=pages, has_figures=True
+    )
     _write([run], path, place)
     write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
@@ -159,6 +191,7 @@ class _Place:
         go_on: of a run that was broken off, the command that goes on with it.
         pages: dataset -> its own page; empty for a page that leads to none.
         whole: the page of all datasets, for the one of a single dataset.
+        has_figures: the figures' own files are written beside it.
     """
 
     folder: Path
@@ -166,6 +199,7 @@ class _Place:
     go_on: str = ""
     pages: Mapping[str, str] = field(default_factory=dict)
     whole: str = ""
+    has_figures: bool = False
 
 
 def _write(runs: Sequence[Run], path: Path, place: _Place) -> None:
@@ -212,7 +246,10 @@ def _template() -> jinja2.Template:
     environment.filters["cited"] = cited
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote
+    environment.filters["in_words"] = metric_words
+    environment.filters["drawing"] = Markup
     environment.globals["costs"] = COSTS
+    environment.globals["depth_gradient"] = Markup(depth_gradient(DIVERGING.tolist()))
     # Ours, and no template: braces in them mean nothing.
     css, script = _packaged("page.css"), _packaged("page.js")
     environment.globals["css"] = Markup(css)
@@ -271,6 +308,7 @@ def _overview(run: Run, prefix: str, place: _Place, *, share: float) -> _Section
         diagram=Markup(run_diagram(next(iter(parts.values())))),
         citations=citations(run),
         datasets=dataset_table(parts, place.pages),
+        curves=curves_over(parts),
         over=over_datasets(parts),
     )
 
@@ -296,29 +334,41 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     ]
     orthoimages, walls = numbered[: len(orthoimages)], numbered[len(orthoimages) :]
     grounds = {(picture.cell, picture.wall): picture.id for picture in reversed(walls)}
-    return _Section(
-        run=run,
-        prefix=prefix,
-        answers=answers(run),
-        limits=limits(run),
-        results=results(run),
-        comparison=comparison_table([run]),
+    every = _Part(
+        cells=tuple(cell for cell in run.record.cells if cell.repeat == 0),
         orthoimages=tuple(orthoimages),
         walls=tuple(walls),
-        sliders=_slider_data(numbered, len(orthoimages)),
-        places=cursor_places(orthoimages, walls),
-        photos=_photo_names(run),
         overlays=tuple(
             _Ground(
                 svg=Markup(overlay.svg),
                 title=overlay.title,
                 caption=overlay.caption,
                 ground=grounds.get((overlay.walls_cell, overlay.wall), ""),
+                cell=overlay.cell,
             )
             for overlay in overlays(run, walls, share=share)
         ),
         planes=tuple(plane_tables(run)),
-        figures=figure_groups(run, share=share),
+        figures=figure_groups(run, share=share, with_files=place.has_figures),
+    )
+    main = baseline_addresses(run)
+    shown_ways = ways(run, prefix)
+    comparison = comparison_table([run])
+    return _Section(
+        run=run,
+        prefix=prefix,
+        answers=answers(run),
+        limits=limits(run),
+        results=results(run),
+        comparison=comparison,
+        curves=curves(run) if comparison else (),
+        main=every.of(main),
+        earlier=improved_on(run, main),
+        ways=tuple((way, every.of(way.cells)) for way in shown_ways) if comparison else (),
+        sliders=_slider_data(numbered, len(orthoimages)),
+        places=cursor_places(orthoimages, walls),
+        photos=_photo_names(run),
+        plan=photo_plan(run, walls),
         # Built from escaped parts only, as the overlays are.
         diagram=Markup(run_diagram(run)),
         citations=citations(run),
@@ -344,6 +394,7 @@ def _slider_data(pictures: Sequence[Picture], n_orthoimages: int) -> list[dict[s
                 {
                     "id": pictures[laid.picture].id,
                     "title": shown(laid.title),
+                    "layer": shown(pictures[laid.picture].layer),
                     "left": laid.left,
                     "top": laid.top,
                     "width": laid.width,

@@ -18,17 +18,22 @@ from orthoflow.geometry.levels import eight_bits
 from orthoflow.geometry.threads import in_order
 from orthoflow.products import Orthoimage, Orthoimages, OrthoMask, SurfaceMask, Wall, Walls
 from orthoflow.records import Run
+from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.cursors import CoarseDepths, coarse_depths
+from orthoflow.report.legends import depth_bar, scale_bar
 
 LONGEST_SIDE_PX: Final = 1000
 SHORTEST_SIDE_PX: Final = 320
 # Pictures of the full size that a page holds; of more, each becomes smaller. A picture of 1000 px
 # takes about 90 kB.
-_FULL_PICTURES: Final = 60
+_FULL_PICTURES: Final = 24
+# The baseline's orthoimages are there to be looked into: as many cells as a page can carry, about
+# 0.15 bytes each.
+_CLOSE_CELLS: Final = 12_000_000
 
 # From blue (behind the plane) over white (on it) to red (in front): readable in grey and with
 # red-green blindness. Colours of the classes RdBu, Brewer 2003.
-_DIVERGING: Final = np.array(
+DIVERGING: Final = np.array(
     [[33, 102, 172], [146, 197, 222], [247, 247, 247], [244, 165, 130], [178, 24, 43]],
     dtype=np.float64,
 )
@@ -36,7 +41,7 @@ _DIVERGING: Final = np.array(
 _STEPS: Final = 127
 _PLACES: Final = np.linspace(0.0, 4.0, 2 * _STEPS + 1)
 _DIVERGING_TABLE: Final = np.rint(
-    np.column_stack([np.interp(_PLACES, np.arange(5), channel) for channel in _DIVERGING.T])
+    np.column_stack([np.interp(_PLACES, np.arange(5), channel) for channel in DIVERGING.T])
 ).astype(np.uint8)
 # Rasters of one wall by two methods: their planes are some centimetres and a degree apart at most.
 _SAME_NORMAL_COSINE: Final = float(np.cos(np.radians(5.0)))
@@ -59,6 +64,8 @@ class Picture:
         frame: where it lies in the world, None for what is no raster of a wall.
         id: name of its place on the page; empty where nothing refers to it.
         depths: of the wall, where it shows its depth.
+        legend: `<svg>` elements that stand under it: scale, and what its colours mean.
+        reading: how to read it and what would be bad, a sentence.
     """
 
     uri: str
@@ -72,6 +79,18 @@ class Picture:
     frame: WallFrame | None = None
     id: str = ""
     depths: CoarseDepths | None = None
+    legend: str = ""
+    reading: str = ""
+
+    @property
+    def width_m(self) -> float:
+        """Width on the wall, metres; 0 for what is no raster of a wall."""
+        return self.frame.width * self.frame.gsd_m if self.frame is not None else 0.0
+
+    @property
+    def layer(self) -> str:
+        """What it shows beside its wall, with its variants: alike for all walls of a cell."""
+        return self.title.removeprefix(self.name).strip(" ,") or "orthoimage"
 
 
 def data_uri(content: bytes, media_type: str) -> str:
@@ -93,12 +112,14 @@ def orthoimage_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
         share: which part of a page's bytes they may take.
     """
     places = embedded_products(run, "orthoimages")
+    baseline = {cell.address for cell in baseline_cells(run)}
     # One product at a time: those of a large building fill the memory together.
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         product = Orthoimages.from_payload(payload)
         yield from _drawn(
             [_orthoimage(run, address, image) for image in product.images],
             n_products=len(places) / share,
+            close_cells=share * _CLOSE_CELLS / len(product.images) if address in baseline else 0.0,
         )
 
 
@@ -144,13 +165,28 @@ class _Drawing:
     number: int
     name: str
     frame: WallFrame
+    reading: str
     depths: CoarseDepths | None = None
+    colours: str = ""
 
 
-def _drawn(drawings: Sequence[_Drawing], *, n_products: float) -> Iterator[Picture]:
-    """Draw pictures side by side; encoding takes most of a report's time."""
-    longest_side_px = side_px(n_products * len(drawings))
-    contents = in_order(lambda drawing: drawing.draw(longest_side_px), drawings)
+def _drawn(
+    drawings: Sequence[_Drawing], *, n_products: float, close_cells: float = 0.0
+) -> Iterator[Picture]:
+    """Draw pictures side by side; encoding takes most of a report's time.
+
+    Args:
+        drawings: of one product.
+        n_products: how many products share the page.
+        close_cells: each of them shows so many cells at least, where it has them.
+    """
+    small_px = side_px(n_products * len(drawings))
+
+    def longest_px(frame: WallFrame) -> int:
+        shorter, longer = sorted((frame.width, frame.height))
+        return max(small_px, int(math.sqrt(close_cells * longer / shorter)))
+
+    contents = in_order(lambda drawing: drawing.draw(longest_px(drawing.frame)), drawings)
     for drawing, content in zip(drawings, contents, strict=True):
         yield Picture(
             uri=data_uri(content, "image/webp"),
@@ -163,13 +199,12 @@ def _drawn(drawings: Sequence[_Drawing], *, n_products: float) -> Iterator[Pictu
             name=drawing.name,
             frame=drawing.frame,
             depths=drawing.depths,
+            legend=drawing.colours + scale_bar(drawing.frame.width * drawing.frame.gsd_m),
+            reading=drawing.reading,
         )
 
 
 def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
-    n_filled = count_cells(image.mask, OrthoMask.FILLED)
-    shown = (n_filled + count_cells(image.mask, OrthoMask.PAINTED)) / image.mask.size
-    filled = n_filled / image.mask.size
 
     def cells(part: Part) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         shows = np.isin(image.mask[part], (OrthoMask.PAINTED, OrthoMask.FILLED))
@@ -178,19 +213,32 @@ def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
     return _Drawing(
         draw=lambda side: cells_webp(image.mask.shape, cells, longest_side_px=side),
         title=_title(image.name, address),
-        caption=(
-            f"{frame_words(image.frame)}; {_percent(shown)} of the cells show something, "
-            f"{_percent(filled)} of them filled from neighbours"
-            if filled
-            else f"{frame_words(image.frame)}; {_percent(shown)} of the cells painted"
-        ),
+        caption=f"{frame_words(image.frame)}; of all cells {_states(image)}",
         file=_published(run, address, f"wall_{image.number}_ortho.tif"),
         cell=address,
         wall=image.wall,
         number=image.number,
         name=image.name,
         frame=image.frame,
+        reading=(
+            "Lines of the building run through unbroken; doubled or broken ones, and blur, are "
+            "photos or depths that do not fit, the chequered ground is where nothing was seen."
+        ),
     )
+
+
+def _states(image: Orthoimage) -> str:
+    """Say what became of the cells, so that the shares add up to all of them."""
+    words = {
+        OrthoMask.PAINTED: "painted",
+        OrthoMask.FILLED: "filled from neighbours",
+        OrthoMask.NO_SURFACE: "where no station saw a surface",
+        OrthoMask.OCCLUDED: "hidden from every photo",
+        OrthoMask.NONE: "in no photo",
+    }
+    shares = {said: count_cells(image.mask, state) for state, said in words.items()}
+    told = [f"{_percent(n / image.mask.size)} {said}" for said, n in shares.items() if n]
+    return ", ".join(told)
 
 
 def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
@@ -203,17 +251,19 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
     return _Drawing(
         draw=lambda side: cells_webp(wall.mask.shape, cells, longest_side_px=side),
         title=_title(f"{wall.name}, depth", address),
-        caption=(
-            f"blue {1000 * limit_m:.0f} mm behind the plane, white on it, red "
-            f"{1000 * limit_m:.0f} mm in front; {_percent(known)} of the cells known"
-        ),
+        caption=f"{_percent(known)} of the cells known",
         file=_published(run, address, f"wall_{wall.plane_index}_depth.tif"),
         cell=address,
         wall=index,
         number=wall.plane_index,
         name=wall.name,
         frame=wall.frame,
+        reading=(
+            "Relief shows as even colours with sharp edges; stripes, or a slope over the whole "
+            "wall, are scans or a plane that do not fit."
+        ),
         depths=coarse_depths(wall.depth_m),
+        colours=depth_bar(limit_m),
     )
 
 
@@ -233,6 +283,10 @@ def _intensity(
         number=wall.plane_index,
         name=wall.name,
         frame=wall.frame,
+        reading=(
+            "What photos are matched with: texture everywhere is good; where it is flat grey, ties "
+            "cannot be found."
+        ),
     )
 
 

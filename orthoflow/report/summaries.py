@@ -9,25 +9,29 @@ from typing import Final
 from orthoflow.alike import alike
 from orthoflow.records import Run, cell_metrics
 from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.metric_words import WORDS
 from orthoflow.report.numbers import number, number_with_unit
 
 # Without photos that show a place, completeness cannot be asked for there.
 _SHARPER_COMPLETENESS: Final = "completeness_seen_by_both"
 # Metrics that say how good the products are, in the order in which a reader wants them.
 QUALITY: Final[Mapping[str, str]] = {
-    "rmse_u_mm": "error along u (right), RMS",
-    "rmse_v_mm": "error along v (down), RMS",
-    "nmad_u_mm": "typical error along u (NMAD)",
-    "nmad_v_mm": "typical error along v (NMAD)",
-    _SHARPER_COMPLETENESS: "painted, of what a station and a photo see",
-    "n_oriented": "photos oriented",
-    "sigma_wall_mm_worst": "expected error on the wall, worst photo",
-    "check_rmse_mm_worst": "ties that only check, RMS on the wall, worst photo",
-    "plane_angle_deg": "direction of the main plane, error",
-    "plane_offset_mm": "position of the main plane, error",
-    "depth_rmse_mm": "error of the depth, RMS",
-    "completeness": "share of the visible cells that is painted",
-    "rms_mm": "points to their plane, RMS",
+    name: WORDS[name]
+    for name in (
+        "rmse_u_mm",
+        "rmse_v_mm",
+        "nmad_u_mm",
+        "nmad_v_mm",
+        _SHARPER_COMPLETENESS,
+        "n_oriented",
+        "sigma_wall_mm_worst",
+        "check_rmse_mm_worst",
+        "plane_angle_deg",
+        "plane_offset_mm",
+        "depth_rmse_mm",
+        "completeness",
+        "rms_mm",
+    )
 }
 
 

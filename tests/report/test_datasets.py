@@ -79,7 +79,11 @@ def rooms(tmp_path: Path) -> HeldRun:
 
 def methods(run: Run) -> dict[str, MethodOverDatasets]:
     (metric,) = over_datasets(parts_of(run))
-    assert (metric.step, metric.label, metric.sense) == ("plane", "rms_mm", Sense.LESS)
+    assert (metric.step, metric.label, metric.sense) == (
+        "plane",
+        "points to their plane, RMS / mm",
+        Sense.LESS,
+    )
     return {method.name: method for method in metric.methods}
 
 
@@ -152,7 +156,7 @@ def test_differences_are_told_in_the_sign_of_the_metric() -> None:
 
 def test_a_dataset_has_a_row_with_its_own_numbers(rooms: Run) -> None:
     table = dataset_table(parts_of(rooms), {"hall": "pages/hall.html"})
-    assert table.columns == (("plane", "rms_mm"),)
+    assert table.columns == (("plane", "points to their plane, RMS / mm"),)
     assert [row.name for row in table.rows] == list(RMS_MM)
     assert table.n_whole == 6
     hall, attic = table.rows[0], table.rows[2]

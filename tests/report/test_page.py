@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import axe_core_python
 import pytest
 from orthoflow_provenance.model import Metric, RecordedCell, RecordedFigure
 
@@ -16,7 +17,7 @@ from tests.browser import PROGRAM, BrowserError, Page, browser
 from tests.report_runs import HeldRun, compared_run
 
 pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no chromium is installed")
-ROWS = "[...document.querySelectorAll('#r1-comparison ~ .scroll tbody tr')]"
+ROWS = "[...document.querySelectorAll('[data-chooser] tbody tr')]"
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,7 @@ def test_every_picture_shows_and_says_what_it_is(page: Page) -> None:
 
 def test_headings_sort_the_table_by_mouse_and_keyboard(page: Page) -> None:
     names = f"{ROWS}.map(row => row.cells[0].innerText.split(' ')[0])"
-    heading = "document.querySelectorAll('#r1-comparison ~ .scroll th[data-sort]')[1]"
+    heading = "document.querySelectorAll('[data-chooser] th[data-sort]')[1]"
     assert page.evaluate(names) == ["fine", "coarse", "broken"]
     page.evaluate(f"{heading}.querySelector('button').click()")
     assert page.evaluate(f"{heading}.getAttribute('aria-sort')") == "ascending"
@@ -90,7 +91,7 @@ def test_the_slider_shows_what_was_chosen(page: Page) -> None:
         "[document.querySelector('.stage .layer img').alt,"
         " document.querySelector('[data-part=right]').selectedOptions[0].text]"
     )
-    assert chosen[0] == chosen[1]
+    assert chosen[0] == f"wall 0, {chosen[1]}"
     assert "intensity" in chosen[0]
 
 
@@ -197,10 +198,122 @@ def test_the_first_screen_of_a_phone_shows_picture_and_accuracy(page: Page) -> N
     assert max(bottoms) <= 844
 
 
+VIEWER = "document.getElementById('viewer')"
+
+
+def test_pictures_open_large_and_the_arrow_keys_lead_on(page: Page) -> None:
+    page.show_as(1440)
+    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+    inline = page.evaluate("document.querySelector('.plain .picture img').clientWidth")
+    page.evaluate("document.querySelector('.plain .enlarge').click()")
+    assert page.evaluate(f"{VIEWER}.open")
+    first = page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText")
+    assert page.evaluate(f"{VIEWER}.querySelector('img').getBoundingClientRect().width") > inline
+    page.press("ArrowRight")
+    assert page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText") != first
+    page.press("ArrowLeft")
+    assert page.evaluate(f"{VIEWER}.querySelector('[data-part=caption]').innerText") == first
+    page.evaluate(f"{VIEWER}.querySelector('[data-part=close]').click()")
+    assert not page.evaluate(f"{VIEWER}.open")
+
+
+def test_the_viewer_goes_into_a_picture_down_to_its_cells(page: Page) -> None:
+    page.evaluate("document.querySelector('.first .enlarge').click()")
+    width = f"{VIEWER}.querySelector('img').getBoundingClientRect().width"
+    before = page.evaluate(width)
+    assert not page.evaluate(f"{VIEWER}.querySelector('.shown').classList.contains('cells')") or (
+        before > 240  # two pixels for each of the 120 cells
+    )
+    for _ in range(3):
+        page.evaluate(f"{VIEWER}.querySelector('[data-part=in]').click()")
+    assert page.evaluate(width) == pytest.approx(before * 1.5**3, rel=1e-3)
+    told = page.evaluate(f"{VIEWER}.querySelector('[data-part=scale]').innerText")
+    assert re.fullmatch(r"\d+ %, 10 cm are \d+ px", told)
+    page.evaluate(f"{VIEWER}.querySelector('[data-part=close]').click()")
+
+
+def test_the_slider_remembers_what_was_compared(page: Page) -> None:
+    path = page.evaluate("location.pathname")
+    position = "document.querySelector('[data-part=position]')"
+    page.evaluate(
+        "(() => { const right = document.querySelector('[data-part=right]'); right.value = 3;"
+        f" right.dispatchEvent(new Event('change')); {position}.value = 30;"
+        f" {position}.dispatchEvent(new Event('input')); }})()"
+    )
+    page.open(Path(path))
+    assert page.evaluate("document.querySelector('[data-part=right]').value") == "3"
+    assert page.evaluate(f"{position}.value") == "30"
+
+
+def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> None:
+    bar = "document.querySelector('.chooser')"
+    page.evaluate(
+        f"(() => {{ const filter = {bar}.querySelector('input[type=search]');"
+        " filter.value = 'coarse'; filter.dispatchEvent(new Event('input')); })()"
+    )
+    shown = page.evaluate(f"{ROWS}.filter(row => !row.hidden).map(row => row.cells[0].innerText)")
+    assert shown == ["coarse"]
+    page.evaluate(f"{bar}.querySelector('.names input').click()")
+    assert page.evaluate("document.querySelector('[data-chooser] [data-name=rms_mm]').hidden")
+    page.evaluate(f"{bar}.querySelector('button').click()")
+    heads = page.evaluate(
+        "[...document.querySelectorAll('.turned thead th')].map(e => e.innerText)"
+    )
+    assert heads == ["what", "coarse"]
+    names = page.evaluate(
+        "[...document.querySelectorAll('.turned tbody th')].map(e => e.innerText)"
+    )
+    assert any("error along u (right), RMS / mm" in name for name in names)
+    assert not any("points to their plane" in name for name in names)
+
+
+def test_what_stands_behind_a_row_opens_from_it(page: Page) -> None:
+    page.evaluate("location.reload()")
+    page.open(Path(page.evaluate("location.pathname")))
+    way = "document.querySelector('.way')"
+    assert not page.evaluate(f"{way}.open")
+    page.evaluate(f"document.querySelector('a[href=\"#' + {way}.id + '\"]').click()")
+    page.evaluate("new Promise(done => setTimeout(done, 50))")
+    assert page.evaluate(f"{way}.open")
+    assert "plane=coarse" in page.evaluate(f"{way}.querySelector('summary').innerText")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1440, 390])
+def test_axe_finds_nothing_that_keeps_people_out(page: Page, width: int, theme: str) -> None:
+    axe = Path(axe_core_python.__file__).with_name("axe.min.js").read_text(encoding="utf-8")
+    page.show_as(width, theme=theme)
+    page.open(Path(page.evaluate("location.pathname")))
+    page.evaluate(f"{axe}; document.querySelectorAll('details').forEach(one => one.open = true)")
+    for look in ("0", "document.querySelector('.enlarge').click()"):
+        page.evaluate(look)
+        found = page.evaluate(
+            "axe.run().then(result => result.violations.map("
+            "rule => [rule.id, ...rule.nodes.map(node => node.html.slice(0, 120))]))"
+        )
+        assert found == []
+
+
+def test_on_paper_numbers_and_parameters_are_unfolded(page: Page) -> None:
+    page.show_as(1440)
+    page.open(Path(page.evaluate("location.pathname")))
+    page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    assert page.evaluate(
+        "document.querySelectorAll('main details.numbers:not([open])').length"
+    ) == (page.evaluate("document.querySelectorAll('.way details.numbers').length"))
+    wide = page.evaluate(
+        "[...document.querySelectorAll('.on-paper table')].map(t => t.rows[0].cells.length)"
+    )
+    assert wide
+    assert max(wide) <= 6
+    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    assert page.evaluate("document.querySelectorAll('.on-paper').length") == 0
+
+
 def test_all_that_can_be_used_has_a_name(page: Page) -> None:
     nameless = page.evaluate(
         "[...document.querySelectorAll('button, select, input, a, [role=region]')]"
-        ".filter(element => !(element.innerText || element.ariaLabel || element.labels?.length))"
+        ".filter(element => !(element.textContent || element.ariaLabel || element.labels?.length))"
         ".map(element => element.outerHTML.slice(0, 80))"
     )
     assert nameless == []

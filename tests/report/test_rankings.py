@@ -38,21 +38,29 @@ def test_what_is_alike_has_neither_and_equal_bests_are_all_best() -> None:
 
 
 @pytest.mark.parametrize(
-    ("best_spread", "spread", "mark"),
+    ("best_spread", "spread", "found"),
     [
-        (0.3, 0.4, "NEAR"),
-        (0.3, 0.39, "WORST"),
-        (math.nan, 0.5, "NEAR"),
-        (0.5, math.nan, "NEAR"),
-        (math.nan, 0.49, "WORST"),
-        (math.nan, math.nan, "WORST"),
+        (0.3, 0.4, ["NEAR", "NEAR"]),
+        (0.3, 0.39, ["BEST", "NONE"]),
+        (math.nan, 0.5, ["NEAR", "NEAR"]),
+        (0.5, math.nan, ["NEAR", "NEAR"]),
+        (math.nan, 0.49, ["BEST", "NONE"]),
+        (math.nan, math.nan, ["BEST", "NONE"]),
     ],
 )
 def test_a_value_within_both_spreads_of_the_best_is_near_it(
-    best_spread: float, spread: float, mark: str
+    best_spread: float, spread: float, found: list[str]
 ) -> None:
     # Half apart: 0.3 and 0.4 in quadrature.
-    assert marks(of(1.0, best_spread), of(1.5, spread)) == ["BEST", mark]
+    assert marks(of(1.0, best_spread), of(1.5, spread), of(9.0)) == [*found, "WORST"]
+
+
+def test_without_repeats_a_hundredth_is_no_difference_and_a_tenth_of_a_cost() -> None:
+    assert marks(of(1.238), of(1.239)) == ["NONE", "NONE"]
+    assert marks(of(1.238), of(1.239), of(2.0)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(of(1.0), of(1.011), of(2.0)) == ["BEST", "NONE", "WORST"]
+    costs = rank([of(10.0), of(10.9), of(11.1)], Sense.LESS, is_cost=True)
+    assert [value.mark.name for value in costs] == ["NEAR", "NEAR", "WORST"]
 
 
 def test_groups_are_ranked_apart_and_what_is_absent_is_not_ranked() -> None:

@@ -102,13 +102,10 @@ def test_a_time_is_printed_in_seconds_or_minutes(seconds: float, printed: str) -
     assert numbers.seconds_in_words(seconds) == printed
 
 
-def test_numbers_may_have_fewer_digits_and_labels_say_a_unit_once() -> None:
+def test_numbers_may_have_fewer_digits() -> None:
     assert numbers.number(0.14151, significant=2) == "0.14"
     assert numbers.number_with_unit(0.14151, "m", significant=2) == "0.14 m"
     assert numbers.number_with_unit(0.14151, "1") == "0.1415"
-    assert numbers.metric_label("peak_rss_mib", "MiB") == "peak_rss_mib"
-    assert numbers.metric_label("rms", "mm") == "rms (mm)"
-    assert numbers.metric_label("n_points", "1") == "n_points"
 
 
 # --- ranks ---
@@ -141,9 +138,9 @@ def test_the_best_and_the_worst_are_marked() -> None:
 
 def test_what_lies_within_both_spreads_of_the_best_is_near_it() -> None:
     # 3 and 4 in quadrature are 5.
-    assert marks(Sense.LESS, (10, 3), (15, 4), (15.1, 4)) == ["BEST", "NEAR", "WORST"]
-    assert marks(Sense.LESS, (10, 3), (13,), (13.5,)) == ["BEST", "NEAR", "WORST"]
-    assert marks(Sense.MORE, (10, 3), (5, 4), (4.9, 4)) == ["BEST", "NEAR", "WORST"]
+    assert marks(Sense.LESS, (10, 3), (15, 4), (15.1, 4)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(Sense.LESS, (10, 3), (13,), (13.5,)) == ["NEAR", "NEAR", "WORST"]
+    assert marks(Sense.MORE, (10, 3), (5, 4), (4.9, 4)) == ["NEAR", "NEAR", "WORST"]
 
 
 def test_badness_grows_as_values_get_worse() -> None:
@@ -384,42 +381,46 @@ def test_all_that_differs_between_two_runs_is_told() -> None:
 # --- the graph ---
 
 
-def test_the_graph_is_drawn_from_left_to_right() -> None:
+def test_the_graph_is_drawn_downwards_where_its_levels_are_narrow() -> None:
     cloud = given("scan.cloud", "1", "cloud")
     told = run(
         cell("scan", wall_s=125.0),
         cell("plane", inputs={"cloud": cloud}, cached_from="r0"),
-        cell("a-name-of-twenty-six-chars", inputs={"cloud": cloud}, status="failed"),
+        cell("a-name-of-thirty-one-characters", inputs={"cloud": cloud}, status="failed"),
         cell("w", inputs={"c": cloud, "p": given("plane.p", "2", "planes")}, status="skipped"),
     )
     assert run_diagram(told) == (
-        '<svg viewBox="0 0 693 111" width="693" role="img" aria-label="graph of the run">'
-        '<path class="arrow" d="M191,24 C221,24 221,24 251,24"/>'
-        '<path class="arrow" d="M191,24 C221,24 221,86 251,86"/>'
-        '<path class="arrow" d="M191,24 C346,24 346,24 501,24"/>'
-        '<path class="arrow" d="M441,24 C471,24 471,24 501,24"/>'
+        '<svg viewBox="0 0 461 229" width="461" role="img" aria-label="graph of the run">'
+        '<path class="arrow" d="M230,47 C230,69 111,69 111,91"/>'
+        '<path class="arrow" d="M230,47 C230,69 349,69 349,91"/>'
+        '<path class="arrow" d="M230,47 C230,114 230,114 230,181"/>'
+        '<path class="arrow" d="M111,137 C111,159 230,159 230,181"/>'
         '<g class="cell ok"><title>scan: scan.toy, 2 min 05 s</title>'
-        '<rect x="1" y="1" width="190" height="46" rx="6"/>'
-        '<text x="11" y="20">scan</text>'
-        '<text class="small" x="11" y="37">scan.toy, 2 min 05 s</text></g>'
+        '<rect x="120" y="1" width="220" height="46" rx="6"/>'
+        '<text x="130" y="20">scan</text>'
+        '<text class="small" x="130" y="37">scan.toy, 2 min 05 s</text></g>'
         '<g class="cell cached"><title>plane: plane.toy, 1.00 s</title>'
-        '<rect x="251" y="1" width="190" height="46" rx="6"/>'
-        '<text x="261" y="20">plane</text>'
-        '<text class="small" x="261" y="37">plane.toy, 1.00 s</text></g>'
-        '<g class="cell failed"><title>a-name-of-twenty-six-chars: failed</title>'
-        '<rect x="251" y="63" width="190" height="46" rx="6"/>'
-        '<text x="261" y="82">a-name-of-twenty-six-cha…</text>'
-        '<text class="small" x="261" y="99">failed</text></g>'
+        '<rect x="1" y="91" width="220" height="46" rx="6"/>'
+        '<text x="11" y="110">plane</text>'
+        '<text class="small" x="11" y="127">plane.toy, 1.00 s</text></g>'
+        '<g class="cell failed"><title>a-name-of-thirty-one-characters: failed</title>'
+        '<rect x="239" y="91" width="220" height="46" rx="6"/>'
+        '<text x="249" y="110">a-name-of-thirty-one-characte…</text>'
+        '<text class="small" x="249" y="127">failed</text></g>'
         '<g class="cell skipped"><title>w: skipped</title>'
-        '<rect x="501" y="1" width="190" height="46" rx="6"/>'
-        '<text x="511" y="20">w</text>'
-        '<text class="small" x="511" y="37">skipped</text></g></svg>'
+        '<rect x="120" y="181" width="220" height="46" rx="6"/>'
+        '<text x="130" y="200">w</text>'
+        '<text class="small" x="130" y="217">skipped</text></g></svg>'
     )
-    alone = run_diagram(told, stands_alone=True)
-    assert alone.startswith(
-        '<svg xmlns="http://www.w3.org/2000/svg" height="111" viewBox="0 0 693 '
-    )
-    assert "<style>svg{" in alone
+
+
+def test_a_level_too_wide_for_a_page_is_drawn_from_left_to_right() -> None:
+    cloud = given("scan.cloud", "1", "cloud")
+    cells = [cell(f"plane{index}", inputs={"cloud": cloud}) for index in range(6)]
+    drawn = run_diagram(run(cell("scan"), *cells))
+    assert drawn.startswith('<svg viewBox="0 0 487 369" width="487"')
+    assert drawn.count('<rect x="265"') == 6
+    assert '<path class="arrow" d="M221,24 C251,24 235,24 265,24"/>' in drawn
 
 
 @pytest.mark.parametrize(("n_cells", "n_boxes"), [(24, 24), (25, 1)])

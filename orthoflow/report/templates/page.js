@@ -6,21 +6,22 @@
   // Colours: as the system, light, dark. What was chosen is remembered where the browser allows it.
   const themes = { auto: "as the system", light: "light", dark: "dark" };
   const store = {
-    get() { try { return localStorage.getItem("orthoflow-theme"); } catch { return null; } },
-    set(name) { try { localStorage.setItem("orthoflow-theme", name); } catch { /* private windows */ } },
+    read(key) { try { return localStorage.getItem(key); } catch { return null; } },
+    write(key, value) { try { localStorage.setItem(key, value); } catch { /* private windows */ } },
   };
+  const THEME = "orthoflow-theme";
   const button = document.getElementById("theme");
   const show = (name) => {
     if (name === "auto") root.removeAttribute("data-theme"); else root.dataset.theme = name;
     button.textContent = `colours: ${themes[name]}`;
     button.setAttribute("aria-label", button.textContent);
   };
-  let theme = store.get() in themes ? store.get() : "auto";
+  let theme = store.read(THEME) in themes ? store.read(THEME) : "auto";
   show(theme);
   button.addEventListener("click", () => {
     const names = Object.keys(themes);
     theme = names[(names.indexOf(theme) + 1) % names.length];
-    store.set(theme);
+    store.write(THEME, theme);
     show(theme);
   });
 
@@ -52,6 +53,118 @@
       const keyed = [...body.rows].map((row) => ({ row, key: keyOf(row, heading.cellIndex, kind) }));
       keyed.sort((one, other) => compare(one.key, other.key, kind, direction));
       body.append(...keyed.map((item) => item.row));
+    });
+  }
+
+  // Wide tables: columns are chosen, rows filtered, and metrics stand as rows where there are few combinations.
+  const MANY = 9, FEW_ROWS = 6;
+  const isShown = (element) => !element.hidden;
+  // A table of the same places with columns as rows, so many combinations beside each other.
+  const turned = (table, most) => {
+    const bodyRows = [...table.tBodies[0].rows].filter(isShown);
+    const headings = [...table.tHead.rows[0].cells].filter(isShown);
+    const named = bodyRows.map((row) => [...row.cells].slice(0, table.dataset.names).map((place) => place.textContent.trim()));
+    const blocks = [];
+    for (let start = 0; start < bodyRows.length; start += most) {
+      const block = document.createElement("table");
+      block.className = "turned";
+      const top = block.createTHead().insertRow();
+      const corner = document.createElement("th");
+      corner.scope = "col";
+      corner.textContent = "what";
+      top.append(corner);
+      bodyRows.slice(start, start + most).forEach((_, index) => {
+        const heading = document.createElement("th");
+        heading.scope = "col";
+        heading.className = "n";
+        heading.textContent = named[start + index].filter((name) => name !== "-").join(", ");
+        top.append(heading);
+      });
+      const body = block.createTBody();
+      for (const heading of headings.slice(Number(table.dataset.names))) {
+        const row = body.insertRow();
+        const first = document.createElement("th");
+        first.scope = "row";
+        for (const part of heading.childNodes) {
+          if (part.nodeType !== Node.ELEMENT_NODE) { first.append(part.textContent); continue; }
+          const copy = part.cloneNode(true);
+          if (copy.tagName === "BUTTON") first.append(...copy.childNodes); else first.append(copy);
+        }
+        row.append(first);
+        for (const from of bodyRows.slice(start, start + most)) row.append(from.cells[heading.cellIndex].cloneNode(true));
+      }
+      blocks.push(block);
+    }
+    return blocks;
+  };
+  for (const region of document.querySelectorAll("[data-chooser]")) {
+    const table = region.querySelector("table");
+    const headings = [...table.tHead.rows[0].cells];
+    table.dataset.names = headings.findIndex((heading) => heading.dataset.name);
+    if (table.dataset.names < 0) continue;
+    const bar = document.createElement("div");
+    bar.className = "chooser";
+    const filter = Object.assign(document.createElement("input"), { type: "search", placeholder: "filter rows" });
+    filter.setAttribute("aria-label", `filter the rows: ${region.getAttribute("aria-label")}`);
+    const turn = Object.assign(document.createElement("button"), { type: "button" });
+    const all = Object.assign(document.createElement("button"), { type: "button" });
+    const details = document.createElement("details");
+    const summary = Object.assign(document.createElement("summary"), { textContent: "choose columns" });
+    const names = Object.assign(document.createElement("div"), { className: "names" });
+    details.append(summary, names);
+    bar.append(filter, turn, all, details);
+    region.before(bar);
+    const optional = headings.filter((heading) => heading.dataset.name);
+    const boxes = optional.map((heading) => {
+      const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: true });
+      const label = document.createElement("label");
+      label.append(box, [...heading.querySelectorAll("button small, button")].pop()?.textContent.trim() ?? heading.textContent);
+      names.append(label);
+      box.addEventListener("change", () => draw());
+      return box;
+    });
+    const keys = optional.map((heading) => "key" in heading.dataset);
+    let isTurned = optional.length > MANY && table.tBodies[0].rows.length <= FEW_ROWS;
+    // Of many columns those that judge quality come first; all are one click away.
+    if (!isTurned && optional.length > MANY && keys.some(Boolean)) {
+      boxes.forEach((box, index) => { box.checked = keys[index]; });
+    }
+    const draw = () => {
+      optional.forEach((heading, index) => {
+        for (const row of table.rows) row.cells[heading.cellIndex].hidden = !boxes[index].checked;
+      });
+      for (const row of table.tBodies[0].rows) {
+        row.hidden = !row.textContent.toLowerCase().includes(filter.value.trim().toLowerCase());
+      }
+      const count = boxes.filter((box) => box.checked).length;
+      summary.textContent = `choose columns (${count} of ${boxes.length})`;
+      all.textContent = count === boxes.length ? "key columns only" : "all columns";
+      all.hidden = !keys.some(Boolean) || keys.every(Boolean);
+      turn.textContent = isTurned ? "combinations as rows" : "metrics as rows";
+      region.replaceChildren(...(isTurned ? turned(table, Infinity) : [table]));
+    };
+    filter.addEventListener("input", draw);
+    turn.addEventListener("click", () => { isTurned = !isTurned; draw(); });
+    all.addEventListener("click", () => {
+      const every = boxes.every((box) => box.checked);
+      boxes.forEach((box, index) => { box.checked = !every || keys[index]; });
+      draw();
+    });
+    draw();
+    // Paper has no columns to scroll to.
+    addEventListener("beforeprint", () => {
+      if (boxes.length <= 6) return;
+      const paper = document.createElement("div");
+      paper.className = "on-paper";
+      for (const row of table.rows) for (const place of row.cells) place.hidden = false;
+      paper.append(...turned(table, 5));
+      region.classList.add("off-paper");
+      region.after(paper);
+    });
+    addEventListener("afterprint", () => {
+      if (region.nextElementSibling?.className === "on-paper") region.nextElementSibling.remove();
+      region.classList.remove("off-paper");
+      draw();
     });
   }
 
@@ -93,6 +206,12 @@
       right.style.clipPath = `inset(0 0 0 ${position}%)`;
       line.style.left = `${position}%`;
     };
+    // What was looked at is looked at again: on another wall, and when the page is opened once more.
+    const memory = `orthoflow-slider-${slider.dataset.remember}`;
+    let chosen = {};
+    try { chosen = JSON.parse(store.read(memory)) ?? {}; } catch { /* nothing was kept */ }
+    const keep = () => store.write(memory, JSON.stringify(chosen));
+    const layerOf = (select) => groups[part.wall.value].pictures[select.value].layer;
     const lay = () => {
       const { pictures } = groups[part.wall.value];
       part.stage.replaceChildren(layer(pictures[part.right.value]), layer(pictures[part.left.value]), line);
@@ -100,23 +219,36 @@
     };
     const choose = () => {
       const { pictures, ratio } = groups[part.wall.value];
-      const names = pictures.map((picture) => picture.title);
-      fill(part.left, names, 0);
-      fill(part.right, names, 1);
+      const names = pictures.map((picture) => picture.layer);
+      const at = (name, otherwise) => {
+        const found = pictures.findIndex((picture) => picture.layer === name);
+        return found < 0 ? otherwise : found;
+      };
+      const left = at(chosen.left, 0);
+      fill(part.left, names, left);
+      fill(part.right, names, at(chosen.right, left === 1 ? 0 : 1));
       part.stage.style.aspectRatio = ratio;
       part.stage.style.width = `min(100%, calc(75vh * ${ratio}))`;
       lay();
     };
-    fill(part.wall, groups.map((group) => group.name), 0);
-    part.wall.addEventListener("change", choose);
-    part.left.addEventListener("change", lay);
-    part.right.addEventListener("change", lay);
-    part.position.addEventListener("input", cut);
+    const wall = groups.findIndex((group) => group.name === chosen.wall);
+    fill(part.wall, groups.map((group) => group.name), Math.max(0, wall));
+    if (chosen.position) part.position.value = chosen.position;
+    const changed = () => {
+      chosen = { wall: groups[part.wall.value].name, left: layerOf(part.left), right: layerOf(part.right),
+        position: part.position.value };
+      keep();
+    };
+    part.wall.addEventListener("change", () => { choose(); changed(); });
+    part.left.addEventListener("change", () => { lay(); changed(); });
+    part.right.addEventListener("change", () => { lay(); changed(); });
+    part.position.addEventListener("input", () => { cut(); changed(); });
     const drag = (event) => {
       if (event.buttons === 0 && event.type !== "pointerdown") return;
       const box = part.stage.getBoundingClientRect();
       part.position.value = (100 * (event.clientX - box.left)) / box.width;
       cut();
+      changed();
     };
     part.stage.addEventListener("pointerdown", drag);
     part.stage.addEventListener("pointermove", drag);
@@ -226,10 +358,172 @@
     }
   }
 
-  // On paper nothing can be unfolded.
+  // Every picture opens large: drag and wheel, arrow keys for the next one, a link to its file.
+  const viewer = document.getElementById("viewer");
+  const view = Object.fromEntries(
+    [...viewer.querySelectorAll("[data-part]")].map((element) => [element.dataset.part, element]));
+  const every = [...document.querySelectorAll("figure[data-large]")];
+  // Arrow keys lead through what is unfolded.
+  const unfolded = () => every.filter((figure) => !figure.closest("details:not([open])"));
+  let now = null, place = { scale: 1, x: 0, y: 0 }, size = { width: 1, height: 1, cells: 1, metres: 0 };
+  const lie = () => {
+    const shown = view.stage.firstElementChild;
+    shown.style.transform = `translate(${place.x}px, ${place.y}px) scale(${place.scale})`;
+    const perCell = (place.scale * size.width) / size.cells;
+    shown.classList.toggle("cells", perCell > 2);
+    const whole = size.metres ? `, 10 cm are ${Math.round((0.1 * place.scale * size.width) / size.metres)} px` : "";
+    view.scale.textContent = size.cells ? `${Math.round(100 * perCell)} %${whole}` : "";
+  };
+  const fit = () => {
+    const { clientWidth, clientHeight } = view.stage;
+    const scale = Math.min(clientWidth / size.width, clientHeight / size.height);
+    place = { scale, x: (clientWidth - scale * size.width) / 2, y: (clientHeight - scale * size.height) / 2 };
+    lie();
+  };
+  const zoom = (factor, x = view.stage.clientWidth / 2, y = view.stage.clientHeight / 2) => {
+    const scale = Math.min(60, Math.max(0.02, place.scale * factor));
+    const kept = scale / place.scale;
+    place = { scale, x: x - kept * (x - place.x), y: y - kept * (y - place.y) };
+    lie();
+  };
+  const open = (figure) => {
+    now = figure;
+    const picture = figure.querySelector(".picture");
+    const image = picture.querySelector("img"), drawn = picture.querySelector("svg:not(.legend)");
+    const box = (drawn ?? image).getBoundingClientRect();
+    const natural = drawn ? { width: drawn.viewBox.baseVal.width, height: drawn.viewBox.baseVal.height }
+      : { width: image.naturalWidth || box.width, height: image.naturalHeight || box.height };
+    size = { ...natural, cells: image && !drawn ? natural.width : 0, metres: Number(figure.dataset.widthM ?? 0) };
+    const shown = document.createElement("div");
+    shown.className = `shown ${figure.className} ${picture.className.replace("picture", "")}`;
+    for (const part of picture.querySelectorAll(":scope > img, :scope > svg:not(.legend)")) shown.append(part.cloneNode(true));
+    Object.assign(shown.style, { width: `${size.width}px`, height: `${size.height}px` });
+    view.stage.replaceChildren(shown);
+    view.caption.textContent = [...figure.querySelectorAll("figcaption strong, figcaption .soft")]
+      .map((part) => part.textContent.trim().replace(/\s+/g, " ")).join(": ");
+    const pages = unfolded();
+    view.place.textContent = `${pages.indexOf(figure) + 1} of ${pages.length}`;
+    const file = figure.querySelector("a.file");
+    view.file.replaceChildren(...(file ? [Object.assign(file.cloneNode(), { textContent: "open the file" })] : []));
+    if (!viewer.open) viewer.showModal();
+    view.stage.focus();
+    fit();
+  };
+  const go = (step) => {
+    const pages = unfolded();
+    open(pages[(pages.indexOf(now) + step + pages.length) % pages.length]);
+  };
+  every.forEach((figure) => {
+    const button = Object.assign(document.createElement("button"), { type: "button", className: "enlarge", textContent: "⤢" });
+    button.setAttribute("aria-label", `enlarge: ${figure.querySelector("figcaption strong").textContent}`);
+    button.addEventListener("click", () => open(figure));
+    const picture = figure.querySelector(".picture");
+    picture.append(button);
+    // On orthoimages and walls a click collects a point.
+    if (!figure.classList.contains("raster")) {
+      picture.querySelector("img, svg").addEventListener("click", () => open(figure));
+    }
+  });
+  view.previous.addEventListener("click", () => go(-1));
+  view.next.addEventListener("click", () => go(1));
+  view.in.addEventListener("click", () => zoom(1.5));
+  view.out.addEventListener("click", () => zoom(1 / 1.5));
+  view.fit.addEventListener("click", fit);
+  view.close.addEventListener("click", () => viewer.close());
+  viewer.addEventListener("keydown", (event) => {
+    const keys = { ArrowLeft: () => go(-1), ArrowRight: () => go(1), "+": () => zoom(1.5), "-": () => zoom(1 / 1.5), 0: fit };
+    if (!(event.key in keys)) return;
+    event.preventDefault();
+    keys[event.key]();
+  });
+  view.stage.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const box = view.stage.getBoundingClientRect();
+    zoom(Math.exp(-event.deltaY / 400), event.clientX - box.left, event.clientY - box.top);
+  }, { passive: false });
+  view.stage.addEventListener("pointerdown", (event) => view.stage.setPointerCapture(event.pointerId));
+  view.stage.addEventListener("pointermove", (event) => {
+    if (!view.stage.hasPointerCapture(event.pointerId)) return;
+    place = { ...place, x: place.x + event.movementX, y: place.y + event.movementY };
+    lie();
+  });
+  addEventListener("resize", () => { if (viewer.open) fit(); });
+
+  // Contents: a column that stays, folded on narrow screens; where the reader is stands out.
+  const contents = document.querySelector(".contents details");
+  const wide = matchMedia("(min-width: 72rem)");
+  const unfold = () => { contents.open = wide.matches; };
+  wide.addEventListener("change", unfold);
+  unfold();
+  const anchors = [...contents.querySelectorAll("a")].map((link) => ({ link, target: document.getElementById(link.hash.slice(1)) }))
+    .filter(({ target }) => target);
+  const mark = () => {
+    const above = anchors.filter(({ target }) => target.getBoundingClientRect().top < 140);
+    const current = (above.length ? above[above.length - 1] : anchors[0])?.link;
+    for (const { link } of anchors) {
+      if (link === current) link.setAttribute("aria-current", "true"); else link.removeAttribute("aria-current");
+    }
+  };
+  let isWaiting = false;
+  addEventListener("scroll", () => {
+    if (isWaiting) return;
+    isWaiting = true;
+    requestAnimationFrame(() => { isWaiting = false; mark(); });
+  }, { passive: true });
+  mark();
+  contents.addEventListener("click", (event) => { if (event.target.closest("a") && !wide.matches) contents.open = false; });
+  // Links lead into what is folded.
+  const unfoldTarget = () => {
+    const target = location.hash && document.getElementById(location.hash.slice(1));
+    for (let at = target; at; at = at.parentElement) if (at.tagName === "DETAILS") at.open = true;
+  };
+  addEventListener("hashchange", unfoldTarget);
+  unfoldTarget();
+
+  // Browsers put pictures into a PDF bit by bit, but JPEG as it is: paper gets one of each, made while nobody
+  // waits, because at printing it is too late to.
+  const PAPER_PX = 1100;
+  const onPaper = new Map();
+  const paperOf = (image) => {
+    const scale = Math.min(1, PAPER_PX / Math.max(image.naturalWidth, image.naturalHeight));
+    const canvas = document.createElement("canvas");
+    canvas.width = Math.max(1, Math.round(scale * image.naturalWidth));
+    canvas.height = Math.max(1, Math.round(scale * image.naturalHeight));
+    const brush = canvas.getContext("2d");
+    brush.fillStyle = "#fff";
+    brush.fillRect(0, 0, canvas.width, canvas.height);
+    brush.fillStyle = "#dcdcdc";
+    for (let y = 0; y < canvas.height; y += 8) for (let x = y % 16; x < canvas.width; x += 16) brush.fillRect(x, y, 8, 8);
+    brush.drawImage(image, 0, 0, canvas.width, canvas.height);
+    const copy = new Image();
+    copy.src = canvas.toDataURL("image/jpeg", 0.8);
+    return copy;
+  };
+  const waiting = [...document.images].filter((image) => !image.closest(".way, .stage, .earlier") && image.naturalWidth > 200
+    && image.src.startsWith("data:image/webp"));
+  const later = window.requestIdleCallback ?? ((work) => setTimeout(work, 50));
+  const prepare = () => {
+    const image = waiting.shift();
+    if (!image) { root.dataset.paper = "ready"; return; }
+    onPaper.set(image, paperOf(image));
+    later(prepare);
+  };
+  addEventListener("load", () => later(prepare));
+  let onScreen = [];
+  addEventListener("beforeprint", () => {
+    onScreen = [...onPaper].filter(([, copy]) => copy.complete).map(([image, copy]) => {
+      const was = image.src;
+      image.src = copy.src;
+      return [image, was];
+    });
+  });
+  addEventListener("afterprint", () => { for (const [image, was] of onScreen) image.src = was; });
+
+  // On paper nothing can be unfolded: figures, metrics and parameters of what the page itself shows are.
   let folded = [];
   addEventListener("beforeprint", () => {
-    folded = [...document.querySelectorAll("details.group:not([open])")];
+    folded = [...document.querySelectorAll("details.group:not([open]), details.numbers:not([open])")]
+      .filter((group) => !group.closest(".way"));
     for (const group of folded) group.open = true;
   });
   addEventListener("afterprint", () => { for (const group of folded) group.open = false; });

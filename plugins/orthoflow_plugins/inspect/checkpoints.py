@@ -260,7 +260,8 @@ def _draw(pictures: Sequence[Picture], points: Sequence[ShownPoint], ctx: StepCo
             f"wall_{picture.image.number}_residuals",
             vector_map(picture.image, places, shifts),
             f"{picture.image.name}: check points, shown - surveyed, {times:g} times enlarged; "
-            "yellow over the median, red over twice the median.",
+            "yellow over the median, red over twice the median. Short arrows to all sides are "
+            "noise; neighbours that point the same way are a real shift of the orthoimage.",
         )
 
 

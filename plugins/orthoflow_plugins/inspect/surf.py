@@ -166,7 +166,8 @@ class _Verdict:
             f"wall_{self.image.number}_displacements",
             vector_map(self.image, self.pairs.places, self.pairs.shift),
             f"{self.image.name}: orthoimage against intensity, displacements {times:g} times "
-            "enlarged; yellow over the median, red over twice the median.",
+            "enlarged; yellow over the median, red over twice the median. Short arrows to all "
+            "sides are noise; neighbours that point the same way are a real shift.",
         )
 
 

@@ -325,12 +325,14 @@ def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
         f"wall_{image.number}_depth_error",
         depth_error_map(errors.depth_m),
         f"{image.name}: measured - true depth, blue {-DEPTH_SPAN_MM:g} mm to red "
-        f"{DEPTH_SPAN_MM:g} mm.",
+        f"{DEPTH_SPAN_MM:g} mm. Fine grain is noise of the scanner; whole areas of one colour are "
+        "a plane or a surface in the wrong place.",
     )
     ctx.figure(
         f"wall_{image.number}_colour_error",
         colour_error_map(errors.grey),
-        f"{image.name}: colour error, black 0 to yellow {COLOUR_SPAN_GREY:g} grey levels.",
+        f"{image.name}: colour error, black 0 to yellow {COLOUR_SPAN_GREY:g} grey levels. Bright "
+        "outlines are displaced edges, bright areas wrong paint or light of another photo.",
     )
     if verdict.sources is not None:
         length_m = np.linalg.norm(verdict.sources.displacement_m, axis=2)
@@ -338,7 +340,8 @@ def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
             f"wall_{image.number}_displacement",
             displacement_map(length_m / image.frame.gsd_m),
             f"{image.name}: true displacement of cells that photos painted, black 0 to yellow "
-            f"{DISPLACEMENT_SPAN_CELLS:g} cells of {1e3 * image.frame.gsd_m:g} mm.",
+            f"{DISPLACEMENT_SPAN_CELLS:g} cells of {1e3 * image.frame.gsd_m:g} mm. Dark is good; a "
+            "bright area with a sharp border is a photo oriented worse than its neighbours.",
         )
 
 

@@ -299,7 +299,10 @@ def _caption(image: Orthoimage) -> str:
     legend = ", ".join(
         f"{names[index % len(names)]} {name}" for index, name in enumerate(image.sources)
     )
-    return f"{image.name}, by source: {legend}; seams in white."
+    return (
+        f"{image.name}, by source: {legend}; seams in white. Large even areas are good; crumbs of "
+        "many colours are places that no photo shows well, where edges may be doubled."
+    )
 
 
 def _report(ctx: StepContext, verdicts: Sequence[_Joined]) -> None:

@@ -97,7 +97,9 @@ def draw_ties(
     ctx.figure(
         name,
         encode_webp(canvas),
-        f"Ties of {photo.name}: control green, check yellow, rejected red. {status}.",
+        f"Ties of {photo.name}: control green, check yellow, rejected red. {status}. Green over "
+        "the whole wall holds the photo; green in one corner alone, or red among it everywhere, "
+        "does not.",
     )
 
 
@@ -130,7 +132,8 @@ def draw_wall_errors(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
             _error_map(best / high_m),
             f"Predicted error of a coordinate on {wall.name}, of the photo that knows each place "
             f"best: black 0 to yellow {1e3 * high_m:.2g} mm and more, median "
-            f"{1e3 * median_m:.2g} mm; blue where no oriented photo shows the wall.",
+            f"{1e3 * median_m:.2g} mm; blue where no oriented photo shows the wall. Bright places "
+            "far from ties are where the orthoimage may be off; more ties there would mend it.",
         )
 
 
@@ -170,7 +173,8 @@ def draw_positions(ctx: StepContext, candidates: Sequence[Candidate]) -> None:
         "positions",
         figure,
         "Where the oriented photos were taken and which way they look, with their control: seen "
-        "along the first wall (left) and facing it (right); of a floor the right view is its plan.",
+        "along the first wall (left) and facing it (right); of a floor the right view is its plan. "
+        "A photo behind a wall or far from the others is oriented wrongly.",
     )
 
 
@@ -236,7 +240,12 @@ def _draw_pooled(ctx: StepContext, pooled: dict[TieRole, NDArray[np.float64]]) -
             )
             axes.set_xlabel("observed - computed [px]", fontsize=8)
             axes.tick_params(labelsize=7)
-    ctx.figure("residuals", figure, "Residuals of all oriented photos, with normal distributions.")
+    ctx.figure(
+        "residuals",
+        figure,
+        "Residuals of all oriented photos, with normal distributions: narrow hills about 0 are "
+        "good; one beside 0, or broader for check ties than for control, is a systematic error.",
+    )
 
 
 def _draw_each(
@@ -265,7 +274,8 @@ def _draw_each(
     ctx.figure(
         "residuals_by_photo",
         figure,
-        "Residuals of each oriented photo, with the normal distribution of the same mean and SD.",
+        "Residuals of each oriented photo, with the normal distribution of the same mean and SD: a "
+        "row that is broader than the others, or beside 0, is a photo to look at.",
     )
 
 

@@ -152,7 +152,12 @@ class PointcloudDirect(Method):
         _require_paint(layers)
         _report(ctx, layers, seconds)
         if best_preview is not None:
-            ctx.figure("filling", best_preview[1], "Before and after filling; magenta is void.")
+            ctx.figure(
+                "filling",
+                best_preview[1],
+                "Before and after filling; magenta is void. Fine magenta dots fill well; what was "
+                "a large area of it is invented from its rim.",
+            )
         names = tuple(wall.name for wall in inputs.walls.walls)
         places = tuple(wall.plane_index for wall in inputs.walls.walls)
         return self.Out(layers=Layers(layers=tuple(layers), names=names, plane_indices=places))

@@ -108,7 +108,8 @@ def draw_deviations(ctx: StepContext, assembly: Assembly) -> None:
         figure,
         "Distances of the points to their plane, positive towards the viewer; the curve is the "
         f"normal distribution of those within {1000.0 * deviations.fit_m:.0f} mm. Below, their "
-        "quantiles against those of a normal distribution, which would lie on the line.",
+        "quantiles against those of a normal distribution, which would lie on the line: a second "
+        "hill, or ends that leave the line early, are relief or another surface on the plane.",
     )
 
 
@@ -160,7 +161,9 @@ def draw_planes(
         "planes",
         figure,
         "Left: a sample of the points, coloured by plane, without planes seen from behind; on none "
-        f"(grey) are {np.mean(on_none):.1%}. Right: the rectangles of the planes' connected parts.",
+        f"(grey) are {np.mean(on_none):.1%}. Right: the rectangles of the planes' connected parts. "
+        "Each wall should have one colour: two side by side are one wall taken for two, and a grey "
+        "one was missed.",
     )
 
 
@@ -207,7 +210,8 @@ def draw_thickness(
         "thickness",
         figure,
         "Thickness of the cloud, one standard deviation in millimetres: on each plane beside the "
-        "scan step there, by class and by material. Below, one row of the scan on the first plane.",
+        "scan step there, by class and by material. Below, one row of the scan on the first plane. "
+        "A cloud thicker than its scan step shows noise, or scans that do not fit each other.",
     )
 
 

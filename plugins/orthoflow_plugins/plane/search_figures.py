@@ -100,7 +100,8 @@ def draw_accumulator(
         "accumulator",
         figure,
         "Left: points per plan cell with the walls found. Right: the parameter space, in which "
-        f"{picture.voters}; circles mark the walls.",
+        f"{picture.voters}; circles mark the walls. A wall stands out as a sharp bright spot; a "
+        "bright spot without a circle is a wall that was missed, a circle on grey ground a chance.",
     )
 
 
@@ -157,7 +158,8 @@ def draw_sections(ctx: StepContext, planes: Planes, cloud: PointCloud, *, cell_m
         "voxels",
         figure,
         f"Points per voxel of {100.0 * cell_m:.3g} cm (darker is more, logarithmic) in three "
-        "sections through the middle of the planes' parts.",
+        "sections through the middle of the planes' parts: walls are thin dark lines; where they "
+        "are wide or double, the scans disagree or the cloud is noisy.",
     )
 
 
@@ -236,7 +238,8 @@ def _draw_best(ctx: StepContext, picture: SpacePicture, planes: Planes) -> None:
         "accumulator",
         figure,
         "The best votes of any distance over the direction of the normal; circles mark the planes. "
-        "Directions are even over the hemisphere: towards the poles one stands for several.",
+        "Directions are even over the hemisphere: towards the poles one stands for several. A "
+        "bright spot without a circle is a direction whose plane was missed.",
     )
 
 
@@ -258,7 +261,8 @@ def _draw_sections(ctx: StepContext, picture: SpacePicture) -> None:
         "accumulator-sections",
         figure,
         "Votes over direction and distance before any plane was taken, in sections of one phi "
-        "(above) and of one omega (below); the brighter the more, by the square root.",
+        "(above) and of one omega (below); the brighter the more, by the square root. Planes are "
+        "sharp spots where bands cross; without any, there is no plane to find.",
     )
 
 
@@ -325,5 +329,6 @@ def _draw_normals(
         "Left: how the normals of the neighbourhoods lie to the first plane, by points. Middle: "
         "how far they point along the second horizontal axis (markiewicz2015, Figure 8). Right: "
         f"the first over the plane's rectangle, up to {1000.0 * _MAP_DEPTH_M:.0f} mm before and "
-        "behind it; what has the wall's colour is told from it by its distance alone.",
+        "behind it; what has the wall's colour is told from it by its distance alone. Normals of a "
+        "good wall gather near 0 degrees; a broad hill means noise or relief.",
     )

@@ -68,7 +68,8 @@ def report(ctx: StepContext, rasters: Sequence[WallRaster]) -> None:
     ctx.figure(
         "depth",
         _depth_preview(walls[0]),
-        f"Depth of {walls[0].name}: brighter is nearer to the viewer, grey is void.",
+        f"Depth of {walls[0].name}: brighter is nearer to the viewer, grey is void. Relief has "
+        "sharp edges; stripes or steps on an even wall come from scans that do not fit each other.",
     )
 
 

@@ -142,8 +142,13 @@ class ContactSheet:
     def caption(self) -> str:
         """One sentence on what the sheet shows."""
         if self.n_shown < self.n_photos:
-            return f"The first {self.n_shown} of {self.n_photos} photos, as they are stored."
-        return "The photos, as they are stored."
+            which = f"The first {self.n_shown} of {self.n_photos} photos, as they are stored"
+        else:
+            which = "The photos, as they are stored"
+        return (
+            f"{which}: a wall is painted well where several show it squarely; blur, or a part of "
+            "it that none shows, cannot be made good later."
+        )
 
     def add(self, name: str, image: NDArray[np.uint8]) -> None:
         """Put the next photo (rows, cols, 3) RGB on the sheet, if there is room left."""

@@ -147,13 +147,26 @@ class ReadScan(Method):
                 ctx.warn(note)
         assembly.require_points()
         cloud = _finish(ctx, assembly, files, params)
-        ctx.figure("plan", plan_view_png(cloud), "The cloud from above, brighter where denser.")
+        ctx.figure(
+            "plan",
+            plan_view_png(cloud),
+            "The cloud from above, brighter where denser: walls are thin bright lines; double "
+            "lines are scans that do not fit each other.",
+        )
         polar = polar_view_png(cloud)
         if polar is not None:
-            ctx.figure("polar", polar, "Intensity over the scanner's own rows and columns.")
+            ctx.figure(
+                "polar",
+                polar,
+                "Intensity over the scanner's own rows and columns: what the scanner saw; black is "
+                "no return, and where a wall is black nothing can be measured on it.",
+            )
         lines = scan_lines_png(cloud)
         if lines is not None:
-            caption = "A wall seen squarely: rows of the scan yellow, columns blue."
+            caption = (
+                "A wall seen squarely: rows of the scan yellow, columns blue. Meshes are even "
+                "where the scan is good; lines that break off or cross are gaps and mixed points."
+            )
             ctx.figure("scan-lines", lines, caption)
         return self.Out(cloud=cloud)
 

@@ -151,7 +151,8 @@ def report_room(truth: Truth, cloud: PointCloud, ctx: StepContext) -> None:
     ctx.figure(
         "main_wall",
         _picture(truth, ctx.cores),
-        f"True orthoimage of the {truth.planes.names[0]} at {_PICTURE_GSD_M * 1000:.0f} mm.",
+        f"True orthoimage of the {truth.planes.names[0]} at {_PICTURE_GSD_M * 1000:.0f} mm: what "
+        "the run should come to; blurred or doubled edges in its orthoimage are errors.",
     )
 
 
@@ -163,7 +164,12 @@ def report_photos(photos: Photos, shots: tuple[Shot, ...], ctx: StepContext) -> 
     ctx.metric("photo_megapixels", sum(p.width * p.height for p in photos.photos) / 1e6, "1")
     ctx.metric("photo_gsd_mm", float(np.mean([1000.0 * shot.gsd_m for shot in shots])), "mm")
     ctx.metric("photo_obliquity_max_deg", max(shot.obliquity_deg for shot in shots), "deg")
-    ctx.figure("photos", _contact_sheet(photos), "The photos, in the order of their names.")
+    ctx.figure(
+        "photos",
+        _contact_sheet(photos),
+        "The photos, in the order of their names: a wall is painted well where several show it "
+        "squarely; blur, or a part of it that none shows, cannot be made good later.",
+    )
 
 
 def _contact_sheet(photos: Photos) -> bytes:

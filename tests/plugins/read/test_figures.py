@@ -225,7 +225,7 @@ def _exact_sheets(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("_exact_sheets")
 def test_photos_stand_in_rows_above_their_names() -> None:
     sheet = ContactSheet(3)
-    assert sheet.caption == "The photos, as they are stored."
+    assert sheet.caption.startswith("The photos, as they are stored: ")
     colours = [(200, 10, 10), (10, 200, 10), (10, 10, 200)]
     shapes = [(400, 800), (800, 400), (200, 576)]
     for k, (colour, shape) in enumerate(zip(colours, shapes, strict=True)):
@@ -250,7 +250,7 @@ def test_photos_stand_in_rows_above_their_names() -> None:
 def test_sheets_hold_no_more_than_a_hundred_photos_and_twelve_hundred_pixels() -> None:
     sheet = ContactSheet(130)
     assert (sheet.n_shown, sheet.n_photos) == (100, 130)
-    assert sheet.caption == "The first 100 of 130 photos, as they are stored."
+    assert sheet.caption.startswith("The first 100 of 130 photos, as they are stored: ")
     for k in range(130):
         sheet.add(f"{k}", np.zeros((50, 50, 3), dtype=np.uint8))
     shown: Any = np.array(sheet.encoded())

@@ -363,9 +363,9 @@ def test_reading_stops_when_it_is_cancelled(tmp_path: Path, read: Reader) -> Non
 @pytest.mark.parametrize(
     ("count", "caption"),
     [
-        (1, "The photos, as they are stored."),
-        (10, "The photos, as they are stored."),
-        (103, "The first 100 of 103 photos, as they are stored."),
+        (1, "The photos, as they are stored: "),
+        (10, "The photos, as they are stored: "),
+        (103, "The first 100 of 103 photos, as they are stored: "),
     ],
 )
 def test_the_contact_sheet_stays_small(
@@ -376,7 +376,7 @@ def test_the_contact_sheet_stays_small(
     read(*made.write(tmp_path, dict.fromkeys(names, image)))
     assert max(read.sheet) <= 1200
     assert min(read.sheet) >= 100
-    assert read.ctx.figures[0].caption == caption
+    assert read.ctx.figures[0].caption.startswith(caption)
 
 
 def test_real_phone_photos_keep_their_stored_frame(shared_data: Path, read: Reader) -> None:

@@ -1,0 +1,284 @@
+"""What a parameter does: metrics over the values that it was given, as drawings for the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Final
+
+import numpy as np
+
+from orthoflow.foreign_text import shown
+from orthoflow.geometry.robust import median_deviation
+from orthoflow.records import RecordedCell, Run
+from orthoflow.report.combinations import Combination, combinations_of
+from orthoflow.report.comparisons import Column, comparison_columns
+from orthoflow.report.numbers import number
+from orthoflow.report.rankings import Sense
+from orthoflow.workflow.format import DATA
+
+_MOST_CURVES: Final = 12
+_MOST_LINES: Final = 6
+_FEWEST_VALUES: Final = 3
+_LOGARITHMIC_RATIO: Final = 20.0
+_WIDTH, _HEIGHT = 460.0, 290.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 14.0, 12.0, 46.0
+_LETTER: Final = 6.2  # width of one, at the size of the drawing's text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """One metric over one parameter.
+
+    Attributes:
+        title: the metric, its step and the parameter.
+        svg: an `<svg>` element.
+        caption: what the points and bars are, in words.
+    """
+
+    title: str
+    svg: str
+    caption: str
+
+
+def curves(run: Run) -> tuple[Curve, ...]:
+    """Draw the metrics of a comparison over every parameter in which variants differ alone.
+
+    A sweep is known by what was run, not by how the workflow was written: variants of a step that
+    call one method and differ in one number.
+    """
+    return tuple(_curves([run]))[:_MOST_CURVES]
+
+
+def curves_over(parts: Mapping[str, Run]) -> tuple[Curve, ...]:
+    """The same over datasets: medians, and how far the datasets lie apart."""
+    return tuple(_curves(list(parts.values())))[:_MOST_CURVES]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """Variants of a step that differ in one number.
+
+    Attributes:
+        step: name of the step.
+        parameter: name of the parameter.
+        values: variant -> value.
+    """
+
+    step: str
+    parameter: str
+    values: Mapping[str, float]
+
+
+def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
+    """Find the sweeps among cells."""
+    by_method: dict[tuple[str, str], dict[str, RecordedCell]] = {}
+    for cell in cells:
+        variant = cell.assignment.get(cell.step)
+        if variant is not None and cell.repeat == 0 and cell.status != "skipped":
+            by_method.setdefault((cell.step, cell.method), {}).setdefault(variant, cell)
+    for (step, _), variants in by_method.items():
+        names = {name for cell in variants.values() for name in cell.params}
+        differ = [
+            name
+            for name in sorted(names)
+            if len({repr(cell.params.get(name)) for cell in variants.values()}) > 1
+        ]
+        values = (
+            {variant: cell.params.get(differ[0]) for variant, cell in variants.items()}
+            if len(differ) == 1
+            else {}
+        )
+        known = {
+            variant: float(value)
+            for variant, value in values.items()
+            if isinstance(value, int | float) and not isinstance(value, bool)
+        }
+        if len(known) == len(variants) >= _FEWEST_VALUES:
+            yield Sweep(step=step, parameter=differ[0], values=known)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Point:
+    x: float
+    y: float
+    spread: float
+
+
+def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
+    combinations = [one for part in parts for one in combinations_of(part)]
+    columns = comparison_columns(combinations)
+    chosen = [one for one in columns if one.is_key or one.sense is not Sense.NEITHER]
+    cells = [cell for part in parts for cell in part.record.cells]
+    found = list(sweeps(cells))
+    for column in sorted(chosen, key=lambda one: not one.is_key):
+        for sweep in found:
+            lines = _lines(combinations, sweep, column)
+            if any(len(points) >= _FEWEST_VALUES for points in lines.values()):
+                yield _curve(sweep, column, lines, n_datasets=len(parts))
+
+
+def _lines(
+    combinations: Sequence[Combination], sweep: Sweep, column: Column
+) -> dict[str, list[_Point]]:
+    """One line per combination of the other variants."""
+    values: dict[str, dict[float, list[tuple[float, float]]]] = {}
+    for one in combinations:
+        variant = one.assignment.get(sweep.step, "")
+        measured = one.measured(column.step, column.metric)
+        if variant not in sweep.values or measured is None or one.failure is not None:
+            continue
+        others = ", ".join(
+            f"{step}={chosen}"
+            for step, chosen in one.assignment.items()
+            if step not in (sweep.step, DATA)
+        )
+        at = values.setdefault(others, {}).setdefault(sweep.values[variant], [])
+        at.append((measured.value, measured.spread))
+    return {
+        name: [_point(x, found) for x, found in sorted(line.items())]
+        for name, line in list(values.items())[:_MOST_LINES]
+    }
+
+
+def _point(x: float, found: Sequence[tuple[float, float]]) -> _Point:
+    if len(found) == 1:
+        return _Point(x=x, y=found[0][0], spread=found[0][1])
+    numbers = np.array([value for value, _ in found])
+    return _Point(x=x, y=float(np.median(numbers)), spread=median_deviation(numbers))
+
+
+def _curve(
+    sweep: Sweep, column: Column, lines: Mapping[str, Sequence[_Point]], *, n_datasets: int
+) -> Curve:
+    title = f"{column.label} ({column.step}) over {sweep.step}.{sweep.parameter}"
+    has_spread = any(
+        math.isfinite(point.spread) and point.spread > 0
+        for points in lines.values()
+        for point in points
+    )
+    if n_datasets > 1:
+        said = f"medians of {n_datasets} datasets, bars 1.4826 times the median absolute deviation"
+    elif has_spread:
+        said = "means of the repeats, bars their standard deviation"
+    else:
+        said = "one value each: without repeats nobody knows how far they scatter"
+    good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
+    return Curve(
+        title=title,
+        svg=_Axes.of([point for points in lines.values() for point in points]).drawn(
+            lines, label=title, below=f"{sweep.step}.{sweep.parameter}"
+        ),
+        caption=(
+            f"Points are {said}{good}. A flat stretch is where the parameter does not matter; at a "
+            "steep end the chosen value decides the result."
+        ),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Axes:
+    """Where numbers lie in the drawing.
+
+    Attributes:
+        x: least and largest.
+        y: least and largest.
+        is_logarithmic: along x.
+    """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    is_logarithmic: bool
+
+    @classmethod
+    def of(cls, points: Sequence[_Point]) -> _Axes:
+        xs = [point.x for point in points]
+        spreads = [point.spread if math.isfinite(point.spread) else 0.0 for point in points]
+        low = min(point.y - spread for point, spread in zip(points, spreads, strict=True))
+        high = max(point.y + spread for point, spread in zip(points, spreads, strict=True))
+        margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
+        # An axis that begins near 0 begins there: half of it would show a difference too large.
+        begin = 0.0 if 0.0 <= low < 0.6 * high else low - margin
+        is_logarithmic = min(xs) > 0 and max(xs) / min(xs) >= _LOGARITHMIC_RATIO
+        return cls(x=(min(xs), max(xs)), y=(begin, high + margin), is_logarithmic=is_logarithmic)
+
+    def across(self, x: float) -> float:
+        low, high = self.x
+        if self.is_logarithmic:
+            x, low, high = math.log(x), math.log(low), math.log(high)
+        share = (x - low) / (high - low) if high > low else 0.5
+        return _LEFT + 12.0 + share * (_WIDTH - _LEFT - _RIGHT - 30.0)
+
+    def down(self, y: float) -> float:
+        low, high = self.y
+        return _HEIGHT - _BOTTOM - (y - low) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
+
+    def drawn(self, lines: Mapping[str, Sequence[_Point]], *, label: str, below: str) -> str:
+        floor = _HEIGHT - _BOTTOM
+        parts = [
+            f'<path class="axis" d="M{_LEFT} {_TOP}V{floor}H{_WIDTH - _RIGHT}"/>',
+            (
+                f'<text x="{0.5 * (_LEFT + _WIDTH):.0f}" y="{_HEIGHT - 6}" text-anchor="middle">'
+                f"{escape(shown(below))}{' (logarithmic)' if self.is_logarithmic else ''}</text>"
+            ),
+        ]
+        for value in _ticks(*self.y):
+            y = self.down(value)
+            parts.append(
+                f'<path class="grid" d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}"/>'
+                f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{number(value)}</text>'
+            )
+        taken = -math.inf
+        for value in sorted({point.x for points in lines.values() for point in points}):
+            text, x = number(value), self.across(value)
+            # Values may lie too close for their numbers.
+            if x - 0.5 * _LETTER * len(text) > taken:
+                parts.append(
+                    f'<text x="{x:.1f}" y="{floor + 17}" text-anchor="middle">{text}</text>'
+                )
+                taken = x + 0.5 * _LETTER * len(text) + 6.0
+        for index, (name, points) in enumerate(lines.items()):
+            parts.append(self._line(index, points))
+            if name:
+                y = _TOP + 12 + 15 * index
+                parts.append(
+                    f'<path class="line line-{index}" d="M{_WIDTH - 172} {y - 4}h22"/>'
+                    f'<text x="{_WIDTH - 146}" y="{y}">{escape(shown(name))}</text>'
+                )
+        return (
+            f'<svg class="curve" viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" '
+            f'aria-label="{escape(shown(label))}">{"".join(parts)}</svg>'
+        )
+
+    def _line(self, index: int, points: Sequence[_Point]) -> str:
+        at = [(self.across(point.x), self.down(point.y)) for point in points]
+        way = "L".join(f"{x:.1f} {y:.1f}" for x, y in at)
+        bars = "".join(
+            f"M{x:.1f} {self.down(point.y - point.spread):.1f}"
+            f"V{self.down(point.y + point.spread):.1f}"
+            for (x, _), point in zip(at, points, strict=True)
+            if math.isfinite(point.spread)
+        )
+        dots = "".join(
+            f'<circle class="dot line-{index}" cx="{x:.1f}" cy="{y:.1f}" r="3.6">'
+            f"<title>{number(point.x)}: {number(point.y)}</title></circle>"
+            for (x, y), point in zip(at, points, strict=True)
+        )
+        bar = f'<path class="bar line-{index}" d="{bars}"/>' if bars else ""
+        return f'<path class="line line-{index}" d="M{way}"/>{bar}{dots}'
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Round numbers between two, about five.
+
+    >>> _ticks(0.0, 1.1)
+    [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+    """
+    rough = (high - low) / 5.0
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(power * round_ for round_ in (1, 2, 5, 10) if power * round_ >= 0.8 * rough)
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
+    return [float(f"{index * step:.6g}") for index in range(first, last + 1)]
