@@ -100,7 +100,7 @@ class Bench:
         layers = DsmBackward().run(inputs, DsmBackward.Params(), self.context()).layers
         join = MosaicSeams()
         return join.run(
-            join.In(layers=layers, walls=walls), join.Params(), self.context()
+            join.In(layers=layers, walls=walls), join.Params(gains="none"), self.context()
         ).orthoimages
 
     def truth(self, walls: Walls, cameras: Cameras, images: Orthoimages) -> dict[str, float]:

@@ -173,7 +173,7 @@ def main() -> None:
         )
         layers = DsmBackward().run(painting, DsmBackward.Params(), context(1)).layers
         joined = MosaicSeams().run(
-            MosaicSeams.In(layers=layers, walls=walls), MosaicSeams.Params(), context(1)
+            MosaicSeams.In(layers=layers, walls=walls), MosaicSeams.Params(gains="none"), context(1)
         )
         shares += [row(seed, room.truth, walls, image) for image in joined.orthoimages.images]
     scanned, painted = np.array(shares).T

@@ -26,7 +26,7 @@ from orthoflow.products import (
 from orthoflow.products.inspections import Finding
 from orthoflow.products.product import Product
 from tests.provenance_records import ProductShelf
-from tests.report_runs import cell, record
+from tests.report_runs import cell, metrics, record
 
 # As far from the origin as survey coordinates are, and turned.
 CORNER = np.array([4.0e5, 5.0e6, 100.0])
@@ -85,7 +85,7 @@ def wall_frame(planes: Planes) -> WallFrame:
     return frame_over(planes.corners[WALL], planes.normal[WALL], gsd_m=GSD_M)
 
 
-def write_drawing_run(folder: Path, *, gains: str = "none") -> Path:
+def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False) -> Path:
     """Write `run.h5` and `products/` of planes, one wall, its orthoimage and its inspection."""
     folder.mkdir(parents=True)
     planes = box_planes()
@@ -114,6 +114,7 @@ def write_drawing_run(folder: Path, *, gains: str = "none") -> Path:
         cell(
             step,
             params={"gains": gains} if step == "mosaic" else {},
+            metrics=metrics(gain_max=1.2) if step == "mosaic" and differ else (),
             environment="",
             inputs={
                 port: _given_by(given[source], f"{source}.{port}")

@@ -252,4 +252,6 @@ def _colours(cell: RecordedCell) -> str:
         return f"colours as {cell.method} gave them"
     if gains == "none":
         return "colours untouched: as photos or scan have them"
+    if not any(metric.name == "gain_max" for metric in cell.metrics):
+        return "colours untouched: the photos agree, or there is one only"
     return f"colours balanced between photos (gains: {gains})"

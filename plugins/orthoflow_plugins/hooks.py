@@ -62,7 +62,7 @@ def orthoflow_kinds() -> list[KindSpec]:
         KindSpec(
             name="mosaic",
             summary="join the layers of each wall",
-            inputs={"layers": "layers", "walls": "walls"},
+            inputs={"layers": "layers", "walls": "walls", "cameras": "cameras"},
             outputs={"orthoimages": "orthoimages"},
         ),
         KindSpec(

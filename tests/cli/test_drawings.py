@@ -134,10 +134,17 @@ def test_a_wall_that_does_not_fit_takes_several_sheets_and_an_index(
         assert "scale 1:25" in pdf.pages[0].extract_text()
 
 
-def test_balanced_colours_are_said(tmp_path: Path) -> None:
-    run = write_drawing_run(tmp_path / "run", gains="global")
+@pytest.mark.parametrize(
+    ("differ", "said"),
+    [
+        (True, "colours balanced between photos (gains: global)"),
+        (False, "colours untouched: the photos agree, or there is one only"),
+    ],
+)
+def test_balanced_colours_are_said(tmp_path: Path, differ: bool, said: str) -> None:
+    run = write_drawing_run(tmp_path / "run", gains="global", differ=differ)
     (wall,) = room_results(open_run(run)).walls
-    assert wall.colours == "colours balanced between photos (gains: global)"
+    assert wall.colours == said
     assert wall.plane_index == WALL
 
 

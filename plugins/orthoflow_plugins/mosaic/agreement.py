@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Layer, LayerMask
-from orthoflow_plugins.mosaic.graph_cut import depth_edges
+from orthoflow_plugins.mosaic.depth_edges import depth_edges
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.mosaic.balance import Balance
 
 PATCH_CELLS: Final = 64
 _PATCHES_MOST: Final = 200
@@ -95,13 +98,23 @@ class SeamSteps:
     delta_e: NDArray[np.float64]
 
 
-def seam_steps(source: NDArray[np.int16], layers: Sequence[Layer]) -> SeamSteps:
+def seam_steps(
+    source: NDArray[np.int16], layers: Sequence[Layer], balance: Balance | None = None
+) -> SeamSteps:
     """Compare both sources in the cells on the left of or above seams that both paint.
 
     Args:
         source: (rows, cols) index of the layer that paints each cell, -1 for none.
         layers: what the index counts.
+        balance: how their colours are balanced, or None.
     """
+
+    def shown(index: int, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.uint8]:
+        colours = layers[index].rgb[rows, columns]
+        if balance is not None:
+            colours = balance.shown(index, colours, rows, columns)
+        return eight_bits(colours)
+
     nothing = np.zeros((0, 3), dtype=np.uint8)
     firsts, seconds = [nothing], [nothing]
     for axis in (0, 1):
@@ -110,12 +123,11 @@ def seam_steps(source: NDArray[np.int16], layers: Sequence[Layer]) -> SeamSteps:
         other = source[rows + (axis == 0), columns + (axis == 1)]
         for index, layer in enumerate(layers):
             chosen = (other == index) & (layer.mask[rows, columns] == LayerMask.PAINTED)
-            seconds.append(eight_bits(layer.rgb[rows[chosen], columns[chosen]]))
+            seconds.append(shown(index, rows[chosen], columns[chosen]))
             first = np.zeros((np.count_nonzero(chosen), 3), dtype=np.uint8)
-            for owner, painter in enumerate(layers):
+            for owner in range(len(layers)):
                 is_mine = mine[chosen] == owner
-                taken = painter.rgb[rows[chosen][is_mine], columns[chosen][is_mine]]
-                first[is_mine] = eight_bits(taken)
+                first[is_mine] = shown(owner, rows[chosen][is_mine], columns[chosen][is_mine])
             firsts.append(first)
     one, another = np.concatenate(firsts), np.concatenate(seconds)
     grey = (one.astype(np.float64) - another) @ _LUMINANCE

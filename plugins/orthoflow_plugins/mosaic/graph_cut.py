@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.bands import row_bands
-from orthoflow.geometry.levels import Colours
 from orthoflow.products import Layer, LayerMask, Wall
+from orthoflow_plugins.mosaic.blocks import Blocks, block_means, raster_means
+from orthoflow_plugins.mosaic.depth_edges import depth_edges_in
+from orthoflow_plugins.mosaic.light import lit_shares
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.mosaic.balance import Balance
 
 # Cuts are made on a smaller picture of about so many cells.
 _CELLS_MOST: Final = 30_000
 _SWEEPS: Final = 2
 # A seam across a depth edge costs as much as one between black and white.
 _DEPTH_EDGE_COST: Final = 1.0
-_DEPTH_EDGE_M: Final = 0.03
 # Even where layers are equal a long seam costs more than a short one.
 _LENGTH_COST: Final = 0.01
 _VIEW_WEIGHT: Final = 0.1
@@ -39,33 +42,6 @@ class _Scene:
     colours: NDArray[np.float32]
     views: NDArray[np.float64]
     edges: NDArray[np.float64]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Blocks:
-    """Blocks of about as many cells each, laid out the same from either end of each side.
-
-    Attributes:
-        rows: first row of each block, and the row after the last one.
-        columns: the same of columns.
-    """
-
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
-
-    @classmethod
-    def over(cls, shape: tuple[int, int], side_cells: int) -> Blocks:
-        """Cut a raster into blocks with sides of about so many cells, one more at most."""
-        rows, columns = (_symmetric_edges(length, side_cells) for length in shape)
-        return cls(rows=rows, columns=columns)
-
-
-def _symmetric_edges(length: int, part: int) -> NDArray[np.int64]:
-    n_parts = -(-length // part)
-    # A middle of one cell belongs to neither half: it takes a part of its own in their middle.
-    n_parts += length % 2 * (1 - n_parts % 2)
-    half = np.arange(n_parts // 2 + 1) * length // n_parts
-    return np.concatenate([half, (length - half[::-1])[1 - n_parts % 2 :]])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +65,9 @@ class CutLabels:
         return wide
 
 
-def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> CutLabels:
+def cut_labels(
+    layers: Sequence[Layer], wall: Wall | None, balance: Balance | None = None
+) -> CutLabels:
     """Give each cell the layer that a graph cut chooses, -1 where none paints it.
 
     Boykov, Veksler and Zabih 2001: each layer in turn may take over cells of the others where that
@@ -99,11 +77,12 @@ def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> CutLabels:
     Args:
         layers: of one wall.
         wall: its surface, for depth edges, or None.
+        balance: how the colours of the layers are balanced before they are compared, if they are.
     """
     shape = layers[0].frame.shape
     factor = max(1, math.ceil(math.sqrt(shape[0] * shape[1] / _CELLS_MOST)))
     blocks = Blocks.over((shape[0], shape[1]), factor)
-    scene = _reduced(layers, wall, blocks)
+    scene = _reduced(layers, wall, blocks, balance)
     labels = np.argmin(scene.views, axis=0)
     for _ in range(_SWEEPS):
         before = labels
@@ -115,62 +94,36 @@ def cut_labels(layers: Sequence[Layer], wall: Wall | None) -> CutLabels:
     return CutLabels(small=labels.astype(np.int16), blocks=blocks)
 
 
-def _reduced(layers: Sequence[Layer], wall: Wall | None, blocks: Blocks) -> _Scene:
-    painted = np.stack([_means(partial(_painted_in, layer.mask), blocks) for layer in layers])
+def _reduced(
+    layers: Sequence[Layer], wall: Wall | None, blocks: Blocks, balance: Balance | None
+) -> _Scene:
+    painted = np.stack([block_means(partial(_painted_in, layer.mask), blocks) for layer in layers])
     colours = np.stack(
         [
-            np.stack([_raster_means(layer.rgb[..., band], blocks) for band in range(3)], axis=-1)
+            np.stack([raster_means(layer.rgb[..., band], blocks) for band in range(3)], axis=-1)
             / np.maximum(share, 1e-3)[..., None]
             / np.iinfo(layer.rgb.dtype).max
             for layer, share in zip(layers, painted, strict=True)
         ]
     )
-    quality = np.stack([_raster_means(layer.quality, blocks) for layer in layers])
+    if balance is not None:
+        rows, columns = (middles.astype(np.int64) for middles in blocks.centres())
+        at = [side.ravel() for side in np.broadcast_arrays(rows[:, None], columns)]
+        for index, shares in enumerate(colours):
+            gains = balance.log_gains(index, at[0], at[1])
+            colours[index] = lit_shares(shares.reshape(-1, 3), gains).reshape(shares.shape)
+    quality = np.stack([raster_means(layer.quality, blocks) for layer in layers])
     best = np.maximum(quality.max(axis=0), 1e-12)
     views = np.where(painted > 0.5, _VIEW_WEIGHT * (1.0 - quality / best), _FORBIDDEN)
     edges = np.zeros(views.shape[1:])
     if wall is not None:
-        steps = _means(partial(_depth_edges_in, wall.depth_m), blocks)
+        steps = block_means(partial(depth_edges_in, wall.depth_m), blocks)
         edges = np.where(steps > 0.0, _DEPTH_EDGE_COST, 0.0)
     return _Scene(colours=colours.astype(np.float32), views=views, edges=edges)
 
 
-def depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Cells whose right or lower neighbour lies 3 cm nearer or farther."""
-    edges = np.zeros(depth_m.shape, dtype=np.bool_)
-    edges[:, :-1] |= np.abs(np.diff(depth_m, axis=1)) > _DEPTH_EDGE_M
-    edges[:-1] |= np.abs(np.diff(depth_m, axis=0)) > _DEPTH_EDGE_M
-    return edges
-
-
 def _painted_in(mask: NDArray[np.uint8], rows: slice) -> NDArray[np.bool_]:
     return np.asarray(mask[rows] == LayerMask.PAINTED, dtype=np.bool_)
-
-
-def _depth_edges_in(depth_m: NDArray[np.float32], rows: slice) -> NDArray[np.bool_]:
-    """Cells of some rows on either side of a depth edge; the rows beside them tell of the rim."""
-    first = max(0, rows.start - 1)
-    around = depth_m[first : rows.stop + 1]
-    beside = depth_edges(around) | depth_edges(around[::-1, ::-1])[::-1, ::-1]
-    return beside[rows.start - first :][: rows.stop - rows.start]
-
-
-def _raster_means(raster: Colours | NDArray[np.float32], blocks: Blocks) -> NDArray[np.float64]:
-    return _means(lambda rows: raster[rows], blocks)
-
-
-def _means(values: Callable[[slice], NDArray[np.generic]], blocks: Blocks) -> NDArray[np.float64]:
-    """Means (rows, cols) of the cells of each block; `values` gives those of some rows."""
-    rows, columns = blocks.rows, blocks.columns
-    means = np.empty((len(rows) - 1, len(columns) - 1))
-    # So many rows of blocks at once as make about a band.
-    for some in row_bands((len(means), int(columns[-1] * np.diff(rows).max()))):
-        first, last = rows[some.start], rows[some.stop]
-        known = values(slice(int(first), int(last))).astype(np.float64)
-        sums = np.add.reduceat(known, rows[some] - first, axis=0)
-        means[some] = np.add.reduceat(sums, columns[:-1], axis=1)
-    means /= np.outer(np.diff(rows), np.diff(columns))
-    return means
 
 
 def _expanded(scene: _Scene, labels: NDArray[np.int64], alpha: int) -> NDArray[np.int64]:

@@ -6,16 +6,19 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.bands import Allocate, bands_with_reach, holds_cells
+from orthoflow.geometry.bands import Allocate, bands_with_reach
 from orthoflow.geometry.levels import Colours, Level, in_levels
-from orthoflow.products import Layer, LayerMask, Orthoimage, OrthoMask, Wall
+from orthoflow.products import Layer, LayerMask, OrthoMask, Wall
 from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
+
+if TYPE_CHECKING:
+    from orthoflow_plugins.mosaic.balance import Balance
 
 SeamRule = Literal["best-view", "voronoi", "graph-cut", "priority"]
 
@@ -26,6 +29,8 @@ Preference = Callable[[slice], NDArray[np.float32]]
 NOBODY: Final = -1
 # Walls with more cells are joined in bands of so many.
 _BAND_CELLS: Final = 1 << 25
+# Balanced colours take more than a hundred bytes a cell for a moment.
+_BALANCED_CELLS: Final = 1 << 20
 # A cell takes the highest of these that a layer gives it. Occluded: no source paints it, although
 # at least one looks at it. A filled cell counts less than a painted one.
 _RANKED: Final = (
@@ -43,6 +48,22 @@ _RANK_OF_LAYER_MASK: Final = np.array(
 
 
 @dataclass(frozen=True, kw_only=True)
+class SeamWish:
+    """Where seams are wanted.
+
+    Attributes:
+        rule: says which layer paints a cell that several show as well.
+        priority: names of photos, for that rule.
+        island_cells_min: smaller patches from one source are painted from the source around
+            them, where that one sees them too.
+    """
+
+    rule: SeamRule
+    priority: tuple[str, ...] = ()
+    island_cells_min: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
 class Choice:
     """What becomes of each cell, before colours are taken.
 
@@ -57,10 +78,10 @@ class Choice:
 
 def preferences(
     layers: Sequence[Layer],
-    rule: SeamRule,
+    wish: SeamWish,
     *,
-    priority: Sequence[str] = (),
     wall: Wall | None = None,
+    balance: Balance | None = None,
 ) -> list[Preference]:
     """Say by a rule how much each layer is preferred in rows of the wall, larger is more.
 
@@ -72,12 +93,12 @@ def preferences(
     Raises:
         MethodError: `priority` names what is no layer of any wall.
     """
-    if rule == "voronoi":
+    if wish.rule == "voronoi":
         return [partial(_rows_of, _depth_inside(layer)) for layer in layers]
-    if rule == "priority":
-        return _by_order(layers, priority)
-    if rule == "graph-cut" and len(layers) > 1:
-        cut = cut_labels(layers, wall)
+    if wish.rule == "priority":
+        return _by_order(layers, wish.priority)
+    if wish.rule == "graph-cut" and len(layers) > 1:
+        cut = cut_labels(layers, wall, balance)
         return [
             partial(_cut_off, layer, index, cut, _best(layers))
             for index, layer in enumerate(layers)
@@ -100,30 +121,11 @@ def require_sources(layers: Sequence[Layer], priority: Sequence[str]) -> None:
         )
 
 
-def joined(
-    layers: tuple[Layer, ...],
-    name: str,
-    *,
-    rule: SeamRule,
-    priority: Sequence[str],
-    wall: Wall | None,
-    island_cells_min: int,
-    allocate: Allocate,
-) -> Orthoimage:
-    """Join the layers of one wall, a large one band by band.
-
-    Args:
-        layers: all of one wall, at least one.
-        name: of the wall.
-        rule: says which layer paints a cell that several show as well.
-        priority: names of photos, for that rule.
-        wall: its surface, for seams off its depth edges, or None.
-        island_cells_min: smaller patches from one source are painted from the source around
-            them, where that one sees them too.
-        allocate: gives the arrays of the orthoimage, by name.
+def require_one_raster(layers: Sequence[Layer], name: str) -> None:
+    """Refuse layers of a wall that do not share one frame.
 
     Raises:
-        MethodError: the layers do not share one frame.
+        MethodError: they do not.
     """
     first = layers[0]
     for layer in layers[1:]:
@@ -132,34 +134,72 @@ def joined(
                 f"the layers {first.source} and {layer.source} of {name} lie on different rasters: "
                 "all layers of a wall must come from the same walls"
             )
-    # What paints nothing is no source; it still tells what is hidden.
-    painters = [layer for layer in layers if holds_cells(layer.mask, LayerMask.PAINTED)]
-    others = [layer for layer in layers if all(layer is not painter for painter in painters)]
-    preferred = preferences(painters, rule, priority=priority, wall=wall) if painters else []
-    shape = first.frame.shape
-    is_deep = any(layer.rgb.dtype == np.uint16 for layer in layers)
-    level: Level = np.uint16 if is_deep else np.uint8
-    rgb: Colours = np.asarray(allocate("rgb", (*shape, 3), level), level)
+
+
+def joined(
+    painters: Sequence[Layer],
+    others: Sequence[Layer],
+    wish: SeamWish,
+    *,
+    wall: Wall | None,
+    balance: Balance | None,
+    allocate: Allocate,
+) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
+    """Say what becomes of each cell of a wall, a large one band by band.
+
+    Args:
+        painters: layers of the wall that paint something.
+        others: layers that paint nothing; they still tell what is hidden.
+        wish: where seams are wanted.
+        wall: its surface, for seams off its depth edges, or None.
+        balance: how colours of the painters are balanced, or None.
+        allocate: gives the arrays of the orthoimage, by name.
+
+    Returns:
+        (rows, cols) `OrthoMask`, and the index of the painter of each cell, `NOBODY` without one.
+    """
+    preferred = preferences(painters, wish, wall=wall, balance=balance) if painters else []
+    shape = [*painters, *others][0].frame.shape
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
-    reach = _island_reach(island_cells_min)
+    reach = _island_reach(wish.island_cells_min)
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
         rows = band.rows
-        choice = _choice_in(band.around, painters, others, preferred, island_cells_min)
+        choice = _choice_in(band.around, painters, others, preferred, wish.island_cells_min)
         mask[rows] = _MASK_OF_RANK[choice.rank[band.inner]]
         source[rows] = choice.source[band.inner]
+    return mask, source
+
+
+def coloured(
+    painters: Sequence[Layer],
+    source: NDArray[np.int16],
+    balance: Balance | None,
+    *,
+    allocate: Allocate,
+) -> Colours:
+    """Take the colour (rows, cols, 3) of each cell from its layer, a large wall band by band.
+
+    Args:
+        painters: layers of the wall that paint something.
+        source: (rows, cols) index of the painter of each cell, `NOBODY` without one.
+        balance: how their colours are balanced; None leaves them untouched.
+        allocate: gives the array.
+    """
+    is_deep = any(layer.rgb.dtype == np.uint16 for layer in painters)
+    level: Level = np.uint16 if is_deep else np.uint8
+    rgb: Colours = np.asarray(allocate("rgb", (*source.shape, 3), level), level)
+    cells_most = _BAND_CELLS if balance is None else _BALANCED_CELLS
+    for band in bands_with_reach(source.shape, cells_most=cells_most, reach_rows=0):
+        rows = band.rows
         for index, layer in enumerate(painters):
             is_mine = source[rows] == index
-            rgb[rows][is_mine] = in_levels(layer.rgb[rows][is_mine], level)
-    return Orthoimage(
-        frame=first.frame,
-        wall=first.wall,
-        name=name,
-        rgb=rgb,
-        mask=mask,
-        source=source,
-        sources=tuple(layer.source for layer in painters),
-    )
+            colours = in_levels(layer.rgb[rows][is_mine], level)
+            if balance is not None and len(colours):
+                down, columns = np.nonzero(is_mine)
+                colours = balance.shown(index, colours, down + rows.start, columns)
+            rgb[rows][is_mine] = colours
+    return rgb
 
 
 def _choice_in(

@@ -43,6 +43,8 @@ _UP: Final = np.array([0.0, 0.0, 1.0])
 _JPEG_QUALITY: Final = 95
 # A focal length as files state it is off by up to so much.
 _EXIF_ERROR: Final = 0.02
+# Levels go about with this root of the light.
+_GAMMA: Final = 2.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,11 +91,13 @@ class Film:
         noise_grey: standard deviation of a pixel and channel.
         vignetting: share of the light that is lost in the corners.
         supersample: rays per side of a pixel.
+        exposures: photos get between 1 less and 1 plus this times the light.
     """
 
     noise_grey: float
     vignetting: float
     supersample: int
+    exposures: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,11 +172,15 @@ def take_photos(
     if not shots:
         return Photos(photos=())
     exif_focal = shots[0].camera.fx * (1.0 + rng.uniform(-_EXIF_ERROR, _EXIF_ERROR))
+    # Of a stream of their own: photos of one exposure stay what they were.
+    light = 1.0 + film.exposures * rng.spawn(1)[0].uniform(-1.0, 1.0, len(shots))
     photos = []
     for place, shot in enumerate(shots):
         ctx.progress(0.5 + 0.5 * place / len(shots), f"photo {place + 1} of {len(shots)}")
         seed = int(rng.integers(0, 2**62))
         image = views.expose(shot.camera, supersample=film.supersample, seed=seed)
+        if film.exposures > 0.0:
+            image *= np.float32(light[place] ** (1.0 / _GAMMA))
         photos.append(
             Photo(
                 name=shot.name,

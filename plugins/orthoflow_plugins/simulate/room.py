@@ -167,6 +167,12 @@ class SimulateRoom(Method):
         photo_vignetting_share: float = Field(
             0.1, ge=0.0, le=0.9, description="Share of the light lost in the corners of a photo."
         )
+        photo_exposure_share: float = Field(
+            0.0,
+            ge=0.0,
+            le=0.9,
+            description="Photos get between 1 less and 1 plus this times the light.",
+        )
         photo_supersample: int = Field(
             2, ge=1, le=8, description="A pixel is the mean of so many rays squared."
         )
@@ -239,8 +245,9 @@ class SimulateRoom(Method):
         views = SceneCameras(room.scene, cores=ctx.cores)
         photos = take_photos(views, shots, _film(params), ctx, photo_rng)
         cloud = cloud_of(delivery)
-        # Of rooms as designed, records do not change.
-        left_out = {"decoration"} if params.decoration == "designed" else set()
+        # Of rooms as they always were, records do not change.
+        added = {"decoration": "designed", "photo_exposure_share": 0.0}
+        left_out = {name for name, before in added.items() if getattr(params, name) == before}
         told = params.model_dump(mode="json", exclude=left_out)
         truth = truth_of(delivery, cloud, shots, told)
         report_room(truth, cloud, ctx)
@@ -275,6 +282,7 @@ def _film(params: SimulateRoom.Params) -> Film:
         noise_grey=params.photo_noise_grey,
         vignetting=params.photo_vignetting_share,
         supersample=params.photo_supersample,
+        exposures=params.photo_exposure_share,
     )
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from orthoflow_plugins.mosaic import graph_cut
-from orthoflow_plugins.mosaic.graph_cut import Blocks, CutLabels
+from orthoflow_plugins.mosaic import blocks, graph_cut
+from orthoflow_plugins.mosaic.blocks import Blocks
+from orthoflow_plugins.mosaic.depth_edges import depth_edges
+from orthoflow_plugins.mosaic.graph_cut import CutLabels
 
 
 @pytest.mark.parametrize("length", range(1, 40))
@@ -13,7 +15,7 @@ from orthoflow_plugins.mosaic.graph_cut import Blocks, CutLabels
 def test_blocks_are_the_same_from_either_end_and_about_as_large_as_wanted(
     length: int, part: int
 ) -> None:
-    edges = graph_cut._symmetric_edges(length, part)
+    edges = blocks._symmetric_edges(length, part)
     sides = np.diff(edges)
     assert (edges[0], edges[-1]) == (0, length)
     np.testing.assert_array_equal(sides, sides[::-1])
@@ -44,10 +46,10 @@ def test_a_depth_edge_is_a_step_of_more_than_three_centimetres_right_or_down() -
     depth_m[2:, 0] = -0.029
     expected = np.zeros((4, 5), dtype=np.bool_)
     expected[:, 2] = True
-    np.testing.assert_array_equal(graph_cut.depth_edges(depth_m), expected)
+    np.testing.assert_array_equal(depth_edges(depth_m), expected)
     depth_m[2:, 0] = -0.031
     expected[1, 0] = expected[2:, 0] = True
-    np.testing.assert_array_equal(graph_cut.depth_edges(depth_m), expected)
+    np.testing.assert_array_equal(depth_edges(depth_m), expected)
 
 
 def scene(edges: tuple[float, float] = (0.0, 0.0)) -> graph_cut._Scene:

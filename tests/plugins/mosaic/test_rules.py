@@ -1,4 +1,4 @@
-"""`mosaic.seams`: where seams lie by each rule, and what gains do to colours."""
+"""`mosaic.seams`: where seams lie by each rule."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic.gains import estimate_gains
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.errors import MethodError
@@ -42,7 +41,7 @@ def mosaic(
     ctx = scenes.context(folder)
     out = MosaicSeams().run(
         MosaicSeams.In(layers=Layers(layers=layers), walls=walls),
-        MosaicSeams.Params.model_validate({"island_cells_min": 1} | params),
+        MosaicSeams.Params.model_validate({"island_cells_min": 1, "gains": "none"} | params),
         ctx,
     )
     metrics = {metric.name: metric.value for metric in ctx.metrics}
@@ -115,24 +114,3 @@ def test_a_graph_cut_keeps_off_depth_edges(tmp_path: Path) -> None:
     depth[:, 100:] = 0.1
     _, best, _ = mosaic(tmp_path, left, right, walls=walls)
     assert best["seam_on_depth_edge_share"] == 1.0
-
-
-def test_gains_bring_overlaps_together_and_are_reported(tmp_path: Path) -> None:
-    rng = np.random.default_rng(6)
-    light = rng.uniform(0.1, 0.5, (*SHAPE, 3))
-    bright, dark = (
-        np.rint(255.0 * (scale * light) ** (1.0 / 2.2)).astype(np.uint8) for scale in (1.0, 0.6)
-    )
-    left, right = layer("left", (0, 100), bright), layer("right", (20, 120), dark)
-    plain, before, details = mosaic(tmp_path, left, right)
-    assert details == {}
-    np.testing.assert_array_equal(plain.rgb[:, :100], bright[:, :100])
-    _, after, details = mosaic(tmp_path, left, right, gains="global")
-    assert after["seam_step_rms_grey"] < 0.25 * before["seam_step_rms_grey"]
-    gains = estimate_gains([left, right])
-    # The prior takes back a few percent of the ratio.
-    np.testing.assert_allclose(gains[1] / gains[0], 1.0 / 0.6, rtol=0.06)
-    np.testing.assert_allclose(gains[0] * gains[1], 1.0, rtol=1e-6)
-    assert set(details) == {"gains"}
-    assert after["gain_max"] == pytest.approx(gains.max(), abs=1e-3)
-    assert after["gain_min"] == pytest.approx(gains.min(), abs=1e-3)

@@ -42,7 +42,7 @@ def random_layer(seed: int, *, wall: int = 0, filled: bool = True) -> Layer:
 
 
 def joined(layers: Layers, folder: Path, *, island_cells_min: int = 1) -> Orthoimages:
-    params = MosaicSeams.Params(island_cells_min=island_cells_min)
+    params = MosaicSeams.Params(island_cells_min=island_cells_min, gains="none")
     ctx = scenes.context(folder)
     return MosaicSeams().run(MosaicSeams.In(layers=layers), params, ctx).orthoimages
 
@@ -141,7 +141,7 @@ def test_shares_of_all_states_are_reported(tmp_path: Path) -> None:
     layers = Layers(layers=(random_layer(1), random_layer(2)))
     ctx = scenes.context(tmp_path)
     inputs = MosaicSeams.In(layers=layers)
-    params = MosaicSeams.Params(island_cells_min=1)
+    params = MosaicSeams.Params(island_cells_min=1, gains="none")
     (image,) = MosaicSeams().run(inputs, params, ctx).orthoimages.images
     metrics = {metric.name: metric.value for metric in ctx.metrics}
     assert metrics.pop("n_orthoimages") == 1

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic import gains
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 from orthoflow_plugins.ortho.dsm_backward import DsmBackward
 from orthoflow_plugins.ortho.dsm_forward import DsmForward
@@ -248,7 +247,8 @@ def test_bands_do_not_show_in_mosaics_nor_in_what_is_told_of_them(
     told = []
     for band_cells in (1 << 24, 270 * 70):
         monkeypatch.setattr(bands, "_BAND_CELLS", band_cells)
-        monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", band_cells)
+        for name in ("_BAND_CELLS", "_BALANCED_CELLS"):
+            monkeypatch.setattr(f"orthoflow_plugins.mosaic.joining.{name}", band_cells)
         ctx = context(tmp_path)
         inputs = MosaicSeams.In(layers=Layers(layers=layers))
         chosen = MosaicSeams.Params.model_validate(params | {"island_cells_min": 4})
@@ -258,16 +258,6 @@ def test_bands_do_not_show_in_mosaics_nor_in_what_is_told_of_them(
     assert metrics == others
     for name in ("rgb", "mask", "source"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(banded, name))
-
-
-def test_an_overlap_is_sampled_as_if_it_lay_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(5)
-    first, second = (rng.integers(0, 3, (97, 50), dtype=np.uint8) for _ in range(2))
-    both = np.flatnonzero((first == LayerMask.PAINTED) & (second == LayerMask.PAINTED))
-    monkeypatch.setattr(gains, "_SAMPLES_MOST", 70)
-    monkeypatch.setattr(bands, "_BAND_CELLS", 50 * 4)
-    sampled = gains._sampled_overlap(first, second)
-    np.testing.assert_array_equal(sampled, both[:: len(both) // 70])
 
 
 @pytest.mark.usefixtures("small_bands")
