@@ -13,7 +13,7 @@ from orthoflow.files.calibration import read_calibration
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import count_e57_images
-from orthoflow.files.images import PHOTO_SUFFIXES
+from orthoflow.files.images import HOW_TO_DEVELOP, PHOTO_SUFFIXES, RAW_SUFFIXES
 from orthoflow.files.points.formats import FORMATS, TEXT, open_scan
 from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.sdk.lines import text_of_path
@@ -90,6 +90,9 @@ def _file(path: Path) -> Recognised:
         return Recognised(kind="other", path=path, said="an orthoimage with its frame beside it")
     if suffix in PHOTO_SUFFIXES:
         return Recognised(kind="photos", path=path, said="a photo", n_photos=1)
+    if suffix in RAW_SUFFIXES:
+        said = f"camera raw, which is not read: {HOW_TO_DEVELOP}"
+        return Recognised(kind="unknown", path=path, said=said)
     readers: dict[str, Callable[[Path], Recognised]] = {
         **dict.fromkeys(TEXT.suffixes, _table),
         **dict.fromkeys(_SCAN_SUFFIXES, _scan),

@@ -61,6 +61,7 @@ def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / "ties.csv").write_text(TIES)
     (folder / "notes.txt").write_text("1 2 3\n4 5 6\n")
     (folder / "plan.dwg").write_bytes(b"AC1027")
+    (folder / "IMG_7.CR2").write_bytes(b"II*\0")
     return folder
 
 
@@ -88,6 +89,7 @@ def test_a_folder_becomes_a_workflow_that_is_fine_as_it_is(data: Path) -> None:
     assert "ties: ties.csv, 1 tie" in out
     assert "not used: notes.txt: text, left out beside scans of other formats" in out
     assert "not used: plan.dwg: no method reads such files" in out
+    assert "not used: IMG_7.CR2: camera raw, which is not read: develop to TIFF of 16 bits" in out
     assert "next: orthoflow check jobs/hall 1.yaml" in out
 
 

@@ -17,18 +17,19 @@ from orthoflow.files.containers import image_format, is_cut_off, stated_bits
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57Image, read_e57_images
 from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
-from orthoflow.files.images import PHOTO_SUFFIXES, decode_image, decode_levels
+from orthoflow.files.images import (
+    HOW_TO_DEVELOP,
+    PHOTO_SUFFIXES,
+    RAW_SUFFIXES,
+    decode_image,
+    decode_levels,
+)
 from orthoflow.files.panoramas import PanoramaFace, faces_of
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Calibration, InputFiles, Intrinsics, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.figures import ContactSheet
 
-# What cameras call their raw photos.
-_RAW: Final = frozenset(
-    {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef"}
-    | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
-)
 # Bits per channel that orthoimages can have.
 _BITS: Final = 16
 _PLAIN_BITS: Final = 8
@@ -208,13 +209,12 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
     raw = [
         name
         for name in others
-        if Path(name).suffix.lower() in _RAW and Path(name).stem.lower() not in developed
+        if Path(name).suffix.lower() in RAW_SUFFIXES and Path(name).stem.lower() not in developed
     ]
     if raw:
         raise InputError(
-            f"the input {input_name} holds camera raw, which is not read: {_counted(raw)}; develop "
-            "to TIFF of 16 bits or JPEG first, without lens corrections, so that a calibration "
-            "holds, or name the photos without it, e.g. 'FOLDER/*.jpg'"
+            f"the input {input_name} holds camera raw, which is not read: {_counted(raw)}; "
+            f"{HOW_TO_DEVELOP}, or name the photos without it, e.g. 'FOLDER/*.jpg'"
         )
 
 
