@@ -7,8 +7,8 @@
 
 Each recipe runs into `FOLDER/<recipe>` on its simulated room, as `orthoflow run <recipe>.yaml` does
 it, unless that folder holds a finished run; a single report of all of them goes to
-`FOLDER/report.html`. Best values are bold where a metric has a good side. Processor seconds are
-without loading and compiling; docs/performance.md measures speed.
+`FOLDER/report.html`. Best values, and what is not told apart from them, are bold where a metric has
+a good side. Processor seconds are without loading and compiling; docs/performance.md has times.
 """
 
 from __future__ import annotations
@@ -128,11 +128,11 @@ def finished_run(folder: Path, recipe: str) -> Run:
 
 
 def markdown(combinations: Sequence[Combination], names: Mapping[str, str]) -> list[str]:
-    """Print a table: a row per combination, a column per metric, the best in bold."""
+    """Print a table: a row per combination, a column per metric, the best and its like in bold."""
     steps = tuple(dict.fromkeys(step for one in combinations for step in one.assignment))
     columns = [
-        rank([value_of(one, key) for one in combinations], sense_of(key.partition(".")[2]))
-        for key in names
+        rank([value_of(one, key) for one in combinations], sense_of(metric), metric)
+        for key, metric in ((key, key.partition(".")[2]) for key in names)
     ]
     header = [*steps, *names.values()]
     lines = [line(header), line(["---"] * len(steps) + ["---:"] * len(names))]
@@ -160,7 +160,7 @@ def value_of(one: Combination, key: str) -> Value:
 def printed(value: Value) -> str:
     if not value.text:
         return "-"
-    return f"**{value.text}**" if value.mark is Mark.BEST else value.text
+    return f"**{value.text}**" if value.mark in (Mark.BEST, Mark.NEAR) else value.text
 
 
 def line(places: Sequence[str]) -> str:

@@ -6,8 +6,9 @@
 `FOLDER/3` ... with the step forced; runs that are there already are taken as they are. Each run is
 laid beside the one before it: every `*_s` of the step's cells but `compile_s`, where one of the two
 exceeds 0.2 s. Printed are those that differ by more than 30 %, and for each time in which order it
-puts the variants, medians of their repeats, and which of them change places. On a machine that does
-other things too, only `cpu_s` says something of the methods: the load is printed beside.
+puts the variants, medians of their repeats, and which of them change places: what differs by less
+is not told apart, neither here nor by a report. On a machine that does other things too, only
+`cpu_s` and `*_cpu_s` say something of the methods: the load is printed beside.
 """
 
 from __future__ import annotations
@@ -95,12 +96,15 @@ def print_orders(before: Times, after: Times) -> None:
             for pair in combinations(sorted(first.keys() & second.keys()), 2)
             if (first[pair[0]] < first[pair[1]]) != (second[pair[0]] < second[pair[1]])
         }
-        if swaps:
-            furthest = max(swaps, key=lambda pair: swaps[pair])
-            print(
-                f"  {len(swaps)} pairs change places; furthest apart of them, x "
-                f"{swaps[furthest]:.2f}: {' and '.join(furthest)}"
-            )
+        apart_of = [max(apart(first, pair), apart(second, pair)) for pair in combinations(first, 2)]
+        n_apart = sum(ratio > FURTHEST for ratio in apart_of)
+        moved = sorted((pair for pair in swaps if swaps[pair] > FURTHEST), key=swaps.__getitem__)
+        print(
+            f"  {len(moved)} of {n_apart} pairs that are further apart change places, and "
+            f"{len(swaps) - len(moved)} of {len(apart_of) - n_apart} nearer ones"
+        )
+        for pair in moved:
+            print(f"  x {swaps[pair]:.2f}: {' and '.join(pair)}")
 
 
 def medians(times: Times, name: str) -> dict[str, float]:

@@ -203,6 +203,7 @@ class _Call:
             listen=listen,
             is_cancelled=is_cancelled,
             clock_s=meter.clock_s,
+            processor_s=self._cpu_s,
         )
 
     @property

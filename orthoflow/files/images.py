@@ -25,9 +25,7 @@ RAW_SUFFIXES: Final = frozenset(
     {".3fr", ".arw", ".cr2", ".cr3", ".dng", ".iiq", ".nef"}
     | {".nrw", ".orf", ".pef", ".raf", ".raw", ".rw2", ".srw"}
 )
-HOW_TO_DEVELOP: Final = (
-    "develop to TIFF of 16 bits or JPEG first, without lens corrections, so that a calibration holds"
-)
+HOW_TO_DEVELOP: Final = "develop to TIFF of 16 bits or JPEG first, without lens corrections"
 PREVIEW_SIDE_PX: Final = 1600
 # 800 MB as RGB: twice what the largest sensors have. A PNG of a hundred kilobytes can state more.
 MOST_PIXELS: Final = 1 << 28

@@ -269,15 +269,11 @@ def _remark(one: Combination) -> str:
 
 def _ranked(rows: Sequence[Row], columns: Sequence[Column]) -> tuple[Row, ...]:
     by_column = [
-        rank(
-            [row.values[index] for row in rows],
-            column.sense,
-            is_cost=column.metric.endswith(("_s", "_mib")),
-        )
+        rank([row.values[index] for row in rows], column.sense, column.metric)
         for index, column in enumerate(columns)
     ]
-    times = rank([row.time for row in rows], Sense.LESS, is_cost=True)
-    memories = rank([row.memory for row in rows], Sense.LESS, is_cost=True)
+    times = rank([row.time for row in rows], Sense.LESS, "wall_s")
+    memories = rank([row.memory for row in rows], Sense.LESS, "peak_rss_mib")
     return tuple(
         replace(
             row,

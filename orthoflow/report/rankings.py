@@ -10,9 +10,10 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 # Without repeats nobody knows how far values of the same method lie apart. What is nearer than this
-# share of the best is no difference then; times and memory of one run scatter more.
+# share of the best is no difference then; times and memory scatter more, times from run to run by
+# so much (docs/performance.md), whatever their repeats in one run say.
 _ALIKE_SHARE: Final = 0.01
-_ALIKE_COST_SHARE: Final = 0.1
+_ALIKE_COST_SHARES: Final = {"_s": 0.3, "_mib": 0.1}
 
 
 class Mark(Enum):
@@ -45,12 +46,18 @@ class Value:
     note: str = ""
 
 
-def rank(values: Sequence[Value], sense: Sense, *, is_cost: bool = False) -> list[Value]:
+def rank(values: Sequence[Value], sense: Sense, metric: str = "") -> list[Value]:
     """Mark the best and the worst of each group; a group whose values are all alike has neither.
 
     A value whose distance from the best is not above both their standard deviations together (in
-    quadrature), or without repeats not above a hundredth of the best (a tenth of a cost), is marked
-    as near the best and never as worst; the best is then only among the best, too.
+    quadrature), or without repeats not above a hundredth of the best (repeats or not a tenth of a
+    memory, three tenths of a time), is marked as near the best and never as worst; the best is then
+    only among the best, too.
+
+    Args:
+        values: a column.
+        sense: what makes its values good.
+        metric: whose values they are.
     """
     if sense is Sense.NEITHER:
         return list(values)
@@ -70,7 +77,7 @@ def rank(values: Sequence[Value], sense: Sense, *, is_cost: bool = False) -> lis
             for index in members
             if scores[index] != scores[best]
             and abs(values[index].sort - values[best].sort)
-            <= _spread(values[index], values[best], is_cost=is_cost)
+            <= _spread(values[index], values[best], metric)
         }
         if len(near) == sum(scores[index] != scores[best] for index in members):
             continue
@@ -86,11 +93,11 @@ def rank(values: Sequence[Value], sense: Sense, *, is_cost: bool = False) -> lis
     return marked
 
 
-def _spread(one: Value, other: Value, *, is_cost: bool) -> float:
+def _spread(one: Value, other: Value, metric: str) -> float:
     known = [value.spread for value in (one, other) if math.isfinite(value.spread)]
-    if known:
-        return math.hypot(*known)
-    return (_ALIKE_COST_SHARE if is_cost else _ALIKE_SHARE) * abs(other.sort)
+    costs = [share for end, share in _ALIKE_COST_SHARES.items() if metric.endswith(end)]
+    share = max([*costs, 0.0 if known else _ALIKE_SHARE])
+    return max(math.hypot(*known), share * abs(other.sort))
 
 
 class Sense(Enum):

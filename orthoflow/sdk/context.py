@@ -82,6 +82,8 @@ class StepContext:
         clock_s: seconds as `time.perf_counter`, which stand still while modules are loaded and
             kernels compiled: what a method measures of its own speed must not hang on what ran
             before. The engine states that time as `compile_s`.
+        processor_s: processor seconds of all threads, and of processes that have ended, without
+            those of loading and compiling: what is left to compare where others use the machine.
         metrics: what `metric` collected.
         figures: what `figure` collected.
         warnings: what `warn` collected.
@@ -93,6 +95,7 @@ class StepContext:
     listen: Callable[[StepEvent], None] = _ignore
     is_cancelled: Callable[[], bool] = _never
     clock_s: Callable[[], float] = time.perf_counter
+    processor_s: Callable[[], float] = time.process_time
     metrics: list[Metric] = field(default_factory=list)
     figures: list[DrawnFigure] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)

@@ -25,7 +25,7 @@ from orthoflow.workflow.format import (
 )
 from orthoflow.workflow.inputs import some_of
 from orthoflow.workflow.problems import ProblemLog
-from orthoflow.workflow.shapes import TEXT
+from orthoflow.workflow.shapes import TEXT, place_of
 from orthoflow.workflow.steps import DraftStep
 
 Assignment: TypeAlias = dict[str, str]
@@ -221,7 +221,8 @@ def _read_metrics(
         elif not _has_wildcard(metric):
             problem = _unknown_metric(metric, [one for one in steps if fnmatchcase(one.name, step)])
         if entry and problem:
-            log.add(entry.value.position, join(COMPARE.name, METRICS.name), problem)
+            place = place_of(pattern, entry.value)
+            log.add(place, join(COMPARE.name, METRICS.name), problem)
     return patterns
 
 

@@ -90,12 +90,10 @@ def _file(path: Path) -> Recognised:
         return Recognised(kind="other", path=path, said="an orthoimage with its frame beside it")
     if suffix in PHOTO_SUFFIXES:
         return Recognised(kind="photos", path=path, said="a photo", n_photos=1)
-    if suffix in RAW_SUFFIXES:
-        said = f"camera raw, which is not read: {HOW_TO_DEVELOP}"
-        return Recognised(kind="unknown", path=path, said=said)
     readers: dict[str, Callable[[Path], Recognised]] = {
         **dict.fromkeys(TEXT.suffixes, _table),
         **dict.fromkeys(_SCAN_SUFFIXES, _scan),
+        **dict.fromkeys(RAW_SUFFIXES, _raw),
         **dict.fromkeys(_YAML, lambda file: _read("calibration", file, _calibration_said)),
         **dict.fromkeys(
             _CAMERAS, lambda file: _read("cameras", file, lambda f: _cameras_said([f]))
@@ -105,6 +103,11 @@ def _file(path: Path) -> Recognised:
     if suffix not in readers or (suffix == ".json" and path.name != "cameras.json"):
         return Recognised(kind="unknown", path=path, said="no method reads such files")
     return readers[suffix](path)
+
+
+def _raw(path: Path) -> Recognised:
+    said = f"camera raw, which is not read: {HOW_TO_DEVELOP}"
+    return Recognised(kind="unknown", path=path, said=said)
 
 
 def _scan(path: Path) -> Recognised:

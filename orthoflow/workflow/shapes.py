@@ -434,8 +434,15 @@ class MetricPatterns:
         for text in patterns:
             if text not in fitting:
                 message = f"expected step.metric, * allowed, got {text}"
-                log.add(value.position, path, message)
+                log.add(place_of(text, value), path, message)
         return fitting
+
+
+def place_of(text: str, value: Value) -> Position:
+    """Where a text stands in a list of texts; where the value stands, if it is none."""
+    items = value.items if isinstance(value, Listing) else ()
+    places = (item.position for item in items if isinstance(item, Text) and item.value == text)
+    return next(places, value.position)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -38,7 +38,8 @@ def test_ten_seconds_of_compiling_show_in_compile_s_only(world: World) -> None:
     # What else it loads and compiles takes seconds on a busy machine.
     assert 10.0 <= result.compile_s < 100.0
     assert 0.2 <= metric(result, "kernel_s") <= result.wall_s < 9.0
-    assert result.cpu_s < 9.0
+    # One of the ten seconds is the processor's.
+    assert 0.0 <= metric(result, "kernel_cpu_s") <= result.cpu_s < 0.9
 
 
 def test_loading_shows_in_compile_s_only_and_stops_no_clock_from_a_daemon(world: World) -> None:

@@ -59,8 +59,15 @@ def test_without_repeats_a_hundredth_is_no_difference_and_a_tenth_of_a_cost() ->
     assert marks(of(1.238), of(1.239)) == ["NONE", "NONE"]
     assert marks(of(1.238), of(1.239), of(2.0)) == ["NEAR", "NEAR", "WORST"]
     assert marks(of(1.0), of(1.011), of(2.0)) == ["BEST", "NONE", "WORST"]
-    costs = rank([of(10.0), of(10.9), of(11.1)], Sense.LESS, is_cost=True)
+    costs = rank([of(10.0), of(10.9), of(11.1)], Sense.LESS, "peak_rss_mib")
     assert [value.mark.name for value in costs] == ["NEAR", "NEAR", "WORST"]
+
+
+def test_times_that_another_run_could_turn_round_are_not_told_apart() -> None:
+    for spread in (math.nan, 0.01):
+        times = [of(1.0, spread), of(1.29, spread), of(1.31, spread), of(2.0, spread)]
+        found = rank(times, Sense.LESS, "detection_cpu_s")
+        assert [value.mark.name for value in found] == ["NEAR", "NEAR", "NONE", "WORST"]
 
 
 def test_groups_are_ranked_apart_and_what_is_absent_is_not_ranked() -> None:

@@ -413,6 +413,14 @@ def test_metrics_that_no_method_of_a_step_declares_are_refused(
         f"compare.metrics: step plane reports no metric rsm_mm (did you mean rms_mm?); {whose}",
         f"compare.metrics: step plane reports no metric depth; {whose}",
     ]
+    # Each where it stands in the list.
+    text = GOOD.replace('"*.wall_s"]', "plane.rsm_mm, plane]")
+    write.write_text(text)
+    with pytest.raises(InvalidWorkflowError) as caught:
+        load_workflow(write, catalog)
+    lines = text.splitlines()
+    shown = [lines[item.line - 1][item.column - 1 :] for item in caught.value.problems]
+    assert shown == ["plane.rsm_mm, plane]", "plane]"]
 
 
 def test_what_takes_from_a_step_of_an_unknown_kind_is_no_mistake_of_its_own(

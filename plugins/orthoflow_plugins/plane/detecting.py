@@ -7,8 +7,6 @@ for each. All planes are found in the sample; one pass over all points fits them
 
 from __future__ import annotations
 
-import contextlib
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
@@ -18,7 +16,6 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import angle_between_deg, basis_from_up, omega_phi_deg
-from orthoflow.geometry.threads import start_beside
 from orthoflow.products import Planes, PointCloud, PointLabels, Thickness
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.plane.assembling import Assembly, RawPlane, assemble, warn_of_guesses
@@ -229,8 +226,7 @@ def _found(
 ) -> tuple[PreparedCloud, list[FoundPlane]]:
     """Prepare a cloud, and find, fit and label its planes; reports how long that takes."""
     rules = rules_of(params)
-    moments_s = [ctx.clock_s()]
-    start_beside(_load_charts)
+    moments_s = [_now(ctx)]
     ctx.progress(0.0, "preparing the points")
 
     def prepared(points: PointCloud) -> PreparedCloud:
@@ -245,7 +241,7 @@ def _found(
 
     def heard(part: float, text: str) -> None:
         if text.startswith(_PLANE_FOUND):
-            moments_s.append(ctx.clock_s())
+            moments_s.append(_now(ctx))
         ctx.progress(0.1 + 0.7 * part, text)
 
     whole = prepared(thinned(cloud, params.thinning))
@@ -267,15 +263,14 @@ def _found(
         label(found, whole, rules.find_m)
     if detector.relabel is not None:
         detector.relabel(found, whole)
-    moments_s.append(ctx.clock_s())
-    _report_times(ctx, np.diff(moments_s))
+    moments_s.append(_now(ctx))
+    _report_times(ctx, np.diff(moments_s, axis=0))
     return whole, found
 
 
-def _load_charts() -> None:
-    """Load what draws, which takes as long as some passes: they leave the interpreter free."""
-    with contextlib.suppress(ImportError):
-        importlib.import_module("matplotlib.figure")
+def _now(ctx: StepContext) -> tuple[float, float]:
+    """Give seconds by the clock, and by the processor."""
+    return ctx.clock_s(), ctx.processor_s()
 
 
 def _report_planes(ctx: StepContext, assembly: Assembly, *, n_points: int) -> None:
@@ -310,12 +305,18 @@ def _report_times(ctx: StepContext, passed_s: NDArray[np.float64]) -> None:
 
     Args:
         ctx: takes the metrics.
-        passed_s: seconds up to each plane, and from the last one to the labels of all points.
+        passed_s: (n, 2) seconds up to each plane, and from the last one to the labels of all
+            points; by the clock and by the processor.
     """
-    ctx.metric("detection_s", float(passed_s.sum()), "s")
-    ctx.metric("first_plane_s", float(passed_s[0]), "s")
+    whole_s, first_s = passed_s.sum(axis=0), passed_s[0]
+    ctx.metric("detection_s", whole_s[0], "s")
+    ctx.metric("detection_cpu_s", whole_s[1], "s")
+    ctx.metric("first_plane_s", first_s[0], "s")
+    ctx.metric("first_plane_cpu_s", first_s[1], "s")
     if len(passed_s) > 2:
-        ctx.metric("next_plane_s", float(passed_s[1:-1].mean()), "s")
+        next_s = passed_s[1:-1].mean(axis=0)
+        ctx.metric("next_plane_s", next_s[0], "s")
+        ctx.metric("next_plane_cpu_s", next_s[1], "s")
 
 
 def _report_thickness(ctx: StepContext, found: tuple[Thickness | None, ...]) -> None:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 DETECTOR_METRICS: Final = (
     *("n_planes", "thinning", "labelled_share", "first_share"),
     *("detection_s", "first_plane_s", "next_plane_s"),
+    *("detection_cpu_s", "first_plane_cpu_s", "next_plane_cpu_s"),
     *("rms_mm", "fit_rms_mm", "omega_deg", "phi_deg", "offset_m", "r_m"),
     *("sigma_angle_deg", "sigma_offset_mm", "n_independent"),
     *("skewness", "excess_kurtosis", "within_[123]_sigma"),

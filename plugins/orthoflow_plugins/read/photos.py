@@ -214,7 +214,8 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
     if raw:
         raise InputError(
             f"the input {input_name} holds camera raw, which is not read: {_counted(raw)}; "
-            f"{HOW_TO_DEVELOP}, or name the photos without it, e.g. 'FOLDER/*.jpg'"
+            f"{HOW_TO_DEVELOP}, so that a calibration holds, or name the photos without it, e.g. "
+            "'FOLDER/*.jpg'"
         )
 
 
