@@ -24,9 +24,8 @@ division) and how often a search goes on at most: one that has converged moves n
 The tests of `orthoflow/engine/x.py` are those in `tests/engine`, of a plugin's module those of its
 kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it. Doctests,
 a file of the module's own name and files that name the module go first, in a run of their own that
-has little to collect; then the conformance suite for modules of kinds, its golden results last
-(they hold what a method gives, too, but a killer that knows why a number is right says more); then
-the other files. The first failure ends a run.
+has little to collect; then the conformance suite for modules of kinds; then the other files. The
+first failure ends a run.
 
 A test kills a mutation only when it passes without it: whatever failed is run once more on the
 source as it is. What fails there as well is left out from then on. A run that takes too long
@@ -287,7 +286,6 @@ class Worker:
     timeout_s: float
     budget_s: float
     _broken: list[str] = field(default_factory=list)
-    _stamp: int = 0
 
     @property
     def tree(self) -> Path:
@@ -323,26 +321,27 @@ class Worker:
         """Try a mutation."""
         began = time.monotonic()
         killer = ""
-        for arguments in _runs(mutation, tree):
-            if time.monotonic() - began > self.budget_s:
-                break
-            if killer := self._killer(arguments, mutation, tree):
-                break
+        with self._kernels_without(mutation, tree) as kernels:
+            for arguments in _runs(mutation, tree):
+                if time.monotonic() - began > self.budget_s:
+                    break
+                if killer := self._killer([*arguments, "-x"], mutation, kernels):
+                    break
         return Verdict(mutation=mutation, killer=killer, seconds=time.monotonic() - began)
 
-    def _killer(self, arguments: Sequence[str], mutation: Mutation, tree: Tree) -> str:
+    def _killer(self, arguments: Sequence[str], mutation: Mutation, kernels: Path) -> str:
         """What fails in a run with a mutation and passes without it; else an empty text."""
         while True:
-            with self._mutated(mutation, tree) as kernels:
-                done = self._pytest([*arguments, "-x"], kernels, self.timeout_s)
+            with self._mutated(mutation):
+                done = self._pytest(arguments, kernels, self.timeout_s)
             if done is None:
-                again = self._pytest([*arguments, "-x"], self._kernels, self.timeout_s / 3)
+                again = self._pytest(arguments, self._kernels, self.timeout_s / 3)
                 is_slower = again is not None and again.returncode == _PASSED
                 return f"timeout of {self.timeout_s:.0f} s" if is_slower else ""
             if done.returncode in (_PASSED, _NOTHING_FOUND):
                 return ""
             failed = self._last_failed()
-            again = self._pytest(failed or [*arguments, "-x"], self._kernels, 3600.0)
+            again = self._pytest(failed or arguments, self._kernels, 3600.0)
             if again is not None and again.returncode == _PASSED:
                 return failed[0] if failed else f"pytest: {done.stdout.strip()[-200:]}"
             broken = self._last_failed()
@@ -352,34 +351,40 @@ class Worker:
             self._broken += broken
 
     @contextmanager
-    def _mutated(self, mutation: Mutation, tree: Tree) -> Iterator[Path]:
-        """Change the copy for a while; gives the folder of kernels to use meanwhile."""
+    def _kernels_without(self, mutation: Mutation, tree: Tree) -> Iterator[Path]:
+        """Give a folder of kernels without those that could differ with a mutation."""
+        hanging = tree.kernels_with(tree.name(mutation.path))
+        if not hanging:
+            yield self._kernels
+            return
+        kernels = self.folder / "kernels-mutated"
+        shutil.rmtree(kernels, ignore_errors=True)
+        self._kernels.mkdir(exist_ok=True)
+        shutil.copytree(self._kernels, kernels, copy_function=os.link)
+        _forget(kernels, self.tree, hanging)
+        yield kernels
+        # What else was compiled meanwhile is the same without the mutation.
+        _forget(kernels, self.tree, hanging)
+        for file in kernels.glob("*/*.nb[ci]"):
+            kept = self._kernels / file.relative_to(kernels)
+            kept.parent.mkdir(exist_ok=True)
+            file.replace(kept)
+
+    @contextmanager
+    def _mutated(self, mutation: Mutation) -> Iterator[None]:
+        """Change the copy for a while."""
         target = self.tree / mutation.path
         before = target.stat()
         source = target.read_bytes()
-        hanging = tree.kernels_with(tree.name(mutation.path))
-        kernels = self.folder / "kernels-mutated" if hanging else self._kernels
-        if hanging:
-            shutil.rmtree(kernels, ignore_errors=True)
-            self._kernels.mkdir(exist_ok=True)
-            shutil.copytree(self._kernels, kernels, copy_function=os.link)
-            _forget(kernels, self.tree, hanging)
         try:
             target.write_bytes(mutation.applied(source))
-            # Interpreters know compiled modules by whole seconds and size.
-            self._stamp += 10
-            os.utime(target, (before.st_atime, before.st_mtime + self._stamp))
-            yield kernels
+            # Interpreters and numba know what they have compiled by whole seconds and size.
+            digest = hashlib.sha256(str(mutation).encode()).digest()
+            os.utime(target, (before.st_atime, before.st_mtime + 1 + int.from_bytes(digest[:3])))
+            yield
         finally:
             target.write_bytes(source)
             os.utime(target, ns=(before.st_atime_ns, before.st_mtime_ns))
-            if hanging:
-                # What else was compiled meanwhile is the same without the mutation.
-                _forget(kernels, self.tree, hanging)
-                for file in kernels.glob("*/*.nb[ci]"):
-                    kept = self._kernels / file.relative_to(kernels)
-                    kept.parent.mkdir(exist_ok=True)
-                    file.replace(kept)
 
     def _last_failed(self) -> list[str]:
         found = self.folder / "cache/v/cache/lastfailed"
@@ -437,8 +442,7 @@ def _runs(mutation: Mutation, tree: Tree) -> Iterator[list[str]]:
         yield near
     if kinds := kinds_of(tree, mutation.path):
         named = " or ".join(f"{kind}." for kind in kinds)
-        for which in ("not golden", "golden"):
-            yield ["tests/testing/test_conformance.py", "-k", f"({named}) and {which}"]
+        yield ["tests/testing/test_conformance.py", "-k", named]
     if others:
         yield others
 

@@ -61,6 +61,26 @@ def test_nearly_parallel_planes_meet_nowhere() -> None:
         assert (line_of(up, other) is not None) == meets
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_line_is_its_point_nearest_to_the_origin_and_a_direction_of_length_one(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    normals = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2] + [[0.0, 0.0, 0.0], [0.3, 0.1, -0.2]]
+    first, second = (
+        Plane(normal=normal / np.linalg.norm(normal), offset_m=float(rng.normal()))
+        for normal in normals
+    )
+    line = line_of(first, second)
+    assert line is not None
+    point, direction = line
+    assert np.linalg.norm(direction) == pytest.approx(1.0, abs=1e-12)
+    assert point @ direction == pytest.approx(0.0, abs=1e-12)
+    along = point + np.array([[-3.0], [0.0], [5.0]]) * direction
+    for plane in (first, second):
+        np.testing.assert_allclose(plane.distances_m(along), 0.0, atol=1e-12)
+
+
 def test_parts_of_a_plane_have_edges_of_their_own() -> None:
     floor = np.array([[0.0, 4.0, 0.0], [0.0, 0.0, 0.0], [6.0, 0.0, 0.0], [6.0, 4.0, 0.0]])
 

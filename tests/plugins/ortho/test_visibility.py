@@ -24,6 +24,7 @@ from orthoflow_plugins.ortho.views import (
 from orthoflow_plugins.ortho.visibility_kernels import look_at_cells
 
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.occluders import nothing_in_the_way
 from orthoflow.products import LayerMask
 from tests import ortho_scenes as scenes
@@ -54,7 +55,13 @@ def seen(camera: ViewingCamera, *, is_transparent: bool) -> TileVisibility:
     return seen_of(surface_of(noisy_depths(), is_transparent=is_transparent), camera)
 
 
-def seen_of(surface: Surface, camera: ViewingCamera) -> TileVisibility:
+def seen_of(
+    surface: Surface,
+    camera: ViewingCamera,
+    buffer: DepthBuffer | None = None,
+    *,
+    is_exact: bool = False,
+) -> TileVisibility:
     height, width = scenes.SHAPE
     visible = TileVisibility(
         u=np.empty((height, width), dtype=np.float32),
@@ -63,8 +70,8 @@ def seen_of(surface: Surface, camera: ViewingCamera) -> TileVisibility:
         quality=np.empty((height, width), dtype=np.float32),
         summary=np.empty(8),
     )
-    view = view_of(camera, surface, PARAMS)
-    look_at_cells(view, surface.relief, nothing_in_the_way(camera), visible, 0, 0)
+    view = view_of(camera, surface, PARAMS, is_exact=is_exact)
+    look_at_cells(view, surface.relief, buffer or nothing_in_the_way(camera), visible, 0, 0)
     return visible
 
 
@@ -145,6 +152,35 @@ def test_every_cell_is_hidden_whose_ray_meets_the_relief(aside_m: float) -> None
     ):
         assert least - 1e-3 <= values[painted].min()
         assert values[painted].max() <= most + 1e-3
+
+
+@pytest.mark.parametrize("is_exact", [True, False], ids=["cell-by-cell", "in-blocks"])
+@pytest.mark.parametrize("aside_m", [-0.7, 1.4])
+def test_a_point_hides_what_lies_behind_it_and_the_slab_of_the_wall(
+    aside_m: float, is_exact: bool
+) -> None:
+    where = scenes.frame()
+    camera = scenes.camera(where, aside_m=aside_m)
+    depths = noisy_depths()
+    surface = surface_of(depths, is_transparent=True)
+    free = seen_of(surface, camera, is_exact=is_exact).mask == PAINTED
+    rows, columns = np.nonzero(free)
+    heights = depths[free].astype(np.float64)
+    points = where.world_from_wall(np.column_stack([columns, rows]) + 0.5, heights)
+    towards = camera.centre_world - points
+    # Where the ray to the camera passes the front of the slab, and its depth along the axis there.
+    share = (surface.front_m - heights) / (towards @ where.normal_world)
+    leaves_m = camera.project(points + share[:, None] * towards)[:, 2]
+    for nearest_m in np.quantile(leaves_m, [0.1, 0.5, 0.9]):
+        buffer = nothing_in_the_way(camera)._replace(
+            nearest=np.full((1, 1), nearest_m, dtype=np.float32)
+        )
+        mask = seen_of(surface, camera, buffer, is_exact=is_exact).mask
+        hidden = nearest_m < leaves_m - surface.tolerance_m
+        # The buffer is float32: at 2 m it knows a quarter of a micrometre.
+        is_clear = np.abs(nearest_m - (leaves_m - surface.tolerance_m)) > 1e-6
+        assert 0.05 < hidden.mean() < 0.95
+        np.testing.assert_array_equal((mask[free] == OCCLUDED)[is_clear], hidden[is_clear])
 
 
 def test_without_visibility_only_void_and_the_frame_of_the_photo_count() -> None:
