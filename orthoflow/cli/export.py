@@ -9,7 +9,6 @@ import click
 
 from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.exports.choices import Choices
-from orthoflow.cli.exports.drawing_options import drawing_options
 from orthoflow.cli.exports.formats import FORMATS, check_choices
 from orthoflow.cli.exports.products import make_empty
 from orthoflow.cli.failures import EXIT_GOOD
@@ -69,7 +68,41 @@ _HELP: Final = "\n\n".join(
     metavar="URL",
     help="ro-crate: the license of the results, its URL or name.",
 )
-@drawing_options
+@click.option(
+    "--scale",
+    type=click.IntRange(min=1, max=100_000),
+    metavar="N",
+    help="sheet: draw at 1:N; without it the largest usual scale at which each wall fits "
+    "onto one sheet.",
+)
+@click.option(
+    "--paper",
+    metavar="PAPER",
+    help="sheet: A0 to A4, or width x height in mm as 700x500; A3 without it. It is turned "
+    "where that saves sheets.",
+)
+@click.option(
+    "--grid",
+    "grid_m",
+    type=click.FloatRange(min=0.0),
+    metavar="METRES",
+    help="sheet: distance of the crosses with coordinates, 0 for none; without it about "
+    "2 cm on the paper.",
+)
+@click.option(
+    "--title-block",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="sheet: YAML file with any of project, title, site, client, organisation, author, "
+    "checked_by, date, drawing, revision, note.",
+)
+@click.option(
+    "--beside",
+    multiple=True,
+    type=click.Choice(["depth", "intensity"]),
+    help="sheet: show depth as contours, or the laser intensity, beside the orthoimage; "
+    "may be given twice.",
+)
 @click.option(
     "--colour",
     type=click.Choice(["photos", "rgb", "intensity", "plane", "deviation"]),

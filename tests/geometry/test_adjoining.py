@@ -66,7 +66,8 @@ def test_a_line_is_its_point_nearest_to_the_origin_and_a_direction_of_length_one
     seed: int,
 ) -> None:
     rng = np.random.default_rng(seed)
-    normals = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2] + [[0.0, 0.0, 0.0], [0.3, 0.1, -0.2]]
+    square = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    normals = (square[0], square[1] + [0.3, 0.1, -0.2])
     first, second = (
         Plane(normal=normal / np.linalg.norm(normal), offset_m=float(rng.normal()))
         for normal in normals

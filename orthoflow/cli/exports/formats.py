@@ -108,11 +108,11 @@ FORMATS: Final[Mapping[str, Format]] = {
         options=frozenset({"cell", "wall"}),
     ),
     "prov": Format(
-        writer="statements:export_prov",
+        writer="results:export_prov",
         summary="W3C PROV-JSON: which products came of which, by which method of which software",
     ),
     "stac": Format(
-        writer="statements:export_stac",
+        writer="results:export_stac",
         summary="the orthoimages with a STAC item beside each, and a collection",
     ),
     "ro-crate": Format(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Literal, TypeAlias, get_args
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, PointLabels
 
 Colouring: TypeAlias = Literal["photos", "rgb", "intensity", "plane", "deviation"]
-COLOURINGS: Final[tuple[str, ...]] = get_args(Colouring)
 # Points at once: ten of their copies take some hundred megabytes.
 BLOCK: Final = 1 << 20
 _SCALE_PERCENT: Final = 99.0
