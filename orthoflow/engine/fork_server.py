@@ -130,7 +130,7 @@ class _Server:
         if not message:
             return False
         text, task_socket, pipe, log = descriptors
-        told = socket.socket(fileno=task_socket)
+        reports = socket.socket(fileno=task_socket)
         with os.fdopen(text, "rb") as stream:
             request = StepRequest(**json.load(stream))
         try:
@@ -138,22 +138,22 @@ class _Server:
         except OSError:
             keeper = NO_PROCESS
         if keeper == 0:
-            self._become_step(request, told, pipe, log)
+            self._become_step(request, reports, pipe, log)
         os.close(pipe)
         os.close(log)
         with suppress(OSError):
-            told.send(NUMBER.pack(keeper))
+            reports.send(NUMBER.pack(keeper))
         if keeper == NO_PROCESS:
-            told.close()
+            reports.close()
             return True
-        self.keepers[keeper] = told
+        self.keepers[keeper] = reports
         process = os.pidfd_open(keeper)
         self.selector.register(process, selectors.EVENT_READ, (keeper, process))
         return True
 
     def _hear_of(self, keeper: int, process: int) -> None:
         """Tell how a keeper has ended; it is reaped once nobody can signal to its number more."""
-        told = self.keepers[keeper]
+        reports = self.keepers[keeper]
         if process >= 0:
             self.selector.unregister(process)
             os.close(process)
@@ -161,11 +161,11 @@ class _Server:
             assert info is not None  # noqa: S101 - it waits
             is_exit = info.si_code == os.CLD_EXITED
             with suppress(OSError):
-                told.send(NUMBER.pack(info.si_status if is_exit else -info.si_status))
-            self.selector.register(told, selectors.EVENT_READ, (keeper, -1))
+                reports.send(NUMBER.pack(info.si_status if is_exit else -info.si_status))
+            self.selector.register(reports, selectors.EVENT_READ, (keeper, -1))
             return
-        self.selector.unregister(told)
-        told.close()
+        self.selector.unregister(reports)
+        reports.close()
         os.waitpid(keeper, 0)
         del self.keepers[keeper]
 
@@ -175,12 +175,14 @@ class _Server:
             known = {*sys.modules, *self.wanted}
             self.wanted += [name for name in names if name in _LIBRARIES and name not in known]
 
-    def _become_step(self, request: StepRequest, told: socket.socket, pipe: int, log: int) -> None:
+    def _become_step(
+        self, request: StepRequest, reports: socket.socket, pipe: int, log: int
+    ) -> None:
         """Go on as the keeper of a step and as the step; never returns."""
         try:
             server = os.getppid()
             os.setsid()
-            for held in (told, self.control, self.learnt[0], *self.keepers.values()):
+            for held in (reports, self.control, self.learnt[0], *self.keepers.values()):
                 held.close()
             for key in list(self.selector.get_map().values()):
                 if isinstance(key.fileobj, int):

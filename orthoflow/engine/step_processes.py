@@ -82,9 +82,9 @@ class StepProcess:
         returncode: as `subprocess` has it, None as long as it runs.
     """
 
-    def __init__(self, told: socket.socket, pid: int) -> None:
+    def __init__(self, reports: socket.socket, pid: int) -> None:
         """Take what a server has forked."""
-        self._told = told
+        self._reports = reports
         self.pid = pid
         self.returncode: int | None = None
         self._silent_since: float | None = None
@@ -96,7 +96,7 @@ class StepProcess:
     @property
     def descriptor(self) -> int:
         """Becomes readable when it ends."""
-        return self._told.fileno()
+        return self._reports.fileno()
 
     def has_ended(self) -> bool:
         """Whether it has ended."""
@@ -104,10 +104,10 @@ class StepProcess:
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for its end; False when it goes on."""
-        if self.returncode is None and _is_readable(self._told, timeout_s):
-            told = _hear(self._told)
+        if self.returncode is None and _is_readable(self._reports, timeout_s):
+            code = _hear(self._reports)
             # When the server is killed, it takes its keepers with it.
-            self.returncode = -signal.SIGKILL if told is None else told
+            self.returncode = -signal.SIGKILL if code is None else code
         elif self._process is not None and _is_readable(self._process, 0):
             self._wait_for_word()
         return self.returncode is not None
@@ -130,7 +130,7 @@ class StepProcess:
 
     def close(self) -> None:
         """Let the server reap it: its number may belong to others from now on."""
-        self._told.close()
+        self._reports.close()
         if self._process is not None:
             os.close(self._process)
 
@@ -189,17 +189,17 @@ class _Server:
         Raises:
             ChildProcessError: the server lives, but got no process for it.
         """
-        told, given = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        reports, given = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with given:
             try:
                 socket.send_fds(self.control, [b"s"], [request, given.fileno(), pipe, log])
             except OSError:
-                told.close()
+                reports.close()
                 return None
-        pid = _hear(told) if _is_readable(told, _START_S) else None
+        pid = _hear(reports) if _is_readable(reports, _START_S) else None
         if pid is not None and pid != NO_PROCESS:
-            return StepProcess(told, pid)
-        told.close()
+            return StepProcess(reports, pid)
+        reports.close()
         if pid == NO_PROCESS:
             raise ChildProcessError
         return None
@@ -297,10 +297,10 @@ def _is_readable(source: socket.socket | int, timeout_s: float) -> bool:
     return bool(waiting.poll(round(timeout_s * 1000)))
 
 
-def _hear(told: socket.socket) -> int | None:
+def _hear(reports: socket.socket) -> int | None:
     """Read a number; None when there is nobody to tell it any more."""
     try:
-        message = told.recv(NUMBER.size)
+        message = reports.recv(NUMBER.size)
     except OSError:
         return None
     return int(NUMBER.unpack(message)[0]) if len(message) == NUMBER.size else None

@@ -126,7 +126,7 @@ class _Document:
         """Give the file."""
         n_images = len(self.images)
         sampler = {"magFilter": _LINEAR, "minFilter": _TRILINEAR}
-        told: dict[str, JsonValue] = {
+        document: dict[str, JsonValue] = {
             "asset": {"version": "2.0", "generator": f"orthoflow {__version__}"},
             "extensionsUsed": ["KHR_materials_unlit"],
             "scene": 0,
@@ -141,7 +141,7 @@ class _Document:
             "bufferViews": self.views,
             "buffers": [{"byteLength": len(self.data)}],
         }
-        text = json.dumps(told, ensure_ascii=False, allow_nan=False).encode()
+        text = json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         head = struct.pack("<III", _MAGIC, 2, 28 + len(text) + len(self.data))
         json_head = struct.pack("<II", len(text), _JSON_CHUNK)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.images import decode_levels, encode_png
 from orthoflow.geometry.levels import Colours
+from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 
 # Rows: right, down and forwards of each face, in the directions of the panorama.
@@ -104,8 +105,8 @@ def face_picture(panorama: Colours, name: str) -> Colours:
     azimuth = np.arctan2(rays[..., 1], rays[..., 0])
     elevation = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
     # OpenCV counts from the centre of the first pixel.
-    columns = width * (0.5 - azimuth / (2.0 * math.pi)) - 0.5
-    rows = height * (0.5 - elevation / math.pi) - 0.5
+    columns = width * (0.5 - azimuth / (2.0 * math.pi)) - HALF_PIXEL
+    rows = height * (0.5 - elevation / math.pi) - HALF_PIXEL
     # Left of the first column is the last; above the first row nothing is nearer than that row.
     framed = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
     looked_up = cv2.remap(

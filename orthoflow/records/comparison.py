@@ -140,7 +140,7 @@ class RunComparison:
     products: tuple[ProductDistance, ...]
 
     def __repr__(self) -> str:
-        told = [
+        differing = [
             f"{sum(not row.is_same for row in rows)} of {len(rows)} {name}"
             for name, rows in (
                 ("inputs", self.inputs),
@@ -149,9 +149,9 @@ class RunComparison:
             )
         ]
         n_products = sum(item.verdict == "different" for item in self.products)
-        told.append(f"{n_products} of {len(self.products)} products")
+        differing.append(f"{n_products} of {len(self.products)} products")
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
-        return f"<RunComparison of {runs}: {', '.join(told)} differ>"
+        return f"<RunComparison of {runs}: {', '.join(differing)} differ>"
 
     def metric_table(self) -> pd.DataFrame:
         """Lay every number of both runs side by side.

@@ -76,8 +76,8 @@ class Run:
 
     def __repr__(self) -> str:
         counts = Counter(cell.status for cell in self.record.cells)
-        told = ", ".join(f"{count} {status}" for status, count in counts.items())
-        return shown(f"<Run {self.record.name} in {self.folder}: {told or 'no cells'}>")
+        statuses = ", ".join(f"{count} {status}" for status, count in counts.items())
+        return shown(f"<Run {self.record.name} in {self.folder}: {statuses or 'no cells'}>")
 
     def metric_rows(self) -> tuple[MetricRow, ...]:
         """Every number of every cell, those that the engine measured included."""

@@ -100,9 +100,9 @@ def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
     for run in runs:
         for name in counts:
             counts[name] += name in run.metrics
-    told = [name for name, count in counts.items() if count]
-    chosen = sorted(told, key=lambda name: -counts[name])[:most]
-    return [name for name in told if name in chosen]
+    known = [name for name, count in counts.items() if count]
+    chosen = sorted(known, key=lambda name: -counts[name])[:most]
+    return [name for name in known if name in chosen]
 
 
 def _below(folder: Path) -> Iterator[Path]:

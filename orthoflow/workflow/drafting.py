@@ -108,11 +108,11 @@ class _Drafting:
             match = _INPUT.fullmatch(line)
             files = taken.get(match[1], ()) if match else ()
             lines.append(self._input_line(match[1], files) if match and files else line)
-        told = {name: _told(files) for name, files in taken.items() if files}
+        described = {name: _described(files) for name, files in taken.items() if files}
         name = re.sub(r"[^A-Za-z0-9_-]+", "-", self.target.stem).strip("-") or self.recipe
         body = re.sub(r"^name: .*$", f"name: {name}", "\n".join(lines), flags=re.MULTILINE)
-        text = f"{self._heading(start, told, left_out)}{body}\n{_without_stand_ins(steps)}"
-        return Draft(recipe=self.recipe, text=text, inputs=told, left_out=left_out)
+        text = f"{self._heading(start, described, left_out)}{body}\n{_without_stand_ins(steps)}"
+        return Draft(recipe=self.recipe, text=text, inputs=described, left_out=left_out)
 
     def _assigned(self, inputs: str) -> tuple[dict[str, Sequence[Recognised]], list[str]]:
         """Which input takes which files, and what is left over."""
@@ -144,18 +144,18 @@ class _Drafting:
         if name == "other":
             places += [_yaml(self._place(path.with_suffix(".json"))) for path in paths]
         if len(places) == 1:
-            return f"  {name}: {{files: {places[0]}}}  # {_seen(_told(items))}"
+            return f"  {name}: {{files: {places[0]}}}  # {_seen(_described(items))}"
         listed = "\n".join(f"      - {place}" for place in places)
-        return f"  {name}:  # {_seen(_told(items))}\n    files:\n{listed}"
+        return f"  {name}:  # {_seen(_described(items))}\n    files:\n{listed}"
 
     def _place(self, path: Path) -> str:
         """A path as the workflow names it: from its folder."""
         relative = os.path.relpath(path.resolve(), self.target.resolve().parent)
         return Path(relative).as_posix()
 
-    def _heading(self, start: str, told: Mapping[str, str], left_out: Sequence[str]) -> str:
+    def _heading(self, start: str, described: Mapping[str, str], left_out: Sequence[str]) -> str:
         said = [f"# Made by `orthoflow new` from the recipe {self.recipe}.yaml."]
-        said += [f"#   {name}: {text}" for name, text in told.items()]
+        said += [f"#   {name}: {text}" for name, text in described.items()]
         said += [f"# Not used: {text}" for text in left_out[:_MOST_LISTED]]
         run = json.dumps(self.target.name)[1:-1]
         said += [
@@ -187,7 +187,7 @@ def _holds_only(folder: Path, suffixes: Sequence[str]) -> bool:
     return all(path.suffix.lower() in suffixes for path in folder.iterdir() if path.is_file())
 
 
-def _told(items: Sequence[Recognised]) -> str:
+def _described(items: Sequence[Recognised]) -> str:
     """What some files are, in one line."""
     if len(items) == 1:
         return f"{_word(items[0].path.name)}, {items[0].said}"

@@ -27,8 +27,8 @@ def write_viewer(folder: Path, images: Mapping[str, OrthoFile]) -> None:
     Raises:
         StoreError: the file cannot be written.
     """
-    told = [_image(name, ortho) for name, ortho in images.items()]
-    text = json.dumps(told, allow_nan=False)
+    described = [_image(name, ortho) for name, ortho in images.items()]
+    text = json.dumps(described, allow_nan=False)
     # Names come from records, and the page must not end within one.
     for letter in "<>&":
         text = text.replace(letter, f"\\u{ord(letter):04x}")

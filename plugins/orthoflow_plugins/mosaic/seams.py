@@ -334,9 +334,9 @@ def _tell_of_empty(ctx: StepContext, image: Orthoimage) -> None:
     shares = {state: count_cells(image.mask, state) / image.mask.size for state in words}
     if shares[OrthoMask.NONE] + shares[OrthoMask.OCCLUDED] < _EMPTY_WORTH_WORDS:
         return
-    told = sorted(words, key=lambda state: -shares[state])
+    ordered = sorted(words, key=lambda state: -shares[state])
     causes = "; ".join(
-        f"{shares[state]:.0%} {words[state]}" for state in told if shares[state] >= _CAUSE_LEAST
+        f"{shares[state]:.0%} {words[state]}" for state in ordered if shares[state] >= _CAUSE_LEAST
     )
     ctx.warn(
         f"the orthoimage of {image.name}: {sum(shares.values()):.0%} of its cells are empty: "

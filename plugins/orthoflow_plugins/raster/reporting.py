@@ -94,16 +94,16 @@ def _causes(empty: Emptiness) -> str:
         "are hidden by what stands before the wall (scan from another station, or raise "
         "buffer_front_m if it is relief)"
     )
-    told = [
+    causes = [
         (empty.behind_share, behind),
         (empty.hidden_share, hidden),
         (empty.sparse_share, "lie between the scan's points (raise gsd_m or recover_gap_cells)"),
         (empty.unseen_share, "show nothing that was scanned: glass, or what no station sees"),
     ]
-    told.sort(key=lambda cause: -cause[0])
+    causes.sort(key=lambda cause: -cause[0])
     # Tiles on the rim of a hole belong to it and to what is about it.
     least = max(0.01, 0.1 * empty.share)
-    return "; ".join(f"{share:.0%} {words}" for share, words in told if share >= least)
+    return "; ".join(f"{share:.0%} {words}" for share, words in causes if share >= least)
 
 
 def _sampled(values: NDArray[_Number]) -> NDArray[_Number]:

@@ -248,8 +248,8 @@ class SimulateRoom(Method):
         # Of rooms as they always were, records do not change.
         added = {"decoration": "designed", "photo_exposure_share": 0.0}
         left_out = {name for name, before in added.items() if getattr(params, name) == before}
-        told = params.model_dump(mode="json", exclude=left_out)
-        truth = truth_of(delivery, cloud, shots, told)
+        settings = params.model_dump(mode="json", exclude=left_out)
+        truth = truth_of(delivery, cloud, shots, settings)
         report_room(truth, cloud, ctx)
         report_photos(photos, shots, ctx)
         return self.Out(
