@@ -12,6 +12,8 @@ from numpy.typing import DTypeLike, NDArray
 # Name, shape, type -> zeroed array, in a file that is mapped into memory where it is large.
 Allocate = Callable[[str, tuple[int, ...], DTypeLike], NDArray[np.generic]]
 
+# Finished rasters of more cells lie in files: a site has many walls.
+IN_MEMORY_CELLS: Final = 1 << 22
 # What is made of a band for a moment takes some 16 MB a byte.
 _BAND_CELLS: Final = 1 << 24
 

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from orthoflow.geometry.bands import Allocate, Band, bands_with_reach, count_cells, in_memory
+from orthoflow.geometry.bands import (
+    IN_MEMORY_CELLS,
+    Allocate,
+    Band,
+    bands_with_reach,
+    count_cells,
+    in_memory,
+)
 from orthoflow.geometry.levels import level_of
 from orthoflow.products import Layer, LayerMask, Layers
 from orthoflow.sdk import Determinism, Method, Ports, StepContext
@@ -144,7 +151,7 @@ def _layer(
     if not is_before(view, surface):
         return None
     shape = surface.frame.shape
-    is_large = math.prod(shape) > _BAND_CELLS
+    is_large = math.prod(shape) > IN_MEMORY_CELLS
     catch = _empty_catch(shape, stack.scratch(wall) if is_large else in_memory)
     lattice = _ray_lattice(photo.viewer, surface)
     if not throw_pixels(view, surface.relief, photo.buffer, lattice, catch):

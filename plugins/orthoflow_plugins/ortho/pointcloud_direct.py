@@ -11,6 +11,7 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import (
+    IN_MEMORY_CELLS,
     Band,
     bands_with_reach,
     count_cells,
@@ -185,7 +186,7 @@ def _empty_layer(wall: Wall, index: int, ctx: StepContext) -> Layer:
     shape = wall.frame.shape
 
     def new(name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-        if wall.mask.size <= _BAND_CELLS:
+        if wall.mask.size <= IN_MEMORY_CELLS:
             return in_memory(name, shape, dtype)
         return ctx.allocate("layers", f"{index}.{name}", shape, dtype)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.bands import Allocate, bands_with_reach
+from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, bands_with_reach
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
 from orthoflow_plugins.raster.rules import RasterRule, Surface
@@ -26,8 +26,8 @@ _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 _BYTES_KEPT: Final = 25
 _BYTES_WORKING: Final = 90
 _MEMORY_SHARE: Final = 0.75
-# Larger walls are rastered in bands of so many cells: 3 GB of memory.
-_BAND_CELLS: Final = 1 << 25
+# Larger walls are rastered in bands of so many cells: 1.5 GB of memory.
+_BAND_CELLS: Final = 1 << 24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +45,13 @@ def require_memory(frames: Sequence[WallFrame], surface: Surface) -> None:
         MethodError: the rasters would not fit into memory.
     """
     sizes = [frame.width * frame.height for frame in frames]
-    # What is rastered in bands lies in files, and takes the memory of a band.
-    kept = [
-        size for size, frame in zip(sizes, frames, strict=True) if not _is_banded(frame, surface)
-    ]
-    working = max([*kept, _BAND_CELLS] if len(kept) < len(sizes) else kept)
-    needed = _BYTES_KEPT * sum(kept) + _BYTES_WORKING * working
+    # What is large lies in files once it is done; in bands it takes the memory of a band.
+    kept = sum(size for size in sizes if size <= IN_MEMORY_CELLS)
+    working = max(
+        _BAND_CELLS if _is_banded(frame, surface) else size
+        for size, frame in zip(sizes, frames, strict=True)
+    )
+    needed = _BYTES_KEPT * kept + _BYTES_WORKING * working
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     # Cells are numbered with 32 bits.
     if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
@@ -85,6 +86,8 @@ def rastered_wall(
         raster = _rastered_in_bands(cloud, slab, rule, allocate)
     else:
         raster = _rastered(cloud, slab, rule)
+        if slab.n_cells > IN_MEMORY_CELLS:
+            raster = _in_files(raster, allocate)
     surface, shape = raster.surface, slab.frame.shape
     wall = Wall(
         frame=slab.frame,
@@ -178,15 +181,12 @@ def _rastered_in_bands(
 
     whole: dict[str, NDArray[np.generic]] = {}
     frame, width = slab.frame, slab.frame.width
-    kept = [field.name for field in fields(CellSurface) if field.name != "places"]
     for band in bands_with_reach(frame.shape, cells_most=_BAND_CELLS, reach_rows=rule.reach_rows):
         raster = _rastered(cloud, slab.over(band.around), rule)
         cells = slice(band.rows.start * width, band.rows.stop * width)
         inner = slice(band.inner.start * width, band.inner.stop * width)
-        arrays = {"mask": raster.mask} | {name: getattr(raster.surface, name) for name in kept}
+        arrays = {"mask": raster.mask} | _fields_of(raster.surface)
         for name, values in arrays.items():
-            if values is None:
-                continue
             if name not in whole:
                 shape = (slab.n_cells, *values.shape[1:])
                 whole[name] = allocate(name, shape, values.dtype)
@@ -196,6 +196,24 @@ def _rastered_in_bands(
     # The arrays have the types of the bands' own.
     surface = CellSurface(**cast("dict[str, Any]", absent | whole))
     return _Raster(surface=surface, mask=mask.astype(np.uint8, copy=False))
+
+
+def _in_files(raster: _Raster, allocate: Allocate) -> _Raster:
+    """Move the arrays of a finished raster into files."""
+    kept: dict[str, Any] = {}
+    for name, values in (("mask", raster.mask), *_fields_of(raster.surface).items()):
+        kept[name] = allocate(name, values.shape, values.dtype)
+        kept[name][...] = values
+    mask = kept.pop("mask")
+    return _Raster(surface=replace(raster.surface, **kept), mask=mask)
+
+
+def _fields_of(surface: CellSurface) -> dict[str, NDArray[np.generic]]:
+    """Arrays of a surface that a wall keeps, by name."""
+    found = {field.name: getattr(surface, field.name) for field in fields(surface)}
+    return {
+        name: values for name, values in found.items() if name != "places" and values is not None
+    }
 
 
 def _where_known(

@@ -41,8 +41,9 @@ def small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("orthoflow_plugins.mosaic.agreement._ROWS_AT_ONCE", 64)
     monkeypatch.setattr("orthoflow_plugins.mosaic.joining._BAND_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.mosaic.seams._LONGEST_PX", 100)
-    monkeypatch.setattr("orthoflow_plugins.ortho.dsm_forward._BAND_CELLS", BAND_CELLS)
-    monkeypatch.setattr("orthoflow_plugins.ortho.pointcloud_direct._BAND_CELLS", BAND_CELLS)
+    for place in ("ortho.dsm_forward", "ortho.pointcloud_direct"):
+        monkeypatch.setattr(f"orthoflow_plugins.{place}._BAND_CELLS", BAND_CELLS)
+        monkeypatch.setattr(f"orthoflow_plugins.{place}.IN_MEMORY_CELLS", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.walls._BAND_CELLS", 2 * BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.reporting._CELLS_ASKED", BAND_CELLS)
     monkeypatch.setattr("orthoflow_plugins.raster.reporting._LONGEST_PX", 100)
@@ -271,6 +272,26 @@ def test_walls_are_rastered_and_reported_in_the_memory_of_a_band(tmp_path: Path)
         walls = RasterGrid().run(inputs, params, context(tmp_path)).walls
         # A wall keeps 13 bytes per cell without colours, and a band has a fifteenth of the cells.
         assert peak() < 10.0 * walls.walls[0].mask.size, peak()
+
+
+def test_a_raster_of_several_megacells_lies_in_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = raster_scenes.leaning_wall(shape=(60, 50))
+    places = np.random.default_rng(7).uniform([0, 0], [50, 60], (9_000, 2))
+    points = known.world(*places.T, np.zeros(len(places)))
+    rgb = np.full((len(places), 3), 90, dtype=np.uint8)
+    cloud = raster_scenes.cloud_of(points, rgb=rgb)
+    inputs = RasterGrid.In(cloud=cloud, planes=known.planes())
+    found = []
+    for n_cells in (1 << 22, 100):
+        monkeypatch.setattr("orthoflow_plugins.raster.walls.IN_MEMORY_CELLS", n_cells)
+        params = RasterGrid.Params(gsd_m=known.gsd_m, buffer_m=0.3, percentiles=(50.0,))
+        found.append(RasterGrid().run(inputs, params, context(tmp_path)).walls.walls[0])
+    for name in ("depth_m", "sigma_m", "count", "mask", "intensity", "rgb", "percentiles_m"):
+        one, other = (getattr(wall, name) for wall in found)
+        np.testing.assert_array_equal(one, other, err_msg=name)
+        assert (tmp_path / "allocated" / f"walls.0.{name}").is_file()
 
 
 def test_cells_are_counted_in_bands_as_in_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:

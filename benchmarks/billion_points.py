@@ -1,0 +1,134 @@
+"""From LAZ files to orthoimages: time per point and memory, for one room and for many beside it.
+
+    python benchmarks/great_room.py room
+    python benchmarks/billion_points.py --npy room/room.npy --tiles 1 21 --folder FOLDER
+
+Each file holds the great room, moved along its main wall: 21 files are a suite of 180 m and a billion
+points. They are read, planes found, walls rastered, and the points laid onto them, through the engine.
+Memory is the largest sum of RssAnon over all processes, sampled; files that are mapped do not count.
+The folder takes 18 bytes of store and 4 of files per point; what it held is removed in the end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import shutil
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+from plane_streaming import measured, write_laz
+
+# Along the main wall, right beside each other but for a hand's breadth.
+STEP_M = 8.7
+ALONG = np.array([0.97814760, 0.20791169, 0.0])
+# Where a LAS 1.4 header has the offsets, and the bounds of x, y and z.
+OFFSETS_AT, BOUNDS_AT = 155, 179
+WORKFLOW = """\
+orthoflow: 1
+name: billion
+inputs: {{scan: {{}}}}
+steps:
+  cloud: {{use: read.scan, in: {{files: inputs.scan}}}}
+  plane: {{use: plane.{method}, in: {{cloud: cloud.cloud}}}}
+  wall: {{use: raster.grid, in: {{cloud: cloud.cloud, planes: plane.planes}}}}
+  ortho: {{use: ortho.pointcloud-direct, in: {{walls: wall.walls, cloud: cloud.cloud}}}}
+  mosaic: {{use: mosaic.seams, in: {{layers: ortho.layers}}}}
+"""
+
+
+def main() -> None:
+    """Run the chain for each number of rooms."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--npy", type=Path, required=True, help="(n, 3) float32 points of the room")
+    parser.add_argument("--points", type=int, default=48_000_000, help="of each room")
+    parser.add_argument("--tiles", type=int, nargs="+", default=[1, 21])
+    parser.add_argument("--method", default="hough2d")
+    parser.add_argument("--folder", type=Path, required=True)
+    wanted = parser.parse_args()
+    wanted.folder.mkdir(parents=True, exist_ok=True)
+    first = wanted.folder / "room_00.laz"
+    stored = np.load(wanted.npy, mmap_mode="r")
+    points = stored[:: max(1, round(len(stored) / wanted.points))]
+    if not first.exists():
+        write_laz(first, points)
+    workflow = wanted.folder / "billion.yaml"
+    workflow.write_text(WORKFLOW.format(method=wanted.method))
+    run_small(wanted.folder, workflow, points)
+    per_point = []
+    for n_tiles in wanted.tiles:
+        files = [first, *(beside(first, tile) for tile in range(1, n_tiles))]
+        n_points = n_tiles * len(points)
+        store, out = wanted.folder / "store", wanted.folder / "out"
+        cost = measured(run_command(workflow, files, store, out))
+        per_point.append(cost.cpu_s / n_points)
+        print(
+            f"{n_points} points, {n_tiles} files: {cost.wall_s:.0f} s, processor "
+            f"{cost.cpu_s:.0f} s = {1e9 * per_point[-1]:.0f} ns a point; anonymous "
+            f"{cost.anonymous_mib:.0f} MiB",
+            flush=True,
+        )
+        print_steps(out / "products" / "metrics.csv")
+        for path in (store, out):
+            shutil.rmtree(path)
+        for path in files[1:]:
+            path.unlink()
+    print(f"per point, the last beside the first: {per_point[-1] / per_point[0]:.2f} x")
+    for path in (first, workflow):
+        path.unlink()
+
+
+def run_small(folder: Path, workflow: Path, points: np.ndarray) -> None:
+    """Run the chain on few points, so that nothing is compiled in what is measured."""
+    small, store, out = folder / "small.laz", folder / "small-store", folder / "small-out"
+    write_laz(small, points[:: max(1, len(points) // 300_000)])
+    measured(run_command(workflow, [small], store, out))
+    small.unlink()
+    for path in (store, out):
+        shutil.rmtree(path)
+
+
+def beside(first: Path, tile: int) -> Path:
+    """Copy a file, so many rooms farther: what moves are the offsets and bounds of its header."""
+    path = first.with_name(f"room_{tile:02}.laz")
+    if path.exists():
+        return path
+    shutil.copyfile(first, path)
+    shift = np.round(tile * STEP_M * ALONG, 4)
+    with path.open("r+b") as file:
+        for at, repeat in ((OFFSETS_AT, 1), (BOUNDS_AT, 2)):
+            file.seek(at)
+            values = np.array(struct.unpack(f"<{3 * repeat}d", file.read(24 * repeat)))
+            file.seek(at)
+            # Bounds are largest and smallest of x, then of y, then of z.
+            file.write(struct.pack(f"<{3 * repeat}d", *(values + np.repeat(shift, repeat))))
+    return path
+
+
+def run_command(workflow: Path, files: list[Path], store: Path, out: Path) -> list[str]:
+    """The command that runs the chain."""
+    pattern = files[0].parent / ("room_*.laz" if len(files) > 1 else files[0].name)
+    run = ["run", str(workflow), "--input", f"scan={pattern}", "--store", str(store)]
+    return [sys.executable, "-m", "orthoflow", *run, "-o", str(out)]
+
+
+def print_steps(table: Path) -> None:
+    """Print what each step cost, and what it found."""
+    wanted = {"cpu_s", "wall_s", "peak_rss_mib", "n_points", "n_planes", "n_walls", "compile_s"}
+    with table.open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["metric"] in wanted]
+    for step in dict.fromkeys(row["step"] for row in rows):
+        told = ", ".join(
+            f"{row['metric']} {float(row['value']):.6g}" for row in rows if row["step"] == step
+        )
+        print(f"  {step:7} {told}", flush=True)
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("PYTHONUNBUFFERED", "1")
+    main()
