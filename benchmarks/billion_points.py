@@ -3,10 +3,11 @@
     python benchmarks/great_room.py room
     python benchmarks/billion_points.py --npy room/room.npy --tiles 1 21 --folder FOLDER
 
-Each file holds the great room, moved along its main wall: 21 files are a suite of 180 m and a billion
-points. They are read, planes found, walls rastered, and the points laid onto them, through the engine.
-Memory is the largest sum of RssAnon over all processes, sampled; files that are mapped do not count.
-The folder takes 18 bytes of store and 4 of files per point; what it held is removed in the end.
+Each file holds the great room, moved along its main wall: 21 files are a suite of 180 m and a
+billion points. They are read, planes found, walls rastered, and the points laid onto them, through
+the engine. Memory is the largest sum of RssAnon over all processes, sampled; files that are mapped
+do not count. The folder takes 18 bytes of store and 4 of files per point; what it held is removed
+in the end.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--npy", type=Path, required=True, help="(n, 3) float32 points of the room")
+    parser.add_argument("--npy", type=Path, required=True, help="(n, 3) float32 points")
     parser.add_argument("--points", type=int, default=48_000_000, help="of each room")
     parser.add_argument("--tiles", type=int, nargs="+", default=[1, 21])
     parser.add_argument("--method", default="hough2d")

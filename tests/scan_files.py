@@ -54,6 +54,76 @@ def write_las(
     return path
 
 
+def write_copc(path: Path, levels: Sequence[Mapping[tuple[int, int, int], Any]]) -> Path:
+    """Write points (n, 3) in a cube of side 8 from the origin on, by level and place of their node.
+
+    Points of the root are half a metre apart, it says. The nodes of each level below the first
+    stand in a page of the hierarchy of their own.
+    """
+    import laspy
+    import lazrs
+
+    keys = [(level, *place) for level, nodes in enumerate(levels) for place in nodes]
+    chunks = [np.asarray(levels[level][x, y, z]) for level, x, y, z in keys]
+    record = lazrs.LazVlr.new_for_compression(6, 0, True)
+    plain = path.with_suffix(".las")
+    write_las(plain, np.concatenate(chunks))
+    with laspy.open(plain) as reader:
+        vlrs = [
+            laspy.VLR("copc", 1, "", bytes(160)),
+            laspy.VLR("laszip encoded", 22204, "", bytes(record.record_data())),
+        ]
+        points = reader.read_points(-1).array.tobytes()
+    content = bytearray(plain.read_bytes()[:375])
+    for vlr in vlrs:
+        data = vlr.record_data_bytes()
+        name = vlr.user_id.encode().ljust(16, b"\0")
+        content += struct.pack("<H16sHH32s", 0, name, vlr.record_id, len(data), b"") + data
+    struct.pack_into("<HII", content, 94, 375, len(content), len(vlrs))
+    content[104] |= 0x80
+    with path.open("w+b") as file:
+        file.write(content)
+        compressor = lazrs.LasZipCompressor(file, record)
+        compressor.reserve_offset_to_chunk_table()
+        size, begin, places = len(points) // sum(map(len, chunks)), 0, [file.tell()]
+        for chunk in chunks:
+            if begin:
+                # Also after the last one, it would begin another.
+                compressor.finish_current_chunk()
+                places.append(file.tell())
+            compressor.compress_many(points[begin : begin + size * len(chunk)])
+            begin += size * len(chunk)
+        compressor.done()
+        end_of_file = file.tell()
+        file.seek(len(content))
+        places += struct.unpack("<q", file.read(8))  # the chunk table
+        file.seek(end_of_file)
+        entries = [
+            struct.pack("<4iQii", *key, at, end - at, len(chunk))
+            for key, at, end, chunk in zip(keys, places, places[1:], chunks, strict=False)
+        ]
+        _add_hierarchy(file, [key[0] for key in keys], entries)
+    return path
+
+
+def _add_hierarchy(file: Any, levels: list[int], entries: list[bytes]) -> None:
+    start = file.tell() + 60
+    pages = [
+        b"".join(entries[k] for k in range(len(levels)) if levels[k] == level)
+        for level in range(max(levels) + 1)
+    ]
+    root, at = pages[0], start + len(pages[0]) + 32 * (len(pages) - 1)
+    for level, page in enumerate(pages[1:], start=1):
+        root += struct.pack("<4iQii", level, 0, 0, 0, at, len(page), -1)
+        at += len(page)
+    data = root + b"".join(pages[1:])
+    file.write(struct.pack("<H16sHQ32s", 0, b"copc", 1000, len(data), b"hierarchy") + data)
+    file.seek(235)
+    file.write(struct.pack("<QI", start - 60, 1))
+    file.seek(375 + 54)
+    file.write(struct.pack("<5d2Q", 4.0, 4.0, 4.0, 4.0, 0.5, start, len(root)))
+
+
 def write_e57(
     path: Path, scans: Sequence[Mapping[str, Any]], images: Sequence[Mapping[str, Any]] = ()
 ) -> Path:

@@ -10,6 +10,7 @@ from typing import Final
 from orthoflow.errors import InputError
 from orthoflow.files.points.blocks import MOST_POINTS_PER_BYTE, ScanFile
 from orthoflow.files.points.columns import Columns
+from orthoflow.files.points.copc import Wish
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +78,7 @@ def open_scan(
     *,
     classes: Collection[int] = (),
     cores: int = 1,
+    wish: Wish | None = None,
 ) -> ScanFile:
     """Open a point file as far as its header.
 
@@ -85,12 +87,13 @@ def open_scan(
         columns: what the columns of a text file are, if the user says so.
         classes: of a LAS or LAZ file only points of these classes are given; all when empty.
         cores: processes that may decode points; only large LAZ files use more than one.
+        wish: of a COPC file only parts are read that hold such points; others are read whole.
 
     Raises:
         InputError: the file cannot be read, says what and why in one sentence.
         PluginError: the library for this format is missing.
     """
-    scan = _opened(path, columns, classes=classes, cores=cores)
+    scan = _opened(path, columns, classes=classes, cores=cores, wish=wish)
     n_bytes = path.stat().st_size
     if scan.n_most > MOST_POINTS_PER_BYTE * n_bytes:
         raise InputError(
@@ -101,7 +104,12 @@ def open_scan(
 
 
 def _opened(
-    path: Path, columns: Columns | None, *, classes: Collection[int], cores: int
+    path: Path,
+    columns: Columns | None,
+    *,
+    classes: Collection[int],
+    cores: int,
+    wish: Wish | None,
 ) -> ScanFile:
     found = find_format(path)
     if found is TEXT:
@@ -111,7 +119,7 @@ def _opened(
     if found is LAS:
         from orthoflow.files.points.las import open_las
 
-        return open_las(path, classes=classes, cores=cores)
+        return open_las(path, classes=classes, cores=cores, wish=wish)
     return _openers()[found.name](path)
 
 

@@ -9,18 +9,19 @@ meanwhile. Of a large file other processes decode blocks of whole chunks, in tur
 they share with this one, which converts and stores a block while the next ones are decoded.
 
 Of point formats 6 and up, whose fields are compressed apart, only the fields are decoded that make
-a cloud.
+a cloud. Of a COPC file only those nodes of the octree are decoded that hold points asked for.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import mmap
 import os
 import struct
 import subprocess
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -36,6 +37,7 @@ from orthoflow.files.points.blocks import (
     point_fields,
     short_file_error,
 )
+from orthoflow.files.points.copc import Node, Wish, read_octree
 from orthoflow.files.points.libraries import guarded, load_library, reading
 
 FORMAT: Final = "LAS/LAZ"
@@ -63,13 +65,16 @@ _LARGEST_CHUNK: Final = 2 * BLOCK_POINTS
 _PROCESSES_MOST: Final = 16
 
 
-def open_las(path: Path, *, classes: Collection[int] = (), cores: int = 1) -> ScanFile:
+def open_las(
+    path: Path, *, classes: Collection[int] = (), cores: int = 1, wish: Wish | None = None
+) -> ScanFile:
     """Open a LAS, LAZ or COPC file.
 
     Args:
         path: the file.
         classes: only points of these classes are given; all when empty.
         cores: processes that may decode its points.
+        wish: of a COPC file only the nodes are read that hold such points.
     """
     laspy = load_library("laspy", path)
     _check_header(path)
@@ -84,10 +89,18 @@ def open_las(path: Path, *, classes: Collection[int] = (), cores: int = 1) -> Sc
             "point_format": int(header.point_format.id),
             "scale": float(np.max(header.scales)),
         }
-        if n_points > 0:
-            _check_chunks(path, header)
+        chunks = _checked_chunks(path, header) if n_points > 0 else []
+    nodes: tuple[Node, ...] | None = None
+    octree = read_octree(path, chunks) if wish and chunks else None
+    if octree is not None and wish:
+        nodes = octree.chosen(wish)
+        n_points = sum(node.n_points for node in nodes)
+        details["octree"] = (
+            f"{len(nodes)} of {len(octree.nodes)} nodes, levels 0 to "
+            f"{max(node.level for node in nodes)} of 0 to {octree.deepest}"
+        )
     notes: list[str] = []
-    wanted = _Wanted(n_points=n_points, classes=frozenset(classes), cores=cores)
+    wanted = _Wanted(n_points=n_points, classes=frozenset(classes), cores=cores, nodes=nodes)
     return ScanFile(
         name=path.name,
         format_name=FORMAT,
@@ -106,14 +119,16 @@ class _Wanted:
     """What is read of a file.
 
     Attributes:
-        n_points: that its header states.
+        n_points: that its header states, or its octree for the nodes.
         classes: of the points; empty for all.
         cores: processes that may decode at the same time.
+        nodes: of the octree, in the order of the file; None for all points of the file.
     """
 
     n_points: int
     classes: frozenset[int]
     cores: int
+    nodes: tuple[Node, ...] | None = None
 
 
 def _blocks(
@@ -243,21 +258,24 @@ def _check_header(path: Path) -> None:
             raise _damaged(path, "records at its end are missing, it is cut off")
 
 
-def _check_chunks(path: Path, header: Any) -> None:
+def _checked_chunks(path: Path, header: Any) -> list[tuple[int, int, int]]:
     """Compare the chunk table with the file's size and the header's number of points.
 
     Args:
         path: the file.
         header: laspy's header of it.
 
+    Returns:
+        Offset in the file, bytes and points of each chunk; none without compression by chunks.
+
     Raises:
         InputError: the table cannot belong to this file.
     """
     if not header.are_points_compressed:
-        return
+        return []
     record = header.vlrs[header.vlrs.index("LasZipVlr")].record_data
     if len(record) < 2 or struct.unpack_from("<H", record)[0] not in _CHUNKED:
-        return
+        return []
     lazrs = load_library("lazrs", path)
     compression = lazrs.LazVlr(record)
     if compression.item_size() != header.point_format.size:
@@ -281,6 +299,9 @@ def _check_chunks(path: Path, header: Any) -> None:
         raise _damaged(
             path, f"its chunks hold {n_points} points, its header states {header.point_count}"
         )
+    sizes = [size for _, size in table]
+    begins = itertools.accumulate(sizes, initial=start + _OFFSET_BYTES)
+    return [(begin, size, count) for begin, (count, size) in zip(begins, table, strict=False)]
 
 
 def _is_layered(record: bytes) -> bool:
@@ -376,6 +397,9 @@ def _records(path: Path, laspy: Any, wanted: _Wanted) -> Iterator[Any]:
     if wanted.classes:
         fields = fields.decompress_classification()
     with laspy.open(path, decompression_selection=fields, read_evlrs=False) as reader:
+        if wanted.nodes is not None:
+            yield from _nodes_decoded(path, laspy, reader.header, wanted.nodes, fields.to_lazrs())
+            return
         # Where memory cannot be shared without a name, this process decodes all by itself.
         is_shared_out = wanted.cores > 1 and hasattr(os, "memfd_create")
         layout = _layout(path, reader.header, wanted) if is_shared_out else None
@@ -384,6 +408,33 @@ def _records(path: Path, laspy: Any, wanted: _Wanted) -> Iterator[Any]:
         else:
             n_processes = min(wanted.cores, _PROCESSES_MOST)
             yield from _decoded_elsewhere(path, laspy, reader.header, layout, n_processes)
+
+
+def _nodes_decoded(
+    path: Path, laspy: Any, header: Any, nodes: Sequence[Node], fields: Any
+) -> Iterator[Any]:
+    """Decode some chunks of a file, as many at once as make a block."""
+    lazrs = load_library("lazrs", path)
+    record = bytes(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    totals = itertools.accumulate(node.n_points for node in nodes)
+    by_block = zip(nodes, totals, strict=True)
+    with path.open("rb") as file:
+        for _, members in itertools.groupby(by_block, key=lambda item: item[1] // BLOCK_POINTS):
+            group = [node for node, _ in members]
+            packed = bytearray()
+            for node in group:
+                file.seek(node.offset)
+                packed += file.read(node.n_bytes)
+            n_points = sum(node.n_points for node in group)
+            points = np.zeros(n_points * int(header.point_format.size), dtype=np.uint8)
+            table = [(node.n_points, node.n_bytes) for node in group]
+            lazrs.decompress_points_with_chunk_table(bytes(packed), record, points, table, fields)
+            yield laspy.ScaleAwarePointRecord(
+                points.view(header.point_format.dtype()),
+                header.point_format,
+                header.scales,
+                header.offsets,
+            )
 
 
 def _layout(path: Path, header: Any, wanted: _Wanted) -> _Layout | None:

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from orthoflow.errors import InputError
 from orthoflow.files.points import ScanFile, open_scan
 from orthoflow.files.points.columns import columns_of_text
+from orthoflow.files.points.copc import Wish
 from orthoflow.files.points.formats import LAS
 from orthoflow.geometry import UpDirection, up_vector
 from orthoflow.products import InputFiles, JsonValue, PointCloud
@@ -94,6 +95,12 @@ class ReadScan(Method):
             description="Lowest and highest corner, [[x, y, z], [x, y, z]], world metres (after "
             "unit was applied): points outside are left out, those on its faces are kept.",
         )
+        gsd_m: float | None = Field(
+            None,
+            gt=0,
+            description="Of a COPC file read points only as dense as this, in metres: levels of "
+            "its octree down to the first whose points are no farther apart. None reads all.",
+        )
         classes: tuple[Annotated[int, Field(ge=0, le=255)], ...] = Field(
             (),
             description="Classes of LAS and LAZ points that are kept, e.g. [1, 6] (ASPRS: 6 is "
@@ -126,18 +133,25 @@ class ReadScan(Method):
         columns = None if params.columns is None else columns_of_text(params.columns)
         if not inputs.files.paths:
             raise InputError(f"the input {inputs.files.name} names no files: expected a scan")
+        unit_m = UNITS_M[params.unit]
+        box_m = None if params.box is None else np.array(params.box)
+        wish = Wish(
+            box=None if box_m is None else box_m / unit_m,
+            spacing=None if params.gsd_m is None else params.gsd_m / unit_m,
+        )
         files = [
-            open_scan(path, columns, classes=params.classes, cores=ctx.cores)
+            open_scan(path, columns, classes=params.classes, cores=ctx.cores, wish=wish)
             for path in inputs.files.paths
         ]
+        if params.gsd_m is not None and not any("octree" in file.details for file in files):
+            ctx.warn("gsd_m only speaks of COPC files, and none was read; it has no effect")
         if params.classes and not any(file.format_name == LAS.name for file in files):
             ctx.warn(
                 "classes only speaks of LAS and LAZ files, and none was read; it has no effect"
             )
         if columns is not None and not any(file.format_name == "text" for file in files):
             ctx.warn("columns only speaks of text files, and none was read; it has no effect")
-        box_m = None if params.box is None else np.array(params.box)
-        assembly = CloudAssembly(ctx, files, UNITS_M[params.unit], box_m)
+        assembly = CloudAssembly(ctx, files, unit_m, box_m)
         _warn_of_missing_fields(ctx, files, assembly)
         for file in files:
             # Damaged numbers overflow on their way; what is not finite is dropped and counted.

@@ -138,6 +138,29 @@ def test_a_box_beside_the_scan_says_where_the_scan_is(tmp_path: Path, read: Read
     )
 
 
+def test_gsd_and_box_choose_nodes_of_a_copc_file_in_metres(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    rng = np.random.default_rng(3)
+    coarse, left, right = (
+        rng.uniform(low, high, (400, 3)) for low, high in ((0.1, 7.9), (0.1, 3.9), (4.1, 7.9))
+    )
+    nodes = [{(0, 0, 0): coarse}, {(0, 0, 0): left, (1, 1, 1): right}]
+    path = scan_files.write_copc(tmp_path / "a.copc.laz", nodes)
+    # The file is in feet, and points of its root are half a foot apart.
+    assert len(read(path, unit="ft", gsd_m=0.5 * 0.3048)) == 400
+    assert len(read(path, unit="ft", gsd_m=0.4 * 0.3048)) == 1200
+    box = [[0.0, 0.0, 0.0], [3.9 * 0.3048] * 3]
+    cloud = read(path, unit="ft", box=box)
+    assert len(cloud) == 400 + np.count_nonzero((coarse <= 3.9).all(axis=1))
+    (file,) = cloud.source["files"]  # type: ignore[misc]
+    assert file["read"] == 800  # type: ignore[index,call-overload]
+    assert file["header"]["octree"] == "2 of 3 nodes, levels 0 to 1 of 0 to 1"  # type: ignore[index,call-overload]
+    assert "gsd_m only speaks" not in read.warnings
+    read(scan_files.write_las(tmp_path / "b.laz", points), gsd_m=0.1)
+    assert "gsd_m only speaks of COPC files" in read.warnings
+
+
 def test_a_box_without_an_inside_is_refused() -> None:
     with pytest.raises(ValueError, match="the lowest corner and then the highest"):
         ReadScan.Params(box=((0.0, 0.0, 1.0), (1.0, 1.0, 1.0)))

@@ -1,0 +1,147 @@
+"""COPC: only the nodes are read that hold points asked for, and a damaged octree is told."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.points import las, open_scan
+from orthoflow.files.points.copc import Wish
+from tests import scan_files
+
+# Root, its eight children, and two children of the last of these.
+PLACES = (
+    ((0, 0, 0),),
+    tuple((x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)),
+    ((2, 2, 2), (3, 3, 3)),
+)
+
+
+def points_of(level: int, place: tuple[int, int, int]) -> NDArray[np.float64]:
+    rng = np.random.default_rng([level, *place])
+    side = 8.0 / 2**level
+    low = side * np.array(place)
+    return np.round(low + rng.uniform(0.01 * side, 0.99 * side, (300 + 10 * level, 3)), 4)
+
+
+NODES = [{place: points_of(level, place) for place in PLACES[level]} for level in range(3)]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return scan_files.write_copc(tmp_path / "a.copc.laz", NODES)
+
+
+def sorted_points(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    rounded = np.round(points, 4)
+    return rounded[np.lexsort(rounded.T)]
+
+
+def read(path: Path, wish: Wish | None) -> NDArray[np.float64]:
+    scan = open_scan(path, wish=wish)
+    blocks = list(scan.read())
+    points = np.concatenate([block.points for block in blocks])
+    assert scan.n_most == len(points) == sum(block.n_read for block in blocks)
+    return points
+
+
+def all_points(n_levels: int = 3) -> NDArray[np.float64]:
+    return np.concatenate([points for level in NODES[:n_levels] for points in level.values()])
+
+
+def test_a_copc_file_is_read_whole_unless_somebody_asks_for_less(path: Path) -> None:
+    for wish in (None, Wish()):
+        np.testing.assert_array_equal(read(path, wish).round(4), all_points().round(4))
+        assert "octree" not in open_scan(path, wish=wish).details
+
+
+@pytest.mark.parametrize(
+    ("spacing", "n_levels"), [(2.0, 1), (0.5, 1), (0.4, 2), (0.25, 2), (0.2, 3), (0.001, 3)]
+)
+def test_levels_are_read_down_to_the_spacing_asked_for(
+    path: Path, spacing: float, n_levels: int
+) -> None:
+    found = read(path, Wish(spacing=spacing))
+    np.testing.assert_array_equal(sorted_points(found), sorted_points(all_points(n_levels)))
+    said = open_scan(path, wish=Wish(spacing=spacing)).details["octree"]
+    assert str(said).endswith(f"levels 0 to {n_levels - 1} of 0 to 2")
+
+
+@pytest.mark.parametrize("block_points", [500_000, 700])
+def test_only_nodes_that_meet_the_box_are_read_and_none_of_its_points_is_missing(
+    path: Path, monkeypatch: pytest.MonkeyPatch, block_points: int
+) -> None:
+    monkeypatch.setattr(las, "BLOCK_POINTS", block_points)
+    box = np.array([[0.5, 4.5, 0.5], [3.5, 7.5, 3.5]])
+    found = read(path, Wish(box=box))
+    expected = np.concatenate([NODES[0][0, 0, 0], NODES[1][0, 1, 0]])
+    np.testing.assert_array_equal(sorted_points(found), sorted_points(expected))
+
+    def inside(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        return sorted_points(points[((points >= box[0]) & (points <= box[1])).all(axis=1)])
+
+    np.testing.assert_array_equal(inside(found), inside(all_points()))
+
+
+def test_a_box_beside_all_nodes_gives_the_root_which_tells_where_the_cloud_is(path: Path) -> None:
+    found = read(path, Wish(box=np.array([[90.0, 0.0, 0.0], [91.0, 1.0, 1.0]])))
+    np.testing.assert_array_equal(sorted_points(found), sorted_points(NODES[0][0, 0, 0]))
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_files_without_an_octree_are_read_whole(tmp_path: Path, suffix: str) -> None:
+    plain = scan_files.write_las(tmp_path / f"a{suffix}", all_points())
+    assert len(read(plain, Wish(spacing=0.5))) == len(all_points())
+
+
+def hierarchy(content: bytes) -> tuple[int, int]:
+    at, size = struct.unpack_from("<2Q", content, 429 + 40)
+    return int(at), int(size)
+
+
+@pytest.mark.parametrize(
+    ("where", "change", "reason"),
+    [
+        ("info", struct.pack("<d", -1.0), "its root has no size"),
+        ("info", struct.pack("<d", float("nan")), "its root has no size"),
+        ("root", struct.pack("<2Q", 1 << 60, 32), "its pages lie outside the file"),
+        ("root", struct.pack("<2Q", 0, 0), "it has no nodes"),
+        ("level", struct.pack("<4i", 40, 0, 0, 0), "a node lies outside the root"),
+        ("level", struct.pack("<4i", 1, 0, 2, 0), "a node lies outside the root"),
+        ("chunk", struct.pack("<Q", 500), "it names chunks that the file does not have"),
+        ("count", struct.pack("<i", 1 << 30), "it names chunks that the file does not have"),
+        ("count", struct.pack("<i", -7), "a node lies outside the root"),
+    ],
+)
+def test_a_damaged_octree_is_told_before_anything_is_decoded(
+    path: Path, where: str, change: bytes, reason: str
+) -> None:
+    content = bytearray(path.read_bytes())
+    page, _ = hierarchy(content)
+    at = {
+        "info": 429 + 24,
+        "root": 429 + 40,
+        "level": page,
+        "chunk": page + 16,
+        "count": page + 28,
+    }[where]
+    content[at : at + len(change)] = change
+    path.write_bytes(bytes(content))
+    with pytest.raises(InputError, match=rf"a\.copc\.laz cannot be read as COPC: .*{reason}"):
+        open_scan(path, wish=Wish(spacing=0.1))
+    # Its points need no octree.
+    assert len(read(path, None)) == len(all_points())
+
+
+def test_pages_that_name_each_other_end(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    page, size = hierarchy(content)
+    for at in range(page + 32, page + size, 32):
+        struct.pack_into("<4iQii", content, at, 1, 0, 0, 0, page, size, -1)
+    path.write_bytes(bytes(content))
+    assert len(read(path, Wish(spacing=0.1))) == len(NODES[0][0, 0, 0])
