@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from typing import TYPE_CHECKING, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from orthoflow.geometry import UpDirection, basis_from_up, up_vector
 from orthoflow.products import Calibration, CheckPoints, Photos, PointCloud, Truth
@@ -126,6 +126,12 @@ class SimulateRoom(Method):
             description="drawn: cornices, pilasters, niches, panels and doors set back differ from "
             "seed to seed, relief up to 0.3 m, recesses up to 0.45 m; no cloth hangs there.",
         )
+        design_seed: int | None = Field(
+            default=None,
+            ge=0,
+            description="Which of the drawn rooms, so that datasets have rooms of their own; "
+            "without it, the seed of the workflow says. Scanning errors do not hang on it.",
+        )
         obstacle: bool = Field(
             default=True, description="An object stands free 0.6 m before the main wall."
         )
@@ -188,6 +194,15 @@ class SimulateRoom(Method):
             (0.0, 0.0, 0.0), description="World position of the room's origin, survey coordinates."
         )
 
+        @model_validator(mode="after")
+        def _only_drawn_rooms_have_a_seed(self) -> Self:
+            if self.design_seed is not None and self.decoration != "drawn":
+                raise ValueError(
+                    f"design_seed {self.design_seed} draws a room, but decoration is "
+                    f"{self.decoration}: set decoration to drawn, or leave out design_seed"
+                )
+            return self
+
     class In(Ports):
         """No inputs."""
 
@@ -218,6 +233,8 @@ class SimulateRoom(Method):
         )
 
         scan_rng, photo_rng, wall_rng = ctx.rng.spawn(3)
+        if params.design_seed is not None:
+            wall_rng = np.random.default_rng(params.design_seed)
         room = build_room(
             RoomPlan(
                 relief=params.relief_scale,
@@ -246,7 +263,7 @@ class SimulateRoom(Method):
         photos = take_photos(views, shots, _film(params), ctx, photo_rng)
         cloud = cloud_of(delivery)
         # Of rooms as they always were, records do not change.
-        added = {"decoration": "designed", "photo_exposure_share": 0.0}
+        added = {"decoration": "designed", "design_seed": None, "photo_exposure_share": 0.0}
         left_out = {name for name, before in added.items() if getattr(params, name) == before}
         settings = params.model_dump(mode="json", exclude=left_out)
         truth = truth_of(delivery, cloud, shots, settings)

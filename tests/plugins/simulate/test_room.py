@@ -215,6 +215,23 @@ def test_drawn_walls_differ_from_seed_to_seed_and_stay_in_their_family(tmp_path:
     assert len(kinds) == 6
 
 
+def test_a_design_has_a_seed_of_its_own_and_errors_have_that_of_the_cell(tmp_path: Path) -> None:
+    drawn = {"decoration": "drawn", **COARSE}
+    rooms = {
+        (seed, design): simulate(
+            tmp_path / f"{seed}-{design}", seed=seed, design_seed=design, **drawn
+        )
+        for seed, design in ((1, 7), (2, 7), (1, 8))
+    }
+
+    centres = {key: room.truth.scene.centre for key, room in rooms.items()}
+    np.testing.assert_array_equal(centres[1, 7], centres[2, 7])
+    assert not np.array_equal(centres[1, 7], centres[1, 8])
+    assert not np.array_equal(rooms[1, 7].cloud.x[:1000], rooms[2, 7].cloud.x[:1000])
+    with pytest.raises(ValueError, match="design_seed 7 draws a room, but decoration is designed"):
+        SimulateRoom.Params(design_seed=7)
+
+
 def test_recesses_of_drawn_walls_are_true_planes(tmp_path: Path) -> None:
     truth = simulate(tmp_path / "room", seed=3, decoration="drawn", **COARSE).truth
     recesses = [k for k, name in enumerate(truth.planes.names) if " in " in name]
