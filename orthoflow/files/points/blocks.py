@@ -76,6 +76,7 @@ class ScanFile:
         rgb_limit: the value of full brightness the file states, or None when it must be found out.
         details: what else the header says and is worth keeping.
         notes: what the reader noticed while reading, in sentences for the user.
+        is_chosen: only the parts of the file come that were asked for.
     """
 
     name: str
@@ -87,6 +88,7 @@ class ScanFile:
     rgb_limit: float | None = None
     details: dict[str, str | int | float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    is_chosen: bool = False
 
     def __post_init__(self) -> None:
         if self.n_most <= 0:

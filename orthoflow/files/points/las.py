@@ -111,6 +111,7 @@ def open_las(
         read=lambda: _blocks(path, laspy, bounds, notes, wanted),
         details=details,
         notes=notes,
+        is_chosen=nodes is not None,
     )
 
 

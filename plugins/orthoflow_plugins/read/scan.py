@@ -143,7 +143,7 @@ class ReadScan(Method):
             open_scan(path, columns, classes=params.classes, cores=ctx.cores, wish=wish)
             for path in inputs.files.paths
         ]
-        if params.gsd_m is not None and not any("octree" in file.details for file in files):
+        if params.gsd_m is not None and not any(file.is_chosen for file in files):
             ctx.warn("gsd_m only speaks of COPC files, and none was read; it has no effect")
         if params.classes and not any(file.format_name == LAS.name for file in files):
             ctx.warn(
