@@ -10,6 +10,7 @@ from orthoflow_provenance.model import PublishedFile, RecordedProduct
 from orthoflow_provenance.writer import write_record
 
 from orthoflow.engine.file_digests import file_sha256
+from orthoflow.engine.store import digest_of
 from orthoflow.files.publishing import publish_orthoimages, publish_planes, publish_walls
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import frame_over
@@ -85,12 +86,11 @@ def wall_frame(planes: Planes) -> WallFrame:
     return frame_over(planes.corners[WALL], planes.normal[WALL], gsd_m=GSD_M)
 
 
-def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False) -> Path:
-    """Write `run.h5` and `products/` of planes, one wall, its orthoimage and its inspection."""
-    folder.mkdir(parents=True)
+def box_products() -> dict[str, Product]:
+    """What the steps of the run give."""
     planes = box_planes()
     frame = wall_frame(planes)
-    products = {
+    return {
         "plane": planes,
         "wall": Walls(
             walls=(_wall(frame),),
@@ -103,8 +103,35 @@ def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False
         "check": _inspection(frame),
         "points": _checkpoints(frame),
     }
+
+
+def publish_box(folder: Path) -> tuple[PublishedFile, ...]:
+    """Write `products/` of a run folder, and say what lies there."""
+    products = box_products()
+    for step, publish in (
+        ("plane", publish_planes),
+        ("wall", publish_walls),
+        ("mosaic", publish_orthoimages),
+    ):
+        into = folder / "products" / step
+        into.mkdir(parents=True)
+        publish(products[step], into, digest_of(products[step]))  # type: ignore[operator] # each its own
+    files = sorted(path for path in (folder / "products").rglob("*") if path.is_file())
+    return tuple(
+        PublishedFile(
+            path=path.relative_to(folder).as_posix(),
+            size_bytes=path.stat().st_size,
+            sha256=file_sha256(path),
+        )
+        for path in files
+    )
+
+
+def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False) -> Path:
+    """Write `run.h5` and `products/` of planes, one wall, its orthoimage and its inspection."""
+    folder.mkdir(parents=True)
     shelf = ProductShelf(folder)
-    given = {step: _recorded(shelf, product) for step, product in products.items()}
+    given = {step: _recorded(shelf, product) for step, product in box_products().items()}
     taken = {
         "wall": {"planes": "plane"},
         "mosaic": {"walls": "wall"},
@@ -124,24 +151,7 @@ def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False
         )
         for step in ("points", "plane", "wall", "mosaic", "check")
     ]
-    for step, publish in (
-        ("plane", lambda into, digest: publish_planes(planes, into, digest)),
-        ("wall", lambda into, digest: publish_walls(products["wall"], into, digest)),
-        ("mosaic", lambda into, digest: publish_orthoimages(products["mosaic"], into, digest)),
-    ):
-        into = folder / "products" / step
-        into.mkdir(parents=True)
-        publish(into, given[step].digest)
-    files = sorted(path for path in (folder / "products").rglob("*") if path.is_file())
-    published = tuple(
-        PublishedFile(
-            path=path.relative_to(folder).as_posix(),
-            size_bytes=path.stat().st_size,
-            sha256=file_sha256(path),
-        )
-        for path in files
-    )
-    made = record(cells, name="box", published=published, environments=())
+    made = record(cells, name="box", published=publish_box(folder), environments=())
     write_record(folder / "run.h5", made, shelf.find)
     return folder
 

@@ -9,6 +9,7 @@ from orthoflow.errors import InputError
 from orthoflow.files.colmap import read_colmap_model
 from orthoflow.files.e57_images import read_e57_images
 from orthoflow.files.given_cameras import (
+    MOST_CAMERAS,
     GivenCamera,
     bare_name,
     read_bundler,
@@ -23,8 +24,15 @@ def read_given_cameras(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
     """Read the cameras of one file, or of a folder that several files make.
 
     Raises:
-        InputError: the files are of no known kind, or damaged.
+        InputError: the files are of no known kind, damaged, or hold too many.
     """
+    found = _read(paths)
+    if len(found) > MOST_CAMERAS:
+        raise InputError(f"{paths[0].name} holds more than {MOST_CAMERAS} cameras: split it")
+    return found
+
+
+def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
     by_name = {path.name.lower(): path for path in paths}
     for suffix in (".bin", ".txt"):
         if f"images{suffix}" in by_name and f"cameras{suffix}" in by_name:
@@ -57,5 +65,5 @@ def _photo_list(path: Path, paths: Sequence[Path]) -> list[str]:
             f"{path.name} says nothing of names: give the folder with it and its list of photos "
             f"(.txt), one line each; there are {len(lists)} such files"
         )
-    lines = [line.split() for line in text_of(lists[0]).splitlines()]
-    return [bare_name(words[0]) for words in lines if words]
+    lines = [line.split(maxsplit=1) for line in text_of(lists[0]).splitlines()]
+    return [bare_name(words[0]) for words in lines if words][: MOST_CAMERAS + 1]

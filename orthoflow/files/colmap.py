@@ -10,7 +10,7 @@ import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import ArgumentError, InputError
 from orthoflow.files.given_cameras import (
+    MOST_CAMERAS,
     GivenCamera,
     bare_name,
+    bytes_of,
     checked_lens,
     damaged,
+    lines_of,
     numbers_of,
-    text_of,
 )
 from orthoflow.files.sidecars import write_text
 from orthoflow.geometry.rotations import quaternion_from_rotation, rotation_from_quaternion
@@ -57,6 +59,8 @@ _COLUMNS: Final = {
         *("k3", "k4", "k5", "k6"),
     ),
 }
+# More than a camera of any model has.
+_MOST_WORDS: Final = 30
 # u, v and the number of the point.
 _OBSERVATION_BYTES: Final = 24
 
@@ -194,7 +198,8 @@ def read_colmap_model(cameras: Path, images: Path) -> tuple[GivenCamera, ...]:
     is_binary = images.suffix.lower() == ".bin"
     lenses = (_binary_lenses if is_binary else _text_lenses)(cameras)
     found = []
-    for name, camera_id, pose in (_binary_images if is_binary else _text_images)(images):
+    poses = (_binary_images if is_binary else _text_images)(images)
+    for name, camera_id, pose in islice(poses, MOST_CAMERAS + 1):
         if camera_id not in lenses:
             raise damaged(images, f"{name} has camera {camera_id}, which {cameras.name} has not")
         lens, length = lenses[camera_id], float(np.linalg.norm(pose[:4]))
@@ -218,8 +223,8 @@ def read_colmap_model(cameras: Path, images: Path) -> tuple[GivenCamera, ...]:
 
 def _text_lenses(path: Path) -> dict[int, Intrinsics | str]:
     lenses: dict[int, Intrinsics | str] = {}
-    for number, line in enumerate(text_of(path).splitlines(), start=1):
-        words = line.split()
+    for number, line in enumerate(lines_of(path), start=1):
+        words = line.split(maxsplit=_MOST_WORDS)
         if not words or words[0].startswith("#"):
             continue
         if len(words) < 5:
@@ -228,11 +233,12 @@ def _text_lenses(path: Path) -> dict[int, Intrinsics | str]:
             [words[0], *words[2:]], path, "a camera's parameters", number
         )
         lenses[int(camera_id)] = _lens_of(words[1], (int(width), int(height)), params, path)
+        _check_count(lenses, path)
     return lenses
 
 
 def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
-    lines = iter(enumerate(text_of(path).splitlines(), start=1))
+    lines = enumerate(lines_of(path), start=1)
     for number, line in lines:
         words = line.split(maxsplit=9)
         if not words or words[0].startswith("#"):
@@ -257,7 +263,13 @@ def _binary_lenses(path: Path) -> dict[int, Intrinsics | str]:
         name, n_params = _MODELS[model]
         params = list(data.values(f"<{n_params}d"))
         lenses[camera_id] = _lens_of(name, (width, height), params, path)
+        _check_count(lenses, path)
     return lenses
+
+
+def _check_count(lenses: dict[int, Intrinsics | str], path: Path) -> None:
+    if len(lenses) > MOST_CAMERAS:
+        raise InputError(f"{path.name} holds more than {MOST_CAMERAS} cameras: split it")
 
 
 def _binary_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
@@ -273,11 +285,7 @@ class _Bytes:
     """A binary file of COLMAP's, read from the front."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._at = path, 0
-        try:
-            self._content = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
+        self._path, self._at, self._content = path, 0, bytes_of(path)
 
     def values(self, form: str) -> tuple[Any, ...]:
         """The next values."""

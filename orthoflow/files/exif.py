@@ -35,7 +35,7 @@ _FOCAL_LENGTH_35MM: Final = 0xA405
 
 _SHORT: Final = 3
 # More than what cameras write beside the picture, notes of makers included.
-_MOST_BYTES: Final = 1 << 20
+MOST_BYTES: Final = 1 << 20
 _UNIT_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _INCH: Final = 2
 # Longest side of sensors, from the smallest phone to large format scanning backs.
@@ -101,10 +101,10 @@ def read_exif(encoded: bytes) -> Exif:
     block = exif_block(encoded)
     if block is None:
         return Exif()
-    main = read_directory(block, most_bytes=_MOST_BYTES)
+    main = read_directory(block, most_bytes=MOST_BYTES)
     start = main.number(_EXIF_DIRECTORY)
     inner = (
-        Directory() if start is None else read_directory(block, int(start), most_bytes=_MOST_BYTES)
+        Directory() if start is None else read_directory(block, int(start), most_bytes=MOST_BYTES)
     )
     return Exif(
         orientation=_orientation(main),
@@ -188,7 +188,7 @@ def without_orientation(encoded: bytes) -> bytes:
     """
     if image_format(encoded) != "TIFF":
         return encoded
-    main = read_directory(encoded, most_bytes=_MOST_BYTES)
+    main = read_directory(encoded, most_bytes=MOST_BYTES)
     orientation = _orientation(main)
     if orientation == 1:
         return encoded

@@ -8,10 +8,12 @@ list; `camera_formats` knows who reads the rest.
 from __future__ import annotations
 
 import csv
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from io import TextIOWrapper
+from itertools import islice
 from pathlib import Path, PureWindowsPath
 from typing import Any, Final
 
@@ -19,11 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.regular_files import text_of_file
+from orthoflow.files.images import MOST_PIXELS
+from orthoflow.files.json_texts import parse_json
+from orthoflow.files.regular_files import open_file, text_of_file
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
 
-_MOST_BYTES: Final = 500_000_000
+# Of a model with the observations of each photo, which is read line by line, and of other files.
+MOST_MODEL_BYTES: Final = 500_000_000
+MOST_BYTES: Final = 50_000_000
+MOST_LINE: Final = 20_000_000
+MOST_CAMERAS: Final = 100_000
+_LONGEST_NUMBER: Final = 12
 _FULL_FRAME_MM: Final = 36.0
 _ORTHONORMAL: Final = 1e-4
 # Axes of OpenGL, which Bundler and RealityCapture have: x right, y up, z backwards.
@@ -90,10 +99,46 @@ def text_of(path: Path) -> str:
     Raises:
         InputError: it cannot be read, is no text, or larger than any such file.
     """
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path.name} is too large for a file of cameras")
+    with _reading(path, MOST_BYTES):
         return text_of_file(path)
+
+
+def lines_of(path: Path) -> Iterator[str]:
+    """Lines of a model, one after the other, without their ends.
+
+    Raises:
+        InputError: it cannot be read, is no text, is larger than any such file, or has a longer
+            line.
+    """
+    with (
+        _reading(path, MOST_MODEL_BYTES),
+        TextIOWrapper(open_file(path), encoding="utf-8-sig") as stream,
+    ):
+        while line := stream.readline(MOST_LINE):
+            if len(line) == MOST_LINE:
+                raise InputError(f"{path.name} has a line of more than {MOST_LINE} letters")
+            yield line.rstrip("\n")
+
+
+def bytes_of(path: Path) -> bytes:
+    """Content of a binary model.
+
+    Raises:
+        InputError: it cannot be read, or is larger than any such file.
+    """
+    with _reading(path, MOST_MODEL_BYTES), open_file(path) as stream:
+        return stream.read(MOST_MODEL_BYTES)
+
+
+@contextmanager
+def _reading(path: Path, most_bytes: int) -> Iterator[None]:
+    try:
+        if path.stat().st_size > most_bytes:
+            raise InputError(
+                f"{path.name} has {path.stat().st_size} bytes, more than {most_bytes}: it is too "
+                "large for a file of cameras"
+            )
+        yield
     except UnicodeDecodeError as error:
         raise InputError(f"{path.name} is no UTF-8 text: expected a file of cameras") from error
     except OSError as error:
@@ -149,9 +194,15 @@ def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:
     values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew or 0.0, *lens.distortion)
     if not (all(map(math.isfinite, values)) and lens.fx > 0.0 and lens.fy > 0.0):
         raise damaged(path, f"the lens of {whose} is none: focal length {lens.fx:g}, {lens.fy:g}")
-    if lens.width < 1 or lens.height < 1:
-        raise damaged(path, f"the photo {whose} is {lens.width} x {lens.height} pixels")
+    if min(lens.width, lens.height) < 1 or lens.width * lens.height > MOST_PIXELS:
+        size = f"{_cut(lens.width)} x {_cut(lens.height)}"
+        raise damaged(path, f"the photo {whose} is {size} pixels, expected 1 to {MOST_PIXELS}")
     return lens
+
+
+def _cut(number: int) -> str:
+    text = str(number)
+    return text if len(text) <= _LONGEST_NUMBER else f"{text[:_LONGEST_NUMBER]}..."
 
 
 def read_cameras_json(path: Path) -> tuple[GivenCamera, ...]:
@@ -161,10 +212,13 @@ def read_cameras_json(path: Path) -> tuple[GivenCamera, ...]:
         InputError: it is damaged.
     """
     try:
-        content = json.loads(text_of(path))
+        content: Any = parse_json(text_of(path))
         entries: Mapping[str, Any] = dict(content["cameras"])
-        return tuple(_of_json(name, dict(entry), path) for name, entry in entries.items())
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        return tuple(
+            _of_json(name, dict(entry), path)
+            for name, entry in islice(entries.items(), MOST_CAMERAS + 1)
+        )
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise damaged(path, "it is no cameras.json of a run") from error
@@ -198,7 +252,9 @@ def _of_json(name: str, entry: Mapping[str, Any], path: Path) -> GivenCamera:
         translation=np.array(
             numbers_of([str(v) for v in entry["t_camera_from_world"]], path, f"t of {name}")
         ).reshape(3),
-        sigma_wall_m=None if sigma_mm is None else float(sigma_mm) / 1000.0,
+        sigma_wall_m=None
+        if sigma_mm is None
+        else numbers_of([str(sigma_mm)], path, f"sigma_wall_mm of {name}")[0] / 1000.0,
     )
 
 
@@ -214,12 +270,8 @@ def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
     Raises:
         InputError: it is damaged.
     """
-    words = [
-        word
-        for line in text_of(path).splitlines()
-        if not line.lstrip().startswith("#")
-        for word in line.split()
-    ]
+    # What follows the cameras are points, which may be many.
+    words = list(islice(_words_of(path), 2 + 15 * len(names)))
     counts = numbers_of(words[:2], path, "the counts of cameras and points")
     if len(counts) < 2 or counts[0] != len(names):
         raise damaged(
@@ -248,6 +300,12 @@ def read_bundler(path: Path, names: Sequence[str]) -> tuple[GivenCamera, ...]:
     return tuple(found)
 
 
+def _words_of(path: Path) -> Iterator[str]:
+    for line in lines_of(path):
+        if not line.lstrip().startswith("#"):
+            yield from line.split()
+
+
 def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
     """Read RealityCapture's "internal/external camera parameters" (CSV).
 
@@ -259,7 +317,13 @@ def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
         InputError: it is damaged, or has tangential distortion, whose sign it does not say.
     """
     lines = text_of(path).lstrip("# ").splitlines()
-    table = csv.DictReader(lines)
+    try:
+        return tuple(_of_rows(csv.DictReader(lines), path))
+    except csv.Error as error:
+        raise damaged(path, f"it is no table: {error}") from error
+
+
+def _of_rows(table: csv.DictReader[str], path: Path) -> Iterator[GivenCamera]:
     wanted = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3")
     missing = [name for name in ("name", *wanted) if name not in (table.fieldnames or ())]
     if missing:
@@ -268,16 +332,15 @@ def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
             f"the column {missing[0]} is missing: expected RealityCapture's internal/external "
             "camera parameters, #name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2",
         )
-    found = []
-    for row in table:
+    for row in islice(table, MOST_CAMERAS + 1):
         line, name = table.line_num, bare_name(row["name"] or "")
         x, y, z, heading, pitch, roll, focal, px, py, k1, k2, k3 = numbers_of(
             [row[key] or "" for key in wanted], path, "the parameters", line
         )
         if not focal > 0.0:
             raise damaged(path, f"the focal length of {name} must be positive, got {focal:g}", line)
-        others = [float(row.get(key) or 0.0) for key in ("k4", "t1", "t2")]
-        if any(others):
+        others = [row.get(key) or "0" for key in ("k4", "t1", "t2")]
+        if any(numbers_of(others, path, "k4, t1 and t2", line)):
             raise damaged(
                 path,
                 f"{name} has k4 or tangential distortion, which orthoflow does not take from this "
@@ -285,19 +348,16 @@ def read_realitycapture_list(path: Path) -> tuple[GivenCamera, ...]:
                 line,
             )
         rotation = _FROM_OPENGL @ _world_from_angles(heading, pitch, roll).T
-        found.append(
-            GivenCamera(
-                name=name,
-                lens=CentredLens(
-                    focal_share=focal / _FULL_FRAME_MM,
-                    off_middle=(px, py),
-                    radial=(k1, k2, k3),
-                ),
-                rotation=rotation,
-                translation=-rotation @ np.array([x, y, z]),
-            )
+        yield GivenCamera(
+            name=name,
+            lens=CentredLens(
+                focal_share=focal / _FULL_FRAME_MM,
+                off_middle=(px, py),
+                radial=(k1, k2, k3),
+            ),
+            rotation=rotation,
+            translation=-rotation @ np.array([x, y, z]),
         )
-    return tuple(found)
 
 
 def _world_from_angles(

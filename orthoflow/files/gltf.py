@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import encode_jpeg, encode_png
+from orthoflow.files.json_texts import json_bytes
 from orthoflow.files.ortho_files import OrthoFile
 from orthoflow.files.sidecars import numbers, write_bytes
 from orthoflow.geometry.directions import basis_from_up
@@ -141,7 +141,7 @@ class _Document:
             "bufferViews": self.views,
             "buffers": [{"byteLength": len(self.data)}],
         }
-        text = json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
+        text = json_bytes(document, indent=None)
         text += b" " * (-len(text) % 4)
         head = struct.pack("<III", _MAGIC, 2, 28 + len(text) + len(self.data))
         json_head = struct.pack("<II", len(text), _JSON_CHUNK)

@@ -8,8 +8,9 @@ from it to the chunk, whose own transform leads to the world.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path, PurePath
 from typing import Final
 from xml.etree import ElementTree as ET
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.given_cameras import (
+    MOST_CAMERAS,
     GivenCamera,
     bare_name,
     checked_lens,
@@ -27,9 +29,11 @@ from orthoflow.files.given_cameras import (
     rotation_of,
     text_of,
 )
+from orthoflow.files.images import MOST_PIXELS
 from orthoflow.files.panoramas import FACES, face_lens, face_name
 from orthoflow.products import Intrinsics
 
+MOST_TAGS: Final = 2_000_000
 # A panorama's directions are x forwards, y left, z up.
 _PANORAMA_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _UNKNOWN_TERMS: Final = ("k4", "p3", "p4")
@@ -44,7 +48,8 @@ def read_metashape_xml(path: Path) -> tuple[GivenCamera, ...]:
     """
     root = _root(path)
     chunks = root.findall("chunk") or root.findall(".//chunk")
-    found = [camera for chunk in chunks for camera in _of_chunk(chunk, path)]
+    cameras = (camera for chunk in chunks for camera in _of_chunk(chunk, path))
+    found = list(islice(cameras, MOST_CAMERAS + 1))
     if not found:
         raise damaged(path, "it holds no cameras of Metashape (document/chunk/cameras/camera)")
     return tuple(found)
@@ -59,13 +64,15 @@ def _root(path: Path) -> ET.Element:
             f"{path.name} defines a document type, which no export of Metashape does, so it is not "
             "read"
         )
+    if text.count("<") > MOST_TAGS:
+        raise InputError(f"{path.name} has more than {MOST_TAGS} tags, too many for cameras")
     try:
         return ET.fromstring(text)
     except ET.ParseError as error:
         raise damaged(path, f"it is no XML: {error.msg}", error.position[0]) from error
 
 
-def _of_chunk(chunk: ET.Element, path: Path) -> list[GivenCamera]:
+def _of_chunk(chunk: ET.Element, path: Path) -> Iterator[GivenCamera]:
     lenses = {
         sensor.get("id", ""): _lens(sensor, path) for sensor in chunk.findall("sensors/sensor")
     }
@@ -79,12 +86,10 @@ def _of_chunk(chunk: ET.Element, path: Path) -> list[GivenCamera]:
         for sensor in chunk.findall("sensors/sensor")
         if sensor.get("type") == "spherical"
     }
-    found = []
     for camera in [*chunk.findall("cameras/camera"), *chunk.findall("cameras/group/camera")]:
         world = worlds.get(camera.get("component_id", ""), whole)
         given = _camera(camera, lenses, world, path)
-        found += _faces(given) if camera.get("sensor_id", "") in panoramas else [given]
-    return found
+        yield from _faces(given) if camera.get("sensor_id", "") in panoramas else [given]
 
 
 class _Similarity:
@@ -139,7 +144,7 @@ def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
     size = owner.find("resolution")
     words = [] if size is None else [size.get("width", ""), size.get("height", "")]
     values = numbers_of(words, path, f"the size of sensor {label}")
-    if len(values) != 2 or min(values) < 1.0:
+    if len(values) != 2 or min(values) < 1.0 or values[0] * values[1] > MOST_PIXELS:
         raise damaged(path, f"sensor {label} does not say how many pixels it has")
     return round(values[0]), round(values[1])
 

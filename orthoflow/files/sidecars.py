@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError, InputError, StoreError
 from orthoflow.files.geotiff import RasterParts
-from orthoflow.files.json_texts import parse_json
+from orthoflow.files.json_texts import json_bytes, parse_json
 from orthoflow.files.regular_files import text_of_file
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import FARTHEST_M
@@ -238,7 +238,7 @@ def write_json(path: Path, content: Mapping[str, JsonValue]) -> None:
     Raises:
         StoreError: the file cannot be written.
     """
-    write_text(path, json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    write_bytes(path, json_bytes(content, indent=2) + b"\n")
 
 
 def write_text(path: Path, text: str) -> None:

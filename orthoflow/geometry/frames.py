@@ -55,6 +55,9 @@ class WallFrame:
                 f"a wall frame needs a positive cell size and at least one cell, got "
                 f"{self.gsd_m} m and {self.width} x {self.height}"
             )
+        vectors = (self.origin_world, self.u_world, self.v_world, self.normal_world)
+        if any(np.shape(vector) != (3,) for vector in vectors):
+            raise GeometryError("a wall frame needs an origin and axes of three numbers each")
         if not np.allclose(np.cross(self.u_world, self.v_world), -self.normal_world, atol=1e-9):
             raise GeometryError("a wall frame needs u x v = -n; these axes mirror the image")
 

@@ -114,7 +114,7 @@ class PointCloud(Product):
         """
         if len(self) < n_least:
             raise ProductError(f"the cloud has {len(self)} points, at least {n_least} are needed")
-        for name, values in (("x", self.x), ("y", self.y), ("z", self.z)):
+        for name, values in (("x", self.x), ("y", self.y), ("z", self.z), ("origin", self.origin)):
             # A sum is NaN or infinite exactly when a term is (float64 cannot overflow here), and
             # needs no mask of scan size.
             if not np.isfinite(np.sum(values, dtype=np.float64)):

@@ -9,10 +9,17 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.errors import ProductError
 from orthoflow.geometry.scenes import Scene
 from orthoflow.products.photographs import Cameras
 from orthoflow.products.planes import Planes
-from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
+from orthoflow.products.product import (
+    JsonValue,
+    Payload,
+    Product,
+    Tolerance,
+    require_shapes,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +46,20 @@ class CheckPoints(Product):
     wall: NDArray[np.int32]
     pixels_wall: NDArray[np.float64]
     places_m: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        if len(self.classes) != count:
+            raise ProductError(f"checkpoints: {count} names have {len(self.classes)} classes")
+        require_shapes(
+            "checkpoints",
+            {
+                "points_world": (self.points_world, (count, 3)),
+                "wall": (self.wall, (count,)),
+                "pixels_wall": (self.pixels_wall, (count, 2)),
+                "places_m": (self.places_m, (count, 2)),
+            },
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,3 +188,17 @@ class Inspection(Product):
     kinds: tuple[str, ...]
     findings: tuple[Finding, ...]
     details: dict[str, JsonValue] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.wall)
+        require_shapes(
+            "inspection",
+            {
+                "wall": (self.wall, (count,)),
+                "points_world": (self.points_world, (count, 3)),
+                "displacement_m": (self.displacement_m, (count, 2)),
+                "kind": (self.kind, (count,)),
+            },
+        )
+        if count and int(self.kind.max()) >= len(self.kinds):
+            raise ProductError(f"inspection.kind has more than the {len(self.kinds)} named kinds")

@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
+from orthoflow.products.product import (
+    JsonValue,
+    Payload,
+    Product,
+    Tolerance,
+    require_shapes,
+)
 from orthoflow.products.walls import Wall
 
 
@@ -234,6 +240,25 @@ class Ties(Product):
     details: dict[str, JsonValue] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        count = len(self.photo)
+        require_shapes(
+            "ties",
+            {
+                "photo": (self.photo, (count,)),
+                "wall": (self.wall, (count,)),
+                "pixels_photo": (self.pixels_photo, (count, 2)),
+                "points_world": (self.points_world, (count, 3)),
+                "sigma_px": (self.sigma_px, (count,)),
+                "sigma_m": (self.sigma_m, (count,)),
+                "role": (self.role, (count,)),
+                "residual_px": (self.residual_px, (count, 2)),
+                "by_hand": (self.by_hand, (count,)),
+            },
+        )
+        if count and not 0 <= int(self.photo.min()) <= int(self.photo.max()) < len(
+            self.photo_names
+        ):
+            raise ProductError(f"ties.photo must name one of {len(self.photo_names)} photos")
         if self.search_radius_px and len(self.search_radius_px) != len(self.photo_names):
             raise ProductError(
                 f"ties of {len(self.photo_names)} photos have {len(self.search_radius_px)} search "

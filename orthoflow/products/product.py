@@ -14,7 +14,7 @@ from typing import ClassVar, Final, Literal, Self, TypeAlias, Union
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import ProductError
+from orthoflow.errors import GeometryError, ProductError
 
 JsonValue: TypeAlias = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
 Array: TypeAlias = NDArray[np.generic]
@@ -117,6 +117,17 @@ class Product:
         return dataclasses.replace(payload, encoding_version=cls.encoding_version)
 
 
+def require_shapes(what: str, wanted: Mapping[str, tuple[Array | None, tuple[int, ...]]]) -> None:
+    """Refuse arrays that do not go with each other; those that are None are left out.
+
+    Raises:
+        ProductError: an array has another shape than wanted.
+    """
+    for name, (array, shape) in wanted.items():
+        if array is not None and np.shape(array) != shape:
+            raise ProductError(f"{what}.{name} must have shape {shape}, got {np.shape(array)}")
+
+
 def _encode_fields(owner: object, prefix: str, arrays: dict[str, Array]) -> dict[str, JsonValue]:
     encoded: dict[str, JsonValue] = {}
     for field in dataclasses.fields(typing.cast("typing.Any", owner)):
@@ -165,6 +176,11 @@ def _decode_fields(
         return cls(**values)
     except TypeError as error:
         raise ProductError(f"a stored {cls.__name__} lacks fields: {error}") from error
+    except ProductError:
+        raise
+    except (AttributeError, IndexError, KeyError, ValueError, GeometryError) as error:
+        # Arrays of too few dimensions, where a product looks at its own before it judges them.
+        raise ProductError(f"a stored {cls.__name__} makes no sense: {error}") from error
 
 
 @cache
@@ -177,19 +193,54 @@ def _decode(hint: object, stored: JsonValue, name: str, arrays: Mapping[str, Arr
         if name not in arrays:
             raise ProductError(f"the stored product lacks the array {name}")
         array = arrays[name]
-        return array.tobytes() if stored[_ARRAY] == "bytes" else array
+        value = array.tobytes() if stored[_ARRAY] == "bytes" else array
+        return _of_kind(hint, value, name)
     for candidate in _alternatives(hint):
         if dataclasses.is_dataclass(candidate) and isinstance(stored, dict):
             return _decode_fields(typing.cast("type", candidate), name + "/", stored, arrays)
         if typing.get_origin(candidate) is tuple and isinstance(stored, list):
             items = typing.get_args(candidate)
+            if items[-1] is not Ellipsis and len(items) != len(stored):
+                raise ProductError(
+                    f"the stored {name} must have {len(items)} entries, got {len(stored)}"
+                )
             return tuple(
                 _decode(
                     items[0] if items[-1] is Ellipsis else items[i], item, f"{name}/{i}", arrays
                 )
                 for i, item in enumerate(stored)
             )
-    return stored
+    return _of_kind(hint, stored, name)
+
+
+def _of_kind(hint: object, value: object, name: str) -> object:
+    """Give a stored value that its field can hold; whoever seals a record may store any.
+
+    Raises:
+        ProductError: it is of another kind.
+    """
+    kinds = _kinds(hint)
+    if kinds is None or (isinstance(value, kinds) and (bool in kinds or value is not True)):
+        return value
+    wanted = " or ".join(kind.__name__ for kind in kinds)
+    raise ProductError(f"the stored {name} must be {wanted}, got {type(value).__name__}")
+
+
+@cache
+def _kinds(hint: object) -> tuple[type, ...] | None:
+    """Types that a decoded value of a field may have; None for any."""
+    found: list[type] = []
+    for candidate in _alternatives(hint):
+        origin = typing.get_origin(candidate) or candidate
+        if origin is Literal:
+            found += {type(value) for value in typing.get_args(candidate)}
+        elif origin is float:
+            found += [float, int]
+        elif isinstance(origin, type) and origin is not object:
+            found.append(dict if issubclass(origin, Mapping) else origin)
+        else:
+            return None
+    return tuple(found)
 
 
 def _alternatives(hint: object) -> Iterator[object]:

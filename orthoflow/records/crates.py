@@ -95,7 +95,8 @@ def write_crate(
 
 def _write(folder: Path, name: str, text: str) -> None:
     with creating(folder, name) as stream:
-        stream.write(text.encode("utf-8"))
+        # Halves of letters, which parameters may have, as JSON writes them.
+        stream.write(text.encode("utf-8", "backslashreplace"))
 
 
 def _copy_files(run: Run, folder: Path, record: Run) -> list[str]:

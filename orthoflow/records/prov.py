@@ -262,7 +262,7 @@ def _literal(value: JsonValue) -> JsonValue:
 
 
 def _sha256(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()
 
 
 def count_things(document: Mapping[str, JsonValue]) -> dict[str, int]:

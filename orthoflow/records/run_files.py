@@ -64,12 +64,15 @@ def figure_files(run: Run, addresses: Iterable[str]) -> Mapping[str, RecordedFig
     return dict(named)
 
 
-def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]) -> None:
+def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]) -> int:
     """Write files below a folder, through no link; a file of that name is replaced.
 
     Args:
         folder: made when missing.
         contents: path below it -> what gives the bytes, called in threads; None for no file.
+
+    Returns:
+        How many were written.
 
     Raises:
         StoreError: the disk refuses, or a link stands in the way.
@@ -77,16 +80,16 @@ def write_files(folder: Path, contents: Mapping[str, Callable[[], bytes | None]]
     with writing_to(folder):
         folder.mkdir(parents=True, exist_ok=True)
 
-    def write(item: tuple[str, Callable[[], bytes | None]]) -> None:
+    def write(item: tuple[str, Callable[[], bytes | None]]) -> bool:
         path, content = item
         data = content()
         if data is None:
-            return
+            return False
         with creating(folder, path) as stream:
             stream.write(data)
+        return True
 
-    # Drained, so that an error in a thread is not lost.
-    list(in_order(write, contents.items()))
+    return sum(in_order(write, contents.items()))
 
 
 def copy_files(

@@ -36,7 +36,9 @@ def write_csv_tables(run: Run, folder: Path) -> tuple[Path, ...]:
     }
     write_metrics_csv(folder / METRICS_FILE, run.metric_rows())
     for name, rows in tables.items():
-        (folder / name).write_text(csv_text(rows), encoding="utf-8", newline="")
+        (folder / name).write_text(
+            csv_text(rows), encoding="utf-8", errors="backslashreplace", newline=""
+        )
     return tuple(folder / name for name in (METRICS_FILE, *tables))
 
 

@@ -6,13 +6,13 @@ those in the plane of a wall are items without a geometry, as STAC allows.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Final
 
 from orthoflow.errors import ArgumentError
+from orthoflow.files.json_texts import json_bytes
 from orthoflow.files.raster_places import RasterPlace, place_of
 from orthoflow.files.sidecars import read_sidecar
 from orthoflow.foreign_text import shown
@@ -106,6 +106,7 @@ def _item(run: Run, folder: Path, ortho: _Ortho, beside: list[str]) -> dict[str,
     place, sidecar = ortho.place, read_sidecar(folder / ortho.path.with_suffix(".json"))
     outline: list[JsonValue] = [list(corner) for corner in ortho.place.outline_lonlat]
     geometry: JsonValue = {"type": "Polygon", "coordinates": [outline]} if outline else None
+    digest = sidecar.get("product_digest")
     cell = run.cells[ortho.address]
     up = "/".join([".."] * (len(ortho.item_path.parts) - 1)) or "."
     collection = f"{up}/{COLLECTION_FILE}"
@@ -119,8 +120,8 @@ def _item(run: Run, folder: Path, ortho: _Ortho, beside: list[str]) -> dict[str,
         "properties": {
             "datetime": cell.ended or run.record.ended,
             "title": f"{sidecar.get('name', 'wall')}, {ortho.address}",
-            "gsd": sidecar.get("gsd_m", place.transform[0]),  # type: ignore[dict-item]
-            "processing_digest": sidecar.get("product_digest"),  # type: ignore[dict-item]
+            "gsd": place.transform[0],
+            "processing_digest": digest if isinstance(digest, str) else None,
             "proj:code": None if place.epsg is None else f"EPSG:{place.epsg}",
             "proj:wkt2": place.wkt2 or None,
             "proj:shape": list(place.shape),
@@ -196,6 +197,5 @@ def _item_id(ortho: _Ortho) -> str:
 
 
 def _write(folder: Path, path: PurePosixPath, content: Mapping[str, JsonValue]) -> None:
-    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     with creating(folder, str(path)) as stream:
-        stream.write(text.encode())
+        stream.write(json_bytes(content, indent=1) + b"\n")

@@ -107,7 +107,7 @@ def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: s
         inside: a folder in it that takes the place of `folder`; it must be no link.
 
     Returns:
-        How many figures.
+        How many figures were written.
 
     Raises:
         RecordError: a figure has a name or a type that no file can have; nothing is written.
@@ -119,8 +119,8 @@ def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: s
     }
     contents |= {path: partial(_content, figure) for path, figure in named.items()}
     way = f"{inside}/" if inside else ""
-    write_files(folder, {f"{way}{path}": content for path, content in contents.items()})
-    return len(named)
+    written = write_files(folder, {f"{way}{path}": content for path, content in contents.items()})
+    return written - 1
 
 
 def _content(figure: RecordedFigure) -> bytes | None:

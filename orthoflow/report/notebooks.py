@@ -167,7 +167,7 @@ class Figures(Mapping[str, RecordedFigure]):
         return len(self._figures)
 
     def __repr__(self) -> str:
-        return "\n".join(f"{name}: {shown(one.caption)}" for name, one in self._figures.items())
+        return "\n".join(shown(f"{name}: {one.caption}") for name, one in self._figures.items())
 
 
 @dataclass(frozen=True, kw_only=True)

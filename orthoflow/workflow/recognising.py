@@ -28,8 +28,8 @@ _CAMERAS: Final = (".xml", ".out", ".json")
 _SCAN_SUFFIXES: Final = tuple(
     suffix for item in FORMATS if item is not TEXT for suffix in item.suffixes
 )
-_DEEPEST: Final = 3
-_MOST_FILES: Final = 20_000
+DEEPEST: Final = 3
+MOST_FILES: Final = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,8 +62,8 @@ def recognised(paths: Sequence[Path]) -> list[Recognised]:
         if not path.exists():
             raise InputError(f"{path} does not exist: give scans, photos, and folders with them")
         found += _in_folder(path, 0) if path.is_dir() else [_file(path)]
-        if len(found) > _MOST_FILES:
-            raise InputError(f"{path} holds more than {_MOST_FILES} files: name those that count")
+        if len(found) > MOST_FILES:
+            raise InputError(f"{path} holds more than {MOST_FILES} files: name those that count")
     return found
 
 
@@ -76,7 +76,7 @@ def _in_folder(folder: Path, depth: int) -> Iterator[Recognised]:
         return
     yield from map(_file, files)
     for path in inside:
-        if path.is_dir() and not path.is_symlink() and depth < _DEEPEST:
+        if path.is_dir() and not path.is_symlink() and depth < DEEPEST:
             yield from _in_folder(path, depth + 1)
 
 

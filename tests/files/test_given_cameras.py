@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.colmap import write_colmap_model
-from orthoflow.files.given_cameras import CentredLens, GivenCamera
+from orthoflow.files.given_cameras import MOST_BYTES, MOST_MODEL_BYTES, CentredLens, GivenCamera
+from orthoflow.files.metashape import MOST_TAGS
 from orthoflow.files.panoramas import face_picture
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.geometry.rotations import quaternion_from_rotation
@@ -448,6 +449,8 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
          "the lens of a.jpg is none: focal length 0, 2"),
         ({"c.json": cameras_json(lambda e: e.update(K=[[1, 0, 0], [0, 2, 0]]))}, r"must be K \(3"),
         ({"c.json": cameras_json(lambda e: e.update(distortion=[0, 0, 0, 0, math.nan]))},
+         "it is no cameras.json of a run"),
+        ({"c.json": cameras_json(lambda e: e.update(distortion=[0, 0, 0, 0, "1e999"]))},
          "the lens of a.jpg is none"),
         # A mirror is no turn.
         ({"c.json": cameras_json(
@@ -459,6 +462,14 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
         ({"c.csv": "name,x,y,z\n"}, "the column alt is missing"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,0,0.1,0\n"}, "c.csv:2: .* tangential"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,zero,0,0,0,0,0,0\n"}, "c.csv:2: the parameters"),
+        ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,four,0,0\n"}, "c.csv:2: k4, t1 and t2"),
+        ({"c.csv": HEAD + "x" * 200_000 + ",1\n"}, "c.csv: it is no table: field larger than"),
+        ({"c.json": cameras_json(lambda e: e.update(width=math.inf))}, "no cameras.json of a run"),
+        ({"c.json": cameras_json(lambda e: e.update(sigma_wall_mm=[1]))},
+         "sigma_wall_mm of a.jpg must be numbers"),
+        ({"c.json": cameras_json(lambda e: e.update(width=10**30))},
+         r"a.jpg is 100000000000\.\.\. x 480 pixels"),
+        ({"c.xml": "<a/>" * (MOST_TAGS + 1)}, f"c.xml has more than {MOST_TAGS} tags"),
     ],
 )  # fmt: skip
 def test_files_that_make_no_sense_end_in_one_sentence(
@@ -469,12 +480,61 @@ def test_files_that_make_no_sense_end_in_one_sentence(
     assert "\n" not in str(caught.value)
 
 
-def test_a_file_of_half_a_gigabyte_is_no_file_of_cameras(tmp_path: Path) -> None:
-    path = tmp_path / "cameras.json"
-    with path.open("wb") as file:
-        file.truncate(500_000_001)
-    with pytest.raises(InputError, match=r"cameras\.json is too large for a file of cameras"):
-        read_given_cameras([path])
+def test_more_cameras_than_any_project_has_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("camera_formats", "colmap", "given_cameras", "metashape"):
+        monkeypatch.setattr(f"orthoflow.files.{module}.MOST_CAMERAS", 2)
+    pose = "1 1 0 0 0 0 0 0 1 a.jpg\n\n"
+    row = "a.jpg,1,2,3,0,0,0,24,0,0,0,0,0,0,0,0\n"
+    camera = "<camera label='a.jpg'/>"
+    many: list[tuple[int, dict[str, str | bytes]]] = [
+        *((n, {"cameras.txt": CAMERA, "images.txt": pose * n}) for n in (2, 3, 9)),
+        *((n, {"c.csv": HEAD + row * n}) for n in (2, 3, 9)),
+        *(
+            (n, {"c.xml": f"<d><chunk><cameras>{camera * n}</cameras></chunk></d>"})
+            for n in (2, 3, 9)
+        ),
+    ]
+    for n_cameras, files in many:
+        paths = write(tmp_path, files)
+        if n_cameras == 2:
+            assert len(read_given_cameras(paths)) == 2
+            continue
+        with pytest.raises(InputError, match="holds more than 2 cameras: split it"):
+            read_given_cameras(paths)
+    lenses = "".join(f"{k} PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n" for k in range(3))
+    with pytest.raises(InputError, match=r"cameras.txt holds more than 2 cameras"):
+        read_given_cameras(write(tmp_path, {"cameras.txt": lenses, "images.txt": pose}))
+
+
+def test_a_line_that_no_model_has_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.files.given_cameras.MOST_LINE", 100)
+    files: dict[str, str | bytes] = {"cameras.txt": CAMERA, "images.txt": "#" * 100}
+    with pytest.raises(InputError, match=r"images.txt has a line of more than 100 letters"):
+        read_given_cameras(write(tmp_path, files))
+
+
+@pytest.mark.parametrize(
+    ("names", "most"),
+    [
+        (("cameras.json",), MOST_BYTES),
+        (("a.xml",), MOST_BYTES),
+        (("a.csv",), MOST_BYTES),
+        (("cameras.txt", "images.txt"), MOST_MODEL_BYTES),
+        (("cameras.bin", "images.bin"), MOST_MODEL_BYTES),
+    ],
+)
+def test_a_file_that_no_cameras_need_is_not_read(
+    tmp_path: Path, names: tuple[str, ...], most: int
+) -> None:
+    for name in names:
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(most + 1)
+    with pytest.raises(InputError, match=f"has {most + 1} bytes, more than {most}: it is too"):
+        read_given_cameras([tmp_path / name for name in names])
 
 
 @pytest.mark.parametrize("turned", [1e-5, 1e-3])

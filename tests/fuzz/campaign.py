@@ -8,8 +8,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.fuzz import readers, records
+from tests.fuzz import read_cameras, readers, record_exports, records
 from tests.fuzz.harness import SEED, fuzz
+
+# Each says in `NAMES` which targets it has.
+_MODULES = (readers, read_cameras, records, record_exports)
 
 
 def main() -> None:
@@ -22,9 +25,9 @@ def main() -> None:
     options = parser.parse_args()
     n_cases = n_findings = 0
     _say("reader             cases  refused   peak MiB  slowest s   (case)  findings")
-    for target in options.targets or (*readers.NAMES, *records.NAMES):
-        module = "records" if target in records.NAMES else "readers"
-        name = target if ":" in target else f"tests.fuzz.{module}:{target}"
+    known = {name: module.__name__ for module in _MODULES for name in module.NAMES}
+    for target in options.targets or known:
+        name = target if ":" in target else f"{known[target]}:{target}"
         folder = Path(tempfile.mkdtemp(prefix="fuzz-"))
         outcome = fuzz(
             name, folder, seed=options.seed, budget_s=options.seconds, most_cases=options.cases

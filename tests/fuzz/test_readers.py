@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.fuzz import read_cameras, readers
 from tests.fuzz.harness import fuzz
-from tests.fuzz.readers import NAMES
+
+MODULES = {name: module.__name__ for module in (readers, read_cameras) for name in module.NAMES}
 
 
-@pytest.mark.parametrize("name", NAMES, ids=str.lower)
+@pytest.mark.parametrize("name", MODULES, ids=str.lower)
 def test_a_damaged_file_is_read_or_refused(name: str, tmp_path: Path) -> None:
-    outcome = fuzz(f"tests.fuzz.readers:{name}", tmp_path)
+    outcome = fuzz(f"{MODULES[name]}:{name}", tmp_path)
     assert outcome.n_cases > 0
     assert not outcome.findings, outcome.report()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
+from tests.drawing_runs import box_planes, box_products
 
 
 def frame(width: int = 4, height: int = 3) -> WallFrame:
@@ -234,6 +237,53 @@ def test_a_payload_that_lacks_a_field_is_refused() -> None:
     payload = Payload(type_name="walls", encoding_version=1, metadata={}, arrays={})
     with pytest.raises(ProductError, match="lacks fields"):
         Walls.from_payload(payload)
+
+
+@pytest.mark.parametrize(
+    ("product", "changed", "said"),
+    [
+        (box_planes(), {"names": "wall 0"}, "the stored names must be tuple, got str"),
+        (box_planes(), {"names": [1, 2]}, "the stored names/0 must be str, got int"),
+        (box_planes(), {"offset": [1.0]}, "the stored offset must be ndarray, got list"),
+        (
+            box_planes(),
+            {"offset": {"$array": "bytes"}},
+            "the stored offset must be ndarray, got bytes",
+        ),
+        (
+            box_planes(),
+            {"tolerance_m": True},
+            "the stored tolerance_m must be float or int, got bool",
+        ),
+        (box_planes(), {"details": []}, "the stored details must be dict, got list"),
+        (
+            box_planes(),
+            {"thickness": [3]},
+            "the stored thickness/0 must be Thickness or NoneType, got",
+        ),
+        (walls(), {"walls": [{}]}, "a stored Wall lacks fields"),
+        (walls(), {"walls": [[]]}, "the stored walls/0 must be Wall, got list"),
+    ],
+    ids=lambda value: str(value)[:30] if isinstance(value, dict) else "",
+)
+def test_what_a_field_cannot_hold_is_refused(
+    product: Product, changed: dict[str, JsonValue], said: str
+) -> None:
+    # Whoever seals a record may store anything in it.
+    payload = product.to_payload()
+    metadata = {**payload.metadata, **changed}
+    with pytest.raises(ProductError, match=re.escape(said)):
+        type(product).from_payload(dataclasses.replace(payload, metadata=metadata))
+
+
+def test_arrays_that_do_not_go_with_each_other_are_refused() -> None:
+    for product in (*PRODUCTS, *box_products().values()):
+        payload = product.to_payload()
+        for name in payload.arrays:
+            arrays = {**payload.arrays, name: np.zeros((2, 5, 3, 2, 1))}
+            # A product, or a sentence: never an error of numpy's.
+            with contextlib.suppress(ProductError):
+                type(product).from_payload(dataclasses.replace(payload, arrays=arrays))
 
 
 def test_metadata_that_is_not_finite_is_refused() -> None:

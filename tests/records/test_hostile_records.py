@@ -313,6 +313,30 @@ def test_tables_for_spreadsheets_hold_no_formulas(finished: Studio, folder: Path
     assert "paint,paint,paint.plain,plain,2.0,1\n" in text
 
 
+def test_halves_of_letters_are_written_as_json_has_them(finished: Studio, folder: Path) -> None:
+    def write(file: h5py.File) -> None:
+        hostile.set_text(file["cells/paint"], "params", '{"odd": "a\\ud800"}')
+
+    run = hostile.changed(finished.folder / "first", folder / "run", write)
+    for target in ("csv", "prov", "ro-crate"):
+        done = finished("export", run, "--to", target, "-o", target)
+        assert done.exit_code == 0, done.output
+    assert "a\\ud800" in Path("csv/parameters.csv").read_text()
+    assert "a\\ud800" in Path("prov/prov.json").read_text()
+
+
+def test_pictures_that_cannot_be_decoded_are_not_counted(finished: Studio, folder: Path) -> None:
+    def draw(file: h5py.File) -> None:
+        hostile.add_figure(file["cells/paint"], "good")
+        hostile.add_figure(file["cells/paint"], "bad", "image/webp")
+
+    run = hostile.changed(finished.folder / "first", folder / "run", draw)
+    done = finished("export", run, "--to", "figures", "-o", "drawn")
+    assert done.exit_code == 0, done.output
+    assert "1 figure and the graph; 1 damaged one left out" in done.stdout
+    assert [path.name for path in Path("drawn/paint").iterdir()] == ["good.png"]
+
+
 @pytest.mark.parametrize("command", [("compare",), ("show",), ("report",)], ids=" ".join)
 def test_what_fails_on_a_damaged_record_is_said_to_be_its_fault(
     finished: Studio, folder: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch

@@ -13,7 +13,7 @@ from orthoflow_provenance.writer import write_record
 import orthoflow
 from orthoflow.errors import ArgumentError, OrthoflowError, WorkflowError
 from orthoflow.products import Orthoimages
-from orthoflow.report.notebooks import OpenedRun
+from orthoflow.report.notebooks import Figures, OpenedRun
 from tests.provenance_records import write_sample
 from tests.report_runs import cell, compared_resolved, metrics, record
 from tests.report_runs import orthoimages_product as images_of
@@ -77,6 +77,8 @@ def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:
     assert list(figures) == ["scan/plan"]
     assert repr(figures) == "scan/plan: a <plan>"
     figure = figures["scan/plan"]
+    told = Figures({"scan/\x1b[2J": replace(figure, caption="a\u202eb")})
+    assert repr(told) == "scan/\\x1b[2J: a\\u202eb"
     assert "a &lt;plan&gt;" in figure._repr_html_()
     assert 'src="data:image/png;base64,iVBORw0KGgo' in figure._repr_html_()
     figure.save(tmp_path / "plan.png")

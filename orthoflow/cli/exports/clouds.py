@@ -146,6 +146,7 @@ def _found(run: Run, chosen: Choices) -> _Found:
     cloud = product_of(run, digest, PointCloud, chosen.store)
     if len(cloud) == 0:
         raise ArgumentError(f"the cloud of {address} has no points, so there is nothing to write")
+    cloud.require_points(1)
     if labels is not None and len(labels.plane_index) != len(cloud):
         raise ArgumentError(
             f"the labels are of {len(labels.plane_index)} points, but the cloud has {len(cloud)}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,9 +43,12 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
 
     addresses = run.cells if chosen.cell is None else (run.cell(chosen.cell).address,)
     # Refused before a folder is made for them.
-    figure_files(run, addresses)
+    n_figures = len(figure_files(run, addresses))
     make_empty(folder)
-    return f"{counted(write_figures(run, folder, addresses), 'figure')} and the graph"
+    n_written = write_figures(run, folder, addresses)
+    damaged = n_figures - n_written
+    left_out = f"; {counted(damaged, 'damaged one')} left out" if damaged else ""
+    return f"{counted(n_written, 'figure')} and the graph{left_out}"
 
 
 def export_crate(run: Run, folder: Path, chosen: Choices) -> str:
@@ -75,14 +77,14 @@ def export_layers(run: Run, folder: Path, chosen: Choices) -> str:
 
 def export_prov(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write `prov.json`."""
+    from orthoflow.files.json_texts import json_bytes
     from orthoflow.records.prov import count_things, prov_document
     from orthoflow.records.run_files import creating
 
     document = prov_document(run.record)
     make_empty(folder)
     with creating(folder, "prov.json") as stream:
-        text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-        stream.write(text.encode())
+        stream.write(json_bytes(document, indent=1) + b"\n")
     counts = count_things(document)
     return f"prov.json: {', '.join(f'{name}: {count}' for name, count in counts.items())}"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -11,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of
-from orthoflow.files.sidecars import write_text
+from orthoflow.files.json_texts import json_bytes
+from orthoflow.files.sidecars import write_bytes
 from orthoflow.geometry.adjoining import Edge
 from orthoflow.products import JsonValue
 
@@ -102,4 +102,4 @@ def _write(path: Path, features: list[_Feature], map_crs: str | None) -> None:
         name = f"urn:ogc:def:crs:EPSG::{map_crs.removeprefix('EPSG:')}"
         content["crs"] = {"type": "name", "properties": {"name": name}}
     content["features"] = list(features)
-    write_text(path, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    write_bytes(path, json_bytes(content, indent=1) + b"\n")

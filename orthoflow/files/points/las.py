@@ -54,7 +54,7 @@ _LAYERED: Final = 3
 _ITEMS_AT: Final = 32
 _LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES: Final = 14
-_MOST_FIXED_CHUNK: Final = 50_000_000
+MOST_FIXED_CHUNK: Final = 50_000_000
 _WORKER: Final = Path(__file__).with_name("las_worker.py")
 # Blocks that a process may be ahead.
 _SLOTS: Final = 2
@@ -289,9 +289,7 @@ def _checked_chunks(path: Path, header: Any) -> list[tuple[int, int, int]]:
     if sum(size for _, size in table) > n_bytes:
         raise _damaged(path, "its chunks are larger than the file")
     is_variable = compression.uses_variable_size_chunks()
-    if not is_variable and compression.chunk_size() > max(
-        _MOST_FIXED_CHUNK, 2 * header.point_count
-    ):
+    if not is_variable and compression.chunk_size() > max(MOST_FIXED_CHUNK, 2 * header.point_count):
         raise _damaged(path, f"its chunks are said to hold {compression.chunk_size()} points each")
     n_points = sum(count for count, _ in table)
     if _is_layered(record):

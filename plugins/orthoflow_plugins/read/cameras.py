@@ -12,6 +12,7 @@ from pydantic import Field
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.given_cameras import CentredLens, GivenCamera
+from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.scan import UNITS_M, Unit
@@ -64,7 +65,8 @@ class ReadCameras(Method):
         ctx.progress(0.0, inputs.files.name)
         given = read_given_cameras(inputs.files.paths)
         photos = inputs.photos.photos
-        cameras = tuple(_camera(photo, given, UNITS_M[params.unit]) for photo in photos)
+        by_name = _ByName(given)
+        cameras = tuple(_camera(photo, by_name, UNITS_M[params.unit]) for photo in photos)
         n_oriented = sum(camera.status == "ok" for camera in cameras)
         if not n_oriented:
             names = ", ".join(item.name for item in given[:_NAMED])
@@ -83,8 +85,8 @@ class ReadCameras(Method):
         return self.Out(cameras=Cameras(cameras=cameras, details={"given": True}))
 
 
-def _camera(photo: Photo, given: Sequence[GivenCamera], unit_m: float) -> Camera:
-    found = _of_photo(photo.name, given)
+def _camera(photo: Photo, given: _ByName, unit_m: float) -> Camera:
+    found = given.of_photo(photo.name)
     if found is None:
         return Camera(photo=photo.name, status="the files of given cameras say nothing of it")
     if found.lens is None or found.rotation is None or found.translation is None:
@@ -98,30 +100,46 @@ def _camera(photo: Photo, given: Sequence[GivenCamera], unit_m: float) -> Camera
             f"{lens.width} x {lens.height}: give the photos that were oriented, at the same size "
             "and not turned"
         )
+    translation_m = unit_m * np.asarray(found.translation, dtype=np.float64)
+    # Also not where it is no number.
+    if not np.abs(translation_m).max() < FARTHEST_M:
+        raise InputError(
+            f"photo {photo.name} was taken {np.abs(translation_m).max():.3g} m from the origin, "
+            f"as its given camera says; expected less than {FARTHEST_M:g} m: check the unit"
+        )
     return Camera(
         photo=photo.name,
         status="ok",
         intrinsics=lens,
         rotation_camera_from_world=found.rotation,
-        translation_camera_from_world=unit_m * np.asarray(found.translation, dtype=np.float64),
+        translation_camera_from_world=translation_m,
         sigma_wall_m=found.sigma_wall_m,
     )
 
 
-def _of_photo(name: str, given: Sequence[GivenCamera]) -> GivenCamera | None:
-    """The camera of a photo: of its name, or else of its name without suffix.
+class _ByName:
+    """Given cameras by the names of their photos."""
 
-    Raises:
-        InputError: several cameras have that name.
-    """
-    for wanted in (name, PurePath(name).stem):
-        found = [item for item in given if item.name == wanted]
-        found = found or [item for item in given if item.name.lower() == wanted.lower()]
-        if len(found) > 1:
-            raise InputError(
-                f"the files of given cameras have {len(found)} cameras {found[0].name}: photo "
-                f"{name} must have one"
-            )
-        if found:
-            return found[0]
-    return None
+    def __init__(self, given: Sequence[GivenCamera]) -> None:
+        self._exact: dict[str, list[GivenCamera]] = {}
+        self._lower: dict[str, list[GivenCamera]] = {}
+        for camera in given:
+            self._exact.setdefault(camera.name, []).append(camera)
+            self._lower.setdefault(camera.name.lower(), []).append(camera)
+
+    def of_photo(self, name: str) -> GivenCamera | None:
+        """Give the camera of a photo: of its name, or else of its name without suffix.
+
+        Raises:
+            InputError: several cameras have that name.
+        """
+        for wanted in (name, PurePath(name).stem):
+            found = self._exact.get(wanted) or self._lower.get(wanted.lower(), [])
+            if len(found) > 1:
+                raise InputError(
+                    f"the files of given cameras have {len(found)} cameras {found[0].name}: photo "
+                    f"{name} must have one"
+                )
+            if found:
+                return found[0]
+        return None

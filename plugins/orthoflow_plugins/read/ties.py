@@ -70,11 +70,13 @@ class ReadTies(Method):
         ctx.progress(0.0, inputs.files.name)
         found = [tie for path in inputs.files.paths for tie in read_measured_ties(path)]
         photos = {photo.name: photo for photo in inputs.photos.photos}
-        problems = [text for tie in found if (text := _problem(tie, photos))]
-        if problems:
-            left_out = len(problems) - _MOST_PROBLEMS
+        wrong = [tie for tie in found if not _is_in_photo(tie, photos)]
+        if wrong:
+            left_out = len(wrong) - _MOST_PROBLEMS
             more = [f"... and {left_out} more problems"] if left_out > 0 else []
-            raise InputError("\n".join(problems[:_MOST_PROBLEMS] + more))
+            # To look for similar names takes long, so only those that are told are looked at.
+            told = [_problem(tie, photos) for tie in wrong[:_MOST_PROBLEMS]]
+            raise InputError("\n".join(told + more))
         ties = _ties(found, tuple(photos), params)
         per_photo = np.bincount(ties.photo, minlength=len(photos))
         ctx.metric("n_ties", len(found), "1")
@@ -85,20 +87,26 @@ class ReadTies(Method):
         return self.Out(ties=ties)
 
 
+def _is_in_photo(tie: MeasuredTie, photos: Mapping[str, Photo]) -> bool:
+    photo = photos.get(tie.photo)
+    if photo is None:
+        return False
+    u, v = tie.pixel
+    return -0.5 <= u <= photo.width - 0.5 and -0.5 <= v <= photo.height - 0.5
+
+
 def _problem(tie: MeasuredTie, photos: Mapping[str, Photo]) -> str:
-    """Say what is wrong with a tie; empty when nothing is."""
+    """Say why a tie is in no photo."""
     photo = photos.get(tie.photo)
     if photo is None:
         near = difflib.get_close_matches(tie.photo, photos, n=1)
         hint = f" (did you mean {near[0]}?)" if near else ""
         return f"{tie.where}: there is no photo {tie.photo} among those given{hint}"
     u, v = tie.pixel
-    if not (-0.5 <= u <= photo.width - 0.5 and -0.5 <= v <= photo.height - 0.5):
-        return (
-            f"{tie.where}: (u {u:g}, v {v:g}) lies outside photo {tie.photo}, which is "
-            f"{photo.width} x {photo.height} pixels as it is stored"
-        )
-    return ""
+    return (
+        f"{tie.where}: (u {u:g}, v {v:g}) lies outside photo {tie.photo}, which is "
+        f"{photo.width} x {photo.height} pixels as it is stored"
+    )
 
 
 def _ties(found: Sequence[MeasuredTie], names: tuple[str, ...], params: ReadTies.Params) -> Ties:

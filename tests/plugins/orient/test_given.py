@@ -67,6 +67,14 @@ def test_a_model_gives_the_poses_of_the_photos_by_name(folder: Path) -> None:
     assert warnings == [f"photo b.jpg is not oriented: {second.status}"]
 
 
+@pytest.mark.parametrize("metres", [1e9, 1e300])
+def test_a_photo_taken_from_nowhere_on_earth_is_refused(folder: Path, metres: float) -> None:
+    far = replace(CAMERA, translation=np.array([0.0, metres, 0.0]))
+    write_colmap_model(folder / "given", oriented(far))
+    with pytest.raises(InputError, match=r"m from the origin, as its given camera says; expected"):
+        read(folder)
+
+
 def test_the_unit_of_a_model_scales_its_poses(folder: Path) -> None:
     millimetres = replace(CAMERA, translation=1000.0 * CAMERA.translation)
     write_colmap_model(folder / "given", oriented(millimetres))

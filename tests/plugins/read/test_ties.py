@@ -82,3 +82,17 @@ def test_all_problems_are_said_at_once(tmp_path: Path) -> None:
         "ties0.csv:2",
         "ties0.csv:4",
     ]
+
+
+def test_names_that_are_near_are_sought_for_what_is_told_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Of a hundred thousand ties in photos that are not there, this took an hour.
+    sought = []
+    monkeypatch.setattr(
+        "difflib.get_close_matches", lambda name, *_, **__: sought.append(name) or []
+    )
+    text = "photo,u_px,v_px,x,y,z\n" + "c.jpg,1,2,3,4,5\n" * 500
+    with pytest.raises(InputError, match=r"\.\.\. and 480 more problems"):
+        read(tmp_path, text)
+    assert len(sought) == 20

@@ -1,0 +1,260 @@
+"""Readers of what other programs say of photos, as targets of the fuzzing: cameras, ties, E57."""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from random import Random
+from typing import Final
+
+import numpy as np
+from orthoflow_plugins.read.cameras import ReadCameras
+from orthoflow_plugins.read.photos import ReadPhotos
+from orthoflow_plugins.read.ties import ReadTies
+
+from orthoflow.engine.store import digest_of
+from orthoflow.files.colmap import write_colmap_model
+from orthoflow.files.e57_images import count_e57_images
+from orthoflow.files.images import encode_jpeg, encode_png
+from orthoflow.files.publishing import publish_cameras
+from orthoflow.products import Camera, Cameras, InputFiles, Intrinsics, Photo, Photos, Product
+from orthoflow.sdk import Method
+from orthoflow.testing.trials import Trial, run_trial
+from orthoflow.workflow.drafting import draft_workflow
+from orthoflow.workflow.recognising import recognised
+from tests import photo_files, scan_files
+from tests.fuzz.harness import Target
+from tests.fuzz.mutation import mutate_bytes, mutate_e57, mutate_json, mutate_text
+
+_WIDTH, _HEIGHT = 64, 48
+_PHOTOS: Final = ("a.jpg", "b.jpg")
+_POSE: Final = (*np.eye(4)[:3].ravel(), 0.0, 0.0, 0.0, 1.0)
+
+
+def _photos() -> Photos:
+    return Photos(
+        photos=tuple(
+            Photo(name=name, width=_WIDTH, height=_HEIGHT, encoded=b"") for name in _PHOTOS
+        )
+    )
+
+
+def _read(method: type[Method], paths: Sequence[Path], **more: Product) -> object:
+    files = InputFiles(name="files", paths=tuple(paths))
+    trial = Trial(method=method, inputs={"files": files, **more})
+    return run_trial(trial, paths[0].parent / "scratch", draws=False).digests
+
+
+# Cameras ------------------------------------------------------------------------------------------
+
+_METASHAPE: Final = f"""\
+<?xml version="1.0" encoding="UTF-8"?>
+<document version="1.5.0"><chunk label="Chunk 1">
+<sensors>
+<sensor id="0" label="NIKON" type="frame"><resolution width="64" height="48"/>
+<calibration type="frame" class="adjusted"><resolution width="64" height="48"/>
+<f>60.5</f><cx>0.5</cx><cy>-0.25</cy><k1>-0.1</k1><p1>0.001</p1><b1>0.01</b1></calibration></sensor>
+<sensor id="1" label="360" type="spherical"><resolution width="256" height="128"/></sensor>
+</sensors>
+<components><component id="0"><transform><rotation>1 0 0 0 1 0 0 0 1</rotation>
+<translation>4e5 5e6 100</translation><scale>1.5</scale></transform></component></components>
+<cameras>
+<camera id="0" sensor_id="0" component_id="0" label="a.jpg">
+<transform>{" ".join(map(str, _POSE))}</transform></camera>
+<group><camera id="1" sensor_id="1" label="b.jpg">
+<transform>{" ".join(map(str, _POSE))}</transform></camera></group>
+</cameras></chunk></document>
+"""
+_BUNDLER: Final = """\
+# Bundle file v0.3
+2 0
+60.5 -0.1 0.01
+1 0 0
+0 1 0
+0 0 1
+0.5 1.5 2.5
+0 0 0
+0 0 0
+0 0 0
+0 0 0
+0 0 0
+"""
+_REALITYCAPTURE: Final = """\
+#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2
+a.jpg,1.5,2.5,3.5,90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0
+b.jpg,2.5,2.5,3.5,-90,85,0.5,34.0,0.001,-0.002,-0.05,0.01,0,0,0,0
+"""
+
+
+def _given() -> Cameras:
+    lens = Intrinsics(width=_WIDTH, height=_HEIGHT, fx=60.5, fy=61.0, cx=31.5, cy=24.0)
+    first = Camera(
+        photo=_PHOTOS[0],
+        status="ok",
+        intrinsics=lens,
+        rotation_camera_from_world=np.eye(3),
+        translation_camera_from_world=np.array([1.0, 2.0, 3.0]),
+        sigma_wall_m=0.002,
+    )
+    return Cameras(cameras=(first, Camera(photo=_PHOTOS[1], status="no wall is recognised in it")))
+
+
+def _binary_model() -> tuple[bytes, bytes]:
+    lens = struct.pack("<IiQQ8d", 7, 4, _WIDTH, _HEIGHT, 60.5, 61.0, 32, 24, -0.1, 0.01, 0, 0)
+    pose = struct.pack("<I7dI", 1, 1.0, 0.0, 0.0, 0.0, 0.5, 1.5, 2.5, 7)
+    observed = struct.pack("<Q", 2) + struct.pack("<ddq", 1.5, 2.5, -1) * 2
+    count = struct.pack("<Q", 1)
+    return count + lens, count + pose + _PHOTOS[0].encode() + b"\0" + observed
+
+
+def _camera_files(folder: Path) -> None:
+    publish_cameras(_given(), folder, "sha256:0")
+    write_colmap_model(folder, _given())
+    (folder / "points3D.txt").unlink()
+    for name, content in zip(("cameras.bin", "images.bin"), _binary_model(), strict=True):
+        (folder / name).write_bytes(content)
+    (folder / "metashape.xml").write_text(_METASHAPE)
+    (folder / "bundle.out").write_text(_BUNDLER)
+    (folder / "list.txt").write_text("walls/a.jpg 0 60.5\nwalls/b.jpg\n")
+    (folder / "list.csv").write_text(_REALITYCAPTURE)
+
+
+# What must lie beside a file for it to be read.
+_BESIDE: Final = {
+    "cameras.txt": "images.txt",
+    "images.txt": "cameras.txt",
+    "cameras.bin": "images.bin",
+    "images.bin": "cameras.bin",
+    "bundle.out": "list.txt",
+    "list.txt": "bundle.out",
+}
+
+
+def _read_cameras(path: Path) -> object:
+    paths = [path]
+    if path.name in _BESIDE:
+        paths.append(path.with_name(_BESIDE[path.name]))
+        paths[-1].write_bytes(_sound()[paths[-1].name])
+    return _read(ReadCameras, paths, photos=_photos())
+
+
+@cache
+def _sound() -> Mapping[str, bytes]:
+    with tempfile.TemporaryDirectory() as folder:
+        _camera_files(Path(folder))
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+def _mutate_cameras(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    if b"\0" in content:
+        return mutate_bytes(content, rng, others)
+    is_json = content.startswith(b"{") and rng.random() < 0.7
+    return (mutate_json if is_json else mutate_text)(content, rng, others)
+
+
+CAMERAS = Target(seeds=_camera_files, read=_read_cameras, mutate=_mutate_cameras)
+
+
+# Ties ---------------------------------------------------------------------------------------------
+
+_TIES: Final = """\
+# photo, then pixels as OpenCV counts them
+photo,u_px,v_px,x,y,z,sigma_px
+a.jpg,10.5,20.5,1.0,2.0,3.0,0.5
+b.jpg,0,47.5,-1e2,2.5,0.001,
+"a.jpg",63.5,0,0,0,0,2
+"""
+
+
+TIES = Target(
+    seeds=lambda folder: (folder / "ties.csv").write_text(_TIES),
+    read=lambda path: _read(ReadTies, [path], photos=_photos()),
+    mutate=mutate_text,
+)
+
+
+# Photos in E57 files ------------------------------------------------------------------------------
+
+_NUMBERS: Final = {
+    "imageWidth": _WIDTH,
+    "imageHeight": _HEIGHT,
+    "focalLength": 0.03,
+    "pixelWidth": 5e-4,
+    "pixelHeight": 6e-4,
+    "principalPointX": 33.5,
+    "principalPointY": 22.25,
+}
+
+
+def _e57_files(folder: Path) -> None:
+    picture = photo_files.picture(_WIDTH, _HEIGHT)
+    points = np.random.default_rng(1).uniform(0.0, 1.0, (5, 3))
+    fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), points.T, strict=True))
+    pose = {"rotation": (0.8, 0.0, 0.0, 0.6), "translation": (1.0, 2.0, 3.0)}
+    sphere = {
+        "imageWidth": 64,
+        "imageHeight": 32,
+        "pixelWidth": 2.0 * np.pi / 64,
+        "pixelHeight": np.pi / 32,
+    }
+    images = [
+        {
+            "kind": "pinhole",
+            "name": "north",
+            "content": encode_jpeg(picture),
+            "numbers": _NUMBERS,
+            **pose,
+        },
+        {
+            "kind": "spherical",
+            "content": encode_png(photo_files.picture(64, 32)),
+            "numbers": sphere,
+            **pose,
+        },
+        {"kind": "visualReference", "content": encode_png(picture)},
+    ]
+    scan_files.write_e57(folder / "room.e57", [{"fields": fields}], images)
+
+
+def _read_e57_photos(path: Path) -> object:
+    """Count them, read them as photos, and their cameras."""
+    count_e57_images(path)
+    files = InputFiles(name="photos", paths=(path,))
+    scratch = path.parent / "scratch"
+    trial = Trial(method=ReadPhotos, inputs={"files": files})
+    photos = run_trial(trial, scratch, draws=False).outputs["photos"]
+    trial = Trial(method=ReadCameras, inputs={"files": files, "photos": photos})
+    return digest_of(photos), run_trial(trial, scratch, draws=False).digests
+
+
+E57_PHOTOS = Target(seeds=_e57_files, read=_read_e57_photos, mutate=mutate_e57)
+
+
+# Folders that a workflow is drafted for -----------------------------------------------------------
+
+
+def _folder_files(folder: Path) -> None:
+    _camera_files(folder)
+    for name in ("images.txt", "images.bin", "bundle.out", "list.txt"):
+        (folder / name).unlink()
+    (folder / "ties.csv").write_text(_TIES)
+    (folder / "points.csv").write_text("name,x,y,z\np1,1.0,2.0,3.0\n")
+    (folder / "calibration.yaml").write_text(
+        'cameras: {"*": {width: 64, height: 48, fx: 60, fy: 60, cx: 31.5, cy: 23.5}}\n'
+    )
+    (folder / "scan.xyz").write_text("1.5 2.5 3.5\n4.5 5.5 6.5\n")
+    photo_files.write(folder, {"a.jpg": photo_files.jpeg(photo_files.picture())})
+
+
+def _draft(path: Path) -> object:
+    """Draft for the file, with a scan and a name from nowhere beside it."""
+    path.with_name("room.xyz").write_text("1.5 2.5 3.5\n4.5 5.5 6.5\n")
+    return draft_workflow(recognised([path.parent]), path.with_name("workflow.yaml"), None).text
+
+
+FOLDER = Target(seeds=_folder_files, read=_draft, mutate=_mutate_cameras)
+
+NAMES: Final = ("CAMERAS", "TIES", "E57_PHOTOS", "FOLDER")

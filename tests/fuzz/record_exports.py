@@ -1,0 +1,357 @@
+"""What becomes of a run whose record and files fit each other and are hostile: exports of it.
+
+A case's file holds no more than the number that the damage follows from. Records alone are in
+`records`; here products are changed before they are digested, and files before the record names
+them, so that nothing is found wrong but what they say.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from random import Random
+from typing import Any, Final
+
+import numpy as np
+from orthoflow_provenance.digests import sha256_text
+from orthoflow_provenance.encoding import read_table, write_table
+from orthoflow_provenance.layout import PUBLISHED
+from orthoflow_provenance.model import RecordedProduct
+from orthoflow_provenance.writer import write_record
+
+from orthoflow.engine.file_digests import file_sha256
+from orthoflow.geometry import WallFrame
+from orthoflow.products import (
+    Camera,
+    Cameras,
+    Intrinsics,
+    Layer,
+    Layers,
+    Photo,
+    Photos,
+    PointCloud,
+    PointLabels,
+    Product,
+    TieRole,
+    Ties,
+)
+from orthoflow.products.product import Payload
+from tests import drawing_runs, photo_files
+from tests import hostile_records as hostile
+from tests.fuzz.harness import Target
+from tests.fuzz.hostile_files import changed_json
+from tests.fuzz.mutation import mutate_bytes
+from tests.fuzz.records import SECRET, Command, RefusedError, check_command, surroundings
+from tests.provenance_records import ProductShelf
+from tests.report_runs import cell, record
+from tests.studios import Studio
+
+Change = Callable[[Payload], Payload]
+MOST_CPU_S: Final = 10.0  # of a command that may be the first to compile a kernel
+
+_PICTURED: Final[Sequence[Command]] = tuple(
+    ("export", "--to", target, "-o", f"out/{target}")
+    for target in ("sheet", "dxf", "geojson", "gltf", "tiles", "stac")
+)
+_CLOUDS: Final[Sequence[Command]] = (
+    *(("export", "--to", target, "-o", f"out/{target}") for target in ("laz", "ply", "e57")),
+    ("export", "--to", "ply", "--colour", "deviation", "--clean", "-o", "out/cleaned"),
+    ("export", "--to", "laz", "--wall", "2", "-o", "out/wall"),
+)
+COMMANDS: Final[Sequence[Command]] = (
+    *_PICTURED,
+    *_PICTURED,
+    *_CLOUDS,
+    ("export", "--to", "colmap", "-o", "out/colmap"),
+    ("export", "--to", "layers", "-o", "out/layers"),
+    ("export", "--to", "prov", "-o", "out/prov"),
+    ("report", "-o", "out/report.html"),
+    ("show",),
+    ("runs",),
+    ("runs", "--csv"),
+    ("runs", "--json"),
+)
+
+
+# Runs ---------------------------------------------------------------------------------------------
+
+
+def _cloud() -> PointCloud:
+    """Points on the photographed wall and the floor, some of them far from both."""
+    rng = np.random.default_rng(5)
+    places = rng.uniform(0.2, 0.8, (300, 3)) * drawing_runs.SIZE_M
+    places[:200, 1] = drawing_runs.SIZE_M[1] + rng.normal(0.0, 0.002, 200)
+    places[200:280, 2] = 0.0
+    x, y, z = (drawing_runs.box_points(places) - drawing_runs.CORNER).T.astype(np.float32)
+    return PointCloud(
+        origin=drawing_runs.CORNER,
+        x=x,
+        y=y,
+        z=z,
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity=rng.uniform(0.0, 1.0, 300).astype(np.float32),
+        rgb=rng.integers(0, 256, (300, 3)).astype(np.uint8),
+        scan=(np.arange(300) % 2).astype(np.uint16),
+        stations=np.array([drawing_runs.CORNER + 1.0, drawing_runs.CORNER + 1.5]),
+        stations_source="file",
+        source={"files": ["a.e57", "b.e57"]},
+    )
+
+
+def _labels() -> PointLabels:
+    plane = np.repeat([drawing_runs.WALL, 0, -1], [200, 80, 20])
+    return PointLabels(plane_index=plane.astype(np.int16))
+
+
+def _cameras(frame: WallFrame) -> Cameras:
+    size = 640, 480
+    lens = Intrinsics(
+        width=size[0], height=size[1], fx=500.0, fy=500.0, cx=320.0, cy=240.0, source="given"
+    )
+    rotation = np.array([frame.u_world, frame.v_world, -frame.normal_world])
+    middle = frame.world_from_wall(np.array([[190.0, 115.0]]))[0]
+    camera = Camera(
+        photo="a.jpg",
+        status="ok",
+        intrinsics=lens,
+        rotation_camera_from_world=rotation,
+        translation_camera_from_world=-rotation @ (middle + 2.5 * frame.normal_world),
+    )
+    places = np.random.default_rng(6).uniform((50, 50), (300, 200), (12, 2))
+    ties = Ties(
+        photo_names=("a.jpg",),
+        photo=np.zeros(12, dtype=np.int32),
+        wall=np.zeros(12, dtype=np.int32),
+        pixels_photo=places,
+        points_world=frame.world_from_wall(places),
+        sigma_px=np.ones(12),
+        sigma_m=np.full(12, 0.001),
+        role=np.full(12, TieRole.CONTROL, dtype=np.uint8),
+        residual_px=np.zeros((12, 2)),
+    )
+    return Cameras(cameras=(camera, Camera(photo="b.jpg", status="dark")), ties=ties)
+
+
+def _layers(frame: WallFrame) -> Layers:
+    small = replace(frame, width=40, height=30)
+    layer = Layer(
+        frame=small,
+        wall=0,
+        source="a.jpg",
+        rgb=np.full((30, 40, 3), 90, np.uint8),
+        mask=np.ones((30, 40), np.uint8),
+        quality=np.ones((30, 40), np.float32),
+    )
+    return Layers(layers=(layer,), names=("wall 2",), plane_indices=(drawing_runs.WALL,))
+
+
+def _photos() -> Photos:
+    encoded = photo_files.jpeg(photo_files.picture(640, 480))
+    return Photos(photos=(Photo(name="a.jpg", encoded=encoded, width=640, height=480),))
+
+
+@cache
+def _payloads() -> dict[tuple[str, str], Payload]:
+    """What each step gives, by its port, with what the drawing run has."""
+    frame = drawing_runs.wall_frame(drawing_runs.box_planes())
+    more: dict[tuple[str, str], Product] = {
+        ("scan", "cloud"): _cloud(),
+        ("photos", "photos"): _photos(),
+        ("plane", "labels"): _labels(),
+        ("orient", "cameras"): _cameras(frame),
+        ("ortho", "layers"): _layers(frame),
+    }
+    named = {(step, item.type_name): item for step, item in drawing_runs.box_products().items()}
+    return {place: item.to_payload() for place, item in {**named, **more}.items()}
+
+
+# Which step takes what of which other one.
+_TAKEN: Final[dict[str, Sequence[tuple[str, str]]]] = {
+    "scan": (),
+    "photos": (),
+    "points": (),
+    "plane": (("scan", "cloud"),),
+    "wall": (("plane", "planes"),),
+    "orient": (("photos", "photos"),),
+    "ortho": (("orient", "cameras"), ("photos", "photos")),
+    "mosaic": (("wall", "walls"), ("ortho", "layers")),
+    "check": (("mosaic", "orthoimages"), ("points", "checkpoints")),
+}
+
+
+def write_run(folder: Path, change: Change = lambda payload: payload) -> None:
+    """Write a run whose record verifies, with products that were changed before it was made."""
+    (folder / "products").mkdir(parents=True)
+    published = drawing_runs.publish_box(folder)
+    shelf = ProductShelf(folder)
+    given = {
+        place: RecordedProduct(
+            type_name=payload.type_name,
+            encoding_version=payload.encoding_version,
+            digest=shelf.put(change(payload)),  # type: ignore[arg-type] # a payload like any
+            embedded=True,
+        )
+        for place, payload in _payloads().items()
+    }
+    cells = [
+        cell(
+            step,
+            key=sha256_text("{}"),
+            key_preimage="{}",
+            started="2026-01-02T03:04:05Z",
+            ended="2026-01-02T03:04:06Z",
+            determinism="exact",
+            distribution="orthoflow-tls",
+            distribution_version="0.1.0",
+            inputs={
+                port: replace(given[source, port], source=f"{source}.{port}", embedded=False)
+                for source, port in taken
+            },
+            outputs={port: item for (source, port), item in given.items() if source == step},
+        )
+        for step, taken in _TAKEN.items()
+    ]
+    write_record(folder / "run.h5", record(cells, name="box", published=published), shelf.find)
+    for path in shelf.files.values():
+        path.unlink()
+
+
+# Damage -------------------------------------------------------------------------------------------
+
+_VALUES: Final = (0.0, -1.0, 1.0, 1e30, -1e300, float("nan"), float("inf"), 5e-324)
+_REFUSED: Final = (ValueError, TypeError, KeyError, OverflowError, RecursionError, OSError)
+
+
+def _change_payload(random: Random, wanted: str, payload: Payload) -> Payload:
+    """Change an array or the rest of a product of one type."""
+    if payload.type_name != wanted:
+        return payload
+    names = sorted(payload.arrays)
+    if not names or random.random() < 0.4:
+        text = changed_json(json.dumps(dict(payload.metadata)).encode(), random)
+        changed = json.loads(text)
+        return replace(payload, metadata=changed) if isinstance(changed, dict) else payload
+    name = random.choice(names)
+    arrays = {**payload.arrays, name: _changed_array(payload.arrays[name], random)}
+    if random.random() < 0.1:
+        del arrays[name]
+    return replace(payload, arrays=arrays)
+
+
+# Any: arrays of every kind.
+def _changed_array(array: np.ndarray[Any, Any], random: Random) -> np.ndarray[Any, Any]:
+    changed = np.array(array)
+    match random.randrange(6):
+        case 0 | 1 if changed.size:
+            places = random.choice((slice(None), slice(0, 1), random.randrange(changed.size)))
+            with np.errstate(all="ignore"):
+                changed.reshape(-1)[places] = np.float64(random.choice(_VALUES)).astype(array.dtype)
+        case 2:
+            return changed[: len(changed) // 2] if changed.ndim else changed
+        case 3:
+            return changed.astype(random.choice(("<f8", "<f4", "<i8", "|u1", "?")))
+        case 4:
+            return changed.reshape(random.choice(((-1,), (1, -1), (-1, 1))))
+        case _ if changed.ndim:
+            return np.concatenate([changed] * random.choice((0, 2, 50)) or [changed[:0]])
+    return changed
+
+
+def _name_published(run: Path) -> None:
+    """Let the record name the published files as they are now."""
+
+    def name(file: Any) -> None:  # Any: h5py has no types
+        rows = [
+            (path, (run / path).stat().st_size, file_sha256(run / path))
+            for path, _, _ in read_table(file, PUBLISHED, hostile.PATHS)
+        ]
+        del file[PUBLISHED]
+        write_table(file, PUBLISHED, hostile.PATHS, rows)
+
+    hostile.reseal(run / "run.h5", name)
+
+
+def _damage_file(run: Path, random: Random) -> None:
+    """Change a published file and let the record name it so, or put something else there."""
+    files = sorted(path for path in (run / "products").rglob("*") if path.is_file())
+    path, kind = random.choice(files), random.randrange(8)
+    if kind == 0:
+        path.unlink()
+        path.symlink_to(random.choice(("/dev/zero", "../../../secret.txt", "/dev/tty", "..")))
+    elif kind == 1:
+        path.unlink()
+        os.mkfifo(path)
+    elif path.suffix == ".json":
+        path.write_text(changed_json(path.read_bytes(), random))
+        _name_published(run)
+    else:
+        path.write_bytes(mutate_bytes(path.read_bytes(), random, [path.read_bytes()]))
+        _name_published(run)
+
+
+_MARK: Final = b"\ndamage "
+
+
+def _with_damage(content: bytes, random: Random, _: Sequence[bytes]) -> bytes:
+    return content + _MARK + str(random.getrandbits(64)).encode()
+
+
+def _read(path: Path) -> None:
+    """Write a run, damaged, and make something of it; all of it of a sound one."""
+    folder = path.parent
+    _, mark, number = path.read_bytes().rpartition(_MARK)
+    (folder / "secret.txt").write_text(SECRET)
+    run, random = folder / "out" / "run", Random(number)
+    commands: Sequence[Command] = tuple(dict.fromkeys(COMMANDS))
+    if mark:
+        commands = (random.choice(COMMANDS),)
+    if mark and random.random() < 0.5:
+        wanted = random.choice(sorted({item.type_name for item in _payloads().values()}))
+        try:
+            write_run(run, partial(_change_payload, random, wanted))
+        except _REFUSED:
+            raise RefusedError from None
+    else:
+        write_run(run)
+        if mark:
+            _damage_file(run, random)
+    before = surroundings(folder)
+    limit_s = MOST_CPU_S if mark else float("inf")
+    codes = [
+        check_command(Studio(folder), command, run, most_cpu_s=limit_s) for command in commands
+    ]
+    _check_made(folder / "out", run)
+    assert surroundings(folder) == before
+    if any(codes):
+        raise RefusedError
+
+
+def _check_made(out: Path, run: Path) -> None:
+    """What was made is files, nothing from outside, and what was text stays text."""
+    for path in out.rglob("*"):
+        if path.is_relative_to(run):
+            continue
+        assert not path.is_symlink(), path
+        assert path.is_file() or path.is_dir(), path
+        if path.is_file():
+            content = path.read_bytes()
+            assert SECRET.encode() not in content, path
+            if path.suffix == ".html":
+                assert b"<script>alert" not in content
+            elif path.suffix in (".json", ".geojson"):
+                json.loads(content)
+
+
+RECORD_EXPORTS = Target(
+    seeds=lambda folder: (folder / "run").write_bytes(b""),
+    read=_read,
+    mutate=_with_damage,
+    refusals=(RefusedError,),
+    most_cpu_s=2 * MOST_CPU_S,
+)
+
+NAMES: Final = ("RECORD_EXPORTS",)
