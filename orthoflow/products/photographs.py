@@ -99,6 +99,8 @@ class Photo:
         exif_orientation: EXIF tag 1..8, 1 without one.
         exif_focal_px: focal length from EXIF in pixels, or None.
         intrinsics: calibration if known, or None.
+        mask: PNG of the same pixels, white where they may be used; None where all may
+            (`files.photo_masks`).
     """
 
     name: str
@@ -108,6 +110,7 @@ class Photo:
     exif_orientation: int = 1
     exif_focal_px: float | None = None
     intrinsics: Intrinsics | None = None
+    mask: bytes | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.files.images import decode_image
+from orthoflow.files.photo_masks import before_masks
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Photo, PointCloud
@@ -88,7 +89,7 @@ def colour_points(
         progress(place / len(oriented), photo.name)
         ready = _ReadyPhoto(
             camera=camera.shifted(cloud.origin),
-            buffer=depth_buffer(occluders, camera),
+            buffer=before_masks(depth_buffer(occluders, camera), photo),
             tolerance_m=tolerance_m,
             place=place,
         )

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.photo_masks import used_pixels
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, TieWall, Wall, Walls
 from orthoflow_plugins.match.features import Features
 from orthoflow_plugins.match.pictures import points_on_wall
@@ -99,7 +100,7 @@ def ties_of(
     *,
     search_radius_px: tuple[float | None, ...] = (),
 ) -> Ties:
-    """Join pieces into one product, in their order.
+    """Join pieces into one product, in their order, without what is masked in its photo.
 
     Args:
         pieces: the ties.
@@ -108,6 +109,8 @@ def ties_of(
         details: what people may want to know.
         search_radius_px: one per photo, as `Ties` has it.
     """
+    masks = [used_pixels(photo) for photo in photos.photos]
+    pieces = [_unmasked(piece, masks[piece.photo]) for piece in pieces]
     counts = [len(piece) for piece in pieces]
     total = sum(counts)
 
@@ -132,6 +135,15 @@ def ties_of(
         search_radius_px=search_radius_px,
         details=details,
     )
+
+
+def _unmasked(piece: TiePiece, used: NDArray[np.bool_] | None) -> TiePiece:
+    """Give the ties of a photo whose pixels may be used."""
+    if used is None:
+        return piece
+    most = np.array(used.shape[::-1]) - 1
+    columns, rows = np.clip(piece.pixels_photo.astype(np.int64), 0, most).T
+    return piece.take(used[rows, columns])
 
 
 def without_twins(pieces: Sequence[TiePiece]) -> list[TiePiece]:

@@ -118,7 +118,7 @@ class DsmBackward(Method):
             started = ctx.clock_s()
             pixels = pixels_of(photo, camera, level)
             decoded = ctx.clock_s()
-            buffer = depth_buffer_of(occluders, viewer)
+            buffer = depth_buffer_of(occluders, viewer, photo)
             looked = ctx.clock_s()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
             footprints += _lay(opened, stack, params, threads=ctx.cores)

@@ -102,7 +102,7 @@ class DsmForward(Method):
             ctx.progress(place / len(oriented), photo.name)
             pixels = pixels_of(photo, camera, level)
             started = ctx.clock_s()
-            buffer = depth_buffer_of(occluders, viewer)
+            buffer = depth_buffer_of(occluders, viewer, photo)
             looked = ctx.clock_s()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
             with stack.painting_from(photo.name):

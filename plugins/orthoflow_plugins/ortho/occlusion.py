@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.files.photo_masks import before_masks
 from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
@@ -18,7 +19,7 @@ from orthoflow.geometry.occluders import (
     nothing_in_the_way,
     occluders_in,
 )
-from orthoflow.products import PointCloud, Walls
+from orthoflow.products import Photo, PointCloud, Walls
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.ortho.photos_on_walls import PhotosOnWalls, VisibilityParams
 
@@ -52,9 +53,12 @@ def occluders_before(
     )
 
 
-def depth_buffer_of(occluders: Occluders | None, viewer: ViewingCamera) -> DepthBuffer:
-    """Look at what stands free through a camera; None for nothing."""
-    return nothing_in_the_way(viewer) if occluders is None else depth_buffer(occluders, viewer)
+def depth_buffer_of(
+    occluders: Occluders | None, viewer: ViewingCamera, photo: Photo
+) -> DepthBuffer:
+    """Look at what stands free through a photo's camera; None for nothing but what is masked."""
+    free = nothing_in_the_way(viewer) if occluders is None else depth_buffer(occluders, viewer)
+    return before_masks(free, photo)
 
 
 def find_occluders(

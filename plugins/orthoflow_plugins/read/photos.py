@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import ClassVar, Final
@@ -29,6 +29,7 @@ from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import Calibration, InputFiles, Intrinsics, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.read.figures import ContactSheet
+from orthoflow_plugins.read.masks import Masks, beside_photos
 
 # Bits per channel that orthoimages can have.
 _BITS: Final = 16
@@ -45,6 +46,10 @@ class ReadPhotos(Method):
     The files' bytes are kept and never encoded again. Pixels are those of the stored array: the
     EXIF orientation is written down, not applied. Every photo is decoded once, so that a damaged
     file is found here and not after an hour.
+
+    What is black in a mask, or within polygons, is used of a photo neither for ties nor for
+    colours: pictures NAME_mask.png beside NAME.jpg, or files of the input masks, named likewise or
+    as the photo, or GeoJSON with polygons in pixels.
     """
 
     id = "read.photos"
@@ -73,10 +78,11 @@ class ReadPhotos(Method):
         )
 
     class In(Ports):
-        """The photos, and a calibration file if there is one."""
+        """The photos, and a calibration file and masks if there are any."""
 
         files: InputFiles
         calibration: InputFiles | None = None
+        masks: InputFiles | None = None
 
     class Out(Ports):
         """The photos."""
@@ -86,14 +92,17 @@ class ReadPhotos(Method):
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Read all photos; see the class."""
         ctx.progress(0.0, inputs.files.name)
-        sources = _sources(ctx, inputs.files, params.panoramas)
+        beside = beside_photos(inputs.files.paths)
+        masks = Masks.of(sorted(beside), () if inputs.masks is None else inputs.masks.paths)
+        sources = _sources(ctx, inputs.files, beside, params.panoramas)
         calibration = _calibration(inputs.calibration)
         sheet = ContactSheet(len(sources))
         read = []
         for index, source in enumerate(sources):
             ctx.progress(index / len(sources), source.name)
-            read.append(_read_photo(source, calibration, sheet))
+            read.append(_masked(_read_photo(source, calibration, sheet), masks))
             ctx.log(_described(read[-1]))
+        masks.warn_of_unused(ctx)
         _warn(ctx, read, calibration)
         photos = Photos(photos=tuple(item.photo for item in read))
         _report_metrics(ctx, photos)
@@ -162,13 +171,24 @@ def _inside_e57(path: Path) -> list[_Source]:
     ]
 
 
-def _sources(ctx: StepContext, files: InputFiles, panoramas: Sequence[str]) -> list[_Source]:
+def _masked(read: _ReadPhoto, masks: Masks) -> _ReadPhoto:
+    """Give a photo with its mask, where it has one."""
+    photo = read.photo
+    mask = masks.encoded(photo.name, (photo.width, photo.height))
+    return read if mask is None else replace(read, photo=replace(photo, mask=mask))
+
+
+def _sources(
+    ctx: StepContext, files: InputFiles, masks: Set[Path], panoramas: Sequence[str]
+) -> list[_Source]:
     """Photos ordered by name; says which other files there are."""
     if not files.paths:
         raise InputError(f"the input {files.name} names no files: expected photos")
     sources, others = [], []
     for path in files.paths:
         is_photo = path.suffix.lower() in PHOTO_SUFFIXES
+        if path in masks:
+            continue
         if is_photo and any(fnmatchcase(path.name, pattern) for pattern in panoramas):
             sources += _of_panorama(path)
         elif is_photo:
@@ -295,6 +315,8 @@ def _described(read: _ReadPhoto) -> str:
         parts.append(f"focal length {focal.value_px:.1f} px from the {focal.reason}")
     else:
         parts.append(focal.reason)
+    if photo.mask is not None:
+        parts.append("masked")
     return ", ".join(parts)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.match import tie_pieces
 from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
+from orthoflow.files.images import encode_png
 from orthoflow.products import TieRole
 from tests import inspect_scenes
 from tests.inspect_scenes import GSD_M
@@ -75,7 +76,9 @@ def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
     first = piece([(1.0, 2.0), (3.0, 4.0)], [(0, 0, 0), (1, 1, 1)], [0.1, 0.2], photo=1)
     second = piece([(5.0, 6.0)], [(2, 2, 2)], [0.3], wall=0, role=TieRole.CHECK)
     walls = inspect_scenes.walls()
-    photos: Any = SimpleNamespace(photos=(SimpleNamespace(name="a"), SimpleNamespace(name="b")))
+    photos: Any = SimpleNamespace(
+        photos=tuple(SimpleNamespace(name=name, mask=None) for name in "ab")
+    )
     ties = ties_of([first, second], photos, walls, {"said": 1}, search_radius_px=(4.0, None))
     assert ties.photo_names == ("a", "b")
     np.testing.assert_array_equal(ties.photo, [1, 1, 0])
@@ -90,6 +93,18 @@ def test_ties_are_joined_in_the_order_of_their_pieces() -> None:
     empty = ties_of([], photos, walls, {})
     assert empty.pixels_photo.shape == (0, 2)
     assert empty.points_world.shape == (0, 3)
+
+
+def test_ties_in_masked_pixels_are_left_out() -> None:
+    used = np.full((8, 10), 255, dtype=np.uint8)
+    used[5:7, 3] = 0
+    # In the mask; right beside it; and on the rim of the photo, which is nowhere.
+    pixels = [(3.2, 5.9), (4.01, 5.9), (10.0, 8.0)]
+    first = piece(pixels, [(k, k, k) for k in range(3)], [0.1, 0.2, 0.3])
+    photos: Any = SimpleNamespace(photos=(SimpleNamespace(name="a", mask=encode_png(used)),))
+    ties = ties_of([first], photos, inspect_scenes.walls(), {})
+    np.testing.assert_array_equal(ties.sigma_m, [0.2, 0.3])
+    np.testing.assert_array_equal(ties.pixels_photo, pixels[1:])
 
 
 def features(pixels: NDArray[np.float64], sizes: list[float]) -> Any:

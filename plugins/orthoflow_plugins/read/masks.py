@@ -1,0 +1,189 @@
+"""Masks of photos from files: pictures beside the photos, or polygons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.images import PHOTO_SUFFIXES, encode_png
+from orthoflow.files.json_texts import parse_json
+from orthoflow.files.photo_masks import decode_mask
+from orthoflow.sdk import StepContext
+
+_ENDING: Final = "_mask"
+_POLYGONS: Final = (".geojson", ".json")
+_NAMED: Final = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Polygon:
+    """What is masked in the photos of a name or pattern: rings (n, 2) of pixels (u, v)."""
+
+    pattern: str
+    rings: tuple[NDArray[np.float64], ...]
+
+
+class Masks:
+    """Pictures and polygons, and which of them photos have taken."""
+
+    def __init__(self, pictures: Mapping[str, Path], polygons: Sequence[_Polygon]) -> None:
+        self._pictures = pictures
+        self._polygons = polygons
+        self._taken: set[str] = set()
+
+    @classmethod
+    def of(cls, beside: Iterable[Path], given: Iterable[Path]) -> Masks:
+        """Sort mask files by what they are.
+
+        Args:
+            beside: pictures found among the photos.
+            given: files of an input of their own.
+
+        Raises:
+            InputError: a file is no mask, or two are for one photo.
+        """
+        pictures: dict[str, Path] = {}
+        polygons: list[_Polygon] = []
+        for path in [*beside, *given]:
+            if path.suffix.lower() in _POLYGONS:
+                polygons += _polygons(path)
+            elif path.suffix.lower() not in PHOTO_SUFFIXES:
+                raise InputError(
+                    f"mask {path.name} is neither a picture (PNG, JPEG, TIFF) nor polygons "
+                    "(GeoJSON)"
+                )
+            elif pictures.setdefault(_key(path.stem), path) != path:
+                raise InputError(
+                    f"{path.name} and {pictures[_key(path.stem)].name} are masks of one photo: "
+                    "leave one of them"
+                )
+        return cls(pictures, polygons)
+
+    def encoded(self, photo: str, size: tuple[int, int]) -> bytes | None:
+        """Mask of a photo of some width and height as PNG, white where it may be used.
+
+        Raises:
+            InputError: the picture is none, has another size, or leaves nothing of the photo.
+        """
+        used: NDArray[np.bool_] | None = None
+        for key in dict.fromkeys((photo, Path(photo).stem)):
+            path = self._pictures.get(key)
+            if path is not None:
+                used = self._picture(path, photo, size)
+                break
+        for polygon in self._polygons:
+            if fnmatchcase(photo, polygon.pattern):
+                self._taken.add(polygon.pattern)
+                used = np.ones(size[::-1], dtype=np.bool_) if used is None else used
+                used = used & ~_filled(polygon, size)
+        if used is None or used.all():
+            return None
+        if not used.any():
+            raise InputError(f"the mask of {photo} leaves nothing of it: leave the photo out")
+        return encode_png(np.where(used, np.uint8(255), np.uint8(0)))
+
+    def warn_of_unused(self, ctx: StepContext) -> None:
+        """Say which masks are of no photo."""
+        unused = [path.name for path in self._pictures.values() if path.name not in self._taken] + [
+            polygon.pattern for polygon in self._polygons if polygon.pattern not in self._taken
+        ]
+        if unused:
+            named = ", ".join(sorted(set(unused))[:_NAMED])
+            more = " ..." if len(set(unused)) > _NAMED else ""
+            ctx.warn(f"masks of no photo: {named}{more}; photos are found by their names")
+
+    def _picture(self, path: Path, photo: str, size: tuple[int, int]) -> NDArray[np.bool_]:
+        self._taken.add(path.name)
+        try:
+            encoded = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"mask {path.name} cannot be read: {error.strerror}") from error
+        used = decode_mask(encoded, f"mask {path.name}")
+        if used.shape != size[::-1]:
+            raise InputError(
+                f"mask {path.name} has {used.shape[1]} x {used.shape[0]} pixels, but {photo} "
+                f"{size[0]} x {size[1]}: a mask has the pixels of its photo, not turned"
+            )
+        return used
+
+
+def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
+    """Files among photos that are masks of others: NAME_mask.png of NAME.jpg."""
+    stems = {path.stem for path in paths}
+    return frozenset(
+        path
+        for path in paths
+        if path.stem.endswith(_ENDING)
+        and path.suffix.lower() in PHOTO_SUFFIXES
+        and _key(path.stem) in stems | {other.name for other in paths}
+    )
+
+
+def _key(stem: str) -> str:
+    """Name or stem of the photo that a mask of this stem is for."""
+    return stem.removesuffix(_ENDING)
+
+
+def _polygons(path: Path) -> list[_Polygon]:
+    """Polygons of a GeoJSON file, each with the property `photo`, a name or a pattern."""
+    expected = (
+        f"{path.name} is no mask: expected a GeoJSON FeatureCollection of polygons in pixels "
+        '(u to the right, v down), each with the property "photo", a name or a pattern'
+    )
+    try:
+        content = parse_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{expected}; {error}") from error
+    features = content.get("features") if isinstance(content, dict) else None
+    if not isinstance(features, list):
+        raise InputError(expected)
+    found: list[_Polygon] = []
+    for number, feature in enumerate(features):
+        try:
+            found += _polygons_of(feature)
+        except (TypeError, ValueError, KeyError, IndexError) as error:
+            raise InputError(f"{expected} (feature {number})") from error
+    return found
+
+
+def _polygons_of(feature: Any) -> Iterator[_Polygon]:
+    """Polygons of a feature; what is none of the expected fails somehow."""
+    photo, geometry = feature["properties"]["photo"], feature["geometry"]
+    kinds = {"Polygon": [geometry["coordinates"]], "MultiPolygon": geometry["coordinates"]}
+    for parts in kinds[geometry["type"]]:
+        rings = tuple(np.array(ring, dtype=np.float64)[:, :2] for ring in parts)
+        yield _Polygon(pattern=_text(photo), rings=_finite(rings))
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError
+    return value
+
+
+def _finite(rings: tuple[NDArray[np.float64], ...]) -> tuple[NDArray[np.float64], ...]:
+    if not rings or not all(ring.size and np.isfinite(ring).all() for ring in rings):
+        raise ValueError
+    return rings
+
+
+def _filled(polygon: _Polygon, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Pixels (height, width) that a polygon touches, but not those well inside its holes."""
+    import cv2
+
+    filled = np.zeros(size[::-1], dtype=np.uint8)
+    # Corners in 1/16 pixels; OpenCV's pixels have their centre at whole numbers.
+    limit = 4.0 * max(size)
+    rings = [
+        np.rint(16.0 * (np.clip(ring, -limit, limit) - 0.5)).astype(np.int32)
+        for ring in polygon.rings
+    ]
+    cv2.fillPoly(filled, rings, 1, shift=4)
+    return filled.astype(np.bool_)

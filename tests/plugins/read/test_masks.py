@@ -1,0 +1,152 @@
+"""Masks of photos: pictures beside them or elsewhere, and polygons."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.read.photos import ReadPhotos
+
+from orthoflow.errors import InputError
+from orthoflow.files.images import encode_jpeg, encode_png
+from orthoflow.files.photo_masks import used_pixels
+from orthoflow.products import InputFiles, Photo
+from tests import raster_scenes as scenes
+
+SIZE = (64, 48)
+INSIDE = np.s_[10:20, 30:50]
+
+
+def picture(*, masked: bool = True, size: tuple[int, int] = SIZE) -> bytes:
+    """White, with a black rectangle if wanted."""
+    grey = np.full(size[::-1], 255, dtype=np.uint8)
+    if masked:
+        grey[INSIDE] = 0
+    return encode_png(grey)
+
+
+def photo_in(folder: Path, name: str = "a.jpg") -> Path:
+    path = folder / name
+    path.write_bytes(encode_jpeg(np.full((*SIZE[::-1], 3), 99, dtype=np.uint8)))
+    return path
+
+
+def file_in(folder: Path, name: str, content: bytes | str) -> Path:
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def read(
+    folder: Path, photos: list[Path], masks: list[Path] | None = None
+) -> tuple[tuple[Photo, ...], str]:
+    ctx = scenes.context(folder)
+    inputs = ReadPhotos.In(
+        files=InputFiles(name="photos", paths=tuple(photos)),
+        masks=None if masks is None else InputFiles(name="masks", paths=tuple(masks)),
+    )
+    read = ReadPhotos().run(inputs, ReadPhotos.Params(), ctx).photos.photos
+    return read, "\n".join(ctx.warnings)
+
+
+def masked(photo: Photo) -> NDArray[np.bool_]:
+    used = used_pixels(photo)
+    assert used is not None
+    return ~used
+
+
+def expected() -> NDArray[np.bool_]:
+    cells = np.zeros(SIZE[::-1], dtype=np.bool_)
+    cells[INSIDE] = True
+    return cells
+
+
+def polygons(photo: str, *rings: list[tuple[float, float]]) -> str:
+    geometry = {"type": "Polygon", "coordinates": [[*ring, ring[0]] for ring in rings]}
+    feature = {"type": "Feature", "properties": {"photo": photo}, "geometry": geometry}
+    return json.dumps({"type": "FeatureCollection", "features": [feature]})
+
+
+RING = [(30.0, 10.0), (50.0, 10.0), (50.0, 20.0), (30.0, 20.0)]
+
+
+def test_a_mask_beside_its_photo_is_no_photo(tmp_path: Path) -> None:
+    files = [photo_in(tmp_path), file_in(tmp_path, "a_mask.png", picture())]
+    (photo,), said = read(tmp_path, files)
+    assert photo.name == "a.jpg"
+    np.testing.assert_array_equal(masked(photo), expected())
+    assert "masks of no photo" not in said
+    # What ends like a mask, but of no photo, is a photo.
+    alone, _ = read(tmp_path, [file_in(tmp_path, "white_mask.png", picture())])
+    assert [item.name for item in alone] == ["white_mask.png"]
+
+
+@pytest.mark.parametrize("name", ["a.png", "a_mask.png", "a.jpg.png", "a.jpg_mask.png"])
+def test_masks_are_found_by_the_name_of_the_photo(tmp_path: Path, name: str) -> None:
+    mask = file_in(tmp_path / "masks", name, picture())
+    (photo,), _ = read(tmp_path, [photo_in(tmp_path)], [mask])
+    np.testing.assert_array_equal(masked(photo), expected())
+
+
+def test_polygons_mask_photos_by_name_or_pattern(tmp_path: Path) -> None:
+    files = [photo_in(tmp_path, "a.jpg"), photo_in(tmp_path, "b.jpg")]
+    one = file_in(tmp_path, "one.geojson", polygons("a.jpg", RING))
+    (first, second), _ = read(tmp_path, files, [one])
+    # What a polygon touches is masked: one pixel more at its rim.
+    touched = np.zeros(SIZE[::-1], dtype=np.bool_)
+    touched[10:21, 30:51] = True
+    np.testing.assert_array_equal(masked(first), touched)
+    assert second.mask is None
+    every = file_in(tmp_path, "all.geojson", polygons("*", RING, [(35, 12), (45, 12), (40, 18)]))
+    (first, second), _ = read(tmp_path, files, [every])
+    holed = masked(first)
+    # The hole has 30 pixels, those on its border touch the polygon.
+    assert not (holed & ~touched).any()
+    assert 10 <= (touched & ~holed).sum() <= 30
+    np.testing.assert_array_equal(masked(second), holed)
+
+
+def test_masks_of_no_photo_are_told(tmp_path: Path) -> None:
+    masks = [
+        file_in(tmp_path / "masks", "c.png", picture()),
+        file_in(tmp_path, "none.geojson", polygons("x*.jpg", RING)),
+    ]
+    (photo,), said = read(tmp_path, [photo_in(tmp_path)], masks)
+    assert photo.mask is None
+    assert "masks of no photo: c.png, x*.jpg; photos are found by their names" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        (
+            "a.png",
+            picture(size=(48, 64), masked=False),
+            r"a.png has 48 x 64 pixels, but a.jpg 64 x",
+        ),
+        ("a.png", encode_png(np.zeros(SIZE[::-1], np.uint8)), "the mask of a.jpg leaves nothing"),
+        ("a.png", b"no picture", "mask a.png"),
+        ("a.txt", "words", "mask a.txt is neither a picture"),
+        ("a.json", "{", "a.json is no mask: expected a GeoJSON FeatureCollection"),
+        ("a.json", '{"features": 3}', "a.json is no mask"),
+        ("a.json", '{"features": [3]}', r"\(feature 0\)"),
+        ("a.json", polygons("a.jpg", RING).replace("50.0", "NaN"), r"\(feature 0\)"),
+        ("a.json", polygons("a.jpg", RING).replace("Polygon", "Point"), r"\(feature 0\)"),
+    ],
+)
+def test_what_is_no_mask_is_refused(
+    tmp_path: Path, name: str, content: bytes | str, said: str
+) -> None:
+    mask = file_in(tmp_path / "masks", name, content)
+    with pytest.raises(InputError, match=said):
+        read(tmp_path, [photo_in(tmp_path)], [mask])
+
+
+def test_two_masks_of_one_photo_are_refused(tmp_path: Path) -> None:
+    masks = [file_in(tmp_path / "masks", name, picture()) for name in ("a.png", "a_mask.png")]
+    with pytest.raises(InputError, match=r"a_mask\.png and a\.png are masks of one photo"):
+        read(tmp_path, [photo_in(tmp_path)], masks)
