@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,15 @@ N_POINTS = 40_000
 def test_metrics_are_those_of_the_planes_and_labels(method_id: str, tmp_path: Path) -> None:
     cloud, true = example_room(n_points=N_POINTS)
     method = discover_catalog().method(method_id).load()
-    ctx = StepContext(rng=np.random.default_rng(3), cores=1, scratch=tmp_path)
+    # A clock that goes on when it is asked: once at the beginning, for each plane, and at the end.
+    clock, processor = count(), count(step=10)
+    ctx = StepContext(
+        rng=np.random.default_rng(3),
+        cores=1,
+        scratch=tmp_path,
+        clock_s=lambda: float(next(clock)),
+        processor_s=lambda: float(next(processor)),
+    )
     out = vars(method().run(method.In(cloud=cloud), method.Params(), ctx))
     planes, labels = out["planes"], out["labels"]
     assert isinstance(planes, Planes)
@@ -40,4 +49,13 @@ def test_metrics_are_those_of_the_planes_and_labels(method_id: str, tmp_path: Pa
     assert (told["omega_deg"], told["phi_deg"]) == (omega_deg, phi_deg)
     assert planes.up.tolist() == true.up.tolist()
     distances = planes.plane(0).distances_m(cloud.points_world()[labels.plane_index == 0])
+    seconds = {name: value for name, value in told.items() if name.endswith("_s")}
+    assert seconds == {
+        "detection_s": len(true) + 1,
+        "detection_cpu_s": 10 * (len(true) + 1),
+        "first_plane_s": 1,
+        "first_plane_cpu_s": 10,
+        "next_plane_s": 1,
+        "next_plane_cpu_s": 10,
+    }
     assert np.sqrt(np.mean(distances**2)) == pytest.approx(planes.rms_m[0], rel=1e-3)

@@ -115,6 +115,12 @@ def test_a_plane_is_proposed_where_it_is_and_not_again_once_rejected() -> None:
     rejected = [proposer._last]
     votes = [first.votes]
     proposer.reject(first)
+    # About the place in directions as near as that, and nowhere else.
+    cosines = np.abs(normals @ normals[rejected[0][0]])
+    is_near = np.degrees(np.arccos(np.minimum(cosines, 1.0))) < 2.2 * 3.0
+    assert 3 < is_near.sum() < 30
+    widths = np.where(is_near, 2 * proposer._smear_bins + 3, 0)
+    np.testing.assert_array_equal(proposer._barred.sum(axis=1), widths)
     for _ in range(6):
         other = proposer.propose(unassigned)
         assert other is not None
