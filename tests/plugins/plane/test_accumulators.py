@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from orthoflow_plugins.plane.accumulators import (
+    PlanProposer,
     ResidualCounts,
+    Voting,
     contrast,
     parabola,
     plan_centre_m,
@@ -13,10 +15,12 @@ from orthoflow_plugins.plane.accumulators import (
     voters,
 )
 from orthoflow_plugins.plane.block_kernels import Boxes, PlanCounts, PlanGrid, blocked, box_blocks
-from orthoflow_plugins.plane.sample import Sample
+from orthoflow_plugins.plane.sample import Sample, Unassigned, prepare
 
 from orthoflow.geometry.point_kernels import read_only
 from tests import scenes
+from tests.plane_scenes import Rectangle, cloud_of
+from tests.plane_scenes import sampled as points_of
 
 GRID = PlanGrid(
     basis=scenes.random_rotation(np.random.default_rng(5)),
@@ -141,3 +145,55 @@ def test_of_a_thin_sample_cells_ask_their_neighbours_too() -> None:
     ]
     expected = np.rint(plan.cells * (around[1] / around[0]))
     np.testing.assert_array_equal(residuals.cells(claims), expected)
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 37.0, 178.0], ids=lambda turn: f"{turn:.0f}")
+def test_what_was_rejected_bars_lines_like_it_from_both_sides(turn_deg: float) -> None:
+    turn = np.radians(turn_deg)
+    normal, along = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    u_m = (*(2.0 * along), 0.0)
+    walls = [Rectangle("wall", (*(far_m * normal), 0.0), u_m, (0, 0, 1), 4_000) for far_m in (0, 1)]
+    cloud = prepare(
+        cloud_of(points_of(tuple(walls), noise_m=0.002)),
+        np.eye(3),
+        cell_m=0.05,
+        least_share=0.005,
+        parts=1,
+        counts_plan=True,
+    )
+    proposer = PlanProposer(cloud, Voting(angle_step_deg=1.0, least_points=1_000.0, levels=False))
+    candidate = proposer.propose(Unassigned.of(cloud))
+    assert candidate is not None
+    angle, place = proposer._last
+    proposer.reject(candidate)
+    assert not proposer._barred_heights.any()
+    n_angles, n_bins = proposer._barred.shape
+    assert n_angles == 180
+    # A line at 180 degrees is the line at 0, its distance counted the other way.
+    steps = (np.arange(n_angles) - angle + 90) % 180 - 90
+    is_turned = np.abs(np.arange(n_angles) - angle) > 90
+    centre = np.where(is_turned, n_bins - 1 - place, place)
+    apart = np.abs(np.arange(n_bins) - centre[:, None])
+    is_near = (np.abs(steps) <= 2)[:, None] & (apart <= proposer._smear_bins + 1)
+    np.testing.assert_array_equal(proposer._barred, is_near)
+
+
+def test_what_was_rejected_bars_the_heights_about_it() -> None:
+    floor = Rectangle("floor", (0, 0, 0.3), (2, 0, 0), (0, 2, 0), 4_000)
+    cloud = prepare(
+        cloud_of(points_of((floor,), noise_m=0.002)),
+        np.eye(3),
+        cell_m=0.05,
+        least_share=0.005,
+        parts=1,
+        counts_plan=True,
+    )
+    proposer = PlanProposer(cloud, Voting(angle_step_deg=5.0, least_points=1_000.0, walls=False))
+    candidate = proposer.propose(Unassigned.of(cloud))
+    assert candidate is not None
+    _, storey = proposer._last
+    proposer.reject(candidate)
+    storeys = np.arange(len(proposer._barred_heights))
+    np.testing.assert_array_equal(proposer._barred_heights, np.abs(storeys - storey) <= 2)
+    assert not proposer._barred.any()
+    assert proposer.propose(Unassigned.of(cloud)) is None
