@@ -66,7 +66,7 @@ _UNSEEN_KEYWORDS: Final = re.compile(
     r"^(strict|copy|cores|(n_)?threads|n_per_run|max_workers|maxsize|stacklevel|daemon|flush"
     r"|figsize|dpi|alpha|linewidths?|lw|fontsize|labelsize|(face|edge)?color|cmap|markersize|zorder"
     r"|pad|rotation_mode|interpolation|frameon|loc|ncols|capsize|hspace|wspace|description|examples"
-    r"|title|help|compresslevel|quality|indent)$"
+    r"|title|help|show_default|compresslevel|quality|indent)$"
 )
 _UNSEEN_NAMES: Final = re.compile(
     r"AT_ONCE|PER_RUN|CHUNK|BLOCK_(POINTS|BYTES)|PART_POINTS|(SCAN|CACHE)_BYTES|IN_MEMORY|_POLL"

@@ -79,6 +79,7 @@ def test_each_operator_changes_what_it_says(source: str, kind: str, lines: set[s
         "BLOCK_POINTS: Final = 500_000",
         "_CACHE_BYTES: Final = 1 << 27",
         "json.dumps(a, indent=2)",
+        "click.option('--a', show_default=True)",
         "_ROUNDS: Final = 20",
         "_STEPS_MOST: Final = 30",
         "def f(*, cores: int = 1): ...",
