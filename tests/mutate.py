@@ -408,15 +408,16 @@ class Worker:
             "MPLBACKEND": "Agg",
             "TMPDIR": str(scratch),
         }
+        deselected = [f"--deselect={name}" for name in self._broken if "::" in name]
         # Of a file that cannot be collected nothing can be left out.
-        deselected = [
-            f"--deselect={name}" if "::" in name else f"--ignore={name}" for name in self._broken
-        ]
+        named = [argument for argument in arguments if argument not in self._broken]
         command = [
             *(sys.executable, "-m", "pytest", "-q", "-n", "0"),
             *("-o", f"cache_dir={self.folder / 'cache'}"),
-            *(*deselected, *arguments),
+            *(*deselected, *named),
         ]
+        if not any(".py" in argument for argument in named):
+            return subprocess.CompletedProcess(command, _NOTHING_FOUND, "", "")
         with subprocess.Popen(
             command,
             cwd=self.tree,

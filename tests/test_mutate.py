@@ -224,6 +224,11 @@ def test_a_mutation_is_killed_by_a_test_that_passes_without_it(worker: mutate.Wo
     assert (worker.tree / "orthoflow/sizes.py").read_bytes() == SOURCE
 
 
+def test_a_file_of_tests_that_does_not_load_here_is_left_out(worker: mutate.Worker) -> None:
+    (worker.tree / "tests/sizes/test_sizes.py").write_text("import no_such_library\n")
+    assert worker.verdict(MUTATION, mutate.Tree.of(worker.tree)).killer == ""
+
+
 @pytest.mark.parametrize(
     ("mutated", "unmutated", "killer"),
     [
