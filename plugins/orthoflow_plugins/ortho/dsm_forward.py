@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from orthoflow_plugins.ortho.surfaces import Surface
 
 # Larger layers are coloured in bands of so many cells: some 600 MB.
-_BAND_CELLS: Final = 1 << 24
+_BAND_CELLS: Final = 1 << 23
 
 
 class DsmForward(Method):

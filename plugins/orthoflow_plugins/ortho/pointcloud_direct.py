@@ -33,8 +33,8 @@ from orthoflow_plugins.ortho.filling import (
 )
 from orthoflow_plugins.ortho.point_colours import Colouring, ColourRule, colours_of
 
-# Larger walls are painted in bands of so many cells: some 1.5 GB.
-_BAND_CELLS: Final = 1 << 24
+# Larger walls are painted in bands of so many cells: some 600 MB.
+_BAND_CELLS: Final = 1 << 22
 _POINTS_AT_ONCE: Final = 1 << 22
 
 
@@ -147,6 +147,8 @@ class PointcloudDirect(Method):
                 projected = ctx.clock_s()
                 _fill(projection, layers[-1], band, params, threads=ctx.cores)
                 seconds += (projected - started, ctx.clock_s() - projected)
+                # The next band is projected without this one in memory.
+                del projection
             n_filled = _n_filled(layers[-1])
             if best_preview is None or n_filled > best_preview[0]:
                 best_preview = (n_filled, filling_preview(layers[-1]))
