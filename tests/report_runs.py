@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -63,6 +64,10 @@ class HeldRun(Run):
     def payloads(self, places: Sequence[tuple[str, str]]) -> Iterator[Payload]:
         for place in places:
             yield self.products[place].to_payload()
+
+    @contextmanager
+    def held_open(self) -> Iterator[Run]:
+        yield self
 
 
 def cell(address: str, **more: object) -> RecordedCell:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import errno
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 from orthoflow_provenance.errors import RecordFormatError
 from orthoflow_provenance.model import RecordedCell, RecordedFigure, RunRecord
-from orthoflow_provenance.reader import read_outputs, read_record
+from orthoflow_provenance.payloads import StoredPayload
+from orthoflow_provenance.reader import open_outputs, read_record
 
 from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.errors import ArgumentError, OrthoflowError, RecordError
@@ -34,10 +35,27 @@ class Run:
     Attributes:
         path: the record file.
         record: everything the record says except the products' arrays.
+        output: reads an output by address and port from the record that is held open; None where
+            it is opened for it.
     """
 
     path: Path
     record: RunRecord
+    output: Callable[[str, str], StoredPayload] | None = field(default=None, compare=False)
+
+    @contextmanager
+    def held_open(self) -> Iterator[Run]:
+        """Give the run with its record held open, for whoever reads often.
+
+        To open a record is to look at all of it: once for each of many datasets would be too often.
+
+        Raises:
+            RecordError: the record is damaged, or gone.
+        """
+        with ExitStack() as stack:
+            with record_errors(self.path):
+                output = stack.enter_context(open_outputs(self.path))
+            yield replace(self, output=output)
 
     @property
     def folder(self) -> Path:
@@ -116,10 +134,14 @@ class Run:
         for address, port in places:
             self._check_embedded(address, port)
         if not places:
-            # To open a record is to look at all of it, a page of each of many datasets too often.
+            return
+        if self.output is None:
+            with self.held_open() as run:
+                yield from run.payloads(places)
             return
         with record_errors(self.path):
-            for stored in read_outputs(self.path, places):
+            for address, port in places:
+                stored = self.output(address, port)
                 yield Payload(
                     type_name=stored.type_name,
                     encoding_version=stored.encoding_version,

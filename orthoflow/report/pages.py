@@ -140,18 +140,19 @@ def write_page(run: Run, path: Path, *, go_on: str = "") -> None:
     # Before the page is written: a record with such names gets none.
     figure_files(run, addresses)
     pages = pages_of(run)
-    parts = parts_of(run) if pages else {}
     for folder in {(path.parent / page).parent for page in pages.values()}:
         _make_folder(folder)
-    for name, page in pages.items():
-        target = path.parent / page
-        title = f"{run.record.name}: {name}"
-        place = _Place(folder=target.parent, title=title, whole=f"../{path.name}")
-        _write([parts[name]], target, place)
-    place = _Place(
-        folder=path.parent, title=run.record.name, go_on=go_on, pages=pages, has_figures=True
-    )
-    _write([run], path, place)
+    with run.held_open() as opened:
+        parts = parts_of(opened) if pages else {}
+        for name, page in pages.items():
+            target = path.parent / page
+            title = f"{run.record.name}: {name}"
+            place = _Place(folder=target.parent, title=title, whole=f"../{path.name}")
+            _write([parts[name]], target, place)
+        place = _Place(
+            folder=path.parent, title=run.record.name, go_on=go_on, pages=pages, has_figures=True
+        )
+        _write([opened], path, place)
     write_figures(run, path.parent, addresses, inside=FIGURES_FOLDER)
 
 

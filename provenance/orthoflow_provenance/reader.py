@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -74,19 +75,20 @@ class OpenRecord:
         return _payload(self.file, address, port)
 
 
-def read_outputs(path: Path, wanted: Iterable[tuple[str, str]]) -> Iterator[StoredPayload]:
-    """Read embedded outputs, each an address and a port, one after the other from one open file.
+@contextmanager
+def open_outputs(path: Path) -> Iterator[Callable[[str, str], StoredPayload]]:
+    """Open a record for reading embedded outputs, each by its address and port.
 
-    Opening looks at everything in the file, which takes longer than most outputs do.
+    Opening looks at everything in the file, which takes longer than most outputs do. Arrays of
+    mapped products stay valid after closing.
 
     Raises:
-        RecordFormatError: the file is no record, or it has no such output, or it is damaged.
+        RecordFormatError: the file is no record or damaged; of the reading, it has no such output.
         OSError: the file cannot be opened.
     """
     with safe_open(path) as file:
         check_format(file, RUN_FORMAT, RUN_FORMAT_VERSION)
-        for address, port in wanted:
-            yield _payload(file, address, port)
+        yield partial(_payload, file)
 
 
 def read_record(path: Path) -> RunRecord:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import dataclasses
 import hashlib
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_provenance import reader
 from orthoflow_provenance.model import RunRecord
 from orthoflow_provenance.payloads import write_product_file
 from orthoflow_provenance.writer import write_record
@@ -183,6 +185,36 @@ def test_a_run_opens_by_folder_and_by_record_alike(run_folder: Path) -> None:
     assert by_folder.record.run_id == "20260102-abc"
     assert list(by_folder.cells) == ["cloud", "plane@plane=given", "wall"]
     assert by_folder.folder == run_folder
+
+
+def test_a_run_that_is_held_open_looks_at_its_record_once(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked_at = []
+
+    def safe_open(path: Path) -> AbstractContextManager[object]:
+        looked_at.append(path)
+        return reader_safe_open(path)
+
+    reader_safe_open = reader.safe_open
+    monkeypatch.setattr(reader, "safe_open", safe_open)
+    place = ("plane@plane=given", "planes")
+    with run.held_open() as held:
+        # Also parts of a run, which are runs of their own.
+        for one in (held, held, dataclasses.replace(held, record=held.record)):
+            (payload,) = one.payloads([place])
+            np.testing.assert_array_equal(payload.arrays["offset"], one_plane().offset)
+    assert looked_at == [run.path]
+    assert len(list(run.payloads([place, place]))) == 2
+    assert looked_at == [run.path] * 2
+    assert not list(run.payloads([]))
+    assert looked_at == [run.path] * 2
+
+
+def test_a_record_that_is_gone_cannot_be_held_open(run: Run) -> None:
+    run.path.unlink()
+    with pytest.raises(ArgumentError, match="is no file"), run.held_open():
+        pass
 
 
 def test_a_product_comes_back_as_it_was(run: Run) -> None:
