@@ -25,6 +25,13 @@ FIGURES = sorted(
         for name in re.findall(r"`([^` ]+)`", names)
     }
 )
+METRICS = sorted(
+    {
+        name
+        for names in re.findall(r"metrics? ((?:`[^`]+`(?:, )?)+)", TEXT)
+        for name in re.findall(r"`([^` ]+)`", names)
+    }
+)
 
 # Rows of both papers by what they are of: method, theirs, ours, deviation.
 ROWS = {
@@ -71,6 +78,15 @@ def test_every_figure_named_is_drawn_by_a_method(figure: str) -> None:
     name = re.escape(figure.removesuffix("_...")).replace("_0_", r"_\{[^}]+\}_")
     sources = (ROOT / "plugins" / "orthoflow_plugins").rglob("*.py")
     assert any(re.search(rf'"{name}"', source.read_text()) for source in sources)
+
+
+def test_every_metric_named_is_declared_by_a_method() -> None:
+    methods = discover_catalog().methods
+    ours = [name for name in methods if methods[name].distribution.name == "orthoflow-tls"]
+    loaded = [discover_catalog().method(name).load() for name in ours]
+    known = {metric for method in loaded for metric in method.metrics}
+    assert len(METRICS) > 15
+    assert set(METRICS) <= known
 
 
 @pytest.mark.parametrize("code", [code for code in CODE if re.fullmatch(r"[a-z-]+\.yaml", code)])
