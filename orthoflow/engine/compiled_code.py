@@ -16,6 +16,8 @@ VARIABLE: Final = "ORTHOFLOW_KERNELS"
 # Our own kernels (`geometry.kept_kernels`): no two of these have one name, and damage shows. What
 # a plugin keeps past them stays in its store.
 _SHARED: Final = "*.checked*.nb[ci]"
+# Of the files that say of a method that its kernels are there; they hold no code.
+DONE: Final = ".foretold"
 
 
 def warm_folder() -> Path:
@@ -65,8 +67,11 @@ def leave_for_others(folder: Path, since_ns: int) -> None:
         # Without a home there is no cache; `warm` compiles where they shall stay.
         if "~" in shared.parts or (shared.exists() and shared.samefile(folder)):
             return
-        new = [path for path in folder.rglob(_SHARED) if path.stat().st_mtime_ns >= since_ns]
-        for path in sorted(new, key=lambda path: path.suffix):
+        found = [*folder.rglob(_SHARED), *folder.glob(f"*{DONE}")]
+        new = [path for path in found if path.stat().st_mtime_ns >= since_ns]
+        # Kernels, their indices, then what says of a method that all of its kernels are there.
+        order = (".nbc", ".nbi", DONE)
+        for path in sorted(new, key=lambda path: order.index(path.suffix)):
             place = shared / path.relative_to(folder)
             place.parent.mkdir(parents=True, exist_ok=True)
             aside = place.with_name(f".{uuid.uuid4().hex}")

@@ -13,6 +13,7 @@ from typing import Final, Literal
 
 from orthoflow.engine.clock import now
 from orthoflow.engine.compiled_code import begun_with_warm, leave_for_others
+from orthoflow.engine.compiling_ahead import AheadCompiler
 from orthoflow.engine.durability import remove_tree, writing_to
 from orthoflow.engine.environment import environment
 from orthoflow.engine.events import (
@@ -167,9 +168,13 @@ def execute(
                 run_id=journal.run_id,
             )
             executor = _executor(plan, scratch, _passing_on(listen), interruption)
-            run = _Run(tasks, journal, listen)
+            # Of other executors, one computes in this process, and others on other machines.
+            ahead = AheadCompiler(
+                is_wanted=plan.options.executor == "local" and plan.options.all_cores > 1
+            )
+            run = _Run(tasks, journal, listen, ahead)
             try:
-                with closing(executor), tasks.sharing_kernels():
+                with closing(executor), tasks.sharing_kernels(), closing(ahead):
                     run.go(executor, interruption)
             except (CancelledStepError, ClusterError, StoreError):
                 if on_interruption is not None:
@@ -189,8 +194,11 @@ class _Ready:
 class _Run:
     """The state of one run; used from one thread."""
 
-    def __init__(self, tasks: _TaskMaker, journal: Journal, listen: RunListener) -> None:
+    def __init__(
+        self, tasks: _TaskMaker, journal: Journal, listen: RunListener, ahead: AheadCompiler
+    ) -> None:
         self._tasks = tasks
+        self._ahead = ahead
         self._plan = tasks.plan
         self._store = tasks.store
         self._failures = Failures.of_store(tasks.store.folder)
@@ -365,6 +373,9 @@ class _Run:
         self._journal.write(CellBegan(time=now(), address=cell.address, key=task.key))
         self._listen(CellStarted(address=cell.address))
         executor.start(task)
+        if self._ahead.is_wanted:
+            later = (item.cell for item in self._waiting.values())
+            self._ahead.begin(self._tasks.kernels_of(later))
 
     def _take(self, end: TaskEnd) -> None:
         task = self._running.pop(end.address)
@@ -537,11 +548,22 @@ class _TaskMaker:
             store=str(self.store.folder),
             folder=str(self.scratch / uuid.uuid4().hex[:12]),
             log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
-            numba_folder=str(begun_with_warm(self.store.numba_folder(facts.compiled_digest))),
+            numba_folder=str(self._kernels(facts)),
             publisher_tag=self.plan.publisher_tag,
             environment=environment(cores),
             **shared_fields(facts, MethodIdentity),
         )
+
+    def kernels_of(self, cells: Iterable[Cell]) -> dict[Path, list[MethodFacts]]:
+        """Give folders for compiled kernels -> the methods of cells, each once."""
+        folders: dict[Path, list[MethodFacts]] = {}
+        for method in dict.fromkeys(cell.method for cell in cells if not cell.skip_reason):
+            facts = self.plan.methods[method]
+            folders.setdefault(self._kernels(facts), []).append(facts)
+        return folders
+
+    def _kernels(self, facts: MethodFacts) -> Path:
+        return begun_with_warm(self.store.numba_folder(facts.compiled_digest))
 
     @contextmanager
     def sharing_kernels(self) -> Iterator[None]:

@@ -16,7 +16,8 @@ from contextlib import suppress
 from typing import Any, Final, TypeVar, cast
 
 import numba
-from numba.core import event, types
+from numba.core import event, sigutils, types
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import TypingError
 
@@ -34,7 +35,8 @@ def compiled(function: _Kernel) -> _Kernel:
     Threads come from `geometry.threads`, not from numba's own loops: those take seconds more to
     compile.
     """
-    return cast("_Kernel", _kept(function, nogil=True))
+    # The second of the wrappers, for callers in C, nobody needs.
+    return cast("_Kernel", _kept(function, nogil=True, no_cfunc_wrapper=True))
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -75,9 +77,26 @@ def _kept(function: Callable[..., Any], **options: object) -> Any:
     # Where nothing can be kept, no home and a program that only others may change, it is compiled
     # in each process.
     with suppress(RuntimeError):
-        kernel._cache = KeptKernels(function)  # noqa: SLF001 - numba has no other door for it
+        _keep(kernel, KeptKernels(function))
     _give_constants_no_version(kernel)
     return kernel
+
+
+def _keep(kernel: Any, kept: KeptKernels) -> None:
+    """Let a kernel be loaded where it is kept, and else be compiled by one process alone."""
+    kernel._cache = kept  # noqa: SLF001 - numba has no other door for it
+    compile_it = kernel.compile
+
+    def compile_once(signature: Any) -> object:
+        # The compiler's lock first: who holds it never waits for a thread of this process.
+        with global_compiler_lock:
+            arguments, _ = sigutils.normalize_signature(signature)  # type: ignore[no-untyped-call]
+            if tuple(arguments) in kernel.overloads or kept.holds(signature, kernel.targetctx):
+                return compile_it(signature)
+            with kept.alone():
+                return compile_it(signature)
+
+    kernel.compile = compile_once
 
 
 def _give_constants_no_version(kernel: Any) -> None:

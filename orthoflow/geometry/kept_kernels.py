@@ -3,13 +3,17 @@
 What numba keeps are pickles, and to read one is to run it. Each file begins with the SHA-256 of the
 rest here: one that was damaged, cut off or written by somebody else is as good as none, and its
 kernel is compiled again. That finds damage, not an enemy, who can write a digest as well.
+
+Of two processes that need a kernel one compiles it, and the other waits and loads it.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import io
 import pickle
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -18,9 +22,15 @@ from typing import Any, BinaryIO, Final
 
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
+from orthoflow.geometry.kernel_news import tell
+
 _DIGEST_BYTES: Final = 32
 # Of an index's files, in their names.
 CHECKED: Final = ".checked"
+# Longer than any kernel takes where its process gets a core. One that does not, beside much other
+# work, or that was stopped, shall not be waited for: then each compiles for itself.
+_PATIENCE_S: Final = 5.0
+_LOOK_EVERY_S: Final = 0.01
 
 
 class KeptKernels(FunctionCache):
@@ -40,6 +50,32 @@ class KeptKernels(FunctionCache):
             f"{self._impl.filename_base}{CHECKED}",
             self._impl.locator.get_source_stamp(),
         )
+
+    def holds(self, signature: object, context: Any) -> bool:
+        """Whether a version is kept, as far as the index says."""
+        context.refresh()
+        key = self._index_key(signature, context.codegen())  # type: ignore[no-untyped-call]
+        return key in self._cache_file._load_index()  # type: ignore[no-untyped-call]  # noqa: SLF001
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep other processes from compiling the same kernel while the block runs.
+
+        Kernels wait for those that they call and never the other way round, so nobody waits in a
+        circle. Where files cannot be locked, or the other takes too long, nobody is kept from it.
+        """
+        path = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
+        try:
+            lock = path.open("wb")
+        except OSError:
+            yield
+            return
+        with lock:
+            if not _is_taken(lock):
+                tell(f"waiting for another process that compiles {self._py_func.__name__}")
+                _wait_for(lock)
+                tell("")
+            yield
 
 
 class _CheckedFiles(IndexDataCacheFile):
@@ -73,6 +109,36 @@ class _CheckedFiles(IndexDataCacheFile):
         with super()._open_for_write(filepath) as stream:
             stream.write(hashlib.sha256(content.getvalue()).digest())
             stream.write(content.getvalue())
+
+
+def _is_taken(lock: BinaryIO) -> bool:
+    """Take a lock that nobody has, or where there are none; False when another process has it."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _wait_for(lock: BinaryIO) -> None:
+    until = time.monotonic() + _patience.left_s
+    while not _is_taken(lock):
+        if time.monotonic() > until:
+            # Nor is the next one waited for, that it will not have compiled either.
+            _patience.left_s = 0.0
+            return
+        time.sleep(_LOOK_EVERY_S)
+
+
+class _Patience:
+    """How long this process waits for another one."""
+
+    left_s = _PATIENCE_S
+
+
+_patience = _Patience()
 
 
 def _checked(path: Path) -> bytes | None:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib.util
 import os
 import pickle
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import pytest
 from numba.core import config
+
+from orthoflow.geometry import kept_kernels
+from orthoflow.geometry.kept_kernels import CHECKED
+from orthoflow.geometry.kernel_news import heard_by
 
 KERNELS = """
 from orthoflow.geometry.compiling import compiled, inlined, kernel_part, typed_kernel_part
@@ -67,6 +74,49 @@ def test_what_one_process_compiled_another_loads(load: Callable[[], Any]) -> Non
     assert counts(again.asked) == (1, 0)
     assert counts(first.most) == (0, 1)
     assert counts(again.most) == (1, 0)
+
+
+def test_a_kernel_that_another_process_compiles_is_waited_for_and_loaded(
+    load: Callable[[], Any], tmp_path: Path
+) -> None:
+    load().asked(3)
+    index = kept(tmp_path, "asked", "nbi")
+    aside = index.rename(index.with_suffix(".aside"))
+    again = load()
+    heard: list[str] = []
+
+    def compile_elsewhere(lock: BinaryIO) -> None:
+        while not heard:
+            time.sleep(0.01)
+        aside.rename(index)
+        lock.close()
+
+    with heard_by(heard.append), ThreadPoolExecutor(1) as pool:
+        lock = _locked(index)
+        pool.submit(compile_elsewhere, lock)
+        assert again.asked(3) == 214.0
+    assert counts(again.asked) == (1, 0)
+    assert heard == ["waiting for another process that compiles asked", ""]
+
+
+def test_who_takes_too_long_to_compile_is_waited_for_once(
+    load: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load().asked(3)
+    index = kept(tmp_path, "asked", "nbi")
+    index.unlink()
+    monkeypatch.setattr(kept_kernels._patience, "left_s", 0.2)
+    again = load()
+    with _locked(index):
+        assert again.asked(3) == 214.0
+        assert counts(again.asked) == (0, 1)
+    assert kept_kernels._patience.left_s == 0.0
+
+
+def _locked(index: Path) -> BinaryIO:
+    lock = index.with_name(index.name.replace(f"{CHECKED}.nbi", ".lock")).open("wb")
+    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return lock
 
 
 class _WritesWhenRead:

@@ -1,0 +1,102 @@
+"""Kernels of later steps are compiled beside earlier ones, by nobody who outlives the run."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from orthoflow.catalog import discover_catalog
+from orthoflow.engine import compiling_ahead
+from orthoflow.engine.compiling_ahead import FORETOLD, AheadCompiler
+from orthoflow.engine.keys import MethodFacts, method_facts
+from orthoflow.geometry.kernel_types import type_of
+from tests.workshop_runs import WORKSHOP
+
+_LONGEST_S = 120.0
+_KERNELS = Path(__file__).resolve().parents[2] / "plugins" / "orthoflow_plugins" / FORETOLD
+
+
+@pytest.fixture
+def facts(monkeypatch: pytest.MonkeyPatch) -> MethodFacts:
+    """Of a method whose package tells which kernel it needs."""
+    monkeypatch.syspath_prepend(str(WORKSHOP))
+    return method_facts("paint.kernel", discover_catalog())
+
+
+def wait_for(path: Path) -> None:
+    until = time.monotonic() + _LONGEST_S
+    while not path.exists():
+        assert time.monotonic() < until, f"{path.name} does not come"
+        time.sleep(0.05)
+
+
+def done_file(folder: Path, facts: MethodFacts) -> Path:
+    [name] = compiling_ahead._orders(folder, [facts])
+    return folder / name
+
+
+def test_what_a_method_needs_is_compiled_before_it_runs(tmp_path: Path, facts: MethodFacts) -> None:
+    done = done_file(tmp_path, facts)
+    ahead = AheadCompiler(is_wanted=True)
+    ahead.begin({tmp_path: [facts]})
+    try:
+        wait_for(done)
+    finally:
+        ahead.close()
+    assert {path.name.split("-")[0] for path in tmp_path.rglob("*.nbi")} == {
+        "kernels.doubled",
+        "kernels.doubled_sum",
+    }
+    # Nobody is asked again for what is done.
+    assert compiling_ahead._orders(tmp_path, [facts]) == {}
+    ahead.begin({tmp_path: [facts]})
+    assert not ahead._processes
+
+
+def test_the_compiler_ends_with_its_run(tmp_path: Path, facts: MethodFacts) -> None:
+    ahead = AheadCompiler(is_wanted=True)
+    ahead.begin({tmp_path: [facts]})
+    [process] = ahead._processes
+    assert process.poll() is None
+    ahead.close()
+    assert process.returncode is not None
+
+
+def test_the_compiler_ends_when_nobody_is_left_who_ordered(
+    tmp_path: Path, facts: MethodFacts
+) -> None:
+    ahead = AheadCompiler(is_wanted=True)
+    ahead.begin({tmp_path: [replace(facts, method="paint.endless")]})
+    assert not ahead._processes, "it compiles for a method of which nothing is told"
+    ahead.begin({tmp_path: [facts]})
+    [process] = ahead._processes
+    assert process.stdin is not None
+    process.stdin.close()
+    process.wait(_LONGEST_S)
+
+
+def test_kernels_that_are_not_as_they_were_foretold_are_left_to_their_steps(tmp_path: Path) -> None:
+    orders = {"gone": [["workshop.kernels", "gone", []], ["nowhere", "f", ["float64"]]]}
+    compiling_ahead.compile_all(tmp_path, orders)
+    assert [path.name for path in tmp_path.iterdir()] == ["gone"]
+
+
+def test_every_kernel_that_is_foretold_is_there_and_takes_what_is_told() -> None:
+    """Where not: `python benchmarks/foretell_kernels.py --write`, with a recipe that needs it."""
+    told = json.loads(_KERNELS.read_bytes())
+    assert "plane.hough2d" in told["methods"]
+    for module, name, arguments in told["kernels"]:
+        kernel = getattr(importlib.import_module(module), name)
+        taken = inspect.signature(kernel.py_func).parameters
+        assert len(taken) == len(arguments), f"{module}.{name}"
+        for text in arguments:
+            type_of(text)
+    numbers = {number for needed in told["methods"].values() for number in needed}
+    assert numbers == set(range(len(told["kernels"])))
+    assert told["methods"].keys() <= discover_catalog().methods.keys()
