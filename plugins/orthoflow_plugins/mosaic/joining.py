@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry.bands import Allocate, bands_with_reach
+from orthoflow.geometry.bands import Allocate, bands_with_reach, in_memory
 from orthoflow.geometry.levels import Colours, Level, in_levels
 from orthoflow.products import Layer, LayerMask, OrthoMask, Wall
 from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
@@ -82,6 +82,7 @@ def preferences(
     *,
     wall: Wall | None = None,
     balance: Balance | None = None,
+    allocate: Allocate = in_memory,
 ) -> list[Preference]:
     """Say by a rule how much each layer is preferred in rows of the wall, larger is more.
 
@@ -94,7 +95,7 @@ def preferences(
         MethodError: `priority` names what is no layer of any wall.
     """
     if wish.rule == "voronoi":
-        return [partial(_rows_of, _depth_inside(layer)) for layer in layers]
+        return [_by_depth_inside(layer, index, allocate) for index, layer in enumerate(layers)]
     if wish.rule == "priority":
         return _by_order(layers, wish.priority)
     if wish.rule == "graph-cut" and len(layers) > 1:
@@ -158,7 +159,11 @@ def joined(
     Returns:
         (rows, cols) `OrthoMask`, and the index of the painter of each cell, `NOBODY` without one.
     """
-    preferred = preferences(painters, wish, wall=wall, balance=balance) if painters else []
+    preferred = (
+        preferences(painters, wish, wall=wall, balance=balance, allocate=allocate)
+        if painters
+        else []
+    )
     shape = [*painters, *others][0].frame.shape
     mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
     source = np.asarray(allocate("source", shape, np.int16), np.int16)
@@ -302,6 +307,14 @@ def _ranks(layer: Layer) -> NDArray[np.uint8]:
 
 def _best(layers: Sequence[Layer]) -> np.float32:
     return np.float32(max(1e-6, *(float(layer.quality.max()) for layer in layers)))
+
+
+def _by_depth_inside(layer: Layer, index: int, allocate: Allocate) -> Preference:
+    if layer.mask.size <= _BAND_CELLS:
+        return partial(_rows_of, _depth_inside(layer))
+    from orthoflow_plugins.mosaic.depths_inside import column_distances, depths_inside
+
+    return partial(depths_inside, column_distances(layer.mask, f"inside.{index}", allocate))
 
 
 def _depth_inside(layer: Layer) -> NDArray[np.float32]:

@@ -215,7 +215,7 @@ def mosaic(layers: tuple[Layer, ...], folder: Path, **params: object) -> MosaicS
     return MosaicSeams().run(inputs, chosen, context(folder))
 
 
-@pytest.mark.parametrize("seams", ["best-view", "priority", "graph-cut"])
+@pytest.mark.parametrize("seams", ["best-view", "priority", "graph-cut", "voronoi"])
 @pytest.mark.usefixtures("small_bands")
 def test_mosaics_are_joined_and_reported_without_memory_per_cell(
     tmp_path: Path, seams: str

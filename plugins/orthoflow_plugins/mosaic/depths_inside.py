@@ -1,0 +1,116 @@
+"""How far inside the area that a layer paints its cells lie: of a large layer some rows at a time.
+
+Distances are exact (Meijster 2000): down and up the columns first, which go into a file, then along
+each row over the parabolas that these open. OpenCV's need the whole wall in memory.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.bands import Allocate
+from orthoflow.geometry.compiling import compiled, kernel_part
+from orthoflow.geometry.threads import in_parts
+from orthoflow.products import LayerMask
+
+# Rows are shared by two threads: those of a band wait for the file.
+_THREADS: Final = 2
+
+
+def column_distances(mask: NDArray[np.uint8], name: str, allocate: Allocate) -> NDArray[np.uint32]:
+    """Distances (rows, cols) down or up the column to what a layer does not paint, or to the rim.
+
+    Args:
+        mask: (rows, cols) `LayerMask`.
+        name: of the array that is asked for.
+        allocate: gives it.
+    """
+    distances = np.asarray(allocate(name, mask.shape, np.uint32), np.uint32)
+    before = np.zeros(mask.shape[1], dtype=np.uint32)
+    for row in range(mask.shape[0]):
+        before = np.where(mask[row] == LayerMask.PAINTED, before + np.uint32(1), np.uint32(0))
+        distances[row] = before
+    before = np.zeros(mask.shape[1], dtype=np.uint32)
+    for row in range(mask.shape[0] - 1, -1, -1):
+        before = np.minimum(distances[row], before + np.uint32(1))
+        distances[row] = before
+    return distances
+
+
+def depths_inside(distances: NDArray[np.uint32], rows: slice) -> NDArray[np.float32]:
+    """Distances in cells to the nearest cell that a layer does not paint, or to the rim.
+
+    Args:
+        distances: (rows, cols) as `column_distances` gives them.
+        rows: that are asked for.
+    """
+    part = np.ascontiguousarray(distances[rows]).view(np.ndarray)
+    depths = np.empty(part.shape, dtype=np.float32)
+    in_parts(partial(look_along_rows, part, depths), len(part), threads=_THREADS)
+    return depths
+
+
+@compiled
+def look_along_rows(
+    distances: NDArray[np.uint32], depths: NDArray[np.float32], first: int, end: int
+) -> None:
+    """Set the distances of some rows.
+
+    Args:
+        distances: (rows, cols) along the columns.
+        depths: (rows, cols), overwritten.
+        first: first row to visit.
+        end: the row after the last one.
+    """
+    width = distances.shape[1]
+    # With the rim on either side.
+    squares = np.zeros(width + 2, dtype=np.int64)
+    lowest = np.zeros(width + 2, dtype=np.int64)
+    starts = np.zeros(width + 2, dtype=np.int64)
+    for row in range(first, end):
+        for column in range(width):
+            distance = np.int64(distances[row, column])
+            squares[column + 1] = distance * distance
+        last = _lay_parabolas(squares, lowest, starts)
+        for column in range(width, 0, -1):
+            while starts[last] > column:
+                last -= 1
+            across = column - lowest[last]
+            depths[row, column - 1] = np.sqrt(np.float32(across * across + squares[lowest[last]]))
+
+
+@kernel_part
+def _lay_parabolas(
+    squares: NDArray[np.int64], lowest: NDArray[np.int64], starts: NDArray[np.int64]
+) -> int:
+    """Find which of the parabolas that stand over the columns are lowest, and from where on.
+
+    Args:
+        squares: (columns,) height of the parabola over a column.
+        lowest: (columns,) columns of the lowest parabolas, overwritten up to the last one.
+        starts: (columns,) first column where each of them is the lowest; likewise.
+
+    Returns:
+        Position of the last one.
+    """
+    last = 0
+    lowest[0], starts[0] = 0, 0
+    for column in range(1, squares.size):
+        begin = 0
+        while last >= 0:
+            other = lowest[last]
+            apart = column * column - other * other + squares[column] - squares[other]
+            # Beyond it this parabola is lower than the other one.
+            begin = 1 + apart // (2 * (column - other))
+            if begin > starts[last]:
+                break
+            begin = 0
+            last -= 1
+        if begin < squares.size:
+            last += 1
+            lowest[last], starts[last] = column, begin
+    return last
