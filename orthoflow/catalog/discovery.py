@@ -14,6 +14,7 @@ from typing import Final, Generic, TypeVar
 import pluggy
 
 from orthoflow.catalog.catalog import (
+    FILES,
     BrokenPlugin,
     Catalog,
     EntryState,
@@ -236,7 +237,8 @@ def _collect_kinds(
         state: EntryState = "fine"
         problem = ""
         unknown = sorted(
-            {*first.spec.inputs.values(), *first.spec.outputs.values()} - product_types
+            ({*first.spec.inputs.values()} - product_types - {FILES})
+            | ({*first.spec.outputs.values()} - product_types)
         )
         # The same ports again do no harm: two strangers may both need a kind of their own.
         if any(_ports(claim.spec) != _ports(first.spec) for claim in claims):

@@ -6,6 +6,7 @@ import typing
 from collections.abc import Mapping
 from importlib import import_module
 
+from orthoflow.catalog.catalog import FILES
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
@@ -19,8 +20,6 @@ from orthoflow.sdk.methods import (
     PortSpec,
     port_specs,
 )
-
-FILES = "files"
 
 
 def import_target(target: str, what: str, distribution: DistributionInfo) -> object:

@@ -47,7 +47,8 @@ class KindSpec:
     Attributes:
         name: the kind.
         summary: one line for listings.
-        inputs: port name -> product type name; empty for sources, whose methods have their own.
+        inputs: port name -> product type name, or `files` for an input of the workflow; empty for
+            sources, whose methods have their own.
         outputs: port name -> product type name; likewise.
         is_source: methods declare ports of their own and take no variants.
     """

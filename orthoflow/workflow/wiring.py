@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
 from orthoflow.catalog import did_you_mean
-from orthoflow.catalog.loading import FILES
+from orthoflow.catalog.catalog import FILES
 from orthoflow.files.yaml_positions import join
 from orthoflow.workflow.format import WorkflowStep
 from orthoflow.workflow.problems import ProblemLog

@@ -62,7 +62,12 @@ def orthoflow_kinds() -> list[KindSpec]:
         KindSpec(
             name="mosaic",
             summary="join the layers of each wall",
-            inputs={"layers": "layers", "walls": "walls", "cameras": "cameras"},
+            inputs={
+                "layers": "layers",
+                "walls": "walls",
+                "cameras": "cameras",
+                "seams": "files",
+            },
             outputs={"orthoimages": "orthoimages"},
         ),
         KindSpec(

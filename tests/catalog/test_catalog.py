@@ -243,8 +243,8 @@ def test_the_same_kind_announced_twice_with_the_same_ports_is_fine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kind = (
-        "KindSpec(name='mosaic', summary='mine', inputs={'layers': 'layers', 'walls': 'walls'}, "
-        "outputs={'orthoimages': 'orthoimages'})"
+        "KindSpec(name='mosaic', summary='mine', inputs={'layers': 'layers', 'walls': 'walls', "
+        "'cameras': 'cameras', 'seams': 'files'}, outputs={'orthoimages': 'orthoimages'})"
     )
     catalog = with_plugin("alike", hooks(kinds=kind), tmp_path, monkeypatch)
     assert catalog.method("mosaic.seams").load().id == "mosaic.seams"

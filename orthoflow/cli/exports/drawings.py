@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines
     from orthoflow.files.drawings.sheet_contents import SheetText, WallDrawing
     from orthoflow.files.drawings.title_blocks import TitleBlock
+    from orthoflow.products import Orthoimage
     from orthoflow.records import Run
     from orthoflow.records.wall_results import RoomResults, WallResult
 
@@ -184,8 +185,12 @@ def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
 
 
 def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `wall_<k>.geojson` and `room.geojson`."""
-    from orthoflow.files.drawings.geojson import write_room_geojson, write_wall_geojson
+    """Write `wall_<k>.geojson`, `wall_<k>_seams.geojson` and `room.geojson`."""
+    from orthoflow.files.drawings.geojson import (
+        write_room_geojson,
+        write_seams_geojson,
+        write_wall_geojson,
+    )
     from orthoflow.records.wall_results import room_results
 
     results = room_results(run, chosen.cell)
@@ -194,11 +199,24 @@ def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
     make_empty(folder)
     for wall in walls:
         write_wall_geojson(folder / f"wall_{wall.number}.geojson", _drawn(wall, ""), lines)
+    for image in _images(run, results.address):
+        if len(image.sources) > 1 and chosen.wall in {None, image.number}:
+            write_seams_geojson(folder / f"wall_{image.number}_seams.geojson", image)
     if lines is None:
         return counted(len(walls), "wall")
     crs = next((wall.frame.map_crs for wall in results.walls if wall.frame.map_crs), None)
     write_room_geojson(folder / "room.geojson", lines, crs)
     return f"{counted(len(walls), 'wall')}, and the room: {_said(lines)}"
+
+
+def _images(run: Run, address: str) -> Sequence[Orthoimage]:
+    """The orthoimages of a cell; none where it gives other rasters."""
+    from orthoflow.products import Orthoimages
+
+    for port, output in run.cell(address).outputs.items():
+        if output.type_name == Orthoimages.type_name and output.embedded:
+            return Orthoimages.from_payload(run.payload(address, port)).images
+    return ()
 
 
 def _lines(results: RoomResults) -> RoomLines | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 
 from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of
 from orthoflow.files.json_texts import json_bytes
+from orthoflow.files.polygons import outlines
 from orthoflow.files.sidecars import write_bytes
 from orthoflow.geometry.adjoining import Edge
-from orthoflow.products import JsonValue
+from orthoflow.products import JsonValue, Orthoimage
 
 _Feature: TypeAlias = dict[str, JsonValue]
 _DIGITS: Final = 6
+_SEAM_CELLS_MOST: Final = 16_000_000
 
 
 def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None:
@@ -40,6 +43,27 @@ def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> 
             places = wall.place_m(lines.checkpoints.points_world[near])
             features += _points([lines.checkpoints.names[index] for index in near], places)
     _write(path, features, wall.frame.map_crs)
+
+
+def write_seams_geojson(path: Path, image: Orthoimage) -> None:
+    """Write which photo paints what of a wall, in the coordinates of its GeoTIFF.
+
+    Edited and given back as the input `seams` of `mosaic.seams`, it overrides the automatic seams.
+    """
+    # Of very large walls, corners are good to some cells.
+    step = max(1, math.ceil(math.sqrt(image.source.size / _SEAM_CELLS_MOST)))
+    source = np.ascontiguousarray(image.source[::step, ::step])
+    corner_m = np.array(image.frame.raster_corner_m)
+    features: list[_Feature] = []
+    for index, rings in outlines(source):
+        places = [
+            (corner_m + step * image.frame.gsd_m * ring * [1.0, -1.0]).round(_DIGITS).tolist()
+            for ring in rings
+        ]
+        about: dict[str, JsonValue] = {"photo": image.sources[index], "wall": image.number}
+        geometry: dict[str, JsonValue] = {"type": "Polygon", "coordinates": places}
+        features.append({"type": "Feature", "properties": about, "geometry": geometry})
+    _write(path, features, image.frame.map_crs, indent=None)
 
 
 def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> None:
@@ -95,11 +119,13 @@ def _feature(
     return {"type": "Feature", "properties": dict(about), "geometry": geometry}
 
 
-def _write(path: Path, features: list[_Feature], map_crs: str | None) -> None:
+def _write(
+    path: Path, features: list[_Feature], map_crs: str | None, *, indent: int | None = 1
+) -> None:
     content: dict[str, JsonValue] = {"type": "FeatureCollection", "name": path.stem}
     if map_crs is not None and map_crs.startswith("EPSG:"):
         # Not of RFC 7946, which knows degrees only, but what GIS programs read.
         name = f"urn:ogc:def:crs:EPSG::{map_crs.removeprefix('EPSG:')}"
         content["crs"] = {"type": "name", "properties": {"name": name}}
     content["features"] = list(features)
-    write_bytes(path, json_bytes(content, indent=1) + b"\n")
+    write_bytes(path, json_bytes(content, indent=indent) + b"\n")

@@ -19,6 +19,7 @@ from orthoflow_plugins.mosaic.graph_cut import CutLabels, cut_labels
 
 if TYPE_CHECKING:
     from orthoflow_plugins.mosaic.balance import Balance
+    from orthoflow_plugins.mosaic.drawn_seams import DrawnSeams
 
 SeamRule = Literal["best-view", "voronoi", "graph-cut", "priority"]
 
@@ -56,11 +57,13 @@ class SeamWish:
         priority: names of photos, for that rule.
         island_cells_min: smaller patches from one source are painted from the source around
             them, where that one sees them too.
+        drawn: areas that a person gives to photos, before all rules, where those paint them.
     """
 
     rule: SeamRule
     priority: tuple[str, ...] = ()
     island_cells_min: int = 1
+    drawn: DrawnSeams | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +173,7 @@ def joined(
     reach = _island_reach(wish.island_cells_min)
     for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=reach):
         rows = band.rows
-        choice = _choice_in(band.around, painters, others, preferred, wish.island_cells_min)
+        choice = _choice_in(band.around, painters, others, preferred, wish)
         mask[rows] = _MASK_OF_RANK[choice.rank[band.inner]]
         source[rows] = choice.source[band.inner]
     return mask, source
@@ -212,19 +215,23 @@ def _choice_in(
     painters: Sequence[Layer],
     others: Sequence[Layer],
     preferred: Sequence[Preference],
-    island_cells_min: int,
+    wish: SeamWish,
 ) -> Choice:
     """What becomes of the cells of some rows."""
     parts = [_part(layer, rows) for layer in painters]
+    values = [preference(rows) for preference in preferred]
+    if wish.drawn is not None:
+        wished = wish.drawn.wished(rows)
+        values = [
+            np.where(wished == index, np.float32(np.inf), value)
+            for index, value in enumerate(values)
+        ]
     choice = best_views(
         [*parts, *(_part(layer, rows) for layer in others)],
-        [
-            *(preference(rows) for preference in preferred),
-            *(layer.quality[rows] for layer in others),
-        ],
+        [*values, *(layer.quality[rows] for layer in others)],
     )
-    if island_cells_min > 1 and len(painters) > 1:
-        return without_islands(choice, parts, island_cells_min)
+    if wish.island_cells_min > 1 and len(painters) > 1:
+        return without_islands(choice, parts, wish.island_cells_min)
     return choice
 
 

@@ -15,11 +15,13 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import encode_webp
+from orthoflow.files.polygons import NamedPolygon
 from orthoflow.geometry.bands import Allocate, count_cells, holds_cells
 from orthoflow.geometry.levels import eight_bits
 from orthoflow.products import (
     Camera,
     Cameras,
+    InputFiles,
     JsonValue,
     Layer,
     LayerMask,
@@ -40,6 +42,7 @@ from orthoflow_plugins.mosaic.agreement import (
     seam_steps,
 )
 from orthoflow_plugins.mosaic.balance import Balance, balance_of, with_seams
+from orthoflow_plugins.mosaic.drawn_seams import read_seams, seams_of
 from orthoflow_plugins.mosaic.joining import (
     NOBODY,
     SeamRule,
@@ -158,11 +161,12 @@ class MosaicSeams(Method):
         )
 
     class In(Ports):
-        """Layers of all walls; the walls for their depth edges, the cameras for their lenses."""
+        """Layers of all walls; walls for depth edges, cameras for lenses, seams from a person."""
 
         layers: Layers
         walls: Walls | None = None
         cameras: Cameras | None = None
+        seams: InputFiles | None = None
 
     class Out(Ports):
         """One orthoimage per wall."""
@@ -176,13 +180,19 @@ class MosaicSeams(Method):
             raise MethodError("there is no layer to make an orthoimage of, at least one is needed")
         require_sources(layers, params.priority)
         cameras = {} if inputs.cameras is None else _oriented(inputs.cameras)
+        drawn = read_seams(inputs.seams, {layer.source for layer in layers})
         verdicts: list[_Joined] = []
         for index, members in groupby(layers, key=lambda layer: layer.wall):
             group: tuple[Layer, ...] = tuple(members)
             name = inputs.layers.name(index)
             ctx.progress(index / (layers[-1].wall + 1), name)
             allocate = partial(_allocated, ctx, index)
-            surroundings = _Surroundings(wall=_wall(inputs.walls, index), cameras=cameras)
+            surroundings = _Surroundings(
+                wall=_wall(inputs.walls, index),
+                cameras=cameras,
+                drawn=drawn,
+                number=inputs.layers.number(index),
+            )
             verdict = _join(group, name, params, surroundings, allocate)
             image = replace(verdict.image, plane_index=inputs.layers.number(index))
             verdicts.append(replace(verdict, image=image))
@@ -242,10 +252,14 @@ class _Surroundings:
     Attributes:
         wall: its surface, or None.
         cameras: of photos, by name.
+        drawn: areas that a person gives to photos, of all walls.
+        number: of the wall.
     """
 
     wall: Wall | None
     cameras: Mapping[str, Camera]
+    drawn: Sequence[NamedPolygon]
+    number: int
 
 
 def _allocated(
@@ -277,6 +291,12 @@ def _join(
         rule=params.seams,
         priority=params.priority,
         island_cells_min=params.island_cells_min,
+        drawn=seams_of(
+            surroundings.drawn,
+            surroundings.number,
+            group[0].frame,
+            [layer.source for layer in painters],
+        ),
     )
     mask, source = joined(painters, others, wish, wall=wall, balance=balance, allocate=allocate)
     untouched = seam_steps(source, painters)

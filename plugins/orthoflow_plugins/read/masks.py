@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.images import PHOTO_SUFFIXES, encode_png
-from orthoflow.files.json_texts import parse_json
 from orthoflow.files.photo_masks import decode_mask
+from orthoflow.files.polygons import NamedPolygon, filled, read_polygons
 from orthoflow.sdk import StepContext
 
 _ENDING: Final = "_mask"
@@ -22,18 +21,10 @@ _POLYGONS: Final = (".geojson", ".json")
 _NAMED: Final = 3
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Polygon:
-    """What is masked in the photos of a name or pattern: rings (n, 2) of pixels (u, v)."""
-
-    pattern: str
-    rings: tuple[NDArray[np.float64], ...]
-
-
 class Masks:
     """Pictures and polygons, and which of them photos have taken."""
 
-    def __init__(self, pictures: Mapping[str, Path], polygons: Sequence[_Polygon]) -> None:
+    def __init__(self, pictures: Mapping[str, Path], polygons: Sequence[NamedPolygon]) -> None:
         self._pictures = pictures
         self._polygons = polygons
         self._taken: set[str] = set()
@@ -50,10 +41,10 @@ class Masks:
             InputError: a file is no mask, or two are for one photo.
         """
         pictures: dict[str, Path] = {}
-        polygons: list[_Polygon] = []
+        polygons: list[NamedPolygon] = []
         for path in [*beside, *given]:
             if path.suffix.lower() in _POLYGONS:
-                polygons += _polygons(path)
+                polygons += read_polygons(path, "photo", what="a mask of photos")
             elif path.suffix.lower() not in PHOTO_SUFFIXES:
                 raise InputError(
                     f"mask {path.name} is neither a picture (PNG, JPEG, TIFF) nor polygons "
@@ -79,10 +70,10 @@ class Masks:
                 used = self._picture(path, photo, size)
                 break
         for polygon in self._polygons:
-            if fnmatchcase(photo, polygon.pattern):
-                self._taken.add(polygon.pattern)
+            if fnmatchcase(photo, polygon.name):
+                self._taken.add(polygon.name)
                 used = np.ones(size[::-1], dtype=np.bool_) if used is None else used
-                used = used & ~_filled(polygon, size)
+                used = used & ~filled(polygon.rings, (size[1], size[0]))
         if used is None or used.all():
             return None
         if not used.any():
@@ -92,7 +83,7 @@ class Masks:
     def warn_of_unused(self, ctx: StepContext) -> None:
         """Say which masks are of no photo."""
         unused = [path.name for path in self._pictures.values() if path.name not in self._taken] + [
-            polygon.pattern for polygon in self._polygons if polygon.pattern not in self._taken
+            polygon.name for polygon in self._polygons if polygon.name not in self._taken
         ]
         if unused:
             named = ", ".join(sorted(set(unused))[:_NAMED])
@@ -129,61 +120,3 @@ def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
 def _key(stem: str) -> str:
     """Name or stem of the photo that a mask of this stem is for."""
     return stem.removesuffix(_ENDING)
-
-
-def _polygons(path: Path) -> list[_Polygon]:
-    """Polygons of a GeoJSON file, each with the property `photo`, a name or a pattern."""
-    expected = (
-        f"{path.name} is no mask: expected a GeoJSON FeatureCollection of polygons in pixels "
-        '(u to the right, v down), each with the property "photo", a name or a pattern'
-    )
-    try:
-        content = parse_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{expected}; {error}") from error
-    features = content.get("features") if isinstance(content, dict) else None
-    if not isinstance(features, list):
-        raise InputError(expected)
-    found: list[_Polygon] = []
-    for number, feature in enumerate(features):
-        try:
-            found += _polygons_of(feature)
-        except (TypeError, ValueError, KeyError, IndexError) as error:
-            raise InputError(f"{expected} (feature {number})") from error
-    return found
-
-
-def _polygons_of(feature: Any) -> Iterator[_Polygon]:
-    """Polygons of a feature; what is none of the expected fails somehow."""
-    photo, geometry = feature["properties"]["photo"], feature["geometry"]
-    kinds = {"Polygon": [geometry["coordinates"]], "MultiPolygon": geometry["coordinates"]}
-    for parts in kinds[geometry["type"]]:
-        rings = tuple(np.array(ring, dtype=np.float64)[:, :2] for ring in parts)
-        yield _Polygon(pattern=_text(photo), rings=_finite(rings))
-
-
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError
-    return value
-
-
-def _finite(rings: tuple[NDArray[np.float64], ...]) -> tuple[NDArray[np.float64], ...]:
-    if not rings or not all(ring.size and np.isfinite(ring).all() for ring in rings):
-        raise ValueError
-    return rings
-
-
-def _filled(polygon: _Polygon, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Pixels (height, width) that a polygon touches, but not those well inside its holes."""
-    import cv2
-
-    filled = np.zeros(size[::-1], dtype=np.uint8)
-    # Corners in 1/16 pixels; OpenCV's pixels have their centre at whole numbers.
-    limit = 4.0 * max(size)
-    rings = [
-        np.rint(16.0 * (np.clip(ring, -limit, limit) - 0.5)).astype(np.int32)
-        for ring in polygon.rings
-    ]
-    cv2.fillPoly(filled, rings, 1, shift=4)
-    return filled.astype(np.bool_)

@@ -1,0 +1,119 @@
+"""Polygons that people draw in other programs, from GeoJSON files, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.json_texts import parse_json
+from orthoflow.files.regular_files import open_file
+
+_MOST_BYTES: Final = 1 << 28
+_CORNERS_LEAST: Final = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedPolygon:
+    """A polygon with the name that one of its properties holds.
+
+    Attributes:
+        name: the property that was asked for.
+        rings: (n, 2) float64 each, the outer one first, then holes.
+        properties: all of them.
+    """
+
+    name: str
+    rings: tuple[NDArray[np.float64], ...]
+    properties: Mapping[str, object] = field(default_factory=dict)
+
+
+def read_polygons(path: Path, name: str, *, what: str) -> list[NamedPolygon]:
+    """Read a GeoJSON FeatureCollection of polygons, each with a text in the property `name`.
+
+    Args:
+        path: the file.
+        name: which property names them.
+        what: what the file should be, for errors: "a mask of photos".
+
+    Raises:
+        InputError: it is something else.
+    """
+    expected = (
+        f"{path.name} is not {what}: expected a GeoJSON FeatureCollection of polygons, each with "
+        f'the property "{name}"'
+    )
+    try:
+        with open_file(path) as stream:
+            content = parse_json(stream.read(_MOST_BYTES).decode())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{expected}; {error}") from error
+    features = content.get("features") if isinstance(content, dict) else None
+    if not isinstance(features, list):
+        raise InputError(expected)
+    found: list[NamedPolygon] = []
+    for number, feature in enumerate(features):
+        try:
+            found += _polygons_of(feature, name)
+        except (TypeError, ValueError, KeyError, IndexError) as error:
+            raise InputError(f"{expected} (feature {number})") from error
+    return found
+
+
+def _polygons_of(feature: Any, name: str) -> Iterator[NamedPolygon]:
+    """Polygons of a feature; what is none of the expected fails somehow."""
+    properties, geometry = feature["properties"], feature["geometry"]
+    kinds = {"Polygon": [geometry["coordinates"]], "MultiPolygon": geometry["coordinates"]}
+    for parts in kinds[geometry["type"]]:
+        rings = tuple(np.array(ring, dtype=np.float64)[:, :2] for ring in parts)
+        yield NamedPolygon(
+            name=_text(properties[name]), rings=_finite(rings), properties=dict(properties)
+        )
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError
+    return value
+
+
+def _finite(rings: tuple[NDArray[np.float64], ...]) -> tuple[NDArray[np.float64], ...]:
+    if not rings or not all(
+        len(ring) >= _CORNERS_LEAST and np.isfinite(ring).all() for ring in rings
+    ):
+        raise ValueError
+    return rings
+
+
+def filled(rings: tuple[NDArray[np.float64], ...], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Cells (rows, cols) whose centre lies in a polygon, but in none of its holes.
+
+    Args:
+        rings: (n, 2) corners as (column, row), the centre of the first cell at (0.5, 0.5).
+        shape: rows and columns.
+    """
+    from rasterio.features import rasterize
+
+    coordinates = [np.vstack([ring, ring[:1]]).tolist() for ring in rings]
+    polygon = {"type": "Polygon", "coordinates": coordinates}
+    return np.asarray(rasterize([polygon], out_shape=shape, dtype=np.uint8), dtype=np.bool_)
+
+
+def outlines(values: NDArray[np.int16]) -> list[tuple[int, tuple[NDArray[np.float64], ...]]]:
+    """Areas of one value each, as rings (n, 2) of (column, row) along the sides of their cells.
+
+    Args:
+        values: (rows, cols); negative ones belong to no area.
+    """
+    from rasterio.features import shapes
+
+    found = []
+    for geometry, value in shapes(values, mask=values >= 0, connectivity=4):
+        rings = tuple(np.array(ring, dtype=np.float64) for ring in geometry["coordinates"])
+        found.append((int(value), rings))
+    return found
