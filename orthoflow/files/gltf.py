@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +23,8 @@ from orthoflow.version import __version__
 
 # What graphics cards of today's phones still take.
 LONGEST_TEXTURE_PX: Final = 4096
+# Browsers take pages of some hundred megabytes; letters take a third more.
+_INSIDE_MOST_BYTES: Final = 1 << 27
 _FLOAT, _UNSIGNED_SHORT = 5126, 5123
 _VERTICES, _INDICES = 34962, 34963
 _MAGIC, _JSON_CHUNK, _BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
@@ -63,6 +67,24 @@ def write_room(path: Path, orthos: Sequence[OrthoFile], up: NDArray[np.float64])
         },
     }
     write_bytes(path, document.finished(root))
+
+
+def write_page(path: Path, model: Path) -> None:
+    """Write a page that shows a model without a server: the model is in it, up to some size.
+
+    Of a larger one, or one that cannot be read, the page asks for the file.
+
+    Args:
+        path: the new file, `.html`.
+        model: a file of `write_room`.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    page = files(__package__).joinpath("room_viewer.html").read_text(encoding="utf-8")
+    head, _, tail = page.partition("/*MODEL*/")
+    content = b"" if model.stat().st_size > _INSIDE_MOST_BYTES else b64encode(model.read_bytes())
+    write_bytes(path, b"".join([head.encode(), content, tail.encode()]))
 
 
 @dataclass(frozen=True, kw_only=True)

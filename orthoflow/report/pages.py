@@ -60,6 +60,12 @@ from orthoflow.version import __version__
 # Parentheses in a DOI come in pairs, as in doi:10.1007/3DRes.02(2011)3.
 _DOI: Final = re.compile(r"doi:\s*(10\.(?:\([^\s()]*\)|[^\s,;()])*(?:\([^\s()]*\)|[^\s,;().]))")
 
+# Pages that exports write where no other folder is named.
+_VIEWERS: Final = {
+    "model of the room": Path("export/gltf/room.html"),
+    "orthoimages to measure on": Path("export/tiles/index.html"),
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Ground:
@@ -115,6 +121,7 @@ class _Section:
     plan: PhotoPlan | None
     diagram: Markup
     citations: Mapping[str, tuple[str, ...]]
+    viewers: Mapping[str, str]
     title: str = ""
     whole: str = ""
     datasets: DatasetTable | None = None
@@ -373,6 +380,11 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         # Built from escaped parts only, as the overlays are.
         diagram=Markup(run_diagram(run)),
         citations=citations(run),
+        viewers={
+            text: (from_page / page).as_posix()
+            for text, page in _VIEWERS.items()
+            if (run.folder / page).is_file()
+        },
         title=place.title if place.whole else run.record.name,
         whole=place.whole,
     )

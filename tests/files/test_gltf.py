@@ -1,16 +1,20 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
+from base64 import b64decode
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from orthoflow.files import gltf
-from orthoflow.files.gltf import write_room
+from orthoflow.files.gltf import write_page, write_room
+from tests.browser import browser
 from tests.ortho_file_scenes import CORNER, FLOOR_SHAPE, GSD_M, UP, WALL_SHAPE, colours, room
 
 
@@ -96,3 +100,47 @@ def test_accessors_stay_inside_their_views(written: Path) -> None:
         assert view["byteOffset"] % 4 == 0
     for view in told["bufferViews"]:
         assert view["byteOffset"] + view["byteLength"] <= len(binary)
+
+
+def test_a_page_shows_the_model_without_a_server(written: Path, tmp_path: Path) -> None:
+    page_file = tmp_path / "room.html"
+    write_page(page_file, written)
+    text = page_file.read_text()
+    (inside,) = re.findall(r'const model = "([A-Za-z0-9+/=]*)"', text)
+    assert b64decode(inside) == written.read_bytes()
+    with browser(tmp_path / "profile") as page:
+        page.show_as(800, 600)
+        page.open(page_file)
+        page.evaluate("new Promise(done => setTimeout(done, 1500))")
+        if not page.evaluate("gl !== null"):
+            assert "no WebGL" in page.evaluate("document.getElementById('said').textContent")
+            return
+        names = "[...document.querySelectorAll('option')].map(o => o.textContent)"
+        assert page.evaluate(names) == ["whole room", "wall </script> 0", "floor 1"]
+        # Looked at from its front, the middle of the wall is painted as the orthoimage has it.
+        page.evaluate("show(0)")
+        (tmp_path / "page.png").write_bytes(page.screenshot())
+        picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
+        box = page.evaluate(
+            "(b => [b.left, b.top, b.width, b.height])(canvas.getBoundingClientRect())"
+        )
+        pixel = picture[round(box[1] + box[3] / 2), round(box[0] + box[2] / 2)]
+        rows, columns = WALL_SHAPE
+        middle = colours(WALL_SHAPE)[
+            rows // 2 - 4 : rows // 2 + 4, columns // 2 - 4 : columns // 2 + 4
+        ]
+        assert np.abs(pixel - middle.mean(axis=(0, 1))).max() <= 12
+        # What the browser says of a machine without a graphics card.
+        of_machine = ("software WebGL", "ReadPixels")
+        assert not [
+            text for text in page.complaints if not any(part in text for part in of_machine)
+        ]
+        assert all(address.startswith(("file:", "data:", "blob:")) for address in page.requests)
+
+
+def test_of_a_large_model_the_page_asks_for_the_file(
+    written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gltf, "_INSIDE_MOST_BYTES", written.stat().st_size - 1)
+    write_page(tmp_path / "room.html", written)
+    assert 'const model = "";' in (tmp_path / "room.html").read_text()

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 
 def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
-    """Write `room.glb`."""
-    from orthoflow.files.gltf import write_room
+    """Write `room.glb`, and `room.html` that shows it."""
+    from orthoflow.files.gltf import write_page, write_room
     from orthoflow.products import Planes
 
     address, orthos = _orthos(run, chosen)
@@ -35,7 +35,8 @@ def export_gltf(run: Run, folder: Path, chosen: Choices) -> str:
         )
     make_empty(folder)
     write_room(folder / "room.glb", orthos, planes.up)
-    return f"room.glb: {counted(len(orthos), 'wall')} of {address}"
+    write_page(folder / "room.html", folder / "room.glb")
+    return f"room.glb and room.html: {counted(len(orthos), 'wall')} of {address}"
 
 
 def export_tiles(run: Run, folder: Path, chosen: Choices) -> str:
