@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Literal, Protocol, cast
 
 from orthoflow.catalog.distributions import DistributionInfo, package_path, source_files
 from orthoflow.catalog.wording import did_you_mean, nearest
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
             """Write into an existing folder."""
             raise AssertionError("a protocol is never called")
 
-
-# What a port carries that takes an input of the workflow itself.
-FILES: Final = "files"
 
 EntryState = Literal["fine", "broken", "clash"]
 

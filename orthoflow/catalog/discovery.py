@@ -14,7 +14,6 @@ from typing import Final, Generic, TypeVar
 import pluggy
 
 from orthoflow.catalog.catalog import (
-    FILES,
     BrokenPlugin,
     Catalog,
     EntryState,
@@ -28,6 +27,7 @@ from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import (
     ENTRY_POINT_GROUP,
+    FILES,
     PROJECT,
     KindSpec,
     MethodSpec,

@@ -6,12 +6,11 @@ import typing
 from collections.abc import Mapping
 from importlib import import_module
 
-from orthoflow.catalog.catalog import FILES
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
 from orthoflow.errors import PluginError
-from orthoflow.sdk.hooks import KindSpec, MethodSpec
+from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec
 from orthoflow.sdk.methods import (
     Determinism,
     Method,

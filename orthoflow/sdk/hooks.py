@@ -15,6 +15,8 @@ import pluggy
 
 PROJECT: Final = "orthoflow"
 ENTRY_POINT_GROUP: Final = "orthoflow.plugins"
+# What a port takes that is wired to an input of the workflow itself.
+FILES: Final = "files"
 
 hookimpl: Final = pluggy.HookimplMarker(PROJECT)
 hookspec: Final = pluggy.HookspecMarker(PROJECT)

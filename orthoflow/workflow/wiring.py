@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 
 from orthoflow.catalog import did_you_mean
-from orthoflow.catalog.catalog import FILES
 from orthoflow.files.yaml_positions import join
+from orthoflow.sdk.hooks import FILES
 from orthoflow.workflow.format import WorkflowStep
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import INPUTS_NAME, PlacedPort, PlacedReference
