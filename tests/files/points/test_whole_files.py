@@ -42,7 +42,7 @@ def said(item: object, *silent: str) -> Told:
 
 def file(format_name: str, n_most: int, fields: frozenset[str], **more: object) -> Told:
     common = {"format_name": format_name, "n_most": n_most, "fields": fields, "notes": []}
-    return {**common, "details": {}, **more}
+    return {**common, "details": {}, "is_chosen": False, **more}
 
 
 @pytest.fixture

@@ -316,7 +316,7 @@ def test_the_map_of_sources_names_their_colours(tmp_path: Path) -> None:
     inputs = MosaicSeams.In(layers=Layers(layers=two_halves(), names=("west",)))
     MosaicSeams().run(inputs, MosaicSeams.Params(), ctx)
     (figure,) = ctx.figures
-    assert figure.caption == "west, by source: blue left, orange right; seams in white."
+    assert figure.caption.startswith("west, by source: blue left, orange right; seams in white.")
     picture = decode_image(figure.path.read_bytes()).astype(float)
     third = picture.shape[1] // 3
     left, right = (picture[:, part].mean(axis=(0, 1)) for part in np.s_[:third, -third:])
