@@ -10,7 +10,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from orthoflow.workflow.format import CALL, COMPARISON, DATASET, FILE, INPUT, SHARE, STEP
+from orthoflow.workflow.format import (
+    CALL,
+    COMPARISON,
+    DATASET,
+    FILE,
+    INPUT,
+    SHARE,
+    STEP,
+    SWEPT,
+)
 from orthoflow.workflow.shapes import Key, Section
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,6 +33,7 @@ SECTIONS: dict[str, Section] = {
     "`datasets.<name>`: a dataset": DATASET,
     "`steps.<name>`: a step": STEP,
     "`steps.<name>.variants.<name>`: a method call": CALL,
+    "`params.<name>`: a sweep": SWEPT,
     "`resources`": SHARE,
     "`compare`": COMPARISON,
 }

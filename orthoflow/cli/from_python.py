@@ -33,7 +33,8 @@ def run(
 
     Args:
         workflow: a file, or the name of a shipped one.
-        set: parameters by `step.parameter` or `step.variant.parameter`.
+        set: parameters by `step.parameter` or `step.variant.parameter`; `{"sweep": [...]}` makes a
+            variant of each value.
         inputs: files by name of the input.
         datasets: a table of datasets.
         only_data: of these datasets only.

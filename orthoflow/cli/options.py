@@ -28,6 +28,7 @@ class Changes:
     inputs: tuple[str, ...]
     datasets: str
     only_data: tuple[str, ...]
+    set_files: tuple[str, ...] = ()
 
     def load(self, workflow: str, catalog: Catalog) -> Workflow:
         """Load the workflow with these changes, see `load_workflow` for what may be wrong."""
@@ -40,23 +41,31 @@ class Changes:
             inputs=self.inputs,
             datasets=self.datasets,
             only_data=self.only_data,
+            set_files=self.set_files,
         )
 
 
 def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
-    """Add the workflow and `changes` to it: `WORKFLOW --set --input --datasets --only-data`."""
+    """Add the workflow and `changes` to it: `WORKFLOW --set --set-file --input --datasets ...`."""
 
     # Any: the command's other parameters, whose types click has checked.
     @wraps(run)
     def command(
         *,
         sets: tuple[str, ...],
+        set_files: tuple[str, ...],
         inputs: tuple[str, ...],
         datasets: str,
         only_data: tuple[str, ...],
         **others: Any,
     ) -> int:
-        changes = Changes(sets=sets, inputs=inputs, datasets=datasets, only_data=only_data)
+        changes = Changes(
+            sets=sets,
+            inputs=inputs,
+            datasets=datasets,
+            only_data=only_data,
+            set_files=set_files,
+        )
         return run(changes=changes, **others)
 
     command = click.option(
@@ -73,6 +82,13 @@ def workflow_arguments(run: Callable[..., int]) -> Callable[..., int]:
         help="Run on each dataset of a CSV file: the column name, and a column per input.",
     )(command)
     command = input_option(command)
+    command = click.option(
+        "--set-file",
+        "set_files",
+        multiple=True,
+        metavar="FILE",
+        help="Change the parameters that a YAML file names: step.parameter: value.",
+    )(command)
     command = click.option(
         "--set",
         "sets",

@@ -182,9 +182,7 @@ def _compose(text: str, dialect: Dialect) -> Node:
             _check_size(text, dialect)
             node: Node | None = YAML(typ="safe", pure=True).compose(text)
     except MarkedYAMLError as error:
-        raise _UnreadableError(
-            _mark_position(error.problem_mark), f"this is not YAML: {_words(error)}"
-        ) from error
+        raise _unreadable(error) from error
     except YAMLError as error:
         raise _UnreadableError(
             _reader_position(text, error), f"this is not YAML: {_first_line(error)}"
@@ -222,9 +220,27 @@ def _reader_position(text: str, error: YAMLError) -> Position:
     return Position(line=before.count("\n") + 1, column=len(before) - before.rfind("\n"))
 
 
-def _words(error: MarkedYAMLError) -> str:
-    parts = [part for part in (error.context, error.problem) if part]
-    return ", ".join(" ".join(str(part).split()) for part in parts)
+_OPENED: Final = {
+    "while parsing a flow mapping": "the brace { that opens here is not closed",
+    "while parsing a flow sequence": "the bracket [ that opens here is not closed",
+    "while scanning a quoted scalar": "the quotes that open here are not closed",
+}
+
+
+def _unreadable(error: MarkedYAMLError) -> _UnreadableError:
+    """Say what the parser stumbled over where it was written, not where it was noticed."""
+    problem, context = str(error.problem or ""), str(error.context or "")
+    noticed = _mark_position(error.problem_mark)
+    words = ", ".join(" ".join(part.split()) for part in (context, problem) if part)
+    if "\\t" in problem:
+        return _UnreadableError(noticed, "this is not YAML: a tab stands here; indent with spaces")
+    if context in _OPENED and error.context_mark is not None:
+        opened = _mark_position(error.context_mark)
+        where = f"noticed in line {noticed.line}"
+        return _UnreadableError(opened, f"this is not YAML: {_OPENED[context]}; {where}: {problem}")
+    if "block end" in problem:
+        words = "this line is indented as none above it is, or a line above lacks its end"
+    return _UnreadableError(noticed, f"this is not YAML: {words}")
 
 
 def _first_line(error: YAMLError) -> str:
@@ -293,7 +309,15 @@ class _Converter:
         if self.dialect.is_strict and str(node.tag) == _TAG + "merge":
             return str(node.value), True
         if self.dialect.is_strict and not is_text:
-            self.log.add(position, path, f"a key must be text, got {node.value or 'nothing'}")
+            # Between braces `0,003` is the value 0 and a key.
+            comma = (
+                f"; if it ends a number, decimals have a point: 0.{node.value}"
+                if str(node.value).isdigit()
+                else ""
+            )
+            self.log.add(
+                position, path, f"a key must be text, got {node.value or 'nothing'}{comma}"
+            )
         return str(node.value), is_text
 
     def _merge(self, entries: dict[str, Entry], position: Position, path: str) -> None:

@@ -176,7 +176,12 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
     if patterns:
         wanted = _matching(patterns, units)
     else:
-        wanted = [key for name in QUALITY for key in units if key[1] == name]
+        # A later step of the chain improves on an earlier one: first and final orientation.
+        last: dict[tuple[str, str], None] = {}
+        for one in combinations:
+            steps = {row.metric: row.step for cell in one.cells for row in cell_metrics(cell)}
+            last |= dict.fromkeys((step, metric) for metric, step in steps.items())
+        wanted = [key for name in QUALITY for key in last if key[1] == name]
     return tuple(
         Column(
             step=step,

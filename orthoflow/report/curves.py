@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -59,45 +60,52 @@ def curves_over(parts: Mapping[str, Run]) -> tuple[Curve, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """Variants of a step that differ in one number.
+    """Variants of a step that differ in a number, and perhaps in other parameters.
 
     Attributes:
         step: name of the step.
         parameter: name of the parameter.
         values: variant -> value.
+        others: variant -> what else it sets otherwise, in words.
     """
 
     step: str
     parameter: str
     values: Mapping[str, float]
+    others: Mapping[str, str]
 
 
 def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
-    """Find the sweeps among cells."""
+    """Find the sweeps among cells: some variants differ in one number alone."""
     by_method: dict[tuple[str, str], dict[str, RecordedCell]] = {}
     for cell in cells:
         variant = cell.assignment.get(cell.step)
         if variant is not None and cell.repeat == 0 and cell.status != "skipped":
             by_method.setdefault((cell.step, cell.method), {}).setdefault(variant, cell)
     for (step, _), variants in by_method.items():
-        names = {name for cell in variants.values() for name in cell.params}
+        names = sorted({name for cell in variants.values() for name in cell.params})
         differ = [
             name
-            for name in sorted(names)
+            for name in names
             if len({repr(cell.params.get(name)) for cell in variants.values()}) > 1
         ]
-        values = (
-            {variant: cell.params.get(differ[0]) for variant, cell in variants.items()}
-            if len(differ) == 1
-            else {}
-        )
-        known = {
-            variant: float(value)
-            for variant, value in values.items()
-            if isinstance(value, int | float) and not isinstance(value, bool)
-        }
-        if len(known) == len(variants) >= _FEWEST_VALUES:
-            yield Sweep(step=step, parameter=differ[0], values=known)
+        for parameter in differ:
+            values = {variant: cell.params.get(parameter) for variant, cell in variants.items()}
+            known = {
+                variant: float(value)
+                for variant, value in values.items()
+                if isinstance(value, int | float) and not isinstance(value, bool)
+            }
+            others = {
+                variant: ", ".join(
+                    f"{name}={variants[variant].params.get(name)}"
+                    for name in differ
+                    if name != parameter
+                )
+                for variant in known
+            }
+            if max(Counter(others.values()).values(), default=0) >= _FEWEST_VALUES:
+                yield Sweep(step=step, parameter=parameter, values=known, others=others)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,11 +138,12 @@ def _lines(
         measured = one.measured(column.step, column.metric)
         if variant not in sweep.values or measured is None or one.failure is not None:
             continue
-        others = ", ".join(
+        variants = (
             f"{step}={chosen}"
             for step, chosen in one.assignment.items()
             if step not in (sweep.step, DATA)
         )
+        others = ", ".join(filter(None, [sweep.others[variant], *variants]))
         at = values.setdefault(others, {}).setdefault(sweep.values[variant], [])
         at.append((measured.value, measured.spread))
     return {

@@ -90,7 +90,8 @@ class Picture:
     @property
     def layer(self) -> str:
         """What it shows beside its wall, with its variants: alike for all walls of a cell."""
-        return self.title.removeprefix(self.name).strip(" ,") or "orthoimage"
+        said = self.title.removeprefix(self.name).strip(" ,")
+        return said if said and not said.startswith("(") else f"orthoimage {said}".strip()
 
 
 def data_uri(content: bytes, media_type: str) -> str:

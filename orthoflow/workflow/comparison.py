@@ -200,6 +200,11 @@ def _read_assignment(
     return chosen
 
 
+def first_variants(steps: Sequence[DraftStep]) -> Assignment:
+    """The first variant of every varied step."""
+    return _complete({}, steps)
+
+
 def _complete(baseline: Mapping[str, str], steps: Sequence[DraftStep]) -> Assignment:
     return {
         step.name: baseline.get(step.name, step.variants[0].call.name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,8 +10,8 @@ from typing import Final
 
 from orthoflow.catalog import Catalog
 from orthoflow.errors import WorkflowError
-from orthoflow.files.yaml_positions import Entry, Table, read_yaml
-from orthoflow.workflow.comparison import check_baseline, read_compare
+from orthoflow.files.yaml_positions import Entry, Position, Table, plain, read_yaml
+from orthoflow.workflow.comparison import check_baseline, first_variants, read_compare
 from orthoflow.workflow.datasets import DatasetReader, choose_data
 from orthoflow.workflow.format import (
     COMPARE,
@@ -31,11 +32,18 @@ from orthoflow.workflow.inputs import (
     read_input_options,
     read_inputs,
 )
-from orthoflow.workflow.parameters import CallName, Override, assign_overrides, resolve_params
+from orthoflow.workflow.parameters import (
+    CallName,
+    Override,
+    assign_overrides,
+    assign_settings,
+    resolve_params,
+)
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.recipes import find_workflow
-from orthoflow.workflow.shapes import check_name
+from orthoflow.workflow.shapes import check_name, read_table
 from orthoflow.workflow.steps import DraftStep, read_steps
+from orthoflow.workflow.sweeps import expand_sweeps
 from orthoflow.workflow.wiring import check_wiring
 
 MOST_BYTES: Final = 400_000
@@ -49,6 +57,7 @@ def load_workflow(
     inputs: Sequence[str] = (),
     datasets: str = "",
     only_data: Sequence[str] = (),
+    set_files: Sequence[str | Path] = (),
 ) -> Workflow:
     """Read and check a workflow.
 
@@ -59,6 +68,8 @@ def load_workflow(
         inputs: `NAME=PATH`, each as behind `--input`; relative to the working directory.
         datasets: a table in the place of the file's datasets, as behind `--datasets`.
         only_data: names of datasets, each as behind `--only-data`.
+        set_files: YAML files of `step.parameter: value`, as behind `--set-file`; what stands
+            behind `--set` goes before them.
 
     Raises:
         InvalidWorkflowError: the file has problems; the message lists all of them.
@@ -75,7 +86,11 @@ def load_workflow(
         log.raise_any()
         raise WorkflowError(f"{name_or_path} holds no workflow")
     options = _Options(
-        sets=tuple(sets), inputs=tuple(inputs), datasets=datasets, only_data=tuple(only_data)
+        sets=tuple(sets),
+        inputs=tuple(inputs),
+        datasets=datasets,
+        only_data=tuple(only_data),
+        profiles=tuple(_read_profile(Path(name), log) for name in set_files),
     )
     reader = _Reader(path=path, source=source, catalog=catalog, log=log, options=options)
     workflow = reader.read(table)
@@ -83,21 +98,21 @@ def load_workflow(
     return workflow
 
 
-def _read_text(path: Path) -> str:
+def _read_text(path: Path, what: str = "a workflow file") -> str:
     try:
         content = path.read_bytes()
     except OSError as error:
         raise WorkflowError(f"{path} cannot be read: {error.strerror}") from error
     if len(content) > MOST_BYTES:
-        raise WorkflowError(
-            f"{path} has {len(content)} bytes; a workflow file has at most {MOST_BYTES}"
-        )
+        raise WorkflowError(f"{path} has {len(content)} bytes; {what} has at most {MOST_BYTES}")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
+        column = error.start - content.rfind(b"\n", 0, error.start)
         raise WorkflowError(
-            f"{path}:{line}: expected UTF-8 text, got the byte 0x{content[error.start]:02x}"
+            f"{path}:{line}:{column}: expected UTF-8 text, got the byte "
+            f"0x{content[error.start]:02x}; save the file as UTF-8"
         ) from error
 
 
@@ -109,6 +124,29 @@ class _Options:
     inputs: tuple[str, ...]
     datasets: str
     only_data: tuple[str, ...]
+    profiles: tuple[_Profile, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Profile:
+    """What a file of `--set-file` holds, and the log of that file."""
+
+    settings: Table
+    log: ProblemLog
+
+
+def _read_profile(path: Path, log: ProblemLog) -> _Profile:
+    try:
+        text = _read_text(path, "a file of parameters")
+    except WorkflowError as error:
+        log.add_option(f"--set-file {path}", str(error))
+        text = "{}"
+    beside = log.beside(str(path), text)
+    value = read_yaml(text, beside)
+    settings = read_table(value, "", beside) if value is not None else None
+    return _Profile(
+        settings=settings or Table(position=Position(line=1, column=1), entries=()), log=beside
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +175,8 @@ class _Reader:
         given = read_input_options(self.options.inputs, self.log)
         shared = tuple(option for option in given if not option.is_of_dataset)
         specs = override_inputs(specs, shared, self.log)
-        overrides = assign_overrides(self.options.sets, steps, self.log)
+        expanded = expand_sweeps(steps, self._overrides(steps), self.log)
+        steps, overrides = expanded.steps, expanded.overrides
         read = {step.name: self._step(step, overrides) for step in steps}
         datasets = DatasetReader(
             folder=self.path.resolve().parent,
@@ -153,6 +192,8 @@ class _Reader:
             log=self.log,
         ).read(table.get(DATASETS.name), self.options.datasets)
         compare = self._compare(table.get(COMPARE.name), steps, step_names, tuple(datasets))
+        if compare is None and expanded.has_sweeps:
+            compare = Comparison(baseline=first_variants(steps))
         workflow = Workflow(
             name=self._name(table),
             path=self.path,
@@ -162,7 +203,7 @@ class _Reader:
             steps=read,
             compare=compare,
             overrides=(
-                *(f"--set {text}" for text in self.options.sets),
+                *self._set_options(),
                 *(option.without_folder for option in given),
                 *self._data_options(),
             ),
@@ -172,6 +213,25 @@ class _Reader:
         check_shared_inputs(workflow, shared, self.log)
         own = tuple(option for option in given if option.is_of_dataset)
         return workflow.with_input_specs(override_inputs(workflow.input_specs, own, self.log))
+
+    def _overrides(self, steps: Sequence[DraftStep]) -> dict[CallName, tuple[Override, ...]]:
+        """What files of `--set-file` and then `--set` say of each call."""
+        found: dict[CallName, tuple[Override, ...]] = {}
+        said = [
+            *(assign_settings(one.settings, "", steps, one.log) for one in self.options.profiles),
+            assign_overrides(self.options.sets, steps, self.log),
+        ]
+        for overrides in said:
+            for call, several in overrides.items():
+                found[call] = (*found.get(call, ()), *several)
+        return found
+
+    def _set_options(self) -> Iterator[str]:
+        # A record holds no files of profiles: what they say stands there as if it had been set.
+        for profile in self.options.profiles:
+            for entry in profile.settings:
+                yield f"--set {entry.key}={json.dumps(plain(entry.value), ensure_ascii=False)}"
+        yield from (f"--set {text}" for text in self.options.sets)
 
     def _data_options(self) -> Iterator[str]:
         if self.options.datasets:

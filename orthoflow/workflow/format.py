@@ -36,6 +36,7 @@ from orthoflow.workflow.shapes import (
     OpenTable,
     Reference,
     Section,
+    SweptValues,
     Wires,
     whole_number,
 )
@@ -110,11 +111,29 @@ IN: Final = Key(
     example="{cloud: cloud.cloud, planes: [given.planes, plane.planes]}",
     default="no port is wired",
 )
+SWEEP: Final = Key(
+    name="sweep",
+    shape=SweptValues(),
+    meaning="Values of the parameter, each of which makes a variant.",
+    example="[0.02, 0.05, 0.1]",
+    missing="a sweep needs the key sweep",
+)
+SWEPT: Final = Section(
+    words="a sweep",
+    about="In the place of a value a parameter may be given several: `tolerance_m: {sweep: [0.02, "
+    "0.05]}` makes the variants `tolerance_m-0_02` and `tolerance_m-0_05` of the step, or of its "
+    "variant, whose name then stands in front. Several swept parameters make all combinations. A "
+    "workflow with a sweep is a comparison, with `compare` or without, and its report draws the "
+    "metrics over the parameter. `--set STEP.PARAM=VALUE` takes the place of a sweep, and `--set "
+    "'STEP.PARAM={sweep: [...]}'` makes one.",
+    keys=(SWEEP,),
+)
 PARAMS: Final = Key(
     name="params",
     shape=PARAMETERS,
-    meaning="Parameters of the method; `orthoflow plugins show ID` lists them.",
-    example="{gsd_m: 0.003}",
+    meaning="Parameters of the method, each a value or a sweep; `orthoflow plugins show ID` lists "
+    "them.",
+    example="{gsd_m: 0.003, tolerance_m: {sweep: [0.02, 0.05, 0.1]}}",
     default="the method's defaults",
 )
 REPEAT: Final = Key(

@@ -22,10 +22,12 @@ from orthoflow.files.yaml_positions import (
     Table,
     Value,
     describe_scalar,
+    join,
     plain,
     read_yaml,
 )
 from orthoflow.products.product import JsonValue
+from orthoflow.workflow.hints import meant_number, meant_parameter
 from orthoflow.workflow.methods import MethodInfo
 from orthoflow.workflow.problems import InvalidWorkflowError, ProblemLog
 from orthoflow.workflow.steps import DraftStep, DraftVariant
@@ -90,7 +92,7 @@ def assign_settings(
         if len(parts) < 2 or not all(parts):
             log.add(entry.position, entry.key, "expected step.parameter or step.variant.parameter")
             continue
-        report = partial(log.add, entry.value.position, f"{path}.{entry.key}")
+        report = partial(log.add, entry.value.position, join(path, entry.key))
         try:
             for call, override in _targets(report, parts, plain(entry.value), steps):
                 assigned.setdefault(call, []).append(override)
@@ -137,6 +139,8 @@ def resolve_params(
         with foreign_code(f"checking the parameters of {info.id}"):
             params = info.method.Params.model_validate_json(json.dumps(as_set), strict=True)
             resolved = params.model_dump(mode="json")
+            # As the step will: a default may be refused once it is given like any other value.
+            info.method.Params.model_validate_json(json.dumps(resolved), strict=True)
     except ValidationError as error:
         reports = {override.keys[0]: override.report for override in overrides}
         reporter = _Reporter(variant=variant, info=info, reports=reports, log=log, blame=blame)
@@ -183,7 +187,9 @@ class _Reporter:
         message = self._message(details)
         name = str(location[0]) if location else ""
         if report := self.reports.get(name, self.blame):
-            report(message)
+            # It names the parameter itself, but nothing inside it, and datasets not even that.
+            is_named = name in self.reports and len(location) == 1
+            report(message if is_named else f"{_inner_name(location)}: {message}")
             return
         path = "".join(
             f"[{part}]" if isinstance(part, int) else f".{part}" for part in ("params", *location)
@@ -193,19 +199,20 @@ class _Reporter:
 
     def _message(self, details: ErrorDetails) -> str:
         location = details["loc"]
-        name = str(location[-1]) if location else "the parameters"
+        name = _inner_name(location)
         match details["type"]:
             case "extra_forbidden":
                 known = tuple(self.info.method.Params.model_fields) if len(location) == 1 else ()
                 listed = f"; {self.info.id} has {', '.join(known) or 'none'}" if known else ""
-                return f"unknown parameter {name}{did_you_mean(name, known)}{listed}"
+                meant = meant_parameter(name, known, details["input"]) or did_you_mean(name, known)
+                return f"unknown parameter {name}{meant}{listed}"
             case "missing":
                 return f"{self.info.id} needs parameter {name}"
             case "value_error" | "assertion_error":
-                reason = str(details.get("ctx", {}).get("error", details["msg"]))
-                return f"{name}: {reason}"
+                return str(details.get("ctx", {}).get("error", details["msg"]))
         words = details["msg"][:1].lower() + details["msg"][1:]
-        return f"{name}: {words}, got {_shown(details['input'])}"
+        meant = meant_number(name, details["input"]) if "number" in words else ""
+        return f"{words}, got {_shown(details['input'])}{meant}"
 
     def _position(self, location: tuple[int | str, ...]) -> Position:
         position = self.variant.position
@@ -222,6 +229,10 @@ class _Reporter:
             else:
                 break
         return position
+
+
+def _inner_name(location: tuple[int | str, ...]) -> str:
+    return str(location[-1]) if location else "the parameters"
 
 
 def _shown(value: object) -> str:
@@ -263,9 +274,14 @@ def _targets(
     if not chosen:
         known = sorted({name for variant in variants for name in _parameters(variant)})
         who = " or ".join(dict.fromkeys(variant.call.method for variant in variants))
+        meant = meant_parameter(keys[0], known, value) or did_you_mean(keys[0], known)
         raise ArgumentError(
-            f"there is no parameter {keys[0]} in {who}{did_you_mean(keys[0], known)}; known: "
-            f"{', '.join(known) or 'none'}"
+            f"there is no parameter {keys[0]} in {who}{meant}; known: {', '.join(known) or 'none'}"
+        )
+    if any(keys[0] in variant.swept for variant in chosen):
+        raise ArgumentError(
+            f"{keys[0]} is swept in step {step.name}, so its variants have its values; take the "
+            "sweep away, or this"
         )
     override = Override(report=report, keys=tuple(keys), value=value)
     return [(CallName(step=step.name, variant=variant.call.name), override) for variant in chosen]

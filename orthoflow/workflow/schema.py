@@ -5,7 +5,7 @@ from __future__ import annotations
 from orthoflow.catalog import Catalog
 from orthoflow.errors import PluginError
 from orthoflow.products.product import JsonValue
-from orthoflow.workflow.format import CALL, FILE, PARAMS, STEP, STEPS, USE, VARIANTS
+from orthoflow.workflow.format import CALL, FILE, PARAMS, STEP, STEPS, SWEPT, USE, VARIANTS
 from orthoflow.workflow.methods import MethodInfo, describe_method
 from orthoflow.workflow.shapes import Schema
 
@@ -48,6 +48,10 @@ def _params(info: MethodInfo) -> Schema:
     schema: Schema = info.method.Params.model_json_schema(
         ref_template=f"#/$defs/params.{info.id}/$defs/{{model}}"
     )
+    properties = schema.get("properties")
+    if isinstance(properties, dict):
+        swept = SWEPT.schema()
+        schema["properties"] = {name: {"anyOf": [said, swept]} for name, said in properties.items()}
     return schema
 
 

@@ -40,6 +40,7 @@ class DraftVariant:
         info: the method, None when it cannot be loaded.
         kind: ports of its kind, known even when the method is not.
         params: as written.
+        swept: names of the parameters whose values its name says.
     """
 
     position: Position
@@ -48,6 +49,7 @@ class DraftVariant:
     info: MethodInfo | None
     kind: KindSpec | None
     params: Table | None
+    swept: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -259,7 +259,7 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
         ),
         ("cameras: {}\nnotes: x\n", "2:1: notes: unknown key; expected cameras"),
         ("cameras: {a: {" + GOOD + "}, a: {" + GOOD + "}}", 'found duplicate key "a"; remove one'),
-        ("cameras: {a: {" + GOOD + "]}", "calibration.yaml:1:84: this is not YAML"),
+        ("cameras: {a: {" + GOOD + "]}", "calibration.yaml:1:14: this is not YAML: the brace"),
         (
             "cameras:\n  a.jpg: {width: 4000.5}\n",
             '2:11: cameras."a.jpg".width: expected a whole number',

@@ -287,10 +287,7 @@ MAPPINGS = {
     ),
     "value out of range": (
         "datasets: {hall: {set: {wall.gsd_m: -1}}}",
-        (
-            "rooms.yaml:18:37: datasets.hall.set.wall.gsd_m: gsd_m: input should be greater than "
-            "0, got -1"
-        ),
+        ("rooms.yaml:18:37: datasets.hall.set.wall.gsd_m: input should be greater than 0, got -1"),
     ),
     "parameters that disagree": (
         "datasets: {hall: {set: {plane.hough2d.cell_m: 0.06}}}",
@@ -337,7 +334,7 @@ TABLES = {
     ),
     "value out of range": (
         "name,wall.gsd_m\nhall,1\nattic,-1\n",
-        "rooms.csv:3:7: attic.set.wall.gsd_m: gsd_m: input should be greater than 0, got -1",
+        "rooms.csv:3:7: attic.set.wall.gsd_m: input should be greater than 0, got -1",
     ),
     "value that is no YAML": (
         "name,wall.gsd_m\nhall,[1\n",

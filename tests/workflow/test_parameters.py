@@ -84,8 +84,8 @@ BAD_SETS = {
     "gsd_m=1": "expected step.parameter=value or step.variant.parameter=value",
     "wall.gsd_m=": "expected a value behind the equals sign",
     "wall.gsd_m=[1": "the value cannot be read as YAML: this is not YAML",
-    "wall.gsd_m=-1": "gsd_m: input should be greater than 0, got -1",
-    'wall.gsd_m="1"': 'gsd_m: input should be a valid number, got the text "1"',
+    "wall.gsd_m=-1": "input should be greater than 0, got -1",
+    'wall.gsd_m="1"': 'a valid number, got the text "1"; write it without quotes',
     "plane.ransac.tolerance_m.x=1": "tolerance_m is no mapping, so nothing in it can be set",
 }
 

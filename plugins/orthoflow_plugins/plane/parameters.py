@@ -114,9 +114,19 @@ class DetectorParams(MethodParams):
             before_name, before = name, high
         return materials
 
+    @model_validator(mode="before")
+    @classmethod
+    def _fit_follows_find(cls, given: object) -> object:
+        """A default that is wider than what was set would be refused where it is given back."""
+        if not isinstance(given, dict) or "fit_tolerance_m" in given:
+            return given
+        tolerance_m, fit_m = given.get("tolerance_m"), cls.model_fields["fit_tolerance_m"].default
+        is_narrower = isinstance(tolerance_m, int | float) and 0 < tolerance_m < fit_m
+        return {**given, "fit_tolerance_m": float(tolerance_m)} if is_narrower else given
+
     @model_validator(mode="after")
     def _fit_lies_within_find(self) -> Self:
-        if self.fit_tolerance_m > self.tolerance_m and "fit_tolerance_m" in self.model_fields_set:
+        if self.fit_tolerance_m > self.tolerance_m:
             raise ValueError(
                 f"fit_tolerance_m must be at most tolerance_m = {self.tolerance_m:g}, "
                 f"got {self.fit_tolerance_m:g}"

@@ -1,0 +1,81 @@
+"""What was meant by a number that has a comma, a unit, or stands behind another unit's name."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+from orthoflow.products.product import JsonValue
+
+# Each unit in the first of its family, under the ends that names of parameters have.
+_FAMILIES: Final[tuple[Mapping[str, float], ...]] = (
+    {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "dm": 0.1, "km": 1e3, "um": 1e-6, "µm": 1e-6},
+    {"deg": 1.0, "rad": 180.0 / math.pi, "°": 1.0, "gon": 0.9},
+    {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
+    {"px": 1.0},
+)
+_WORDS: Final = {
+    "m": "metres",
+    "mm": "millimetres",
+    "deg": "degrees",
+    "rad": "radians",
+    "s": "seconds",
+}
+_NUMBER: Final = re.compile(r"([+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?)\s*([a-zµ°]*)")
+
+
+def meant_number(parameter: str, text: object) -> str:
+    """Say how a number is written that was given as text; empty where it looks like none.
+
+    >>> meant_number("tolerance_m", "0,02")
+    '; decimals have a point: 0.02'
+    >>> meant_number("tolerance_m", "5 cm")
+    '; it is in metres, and no unit stands behind it: 0.05'
+    """
+    found = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else None
+    if found is None:
+        return ""
+    value = float(found[1].replace(",", "."))
+    unit = found[2]
+    if not unit:
+        return (
+            f"; decimals have a point: {value:g}"
+            if "," in found[1]
+            else "; write it without quotes"
+        )
+    own = _unit_of(parameter)
+    factor = _factor(unit, own)
+    if factor is None:
+        return "; no unit stands behind a number"
+    return f"; it is in {_WORDS.get(own, own)}, and no unit stands behind it: {value * factor:g}"
+
+
+def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
+    """Name the parameter that holds the same in another unit; empty where there is none.
+
+    >>> meant_parameter("gsd_mm", ["gsd_m", "crs"], 50)
+    ' (it is gsd_m, in metres: gsd_m: 0.05)'
+    """
+    stem, _, unit = name.rpartition("_")
+    for other in known:
+        its_stem, _, own = other.rpartition("_")
+        factor = _factor(unit, own)
+        if stem and stem == its_stem and factor is not None and unit != own:
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            written = f": {other}: {value * factor:g}" if is_number else ""
+            return f" (it is {other}, in {_WORDS.get(own, own)}{written})"
+    return ""
+
+
+def _unit_of(parameter: str) -> str:
+    return parameter.rpartition("_")[2]
+
+
+def _factor(given: str, wanted: str) -> float | None:
+    """By what a number in one unit is multiplied to be one in the other."""
+    for family in _FAMILIES:
+        if given in family and wanted in family:
+            return family[given] / family[wanted]
+    return None
