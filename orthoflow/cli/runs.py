@@ -65,6 +65,13 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
 @click.option(
     "--metric", "metrics", metavar="NAME", multiple=True, help="Show this number.  [default: some]"
 )
+@click.option(
+    "--html",
+    "page",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write a page that leads to the report of each run.",
+)
 @click.option("--csv", "as_csv", is_flag=True, help="Print CSV, with every metric and parameter.")
 @json_option
 def runs(
@@ -75,6 +82,7 @@ def runs(
     as_json: bool,
     sort: str,
     metrics: tuple[str, ...],
+    page: Path | None,
     **only: tuple[str, ...],
 ) -> int:
     """List the runs in and below each FOLDER, by default the working directory.
@@ -93,6 +101,12 @@ def runs(
         _print_csv(kept)
     else:
         print_runs(kept, n_found=len(found), metrics=metrics)
+    if page is not None:
+        from orthoflow.report.run_tables import write_run_table
+
+        write_run_table(kept, page)
+        if not (as_json or as_csv):
+            echo(f"page: {page}")
     return EXIT_GOOD
 
 

@@ -211,19 +211,31 @@ class _Place:
 
 
 def _write(runs: Sequence[Run], path: Path, place: _Place) -> None:
-    text = _template().render(
-        sections=[
-            (_overview if pages_of(run) else _section)(
-                run, f"r{index + 1}-", place, share=1 / len(runs)
-            )
-            for index, run in enumerate(runs)
-        ],
-        comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
-        differences=differences(compare_runs(*runs)) if len(runs) == 2 else None,
-        title=place.title,
-        version=__version__,
-        go_on=place.go_on,
+    text = (
+        environment()
+        .get_template("page.html.j2")
+        .render(
+            sections=[
+                (_overview if pages_of(run) else _section)(
+                    run, f"r{index + 1}-", place, share=1 / len(runs)
+                )
+                for index, run in enumerate(runs)
+            ],
+            comparison_of_all=comparison_table(runs) if len(runs) > 1 else None,
+            differences=differences(compare_runs(*runs)) if len(runs) == 2 else None,
+            title=place.title,
+            go_on=place.go_on,
+        )
     )
+    write_whole(path, text)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a page, as a whole or not at all.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
     aside = path.with_name(f".report-{secrets.token_hex(8)}")
     try:
         # A new file: through a link that lies there it would be another's.
@@ -239,7 +251,8 @@ def _write(runs: Sequence[Run], path: Path, place: _Place) -> None:
 
 
 @cache
-def _template() -> jinja2.Template:
+def environment() -> jinja2.Environment:
+    """Give the templates, with what all pages share."""
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,
@@ -257,6 +270,7 @@ def _template() -> jinja2.Template:
     environment.filters["in_words"] = metric_words
     environment.filters["drawing"] = Markup
     environment.globals["costs"] = COSTS
+    environment.globals["version"] = __version__
     environment.globals["depth_gradient"] = Markup(depth_gradient(DIVERGING.tolist()))
     # Ours, and no template: braces in them mean nothing.
     css, script = _packaged("page.css"), _packaged("page.js")
@@ -267,7 +281,7 @@ def _template() -> jinja2.Template:
         f"style-src {_hash_source(css)}; script-src {_hash_source(script)}; "
         "base-uri 'none'; form-action 'none'"
     )
-    return environment.get_template("page.html.j2")
+    return environment
 
 
 def _shown(value: object) -> object:

@@ -63,8 +63,9 @@ def meant_parameter(name: str, known: Iterable[str], value: JsonValue) -> str:
         its_stem, _, own = other.rpartition("_")
         factor = _factor(unit, own)
         if stem and stem == its_stem and factor is not None and unit != own:
-            is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            written = f": {other}: {value * factor:g}" if is_number else ""
+            written = ""
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                written = f": {other}: {value * factor:g}"
             return f" (it is {other}, in {_WORDS.get(own, own)}{written})"
     return ""
 

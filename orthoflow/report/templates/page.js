@@ -124,7 +124,7 @@
       return box;
     });
     const keys = optional.map((heading) => "key" in heading.dataset);
-    let isTurned = optional.length > MANY && table.tBodies[0].rows.length <= FEW_ROWS;
+    let isTurned = region.dataset.chooser === "either" && optional.length > MANY && table.tBodies[0].rows.length <= FEW_ROWS;
     // Of many columns those that judge quality come first; all are one click away.
     if (!isTurned && optional.length > MANY && keys.some(Boolean)) {
       boxes.forEach((box, index) => { box.checked = keys[index]; });

@@ -121,8 +121,9 @@ class DetectorParams(MethodParams):
         if not isinstance(given, dict) or "fit_tolerance_m" in given:
             return given
         tolerance_m, fit_m = given.get("tolerance_m"), cls.model_fields["fit_tolerance_m"].default
-        is_narrower = isinstance(tolerance_m, int | float) and 0 < tolerance_m < fit_m
-        return {**given, "fit_tolerance_m": float(tolerance_m)} if is_narrower else given
+        if isinstance(tolerance_m, int | float) and 0 < tolerance_m < fit_m:
+            return {**given, "fit_tolerance_m": float(tolerance_m)}
+        return given
 
     @model_validator(mode="after")
     def _fit_lies_within_find(self) -> Self:

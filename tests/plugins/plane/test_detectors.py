@@ -446,3 +446,12 @@ def test_a_part_of_a_large_cloud_is_fitted_whatever_the_number_of_threads(
         angle_deg, miss_m = errors(one, truth, np.eye(3))
         assert angle_deg < 0.02
         assert miss_m < 3e-4  # a third of the points: 1.7 times the error of all of them
+
+
+@pytest.mark.parametrize("detector", sorted(DETECTORS))
+def test_the_fit_follows_a_tolerance_below_its_default(detector: str) -> None:
+    params = DETECTORS[detector][0].Params(tolerance_m=0.01)
+    # What is recorded is given back as it is when the step runs, and by a replay.
+    again = type(params).model_validate_json(params.model_dump_json(), strict=True)
+    assert (again.tolerance_m, again.fit_tolerance_m) == (0.01, 0.01)
+    assert DETECTORS[detector][0].Params(tolerance_m=0.02).fit_tolerance_m == 0.015
