@@ -36,10 +36,10 @@ from orthoflow.workflow.shapes import (
     OpenTable,
     Reference,
     Section,
-    SweptValues,
     Wires,
     whole_number,
 )
+from orthoflow.workflow.swept_values import SweptValues
 
 FORMAT: Final = 1
 MOST_REPEATS: Final = 10_000

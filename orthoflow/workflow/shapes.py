@@ -417,34 +417,6 @@ class OneOrMore(Generic[Found]):
         return tuple(one for one in several if one is not None)
 
 
-# More values than a reader follows in a curve, and more runs than anybody waits for.
-MOST_SWEPT: Final = 100
-
-
-class SweptValues:
-    """A list of at least two values, of whatever kind the parameter is."""
-
-    words = "a list of at least two values"
-
-    def schema(self) -> Schema:
-        """A list that is long enough."""
-        return {"type": "array", "minItems": 2, "maxItems": MOST_SWEPT}
-
-    def read(self, value: Value, path: str, log: ProblemLog) -> tuple[Value, ...]:
-        """Take the values as they are written."""
-        if not isinstance(value, Listing):
-            _report_unexpected(self, value, path, log)
-            return ()
-        if not 2 <= len(value.items) <= MOST_SWEPT:
-            log.add(
-                value.position,
-                path,
-                f"expected 2 to {MOST_SWEPT} values, got {len(value.items)}",
-            )
-            return ()
-        return tuple(value.items)
-
-
 class MetricPatterns:
     """Patterns of metrics, each with the step before the dot."""
 

@@ -15,8 +15,8 @@ from orthoflow.products.product import JsonValue
 from orthoflow.workflow.format import PARAMS, SWEEP, SWEPT
 from orthoflow.workflow.parameters import CallName, Override, Report
 from orthoflow.workflow.problems import ProblemLog
-from orthoflow.workflow.shapes import MOST_SWEPT
 from orthoflow.workflow.steps import DraftStep, DraftVariant
+from orthoflow.workflow.swept_values import MOST_SWEPT
 
 # As names of variants may be, see `catalog.NAME_PATTERN`.
 _LETTERS: Final = 32
