@@ -12,7 +12,7 @@ from typing import Any, Final
 import click
 from click.core import ParameterSource
 
-from orthoflow.errors import OrthoflowError, ProductError, RecordError
+from orthoflow.errors import GeometryError, OrthoflowError, ProductError, RecordError
 
 DEBUG_HELP: Final = "Show tracebacks of errors."
 
@@ -80,7 +80,7 @@ class RecordCommand(Command):
         """Run the command; where it fails on what a record holds, say what is wrong with that."""
         try:
             return super().invoke(ctx)
-        except ProductError as error:
+        except (GeometryError, ProductError) as error:
             raise RecordError(f"a product of this run breaks its own rules: {error}") from error
         except (OrthoflowError, OSError, click.ClickException, click.Abort, click.exceptions.Exit):
             raise

@@ -219,6 +219,8 @@ def _of_kind(hint: object, value: object, name: str) -> object:
     Raises:
         ProductError: it is of another kind.
     """
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ProductError(f"the stored {name} must be finite, got {value}")
     kinds = _kinds(hint)
     if kinds is None or (isinstance(value, kinds) and (bool in kinds or value is not True)):
         return value

@@ -10,6 +10,7 @@ from typing import Final
 
 from orthoflow.errors import InputError
 from orthoflow.files.images import decode_image, encode_png, shrunk_webp
+from orthoflow.files.plain_svg import is_plain_svg
 from orthoflow.geometry.threads import in_order
 from orthoflow.records import RecordedFigure, Run, figure_files, write_files
 from orthoflow.report.combinations import baseline_cells
@@ -98,7 +99,8 @@ def baseline_addresses(run: Run) -> tuple[str, ...]:
 def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: str = "") -> int:
     """Write the figures of cells as PNG or SVG files below `folder/<cell>/`, and the run's graph.
 
-    A picture that is damaged has no file.
+    A picture that is damaged has no file, nor has an SVG one in which a browser would run or load
+    something.
 
     Args:
         run: the run.
@@ -124,13 +126,15 @@ def write_figures(run: Run, folder: Path, addresses: Iterable[str], *, inside: s
 
 
 def _content(figure: RecordedFigure) -> bytes | None:
-    """The bytes of a figure's file; None for a picture that is damaged."""
+    """The bytes of a figure's file; None for one that gets none."""
     if figure.media_type == "image/webp":
         # What papers and word processors take.
         try:
             return encode_png(decode_image(figure.data, figure.name))
         except InputError:
             return None
+    if figure.media_type == "image/svg+xml" and not is_plain_svg(figure.data):
+        return None
     return figure.data
 
 

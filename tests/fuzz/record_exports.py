@@ -253,7 +253,8 @@ def _changed_array(array: np.ndarray[Any, Any], random: Random) -> np.ndarray[An
         case 2:
             return changed[: len(changed) // 2] if changed.ndim else changed
         case 3:
-            return changed.astype(random.choice(("<f8", "<f4", "<i8", "|u1", "?")))
+            with np.errstate(all="ignore"):
+                return changed.astype(random.choice(("<f8", "<f4", "<i8", "|u1", "?")))
         case 4:
             return changed.reshape(random.choice(((-1,), (1, -1), (-1, 1))))
         case _ if changed.ndim:

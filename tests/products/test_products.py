@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import re
 
 import numpy as np
@@ -255,6 +256,7 @@ def test_a_payload_that_lacks_a_field_is_refused() -> None:
             {"tolerance_m": True},
             "the stored tolerance_m must be float or int, got bool",
         ),
+        (box_planes(), {"tolerance_m": math.inf}, "the stored tolerance_m must be finite, got inf"),
         (box_planes(), {"details": []}, "the stored details must be dict, got list"),
         (
             box_planes(),

@@ -333,8 +333,25 @@ def test_pictures_that_cannot_be_decoded_are_not_counted(finished: Studio, folde
     run = hostile.changed(finished.folder / "first", folder / "run", draw)
     done = finished("export", run, "--to", "figures", "-o", "drawn")
     assert done.exit_code == 0, done.output
-    assert "1 figure and the graph; 1 damaged one left out" in done.stdout
+    assert "1 figure and the graph; 1 left out, damaged or more than a drawing" in done.stdout
     assert [path.name for path in Path("drawn/paint").iterdir()] == ["good.png"]
+
+
+def test_drawings_that_run_something_are_not_written(
+    finished: Studio, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    active = b'<svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>'
+    monkeypatch.setattr(hostile, "PNG", active)
+    run = hostile.changed(
+        finished.folder / "first",
+        folder / "run",
+        lambda file: hostile.add_figure(file["cells/paint"], "active", "image/svg+xml"),
+    )
+    (run / "report.html").unlink()
+    for command in (("report", run), ("export", run, "--to", "figures", "-o", "drawn")):
+        done = finished(*command)
+        assert done.exit_code == 0, done.output
+    assert not [path for path in folder.rglob("*") if path.name == "active.svg"]
 
 
 @pytest.mark.parametrize("command", [("compare",), ("show",), ("report",)], ids=" ".join)

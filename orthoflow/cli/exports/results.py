@@ -46,8 +46,9 @@ def export_figures(run: Run, folder: Path, chosen: Choices) -> str:
     n_figures = len(figure_files(run, addresses))
     make_empty(folder)
     n_written = write_figures(run, folder, addresses)
-    damaged = n_figures - n_written
-    left_out = f"; {counted(damaged, 'damaged one')} left out" if damaged else ""
+    left_out = ""
+    if n_written < n_figures:
+        left_out = f"; {n_figures - n_written} left out, damaged or more than a drawing"
     return f"{counted(n_written, 'figure')} and the graph{left_out}"
 
 
