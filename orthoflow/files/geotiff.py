@@ -46,6 +46,7 @@ _IN_MEMORY_CELLS: Final = 1 << 26
 _CACHE_BYTES: Final = 1 << 27
 # What a small file may state: no honest packing comes near, deflate has at most 1032 to 1.
 _LARGEST_RATIO: Final = 1100
+_LONGEST_CRS: Final = 100
 _SIDES_M: Final = (1e-6, 1e6)
 _ALWAYS_ALLOWED_VALUES: Final = 64 << 20
 
@@ -113,16 +114,7 @@ def require_map_crs(crs: str) -> None:
     Raises:
         InputError: there is no such coordinate system, or it is not in metres.
     """
-    from rasterio.errors import CRSError
-
-    try:
-        with quiet():
-            found = _map_crs(crs)
-    except CRSError as error:
-        raise InputError(
-            f"there is no coordinate system {crs}: expected the EPSG code of a projected one, "
-            f"such as EPSG:2100, or {SITE_CRS}"
-        ) from error
+    found = _map_crs(crs)
     # Of a local system GDAL says the unit, but not that it is projected.
     if crs != SITE_CRS and not (found.is_projected and found.linear_units_factor[1] == 1.0):
         raise InputError(
@@ -138,7 +130,7 @@ def epsg_of(map_crs: str | None) -> int | None:
     (25832, None, None)
     """
     # GDAL takes paths and addresses for coordinate systems too, and a record may name any.
-    found = re.fullmatch(r"EPSG:([0-9]{4,6})", map_crs or "")
+    found = re.fullmatch(r"EPSG:([0-9]{4,6})", map_crs or "", re.IGNORECASE)
     return int(found[1]) if found else None
 
 
@@ -155,9 +147,27 @@ def epsg_wkt(epsg: int) -> str:
 
 
 def _map_crs(crs: str) -> CRS:
-    from rasterio.crs import CRS
+    """The coordinate system of a map.
 
-    return CRS.from_wkt(SITE_CRS_WKT) if crs == SITE_CRS else CRS.from_user_input(crs)
+    Raises:
+        InputError: there is none of that name.
+    """
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    if crs == SITE_CRS:
+        return CRS.from_wkt(SITE_CRS_WKT)
+    epsg = epsg_of(crs)
+    try:
+        with quiet():
+            if epsg is not None:
+                return CRS.from_epsg(epsg)
+    except CRSError:
+        pass
+    raise InputError(
+        f"there is no coordinate system {crs[:_LONGEST_CRS]}: expected the EPSG code of a "
+        f"projected one, such as EPSG:2100, or {SITE_CRS}"
+    )
 
 
 def write_raster(

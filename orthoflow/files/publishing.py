@@ -58,6 +58,8 @@ from orthoflow.products import (
     plane_name,
 )
 
+# Letters of a source that its file is called after.
+_LONGEST_SOURCE: Final = 100
 PIXEL_CONVENTION: Final = "OpenCV: the centre of the first (top-left) pixel is at (0, 0)"
 TIE_COLUMNS: Final = (
     "photo",
@@ -198,7 +200,7 @@ def _write_layers(
     for layer in layers:
         nth = counts[layer.wall] = counts.get(layer.wall, -1) + 1
         number, name = called.get(layer.wall, (layer.wall, plane_name("wall", layer.wall)))
-        source = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(layer.source).stem)
+        source = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(layer.source).stem)[:_LONGEST_SOURCE]
         stem = f"wall_{number}_layer_{nth}_{source}"
         content = f"what {layer.source} shows of the wall"
         tags = raster_tags(layer.frame, digest=digest, name=name, content=content, extra={})

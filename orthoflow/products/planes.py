@@ -169,6 +169,11 @@ class Planes(Product):
         for name, (shape, expected) in shapes.items():
             if shape != expected:
                 raise ProductError(f"planes.{name} must have shape {expected}, got {shape}")
+        for name in ("offset", "corners", "up"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ProductError(f"planes.{name} must be finite")
+        if self.up.shape != (3,):
+            raise ProductError(f"planes.up must have shape (3,), got {self.up.shape}")
         lengths = np.linalg.norm(self.normal, axis=1)
         if not np.allclose(lengths, 1.0, atol=1e-9):
             raise ProductError(f"planes.normal must be unit vectors, got lengths {lengths}")

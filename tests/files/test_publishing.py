@@ -21,6 +21,8 @@ from orthoflow.products import (
     Camera,
     Cameras,
     Intrinsics,
+    Layer,
+    Layers,
     Orthoimage,
     Orthoimages,
     Planes,
@@ -479,3 +481,18 @@ def test_previews_of_large_images_are_those_of_the_whole(monkeypatch: pytest.Mon
     monkeypatch.setattr(images, "_WHOLE_PX", 1000)
     bands = images.decode_image(images.preview_png(rgb, shown, longest_side_px=40), "bands")
     np.testing.assert_array_equal(bands, whole)
+
+
+def test_a_layer_of_a_photo_with_any_name_has_a_file(tmp_path: Path, frame: WallFrame) -> None:
+    small = replace(frame, width=4, height=3)
+    layer = Layer(
+        frame=small,
+        wall=0,
+        source=f"../../\x1b{300 * 'x'}.jpg",
+        rgb=np.zeros((3, 4, 3), np.uint8),
+        mask=np.ones((3, 4), np.uint8),
+        quality=np.ones((3, 4), np.float32),
+    )
+    publishing.publish_layers(Layers(layers=(layer,)), tmp_path, "sha256:0")
+    stem = f"wall_0_layer_0_-{99 * 'x'}"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{stem}.json", f"{stem}.tif"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import select
+import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,6 +83,8 @@ def test_a_ceiling_is_no_map(tmp_path: Path) -> None:
         ("EPSG:4326", UP, "EPSG:4326 is no coordinate system in metres"),
         ("EPSG:2225", UP, "EPSG:2225 is no coordinate system in metres"),  # US survey feet
         ("EPSG:9999", UP, "there is no coordinate system EPSG:9999"),
+        ("+proj=utm +zone=33 +datum=WGS84", UP, "there is no coordinate system \\+proj=utm"),
+        ("/etc/passwd", UP, "there is no coordinate system /etc/passwd"),
         ("site", -UP, "needs a cloud whose z is up"),
     ],
 )
@@ -89,6 +93,18 @@ def test_what_is_no_map_in_metres_is_refused(
 ) -> None:
     with pytest.raises(MethodError, match=said):
         placed(level(up=up), tmp_path, crs)
+
+
+def test_no_address_is_asked_what_its_coordinate_system_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # GDAL takes addresses, too, and workflows and records of strangers may name any.
+    monkeypatch.setenv("GDAL_HTTP_TIMEOUT", "1")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        crs = f"http://127.0.0.1:{server.getsockname()[1]}/crs"
+        with pytest.raises(MethodError, match="there is no coordinate system http://127"):
+            placed(level(), tmp_path, crs)
+        assert select.select([server], [], [], 0.0)[0] == []
 
 
 def test_a_map_reads_back_to_where_it_lies(tmp_path: Path) -> None:
