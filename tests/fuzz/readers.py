@@ -67,6 +67,13 @@ def _read_scan(path: Path) -> object:
     return _read_with(ReadScan, _files(path))
 
 
+def _read_part(path: Path) -> object:
+    """Read what a box and a spacing ask for, which the octree of a COPC file says."""
+    params = {"box": [[0.5, 0.5, 0.5], [7.0, 3.0, 7.0]], "gsd_m": 0.2}
+    trial = Trial(method=ReadScan, inputs={"files": _files(path)}, params=params)
+    return run_trial(trial, path.parent / "scratch", draws=False).digests
+
+
 def _points() -> NDArray[np.float64]:
     return np.random.default_rng(1).uniform(-5.0, 5.0, (_N, 3)).round(4)
 
@@ -114,6 +121,16 @@ def _las_files(folder: Path) -> None:
     scan_files.write_las(folder / "bare.las", _points(), withheld=np.arange(_N) % 5 == 0)
 
 
+def _copc_files(folder: Path) -> None:
+    rng = np.random.default_rng(2)
+    levels = [
+        {(0, 0, 0): rng.uniform(0.1, 7.9, (_N, 3))},
+        {(0, 0, 0): rng.uniform(0.1, 3.9, (_N, 3)), (1, 0, 1): rng.uniform(4.1, 7.9, (_N, 3))},
+    ]
+    scan_files.write_copc(folder / "two.laz", levels)
+    (folder / "two.las").unlink()
+
+
 def _ply_files(folder: Path) -> None:
     for encoding in ("ascii", "binary_little_endian", "binary_big_endian"):
         scan_files.write_ply(folder / f"{encoding}.ply", _fields(), encoding=encoding)
@@ -154,6 +171,7 @@ def _text_files(folder: Path) -> None:
 
 E57 = Target(seeds=_e57_files, read=_read_scan, mutate=mutate_e57)
 LAS = Target(seeds=_las_files, read=_read_scan)
+COPC = Target(seeds=_copc_files, read=_read_part)
 PLY = Target(seeds=_ply_files, read=_read_scan, mutate=mutate_text)
 PCD = Target(seeds=_pcd_files, read=_read_scan, mutate=mutate_text)
 PTX = Target(seeds=_ptx_files, read=_read_scan, mutate=mutate_text)
