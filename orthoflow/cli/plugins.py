@@ -371,7 +371,23 @@ def _ports(ports: type[Ports]) -> list[tuple[str, str, bool]]:
 
 @click.command("new", cls=Command)
 @click.argument("name", metavar="NAME")
-@click.option("--kind", required=True, metavar="KIND", help="Kind of the method, e.g. plane.")
+@click.option("--kind", default="", metavar="KIND", help="Kind of the method, e.g. plane.")
+@click.option(
+    "--new-kind", default="", metavar="KIND", help="A kind of its own instead, e.g. segment."
+)
+@click.option(
+    "--takes",
+    default="cloud",
+    show_default=True,
+    metavar="TYPES",
+    help="Product types that methods of the new kind take, with commas between them.",
+)
+@click.option(
+    "--gives",
+    default="",
+    metavar="TYPE",
+    help="Product type that they give, of the plugin's own.  [default: KINDs]",
+)
 @click.option(
     "--folder",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
@@ -382,15 +398,31 @@ def _ports(ports: type[Ports]) -> list[tuple[str, str, bool]]:
 @click.option("--licence", default="MIT", show_default=True, help="SPDX expression.")
 @click.option("--citation", default="", help="Where the method comes from: DOI, title or URL.")
 @json_option
-def plugins_new(name: str, *, as_json: bool, folder: Path, **said: str) -> int:
+def plugins_new(
+    name: str, *, as_json: bool, folder: Path, new_kind: str, takes: str, gives: str, **said: str
+) -> int:
     """Write a plugin NAME that installs, works and passes its tests at once, e.g. my-detector.
 
-    `orthoflow plugins list` names the kinds. The method does something simple; put your own in its
-    place.
+    `orthoflow plugins list` names the kinds and the product types. The method does something
+    simple; put your own in its place. With `--new-kind` the plugin brings a kind and a product
+    type, too.
     """
     from orthoflow.scaffold import Project, write_project
 
-    project = Project(name=name, **said)
+    if bool(said["kind"]) == bool(new_kind):
+        raise click.UsageError(
+            "give --kind, the kind of the method (`orthoflow plugins list`), or --new-kind"
+        )
+    types = (part.strip() for part in takes.split(",")) if new_kind else ()
+    project = Project(
+        name=name,
+        kind=new_kind or said["kind"],
+        author=said["author"],
+        licence=said["licence"],
+        citation=said["citation"],
+        product=(gives or f"{new_kind}s") if new_kind else "",
+        takes=tuple(dict.fromkeys(types)),
+    )
     written = write_project(project, folder, discover_catalog())
     if as_json:
         echo_json({"method": project.method_id, "files": [str(path) for path in written]})

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from ruamel.yaml import YAML
 
 from orthoflow.catalog import Catalog
+from orthoflow.sdk import port_specs
 from orthoflow.workflow import shipped_workflow
 
 # The first recipe that has a step of the kind is taken; cells of 2 cm let it run in seconds.
@@ -32,21 +34,86 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
     if catalog.kinds[kind].spec.is_source:
         return ""
     for recipe in _RECIPES:
-        text = shipped_workflow(recipe).read_text(encoding="utf-8")
-        # Any: a document of nested mappings.
-        document: dict[str, Any] = YAML(typ="safe").load(text)
+        document = _coarse_document(recipe)
         steps: dict[str, dict[str, Any]] = document["steps"]
         of_kind = [step for step, node in steps.items() if node["use"].startswith(f"{kind}.")]
         if not of_kind:
             continue
-        for node in steps.values():
-            if coarse := _COARSE.get(recipe, {}).get(node["use"]):
-                node["params"] = coarse
         _vary(steps[of_kind[-1]], name, method_id)
         document["name"] = f"compare-{name}"
         document["compare"] = {"design": "product"}
         return _dumped(document)
     return ""
+
+
+def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) -> str:
+    """Give a workflow in which a method of a new kind stands behind a shipped recipe, in two ways.
+
+    Args:
+        method_id: the new method, which has a parameter `factor`.
+        takes: product types that it takes.
+        catalog: says what the recipes' methods give.
+
+    Returns:
+        YAML; empty when no shipped recipe has all of them.
+    """
+    kind = method_id.partition(".")[0]
+    for recipe in _RECIPES:
+        document = _coarse_document(recipe)
+        steps: dict[str, dict[str, Any]] = document["steps"]
+        given: dict[str, list[str]] = {}
+        for name, node in steps.items():
+            for port in port_specs(catalog.method(node["use"]).load().Out).values():
+                given.setdefault(port.type_name, []).append(f"{name}.{port.name}")
+        if kind in steps or not given.keys() >= set(takes):
+            continue
+        # Of what is read or simulated, what is there; of what several steps make, the last.
+        wires = {name: given[name] if name == "cloud" else given[name][-1] for name in takes}
+        variants = {
+            "plain": {"use": method_id},
+            "double": {"use": method_id, "params": {"factor": 2.0}},
+        }
+        needed = _needed(steps, wires.values())
+        document["steps"] = {name: node for name, node in steps.items() if name in needed}
+        document["steps"][kind] = {"in": wires, "variants": variants}
+        document["inputs"] = {
+            name: spec
+            for name, spec in document.get("inputs", {}).items()
+            if f"inputs.{name}" in str(document["steps"])
+        }
+        if not document["inputs"]:
+            del document["inputs"]
+        document["name"] = f"compare-{kind}"
+        document["compare"] = {"design": "product", "metrics": [f"{kind}.n_items"]}
+        return _dumped(document)
+    return ""
+
+
+def _coarse_document(recipe: str) -> dict[str, Any]:
+    """A shipped recipe that runs in seconds."""
+    text = shipped_workflow(recipe).read_text(encoding="utf-8")
+    # Any: a document of nested mappings.
+    document: dict[str, Any] = YAML(typ="safe").load(text)
+    for node in document["steps"].values():
+        if coarse := _COARSE.get(recipe, {}).get(node["use"]):
+            node["params"] = coarse
+    return document
+
+
+def _needed(
+    steps: Mapping[str, Mapping[str, Any]], wires: Iterable[str | Sequence[str]]
+) -> set[str]:
+    """Steps that some references come from, and all before them."""
+    found: set[str] = set()
+    waiting = list(wires)
+    while waiting:
+        wire = waiting.pop()
+        for reference in [wire] if isinstance(wire, str) else wire:
+            name = reference.partition(".")[0]
+            if name in steps and name not in found:
+                found.add(name)
+                waiting += steps[name].get("in", {}).values()
+    return found
 
 
 def _vary(node: dict[str, Any], name: str, method_id: str) -> None:

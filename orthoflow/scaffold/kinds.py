@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from orthoflow import products
@@ -92,6 +92,19 @@ def kind_ports(catalog: Catalog, kind: str) -> KindPorts:
         start_module=module,
         start_class=class_name,
         start_id=start.spec.id if start else "",
+    )
+
+
+def taken_ports(catalog: Catalog, takes: Sequence[str]) -> KindPorts:
+    """Give a port of its name for each product type, all of them required."""
+    imports: dict[str, set[str]] = {}
+    for name in takes:
+        module, class_name = _class_of(catalog, name)
+        imports.setdefault(module, set()).add(class_name)
+    return KindPorts(
+        inputs=tuple(Port(name=name, class_name=_class_of(catalog, name)[1]) for name in takes),
+        outputs=(),
+        imports={module: tuple(sorted(names)) for module, names in sorted(imports.items())},
     )
 
 

@@ -12,10 +12,10 @@ from typing import Final
 
 import jinja2
 
-from orthoflow.catalog import Catalog, did_you_mean
+from orthoflow.catalog import NAME_PATTERN, Catalog, did_you_mean
 from orthoflow.errors import ArgumentError
-from orthoflow.scaffold.comparing import comparison_text
-from orthoflow.scaffold.kinds import KindPorts, kind_ports
+from orthoflow.scaffold.comparing import comparison_text, own_comparison_text
+from orthoflow.scaffold.kinds import KindPorts, kind_ports, taken_ports
 from orthoflow.version import __version__
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
@@ -28,10 +28,13 @@ class Project:
 
     Attributes:
         name: of distribution and method, e.g. `my-detector`.
-        kind: kind of its method, any that an installed plugin announces.
+        kind: kind of its method, any that an installed plugin announces, or a new one.
         author: for pyproject, licence and citation.
         licence: SPDX expression.
         citation: where the method comes from: DOI, title or URL; may be empty.
+        product: of a new kind, what its methods give: a product type of the plugin's own; empty for
+            a kind that is there.
+        takes: of a new kind, the product types that its methods take.
     """
 
     name: str
@@ -39,6 +42,8 @@ class Project:
     author: str = "The authors"
     licence: str = "MIT"
     citation: str = ""
+    product: str = ""
+    takes: tuple[str, ...] = ()
 
     @property
     def package(self) -> str:
@@ -53,7 +58,16 @@ class Project:
     @property
     def class_name(self) -> str:
         """Name of the method's class."""
-        return "".join(part.capitalize() for part in self.name.split("-"))
+        return _class_name(self.name)
+
+    @property
+    def product_class(self) -> str:
+        """Name of the class of its own product."""
+        return _class_name(self.product)
+
+
+def _class_name(name: str) -> str:
+    return "".join(part.capitalize() for part in re.split("[-_]", name))
 
 
 def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Path, ...]:
@@ -72,7 +86,11 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
     """
     folder = parent / project.name
     _check(project, folder, catalog)
-    ports = kind_ports(catalog, project.kind)
+    ports = (
+        taken_ports(catalog, project.takes)
+        if project.product
+        else kind_ports(catalog, project.kind)
+    )
     written: list[Path] = []
     for name, text in _files(project, ports, catalog):
         path = folder / name
@@ -88,7 +106,9 @@ def _check(project: Project, folder: Path, catalog: Catalog) -> None:
             f"a plugin's name must be small letters, digits and hyphens, as in my-detector, got "
             f"{project.name!r}"
         )
-    if project.kind not in catalog.kinds:
+    if project.product:
+        _check_new_kind(project, catalog)
+    elif project.kind not in catalog.kinds:
         raise ArgumentError(
             f"no installed plugin announces kind {project.kind}"
             f"{did_you_mean(project.kind, catalog.kinds)}; there are {', '.join(catalog.kinds)}"
@@ -106,6 +126,30 @@ def _check(project: Project, folder: Path, catalog: Catalog) -> None:
         raise ArgumentError(f"{folder} exists already; take another name, or remove it")
 
 
+def _check_new_kind(project: Project, catalog: Catalog) -> None:
+    if project.kind in catalog.kinds:
+        raise ArgumentError(
+            f"kind {project.kind} is announced by an installed plugin already: write a method of "
+            f"it with --kind {project.kind}, or take another name"
+        )
+    for name in (project.kind, project.product):
+        if not re.fullmatch(NAME_PATTERN, name) or keyword.iskeyword(name) or "-" in name:
+            raise ArgumentError(
+                f"kinds and products are named with small letters, digits and underscores, got "
+                f"{name!r}"
+            )
+    if project.product in catalog.products:
+        raise ArgumentError(
+            f"product {project.product} is announced already: name another behind --gives"
+        )
+    for name in project.takes:
+        if name not in catalog.products:
+            raise ArgumentError(
+                f"there is no product type {name}{did_you_mean(name, catalog.products)}; there are "
+                f"{', '.join(catalog.products)}"
+            )
+
+
 def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tuple[str, str]]:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(_TEMPLATES),
@@ -116,8 +160,12 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         undefined=jinja2.StrictUndefined,
     )
     own = f"kinds/{project.kind}.py.jinja"
-    has_own = (_TEMPLATES / own).is_file()
-    comparison = comparison_text(project.method_id, project.name, catalog)
+    method = own if (_TEMPLATES / own).is_file() else "method.py.jinja"
+    comparison = (
+        own_comparison_text(project.method_id, project.takes, catalog)
+        if project.product
+        else comparison_text(project.method_id, project.name, catalog)
+    )
     known = {
         "project": project,
         "ports": ports,
@@ -132,10 +180,14 @@ def _files(project: Project, ports: KindPorts, catalog: Catalog) -> Iterator[tup
         ".gitignore": "gitignore.jinja",
         ".github/workflows/tests.yml": "tests.yml.jinja",
         f"{project.package}/__init__.py": "init.py.jinja",
-        f"{project.package}/hooks.py": "hooks.py.jinja",
-        f"{project.package}/method.py": own if has_own else "method.py.jinja",
+        f"{project.package}/hooks.py": "own_hooks.py.jinja"
+        if project.product
+        else "hooks.py.jinja",
+        f"{project.package}/method.py": "own_method.py.jinja" if project.product else method,
         "tests/test_conformance.py": "test_conformance.py.jinja",
     }
+    if project.product:
+        sources[f"{project.package}/product.py"] = "own_product.py.jinja"
     for name, template in sources.items():
         yield name, environment.get_template(template).render(known)
     if comparison:

@@ -17,7 +17,7 @@ from orthoflow.errors import ArgumentError
 from orthoflow.scaffold import Project, write_project
 from orthoflow.sdk.hooks import ENTRY_POINT_GROUP
 from orthoflow.testing import conformance_cases
-from orthoflow.workflow import load_workflow
+from orthoflow.workflow import doubts_about, expand_cells, load_workflow
 from tests.long_loops import IS_LONG
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,6 +65,52 @@ def test_a_new_plugin_passes_the_suite_as_it_is(
     problems = [case.problem() for case in conformance_cases(project.method_id, golden=golden)]
     assert [problem for problem in problems if problem] == []
     assert project.method_id in golden.read_text()
+
+
+@pytest.mark.parametrize("takes", [("cloud",), ("planes", "cloud")], ids="-".join)
+def test_a_new_kind_brings_its_product_and_passes_the_suite(
+    takes: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = f"kind-of-{len(takes)}"
+    project = Project(name=name, kind=f"part{len(takes)}", product="my_parts", takes=takes)
+    write_project(project, tmp_path, discover_catalog())
+    folder = tmp_path / name
+    install(folder, monkeypatch)
+    catalog = discover_catalog()
+    assert list(catalog.kinds[project.kind].spec.inputs) == list(takes)
+    problems = [case.problem() for case in conformance_cases(project.method_id)]
+    assert [problem for problem in problems if problem] == []
+    workflow = load_workflow(folder / "compare.yaml", catalog)
+    cells = [cell for cell in expand_cells(workflow, catalog) if cell.step == project.kind]
+    assert [cell.params["factor"] for cell in cells] == [1.0, 2.0]
+    assert [cell.skip_reason for cell in cells] == ["", ""]
+    assert doubts_about(workflow) == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "product", "takes", "sentence"),
+    [
+        ("plane", "parts", ("cloud",), "kind plane is announced by an installed plugin already"),
+        ("my-parts", "parts", ("cloud",), "small letters, digits and underscores, got 'my-parts'"),
+        ("part", "planes", ("cloud",), "product planes is announced already"),
+        ("part", "parts", ("clouds",), r"no product type clouds \(did you mean cloud\?\)"),
+    ],
+)
+def test_a_new_kind_that_cannot_be_is_refused(
+    kind: str, product: str, takes: tuple[str, ...], sentence: str, tmp_path: Path
+) -> None:
+    project = Project(name="mine", kind=kind, product=product, takes=takes)
+    with pytest.raises(ArgumentError, match=sentence):
+        write_project(project, tmp_path, discover_catalog())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [[], ["--kind", "plane", "--new-kind", "part"]])
+def test_a_kind_or_a_new_one_is_asked_for(arguments: list[str], tmp_path: Path) -> None:
+    asked = ["plugins", "new", "mine", "--folder", str(tmp_path), *arguments]
+    result = CliRunner().invoke(program, asked)
+    assert result.exit_code == 2
+    assert "or --new-kind" in result.output
 
 
 @pytest.mark.parametrize(
