@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.files.regular_files import open_file
+from orthoflow.geometry.frames import FARTHEST_M
 
-_MOST_BYTES: Final = 1 << 28
+MOST_BYTES: Final = 50_000_000
+# Each may be filled over a whole photo.
+MOST_POLYGONS: Final = 10_000
 _CORNERS_LEAST: Final = 3
 
 
@@ -50,7 +53,10 @@ def read_polygons(path: Path, name: str, *, what: str) -> list[NamedPolygon]:
     )
     try:
         with open_file(path) as stream:
-            content = parse_json(stream.read(_MOST_BYTES).decode())
+            text = stream.read(MOST_BYTES + 1)
+        if len(text) > MOST_BYTES:
+            raise InputError(f"it has more than {MOST_BYTES} bytes")
+        content = parse_json(text.decode())
     except (OSError, ValueError) as error:
         raise InputError(f"{expected}; {error}") from error
     features = content.get("features") if isinstance(content, dict) else None
@@ -60,8 +66,10 @@ def read_polygons(path: Path, name: str, *, what: str) -> list[NamedPolygon]:
     for number, feature in enumerate(features):
         try:
             found += _polygons_of(feature, name)
-        except (TypeError, ValueError, KeyError, IndexError) as error:
+        except (TypeError, ValueError, KeyError, IndexError, OverflowError) as error:
             raise InputError(f"{expected} (feature {number})") from error
+        if len(found) > MOST_POLYGONS:
+            raise InputError(f"{path.name} holds more than {MOST_POLYGONS} polygons: split it")
     return found
 
 
@@ -84,7 +92,7 @@ def _text(value: object) -> str:
 
 def _finite(rings: tuple[NDArray[np.float64], ...]) -> tuple[NDArray[np.float64], ...]:
     if not rings or not all(
-        len(ring) >= _CORNERS_LEAST and np.isfinite(ring).all() for ring in rings
+        len(ring) >= _CORNERS_LEAST and (np.abs(ring) < FARTHEST_M).all() for ring in rings
     ):
         raise ValueError
     return rings

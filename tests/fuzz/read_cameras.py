@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -27,7 +28,7 @@ from orthoflow.workflow.drafting import draft_workflow
 from orthoflow.workflow.recognising import recognised
 from tests import photo_files, scan_files
 from tests.fuzz.harness import Target
-from tests.fuzz.mutation import mutate_bytes, mutate_e57, mutate_json, mutate_text
+from tests.fuzz.mutation import mutate_bytes, mutate_e57, mutate_json, mutate_png, mutate_text
 
 _WIDTH, _HEIGHT = 64, 48
 _PHOTOS: Final = ("a.jpg", "b.jpg")
@@ -233,6 +234,46 @@ def _read_e57_photos(path: Path) -> object:
 E57_PHOTOS = Target(seeds=_e57_files, read=_read_e57_photos, mutate=mutate_e57)
 
 
+# Masks --------------------------------------------------------------------------------------------
+
+
+def _mask_files(folder: Path) -> None:
+    ring = [[4.5, 4], [30, 4], [30, 20.25], [4.5, 20.25], [4.5, 4]]
+    hole = [[10, 8], [12, 8], [12, 10], [10, 8]]
+    shapes = [
+        {"type": "Polygon", "coordinates": [ring, hole]},
+        {"type": "MultiPolygon", "coordinates": [[ring], [hole]]},
+    ]
+    features = [
+        {"type": "Feature", "properties": {"photo": name, "note": 1}, "geometry": shape}
+        for name, shape in zip(("a.jpg", "*.jp?"), shapes, strict=True)
+    ]
+    content = {"type": "FeatureCollection", "features": features}
+    (folder / "masks.geojson").write_text(json.dumps(content))
+    used = np.full((_HEIGHT, _WIDTH), 255, np.uint8)
+    used[:10] = 0
+    (folder / "a_mask.png").write_bytes(encode_png(used))
+
+
+def _read_mask(path: Path) -> object:
+    """Read photos with it; `drawn_seams` of `mosaic` read polygons in the same way."""
+    folder = path.parent / "photos"
+    folder.mkdir()
+    photo = photo_files.jpeg(photo_files.picture(_WIDTH, _HEIGHT))
+    photo_files.write(folder, dict.fromkeys(_PHOTOS, photo))
+    photos = InputFiles(name="photos", paths=tuple(folder / name for name in _PHOTOS))
+    masks = InputFiles(name="masks", paths=(path,))
+    trial = Trial(method=ReadPhotos, inputs={"files": photos, "masks": masks})
+    return run_trial(trial, path.parent / "scratch", draws=False).digests
+
+
+def _mutate_mask(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
+    return (mutate_json if content.startswith(b"{") else mutate_png)(content, rng, others)
+
+
+MASKS = Target(seeds=_mask_files, read=_read_mask, mutate=_mutate_mask)
+
+
 # Folders that a workflow is drafted for -----------------------------------------------------------
 
 
@@ -257,4 +298,4 @@ def _draft(path: Path) -> object:
 
 FOLDER = Target(seeds=_folder_files, read=_draft, mutate=_mutate_cameras)
 
-NAMES: Final = ("CAMERAS", "TIES", "E57_PHOTOS", "FOLDER")
+NAMES: Final = ("CAMERAS", "TIES", "E57_PHOTOS", "MASKS", "FOLDER")

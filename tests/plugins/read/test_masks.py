@@ -13,6 +13,7 @@ from orthoflow_plugins.read.photos import ReadPhotos
 from orthoflow.errors import InputError
 from orthoflow.files.images import encode_jpeg, encode_png
 from orthoflow.files.photo_masks import used_pixels
+from orthoflow.files.polygons import MOST_BYTES
 from orthoflow.products import InputFiles, Photo
 from tests import raster_scenes as scenes
 
@@ -137,6 +138,9 @@ def test_masks_of_no_photo_are_told(tmp_path: Path) -> None:
             r"a\.json is not a mask of photos",
         ),
         ("a.json", polygons("a.jpg", RING).replace("Polygon", "Point"), r"\(feature 0\)"),
+        ("a.json", polygons("a.jpg", RING).replace("50.0", "1" + 400 * "0"), r"\(feature 0\)"),
+        ("a.json", polygons("a.jpg", RING).replace("50.0", "1e300"), r"\(feature 0\)"),
+        ("a.json", " " * (MOST_BYTES + 1), f"more than {MOST_BYTES} bytes"),
     ],
 )
 def test_what_is_no_mask_is_refused(
@@ -151,3 +155,12 @@ def test_two_masks_of_one_photo_are_refused(tmp_path: Path) -> None:
     masks = [file_in(tmp_path / "masks", name, picture()) for name in ("a.png", "a_mask.png")]
     with pytest.raises(InputError, match=r"a_mask\.png and a\.png are masks of one photo"):
         read(tmp_path, [photo_in(tmp_path)], masks)
+
+
+def test_more_polygons_than_anybody_draws_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow.files.polygons.MOST_POLYGONS", 0)
+    mask = file_in(tmp_path / "masks", "a.json", polygons("a.jpg", RING))
+    with pytest.raises(InputError, match=r"a.json holds more than 0 polygons: split it"):
+        read(tmp_path, [photo_in(tmp_path)], [mask])
