@@ -344,6 +344,10 @@ class Worker:
             again = self._pytest(failed or arguments, self._kernels, 3600.0)
             if again is not None and again.returncode == _PASSED:
                 return failed[0] if failed else f"pytest: {done.stdout.strip()[-200:]}"
+            if failed:
+                # What else fails there is asked once, not one test after the other.
+                files = dict.fromkeys(name.partition("::")[0] for name in failed)
+                again = self._pytest(list(files), self._kernels, 3600.0)
             broken = self._last_failed()
             if again is None or not set(broken) - set(self._broken):
                 raise RuntimeError(f"pytest does not run: {'' if again is None else again.stdout}")
