@@ -61,17 +61,7 @@ def inspect_planes(
                 for item in _plane_findings(distance, 0)
             ]
     if labels is not None:
-        scores = label_findings(labels, truth)
-        by_name = {item.name: item.value for item in scores}
-        findings += scores
-        findings += [
-            Finding(
-                name=f"label_{score}",
-                value=by_name[f"label_{score}[{truth.planes.names[0]}]"],
-                unit="1",
-            )
-            for score in _LABEL_SCORES
-        ]
+        findings += _with_those_of_the_main_wall(label_findings(labels, truth), truth)
     for item in findings:
         if "[" not in item.name:
             ctx.metric(item.name, item.value, item.unit)
@@ -83,6 +73,16 @@ def inspect_planes(
         kinds=(),
         findings=tuple(findings),
     )
+
+
+def _with_those_of_the_main_wall(scores: list[Finding], truth: Truth) -> list[Finding]:
+    """Add the scores of the truth's first plane without its name."""
+    values = {item.name: item.value for item in scores}
+    main = truth.planes.names[0]
+    return scores + [
+        Finding(name=f"label_{score}", value=values[f"label_{score}[{main}]"], unit="1")
+        for score in _LABEL_SCORES
+    ]
 
 
 def wall_plane_findings(plane: Plane, wall: int, true: Planes) -> list[Finding]:
