@@ -34,6 +34,21 @@ def oriented() -> Cameras:
     return Cameras(cameras=tuple(cameras), ties=replace(ties, residual_px=residuals, role=role))
 
 
+@pytest.mark.parametrize("has_ties", [True, False], ids=["all-rejected", "none"])
+def test_photos_without_ties_are_a_model_of_cameras_alone(tmp_path: Path, has_ties: bool) -> None:
+    import pycolmap
+
+    cameras = oriented()
+    assert cameras.ties is not None
+    rejected = np.full_like(cameras.ties.role, TieRole.REJECTED)
+    ties = replace(cameras.ties, role=rejected) if has_ties else None
+    written = write_colmap_model(tmp_path, replace(cameras, ties=ties))
+    assert (written.n_images, written.n_points) == (3, 0)
+    scene = pycolmap.Reconstruction(str(tmp_path))
+    assert (scene.num_images(), scene.num_points3D()) == (3, 0)
+    assert all(len(image.points2D) == 0 for image in scene.images.values())
+
+
 def test_colmap_opens_the_model_and_sees_the_same_residuals(tmp_path: Path) -> None:
     import pycolmap
 

@@ -1,0 +1,190 @@
+"""Where edges run, and where a photo of them lies on a wall, against sums done one by one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.match.structures import (
+    Place,
+    WallStructure,
+    _coarser,
+    _is_elsewhere,
+    _part_map,
+    _slipped,
+    _widths_cells,
+    likely_places,
+    structure_of,
+    wall_structure,
+)
+
+from orthoflow.products import Wall
+from orthoflow.testing import photographed as ms
+
+RNG = np.random.default_rng(4)
+
+
+def picture(height: int, width: int) -> NDArray[np.float32]:
+    """Blocks of 7 pixels in greys of their own."""
+    blocks = np.random.default_rng(3).uniform(0.0, 1.0, (height // 7 + 1, width // 7 + 1))
+    wide = np.kron(blocks, np.ones((7, 7)))[:height, :width, None]
+    return np.ascontiguousarray(wide, dtype=np.float32)
+
+
+@pytest.fixture(scope="module")
+def wall() -> Wall:
+    return ms.walls_of(ms.textured_wall(1)).walls[0]
+
+
+@pytest.fixture(scope="module")
+def structure(wall: Wall) -> WallStructure:
+    found = wall_structure(wall)
+    assert found is not None
+    return found
+
+
+def test_edges_are_the_same_whichever_side_is_brighter_and_turn_with_the_picture() -> None:
+    grey, known = picture(120, 120), np.ones((120, 120), dtype=np.bool_)
+    upright = structure_of(grey, known).values
+    np.testing.assert_allclose(structure_of(1.0 - grey, known).values, upright, atol=1e-4)
+    turned = structure_of(np.ascontiguousarray(np.rot90(grey)), known).values
+    # A quarter turn is half a turn of doubled angles, and a whole one of fourfold ones.
+    signs = np.array([-1.0, -1.0, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(turned, np.rot90(upright) * signs, atol=1e-4)
+    # Each place tells where edges run, not how strong they are: vectors of length one at most.
+    lengths = np.linalg.norm(upright, axis=2)
+    assert lengths.max() < 1.0
+    assert np.median(lengths) == pytest.approx(1.0 / 1.3, abs=0.01)
+
+
+def test_what_is_not_known_and_its_border_has_no_structure() -> None:
+    known = np.ones((80, 90), dtype=np.bool_)
+    known[20:40, 30:60] = False
+    found = structure_of(picture(80, 90), known)
+    void = np.zeros_like(known)
+    void[19:41, 29:61] = True
+    np.testing.assert_array_equal(found.known == 0.0, void)
+    assert not found.values[void].any()
+    assert (np.linalg.norm(found.values[~void], axis=1) > 0.0).mean() > 0.99
+
+
+def test_a_coarser_wall_has_means_of_intensity_and_single_depths(wall: Wall) -> None:
+    rows, columns = wall.frame.shape
+    ramp = np.broadcast_to(np.linspace(2.0, 6.0, columns, dtype=np.float32), (rows, columns))
+    depths = np.arange(rows * columns, dtype=np.float32).reshape(rows, columns) / 1e4
+    depths[:5, :6] = np.nan  # whole cells of 3 x 3 in the first row, two thirds in the second
+    coarse = _coarser(replace(wall, intensity=ramp.copy(), depth_m=depths), 3)
+    assert coarse.frame.shape == (rows // 3, columns // 3)
+    assert coarse.frame.gsd_m == 3 * wall.frame.gsd_m
+    middles = depths[1::3, 1::3][: rows // 3, : columns // 3]
+    expected = middles.copy()
+    expected[1, :2] = np.nan
+    np.testing.assert_array_equal(coarse.depth_m, expected)
+    assert coarse.intensity is not None
+    # From the first to the last hundredth of the intensities, cut off beyond.
+    scaled = np.clip((ramp[0] - 2.04) / 3.92, 0.0, 1.0)
+    means = scaled[: 3 * (columns // 3)].reshape(-1, 3).mean(axis=1)
+    np.testing.assert_allclose(coarse.intensity[5:], np.tile(means, (rows // 3 - 5, 1)), atol=4e-3)
+
+
+@pytest.mark.parametrize("photo", [(600, 900), (900, 600), (500, 500)], ids=str)
+@pytest.mark.parametrize("wall_shape", [(200, 260), (400, 200), (900, 2000)], ids=str)
+def test_widths_go_from_a_fifth_of_the_wall_to_more_than_all_of_it(
+    photo: tuple[int, int], wall_shape: tuple[int, int]
+) -> None:
+    widths = _widths_cells(photo, wall_shape)
+    heights = [width * photo[0] / photo[1] for width in widths]
+    longer = [max(pair) for pair in zip(widths, heights, strict=True)]
+    shorter = [min(pair) for pair in zip(widths, heights, strict=True)]
+    assert all(
+        second / first == pytest.approx(1.1, abs=1.2 / first) for first, second in pairwise(widths)
+    )
+    # Parts are half as long as the photo, 16 to 249 cells.
+    least_longer, least_shorter = 0.2 * min(wall_shape), 2 * 16
+    assert longer[0] >= least_longer - 1
+    assert shorter[0] >= least_shorter - 1
+    assert min(longer[0] - least_longer, shorter[0] - least_shorter) < 1.5
+    most_shorter, most_longer = 1.6 * min(wall_shape), 2 * 249
+    assert shorter[-1] <= most_shorter + 1
+    assert longer[-1] <= most_longer + 1
+    assert 1.1 * shorter[-1] > most_shorter - 2 or 1.1 * longer[-1] > most_longer - 2
+
+
+def test_a_part_is_compared_with_what_lies_under_it_everywhere(structure: WallStructure) -> None:
+    channels = np.moveaxis(structure.channels.values, -1, 0).astype(np.float64)
+    height, width = channels.shape[1:]
+    part = channels[:, 40:75, 60:110] + RNG.normal(0.0, 0.2, (5, 35, 50))
+    found = _part_map(part.astype(np.float32), structure)
+    own = float((part**2).sum())
+    places = [(40, 60), (0, 0), (11, 7), (height - 35, width - 50), (height - 9, 5)]
+    for row, column in places:
+        under = channels[:, row : row + 35, column : column + 50]
+        mine = part[:, : under.shape[1], : under.shape[2]]
+        # What lies beside the wall counts as a quarter of the part itself, at least.
+        energy = max(float((under**2).sum()), 0.25 * own)
+        expected = float((mine * under).sum()) / math.sqrt(own * energy)
+        assert found[row, column] == pytest.approx(expected, abs=1e-4)
+    assert np.unravel_index(found.argmax(), found.shape) == (40, 60)
+
+
+def test_a_part_slips_to_the_best_place_nearby_also_across_the_border() -> None:
+    part = np.zeros((30, 40), dtype=np.float32)
+    part[28, 3], part[10, 12], part[10, 17] = 0.5, 0.7, 0.9
+    np.testing.assert_array_equal(_slipped(part, (0, 1), 3), [3, -2])
+    np.testing.assert_array_equal(_slipped(part, (9, 13), 3), [12, 10])
+    np.testing.assert_array_equal(_slipped(part, (9, 13), 4), [17, 10])
+
+
+@pytest.mark.parametrize(
+    ("far_m", "scale", "elsewhere"),
+    [(0.49, 1.0, False), (0.51, 1.0, True), (0.0, 1.28, False), (0.0, 1.29, True)],
+)
+def test_places_differ_by_a_quarter_of_the_width_or_of_the_size(
+    far_m: float, scale: float, elsewhere: bool
+) -> None:
+    def place(x_m: float, width_m: float) -> Place:
+        parts = np.zeros((9, 2))
+        centre_m = np.array([x_m, 1.0])
+        return Place(centre_m=centre_m, width_m=width_m, lead=1.0, parts_photo=parts, parts_m=parts)
+
+    assert _is_elsewhere(place(1.0 + far_m, 2.0 * scale), place(1.0, 2.0)) is elsewhere
+    if not far_m:
+        assert _is_elsewhere(place(1.0, 2.0), place(1.0, 2.0 * scale)) is elsewhere
+
+
+def test_a_piece_of_the_wall_lies_where_it_was_taken_from(
+    wall: Wall, structure: WallStructure
+) -> None:
+    assert wall.intensity is not None
+    rows, columns = wall.frame.shape
+    top, left, height, width = rows // 4, columns // 3, rows // 2, columns // 2
+    grey = np.rint(255 * np.clip(np.nan_to_num(wall.intensity, nan=0.5), 0.0, 1.0)).astype(np.uint8)
+    # Inverted: edges stay where they are.
+    cut = 255 - grey[top : top + height, left : left + width]
+    places = likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=3)
+    assert 1 <= len(places) <= 3
+    best = places[0]
+    leads = [place.lead for place in places]
+    assert leads == sorted(leads, reverse=True)
+    cell_m, fine_m = structure.wall.frame.gsd_m, wall.frame.gsd_m
+    truth_m = fine_m * np.array([left + 0.5 * width, top + 0.5 * height])
+    # Sizes are tried in steps of a tenth, and parts may slip by 3 % of the width.
+    slip_m = 0.03 * best.width_m + cell_m
+    assert best.width_m == pytest.approx(fine_m * width, rel=0.06)
+    assert np.abs(best.centre_m - truth_m).max() < slip_m
+    np.testing.assert_allclose(best.parts_photo.mean(axis=0), 0.5, atol=0.01)
+    np.testing.assert_allclose(np.ptp(best.parts_photo, axis=0), 0.5, atol=0.02)
+    expected_m = fine_m * (np.array([left, top]) + best.parts_photo * [width, height])
+    assert np.abs(best.parts_m - expected_m).max() < slip_m
+    assert len(likely_places(np.repeat(cut[..., None], 3, axis=2), structure, n_most=1)) == 1
+
+
+def test_a_wall_without_intensity_or_of_few_cells_has_no_structure(wall: Wall) -> None:
+    assert wall.intensity is not None
+    assert wall_structure(replace(wall, intensity=None)) is None
+    nothing = np.full_like(wall.intensity, np.nan)
+    assert wall_structure(replace(wall, intensity=nothing)) is None
