@@ -60,8 +60,11 @@ class Simulated:
     moved_tb: float
 
 
-def tasks_of(run: str, points: float, photos: float) -> list[Task]:
-    """Give the tasks of one room, with seconds and sizes for so many times the points or photos."""
+def tasks_of(run: str, points: float, photos: float, cores: float | None = None) -> list[Task]:
+    """Give the tasks of one room, with seconds and sizes for so many times the points or photos.
+
+    Of a record that was made beside other work `cores` share the processor seconds.
+    """
     stored: dict[str, float] = {}
     found: list[Task] = []
     made: set[str] = set()
@@ -77,9 +80,10 @@ def tasks_of(run: str, points: float, photos: float) -> list[Task]:
         stored[cell.address] = (cell.stored_mib or 0.0) * 1.048576 * factor
         if cell.method.startswith("simulate.") or cell.status != "ok":
             continue
+        seconds = (cell.wall_s or 0.0) if cores is None else (cell.cpu_s or 0.0) / cores
         task = Task(
             address=cell.address,
-            seconds=(cell.wall_s or 0.0) * factor + _TASK_S,
+            seconds=seconds * factor + _TASK_S,
             read_mb=sum(stored.get(name, 0.0) for name in needs),
             written_mb=stored[cell.address],
             needs=tuple(name for name in needs if name in made),
@@ -180,6 +184,7 @@ def main() -> None:
     parser.add_argument("--photos", type=float, default=40.0)
     parser.add_argument("--measured-points-m", type=float, required=True)
     parser.add_argument("--measured-photos", type=float, required=True)
+    parser.add_argument("--cores", type=float, help="share processor seconds; else wall time")
     parser.add_argument("--server-mb-s", type=float, default=1000.0)
     parser.add_argument("--link-mb-s", type=float, default=110.0)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 16, 256])
@@ -188,6 +193,7 @@ def main() -> None:
         wanted.run,
         wanted.points_m / wanted.measured_points_m,
         wanted.photos / wanted.measured_photos,
+        wanted.cores,
     )
     longest = max(tasks, key=lambda task: task.seconds)
     print(
