@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
+import tempfile
+import time
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -453,14 +458,13 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None) -> int:
     from orthoflow.testing import conformance_cases
 
     results: list[dict[str, str]] = []
-    for case in conformance_cases(method_id, golden=golden):
-        problem = case.problem()
-        state = "broken" if problem else "kept"
-        results.append(
-            {"check": case.check.name, "state": state, "rule": case.check.rule, "problem": problem}
-        )
-        if not as_json:
-            echo(f"{state:7} {case.check.name}: {problem or case.check.rule}")
+    with _sharing_kernels(method_id):
+        for case in conformance_cases(method_id, golden=golden):
+            problem, name, rule = case.problem(), case.check.name, case.check.rule
+            state = "broken" if problem else "kept"
+            results.append({"check": name, "state": state, "rule": rule, "problem": problem})
+            if not as_json:
+                echo(f"{state:7} {name}: {problem or rule}")
     n_broken = sum(result["state"] == "broken" for result in results)
     if as_json:
         echo_json({"method": method_id, "checks": results})
@@ -468,3 +472,27 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None) -> int:
         kept = f"{method_id} keeps {counted(len(results) - n_broken, 'rule')}"
         echo("", f"{kept}, breaks {n_broken}" if n_broken else kept)
     return EXIT_CELL_FAILED if n_broken else EXIT_GOOD
+
+
+@contextmanager
+def _sharing_kernels(method_id: str) -> Iterator[None]:
+    """Let the suite begin with what this user's runs have compiled, and leave them what it does.
+
+    Without it the runs in a process of their own would compile everything once more.
+    """
+    from orthoflow.engine.compiled_code import begun_with_warm, leave_for_others
+    from orthoflow.engine.executors import COMPILED_CODE, compiled_code_in
+    from orthoflow.engine.keys import compiled_digest
+    from orthoflow.engine.store import Store
+
+    if COMPILED_CODE in os.environ:
+        yield
+        return
+    digest, since_ns = compiled_digest(discover_catalog().method(method_id)), time.time_ns()
+    with tempfile.TemporaryDirectory(prefix="orthoflow-check-") as folder:
+        kernels = begun_with_warm(Store(Path(folder)).numba_folder(digest))
+        try:
+            with compiled_code_in(str(kernels)):
+                yield
+        finally:
+            leave_for_others(kernels, since_ns)

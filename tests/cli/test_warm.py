@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from orthoflow.cli import warm
+from orthoflow.cli import plugins, warm
 from orthoflow.cli.program import program
 from orthoflow.engine.compiled_code import VARIABLE, begun_with_warm, leave_for_others, warm_folder
+from orthoflow.engine.executors import COMPILED_CODE
 from tests.workshop_runs import WORKSHOP, command, workshop_environment, write_studio
 
 
@@ -94,6 +95,22 @@ def test_what_a_run_compiles_every_later_store_begins_with(tmp_path: Path, kerne
     assert found == {name: name.encode() for name in ("f.checked.nbi", "f.checked.1a.nbc")}
     other = begun_with_warm(tmp_path / "other" / "numba" / "abc")
     assert sorted(path.name for path in other.rglob("*.nb?")) == sorted(found)
+
+
+def test_the_conformance_suite_begins_with_kernels_of_runs_and_leaves_its_own(
+    kernels: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(WORKSHOP))
+    monkeypatch.delenv(COMPILED_CODE)
+    with plugins._sharing_kernels("paint.kernel"):
+        folder = Path(os.environ[COMPILED_CODE])
+        folder.mkdir(parents=True)
+        (folder / "f.checked.1a.nbc").write_bytes(b"code")
+    assert not folder.exists()
+    assert COMPILED_CODE not in os.environ
+    assert compiled(kernels) == {"f.checked.1a.nbc"}
+    with plugins._sharing_kernels("paint.kernel"):
+        assert compiled(Path(os.environ[COMPILED_CODE])) == {"f.checked.1a.nbc"}
 
 
 def test_kernels_that_cannot_be_left_are_kept_by_their_store_alone(

@@ -84,7 +84,7 @@ def draw_ties(
     if any(figure.name == name for figure in ctx.figures):
         name = f"{name}-{len(ctx.figures)}"
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
-    scale = min(1.0, _SIDE_PX / max(rgb.shape[:2]))
+    scale = min(1.0, _SIDE_PX / max(photo.width, photo.height))
     size = (max(1, round(photo.width * scale)), max(1, round(photo.height * scale)))
     small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     # Dimmed, so that the marks stand out.
