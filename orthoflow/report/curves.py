@@ -22,6 +22,8 @@ from orthoflow.workflow.format import DATA
 
 _MOST_CURVES: Final = 12
 _MOST_LINES: Final = 6
+# What a record of a stranger says may be any number; differences of larger ones are none.
+_LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 3
 _LOGARITHMIC_RATIO: Final = 20.0
 _WIDTH, _HEIGHT = 460.0, 290.0
@@ -94,7 +96,9 @@ def sweeps(cells: Sequence[RecordedCell]) -> Iterator[Sweep]:
             known = {
                 variant: float(value)
                 for variant, value in values.items()
-                if isinstance(value, int | float) and not isinstance(value, bool)
+                if isinstance(value, int | float)
+                and not isinstance(value, bool)
+                and abs(value) < _LARGEST
             }
             others = {
                 variant: ", ".join(
@@ -137,6 +141,8 @@ def _lines(
         variant = one.assignment.get(sweep.step, "")
         measured = one.measured(column.step, column.metric)
         if variant not in sweep.values or measured is None or one.failure is not None:
+            continue
+        if not abs(measured.value) < _LARGEST:
             continue
         variants = (
             f"{step}={chosen}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -41,6 +42,17 @@ def test_two_values_other_differences_and_words_are_none(tmp_path: Path) -> None
     assert list(sweeps(held(tmp_path, mixed).record.cells)) == []
     words = [cell(f"plane@plane={word}", params={"mode": word}) for word in "abc"]
     assert list(sweeps(held(tmp_path, words).record.cells)) == []
+
+
+def test_numbers_that_cannot_be_drawn_are_left_out(tmp_path: Path) -> None:
+    # A record may hold any; these ended with an error, or with nan for a place.
+    values = (0.02, 10**400, math.nan, 0.05, -1e308, 0.1)
+    cells: list[object] = [
+        cell(f"plane@plane=v{index}", params={"tolerance_m": value})
+        for index, value in enumerate(values)
+    ]
+    (found,) = sweeps(held(tmp_path, cells).record.cells)
+    assert sorted(found.values.values()) == [0.02, 0.05, 0.1]
 
 
 def test_points_lie_in_the_order_of_values_whatever_that_of_the_variants(tmp_path: Path) -> None:
