@@ -197,3 +197,5 @@ def test_what_was_rejected_bars_the_heights_about_it() -> None:
     np.testing.assert_array_equal(proposer._barred_heights, np.abs(storeys - storey) <= 2)
     assert not proposer._barred.any()
     assert proposer.propose(Unassigned.of(cloud)) is None
+    # There is no picture of votes for walls that nobody looked for.
+    assert proposer.first is None

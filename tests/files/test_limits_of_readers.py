@@ -1,0 +1,102 @@
+"""A file exactly as large as allowed is read, and one that is larger by one of anything is not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import InputError
+from orthoflow.files import calibration, images, metashape, polygons, sidecars, survey_points
+from orthoflow.files.drawings import title_blocks
+from orthoflow.files.images import encode_png
+
+LENS = "cameras: {a.jpg: {width: 640, height: 480, fx: 500, fy: 500, cx: 319.5, cy: 239.5}}"
+CSV = "name,x,y,z\na,1,2,3\nlong name,1.25,2.5,3.125\n"
+CHUNK = (
+    "<document><chunk><sensors><sensor id='0'><resolution width='640' height='480'/>"
+    "<calibration><f>500</f></calibration></sensor></sensors>"
+    "<cameras><camera id='0' sensor_id='0' label='a.jpg'/></cameras></chunk></document>"
+)
+MASK = {
+    "type": "FeatureCollection",
+    "features": [
+        {
+            "type": "Feature",
+            "properties": {"photo": f"{number}.jpg"},
+            "geometry": {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 0]]]},
+        }
+        for number in range(3)
+    ],
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limit:
+    """A limit of a reader, a file, and how much of what is limited the file has."""
+
+    module: object
+    constant: str
+    content: bytes
+    size: int
+    read: Callable[[Path], object]
+
+    def __str__(self) -> str:
+        return f"{getattr(self.module, '__name__', '').rpartition('.')[2]}-{self.constant}"
+
+
+def limit(
+    module: object, constant: str, text: str, size: int | None, read: Callable[[Path], object]
+) -> Limit:
+    content = text.encode()
+    size = len(content) if size is None else size
+    return Limit(module=module, constant=constant, content=content, size=size, read=read)
+
+
+def masks(path: Path) -> object:
+    return polygons.read_polygons(path, name="photo", what="a mask")
+
+
+def decoded(path: Path) -> object:
+    return images.decode_image(path.read_bytes(), path.name)
+
+
+BLOCK = "project: Hall\ntitle: West wall\n"
+LIMITS = [
+    limit(calibration, "MOST_BYTES", LENS, None, calibration.read_calibration),
+    limit(title_blocks, "MOST_BYTES", BLOCK, None, title_blocks.read_title_block),
+    limit(title_blocks, "MOST_LETTERS", BLOCK, len("West wall"), title_blocks.read_title_block),
+    limit(survey_points, "MOST_BYTES", CSV, None, survey_points.read_survey_points),
+    limit(survey_points, "MOST_LINE", CSV, 24, survey_points.read_survey_points),
+    limit(survey_points, "MOST_POINTS", CSV, 3, survey_points.read_survey_points),
+    limit(polygons, "MOST_BYTES", json.dumps(MASK), None, masks),
+    limit(polygons, "MOST_POLYGONS", json.dumps(MASK), 3, masks),
+    limit(sidecars, "MOST_SIDECAR_BYTES", '{"gsd_m": 0.5}', None, sidecars.read_sidecar),
+    limit(metashape, "MOST_TAGS", CHUNK, CHUNK.count("<"), metashape.read_metashape_xml),
+    limit(metashape, "MOST_PIXELS", CHUNK, 640 * 480, metashape.read_metashape_xml),
+    Limit(
+        module=images,
+        constant="MOST_PIXELS",
+        content=encode_png(np.zeros((6, 7, 3), dtype=np.uint8)),
+        size=42,
+        read=decoded,
+    ),
+]
+
+
+@pytest.mark.parametrize("limit", LIMITS, ids=str)
+def test_what_is_as_large_as_allowed_is_read_and_nothing_larger(
+    limit: Limit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(limit.content)
+    usual = limit.read(path)
+    monkeypatch.setattr(limit.module, limit.constant, limit.size)
+    assert repr(limit.read(path)) == repr(usual)
+    monkeypatch.setattr(limit.module, limit.constant, limit.size - 1)
+    with pytest.raises(InputError):
+        limit.read(path)
