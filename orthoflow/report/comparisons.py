@@ -118,10 +118,19 @@ class ComparisonTable:
     def glance(self) -> tuple[Standing, ...]:
         """How often each combination leads; the one that is best most often first."""
         labels = [*(f"{one.step}: {one.label}" for one in self.columns), "time", "memory"]
+        marked = [
+            [value.mark for value in (*row.values, row.time, row.memory)] for row in self.rows
+        ]
+        # What several share nobody leads in.
+        shared = [
+            sum(marks[index] is Mark.BEST for marks in marked) > 1 for index in range(len(labels))
+        ]
         found = []
-        for row in self.rows:
-            values = (*row.values, row.time, row.memory)
-            marks = [value.mark for value in values]
+        for row, all_marks in zip(self.rows, marked, strict=True):
+            marks = [
+                Mark.NEAR if mark is Mark.BEST and is_shared else mark
+                for mark, is_shared in zip(all_marks, shared, strict=True)
+            ]
             best = [label for label, mark in zip(labels, marks, strict=True) if mark is Mark.BEST]
             variants = ", ".join(
                 f"{step}={chosen}"

@@ -60,17 +60,43 @@ def read_compare(
         for step in steps
         if step.is_varied
     }
+    families = {step.name: _families(step) for step in steps}
+    # A variant that was swept is still known by its own name.
+    names = {name: [*known, *families[name]] for name, known in names.items()}
     with_data = {DATA: list(datasets), **names} if datasets else names
     combinations = [_read_assignment(item, here, with_data, log) for here, item in excluded]
+    chosen = _read_assignment(baseline, join(path, BASELINE.name), names, log) if baseline else {}
     return Comparison(
         design=design,
-        baseline=_complete(
-            _read_assignment(baseline, join(path, BASELINE.name), names, log) if baseline else {},
-            steps,
+        baseline=_complete(next(_spelt_out(chosen, families)), steps),
+        exclude=tuple(
+            one
+            for combination in combinations
+            if combination
+            for one in _spelt_out(combination, families)
         ),
-        exclude=tuple(combination for combination in combinations if combination),
         metrics=_read_metrics(table, steps, step_names, log),
     )
+
+
+def _families(step: DraftStep) -> dict[str, tuple[str, ...]]:
+    """Of variants that were swept: name -> the variants that its values became."""
+    found: dict[str, tuple[str, ...]] = {}
+    for variant in step.variants:
+        if variant.family:
+            found[variant.family] = (*found.get(variant.family, ()), variant.call.name)
+    return found
+
+
+def _spelt_out(
+    assignment: Mapping[str, str], families: Mapping[str, Mapping[str, tuple[str, ...]]]
+) -> Iterator[Assignment]:
+    """Give an assignment for each value of a swept variant that it names, in their order."""
+    several = [
+        families.get(step, {}).get(variant, (variant,)) for step, variant in assignment.items()
+    ]
+    for names in itertools.product(*several):
+        yield dict(zip(assignment, names, strict=True))
 
 
 def check_baseline(comparison: Comparison, position: Position, log: ProblemLog) -> None:

@@ -122,7 +122,8 @@ SWEPT: Final = Section(
     words="a sweep",
     about="In the place of a value a parameter may be given several: `tolerance_m: {sweep: [0.02, "
     "0.05]}` makes the variants `tolerance_m-0_02` and `tolerance_m-0_05` of the step, or of its "
-    "variant, whose name then stands in front. Several swept parameters make all combinations. A "
+    "variant, whose name then stands in front, and by which `baseline` and `exclude` still know "
+    "it. Several swept parameters make all combinations. A "
     "workflow with a sweep is a comparison, with `compare` or without, and its report draws the "
     "metrics over the parameter. `--set STEP.PARAM=VALUE` takes the place of a sweep, and `--set "
     "'STEP.PARAM={sweep: [...]}'` makes one.",

@@ -41,6 +41,7 @@ class DraftVariant:
         kind: ports of its kind, known even when the method is not.
         params: as written.
         swept: names of the parameters whose values its name says.
+        family: of a swept one, the name of the variant that it came from; empty without.
     """
 
     position: Position
@@ -50,6 +51,7 @@ class DraftVariant:
     kind: KindSpec | None
     params: Table | None
     swept: tuple[str, ...] = ()
+    family: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

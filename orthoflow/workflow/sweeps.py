@@ -160,8 +160,13 @@ def _variants(
         for parameter, index in at.items():
             value, report = found[parameter][index]
             overrides.append(Override(report=report, keys=(parameter,), value=value))
-        call = replace(variant.call, name=name)
-        made.append((replace(variant, call=call, swept=tuple(found)), tuple(overrides)))
+        one = replace(
+            variant,
+            call=replace(variant.call, name=name),
+            swept=tuple(found),
+            family=variant.call.name,
+        )
+        made.append((one, tuple(overrides)))
     return made
 
 

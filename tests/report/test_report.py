@@ -380,3 +380,22 @@ def test_depths_run_from_blue_over_white_to_red() -> None:
 )
 def test_numbers_have_four_digits_and_their_unit(value: float, unit: str, printed: str) -> None:
     assert number_with_unit(value, unit) == printed
+
+
+def test_a_glance_says_who_leads_and_what_is_shared_leads_nobody(compared: Run) -> None:
+    table = comparison_table([compared])
+    assert table is not None
+    first, second, last = table.glance
+    assert (first.name, first.is_baseline) == ("plane=fine", True)
+    assert first.best_in[:2] == (
+        "plane: points to their plane, RMS / mm",
+        "check: error along u (right), RMS / mm",
+    )
+    assert second.n_worst >= 2
+    assert (last.name, last.is_failed, last.n_best) == ("plane=broken", True, 0)
+    row, *others = table.rows
+    best = tuple(replace(value, mark=Mark.BEST) for value in row.values)
+    alike = [replace(one, values=best) for one in (row, *others[:1])]
+    shared = replace(table, rows=tuple(alike)).glance
+    assert all("plane:" not in name for one in shared for name in one.best_in)
+    assert {one.n_near >= len(table.columns) for one in shared} == {True}

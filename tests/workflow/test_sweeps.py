@@ -96,6 +96,23 @@ def test_several_sweeps_make_all_combinations_and_a_variant_stands_in_front(
     ]
 
 
+def test_a_swept_variant_is_still_known_by_its_own_name(catalog: Catalog) -> None:
+    text = (
+        ROOM[: ROOM.index("    use: plane.hough2d")]
+        + """\
+    in: {cloud: room.cloud}
+    variants:
+      ransac: {use: plane.ransac}
+      fine: {use: plane.hough2d, params: {tolerance_m: {sweep: [0.05, 0.1]}}}
+"""
+    )
+    workflow = load(catalog, f"{text}compare: {{baseline: {{plane: fine}}}}\n")
+    assert workflow.baseline == {"plane": "fine-tolerance_m-0_05"}
+    without = load(catalog, f"{text}compare: {{exclude: [{{plane: fine}}]}}\n")
+    cells = [cell for cell in expand_cells(without, catalog) if cell.step == "plane"]
+    assert [cell.assignment["plane"] for cell in cells] == ["ransac"]
+
+
 def test_repeats_belong_to_every_value(catalog: Catalog) -> None:
     workflow = load(catalog, ROOM.replace("    in: {cloud", "    repeat: 2\n    in: {cloud"))
     cells = [cell for cell in expand_cells(workflow, catalog) if cell.step == "plane"]

@@ -123,7 +123,9 @@
       box.addEventListener("change", () => draw());
       return box;
     });
-    const keys = optional.map((heading) => "key" in heading.dataset);
+    const judging = optional.map((heading) => "key" in heading.dataset);
+    // Where few of them judge quality, those that the workflow names first.
+    const keys = judging.filter(Boolean).length < 4 ? optional.map((_, index) => index < MANY) : judging;
     let isTurned = region.dataset.chooser === "either" && optional.length > MANY && table.tBodies[0].rows.length <= FEW_ROWS;
     // Of many columns those that judge quality come first; all are one click away.
     if (!isTurned && optional.length > MANY && keys.some(Boolean)) {
