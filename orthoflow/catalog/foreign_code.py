@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final, NoReturn
 
+from orthoflow.system import working_folder_kept
+
 _SLOW_S: Final = 3.0
 
 
@@ -26,20 +28,16 @@ def foreign_code(what: str) -> Iterator[None]:
     Args:
         what: as the sentence about it begins, e.g. `method plane.mine of mine 1.0`.
     """
-    # Held open: it may have no name any more.
-    folder = os.open(".", os.O_PATH)
     watch = threading.Timer(_SLOW_S, _say_slow, [what])
     watch.daemon = True
     watch.start()
     try:
-        with contextlib.redirect_stdout(sys.stderr), _exits_refused():
+        with working_folder_kept(), contextlib.redirect_stdout(sys.stderr), _exits_refused():
             yield
     finally:
         watch.cancel()
         # Joined, so that nobody forks a process with threads.
         watch.join()
-        os.fchdir(folder)
-        os.close(folder)
 
 
 @contextmanager

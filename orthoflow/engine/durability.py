@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from orthoflow.errors import StoreError
+from orthoflow.system import flags
 
 _REASONS = {
     errno.ENOSPC: "No space left on the disk; free some, or choose another folder",
@@ -63,7 +64,9 @@ def writing_to(folder: Path) -> Iterator[None]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames in a folder survive a power cut."""
+    """Make renames in a folder survive a power cut, where a system lets folders be synced."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -73,7 +76,8 @@ def sync_folder(folder: Path) -> None:
 
 def sync_file(path: Path) -> None:
     """Make the content of a closed file survive a power cut."""
-    descriptor = os.open(path, os.O_RDONLY)
+    # Windows syncs files that may be written only.
+    descriptor = os.open(path, flags("O_RDWR" if os.name == "nt" else "O_RDONLY"))
     try:
         os.fsync(descriptor)
     finally:
@@ -119,7 +123,7 @@ def read_whole(path: Path, most_bytes: int) -> str:
         OSError: there is no file, or a link, a device or something larger than we write.
         UnicodeDecodeError: it is no text.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    descriptor = os.open(path, flags("O_RDONLY", "O_NOFOLLOW", "O_NONBLOCK"))
     with os.fdopen(descriptor, "rb") as stream:
         state = os.fstat(descriptor)
         if not stat.S_ISREG(state.st_mode) or state.st_size > most_bytes:

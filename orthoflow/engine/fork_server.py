@@ -27,7 +27,7 @@ from typing import Final
 from orthoflow.engine.child import run_step
 from orthoflow.engine.executors import tell_numba
 from orthoflow.engine.keeper import fork_kept
-from orthoflow.geometry.threads import address_space
+from orthoflow.system import address_space
 
 # One per message: pid of the keeper, then its end as `os.waitstatus_to_exitcode` has it.
 NUMBER: Final = struct.Struct("=i")

@@ -27,9 +27,9 @@ from orthoflow.engine.step_logs import StepLog
 from orthoflow.engine.step_processes import StepProcess, start_step
 from orthoflow.engine.tasks import Task, write_task
 from orthoflow.errors import CancelledStepError, OrthoflowError, StepFailedError, StoreError
-from orthoflow.geometry.threads import address_space
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line
+from orthoflow.system import address_space
 
 _GRACE_S: Final = 5.0
 _READ_BYTES: Final = 1 << 16

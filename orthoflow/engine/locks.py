@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +9,7 @@ from pathlib import Path
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.errors import StoreError
+from orthoflow.system import FileLock, file_lock, flags
 
 
 @contextmanager
@@ -20,7 +19,7 @@ def shared_lock(path: Path) -> Iterator[None]:
     Raises:
         StoreError: the lock file cannot be made, or the file system has no locks.
     """
-    with _waited_for(path, fcntl.LOCK_SH):
+    with _waited_for(path, is_shared=True):
         yield
 
 
@@ -31,7 +30,7 @@ def taking_turns(path: Path) -> Iterator[None]:
     Raises:
         StoreError: the lock file cannot be made, or the file system has no locks.
     """
-    with _waited_for(path, fcntl.LOCK_EX):
+    with _waited_for(path, is_shared=False):
         yield
 
 
@@ -46,50 +45,45 @@ def exclusive_lock(path: Path, busy: str) -> Iterator[None]:
     Raises:
         StoreError: somebody holds it, or it cannot be made.
     """
-    descriptor = _open(path)
-    try:
-        if not _lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, path):
+    with _opened(path) as lock:
+        if not _taken(lock, path, is_shared=False, waits=False):
             raise StoreError(busy)
         yield
-    finally:
-        os.close(descriptor)
 
 
 def is_locked(path: Path) -> bool:
     """Whether a living process holds the lock file, shared or alone."""
-    try:
-        descriptor = os.open(path, os.O_RDWR)
-    except FileNotFoundError:
+    if not path.exists():
         return False
-    try:
-        return not _lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, path)
-    finally:
-        os.close(descriptor)
+    with _opened(path) as lock:
+        return not _taken(lock, path, is_shared=False, waits=False)
 
 
 @contextmanager
-def _waited_for(path: Path, operation: int) -> Iterator[None]:
-    descriptor = _open(path)
-    try:
-        _lock(descriptor, operation, path)
+def _waited_for(path: Path, *, is_shared: bool) -> Iterator[None]:
+    with _opened(path) as lock:
+        _taken(lock, path, is_shared=is_shared, waits=True)
         yield
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[FileLock]:
+    with writing_to(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, flags("O_RDWR", "O_CREAT"), 0o666)
+    lock = file_lock(path, descriptor)
+    try:
+        yield lock
     finally:
+        lock.close()
         os.close(descriptor)
 
 
-def _open(path: Path) -> int:
-    with writing_to(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-
-
-def _lock(descriptor: int, mode: int, path: Path) -> bool:
+def _taken(lock: FileLock, path: Path, *, is_shared: bool, waits: bool) -> bool:
     try:
-        fcntl.flock(descriptor, mode)
+        return lock.take(is_shared=is_shared, waits=waits)
     except OSError as error:
-        if error.errno == errno.EWOULDBLOCK:
-            return False
         raise StoreError(
-            f"cannot lock {path}: {error.strerror}; the store must lie on a file system with locks"
+            f"cannot lock {path}: {error.strerror or error}; the store must lie on a file system "
+            "with locks"
         ) from error
-    return True

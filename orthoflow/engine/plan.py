@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -27,6 +26,7 @@ from orthoflow.engine.results import CellResult, ProductRef
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError, PluginError, StoreError
 from orthoflow.products.input_files import InputFiles
+from orthoflow.system import usable_cores
 from orthoflow.workflow import Workflow, check_step_names, resolve_input_files
 from orthoflow.workflow.cells import Cell, CellOutput, Selection, select_cells
 
@@ -83,7 +83,7 @@ class RunOptions:
     @property
     def all_cores(self) -> int:
         """Processors the run may use in all."""
-        return self.cores or len(os.sched_getaffinity(0))
+        return self.cores or usable_cores()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -23,6 +22,7 @@ from orthoflow.engine.clock import now, time_in_a_name
 from orthoflow.engine.durability import sync_folder, writing_to
 from orthoflow.engine.results import CellStatus
 from orthoflow.errors import ArgumentError, DiskSpaceError, RecordError, StoreError
+from orthoflow.system import file_lock, flags
 
 JOURNAL: Final = "journal.jsonl"
 RECORD_FILE: Final = "run.h5"
@@ -135,11 +135,12 @@ class Journal:
         _check_folder(folder)
         with writing_to(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o666)
+            self._descriptor = os.open(self._path, flags("O_RDWR", "O_CREAT"), 0o666)
+        self._lock = file_lock(self._path, self._descriptor)
         try:
             self._begin(name, run_id)
         except BaseException:
-            os.close(self._descriptor)
+            self._close()
             raise
 
     def __enter__(self) -> Self:
@@ -151,6 +152,10 @@ class Journal:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        self._lock.close()
         os.close(self._descriptor)
 
     def write(self, line: JournalLine) -> None:
@@ -169,13 +174,11 @@ class Journal:
             os.fsync(self._descriptor)
 
     def _begin(self, name: str, run_id: str) -> None:
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        if not self._lock.take(is_shared=False, waits=False):
             raise StoreError(
                 f"the run folder {self._folder} is in use by another run; wait for its end, or "
                 f"choose another folder with -o"
-            ) from error
+            )
         lines = self._read_lines()
         if (self._folder / RECORD_FILE).exists():
             self._reopen(lines)

@@ -6,7 +6,6 @@ import dataclasses
 import errno
 import json
 import os
-import resource
 import signal
 import threading
 import time
@@ -49,6 +48,7 @@ from orthoflow.products.product import Product
 from orthoflow.sdk.context import StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
 from orthoflow.sdk.methods import Method
+from orthoflow.system import children_processor_s
 
 # Inputs up to this size are digested again after the run: they must not have changed.
 _CHECKED_BYTES: Final = 16 << 20
@@ -247,10 +247,8 @@ class _Call:
 
     def _cpu_s(self) -> float:
         """Processor seconds of this process and its children, without loading and samples."""
-        children = resource.getrusage(resource.RUSAGE_CHILDREN)
-        children_s = children.ru_utime + children.ru_stime
         others_s = self._meter.processor_s + self._sampler.processor_s
-        return time.process_time() + children_s - others_s
+        return time.process_time() + children_processor_s() - others_s
 
     def _read(self, given: TaskInput) -> Product | InputFiles:
         if given.input_name:

@@ -30,7 +30,6 @@ from orthoflow.engine.executors import Capacity, Executor, InlineExecutor, TaskE
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.interruptions import Interruption, watching_interruptions
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
-from orthoflow.engine.local_executor import LocalExecutor
 from orthoflow.engine.locks import exclusive_lock, is_locked
 from orthoflow.engine.plan import (
     PlannedInput,
@@ -60,6 +59,7 @@ from orthoflow.errors import (
 )
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
+from orthoflow.system import HAS_STEP_PROCESSES
 from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
 
 _POLL_S: Final = 0.25
@@ -170,7 +170,9 @@ def execute(
             executor = _executor(plan, scratch, _passing_on(listen), interruption)
             # Of other executors, one computes in this process, and others on other machines.
             ahead = AheadCompiler(
-                is_wanted=plan.options.executor == "local" and plan.options.all_cores > 1
+                is_wanted=HAS_STEP_PROCESSES
+                and plan.options.executor == "local"
+                and plan.options.all_cores > 1
             )
             run = _Run(tasks, journal, listen, ahead)
             try:
@@ -466,6 +468,11 @@ def _executor(plan: RunPlan, scratch: Path, tell: Tell, interruption: Interrupti
                 "--executor dask needs dask: pip install 'orthoflow-tls[dask]'"
             ) from error
         return DaskExecutor(plan, scratch, capacity, tell)
+    if not HAS_STEP_PROCESSES:
+        # No processes of their own that could be stopped: neither timeouts nor a guard of memory.
+        return InlineExecutor(capacity, tell, lambda: interruption.is_asked)
+    from orthoflow.engine.local_executor import LocalExecutor  # noqa: PLC0415 - of Linux
+
     return LocalExecutor(capacity, tell)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.durability import writing_to
+from orthoflow.system import flags
 
 # Of a long log the end is kept: what went wrong stands last.
 _LOOKS: Final = 10
@@ -30,9 +31,9 @@ class StepLog:
         Raises:
             StoreError: it cannot be written.
         """
-        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_NOFOLLOW
+        opened = flags("O_RDWR", "O_CREAT", "O_TRUNC", "O_APPEND", "O_NOFOLLOW")
         with writing_to(path.parent):
-            self.descriptor = os.open(path, flags, 0o666)
+            self.descriptor = os.open(path, opened, 0o666)
         self._n_dropped = 0
         self._notice = b""
 

@@ -8,6 +8,8 @@ import stat
 from io import BufferedReader, TextIOWrapper
 from pathlib import Path
 
+from orthoflow.system import flags
+
 
 def open_file(path: Path) -> BufferedReader:
     """Open a file for reading, at once.
@@ -15,7 +17,7 @@ def open_file(path: Path) -> BufferedReader:
     Raises:
         OSError: it cannot be read, or is a folder, a pipe or a device.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    descriptor = os.open(path, flags("O_RDONLY", "O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC"))
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return os.fdopen(descriptor, "rb")
     os.close(descriptor)

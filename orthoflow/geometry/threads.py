@@ -8,22 +8,17 @@ from __future__ import annotations
 
 import itertools
 import os
-import resource
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from threading import Thread
 from typing import Final, TypeVar
 
+from orthoflow.system import address_space
+
 _ROOM_FOR_THREADS: Final = 2 << 30
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
-
-
-def address_space() -> int | None:
-    """Bytes of memory that this process may ask for (`ulimit -v`); None without such a limit."""
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return None if limit == resource.RLIM_INFINITY else limit
 
 
 def has_room_for_threads() -> bool:

@@ -10,7 +10,6 @@ in: give a method inputs that no other method computed.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -33,6 +32,7 @@ from orthoflow.errors import InputError
 from orthoflow.products import JsonValue, Product
 from orthoflow.products.product import Payload, Tolerance
 from orthoflow.sdk import Method
+from orthoflow.system import lock_where_possible
 from orthoflow.testing.isolation import INSTRUCTION_SWITCHES
 from orthoflow.testing.trials import Trial
 
@@ -195,14 +195,14 @@ def _read(file: Path) -> dict[str, Golden]:
     if not file.is_file():
         return {}
     with file.open(encoding="utf-8") as stream:
-        fcntl.flock(stream, fcntl.LOCK_SH)
+        lock_where_possible(stream.fileno(), is_shared=True)
         return _parsed(stream.read(), file)
 
 
 def _record(file: Path, method_id: str, golden: Golden) -> None:
     """Put a result into the file, which processes that try other methods change meanwhile."""
     with file.open("a+", encoding="utf-8") as stream:
-        fcntl.flock(stream, fcntl.LOCK_EX)
+        lock_where_possible(stream.fileno(), is_shared=False)
         stream.seek(0)
         known = _parsed(stream.read(), file)
         stream.truncate(0)

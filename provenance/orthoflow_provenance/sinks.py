@@ -33,7 +33,9 @@ class FileSink:
 
     def __init__(self, path: Path) -> None:
         # Through a link it would be another's file that is emptied.
-        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC
+        for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"):
+            flags |= int(getattr(os, name, 0))
         self._descriptor = os.open(path, flags, 0o666)
         self._position = 0
         self._kept: list[tuple[int, bytes]] = []

@@ -1,0 +1,135 @@
+"""The portable twins of what only Linux has: locks, and steps without processes of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from orthoflow import system
+from orthoflow.system import FileLock, file_lock, flags
+
+# Our code finds neither these modules nor these names; libraries may have theirs.
+WITHOUT = """
+import os, sys
+class Forbidden:
+    def find_spec(self, name, path=None, target=None):
+        if name in {"fcntl", "resource"}:
+            frame = sys._getframe(1)
+            while frame and "importlib" in frame.f_globals.get("__name__", ""):
+                frame = frame.f_back
+            if frame and frame.f_globals.get("__name__", "").startswith("orthoflow"):
+                raise ImportError(name)
+for name in ("fcntl", "resource"):
+    sys.modules.pop(name, None)
+sys.meta_path.insert(0, Forbidden())
+for name in ("fork", "killpg", "setsid", "pidfd_open", "sched_getaffinity", "getresuid", "O_PATH"):
+    if hasattr(os, name):
+        delattr(os, name)
+from orthoflow.cli import main
+main()
+"""
+
+WORKFLOW = """
+orthoflow: 1
+name: elsewhere
+steps:
+  cloud: {use: read.scan, in: {files: inputs.scan}}
+inputs:
+  scan: {files: scan.xyz}
+"""
+
+
+def without_linux(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT, *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def test_a_workflow_runs_where_there_are_neither_kernel_locks_nor_forks(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere.yaml").write_text(WORKFLOW)
+    points = [f"{x / 10} {y / 10} {(x * y) % 3 / 100}" for x in range(30) for y in range(30)]
+    (tmp_path / "scan.xyz").write_text("\n".join(points))
+    said = without_linux(tmp_path, "run", "elsewhere.yaml", "-o", "run")
+    assert "0 of 1 step cached" in said
+    # The twin of the locks was used, not the kernel's.
+    assert (tmp_path / "run" / "journal.jsonl.lock").is_file()
+    assert "verified" in without_linux(tmp_path, "verify", "run")
+    again = without_linux(tmp_path, "run", "elsewhere.yaml", "-o", "again")
+    assert "cloud: cached (1 of 1)" in again
+
+
+def locks(path: Path, n: int, monkeypatch: pytest.MonkeyPatch, *, twin: bool) -> list[FileLock]:
+    if twin:
+        monkeypatch.setattr(system, "_fcntl", None)
+    return [file_lock(path, os.open(path, os.O_RDWR | os.O_CREAT)) for _ in range(n)]
+
+
+@pytest.mark.parametrize("twin", [False, True], ids=["kernel", "twin"])
+def test_many_share_a_lock_and_one_holds_it_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, twin: bool
+) -> None:
+    if not twin and system._fcntl is None:
+        pytest.skip("this system has no such locks")
+    path = tmp_path / "store"
+    first, second, third = locks(path, 3, monkeypatch, twin=twin)
+    assert first.take(is_shared=True, waits=False)
+    assert second.take(is_shared=True, waits=False)
+    assert not third.take(is_shared=False, waits=False)
+    if twin:
+        first.close()
+        assert not third.take(is_shared=False, waits=False)
+        second.close()
+        assert third.take(is_shared=False, waits=False)
+        assert not first.take(is_shared=True, waits=False)
+        third.close()
+
+
+def test_the_twin_of_a_dead_process_is_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "store"
+    (mine,) = locks(path, 1, monkeypatch, twin=True)
+    holder = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            textwrap.dedent(
+                f"""
+                import time
+                from pathlib import Path
+                from orthoflow.system import _DatabaseLock
+                lock = _DatabaseLock(Path({str(path)!r}))
+                print(lock.take(is_shared=False, waits=True), flush=True)
+                time.sleep(600)
+                """
+            ),
+        ],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "True\n"
+        assert not mine.take(is_shared=False, waits=False)
+    finally:
+        holder.kill()
+        holder.wait()
+        holder.stdout.close()
+    assert mine.take(is_shared=False, waits=False)
+    mine.close()
+
+
+def test_flags_that_a_system_does_not_know_count_nothing() -> None:
+    assert flags("O_RDWR", "O_CREAT", "O_OF_ANOTHER_PLANET") == os.O_RDWR | os.O_CREAT
