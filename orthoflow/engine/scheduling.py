@@ -26,7 +26,8 @@ from orthoflow.engine.events import (
     RunStarted,
     ignore,
 )
-from orthoflow.engine.executors import Capacity, Executor, InlineExecutor, TaskEnd, Tell
+from orthoflow.engine.executor_choice import executor_of
+from orthoflow.engine.executors import Capacity, Executor, TaskEnd, Tell
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.interruptions import Interruption, watching_interruptions
 from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
@@ -54,7 +55,6 @@ from orthoflow.errors import (
     CancelledStepError,
     ClusterError,
     DamageError,
-    PluginError,
     StoreError,
 )
 from orthoflow.sdk.context import StepEvent
@@ -167,7 +167,9 @@ def execute(
                 logs=folder / LOGS,
                 run_id=journal.run_id,
             )
-            executor = _executor(plan, scratch, _passing_on(listen), interruption)
+            executor = executor_of(
+                plan, scratch, _passing_on(listen), lambda: interruption.is_asked
+            )
             # Of other executors, one computes in this process, and others on other machines.
             ahead = AheadCompiler(
                 is_wanted=HAS_STEP_PROCESSES
@@ -453,27 +455,6 @@ def _with_warning(result: CellResult, text: str) -> CellResult:
 
 def _cores(cell: Cell, capacity: Capacity) -> int:
     return min(cell.cores or capacity.share, capacity.cores_of_one)
-
-
-def _executor(plan: RunPlan, scratch: Path, tell: Tell, interruption: Interruption) -> Executor:
-    options = plan.options
-    capacity = Capacity.of_jobs(options.jobs, options.all_cores)
-    if options.executor == "inline":
-        return InlineExecutor(capacity, tell, lambda: interruption.is_asked)
-    if options.executor == "dask":
-        try:
-            from orthoflow.engine.dask_executor import DaskExecutor  # noqa: PLC0415 - an extra
-        except ImportError as error:
-            raise PluginError(
-                "--executor dask needs dask: pip install 'orthoflow-tls[dask]'"
-            ) from error
-        return DaskExecutor(plan, scratch, capacity, tell)
-    if not HAS_STEP_PROCESSES:
-        # No processes of their own that could be stopped: neither timeouts nor a guard of memory.
-        return InlineExecutor(capacity, tell, lambda: interruption.is_asked)
-    from orthoflow.engine.local_executor import LocalExecutor  # noqa: PLC0415 - of Linux
-
-    return LocalExecutor(capacity, tell)
 
 
 def _passing_on(listen: RunListener) -> Tell:
