@@ -100,8 +100,9 @@ def _may_hold_points(
     high = np.array([target.width, end_row, target.front_m])
     # What is lost by rounding is far less.
     slack = 1e-9 * (np.abs(middles) + halves) + 1e-6
-    meets = (middles + halves >= low - slack) & (middles - halves <= high + slack)
-    found: NDArray[np.bool_] = meets.all(axis=1)
+    # A box with a coordinate that is not a number compares with nothing, and is not left out.
+    is_beside = (middles + halves < low - slack) | (middles - halves > high + slack)
+    found: NDArray[np.bool_] = ~is_beside.any(axis=1)
     return found
 
 

@@ -148,6 +148,15 @@ def test_blocks_beside_a_wall_are_not_read_and_nothing_else_changes(
     assert (found[0]["point"] != NO_POINT).mean() > 0.9
 
 
+def test_a_block_with_a_point_that_is_no_number_is_read() -> None:
+    wall = scenes.upright_wall(shape=(60, 80))
+    cloud = random_cloud(wall, n_points=1_100_000, seed=2)
+    spoilt = replace(cloud, x=cloud.x.copy())
+    spoilt.x[::60_000] = np.nan
+    winners = topmost_points(spoilt, slab_of(wall), threads=2)
+    assert (winners["point"] != NO_POINT).all()
+
+
 def test_only_what_may_lie_in_some_rows_is_read() -> None:
     wall = scenes.upright_wall(shape=(60, 80))
     some = random_cloud(wall, n_points=1_100_000, seed=2)
