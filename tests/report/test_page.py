@@ -190,6 +190,11 @@ def test_nothing_sticks_out_of_the_window(page: Page, width: int) -> None:
 
 def test_the_first_screen_of_a_phone_shows_picture_and_accuracy(page: Page) -> None:
     page.show_as(390, 844)
+    # The contents are folded when the browser has told of the new width.
+    page.evaluate(
+        "new Promise(done => { const look = () => document.querySelector('.contents details').open"
+        " ? setTimeout(look, 20) : done(); look(); })"
+    )
     page.evaluate("scrollTo({top: 0, behavior: 'instant'})")
     bottoms = page.evaluate(
         "['.first img', '.answers div'].map("
