@@ -9,20 +9,20 @@ Of two processes that need a kernel one compiles it, and the other waits and loa
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
 import pickle
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from orthoflow.geometry.kernel_news import tell
+from orthoflow.system import FileLock, file_lock
 
 _DIGEST_BYTES: Final = 32
 # Of an index's files, in their names.
@@ -70,10 +70,10 @@ class KeptKernels(FunctionCache):
         except OSError:
             yield
             return
-        with lock:
-            if not _is_taken(lock):
+        with lock, closing(file_lock(path, lock.fileno())) as held:
+            if not _is_taken(held):
                 tell(f"waiting for another process that compiles {self._py_func.__name__}")
-                _wait_for(lock)
+                _wait_for(held)
                 tell("")
             yield
 
@@ -111,18 +111,15 @@ class _CheckedFiles(IndexDataCacheFile):
             stream.write(content.getvalue())
 
 
-def _is_taken(lock: BinaryIO) -> bool:
+def _is_taken(lock: FileLock) -> bool:
     """Take a lock that nobody has, or where there are none; False when another process has it."""
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+        return lock.take(is_shared=False, waits=False)
     except OSError:
         return True
-    return True
 
 
-def _wait_for(lock: BinaryIO) -> None:
+def _wait_for(lock: FileLock) -> None:
     until = time.monotonic() + _patience.left_s
     while not _is_taken(lock):
         if time.monotonic() > until:
