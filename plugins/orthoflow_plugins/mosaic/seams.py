@@ -54,7 +54,7 @@ from orthoflow_plugins.mosaic.joining import (
 )
 
 # Arrays of more values than this lie in files.
-_IN_MEMORY_MOST: Final = 1 << 27
+_IN_MEMORY_MOST: Final = 1 << 24
 # Of the map of sources: its longest side, its colours, and their share beside the grey.
 _LONGEST_PX: Final = 900
 _COLOURS: Final = {
