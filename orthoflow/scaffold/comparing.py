@@ -12,10 +12,14 @@ from orthoflow.catalog import Catalog
 from orthoflow.sdk import port_specs
 from orthoflow.workflow import shipped_workflow
 
-# The first recipe that has a step of the kind is taken; cells of 2 cm let it run in seconds.
+# The first recipe that has a step of the kind is taken; coarse cells of one wall let it run in
+# seconds, and without a warning.
 _RECIPES: Final = ("direct", "quickstart")
 _COARSE: Final = {
-    "direct": {"simulate.room": {"scan_step_m": 0.02}, "raster.grid": {"gsd_m": 0.02}}
+    "direct": {
+        "simulate.room": {"scan_step_m": 0.02},
+        "raster.grid": {"gsd_m": 0.06, "n_walls_max": 1},
+    }
 }
 
 
