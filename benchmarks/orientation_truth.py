@@ -87,6 +87,7 @@ def room(seed: int, gap: str, chosen: argparse.Namespace) -> tuple[Photos, Walls
             "spectral_gap": gap,
             "spectral_inversion_share": getattr(chosen, "inverted", None),
             "textile_share": 0.33,
+            "decoration": getattr(chosen, "decoration", "designed"),
         }
     )
     built = SimulateRoom().run(SimulateRoom.In(), params, context(seed))

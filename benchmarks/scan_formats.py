@@ -176,19 +176,22 @@ def main() -> None:
                     rastered = RasterGrid.In(cloud=cloud, planes=planes)
                     walls = RasterGrid().run(rastered, rule, context(1)).walls
                     score = scores.setdefault((name, gsd_m), Score())
-                    judge(score, walls, room, views)
+                    judge(score, (walls, cloud), room, views)
                     print(f"{seed} {name:14s} {1000 * gsd_m:3.0f} mm {score.row()}", flush=True)
     print(f"\n{'':23s} {titles}")
     for (name, gsd_m), score in scores.items():
         print(f"{name:14s} {1000 * gsd_m:3.0f} mm   {score.row()}")
 
 
-def judge(score: Score, walls: Walls, room: SimulateRoom.Out, views: SceneCameras) -> None:
-    """Add what the photos of a room give on a raster."""
+def judge(
+    score: Score, seen: tuple[Walls, PointCloud], room: SimulateRoom.Out, views: SceneCameras
+) -> None:
+    """Add what the photos of a room give on a raster of a cloud."""
+    walls, cloud = seen
     cameras = room.truth.cameras
     if cameras is None:
         raise SystemExit("the room has no photos")
-    matching = MatchGuided.In(photos=room.photos, walls=walls, cameras=cameras)
+    matching = MatchGuided.In(photos=room.photos, walls=walls, cameras=cameras, cloud=cloud)
     ties = MatchGuided().run(matching, MatchGuided.Params(), context(1)).ties
     if not len(ties.photo):
         return

@@ -55,7 +55,7 @@ def _metrics(patch: Path, centre: list[float], runs: Path, gsd_m: float) -> dict
     run = runs / patch.stem
     survey = runs / f"{patch.stem}.csv"
     survey.write_text("name,x,y,z\n" + ",".join([patch.stem, *map(repr, centre)]) + "\n")
-    normal, offset_m = _plane(np.loadtxt(patch, comments="//", usecols=(0, 1, 2)))
+    normal, offset_m = paper_plane(np.loadtxt(patch, comments="//", usecols=(0, 1, 2)))
     inputs = ["--input", f"scan={patch}", "--input", f"checkpoints={survey}"]
     inputs += ["--set", f"plane.normal={normal.tolist()}", "--set", f"plane.offset_m={offset_m}"]
     # A new store each time: nothing of an earlier run is taken.
@@ -69,7 +69,7 @@ def _metrics(patch: Path, centre: list[float], runs: Path, gsd_m: float) -> dict
     return {row["metric"]: float(row["value"]) for row in rows}
 
 
-def _plane(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def paper_plane(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Normal towards the scanner at the origin, and offset, of the paper alone, not its holder."""
     near = np.ones(len(points), dtype=np.bool_)
     for _ in range(10):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -17,7 +18,7 @@ from orthoflow.geometry.depth_buffer_kernels import (
     splat_points,
 )
 from orthoflow.geometry.point_kernels import Offsets, read_only
-from orthoflow.geometry.slabs import OffsetPoints
+from orthoflow.geometry.slabs import OffsetPoints, Slab
 from orthoflow.geometry.threads import even_parts, in_threads
 
 _LONGEST_SIDE_PX: Final = 2048
@@ -61,6 +62,36 @@ class Occluders:
     around: VoxelGrid
     n_least: int
     threads: int
+
+
+def occluders_before(
+    cloud: OffsetPoints,
+    slabs: Sequence[Slab],
+    cameras: Sequence[ViewingCamera],
+    *,
+    spacing_m: float,
+    stations_world: NDArray[np.float64] | None,
+    n_least: int,
+    threads: int,
+) -> Occluders:
+    """Count the points between cameras and walls, to know outliers and the gaps between points.
+
+    Args:
+        cloud: the whole cloud.
+        slabs: of the walls; nothing beyond the box about them and the cameras can hide them.
+        cameras: all of them.
+        spacing_m: between neighbouring points of a wall, about.
+        stations_world: (s, 3) metres, where scanners stood, if that is known.
+        n_least: see `Occluders`.
+        threads: see `Occluders`.
+    """
+    places = [camera.centre_world for camera in cameras]
+    for slab in slabs:
+        corners = slab.frame.corners_world()
+        places += [*(corners + slab.front_m * slab.frame.normal_world), *corners]
+    between = np.array(places) - cloud.origin
+    box = Box(low=between.min(axis=0), high=between.max(axis=0), spacing_m=spacing_m)
+    return occluders_in(cloud, box, stations_world, n_least=n_least, threads=threads)
 
 
 def occluders_in(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products.planes import plane_name
@@ -161,6 +163,17 @@ class Walls(Product):
             return np.full(len(points_world), -1, dtype=np.int32)
         distances_m = [wall.frame.distances_m(points_world) for wall in self.walls]
         return np.asarray(np.argmin(distances_m, axis=0), dtype=np.int32)
+
+    def spacing_m(self) -> float:
+        """The coarser of the finest raster's cells and the points' spacing on it, about."""
+        wall = min(self.walls, key=lambda wall: wall.frame.gsd_m)
+        n_known = n_points = 0
+        for rows in row_bands(wall.depth_m.shape):
+            known = np.isfinite(wall.depth_m[rows])
+            n_known += int(np.count_nonzero(known))
+            n_points += int(wall.count[rows].sum(where=known, dtype=np.int64))
+        density = n_points / n_known if n_known else 1.0
+        return wall.frame.gsd_m / math.sqrt(min(1.0, max(density, 0.1)))
 
     @classmethod
     def upgraded(cls, payload: Payload) -> Payload:

@@ -38,7 +38,13 @@ def orthoflow_kinds() -> list[KindSpec]:
         KindSpec(
             name="match",
             summary="find points of the photos on the walls",
-            inputs={"photos": "photos", "walls": "walls", "cameras": "cameras", "hand": "ties"},
+            inputs={
+                "photos": "photos",
+                "walls": "walls",
+                "cameras": "cameras",
+                "cloud": "cloud",
+                "hand": "ties",
+            },
             outputs={"ties": "ties"},
         ),
         KindSpec(

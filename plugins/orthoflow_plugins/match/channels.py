@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry.key_points import in_turns
 from orthoflow.products import Wall
-from orthoflow_plugins.match.pictures import filled_smoothly
+from orthoflow_plugins.match.pictures import filled_smoothly, usual_spread_m
 
 _N_DIRECTIONS: Final = 6
 _NOISE_SIGMA_CELLS: Final = 0.8
@@ -27,6 +27,15 @@ _POOL_SIGMA_CELLS: Final = 0.8
 _EVEN_SIGMA_CELLS: Final = 12.0
 _BROAD_STEP: Final = 4
 _MARGIN_CELLS: Final = 2
+# Depths about a cell that differ by more than this many cells and spreads of a point are a step of
+# the relief; nine depths of an even surface differ by three spreads, seldom by five.
+_STEP_CELLS: Final = 1.0
+_STEP_SPREADS: Final = 6.0
+# Of so many cells in a line along the shadow of a step, more than so many are empty.
+_LINE_CELLS: Final = 9
+_LINE_SHARE: Final = 0.5
+# Depth that stands for none, beyond all walls.
+_FAR_M: Final = np.float32(1e6)
 # Places with texture lie so far apart, and are taken in turns from a grid of so many cells a side.
 _APART_CELLS: Final = 5
 _GRID: Final = 16
@@ -130,8 +139,31 @@ def target_of(wall: Wall) -> WallTarget:
     """Prepare a wall for matching."""
     if wall.intensity is None:
         return WallTarget(wall=wall, grey=None)
-    grey = np.where(np.isfinite(wall.depth_m), wall.intensity, np.nan).astype(np.float32)
-    return WallTarget(wall=wall, grey=grey)
+    known = np.isfinite(wall.depth_m) & ~_filled_at_steps(wall)
+    return WallTarget(wall=wall, grey=np.where(known, wall.intensity, np.nan).astype(np.float32))
+
+
+def _filled_at_steps(wall: Wall) -> NDArray[np.bool_]:
+    """Cells (rows, cols) without points beside a step of the relief.
+
+    They lie in the scan's shadow of the step, where the surface and what is painted on it end
+    nobody knows, and what fills them puts an edge of the picture there, off by part of a cell.
+    """
+    import cv2
+
+    empty = wall.count == 0
+    # A shadow is a line of cells; single cells that no point fell into are filled well enough.
+    lines = [(1, _LINE_CELLS), (_LINE_CELLS, 1)]
+    shares = [cv2.blur(empty.astype(np.float32), line) for line in lines]
+    empty &= np.maximum(*shares) > _LINE_SHARE
+    if not empty.any():
+        return np.asarray(empty, dtype=np.bool_)
+    known = np.isfinite(wall.depth_m)
+    kernel = np.ones((3, 3), dtype=np.uint8)
+    high = cv2.dilate(np.where(known, wall.depth_m, -_FAR_M), kernel)
+    low = cv2.erode(np.where(known, wall.depth_m, _FAR_M), kernel)
+    step_m = max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * usual_spread_m(wall))
+    return np.asarray(empty & (high - low > step_m), dtype=np.bool_)
 
 
 def grain_of(wall: Wall, half_patch_cells: int) -> NDArray[np.float32]:

@@ -25,8 +25,8 @@ from orthoflow_plugins.match.patch_kernels import (
 
 # Patches of which less is known than this say nothing.
 _KNOWN_LEAST: Final = 0.6
-# Neighbouring residuals of smoothed pictures agree: independent ones are this much fewer.
-_CORRELATION_AREA_CELLS: Final = 6.0
+CORRELATION_AREA_CELLS: Final = 6.0
+"""Neighbouring residuals of smoothed pictures agree: independent ones are this much fewer."""
 _DRIFT_MOST_CELLS: Final = 1.5
 _DISAGREEMENT_MOST_CELLS: Final = 0.5
 # About patches that are cut out: as far as they drift, and what interpolates there.
@@ -219,7 +219,7 @@ def _matched(
             for rooms in [tuple(np.empty(shape) for shape in shapes)]
         ]
     )
-    sigma = math.sqrt(_CORRELATION_AREA_CELLS) * found[:, 2]
+    sigma = math.sqrt(CORRELATION_AREA_CELLS) * found[:, 2]
     return _Matched(shifts=found[:, :2].copy(), sigma=sigma, score=found[:, 3].copy())
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Camera, Cameras, JsonValue, Photos, Ties, Walls
+from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
@@ -25,6 +25,10 @@ from orthoflow_plugins.match.tie_pieces import TiePiece, ties_of
 
 if TYPE_CHECKING:
     from orthoflow_plugins.match.tracing import Trace, TracingRule
+    from orthoflow_plugins.match.warping import Before
+
+# Points of the cloud with fewer about them are outliers and hide nothing, as in `ortho`.
+_POINTS_LEAST = 6
 
 
 class MatchGuided(Method):
@@ -32,13 +36,14 @@ class MatchGuided(Method):
 
     Only what the photo shows of a wall is searched, within a small radius (the mask of
     markiewicz2015 taken to its end), in oriented gradients and in mixtures of the photo's colours,
-    which survive that a laser sees another colour than a camera. The pose is refitted and the photo
+    which survive that a laser sees another colour than a camera. With the cloud wired, patches keep
+    off what stands free before the walls. The pose is refitted and the photo
     warped again until held-out ties stop improving. Photos without a pose are looked for on what
     the others show of the walls, then traced like these; those not found there give no ties.
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 6
+    result_version: ClassVar[int] = 7
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",
@@ -117,11 +122,12 @@ class MatchGuided(Method):
             return with_paper_ratio(given)
 
     class In(Ports):
-        """Photos, the walls, where the photos were taken, roughly, and ties measured by hand."""
+        """Photos, the walls, where the photos were taken, roughly, the cloud, ties by hand."""
 
         photos: Photos
         walls: Walls
         cameras: Cameras
+        cloud: PointCloud | None = None
         hand: Ties | None = None
 
     class Out(Ports):
@@ -137,6 +143,8 @@ class MatchGuided(Method):
 
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
+        if inputs.cloud is not None:
+            inputs.cloud.require_points(3)
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
         if alone is not None:
             return self.Out(ties=alone)
@@ -148,11 +156,12 @@ class MatchGuided(Method):
         targets = [target_of(wall) for wall in walls.walls]
         indices = [k for k, photo in enumerate(photos.photos) if photo.name in oriented]
         rule = _rule(params, max(1, ctx.cores // len(indices)))
+        before = _before(inputs, [oriented[photos.photos[k].name] for k in indices])
 
         def trace(index: int) -> Trace:
             photo = photos.photos[index]
             camera = oriented[photo.name].viewing()
-            return trace_photo(index, photo, camera, targets, rule)
+            return trace_photo(index, photo, camera, targets, rule, before)
 
         pieces: list[TiePiece] = []
         traces: dict[str, Trace] = {}
@@ -166,7 +175,9 @@ class MatchGuided(Method):
             if not any(len(piece) for piece in found.pieces):
                 ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
         if params.finds_missing:
-            recovered = recovered_traces(photos, oriented, targets, list(traces.values()), rule)
+            recovered = recovered_traces(
+                photos, oriented, targets, list(traces.values()), rule, before
+            )
             for name, found in recovered.items():
                 ctx.log(f"photo {name}: found by what other photos show of the walls")
                 traces[name] = found
@@ -224,6 +235,28 @@ def _oriented(cameras: Cameras) -> dict[str, Camera]:
             + (f" ({reasons})" if reasons else "")
         )
     return oriented
+
+
+def _before(inputs: MatchGuided.In, cameras: list[Camera]) -> Before | None:
+    """What stands free before the walls, where the cloud is wired."""
+    from orthoflow.geometry.occluders import occluders_before
+    from orthoflow_plugins.match.warping import Before
+
+    cloud, walls = inputs.cloud, inputs.walls
+    if cloud is None or not walls.walls:
+        return None
+    slabs = [walls.slab(index) for index in range(len(walls.walls))]
+    occluders = occluders_before(
+        cloud,
+        slabs,
+        [camera.viewing() for camera in cameras],
+        spacing_m=walls.spacing_m(),
+        stations_world=cloud.stations,
+        n_least=_POINTS_LEAST,
+        # Photos share the processors already.
+        threads=1,
+    )
+    return Before(occluders=occluders, front_m=tuple(slab.front_m for slab in slabs))
 
 
 def _rule(params: MatchGuided.Params, threads: int) -> TracingRule:

@@ -8,7 +8,7 @@ beforehand: the one is taken in which most key points agree.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -56,7 +56,11 @@ def pair_in_colours(
     if best.n_recognised >= _CLEARLY:
         return best
     smaller = replace(rule, longest_side_px=min(rule.longest_side_px, _LONGEST_SIDE_PX))
-    for name, picture in _mixed(photo_rgb(photo)):
+    rgb = photo_rgb(photo)
+    for name in MIXTURES:
+        picture = mixed(rgb, name)
+        if picture is None:
+            continue
         tried = pair_photo(picture, walls, smaller)
         if not tried.is_mirrored and tried.n_recognised >= max(LEAST, best.n_recognised + 1):
             best = replace(tried, picture=name)
@@ -65,11 +69,16 @@ def pair_in_colours(
     return best
 
 
-def _mixed(rgb: NDArray[np.uint8]) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """Mixtures that show anything, by name, stretched to all grey levels."""
-    for name, weights in MIXTURES.items():
-        mixture = rgb.astype(np.float32) @ np.array(weights, dtype=np.float32)
-        low, high = np.percentile(mixture[::4, ::4], (0.5, 99.5))
-        if high - low >= _GREY_LEVELS_LEAST:
-            stretched = (mixture - np.float32(low)) * np.float32(255.0 / (high - low))
-            yield name, np.rint(np.clip(stretched, 0.0, 255.0)).astype(np.uint8)
+def mixed(rgb: NDArray[np.uint8], name: str) -> NDArray[np.uint8] | None:
+    """Mix a photo's colours, stretched to all grey levels; None for what shows nothing.
+
+    Args:
+        rgb: (height, width, 3).
+        name: of a mixture.
+    """
+    mixture = rgb.astype(np.float32) @ np.array(MIXTURES[name], dtype=np.float32)
+    low, high = np.percentile(mixture[::4, ::4], (0.5, 99.5))
+    if high - low < _GREY_LEVELS_LEAST:
+        return None
+    stretched = (mixture - np.float32(low)) * np.float32(255.0 / (high - low))
+    return np.asarray(np.rint(np.clip(stretched, 0.0, 255.0)), dtype=np.uint8)

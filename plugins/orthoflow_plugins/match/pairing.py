@@ -342,7 +342,7 @@ def _verified(
         homography = _homography(source, target, matches.ratio, loose_px)
     if homography is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            agreeing = np.hypot(*(_mapped(homography, source) - target).T) < loose_px
+            agreeing = np.hypot(*(mapped(homography, source) - target).T) < loose_px
     # Many key points of a texture may fall on one place of the other image: count places.
     n_places = min(_n_places(source[agreeing], 2.0), _n_places(target[agreeing], 2.0))
     if (
@@ -366,7 +366,7 @@ def _completed(
         if pair.homography is None or wall is None:
             completed.append(pair)
             continue
-        expected = _mapped(pair.homography, wall.pixels)
+        expected = mapped(pair.homography, wall.pixels)
         matches = rematched(
             pair.matches,
             (pairs.features, wall),
@@ -404,16 +404,17 @@ def _homography(
     return matrix
 
 
-def _mapped(homography: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+def mapped(homography: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Map pixels (n, 2) by a homography."""
     lifted = np.column_stack([pixels, np.ones(len(pixels))]) @ homography.T
-    mapped: NDArray[np.float64] = lifted[:, :2] / lifted[:, 2:]
-    return mapped
+    on_other: NDArray[np.float64] = lifted[:, :2] / lifted[:, 2:]
+    return on_other
 
 
 def _is_from_the_front(homography: NDArray[np.float64], at: NDArray[np.float64]) -> bool:
     """Whether the wall keeps its sense of rotation in the photo; from behind it is mirrored."""
-    here = _mapped(homography, at[None])[0]
-    right, down = _mapped(homography, at + np.eye(2)) - here
+    here = mapped(homography, at[None])[0]
+    right, down = mapped(homography, at + np.eye(2)) - here
     return bool(right[0] * down[1] - right[1] * down[0] > 0.0)
 
 

@@ -113,7 +113,7 @@ def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
     known = np.isfinite(values)
     result = np.where(known, values, 0.0).astype(np.float32)
     weight = known.astype(np.float32)
-    if known.all() or min(values.shape) < 2:
+    if known.all() or max(values.shape) < 2:
         return result
     size = (values.shape[1], values.shape[0])
     half = ((size[0] + 1) // 2, (size[1] + 1) // 2)
@@ -121,8 +121,7 @@ def filled_smoothly(values: NDArray[np.floating]) -> NDArray[np.float32]:
     small = cv2.resize(result * weight, half, interpolation=cv2.INTER_AREA)
     with np.errstate(divide="ignore", invalid="ignore"):
         coarse = np.where(small_weight > 0.0, small / small_weight, np.nan)
-    coarse = filled_smoothly(coarse) if min(half) >= 2 else np.nan_to_num(coarse)
-    grown = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
+    grown = cv2.resize(filled_smoothly(coarse), size, interpolation=cv2.INTER_LINEAR)
     return np.where(known, result, grown).astype(np.float32)
 
 
@@ -211,7 +210,7 @@ def _sigma_m(
     gsd_m = wall.frame.gsd_m
     count = np.maximum(wall.count[cell].astype(np.float64), 1.0)
     spread = wall.sigma_m[cell].astype(np.float64)
-    usual = _usual_spread_m(wall)
+    usual = usual_spread_m(wall)
     spread = np.where(np.isfinite(spread) & (count > 1.0), spread, usual)
     # A cell's depth is a mean or median of its points, and its content lies anywhere in the cell.
     noise = np.maximum(spread / np.sqrt(count), 0.3 * usual)
@@ -221,7 +220,7 @@ def _sigma_m(
     return sigma
 
 
-def _usual_spread_m(wall: Wall) -> float:
+def usual_spread_m(wall: Wall) -> float:
     """Spread of the points of a cell, median over cells that lie on an even surface.
 
     Where points lie farther apart than cells are wide, most cells with several points are those on

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Photo, Wall
 from orthoflow_plugins.match.channels import Channels
@@ -43,6 +44,9 @@ _SCORE_LEAST: Final = 0.3
 _DISTINCT_LEAST: Final = 0.03
 # Ties of a round, to go on with the pose that they give.
 _FIT_LEAST: Final = 8
+# Ties of a place that photos beside it may confirm.
+_TIES_FEW: Final = 20
+_SHARE_FEW: Final = 0.05
 # At wrong places in simulated rooms at most 0.13 of all patches agreed, at a lead of 5.2 and less;
 # at right ones at least 0.08, mostly, and leads were 5 to 11.
 _LEAD_LEAST: Final = 5.5
@@ -53,23 +57,36 @@ _OVER_NEXT: Final = 1.5
 _SIGMA_CELLS: Final = 0.5
 # The focal length of a photo of whose lens nothing is known, over its longer side.
 _USUAL_FOCAL: Final = 0.8
+# How far focal lengths may be off (of ln f): by EXIF, and where nothing is known.
+_EXIF_SIGMA: Final = 0.05
+_UNKNOWN_SIGMA: Final = 0.3
+# Quarter turns, anticlockwise, that bring a photo upright, by EXIF's orientation.
+_QUARTERS: Final = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
+_OTHERWISE: Final = (1, 3, 2)
 # Two poses whose photo centres lie nearer on the wall are one place, as a share of the width.
 _SAME_SHARE: Final = 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Placed:
-    """Where a photo was found.
+    """Where a photo may be.
 
     Attributes:
         piece: its ties.
+        camera: its pose by them.
+        lead: by how many robust deviations the place stands out from others, before patches were
+            brought together there.
         share: of the patches that the wall shows, how many agree.
         radius_px: patches were searched so far, in the photo's pixels.
+        is_clear: no other place comes near it.
     """
 
     piece: TiePiece
+    camera: ViewingCamera
+    lead: float
     share: float
     radius_px: float
+    is_clear: bool = False
 
 
 @dataclass(kw_only=True)
@@ -88,43 +105,76 @@ class PlacedWalls:
             return self._ready
 
 
-def placed_photo(index: int, photo: Photo, walls: PlacedWalls) -> Placed | None:
-    """Place a photo on the walls; None where none shows it beyond doubt.
+def places_of(index: int, photo: Photo, walls: PlacedWalls) -> list[Placed]:
+    """Give the places on the walls where a photo may be, the best first.
+
+    Only the first may be clear. A photo of which no EXIF says how it was held is tried in all four
+    ways, unless a clear place is found before.
 
     Args:
         index: of the photo.
-        photo: the photo, roughly upright.
+        photo: the photo.
         walls: the walls.
     """
     rgb = photo_rgb(photo)
-    places = [
+    upright = _QUARTERS.get(photo.exif_orientation, 0)
+    is_told = photo.exif_orientation != 1 or photo.exif_focal_px is not None
+    best: list[Placed] = []
+    for turn in (0,) if is_told else (0, *_OTHERWISE):
+        found = _places_turned((index, photo, rgb), walls, (upright + turn) % 4)
+        if not best or (found and found[0].share > best[0].share):
+            best = found
+        if best and best[0].is_clear:
+            break
+    return best
+
+
+def _places_turned(
+    shot: tuple[int, Photo, NDArray[np.uint8]], walls: PlacedWalls, quarters: int
+) -> list[Placed]:
+    """Places of a photo that stands upright when turned by so many quarters, anticlockwise."""
+    index, photo, rgb = shot
+    turned = np.ascontiguousarray(np.rot90(rgb, quarters))
+    likely = [
         (at, structure, place)
         for at, structure in enumerate(walls.structures())
         if structure is not None
-        for place in likely_places(rgb, structure, n_most=_PLACES)
+        for place in likely_places(turned, structure, n_most=_PLACES)
     ]
-    lens = _lens_before(photo)
-    found: list[tuple[float, Placed]] = []
-    for at, structure, place in sorted(places, key=lambda each: -each[2].lead)[:_PLACES]:
-        camera = _camera_at(place, structure.wall, lens)
-        placed = None if camera is None else _tied((index, at), rgb, camera, structure)
-        if placed is not None:
-            found.append((place.lead, placed))
+    found: list[Placed] = []
+    for at, structure, place in sorted(likely, key=lambda each: -each[2].lead)[:_PLACES]:
+        lens, freedom = _lens_before(photo)
+        camera = _camera_at(place, structure.wall, lens, quarters)
+        if camera is not None:
+            placed = _tied((index, at), rgb, (camera, freedom), structure)
+            if placed is not None:
+                found.append(replace(placed, lead=place.lead))
+    found.sort(key=lambda each: -each.share)
+    found = [
+        each
+        for nth, each in enumerate(found)
+        if len(each.piece) >= _TIES_FEW
+        and each.share >= _SHARE_FEW
+        and not any(_is_same(each.piece, other.piece) for other in found[:nth])
+    ]
     if not found:
-        return None
-    lead, best = max(found, key=lambda each: each[1].share)
-    rivals = [placed.share for _, placed in found if not _is_same(best.piece, placed.piece)]
-    is_clear = all(best.share >= _OVER_NEXT * share for share in rivals)
-    is_enough = len(best.piece) >= _TIES_LEAST and best.share >= _SHARE_LEAST
-    return best if is_clear and is_enough and lead >= _LEAD_LEAST else None
+        return []
+    best = found[0]
+    is_clear = (
+        all(best.share >= _OVER_NEXT * other.share for other in found[1:])
+        and len(best.piece) >= _TIES_LEAST
+        and best.share >= _SHARE_LEAST
+        and best.lead >= _LEAD_LEAST
+    )
+    return [replace(best, is_clear=is_clear), *found[1:]]
 
 
-def _lens_before(photo: Photo) -> ViewingCamera:
+def _lens_before(photo: Photo) -> tuple[ViewingCamera, LensFreedom]:
     """A photo's lens, as far as it is known before any orientation, at the origin."""
     if photo.intrinsics is not None:
-        return photo.intrinsics.posed()
+        return photo.intrinsics.posed(), LensFreedom()
     focal_px = photo.exif_focal_px or _USUAL_FOCAL * max(photo.width, photo.height)
-    return ViewingCamera(
+    lens = ViewingCamera(
         width=photo.width,
         height=photo.height,
         fx=focal_px,
@@ -135,30 +185,42 @@ def _lens_before(photo: Photo) -> ViewingCamera:
         rotation=np.eye(3),
         translation=np.zeros(3),
     )
+    sigma = _UNKNOWN_SIGMA if photo.exif_focal_px is None else _EXIF_SIGMA
+    return lens, LensFreedom(focal_sigma=sigma)
 
 
-def _camera_at(place: Place, wall: Wall, lens: ViewingCamera) -> ViewingCamera | None:
+def _camera_at(
+    place: Place, wall: Wall, lens: ViewingCamera, quarters: int
+) -> ViewingCamera | None:
     """Pose by the places of the photo's parts, from straight before the wall."""
     frame = wall.frame
+    right, down = frame.u_world, frame.v_world
+    x, y = place.parts_photo.T
+    axes, parts = (
+        ((right, down), (x, y)),
+        ((-down, right), (1.0 - y, x)),
+        ((-right, -down), (1.0 - x, 1.0 - y)),
+        ((down, -right), (y, 1.0 - x)),
+    )[quarters]
     # Right, down and into the wall.
-    rotation = np.array([frame.u_world, frame.v_world, -frame.normal_world])
-    ahead_m = place.width_m * lens.fx / lens.width
+    rotation = np.array([*axes, -frame.normal_world])
+    px_per_m = (lens.height if quarters % 2 else lens.width) / place.width_m
     # Around the wall: survey coordinates would cost digits.
     origin = frame.origin_world
     middle = frame.world_from_wall(place.centre_m[None] / frame.gsd_m)[0] - origin
     start = replace(
         lens,
         rotation=rotation,
-        translation=-rotation @ (middle + ahead_m * frame.normal_world),
+        translation=-rotation @ (middle + lens.fx / px_per_m * frame.normal_world),
     )
     pixels = place.parts_m / frame.gsd_m
     lifted = points_on_wall(wall, pixels)
     # On the plane where the wall is void.
     points = np.where(lifted.known[:, None], lifted.points_world, frame.world_from_wall(pixels))
     seen = SeenPoints(
-        pixels_photo=place.parts_photo * [lens.width, lens.height],
+        pixels_photo=np.column_stack(parts) * [lens.width, lens.height],
         points_world=points - origin,
-        sigma_px=np.full(len(points), frame.gsd_m * lens.width / place.width_m),
+        sigma_px=np.full(len(points), frame.gsd_m * px_per_m),
         sigma_m=np.full(len(points), frame.gsd_m),
     )
     try:
@@ -168,10 +230,15 @@ def _camera_at(place: Place, wall: Wall, lens: ViewingCamera) -> ViewingCamera |
 
 
 def _tied(
-    at: tuple[int, int], rgb: NDArray[np.uint8], camera: ViewingCamera, structure: WallStructure
+    at: tuple[int, int],
+    rgb: NDArray[np.uint8],
+    start: tuple[ViewingCamera, LensFreedom],
+    structure: WallStructure,
 ) -> Placed | None:
     """Ties of a photo with a wall, its pose improved round by round."""
     wall, origin = structure.wall, structure.wall.frame.origin_world
+    camera, freedom = start
+    prior = camera
     placed: Placed | None = None
     for radius in _RADII:
         projection = project_walls(camera, [wall])[0]
@@ -184,11 +251,6 @@ def _tied(
         piece = _piece(at, wall, moved, projection)
         if len(piece) < _FIT_LEAST:
             return None
-        placed = Placed(
-            piece=piece,
-            share=len(piece) * _APART_CELLS**2 / float((own.known * other.known).sum()),
-            radius_px=_RADII[0] * projection.pixels_per_cell,
-        )
         seen = SeenPoints(
             pixels_photo=piece.pixels_photo,
             points_world=piece.points_world - origin,
@@ -196,9 +258,17 @@ def _tied(
             sigma_m=piece.sigma_m,
         )
         try:
-            camera = fitted_pose(seen, camera.shifted(origin)).shifted(-origin)
+            around = camera.shifted(origin)
+            camera = fitted_pose(seen, around, lens=(freedom, prior)).shifted(-origin)
         except GeometryError:
             return None
+        placed = Placed(
+            piece=piece,
+            camera=camera,
+            lead=0.0,
+            share=len(piece) * _APART_CELLS**2 / float((own.known * other.known).sum()),
+            radius_px=_RADII[0] * projection.pixels_per_cell,
+        )
     return placed
 
 

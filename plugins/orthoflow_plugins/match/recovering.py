@@ -24,6 +24,7 @@ from orthoflow_plugins.match.pairing import USUAL_RULE, PhotoPairs, pair_photo, 
 from orthoflow_plugins.match.pictures import photo_grey
 from orthoflow_plugins.match.tie_pieces import key_point_ties
 from orthoflow_plugins.match.tracing import Trace, TracingRule, trace_photo
+from orthoflow_plugins.match.warping import Before
 
 # Two photos of one wall share hundreds of key points; fewer than so many may be a repeated motif.
 _AGREEING_LEAST: Final = 24
@@ -51,6 +52,7 @@ def recovered_traces(
     targets: Sequence[WallTarget],
     traces: Sequence[Trace],
     rule: TracingRule,
+    before: Before | None = None,
 ) -> dict[str, Trace]:
     """Trace photos without a pose from the one that the traced photos give them.
 
@@ -60,6 +62,7 @@ def recovered_traces(
         targets: the walls.
         traces: of the oriented photos.
         rule: how photos are traced.
+        before: what stands free before the walls, as far as it is known.
 
     Returns:
         By name, for each photo that was found.
@@ -71,14 +74,16 @@ def recovered_traces(
     while is_new and missing:
         # What was found shows more of the walls, for the next round.
         painted = painted_walls([*known, *recovered.values()], [t.wall for t in targets])
-        before = len(recovered)
+        n_before = len(recovered)
         for index in missing:
             photo = photos.photos[index]
-            found = _recovered(index, photo, painted, lens_of(photo, oriented), (targets, rule))
+            found = _recovered(
+                index, photo, painted, lens_of(photo, oriented), (targets, rule, before)
+            )
             if found is not None:
                 recovered[photo.name] = found
         missing = [k for k in missing if photos.photos[k].name not in recovered]
-        is_new = len(recovered) > before
+        is_new = len(recovered) > n_before
     return recovered
 
 
@@ -87,7 +92,7 @@ def _recovered(
     photo: Photo,
     painted: Sequence[PaintedWall],
     lens: ViewingCamera | None,
-    how: tuple[Sequence[WallTarget], TracingRule],
+    how: tuple[Sequence[WallTarget], TracingRule, Before | None],
 ) -> Trace | None:
     if lens is None:
         return None

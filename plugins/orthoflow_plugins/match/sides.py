@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import ClassVar, Final
 
 import numpy as np
@@ -12,13 +14,22 @@ from pydantic import Field
 
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame, frame_over
 from orthoflow.geometry.slabs import Slab
-from orthoflow.products import Photos, Planes, PointCloud, SideSource, SurfaceMask, Wall
+from orthoflow.products import (
+    Photo,
+    Photos,
+    Planes,
+    PointCloud,
+    SideSource,
+    SurfaceMask,
+    Wall,
+)
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import Features
+from orthoflow_plugins.match.mixtures import MIXTURES, mixed
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import USUAL_RULE, side_matches, wall_features
-from orthoflow_plugins.match.pictures import filled_smoothly, photo_grey, require_photos
+from orthoflow_plugins.match.pictures import filled_smoothly, photo_grey, photo_rgb, require_photos
 
 # Key points need cells as fine as the points lie; what is between them is filled from around. A
 # wall is no larger than key points are found on at once.
@@ -34,12 +45,13 @@ class FaceByPhotos(Method):
 
     A wall seen from behind is a mirror image of what photos show. Where no scanner station says
     from which side a plane was seen, the cloud is laid on it roughly, and photos are matched with
-    that picture as they are and mirrored; the side on which clearly more matches agree is taken.
+    that picture as they are and mirrored, in mixtures of their colours where grey says nothing of
+    any plane; the side on which clearly more matches agree is taken.
     Planes whose side is known are left as they are, and cost nothing; so are floors and ceilings.
     """
 
     id: ClassVar[str] = "face.photos"
-    result_version: ClassVar[int] = 1
+    result_version: ClassVar[int] = 2
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_planes_guessed",
@@ -90,21 +102,11 @@ class FaceByPhotos(Method):
             ctx.metric("n_planes_turned", 0, "1")
             return self.Out(planes=planes)
         pictures = [_features(planes, index, cloud, ctx.cores) for index in asked]
-        counts = np.zeros((len(asked), 2), dtype=np.intp)
-        found = one_by_one(
-            lambda photo: side_matches(photo_grey(photo), pictures, USUAL_RULE),
-            inputs.photos.photos,
-            ctx.cores,
-        )
-        for nth, matches in enumerate(found):
-            ctx.progress((nth + 1) / (len(inputs.photos.photos) + 1), "photos on both sides")
-            counts += matches
+        counts = self._counts(inputs.photos, pictures, params, ctx)
         sources: list[SideSource] = [planes.side_source(index) for index in range(len(planes))]
         n_turned = 0
         for index, (front, behind) in zip(asked, counts.tolist(), strict=True):
-            if max(front, behind) < max(
-                params.n_agreeing_min, params.margin_min_ratio * min(front, behind)
-            ):
+            if not _is_told(front, behind, params):
                 continue
             sources[index] = "photos"
             if behind > front:
@@ -120,10 +122,52 @@ class FaceByPhotos(Method):
             return self.Out(planes=planes)
         return self.Out(planes=replace(planes, side_from=tuple(sources)))
 
+    def _counts(
+        self,
+        photos: Photos,
+        pictures: Sequence[Features | None],
+        params: Params,
+        ctx: StepContext,
+    ) -> NDArray[np.intp]:
+        """Matches (planes, 2) that agree with the front and with the other side of each plane.
+
+        In grey; where that tells nothing of any plane, in the first mixture of colours that does,
+        as a laser that sees red dark may show it.
+        """
+        counts = np.zeros((len(pictures), 2), dtype=np.intp)
+        for name in ("grey", *MIXTURES):
+            look = partial(_seen_sides, pictures=pictures, mixture=name)
+            tried = np.zeros_like(counts)
+            found = one_by_one(look, photos.photos, ctx.cores)
+            for nth, matches in enumerate(found):
+                ctx.progress((nth + 1) / (len(photos.photos) + 1), f"photos on both sides, {name}")
+                tried += matches
+            if any(_is_told(front, behind, params) for front, behind in tried.tolist()):
+                return tried
+            if name == "grey":
+                counts = tried
+        return counts
+
     @classmethod
     def tools(cls) -> dict[str, str]:
         """OpenCV finds and describes the key points."""
         return opencv_version()
+
+
+def _is_told(front: int, behind: int, params: FaceByPhotos.Params) -> bool:
+    """Whether matches tell the side of a plane."""
+    least = max(params.n_agreeing_min, params.margin_min_ratio * min(front, behind))
+    return max(front, behind) >= least
+
+
+def _seen_sides(
+    photo: Photo, *, pictures: Sequence[Features | None], mixture: str
+) -> NDArray[np.intp]:
+    """What a photo says of both sides of each plane, in grey or a mixture of its colours."""
+    picture = photo_grey(photo) if mixture == "grey" else mixed(photo_rgb(photo), mixture)
+    if picture is None:
+        return np.zeros((len(pictures), 2), dtype=np.intp)
+    return side_matches(picture, pictures, USUAL_RULE)
 
 
 def _is_asked(planes: Planes, index: int) -> bool:

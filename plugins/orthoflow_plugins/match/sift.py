@@ -25,6 +25,8 @@ from orthoflow_plugins.match.pictures import photo_grey, require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from orthoflow_plugins.match.placing import Placed
 
 
@@ -32,14 +34,14 @@ class MatchSift(Method):
     """Match photos with the intensity rasters of the walls: RootSIFT, mutual, ratio test.
 
     Every photo is tried on every wall, by its strongest key points first, then by all on the walls
-    recognised; where its grey shows none clearly, mixtures of its colours are tried too, then, on
-    request, where edges run, whichever side is brighter. Walls on which the matches do not agree
-    roughly with a homography keep them as rejected. Ties carry the surface's depth, so relief
-    counts.
+    recognised; where its grey shows none clearly, mixtures of its colours are tried too, then where
+    edges run, whichever side is brighter, if another photo confirms the place. Walls on which the
+    matches do not agree roughly with a homography keep them as rejected. Ties carry the surface's
+    depth, so relief counts.
     """
 
     id: ClassVar[str] = "match.sift"
-    result_version: ClassVar[int] = 4
+    result_version: ClassVar[int] = 5
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",
@@ -105,12 +107,13 @@ class MatchSift(Method):
             description="Whether photos whose grey shows no wall clearly are tried in mixtures of "
             "their colours, as a laser that sees red dark may show it.",
         )
-        tries_structure: bool = Field(
-            default=False,
+        structure: Literal["never", "confirmed", "alone"] = Field(
+            default="confirmed",
             description="Whether photos in which no key points show a wall clearly are laid on the "
             "walls in many sizes and compared by where edges run, in colours, intensity and "
-            "relief. A photo of something else with the same pattern may win: look at the "
-            "overlays.",
+            "relief. confirmed: a place counts when another photo, at its own place, shows the "
+            "same things there. alone: also when no photo says so, by which a photo of something "
+            "else with the same pattern may win: look at the overlays.",
         )
         longest_side_max_px: int = Field(
             default=4000,
@@ -139,8 +142,6 @@ class MatchSift(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Match every photo with every wall."""
-        from orthoflow_plugins.match.placing import PlacedWalls, placed_photo
-
         photos, walls = inputs.photos, inputs.walls
         require_photos(photos)
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
@@ -156,27 +157,26 @@ class MatchSift(Method):
         notes: dict[str, JsonValue] = {}
         radii_px: list[float] = []
 
-        structures = PlacedWalls(walls=walls.walls)
-
-        def pair(index: int) -> tuple[PhotoPairs, Placed | None]:
+        def pair(index: int) -> PhotoPairs:
             photo = photos.photos[index]
             if params.tries_colours:
-                pairs = pair_in_colours(photo, on_walls, rule)
-            else:
-                pairs = pair_photo(photo_grey(photo), on_walls, rule)
-            if not params.tries_structure or pairs.is_mirrored or pairs.n_recognised >= LEAST:
-                return pairs, None
-            return pairs, placed_photo(index, photo, structures)
+                return pair_in_colours(photo, on_walls, rule)
+            return pair_photo(photo_grey(photo), on_walls, rule)
 
-        paired = one_by_one(pair, range(len(photos.photos)), ctx.cores)
-        for index, (photo, (pairs, placed)) in enumerate(zip(photos.photos, paired, strict=True)):
-            ctx.progress((index + 1) / (len(photos.photos) + 1), photo.name)
-            if placed is None:
+        n_photos = len(photos.photos)
+        paired: list[PhotoPairs] = []
+        for pairs in one_by_one(pair, range(n_photos), ctx.cores):
+            paired.append(pairs)
+            ctx.progress(len(paired) / (n_photos + 1), photos.photos[len(paired) - 1].name)
+        placed = _placed(photos, walls, paired, params, ctx)
+        for index, (photo, pairs) in enumerate(zip(photos.photos, paired, strict=True)):
+            place = placed.get(index)
+            if place is None:
                 pieces += _pieces(index, pairs, on_walls, walls)
             else:
-                pieces.append(placed.piece)
-            notes[photo.name] = _note(ctx, photo.name, (pairs, placed), walls)
-            radii_px.append(pairs.radius_px if placed is None else placed.radius_px)
+                pieces.append(place.piece)
+            notes[photo.name] = _note(ctx, photo.name, (pairs, place), walls)
+            radii_px.append(pairs.radius_px if place is None else place.radius_px)
         ties = ties_of(
             pieces,
             photos,
@@ -202,6 +202,57 @@ def _paper(photos: Photos, walls: Walls, ratio_most: float, ctx: StepContext) ->
     ties = ties_of(pieces, photos, walls, {"intensity_source": walls.intensity_source})
     _report(ctx, ties, on_walls)
     return ties
+
+
+def _placed(
+    photos: Photos,
+    walls: Walls,
+    paired: Sequence[PhotoPairs],
+    params: MatchSift.Params,
+    ctx: StepContext,
+) -> dict[int, Placed]:
+    """Place the photos by structure in which no key points show a wall clearly, by index."""
+    from orthoflow_plugins.match.confirming import confirmed
+    from orthoflow_plugins.match.placing import PlacedWalls, places_of
+
+    unclear = [
+        index
+        for index, pairs in enumerate(paired)
+        if not pairs.is_mirrored and pairs.n_recognised < LEAST
+    ]
+    # A photo alone has nobody to confirm it.
+    if params.structure == "never" or not unclear:
+        return {}
+    if params.structure == "confirmed" and len(paired) < 2:
+        return {}
+    on_walls = PlacedWalls(walls=walls.walls)
+    places: dict[int, list[Placed]] = {}
+
+    def look(index: int) -> list[Placed]:
+        return places_of(index, photos.photos[index], on_walls)
+
+    for index, found in zip(unclear, one_by_one(look, unclear, ctx.cores), strict=True):
+        ctx.progress(1.0 - 1.0 / (len(paired) + 1), f"{photos.photos[index].name}, by structure")
+        places[index] = found
+    clear = {k: pairs for k, pairs in enumerate(paired) if pairs.n_recognised >= LEAST}
+    placed = confirmed(photos, places, clear, on_walls, ctx.cores)
+    for index, found in places.items():
+        if index in placed or not found or not found[0].is_clear:
+            continue
+        name = photos.photos[index].name
+        if params.structure == "alone":
+            placed[index] = found[0]
+            ctx.warn(
+                f"photo {name}: placed by where edges run alone; where patterns repeat, that can "
+                f"be a wrong place: look at its overlay"
+            )
+        else:
+            ctx.log(
+                f"photo {name}: where edges run suggests a place on "
+                f"{walls.walls[found[0].piece.wall].name}, but no other photo confirms it; "
+                f"structure: alone takes it all the same"
+            )
+    return placed
 
 
 def _rule(params: MatchSift.Params) -> PairingRule:
@@ -254,10 +305,6 @@ def _note(
 ) -> JsonValue:
     pairs, placed = found
     if placed is not None:
-        ctx.warn(
-            f"photo {name}: placed by where edges run alone; where patterns repeat, that can be a "
-            f"wrong place: look at its overlay"
-        )
         return {
             "picture": "structure",
             "walls": [walls.walls[placed.piece.wall].name],

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import GeometryError
 from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.lenses import LensFreedom
 from orthoflow.geometry.resection import SeenPoints, adjust, misfit
 from orthoflow.geometry.robust import MEDIAN_LENGTH, NMAD_FACTOR
 from orthoflow.products import Photo, Wall
@@ -22,10 +23,15 @@ from orthoflow_plugins.match.channels import (
     colour_channels,
     textured_places,
 )
-from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
+from orthoflow_plugins.match.displacements import (
+    CORRELATION_AREA_CELLS,
+    Displacements,
+    SearchRule,
+    measure,
+)
 from orthoflow_plugins.match.pictures import points_on_wall
 from orthoflow_plugins.match.tie_pieces import TiePiece
-from orthoflow_plugins.match.warping import Projection, View, view_of
+from orthoflow_plugins.match.warping import Before, Projection, View, view_of
 
 _NEIGHBOURS: Final = 12
 _MEDIAN_TOLERANCE_CELLS: Final = 0.6
@@ -113,6 +119,7 @@ def trace_photo(
     camera: ViewingCamera,
     targets: Sequence[WallTarget],
     rule: TracingRule,
+    before: Before | None = None,
 ) -> Trace:
     """Match a photo with the walls it shows by its pose, until held-out ties stop improving.
 
@@ -122,8 +129,10 @@ def trace_photo(
         camera: its pose, good to a few cells on the walls.
         targets: all walls; any of them may hide another.
         rule: how.
+        before: what stands free before the walls, as far as it is known: patches keep off what it
+            hides.
     """
-    view = view_of(index, photo, camera, [target.wall for target in targets])
+    view = view_of(index, photo, camera, [target.wall for target in targets], before)
     found: Trace | None = None
     for content in rule.contents:
         if content == _LAST and found is not None and not _is_doubtful(found, rule):
@@ -263,13 +272,18 @@ def _piece(
     found: tuple[Displacements, Projection],
     grain: NDArray[np.float32],
 ) -> TiePiece:
-    """Ties of one photo with one wall; residuals agree over the cells of a grain."""
+    """Ties of one photo with one wall; residuals agree over the cells of a grain.
+
+    A gap is filled over the grain's cells, and pictures are smoothed besides: one after the other,
+    so that the areas over which residuals agree add up.
+    """
     moved, projection = found
     at = moved.places + moved.shift_cells
     pixels = np.column_stack([between(projection.u, at), between(projection.v, at)])
     points = points_on_wall(wall, moved.places + projection.corner + np.float64(0.5))
-    per_independent = np.sqrt(grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64))
-    sigma_cells = np.hypot(moved.sigma_cells * per_independent, _SIGMA_FLOOR_CELLS)
+    alone = grain[moved.places[:, 1], moved.places[:, 0]].astype(np.float64)
+    wider = np.sqrt((CORRELATION_AREA_CELLS + alone - 1.0) / CORRELATION_AREA_CELLS)
+    sigma_cells = np.hypot(moved.sigma_cells * wider, _SIGMA_FLOOR_CELLS)
     piece = TiePiece(
         photo=photo,
         wall=index,
@@ -305,14 +319,24 @@ def _refitted(seen: SeenPoints, camera: ViewingCamera) -> tuple[ViewingCamera | 
     return fitted, float(np.sqrt(np.mean(kept**2)))
 
 
-def fitted_pose(seen: SeenPoints, camera: ViewingCamera) -> ViewingCamera:
+def fitted_pose(
+    seen: SeenPoints,
+    camera: ViewingCamera,
+    lens: tuple[LensFreedom, ViewingCamera] | None = None,
+) -> ViewingCamera:
     """Give the pose that points agree with, those left out that do not.
+
+    Args:
+        seen: the points.
+        camera: to start from.
+        lens: what of the lens is free, and a camera whose lens is what is known of it beforehand.
 
     Raises:
         GeometryError: they determine none.
     """
+    freedom, prior = (None, None) if lens is None else lens
     for _ in range(3):
-        camera = adjust(seen, camera, soft_limit=2.0).camera
+        camera = adjust(seen, camera, prior=prior, lens=freedom, soft_limit=2.0).camera
         lengths = misfit(seen, camera).normalised
         good = lengths <= _limit(lengths)
         if good.all() or good.sum() < _LEAST:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Photo, Wall
 from orthoflow_plugins.match.pictures import photo_grey, photo_rgb, shrunk
 
+if TYPE_CHECKING:
+    from orthoflow.geometry.occluders import Occluders
+
 # A view flatter than this onto the wall shows too little to match.
 _GRAZING_COSINE: Final = 0.15
 # Side of a cell of the depth buffer, in photo pixels per wall cell; wide enough that the projected
@@ -23,6 +26,9 @@ _BUFFER_CELLS: Final = 2.0
 # Surface behind what a buffer cell saw counts as hidden beyond this, in wall cells.
 _HIDDEN_CELLS: Final = 6.0
 _ROWS_AT_ONCE: Final = 256
+# What stands free is scanned from elsewhere, and the pose is good to a few cells: cells so near to
+# hidden ones may be hidden.
+_BESIDE_CELLS: Final = 3
 # Which part of a wall a photo shows is found on every so many cells first.
 _COARSE: Final = 8
 _CELLS_LEAST: Final = 100
@@ -55,6 +61,19 @@ class Projection:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Before:
+    """What stands free before walls.
+
+    Attributes:
+        occluders: the cloud.
+        front_m: of each wall, how far before its plane its raster holds what is there.
+    """
+
+    occluders: Occluders
+    front_m: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
 class View:
     """A photo laid onto the walls by a pose.
 
@@ -64,6 +83,8 @@ class View:
         colours: gives its (height, width, 3), which few photos need.
         camera: the pose.
         projections: of each wall, None where the photo does not show it.
+        hidden: of each wall, the cells that something free before it hides; empty where nothing
+            is known of that.
         warped: the grey in the raster of each wall, as far as it was needed.
     """
 
@@ -72,6 +93,7 @@ class View:
     colours: Callable[[], NDArray[np.uint8]]
     camera: ViewingCamera
     projections: Sequence[Projection | None]
+    hidden: Sequence[NDArray[np.bool_]] = ()
     warped: dict[int, NDArray[np.float32]] = field(default_factory=dict)
 
     def on_wall(self, index: int, projection: Projection) -> NDArray[np.float32]:
@@ -86,19 +108,81 @@ class View:
 
     def posed(self, camera: ViewingCamera, walls: Sequence[Wall]) -> View:
         """Lay the photo onto the walls by another pose."""
-        return replace(self, camera=camera, projections=project_walls(camera, walls), warped={})
+        projections = _bared(project_walls(camera, walls), self.hidden)
+        return replace(self, camera=camera, projections=projections, warped={})
 
 
-def view_of(index: int, photo: Photo, camera: ViewingCamera, walls: Sequence[Wall]) -> View:
-    """Lay a photo onto the walls by a pose."""
+def view_of(
+    index: int,
+    photo: Photo,
+    camera: ViewingCamera,
+    walls: Sequence[Wall],
+    before: Before | None = None,
+) -> View:
+    """Lay a photo onto the walls by a pose.
+
+    Args:
+        index: of the photo.
+        photo: the photo.
+        camera: the pose.
+        walls: all walls.
+        before: what stands free before the walls, where that is known; it hides them.
+    """
+    projections = project_walls(camera, walls)
+    hidden = [] if before is None else _hidden(projections, camera, walls, before)
     return View(
         index=index,
         grey=photo_grey(photo),
         # Every round warps them to every wall again: decoded once.
         colours=cache(partial(photo_rgb, photo)),
         camera=camera,
-        projections=project_walls(camera, walls),
+        projections=_bared(projections, hidden),
+        hidden=hidden,
     )
+
+
+def _hidden(
+    projections: Sequence[Projection | None],
+    camera: ViewingCamera,
+    walls: Sequence[Wall],
+    before: Before,
+) -> list[NDArray[np.bool_]]:
+    """Cells of each wall that points before its raster hide, and those near them."""
+    import cv2
+
+    from orthoflow.geometry.occluders import depth_buffer
+
+    buffer = depth_buffer(before.occluders, camera)
+    side = 2 * _BESIDE_CELLS + 1
+    hidden = []
+    for wall, projection, front_m in zip(walls, projections, before.front_m, strict=True):
+        mask = np.zeros(wall.frame.shape, dtype=np.uint8)
+        if projection is not None:
+            seen = np.isfinite(projection.u)
+            rows, columns = (
+                (pixels[seen] / buffer.reduction).astype(np.intp)
+                for pixels in (projection.v, projection.u)
+            )
+            # How far along its ray from the camera to the cell the nearest point is, 0 to 1.
+            along = np.minimum(buffer.nearest[rows, columns] / projection.distance[seen], 1.0)
+            frame = wall.frame
+            camera_m = float((camera.centre_world - frame.origin_world) @ frame.normal_world)
+            above_m = (1.0 - along) * camera_m + along * wall.depth_m[projection.part][seen]
+            mask[projection.part][seen] = above_m > front_m + frame.gsd_m
+        dilated = cv2.dilate(mask, np.ones((side, side), dtype=np.uint8))
+        hidden.append(np.asarray(dilated, dtype=np.bool_))
+    return hidden
+
+
+def _bared(
+    projections: Sequence[Projection | None], hidden: Sequence[NDArray[np.bool_]]
+) -> Sequence[Projection | None]:
+    """Projections without the cells that are hidden."""
+    for projection, mask in zip(projections, hidden, strict=bool(hidden)):
+        if projection is not None:
+            projection.u[mask[projection.part]] = np.nan
+            projection.v[mask[projection.part]] = np.nan
+    return projections
 
 
 def project_walls(camera: ViewingCamera, walls: Sequence[Wall]) -> list[Projection | None]:

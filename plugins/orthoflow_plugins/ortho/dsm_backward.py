@@ -95,7 +95,7 @@ class DsmBackward(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Take photo by photo, and lay each onto every wall it sees."""
-        from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_before
+        from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
 
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
@@ -107,9 +107,7 @@ class DsmBackward(Method):
         seconds: defaultdict[str, float] = defaultdict(float)
         started = ctx.clock_s()
         viewers = [camera.viewing() for _, camera in oriented]
-        occluders = (
-            occluders_before(inputs, viewers, params, ctx, method=self.id) if hides else None
-        )
+        occluders = occluders_of(inputs, viewers, params, ctx, method=self.id) if hides else None
         seconds["occluders_s"] += ctx.clock_s() - started
         stack = LayerStack(inputs.walls, surfaces, ctx)
         footprints: list[CellFootprint] = []

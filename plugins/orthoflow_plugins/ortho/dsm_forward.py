@@ -86,7 +86,7 @@ class DsmForward(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Take photo by photo, and throw each onto every wall it sees."""
-        from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_before
+        from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
 
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
@@ -94,7 +94,7 @@ class DsmForward(Method):
         viewers = [camera.viewing() for _, camera in oriented]
         seconds: defaultdict[str, float] = defaultdict(float)
         started = ctx.clock_s()
-        occluders = occluders_before(inputs, viewers, params, ctx, method=self.id)
+        occluders = occluders_of(inputs, viewers, params, ctx, method=self.id)
         seconds["occluders_s"] = ctx.clock_s() - started
         surfaces = surfaces_of(inputs.walls, params, ctx)
         stack = LayerStack(inputs.walls, surfaces, ctx)

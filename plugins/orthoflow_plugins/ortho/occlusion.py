@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from orthoflow.files.photo_masks import before_masks
-from orthoflow.geometry.bands import row_bands
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.depth_buffer_kernels import DepthBuffer
 from orthoflow.geometry.occluders import (
-    Box,
     Occluders,
     depth_buffer,
     nothing_in_the_way,
-    occluders_in,
+    occluders_before,
 )
 from orthoflow.products import Photo, PointCloud, Walls
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.ortho.photos_on_walls import PhotosOnWalls, VisibilityParams
 
 
-def occluders_before(
+def occluders_of(
     inputs: PhotosOnWalls,
     viewers: Sequence[ViewingCamera],
     params: VisibilityParams,
@@ -78,29 +72,12 @@ def find_occluders(
         n_least: see `Occluders`.
         threads: see `Occluders`.
     """
-    low, high = _box_between(cloud, walls, cameras)
-    box = Box(low=low, high=high, spacing_m=_spacing_m(walls))
-    return occluders_in(cloud, box, cloud.stations, n_least=n_least, threads=threads)
-
-
-def _spacing_m(walls: Walls) -> float:
-    """The coarser of the finest raster's cells and the points' spacing on it."""
-    wall = min(walls.walls, key=lambda wall: wall.frame.gsd_m)
-    n_known = n_points = 0
-    for rows in row_bands(wall.depth_m.shape):
-        known = np.isfinite(wall.depth_m[rows])
-        n_known += int(np.count_nonzero(known))
-        n_points += int(wall.count[rows].sum(where=known, dtype=np.int64))
-    density = n_points / n_known if n_known else 1.0
-    return wall.frame.gsd_m / math.sqrt(min(1.0, max(density, 0.1)))
-
-
-def _box_between(
-    cloud: PointCloud, walls: Walls, cameras: Sequence[ViewingCamera]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    places = [camera.centre_world for camera in cameras]
-    for index, wall in enumerate(walls.walls):
-        corners = wall.frame.corners_world()
-        places += [*(corners + walls.slab(index).front_m * wall.frame.normal_world), *corners]
-    between = np.array(places) - cloud.origin
-    return between.min(axis=0), between.max(axis=0)
+    return occluders_before(
+        cloud,
+        [walls.slab(index) for index in range(len(walls.walls))],
+        cameras,
+        spacing_m=walls.spacing_m(),
+        stations_world=cloud.stations,
+        n_least=n_least,
+        threads=threads,
+    )

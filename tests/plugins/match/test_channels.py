@@ -131,6 +131,28 @@ def test_a_wall_without_intensity_is_no_target() -> None:
     assert set(target.grains) == {5}
 
 
+@pytest.mark.parametrize(
+    ("spread_m", "step_m", "is_left_out"),
+    [(0.001, 0.015, True), (0.001, 0.008, False), (0.004, 0.015, False), (0.004, 0.03, True)],
+    ids=["step", "less-than-a-cell", "noise", "step-beyond-noise"],
+)
+def test_the_shadow_of_a_step_is_left_out_of_what_is_compared(
+    spread_m: float, step_m: float, is_left_out: bool
+) -> None:
+    count = np.full((30, 40), 3, dtype=np.uint32)
+    # A column that no point fell into beside a step, another one where the wall is even.
+    count[:, [20, 30]] = 0
+    # Single cells are filled well enough, wherever they are.
+    count[[5, 15], 19] = 0
+    depth_m = np.zeros((30, 40), dtype=np.float32)
+    depth_m[:, :20] = step_m
+    made = wall(count, depth_m)
+    made.sigma_m[:] = spread_m
+    grey = channels.target_of(made).grey
+    assert grey is not None
+    assert np.isnan(grey[15]).nonzero()[0].tolist() == ([20] if is_left_out else [])
+
+
 def test_texture_is_the_weaker_direction() -> None:
     rows, columns = np.mgrid[:60, :60].astype(np.float32)
     everywhere = np.ones((60, 60), dtype=np.float32)

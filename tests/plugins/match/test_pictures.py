@@ -132,6 +132,13 @@ def test_void_is_filled_from_around_and_what_is_known_stays() -> None:
     np.testing.assert_allclose(pictures.filled_smoothly(half), 7.0, rtol=1e-5)
 
 
+@pytest.mark.parametrize("shape", [(200, 3), (3, 200), (1, 90), (90, 1), (7, 150)])
+def test_narrow_pictures_are_filled_to_their_far_end(shape: tuple[int, int]) -> None:
+    half = np.full(shape, np.nan)
+    half[-1, -1] = 7.0
+    np.testing.assert_allclose(pictures.filled_smoothly(half), 7.0, rtol=1e-5)
+
+
 def test_contrast_is_evened_out_only_where_asked_for_and_room() -> None:
     grey = np.tile(np.arange(64, dtype=np.uint8), (64, 1))
     assert pictures.equalised(grey, 0.0) is grey

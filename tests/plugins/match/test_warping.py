@@ -10,9 +10,12 @@ import pytest
 from orthoflow_plugins.match import warping
 from orthoflow_plugins.match.warping import Projection
 
+from orthoflow.files.images import encode_png
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Wall
+from orthoflow.geometry.occluders import occluders_before
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Photo, PointCloud, Wall
 
 UP = np.array([0.0, 0.0, 1.0])
 GSD_M = 0.01
@@ -154,6 +157,49 @@ def test_six_cells_behind_a_surface_are_hidden(apart_cells: float, is_hidden: bo
     behind, _ = warping.project_walls(camera_at(), [wall_at(apart_cells * GSD_M), wall_at(0.0)])
     assert behind is not None
     assert np.isnan(behind.u[40, 50]) == is_hidden
+
+
+def test_what_only_the_cloud_holds_hides_the_wall_and_cells_near_it() -> None:
+    # A board half a metre before the left half of the wall, in no wall's raster.
+    across, down = np.meshgrid(np.arange(-0.35, -0.05, 0.005), np.arange(-0.5, 0.5, 0.005))
+    x = across.ravel().astype(np.float32)
+    cloud = PointCloud(
+        origin=np.array([0.0, -0.5, 0.0]),
+        x=x,
+        y=np.zeros_like(x),
+        z=down.ravel().astype(np.float32),
+        up=UP,
+    )
+    camera, wall = camera_at(), wall_at(0.0)
+    occluders = occluders_before(
+        cloud,
+        [Slab(frame=wall.frame, front_m=0.1, behind_m=0.1)],
+        [camera],
+        spacing_m=0.01,
+        stations_world=None,
+        n_least=6,
+        threads=1,
+    )
+    photo = Photo(
+        name="a.png",
+        encoded=encode_png(np.full((800, 800), 90, dtype=np.uint8)),
+        width=800,
+        height=800,
+    )
+    x_m = -0.5 + GSD_M * (np.arange(100) + 0.5)
+    inside = (x_m > -0.35 * 4 / 3 - 0.02) & (x_m < -0.05 * 4 / 3 + 0.02)
+    outside = (x_m < -0.35 * 4 / 3 - 0.08) | (x_m > -0.05 * 4 / 3 + 0.08)
+    before = warping.Before(occluders=occluders, front_m=(0.1,))
+    view = warping.view_of(0, photo, camera, [wall], before)
+    for looked in (view, view.posed(camera_at(0.01), [wall])):
+        shown = looked.projections[0]
+        assert shown is not None
+        assert np.isnan(shown.u[40, inside]).all()
+        assert np.isfinite(shown.u[40, outside]).all()
+        np.testing.assert_array_equal(np.isnan(shown.u), np.isnan(shown.v))
+    everywhere = warping.view_of(0, photo, camera, [wall]).projections[0]
+    assert everywhere is not None
+    assert np.isfinite(everywhere.u).all()
 
 
 def flat_projection(pixels_per_cell: float, corner_px: float = 0.0) -> Projection:

@@ -1,0 +1,150 @@
+"""Photos confirm each other's places on walls where no key points recognise them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+from orthoflow_plugins.match.confirming import confirmed
+from orthoflow_plugins.match.pairing import USUAL_RULE, pair_photo, wall_features
+from orthoflow_plugins.match.pictures import photo_grey
+from orthoflow_plugins.match.placing import Placed, PlacedWalls
+from orthoflow_plugins.match.sift import MatchSift
+from orthoflow_plugins.match.tie_pieces import TiePiece
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Photos, Ties
+from orthoflow.sdk import StepContext
+from orthoflow.testing import photographed as ms
+
+SCENE = ms.textured_wall(1)
+WALLS = ms.walls_of(SCENE)
+CAMERAS = [
+    ms.camera_before(SCENE),
+    ms.camera_before(SCENE, centre=(1.9, -2.2, 1.0), towards=(1.7, 0.0, 0.9)),
+    ms.camera_before(SCENE, centre=(1.5, -2.4, 0.9), towards=(1.4, 0.0, 1.1)),
+]
+PHOTOS = Photos(
+    photos=tuple(
+        replace(ms.photo_of(SCENE, camera), name=f"{nth}.png") for nth, camera in enumerate(CAMERAS)
+    )
+)
+
+
+def place(
+    photo: int, *, aside_m: float = 0.0, share: float = 0.3, is_clear: bool = False
+) -> Placed:
+    """A place of a photo, the right one or so far to the right of it."""
+    camera = moved(CAMERAS[photo], aside_m)
+    frame = SCENE.frame
+    cells = np.stack(np.meshgrid(np.arange(100.0, 400.0, 30.0), np.arange(60.0, 280.0, 30.0)), -1)
+    points = frame.world_from_wall(cells.reshape(-1, 2), np.zeros(cells[..., 0].size))
+    piece = TiePiece(
+        photo=photo,
+        wall=0,
+        pixels_photo=camera.project(points)[:, :2],
+        points_world=points,
+        sigma_px=np.ones(len(points)),
+        sigma_m=np.full(len(points), 0.01),
+    )
+    return Placed(
+        piece=piece, camera=camera, lead=6.0, share=share, radius_px=30.0, is_clear=is_clear
+    )
+
+
+def moved(camera: ViewingCamera, aside_m: float) -> ViewingCamera:
+    return camera.shifted(-aside_m * SCENE.frame.u_world)
+
+
+def chosen(places: dict[int, Sequence[Placed]], recognised: Sequence[int] = ()) -> dict[int, float]:
+    """Metres that the chosen places are aside, by photo."""
+    rule = USUAL_RULE
+    features = [wall_features(WALLS.walls[0], rule)]
+    pairs = {k: pair_photo(photo_grey(PHOTOS.photos[k]), features, rule) for k in recognised}
+    found = confirmed(PHOTOS, places, pairs, PlacedWalls(walls=WALLS.walls))
+    return {
+        k: float((place.camera.centre_world - CAMERAS[k].centre_world)[0])
+        for k, place in found.items()
+    }
+
+
+def test_places_that_agree_are_taken_if_one_of_them_is_clear() -> None:
+    near = pytest.approx(0.0, abs=1e-9)
+    assert chosen({0: [place(0, is_clear=True)], 1: [place(1)]}) == {0: near, 1: near}
+    assert chosen({0: [place(0)], 1: [place(1)]}) == {}
+    assert chosen({k: [place(k)] for k in range(3)}) == {0: near, 1: near, 2: near}
+
+
+def test_a_place_that_no_photo_confirms_is_not_taken_however_clear_it_is() -> None:
+    assert chosen({0: [place(0, is_clear=True)]}) == {}
+    wrong = place(0, aside_m=0.3, share=0.6, is_clear=True)
+    assert chosen({0: [wrong], 1: [place(1, is_clear=True)]}) == {}
+
+
+def test_of_several_places_of_a_photo_the_one_that_others_confirm_is_taken() -> None:
+    near = pytest.approx(0.0, abs=1e-9)
+    wrong = place(0, aside_m=0.3, share=0.6)
+    right = {1: [place(1, is_clear=True)], 2: [place(2)]}
+    assert chosen({0: [wrong, place(0)], **right}) == {0: near, 1: near, 2: near}
+
+
+def test_photos_that_are_wrong_together_lose_to_one_that_key_points_recognise() -> None:
+    wrong = [place(k, aside_m=0.3, share=0.6, is_clear=True) for k in range(2)]
+    assert chosen({0: wrong[:1], 1: wrong[1:]}) == {
+        k: pytest.approx(0.3, abs=1e-9) for k in range(2)
+    }
+    near = pytest.approx(0.0, abs=1e-9)
+    both = {0: [wrong[0], place(0)], 1: [wrong[1]]}
+    assert chosen(both, recognised=[2]) == {0: near}
+
+
+def sifted(
+    folder: Path, places: dict[int, list[Placed]], structure: Literal["never", "confirmed", "alone"]
+) -> tuple[Ties, list[str]]:
+    said: list[str] = []
+    ctx = StepContext(
+        rng=np.random.default_rng(1),
+        cores=2,
+        scratch=folder,
+        listen=lambda event: said.append(event.text) if event.kind == "warning" else None,
+    )
+    inputs = MatchSift.In(photos=Photos(photos=PHOTOS.photos[:2]), walls=WALLS)
+    ties = MatchSift().run(inputs, MatchSift.Params(structure=structure), ctx).ties
+    return ties, said
+
+
+def test_a_photo_that_nobody_confirms_is_placed_only_for_who_asks_and_looks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As if no key points had shown a wall clearly.
+    monkeypatch.setattr("orthoflow_plugins.match.sift.LEAST", 10**6)
+    asked: list[int] = []
+    places = {0: [place(0, is_clear=True)], 1: [place(1, aside_m=0.3)]}
+
+    def found(index: int, *_: object) -> list[Placed]:
+        asked.append(index)
+        return places[index]
+
+    monkeypatch.setattr("orthoflow_plugins.match.placing.places_of", found)
+
+    def n_placed(structure: Literal["never", "confirmed", "alone"]) -> tuple[int, list[str]]:
+        ties, said = sifted(tmp_path, places, structure)
+        notes = ties.details["photos"]
+        assert isinstance(notes, dict)
+        return sum(
+            isinstance(note, dict) and note["picture"] == "structure" for note in notes.values()
+        ), said
+
+    assert n_placed("never") == (0, [])
+    assert asked == []
+    assert n_placed("confirmed") == (0, [])
+    assert sorted(asked) == [0, 1]
+    count, said = n_placed("alone")
+    assert count == 1
+    assert ["look at its overlay" in text for text in said] == [True]
+    places[1] = [place(1)]
+    assert n_placed("confirmed") == (2, [])
