@@ -50,9 +50,15 @@ def _params(info: MethodInfo) -> Schema:
     )
     properties = schema.get("properties")
     if isinstance(properties, dict):
-        swept = SWEPT.schema()
-        schema["properties"] = {name: {"anyOf": [said, swept]} for name, said in properties.items()}
+        schema["properties"] = {name: _swept_or(said) for name, said in properties.items()}
     return schema
+
+
+def _swept_or(said: JsonValue) -> JsonValue:
+    """A value or a sweep; what editors show of the parameter stays where they look for it."""
+    assert isinstance(said, dict)  # noqa: S101 - the schema of a field
+    shown: Schema = {k: said[k] for k in ("title", "description", "default") if k in said}
+    return {**shown, "anyOf": [said, SWEPT.schema()]}
 
 
 def _call(info: MethodInfo) -> Schema:
