@@ -17,6 +17,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -67,9 +68,11 @@ def hear_kernels(kernels: list[Any]) -> None:
         kernel = getattr(sys.modules[function.__module__], function.__qualname__, None)
         # Those that only kernels call are compiled with these.
         if kernel is not None and not kernel.targetoptions.get("no_cpython_wrapper"):
-            kernels.append(
-                (function.__module__, function.__qualname__, list(map(text_of, signature)))
-            )
+            # What takes records is left to its step.
+            with suppress(TypeError):
+                kernels.append(
+                    (function.__module__, function.__qualname__, list(map(text_of, signature)))
+                )
         return load(self, signature, context)
 
     KeptKernels.load_overload = load_and_note  # type: ignore[method-assign]

@@ -21,13 +21,15 @@ def text_of(kind: types.Type) -> Text:
     """Write a type.
 
     Raises:
-        TypeError: no kernel of ours takes such a one.
+        TypeError: such a one has no short text.
     """
     if isinstance(kind, types.BaseTuple):
         named = getattr(kind, "instance_class", None)
         name = f"{named.__module__}:{named.__qualname__}" if named is not None else ""
         return [name, *map(text_of, kind)]  # type: ignore[call-overload]  # numba has no types
-    if isinstance(kind, types.Array) and kind.aligned:
+    if isinstance(kind, types.Array):
+        if not kind.aligned:  # of records
+            raise TypeError(f"an array of {kind.dtype} cannot be written")
         const = "" if kind.mutable else _CONST
         return f"{const}{_number(kind.dtype)} {kind.ndim} {kind.layout}"
     if kind == types.slice2_type:
