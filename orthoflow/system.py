@@ -150,7 +150,7 @@ def file_lock(path: Path, descriptor: int) -> FileLock:
 def lock_where_possible(descriptor: int, *, is_shared: bool) -> None:
     """Lock an open file until it is closed, where the kernel has locks for that."""
     if _fcntl is not None:
-        _fcntl.flock(descriptor, _fcntl.LOCK_SH if is_shared else _fcntl.LOCK_EX)
+        _KernelLock(descriptor).take(is_shared=is_shared, waits=True)
 
 
 @contextmanager

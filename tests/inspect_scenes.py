@@ -19,6 +19,8 @@ from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
 from orthoflow.products import (
     CheckPoints,
     IntensitySource,
+    Layer,
+    LayerMask,
     Orthoimage,
     Orthoimages,
     OrthoMask,
@@ -47,6 +49,22 @@ def frame(*, gsd_m: float = GSD_M, shape: tuple[int, int] = SHAPE) -> WallFrame:
         gsd_m=gsd_m,
         width=shape[1],
         height=shape[0],
+    )
+
+
+def painted_layer(
+    name: str, columns: slice, rgb: NDArray[np.uint8] | NDArray[np.uint16], quality: float
+) -> Layer:
+    """A layer of the first wall that paints some columns of a picture (rows, cols, 3)."""
+    is_painted = np.zeros(rgb.shape[:2], dtype=np.bool_)
+    is_painted[:, columns] = True
+    return Layer(
+        frame=frame(shape=(rgb.shape[0], rgb.shape[1])),
+        wall=0,
+        source=name,
+        rgb=np.where(is_painted[..., None], rgb, rgb.dtype.type(0)),
+        mask=np.where(is_painted, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8),
+        quality=np.where(is_painted, np.float32(quality), np.float32(0.0)),
     )
 
 

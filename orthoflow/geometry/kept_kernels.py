@@ -71,7 +71,7 @@ class KeptKernels(FunctionCache):
             yield
             return
         with lock, closing(file_lock(path, lock.fileno())) as held:
-            if not _is_taken(held):
+            if not _take(held):
                 tell(f"waiting for another process that compiles {self._py_func.__name__}")
                 _wait_for(held)
                 tell("")
@@ -111,8 +111,8 @@ class _CheckedFiles(IndexDataCacheFile):
             stream.write(content.getvalue())
 
 
-def _is_taken(lock: FileLock) -> bool:
-    """Take a lock that nobody has, or where there are none; False when another process has it."""
+def _take(lock: FileLock) -> bool:
+    """Take a lock that nobody has, or go on where there are none; False when another has it."""
     try:
         return lock.take(is_shared=False, waits=False)
     except OSError:
@@ -121,7 +121,7 @@ def _is_taken(lock: FileLock) -> bool:
 
 def _wait_for(lock: FileLock) -> None:
     until = time.monotonic() + _patience.left_s
-    while not _is_taken(lock):
+    while not _take(lock):
         if time.monotonic() > until:
             # Nor is the next one waited for, that it will not have compiled either.
             _patience.left_s = 0.0

@@ -12,7 +12,7 @@ from orthoflow_plugins.mosaic.exposures import Radii, estimate
 from orthoflow_plugins.mosaic.light import BlockLight, light_of_levels, lit
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
-from orthoflow.products import Layer, LayerMask, Layers, Orthoimages, Wall, Walls
+from orthoflow.products import Layer, Layers, Orthoimages, Wall, Walls
 from tests import inspect_scenes
 from tests import raster_scenes as scenes
 
@@ -32,17 +32,8 @@ def texture(seed: int = 5) -> NDArray[np.float64]:
 def layer(name: str, columns: slice, light: NDArray[np.float64], quality: float) -> Layer:
     """A layer of 16 bits that paints some columns."""
     level = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    is_painted = np.zeros(SHAPE, dtype=np.bool_)
-    is_painted[:, columns] = True
     rgb = np.rint(65535.0 * level).astype(np.uint16)
-    return Layer(
-        frame=inspect_scenes.frame(shape=SHAPE),
-        wall=0,
-        source=name,
-        rgb=np.where(is_painted[..., None], rgb, np.uint16(0)),
-        mask=np.where(is_painted, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8),
-        quality=np.where(is_painted, np.float32(quality), np.float32(0.0)),
-    )
+    return inspect_scenes.painted_layer(name, columns, rgb, quality)
 
 
 def two_photos(

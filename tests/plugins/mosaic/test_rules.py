@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, Wall, Walls
+from orthoflow.products import Layer, Layers, Orthoimage, Wall, Walls
 from tests import inspect_scenes
 from tests import raster_scenes as scenes
 
@@ -22,17 +22,8 @@ def layer(
     name: str, columns: tuple[int, int], rgb: NDArray[np.uint8] | int, quality: float = 1.0
 ) -> Layer:
     """A layer that paints some columns of the wall."""
-    painted = np.zeros(SHAPE, dtype=np.bool_)
-    painted[:, columns[0] : columns[1]] = True
     colour = np.broadcast_to(np.asarray(rgb, dtype=np.uint8), (*SHAPE, 3))
-    return Layer(
-        frame=inspect_scenes.frame(shape=SHAPE),
-        wall=0,
-        source=name,
-        rgb=np.where(painted[..., None], colour, np.uint8(0)),
-        mask=np.where(painted, LayerMask.PAINTED, LayerMask.OUTSIDE).astype(np.uint8),
-        quality=np.where(painted, np.float32(quality), np.float32(0.0)),
-    )
+    return inspect_scenes.painted_layer(name, slice(*columns), colour, quality)
 
 
 def mosaic(
