@@ -116,21 +116,27 @@ def corners_between(
     by_pair: dict[tuple[int, int], list[Edge]] = {}
     for edge in edges:
         by_pair.setdefault((edge.first, edge.second), []).append(edge)
-    used = sorted({index for pair in by_pair for index in pair})
+    beyond: dict[int, set[int]] = {}
+    for i, j in by_pair:
+        beyond.setdefault(i, set()).add(j)
+    triples = [
+        (i, j, k) for i, j in sorted(by_pair) for k in sorted(beyond[i] & beyond.get(j, set()))
+    ]
+    if not triples:
+        return ()
+    at = np.array(triples)
+    normals = np.array([surface.plane.normal for surface in surfaces])[at]
+    offsets = np.array([surface.plane.offset_m for surface in surfaces])[at]
+    meet = np.abs(np.linalg.det(normals)) >= math.sin(math.radians(_LEAST_ANGLE_DEG)) ** 2
+    # About a point nearby, so that survey coordinates lose nothing.
+    middles = np.array([surface.rectangles_world.mean(axis=(0, 1)) for surface in surfaces])
+    near = middles[at[meet, 0]]
+    rest = offsets[meet] - np.einsum("nij,nj->ni", normals[meet], near)
+    points = near + np.linalg.solve(normals[meet], rest[..., None])[..., 0]
     found = []
-    for i, j, k in combinations(used, 3):
-        pairs = [by_pair.get(pair) for pair in ((i, j), (i, k), (j, k))]
-        if not all(pairs):
-            continue
-        planes = [surfaces[index].plane for index in (i, j, k)]
-        normals = np.array([plane.normal for plane in planes])
-        if abs(float(np.linalg.det(normals))) < math.sin(math.radians(_LEAST_ANGLE_DEG)) ** 2:
-            continue
-        # About a point nearby, so that survey coordinates lose nothing.
-        near = surfaces[i].rectangles_world.mean(axis=(0, 1))
-        rest = [plane.offset_m - float(plane.normal @ near) for plane in planes]
-        point = near + np.linalg.solve(normals, np.array(rest))
-        if all(min(_distance(edge, point) for edge in pair or ()) <= reach_m for pair in pairs):
+    for (i, j, k), point in zip(at[meet].tolist(), points, strict=True):
+        pairs = [by_pair[pair] for pair in ((i, j), (i, k), (j, k))]
+        if all(min(_distance(edge, point) for edge in pair) <= reach_m for pair in pairs):
             found.append(Corner(planes=(i, j, k), point_world=point))
     return tuple(found)
 
@@ -139,28 +145,21 @@ def _spans(
     surface: Surface, start: NDArray[np.float64], direction: NDArray[np.float64], reach_m: float
 ) -> list[Interval]:
     """Where along a line a surface is known near it: separate intervals, rising."""
-    aside = np.cross(surface.plane.normal, direction)
-    spans = []
-    for corners in surface.rectangles_world:
-        relative = corners - start
-        outline = np.column_stack([relative @ direction, relative @ aside])
-        for sign in (1.0, -1.0):
-            outline = _clipped(outline, sign, reach_m)
-        if len(outline):
-            spans.append((float(outline[:, 0].min()), float(outline[:, 0].max())))
-    return _merged(spans)
-
-
-def _clipped(outline: NDArray[np.float64], sign: float, limit: float) -> NDArray[np.float64]:
-    """The part of a polygon (n, 2) where `sign * y` is at most a limit."""
-    kept: list[NDArray[np.float64]] = []
-    for here, there in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        over, next_over = sign * here[1] - limit, sign * there[1] - limit
-        if over <= 0.0:
-            kept.append(here)
-        if (over <= 0.0) != (next_over <= 0.0):
-            kept.append(here + over / (over - next_over) * (there - here))
-    return np.array(kept).reshape(-1, 2)
+    relative = surface.rectangles_world - start
+    along = relative @ direction
+    aside = relative @ np.cross(surface.plane.normal, direction)
+    # What lies within reach of the line has its corners there, and where its sides cross the limit.
+    places = [np.where(np.abs(aside) <= reach_m, along, np.nan)]
+    over = np.roll(aside, -1, axis=1) - aside
+    for limit in (-reach_m, reach_m):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = (limit - aside) / over
+            crossing = along + share * (np.roll(along, -1, axis=1) - along)
+        places.append(np.where((share > 0.0) & (share < 1.0), crossing, np.nan))
+    reached = np.concatenate(places, axis=1)
+    reached = reached[~np.isnan(reached).all(axis=1)]
+    ends = np.column_stack([np.nanmin(reached, axis=1), np.nanmax(reached, axis=1)])
+    return _merged([(low, high) for low, high in ends.tolist()])
 
 
 def _merged(spans: list[Interval]) -> list[Interval]:

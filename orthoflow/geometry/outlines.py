@@ -133,7 +133,8 @@ def _bounding(
     ]
     kept: list[_Wall] = []
     for wall in upright:
-        if not any(_is_relief(wall, larger) for larger in kept):
+        # A rectangle without a width, which no detector gives, is nowhere along a wall.
+        if wall.length_m > 0.0 and not any(_is_relief(wall, larger) for larger in kept):
             kept.append(wall)
     return kept
 

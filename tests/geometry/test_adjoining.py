@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
 from itertools import combinations, product
 
 import numpy as np
 import pytest
 
-from orthoflow.files.drawings.key_plans import outline_of, surfaces_of
+from orthoflow.errors import InputError
+from orthoflow.files.drawings.key_plans import MOST_PARTS, MOST_PLANES, outline_of, surfaces_of
 from orthoflow.geometry.adjoining import (
     Edge,
     Surface,
@@ -17,6 +20,7 @@ from orthoflow.geometry.adjoining import (
 )
 from orthoflow.geometry.outlines import room_outline
 from orthoflow.geometry.planes import Plane
+from orthoflow.products import Planes
 from tests.drawing_runs import CORNER, GAP_M, SIZE_M, box_planes, box_points
 
 # Survey coordinates of 5e6 m have 1e-9 m in float64; solving a system loses a little.
@@ -168,3 +172,57 @@ def test_a_room_whose_up_is_x_has_the_same_outline() -> None:
         assert np.linalg.norm(found[one] - found[other]) > 1.0
     for point in straight.chains_world[0]:
         assert np.linalg.norm(found - point, axis=1).min() < _EXACT_M
+
+
+def _crossing_planes(count: int) -> Planes:
+    """Planes through one place, each of which meets most others: what only a made record has."""
+    normals = np.random.default_rng(4).normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    across = np.cross(normals, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    down = np.cross(normals, across)
+    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    return Planes(
+        normal=normals,
+        offset=np.zeros(count),
+        corners=np.stack([4.0 * (a * across + b * down) for a, b in signs], axis=1),
+        covariance=np.zeros((count, 4, 4)),
+        n_points=np.full(count, 100),
+        rms_m=np.zeros(count),
+        up=np.array([0.0, 0.0, 1.0]),
+        names=tuple(f"wall {index}" for index in range(count)),
+    )
+
+
+def test_planes_that_all_meet_all_others_take_little_time() -> None:
+    surfaces = surfaces_of(_crossing_planes(60))
+    begin = time.process_time()
+    edges = edges_between(surfaces)
+    corners = corners_between(surfaces, edges)
+    assert time.process_time() - begin < 20.0  # 0.9 s
+    assert len(edges) > 1000
+    # They all pass through the origin, and so do their lines.
+    assert len(corners) > 10_000
+    assert max(float(np.linalg.norm(corner.point_world)) for corner in corners) < _EXACT_M
+
+
+def test_more_planes_or_parts_than_a_drawing_bears_are_refused() -> None:
+    few, many = _crossing_planes(3), _crossing_planes(MOST_PLANES + 1)
+    in_parts = replace(
+        few,
+        part_corners=np.repeat(few.corners[:1], MOST_PARTS + 1, axis=0),
+        part_plane=np.zeros(MOST_PARTS + 1, np.int32),
+    )
+    for planes in (many, in_parts):
+        for work in (surfaces_of, outline_of):
+            with pytest.raises(InputError, match=r"planes of .* connected parts, at most"):
+                work(planes)
+
+
+def test_a_rectangle_without_a_width_is_no_wall_of_the_room() -> None:
+    planes = box_planes()
+    corners = planes.corners.copy()
+    corners[0] = corners[0].mean(axis=0)
+    with np.errstate(all="raise"):
+        outline = outline_of(replace(planes, corners=corners))
+    assert 0 not in outline.walls

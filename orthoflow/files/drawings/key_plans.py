@@ -5,15 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.errors import InputError
 from orthoflow.geometry.adjoining import Surface
 from orthoflow.geometry.directions import basis_from_up
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame
 from orthoflow.geometry.outlines import RoomOutline, room_outline
 from orthoflow.products import Planes
+
+# Each is held against each other, and three against one another: a record may claim any number.
+MOST_PLANES: Final = 200
+MOST_PARTS: Final = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +42,12 @@ class KeyPlan:
 
 
 def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
-    """Planes with the rectangles of their parts, or of all their points where there are none."""
+    """Planes with the rectangles of their parts, or of all their points where there are none.
+
+    Raises:
+        InputError: there are more than `MOST_PLANES`, or `MOST_PARTS` of them.
+    """
+    _check_counts(planes)
     found = []
     for index in range(len(planes)):
         rectangles = planes.corners[index][None]
@@ -48,10 +59,24 @@ def surfaces_of(planes: Planes) -> tuple[Surface, ...]:
 
 
 def outline_of(planes: Planes) -> RoomOutline:
-    """The outline of the room that planes bound."""
+    """The outline of the room that planes bound.
+
+    Raises:
+        InputError: there are more than `MOST_PLANES`.
+    """
+    _check_counts(planes)
     return room_outline(
         [planes.plane(index) for index in range(len(planes))], planes.corners, planes.up
     )
+
+
+def _check_counts(planes: Planes) -> None:
+    n_parts = 0 if planes.part_corners is None else len(planes.part_corners)
+    if len(planes) > MOST_PLANES or n_parts > MOST_PARTS:
+        raise InputError(
+            f"the run has {len(planes)} planes of {n_parts} connected parts, at most {MOST_PLANES} "
+            f"of {MOST_PARTS} are drawn: run it with fewer planes, or name another step by --cell"
+        )
 
 
 def key_plan(planes: Planes, frame: WallFrame, outlines: Sequence[RoomOutline] = ()) -> KeyPlan:
