@@ -66,8 +66,7 @@ class Alike:
     @property
     def where(self) -> str:
         """The first of the places, and how many more there are."""
-        n_more = len(self.places) - 1
-        return f"{self.places[0]} and {n_more} more" if n_more else self.places[0]
+        return first_few(self.places, most=1)
 
 
 def alike(said: Iterable[tuple[str, str]]) -> tuple[Alike, ...]:
@@ -98,14 +97,14 @@ def sense(text: str) -> str:
     return _MARKS.sub(_MARK, _VARYING.sub(_MARK, text.replace(_MARK, "")))
 
 
-def first_few(names: Sequence[str]) -> str:
-    """Name the first three, and count the others.
+def first_few(names: Sequence[str], most: int = _MOST_NAMED) -> str:
+    """Name the first few, and count the others.
 
-    >>> first_few(["a", "b", "c", "d", "e"])
-    'a, b, c and 2 more'
+    >>> first_few(["a", "b", "c", "d", "e"]), first_few(["a", "b"], most=1)
+    ('a, b, c and 2 more', 'a and 1 more')
     """
-    n_more = len(names) - _MOST_NAMED
-    named = ", ".join(names[:_MOST_NAMED])
+    n_more = len(names) - most
+    named = ", ".join(names[:most])
     return f"{named} and {n_more} more" if n_more > 0 else named
 
 

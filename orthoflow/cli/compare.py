@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
+from orthoflow.alike import first_few
 from orthoflow.cli.commands import RecordCommand
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option, store_option
@@ -128,8 +129,7 @@ def _print_pairs(title: str, rows: Sequence[Pair[Value]], text: Callable[[Value]
 def _files_text(files: Sequence[RecordedFile]) -> str:
     if not files:
         return "not given"
-    named = ", ".join(f"{file.name} {file.sha256[:12]}" for file in files[:3])
-    return named if len(files) <= 3 else f"{named} and {len(files) - 3} more"
+    return first_few([f"{file.name} {file.sha256[:12]}" for file in files])
 
 
 def _facts_text(facts: CellFacts) -> str:

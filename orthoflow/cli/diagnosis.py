@@ -15,6 +15,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Final, Literal
 
+from orthoflow.system import usable_cores
+
 _IMPORT_TIMEOUT_S: Final = 120
 _COMFORTABLE_DISK_BYTES: Final = 5 * 1024**3
 _COMFORTABLE_MEMORY_BYTES: Final = 2 * 1024**3
@@ -205,13 +207,6 @@ def _diagnose_platform() -> Diagnosis:
         found=found,
         cost="" if is_supported else "only Linux on x86-64 is tested",
     )
-
-
-def usable_cores() -> int:
-    """Processors this process may use, which can be fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _diagnose_memory() -> Diagnosis:

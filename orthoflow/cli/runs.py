@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from orthoflow.alike import first_few
 from orthoflow.cli.commands import Command
 from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import json_option
@@ -235,8 +236,7 @@ def _facts_text(facts: Mapping[str, object]) -> str:
             text = ", ".join(map(str, value)) or "not given"
         cut = text if len(text) <= _LONGEST_FACT else f"{text[:_LONGEST_FACT]}..."
         said.append(f"{name}={cut}")
-    more = f" and {len(said) - _FACTS_MOST} more" if len(said) > _FACTS_MOST else ""
-    return ", ".join(said[:_FACTS_MOST]) + more
+    return first_few(said, most=_FACTS_MOST)
 
 
 def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, object]:

@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable
 from functools import wraps
-from types import TracebackType
 from typing import Any, Final, Self, cast
 
 # Every import goes through these, where a module is not there yet and where another thread still
@@ -63,12 +62,7 @@ class LoadingMeter:
         self._listen_to_numba()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for name, function in self._replaced.items():
             setattr(_BOOTSTRAP, name, function)
         if self._listener is not None:

@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, Literal
 
+from orthoflow.alike import first_few
 from orthoflow.catalog import Catalog
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.file_digests import FileRef
@@ -362,8 +363,7 @@ def explain(key: CellKey, step: str, earlier: Sequence[Preimage]) -> str:
     if not changes:
         return "its key is made in another way than before"
     named = list(dict.fromkeys(_sentence(name, before, now) for name in changes))
-    more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-    return ", ".join(named[:_MOST_NAMED]) + more
+    return first_few(named, most=_MOST_NAMED)
 
 
 @lru_cache(maxsize=1024)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from orthoflow.alike import first_few
 from orthoflow.errors import InputError
 from orthoflow.files.colmap import read_colmap_model
 from orthoflow.files.e57_images import read_e57_images
@@ -48,7 +49,7 @@ def _read(paths: Sequence[Path]) -> tuple[GivenCamera, ...]:
         found = [path for path in paths if path.suffix.lower() == suffix]
         if len(found) == 1:
             return reader(found[0])
-    names = ", ".join(path.name for path in paths[:3]) + (" ..." if len(paths) > 3 else "")
+    names = first_few([path.name for path in paths])
     raise InputError(
         f"{names or 'nothing'} holds no cameras that orthoflow reads: expected one cameras.json of "
         "a run, a folder with COLMAP's cameras.txt and images.txt (or .bin), Metashape's .xml, "

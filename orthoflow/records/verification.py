@@ -14,13 +14,13 @@ from orthoflow_provenance.model import PublishedFile, RunRecord
 from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.verify import verify_record
 
+from orthoflow.alike import first_few
 from orthoflow.errors import RecordError
 from orthoflow.geometry.threads import in_order
 from orthoflow.records.published import PRODUCTS_FOLDER
 from orthoflow.records.runs import Run, find_record, record_errors
 from orthoflow.records.signatures import check_signature, read_signature
 
-_FILES_NAMED: Final = 3
 PublishedState: TypeAlias = Literal["same", "changed", "missing", "unreadable", "no file"]
 _WRONG: Final[dict[PublishedState, str]] = {
     "changed": "changed since it was published",
@@ -185,9 +185,7 @@ def _missing_note(missing: list[str], n_published: int) -> str:
             f"the {n_published} published files of the record are not beside it, so they were not "
             "checked"
         )
-    named = ", ".join(missing[:_FILES_NAMED])
-    more = f" and {len(missing) - _FILES_NAMED} more" if len(missing) > _FILES_NAMED else ""
     return (
         f"{len(missing)} of {n_published} published files are not in {PRODUCTS_FOLDER}/ any more: "
-        f"{named}{more}"
+        f"{first_few(missing)}"
     )

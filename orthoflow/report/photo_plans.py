@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.alike import first_few
 from orthoflow.foreign_text import shown
 from orthoflow.geometry import WallFrame
 from orthoflow.products import Camera, Cameras, Planes
@@ -80,12 +81,7 @@ def _up(run: Run) -> NDArray[np.float64]:
 
 def _caption(address: str, cameras: Sequence[Camera], oriented: Sequence[Camera]) -> str:
     refused = [one.photo for one in cameras if one.status != "ok"]
-    missing = (
-        f" Not oriented, and so not drawn: {', '.join(refused[:6])}"
-        + (f" and {len(refused) - 6} more." if len(refused) > 6 else ".")
-        if refused
-        else ""
-    )
+    missing = f" Not oriented, and so not drawn: {first_few(refused, most=6)}." if refused else ""
     return (
         f"{len(oriented)} of {len(cameras)} photos, {address}: walls from above, dots where photos "
         "were taken, strokes which way they look. A photo behind a wall, or one that looks away "

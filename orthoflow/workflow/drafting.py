@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
+from orthoflow.alike import first_few
 from orthoflow.errors import InputError
 from orthoflow.files.images import PHOTO_SUFFIXES
 from orthoflow.files.points.formats import TEXT
@@ -199,7 +200,7 @@ def _described(items: Sequence[Recognised]) -> str:
 
 def _some(names: Sequence[str]) -> str:
     """Name the first of some files."""
-    return ", ".join(map(_word, names[:4])) + (" ..." if len(names) > 4 else "")
+    return first_few([*map(_word, names)], most=4)
 
 
 def _word(name: str) -> str:

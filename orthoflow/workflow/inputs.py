@@ -10,6 +10,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
+from orthoflow.alike import first_few
 from orthoflow.catalog import did_you_mean
 from orthoflow.errors import InputError
 from orthoflow.files.yaml_positions import Value, join
@@ -155,9 +156,7 @@ def some_of(names: Collection[str]) -> str:
     >>> some_of(["scan", "photos"]), some_of([])
     ('scan, photos', 'none')
     """
-    first = list(names)[:_MOST_LISTED]
-    more = f" and {len(names) - len(first)} more" if len(names) > len(first) else ""
-    return f"{', '.join(first) or 'none'}{more}"
+    return first_few(list(names), most=_MOST_LISTED) or "none"
 
 
 def _resolve(spec: WorkflowInputSpec) -> InputFiles | None:

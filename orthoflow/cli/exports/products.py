@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from orthoflow.alike import first_few
 from orthoflow.cli.failures import say_error
 from orthoflow.errors import ArgumentError, StoreError
 
@@ -76,9 +77,8 @@ def output_of(run: Run, type_name: str, cell: str | None) -> tuple[str, str]:
         raise ArgumentError(f"the run {run.record.run_id} {missing}")
     *others, last = found
     if others:
-        rest = f" and {len(others) - _MOST_NAMED} more" if len(others) > _MOST_NAMED else ""
-        first = ", ".join(others[:_MOST_NAMED])
-        say_error(f"note: the {named} of {last}; --cell takes others: {first}{rest}")
+        few = first_few(others, most=_MOST_NAMED)
+        say_error(f"note: the {named} of {last}; --cell takes others: {few}")
     return last, found[last]
 
 
