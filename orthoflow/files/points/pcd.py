@@ -20,7 +20,7 @@ from orthoflow.files.points.blocks import (
     point_fields,
     short_file_error,
 )
-from orthoflow.files.points.tables import Layout, read_table
+from orthoflow.files.points.tables import Layout, read_stated
 
 FORMAT: Final = "PCD"
 _HEADER_BYTES: Final = 1 << 16
@@ -129,12 +129,9 @@ def _ascii_columns(path: Path, header: PcdHeader) -> Iterator[dict[str, NDArray[
     columns = [positions[name] for name in wanted]
     with path.open("rb") as file:
         line = file.read(header.n_bytes).count(b"\n") + 1
-        for start in range(0, header.n_points, BLOCK_POINTS):
-            count = min(BLOCK_POINTS, header.n_points - start)
-            table = read_table(file, layout, columns, n_lines=count, first_line=line + start)
-            if len(table) != count:
-                found = f"{start + len(table)} points"
-                raise short_file_error(path, "data", found, str(header.n_points))
+        for table in read_stated(
+            file, layout, columns, n_points=header.n_points, first_line=line, what="data"
+        ):
             yield {
                 name: table[:, index].astype(_base(header, name))
                 if name == header.colour

@@ -20,7 +20,7 @@ from orthoflow.files.points.blocks import (
     short_file_error,
 )
 from orthoflow.files.points.columns import Columns, columns_of_header, point_block
-from orthoflow.files.points.tables import Layout, read_table, take_lines
+from orthoflow.files.points.tables import Layout, read_stated, take_lines
 
 FORMAT: Final = "PLY"
 _TYPES: Final = {
@@ -142,14 +142,14 @@ def _text_blocks(
             count = min(BLOCK_POINTS, n_skipped - start)
             if len(take_lines(file, count, first_line=line - n_skipped + start)) != count:
                 raise short_file_error(path, "elements", "fewer lines", str(n_skipped))
-        for start in range(0, vertex.count, BLOCK_POINTS):
-            count = min(BLOCK_POINTS, vertex.count - start)
-            table = read_table(
-                file, layout, columns.positions, n_lines=count, first_line=line + start
-            )
-            if len(table) != count:
-                found = f"{start + len(table)} points"
-                raise short_file_error(path, "vertex element", found, str(vertex.count))
+        for table in read_stated(
+            file,
+            layout,
+            columns.positions,
+            n_points=vertex.count,
+            first_line=line,
+            what="vertex element",
+        ):
             yield point_block(table, columns)
 
 

@@ -11,15 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import (
-    BLOCK_POINTS,
-    PointBlock,
-    ScanFile,
-    point_fields,
-    short_file_error,
-)
+from orthoflow.files.points.blocks import PointBlock, ScanFile, point_fields
 from orthoflow.files.points.columns import Columns, point_block
-from orthoflow.files.points.tables import Layout, count_lines, find_layout, read_table, take_lines
+from orthoflow.files.points.tables import Layout, count_lines, find_layout, read_stated, take_lines
 
 FORMAT: Final = "PTX"
 HEADER_LINES: Final = 10
@@ -76,26 +70,25 @@ def _blocks(path: Path, layout: Layout, columns: Columns) -> Iterator[PointBlock
     scan = 0
     with path.open("rb") as file:
         while (header := _read_header(path, file, line)) is not None:
-            yield from _scan_blocks(path, file, header, (layout, columns), scan)
+            yield from _scan_blocks(file, header, layout, columns, scan)
             line = header.first_line + header.n_columns * header.n_rows
             scan += 1
 
 
 def _scan_blocks(
-    path: Path, file: BinaryIO, header: ScanHeader, table_of: tuple[Layout, Columns], scan: int
+    file: BinaryIO, header: ScanHeader, layout: Layout, columns: Columns, scan: int
 ) -> Iterator[PointBlock]:
-    layout, columns = table_of
-    n_points = header.n_columns * header.n_rows
     start = 0
-    while start < n_points:
-        count = min(BLOCK_POINTS, n_points - start)
-        first_line = header.first_line + start
-        table = read_table(file, layout, columns.positions, n_lines=count, first_line=first_line)
-        if len(table) != count:
-            found = f"{start + len(table)} points"
-            raise short_file_error(path, f"scan {scan}", found, str(n_points))
+    for table in read_stated(
+        file,
+        layout,
+        columns.positions,
+        n_points=header.n_columns * header.n_rows,
+        first_line=header.first_line,
+        what=f"scan {scan}",
+    ):
         yield _placed(table, columns, header, scan, start)
-        start += count
+        start += len(table)
 
 
 def _placed(

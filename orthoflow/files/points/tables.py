@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
-from orthoflow.files.points.blocks import MOST_LINE_BYTES
+from orthoflow.files.points.blocks import BLOCK_POINTS, MOST_LINE_BYTES, short_file_error
 
 _NUMBER: Final = re.compile(
     r"[-+]?(\d+(\.\d*|,\d+)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)", re.IGNORECASE
@@ -133,6 +133,29 @@ def read_table(
             return _parse(kept, layout, columns)
         except ValueError:
             raise _bad_line(Path(file.name), lines, layout, columns, first_line) from error
+
+
+def read_stated(
+    file: BinaryIO,
+    layout: Layout,
+    columns: Sequence[int],
+    *,
+    n_points: int,
+    first_line: int,
+    what: str,
+) -> Iterator[NDArray[np.float64]]:
+    """Read as many points as a header states, a line each, in blocks.
+
+    Raises:
+        InputError: a line holds something else than numbers, or there are fewer; `what` holds them.
+    """
+    for start in range(0, n_points, BLOCK_POINTS):
+        count = min(BLOCK_POINTS, n_points - start)
+        table = read_table(file, layout, columns, n_lines=count, first_line=first_line + start)
+        if len(table) != count:
+            found = f"{start + len(table)} points"
+            raise short_file_error(Path(file.name), what, found, str(n_points))
+        yield table
 
 
 def read_tables(

@@ -276,7 +276,7 @@ def _rule(params: MatchGuided.Params, threads: int) -> TracingRule:
 
 def _note(trace: Trace) -> JsonValue:
     return {
-        "n_ties": sum(len(piece) for piece in trace.pieces),
+        "n_ties": trace.n_ties,
         "n_measured": trace.n_measured,
         "n_outliers": trace.n_outliers,
         "channels": trace.content,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -56,28 +56,18 @@ CONTENTS: Final = ("gradients", "grey", _LAST)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TracingRule:
-    """How a photo is traced on the walls.
+class TracingRule(SearchRule):
+    """How a photo is traced on the walls; the search radius is that of the first round.
 
     Attributes:
-        radius_cells: first search radius; halved every round.
-        half_patch_cells: patches are (2 h + 1)^2 cells.
-        score_least: smallest correlation.
-        distinct_least: by how much the best correlation must exceed the next peak.
         n_ties_most: per photo.
-        n_rounds_most: measured at most so often.
+        n_rounds_most: measured at most so often, each time with half the radius.
         contents: what is compared, of `gradients`, `grey` and `colours`; the best one is kept.
-        threads: patches are shared between so many.
     """
 
-    radius_cells: int
-    half_patch_cells: int
-    score_least: float
-    distinct_least: float
     n_ties_most: int
     n_rounds_most: int
     contents: tuple[str, ...]
-    threads: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,13 +226,7 @@ def _measured(
         strength = target.textures[on_wall][projection.part]
         places = textured_places(strength, usable, max(50, round(rule.n_ties_most * share)))
         places = _unoccupied(places, projection, occupied)
-        search = SearchRule(
-            radius_cells=radius,
-            half_patch_cells=rule.half_patch_cells,
-            score_least=rule.score_least,
-            distinct_least=rule.distinct_least,
-            threads=rule.threads,
-        )
+        search = replace(rule, radius_cells=radius)
         moved = measure(channels, _seen(view, index, content), places, search)
         n_measured += len(moved.places)
         moved = moved.take(agrees_around(moved))

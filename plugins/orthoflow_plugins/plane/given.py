@@ -11,8 +11,9 @@ from pydantic import Field, model_validator
 
 from orthoflow.errors import GeometryError, MethodError
 from orthoflow.geometry import Plane, basis_from_up, plane_through
-from orthoflow.products import Planes, PointCloud, PointLabels
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.products import PointCloud, PointLabels
+from orthoflow.sdk import Method, MethodParams, StepContext
+from orthoflow_plugins.plane.parameters import DetectorIn, DetectorOut
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.reference import Reference
@@ -141,16 +142,8 @@ class GivenPlane(Method):
                 )
             return self
 
-    class In(Ports):
-        """What it works on."""
-
-        cloud: PointCloud
-
-    class Out(Ports):
-        """What it gives."""
-
-        planes: Planes
-        labels: PointLabels
+    In = DetectorIn
+    Out = DetectorOut
 
     _too_far: ClassVar[str] = (
         "no point of the cloud lies within {buffer:g} m of the plane; along its normal the "
@@ -158,7 +151,7 @@ class GivenPlane(Method):
         "or height_m, or raise buffer_m (plane.given)"
     )
 
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Lay the planes and find which points are on them."""
         from orthoflow_plugins.plane.reference import lay_references, prepare_for_references
 
@@ -181,7 +174,7 @@ class GivenPlane(Method):
         planes = lay_references(
             references, cloud, prepared, labels, tolerance_m=params.tolerance_m, ctx=ctx
         )
-        return self.Out(planes=planes, labels=PointLabels(plane_index=labels))
+        return DetectorOut(planes=planes, labels=PointLabels(plane_index=labels))
 
     @classmethod
     def _placed(

@@ -6,9 +6,13 @@ from typing import TYPE_CHECKING, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from orthoflow.products import Planes, PointCloud, PointLabels
-from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
+from orthoflow.sdk import Method, StepContext
+from orthoflow_plugins.plane.parameters import (
+    DETECTOR_METRICS,
+    DetectorIn,
+    DetectorOut,
+    DetectorParams,
+)
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.accumulators import PlanProposer
@@ -81,18 +85,10 @@ class Hough2d(Method):
                 )
             return self
 
-    class In(Ports):
-        """What it works on."""
+    In = DetectorIn
+    Out = DetectorOut
 
-        cloud: PointCloud
-
-    class Out(Ports):
-        """What it finds."""
-
-        planes: Planes
-        labels: PointLabels
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.accumulators import PlanProposer, Voting
         from orthoflow_plugins.plane.detecting import Detector, detect
@@ -123,4 +119,4 @@ class Hough2d(Method):
                     voters=_VOTERS["raw" if params.coordinates == "raw" else params.accumulator],
                 )
                 draw_accumulator(ctx, picture, detection.planes, inputs.cloud)
-        return self.Out(planes=detection.planes, labels=detection.labels)
+        return DetectorOut(planes=detection.planes, labels=detection.labels)

@@ -6,9 +6,13 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from orthoflow.products import Planes, PointCloud, PointLabels
-from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
+from orthoflow.sdk import Method, StepContext
+from orthoflow_plugins.plane.parameters import (
+    DETECTOR_METRICS,
+    DetectorIn,
+    DetectorOut,
+    DetectorParams,
+)
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Rules
@@ -61,18 +65,10 @@ class Hough3d(Method):
             "cells", description="What votes: voxels, or points of the sample by themselves."
         )
 
-    class In(Ports):
-        """What it works on."""
+    In = DetectorIn
+    Out = DetectorOut
 
-        cloud: PointCloud
-
-    class Out(Ports):
-        """What it finds."""
-
-        planes: Planes
-        labels: PointLabels
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.detecting import Detector, detect
         from orthoflow_plugins.plane.search_figures import draw_sections, draw_space
@@ -99,4 +95,4 @@ class Hough3d(Method):
             if proposer.first_picture is not None:
                 draw_space(ctx, proposer.first_picture, detection.planes)
         draw_sections(ctx, detection.planes, inputs.cloud, cell_m=params.cell_m)
-        return self.Out(planes=detection.planes, labels=detection.labels)
+        return DetectorOut(planes=detection.planes, labels=detection.labels)

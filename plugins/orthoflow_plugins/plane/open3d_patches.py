@@ -12,13 +12,17 @@ from pydantic import Field
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane
-from orthoflow.products import Planes, PointCloud, PointLabels
-from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow.sdk import Method, StepContext
 from orthoflow_plugins.plane.open3d_ransac import open3d_version
-from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
+from orthoflow_plugins.plane.parameters import (
+    DETECTOR_METRICS,
+    DetectorIn,
+    DetectorOut,
+    DetectorParams,
+)
 
 if TYPE_CHECKING:
-    from orthoflow_plugins.plane.candidates import Candidate, Family, Rules
+    from orthoflow_plugins.plane.candidates import Candidate, Rules
     from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
 
 # Points of a patch, as a share of those that a plane needs.
@@ -61,18 +65,10 @@ class Open3dPatches(Method):
             0.75, gt=0.0, lt=1.0, description="Share of points off the plane that a patch may have."
         )
 
-    class In(Ports):
-        """What it works on."""
+    In = DetectorIn
+    Out = DetectorOut
 
-        cloud: PointCloud
-
-    class Out(Ports):
-        """What it finds."""
-
-        planes: Planes
-        labels: PointLabels
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
         from orthoflow.files.open3d_guard import load_open3d
         from orthoflow_plugins.plane.detecting import Detector, detect
@@ -81,18 +77,12 @@ class Open3dPatches(Method):
 
         def proposer_of(_: PreparedCloud, unassigned: Unassigned, rules: Rules) -> PatchProposer:
             least_points = _PART_SHARE * rules.least_share * len(unassigned.claims)
-            search = PatchSearch(
-                n_neighbours=params.n_neighbours,
-                normal_variance_deg=params.normal_variance_deg,
-                coplanarity_deg=params.coplanarity_deg,
-                outlier_share=params.outlier_share,
-                least_points=max(10, int(least_points)),
-            )
-            return patches(open3d, unassigned.sample.offsets_m, search, params.family)
+            points_m = unassigned.sample.offsets_m
+            return patches(open3d, points_m, params, least_points=max(10, int(least_points)))
 
         detector = Detector(method=self.id, proposer_of=proposer_of)
         detection = detect(inputs.cloud, params, ctx, detector)
-        return self.Out(planes=detection.planes, labels=detection.labels)
+        return DetectorOut(planes=detection.planes, labels=detection.labels)
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:
@@ -115,20 +105,9 @@ class PatchProposer:
         """Patches are named once in any case."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PatchSearch:
-    """What `detect_planar_patches` is asked for, by its own names."""
-
-    n_neighbours: int
-    normal_variance_deg: float
-    coplanarity_deg: float
-    outlier_share: float
-    least_points: int
-
-
 # Any: the library has no types.
 def patches(
-    open3d: Any, points_m: NDArray[np.float64], search: PatchSearch, family: Family
+    open3d: Any, points_m: NDArray[np.float64], params: Open3dPatches.Params, *, least_points: int
 ) -> PatchProposer:
     """Find all patches at once; a patch counts the points in its box.
 
@@ -139,14 +118,14 @@ def patches(
 
     cloud = open3d.geometry.PointCloud()
     cloud.points = open3d.utility.Vector3dVector(points_m)
-    neighbours = open3d.geometry.KDTreeSearchParamKNN(knn=search.n_neighbours)
+    neighbours = open3d.geometry.KDTreeSearchParamKNN(knn=params.n_neighbours)
     try:
         cloud.estimate_normals(neighbours)
         boxes = cloud.detect_planar_patches(
-            normal_variance_threshold_deg=search.normal_variance_deg,
-            coplanarity_deg=search.coplanarity_deg,
-            outlier_ratio=search.outlier_share,
-            min_num_points=search.least_points,
+            normal_variance_threshold_deg=params.normal_variance_deg,
+            coplanarity_deg=params.coplanarity_deg,
+            outlier_ratio=params.outlier_share,
+            min_num_points=least_points,
             search_param=neighbours,
         )
     except RuntimeError as error:
@@ -162,7 +141,7 @@ def patches(
         candidates.append(
             Candidate(
                 plane=Plane(normal=normal, offset_m=float(normal @ centre_m)),
-                family=family,
+                family=params.family,
                 votes=float(inside),
             )
         )

@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.geometry import Plane
-from orthoflow.products import Planes, PointCloud, PointLabels
-from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
+from orthoflow.sdk import Method, StepContext
+from orthoflow_plugins.plane.parameters import (
+    DETECTOR_METRICS,
+    DetectorIn,
+    DetectorOut,
+    DetectorParams,
+)
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Candidate, Family, Rules
@@ -57,18 +61,10 @@ class Open3dRansac(Method):
 
         n_iterations: int = Field(1000, ge=1, le=1_000_000, description="Hypotheses per plane.")
 
-    class In(Ports):
-        """What it works on."""
+    In = DetectorIn
+    Out = DetectorOut
 
-        cloud: PointCloud
-
-    class Out(Ports):
-        """What it finds."""
-
-        planes: Planes
-        labels: PointLabels
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
         from orthoflow.files.open3d_guard import load_open3d
         from orthoflow_plugins.plane.detecting import Detector, detect
@@ -87,7 +83,7 @@ class Open3dRansac(Method):
 
         detector = Detector(method=self.id, proposer_of=proposer_of)
         detection = detect(inputs.cloud, params, ctx, detector)
-        return self.Out(planes=detection.planes, labels=detection.labels)
+        return DetectorOut(planes=detection.planes, labels=detection.labels)
 
     @classmethod
     def tools(cls) -> Mapping[str, str]:

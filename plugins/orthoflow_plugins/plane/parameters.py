@@ -1,4 +1,4 @@
-"""What may be set for every detector: tolerances, constraint, stop rules, thinning, joining."""
+"""What every detector takes and gives: ports, tolerances, constraint, stop rules, thinning."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from orthoflow.sdk import MethodParams
+from orthoflow.products import Planes, PointCloud, PointLabels
+from orthoflow.sdk import MethodParams, Ports
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Family
@@ -25,6 +26,19 @@ DETECTOR_METRICS: Final = (
 )
 
 _FAMILIES: Final[Mapping[str, Family]] = {"any": "any", "vertical": "wall", "horizontal": "level"}
+
+
+class DetectorIn(Ports):
+    """What planes are found in."""
+
+    cloud: PointCloud
+
+
+class DetectorOut(Ports):
+    """Planes, and which of them has each point."""
+
+    planes: Planes
+    labels: PointLabels
 
 
 class DetectorParams(MethodParams):

@@ -6,9 +6,13 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 
-from orthoflow.products import Planes, PointCloud, PointLabels
-from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
+from orthoflow.sdk import Method, StepContext
+from orthoflow_plugins.plane.parameters import (
+    DETECTOR_METRICS,
+    DetectorIn,
+    DetectorOut,
+    DetectorParams,
+)
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Rules
@@ -71,18 +75,10 @@ class Ransac(Method):
                 raise ValueError("model: 2d finds upright planes only, got constraint: horizontal")
             return self
 
-    class In(Ports):
-        """What it works on."""
+    In = DetectorIn
+    Out = DetectorOut
 
-        cloud: PointCloud
-
-    class Out(Ports):
-        """What it finds."""
-
-        planes: Planes
-        labels: PointLabels
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.consensus import ConsensusProposer, Search
         from orthoflow_plugins.plane.detecting import Detector, detect
@@ -104,4 +100,4 @@ class Ransac(Method):
         own_m = detection.raw[0].own_tolerance_m
         if own_m is not None:
             ctx.metric("own_tolerance_mm", 1000.0 * own_m, "mm")
-        return self.Out(planes=detection.planes, labels=detection.labels)
+        return DetectorOut(planes=detection.planes, labels=detection.labels)

@@ -6,9 +6,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pydantic import Field, model_validator
 
-from orthoflow.products import Planes, PointCloud, PointLabels
-from orthoflow.sdk import Method, Ports, StepContext
-from orthoflow_plugins.plane.parameters import DETECTOR_METRICS, DetectorParams
+from orthoflow.sdk import Method, StepContext
+from orthoflow_plugins.plane.parameters import (
+    DETECTOR_METRICS,
+    DetectorIn,
+    DetectorOut,
+    DetectorParams,
+)
 
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import FoundPlane, Rules
@@ -114,18 +118,10 @@ class Region(Method):
                 return {**_PAPER, **given}
             return given
 
-    class In(Ports):
-        """What it works on."""
+    In = DetectorIn
+    Out = DetectorOut
 
-        cloud: PointCloud
-
-    class Out(Ports):
-        """What it finds."""
-
-        planes: Planes
-        labels: PointLabels
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: DetectorIn, params: Params, ctx: StepContext) -> DetectorOut:
         """Detect the planes of a cloud."""
         from orthoflow_plugins.plane.assembling import middle_viewpoint_m
         from orthoflow_plugins.plane.detecting import Detector, detect
@@ -171,7 +167,7 @@ class Region(Method):
         detector = Detector(method=self.id, proposer_of=proposer_of, relabel=relabel)
         detection = detect(inputs.cloud, params, ctx, detector)
         draw_normals(ctx, grown[0], detection.planes, inputs.cloud)
-        return self.Out(planes=detection.planes, labels=detection.labels)
+        return DetectorOut(planes=detection.planes, labels=detection.labels)
 
 
 def _neighbourhood(params: Region.Params) -> Neighbourhood:

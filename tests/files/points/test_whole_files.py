@@ -48,7 +48,7 @@ def file(format_name: str, n_most: int, fields: frozenset[str], **more: object) 
 @pytest.fixture
 def by_twos(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let readers give two points a block."""
-    for name in ("e57", "las", "pcd", "ply", "ptx", "text"):
+    for name in ("e57", "las", "pcd", "ply", "tables", "text"):
         module = importlib.import_module(f"orthoflow.files.points.{name}")
         monkeypatch.setattr(module, "BLOCK_POINTS", 2)
 
