@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -155,20 +155,17 @@ def wall_pictures(run: Run, *, share: float = 1.0) -> Iterator[Picture]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Drawing:
-    """A picture that is still to be drawn."""
+    """A picture of a wall that is still to be drawn.
+
+    Attributes:
+        draw: gives the file, so many pixels long.
+        frame: of the wall.
+        picture: all but the file; its legend says what the colours mean.
+    """
 
     draw: Callable[[int], bytes]
-    title: str
-    caption: str
-    file: str
-    cell: str
-    wall: int
-    number: int
-    name: str
     frame: WallFrame
-    reading: str
-    depths: CoarseDepths | None = None
-    colours: str = ""
+    picture: Picture
 
 
 def _drawn(
@@ -189,20 +186,9 @@ def _drawn(
 
     contents = in_order(lambda drawing: drawing.draw(longest_px(drawing.frame)), drawings)
     for drawing, content in zip(drawings, contents, strict=True):
-        yield Picture(
-            uri=data_uri(content, "image/webp"),
-            title=drawing.title,
-            caption=drawing.caption,
-            file=drawing.file,
-            cell=drawing.cell,
-            wall=drawing.wall,
-            number=drawing.number,
-            name=drawing.name,
-            frame=drawing.frame,
-            depths=drawing.depths,
-            legend=drawing.colours + scale_bar(drawing.frame.width * drawing.frame.gsd_m),
-            reading=drawing.reading,
-        )
+        picture = drawing.picture
+        legend = picture.legend + scale_bar(picture.width_m)
+        yield replace(picture, uri=data_uri(content, "image/webp"), legend=legend)
 
 
 def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
@@ -213,17 +199,19 @@ def _orthoimage(run: Run, address: str, image: Orthoimage) -> _Drawing:
 
     return _Drawing(
         draw=lambda side: cells_webp(image.mask.shape, cells, longest_side_px=side),
-        title=_title(image.name, address),
-        caption=f"{frame_words(image.frame)}; of all cells {_states(image)}",
-        file=_published(run, address, f"wall_{image.number}_ortho.tif"),
-        cell=address,
-        wall=image.wall,
-        number=image.number,
-        name=image.name,
         frame=image.frame,
-        reading=(
-            "Lines of the building run through unbroken; doubled or broken ones, and blur, are "
-            "photos or depths that do not fit, the chequered ground is where nothing was seen."
+        picture=Picture(
+            uri="",
+            title=_title(image.name, address),
+            caption=f"{frame_words(image.frame)}; of all cells {_states(image)}",
+            file=_published(run, address, f"wall_{image.number}_ortho.tif"),
+            cell=address,
+            wall=image.wall,
+            number=image.number,
+            name=image.name,
+            frame=image.frame,
+            reading="Lines of the building run through unbroken; doubled or broken ones, and blur, "
+            "are photos or depths that do not fit, the chequered ground is where nothing was seen.",
         ),
     )
 
@@ -251,20 +239,15 @@ def _depth(run: Run, address: str, index: int, wall: Wall) -> _Drawing:
 
     return _Drawing(
         draw=lambda side: cells_webp(wall.mask.shape, cells, longest_side_px=side),
-        title=_title(f"{wall.name}, depth", address),
-        caption=f"{_percent(known)} of the cells known",
-        file=_published(run, address, f"wall_{wall.plane_index}_depth.tif"),
-        cell=address,
-        wall=index,
-        number=wall.plane_index,
-        name=wall.name,
         frame=wall.frame,
-        reading=(
-            "Relief shows as even colours with sharp edges; stripes, or a slope over the whole "
-            "wall, are scans or a plane that do not fit."
+        picture=replace(
+            _raster(run, address, index, wall, "depth"),
+            caption=f"{_percent(known)} of the cells known",
+            reading="Relief shows as even colours with sharp edges; stripes, or a slope over the "
+            "whole wall, are scans or a plane that do not fit.",
+            depths=coarse_depths(wall.depth_m),
+            legend=depth_bar(limit_m),
         ),
-        depths=coarse_depths(wall.depth_m),
-        colours=depth_bar(limit_m),
     )
 
 
@@ -273,21 +256,31 @@ def _intensity(
 ) -> _Drawing:
     return _Drawing(
         draw=lambda side: cells_webp(intensity.shape, grey_cells(intensity), longest_side_px=side),
-        title=_title(f"{wall.name}, intensity", address),
-        caption={
-            "laser": "laser intensity",
-            "luminance": "no laser intensity in the scan: grey of its colours instead",
-        }.get(source, source),
-        file=_published(run, address, f"wall_{wall.plane_index}_intensity.tif"),
+        frame=wall.frame,
+        picture=replace(
+            _raster(run, address, index, wall, "intensity"),
+            caption={
+                "laser": "laser intensity",
+                "luminance": "no laser intensity in the scan: grey of its colours instead",
+            }.get(source, source),
+            reading="What photos are matched with: texture everywhere is good; where it is flat "
+            "grey, ties cannot be found.",
+        ),
+    )
+
+
+def _raster(run: Run, address: str, index: int, wall: Wall, what: str) -> Picture:
+    """A picture of `depth` or `intensity`, but for what it shows and how it is read."""
+    return Picture(
+        uri="",
+        title=_title(f"{wall.name}, {what}", address),
+        caption="",
+        file=_published(run, address, f"wall_{wall.plane_index}_{what}.tif"),
         cell=address,
         wall=index,
         number=wall.plane_index,
         name=wall.name,
         frame=wall.frame,
-        reading=(
-            "What photos are matched with: texture everywhere is good; where it is flat grey, ties "
-            "cannot be found."
-        ),
     )
 
 
