@@ -431,10 +431,11 @@ class _Run:
             text = f"the stored result was damaged ({damage}) and was computed again"
             result = _with_warning(result, text)
         self._results[cell.address] = result
-        if is_cached and result.run_id == self._journal.run_id:
-            self._resumed.add(cell.address)
-        elif is_cached:
+        # What an equal cell gave a moment ago is as new as that.
+        if is_cached and result.run_id != self._journal.run_id:
             self._cached[cell.address] = result.run_id
+        elif is_cached and result.key not in self._made:
+            self._resumed.add(cell.address)
         self._journal.write(
             CellEnded(
                 time=now(),

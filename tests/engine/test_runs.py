@@ -128,6 +128,8 @@ compare: {design: product}
     started = [event.address for event in world.events if isinstance(event, CellStarted)]
     assert len(started) == 2
     assert len(set(digests(outcome).values())) == 2
+    # Neither another run nor an earlier attempt of this one gave the second.
+    assert (outcome.cached, outcome.resumed) == ({}, frozenset())
 
 
 def test_figures_metrics_and_warnings_are_kept(world: World) -> None:
