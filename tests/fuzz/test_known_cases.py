@@ -317,6 +317,13 @@ KNOWN: Final = {
         content=_ply(_BINARY, "element vertex 1", *_XYZ, *["property int a"] * 60_000),
         words="element vertex has more than 1000 properties",
     ),
+    "PCD whose rows are wider than it has points": Known(
+        target="PCD",
+        file="a.pcd",
+        content=b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 18446744073709551616\nHEIGHT 5\n"
+        b"POINTS 1\nDATA ascii\n1 2 3\n",
+        words="5 rows of 18446744073709551616 points, but 1 points",
+    ),
     "PCD of a billion fields": Known(
         target="PCD",
         file="a.pcd",

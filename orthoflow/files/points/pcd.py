@@ -248,13 +248,16 @@ def _parse_header(entries: Mapping[str, list[str]], n_bytes: int) -> PcdHeader:
     if data not in {"ascii", "binary", "binary_compressed"}:
         raise ValueError(f"data are {data}, expected ascii, binary or binary_compressed")
     width, height = int(entries["WIDTH"][0]), int(entries["HEIGHT"][0])
+    n_points = int(entries["POINTS"][0]) if "POINTS" in entries else width * height
+    if height > 1 and width * height != n_points:
+        raise ValueError(f"it has {height} rows of {width} points, but {n_points} points")
     pose = [float(item) for item in entries.get("VIEWPOINT", ["0"] * 7)]
     if len(pose) < 3:
         raise ValueError(f"VIEWPOINT has {len(pose)} numbers, expected 7")
     return PcdHeader(
         fields=tuple(names),
         dtype=np.dtype(members),
-        n_points=int(entries["POINTS"][0]) if "POINTS" in entries else width * height,
+        n_points=n_points,
         width=max(width, 1),
         height=height,
         data=data,
