@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from orthoflow.catalog import discover_catalog
+from orthoflow.cli.program import program
 from orthoflow.errors import ArgumentError
-from orthoflow.testing import ConformanceCase, ConformanceError, conformance_cases
+from orthoflow.testing import (
+    ConformanceCase,
+    ConformanceError,
+    Trial,
+    TrialRun,
+    conformance_cases,
+    run_trial,
+    witnesses,
+)
 from tests.laboratories import write_distribution
 
 HONEST = """
@@ -307,6 +318,59 @@ def test_a_result_beside_the_truth_is_noticed(method_id: str) -> None:
 @pytest.mark.parametrize("check", sorted({check for check, _, _ in CHEATS.values()}))
 def test_a_method_that_keeps_the_rules_passes(check: str) -> None:
     case_of("plane.floor", check).run()
+
+
+def quickly_checked(method_id: str) -> tuple[int, dict[str, str]]:
+    """Exit code and states of the checks that `plugins check --quick` tells of."""
+    result = CliRunner().invoke(program, ["plugins", "check", method_id, "--quick", "--json"])
+    return result.exit_code, {
+        item["check"]: item["state"] for item in json.loads(result.stdout)["checks"]
+    }
+
+
+@pytest.mark.usefixtures("cheats")
+def test_quick_checks_take_two_runs_and_say_what_they_leave_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    runs: list[int] = []
+
+    def run(trial: Trial, *_: object, **__: object) -> TrialRun:
+        runs.append(trial.cores)
+        return run_trial(trial, *_, **__)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(witnesses, "run_trial", run)
+    code, states = quickly_checked("plane.floor")
+    # The example on one core and on two; clouds that are refused, and a step that was cancelled.
+    assert runs == [1, 2, 1, 1, 1, 1]
+    assert code == 0
+    left_out = {name for name, state in states.items() if state == "left out"}
+    assert left_out == {
+        "nothing-is-written-outside-scratch",
+        "results-repeat",
+        "a-huge-coordinate-does-no-harm",
+        "planes-follow-a-rigid-motion",
+    }
+    assert {states[name] for name in states.keys() - left_out} == {"kept"}
+    # The rules of other kinds, and golden digests, are about no method that finds planes.
+    assert {case.check.name for case in conformance_cases("plane.floor")} == set(states)
+
+
+@pytest.mark.usefixtures("cheats")
+@pytest.mark.parametrize(
+    ("cheat", "code", "state"),
+    [("trusting", 1, "broken"), ("counting_cores", 1, "broken"), ("rounding", 0, "left out")],
+)
+def test_a_quick_check_ends_as_what_it_looked_at(cheat: str, code: int, state: str) -> None:
+    check, _, _ = CHEATS[cheat]
+    found, states = quickly_checked(f"plane.{cheat}")
+    assert (found, states[check]) == (code, state)
+
+
+@pytest.mark.usefixtures("cheats")
+def test_what_a_quick_check_leaves_out_is_told() -> None:
+    said = CliRunner().invoke(program, ["plugins", "check", "plane.floor", "--quick"]).stdout
+    assert "left out results-repeat: Same seed, same digest" in said
+    assert said.endswith("plane.floor keeps 11 rules, 4 left out (--quick)\n")
 
 
 @pytest.mark.usefixtures("cheats")
