@@ -378,6 +378,7 @@ def around(values, params, ctx):
     return np.array([
         os.getpid(), os.getppid(), os.getsid(0), loaded, float(os.environ.get("TOY_NUMBER", -1)),
         resource.getrlimit(resource.RLIMIT_NOFILE)[0], float(ctx.cores),
+        float(os.environ["OPENBLAS_THREAD_TIMEOUT"]),
     ])
 
 @work("exact")

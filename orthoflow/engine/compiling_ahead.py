@@ -4,6 +4,7 @@ A plugin's package may hold `kernels.json`: for each of its methods the kernels 
 with the types of their arguments. Those of the methods that a run still has before it are compiled
 by a process of lowest priority into the folder that the steps read. A step that comes too early
 compiles for itself, or waits for the one kernel that is being compiled (`geometry.kept_kernels`).
+Beside a step whose times are compared nothing is compiled: its core shares memory and cache.
 `python -m orthoflow.engine.compiling_ahead` is that process; it ends with the coordinator.
 """
 
@@ -41,7 +42,7 @@ class AheadCompiler:
     """The processes that compile for one run.
 
     Attributes:
-        is_wanted: whether there is a core besides the one that a step needs, until they began.
+        is_wanted: whether there is a core besides the one that a step needs, while none is there.
     """
 
     is_wanted: bool
@@ -59,6 +60,11 @@ class AheadCompiler:
             if orders:
                 with suppress(OSError):
                     self._processes.append(_start(folder, orders))
+
+    def hold(self) -> None:
+        """End them until a later `begin`; a kernel that is half compiled is begun anew then."""
+        self.is_wanted |= bool(self._processes)
+        self.close()
 
     def close(self) -> None:
         """End them: what is not compiled by now no step of this run needs."""

@@ -2,7 +2,8 @@
 
 `python -m orthoflow.engine.fork_server SOCKET COORDINATOR`. What every step needs is loaded by the
 imports below. A step tells at its end which other libraries it has loaded; whenever nothing else is
-asked for, they are loaded here too, for the steps after it. Never a plugin: no code of a stranger
+asked for, they are loaded here too, for the steps after it; before a step whose times are compared,
+and not beside it. Never a plugin: no code of a stranger
 runs in the process that others come from. What begins threads when it is loaded is left to the
 steps.
 """
@@ -69,6 +70,7 @@ class StepRequest:
         variables: all environment variables.
         paths: where modules are looked for.
         limits: resource -> soft and hard limit, as `resource.getrlimit` has them.
+        is_compared: whether the times of the step stand beside those of others.
     """
 
     task_file: str
@@ -76,6 +78,7 @@ class StepRequest:
     variables: dict[str, str]
     paths: list[str]
     limits: dict[int, tuple[int, int]]
+    is_compared: bool
 
 
 def _messages() -> tuple[socket.socket, socket.socket]:
@@ -133,6 +136,10 @@ class _Server:
         reports = socket.socket(fileno=task_socket)
         with os.fdopen(text, "rb") as stream:
             request = StepRequest(**json.load(stream))
+        if request.is_compared:
+            self._learn()
+            while self.wanted:
+                _load(self.wanted.pop(0))
         try:
             keeper = os.fork()
         except OSError:

@@ -60,7 +60,7 @@ from orthoflow.errors import (
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
 from orthoflow.system import HAS_STEP_PROCESSES
-from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput
+from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput, compared_cells
 
 _POLL_S: Final = 0.25
 _CODE_CHANGED: Final = (
@@ -216,6 +216,7 @@ class _Run:
         self._waiting = {item.cell.address: item for item in self._plan.cells}
         self._ready: dict[str, _Ready] = {}
         self._running: dict[str, Task] = {}
+        self._compared = compared_cells(item.cell for item in self._plan.cells)
 
     def go(self, executor: Executor, interruption: Interruption) -> None:
         """Run until every cell has a result.
@@ -371,13 +372,18 @@ class _Run:
         return len(self._running) < capacity.n_tasks and is_fitting
 
     def _start(self, cell: Cell, ready: _Ready, executor: Executor) -> None:
-        task = self._tasks.make(cell, ready.key, ready.refs, _cores(cell, executor.capacity))
+        task = dataclasses.replace(
+            self._tasks.make(cell, ready.key, ready.refs, _cores(cell, executor.capacity)),
+            is_compared=cell.address in self._compared,
+        )
         del self._waiting[cell.address]
         self._running[cell.address] = task
         self._journal.write(CellBegan(time=now(), address=cell.address, key=task.key))
         self._listen(CellStarted(address=cell.address))
+        if task.is_compared:
+            self._ahead.hold()
         executor.start(task)
-        if self._ahead.is_wanted:
+        if self._ahead.is_wanted and not self._compared.intersection(self._running):
             later = (item.cell for item in self._waiting.values())
             self._ahead.begin(self._tasks.kernels_of(later))
 

@@ -78,6 +78,7 @@ class Task(MethodIdentity):
         numba_folder: where compiled kernels are kept.
         publisher_tag: version of what writes published files.
         environment: where it will run.
+        is_compared: whether its times stand beside those of others.
     """
 
     address: str
@@ -97,6 +98,7 @@ class Task(MethodIdentity):
     numba_folder: str
     publisher_tag: str = ""
     environment: RecordedEnvironment | None = None
+    is_compared: bool = False
 
     @property
     def who(self) -> str:

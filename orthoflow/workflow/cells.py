@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -85,6 +86,19 @@ class Cell:
     cores: int | None = None
     timeout_s: float | None = None
     skip_reason: str = ""
+
+
+def compared_cells(cells: Iterable[Cell]) -> frozenset[str]:
+    """Give the addresses of cells whose times stand beside each other: variants and repeats.
+
+    Those of one step on one dataset; what differs in its data alone is no comparison of methods.
+    """
+    alike: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+    for cell in cells:
+        alike[cell.step, cell.assignment.get(DATA, "")].append(cell.address)
+    return frozenset(
+        address for addresses in alike.values() if len(addresses) > 1 for address in addresses
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

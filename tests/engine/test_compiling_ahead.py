@@ -5,17 +5,21 @@ from __future__ import annotations
 import importlib
 import inspect
 import json
+import subprocess
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.engine import compiling_ahead
+from orthoflow.engine import compiling_ahead, execute
 from orthoflow.engine.compiling_ahead import FORETOLD, AheadCompiler
+from orthoflow.engine.events import CellFinished, RunEvent
 from orthoflow.engine.keys import MethodFacts, method_facts
 from orthoflow.geometry.kernel_types import type_of
+from tests.engine_world import World, toy_world
 from tests.workshop_runs import WORKSHOP
 
 _LONGEST_S = 120.0
@@ -79,6 +83,71 @@ def test_the_compiler_ends_when_nobody_is_left_who_ordered(
     assert process.stdin is not None
     process.stdin.close()
     process.wait(_LONGEST_S)
+
+
+def test_one_that_is_held_begins_anew(tmp_path: Path, facts: MethodFacts) -> None:
+    ahead = AheadCompiler(is_wanted=False)
+    ahead.hold()
+    assert not ahead.is_wanted, "there is no core for it"
+    ahead = AheadCompiler(is_wanted=True)
+    ahead.begin({tmp_path: [facts]})
+    [process] = ahead._processes
+    assert not ahead.is_wanted
+    ahead.hold()
+    assert process.returncode is not None
+    assert ahead.is_wanted
+    done = done_file(tmp_path, facts)
+    ahead.begin({tmp_path: [facts]})
+    try:
+        wait_for(done)
+    finally:
+        ahead.close()
+
+
+COMPARED = """
+steps:
+  first: {use: make.range}
+  second:
+    in: {numbers: first.numbers}
+    variants: {a: {use: work.add, params: {amount: 2}}, b: {use: work.slow}}
+  third: {use: work.add, in: {numbers: first.numbers}, params: {amount: 7}}
+  fourth: {use: work.add, in: {numbers: third.numbers}, params: {amount: 8}}
+compare: {design: product}
+"""
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def test_nothing_is_compiled_beside_steps_whose_times_are_compared(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compilers: list[subprocess.Popen[bytes]] = []
+
+    def start(*_: object) -> subprocess.Popen[bytes]:
+        compilers.append(subprocess.Popen(["sleep", "600"], stdin=subprocess.PIPE))
+        return compilers[-1]
+
+    living: dict[str, list[bool]] = {}
+
+    def listen(event: RunEvent) -> None:
+        if isinstance(event, CellFinished):
+            living[event.address] = [process.poll() is None for process in compilers]
+
+    monkeypatch.setattr(compiling_ahead, "_start", start)
+    monkeypatch.setattr(compiling_ahead, "_orders", lambda *_: {"method": []})
+    execute(world.plan(COMPARED, cores=2), world.folder / "run", world.store, listen)
+    assert living == {
+        "first": [True],
+        "second@second=a": [False],
+        "second@second=b": [False],
+        "third": [False, True],
+        "fourth": [False, True],
+    }
+    assert [process.poll() is None for process in compilers] == [False, False]
 
 
 def test_kernels_that_are_not_as_they_were_foretold_are_left_to_their_steps(tmp_path: Path) -> None:

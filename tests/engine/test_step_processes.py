@@ -20,6 +20,17 @@ from tests.engine_world import World, has_ended, start_coordinator, toy_world
 
 STEPS = "steps:\n  first: {use: make.range}\n"
 AROUND = STEPS + "  second: {use: work.around, in: {numbers: first.numbers}}\n"
+COMPARED = (
+    STEPS
+    + """
+  second:
+    in: {numbers: first.numbers}
+    variants:
+      one: {use: work.around, params: {steps: 1}}
+      two: {use: work.around, params: {steps: 2}}
+compare: {design: product}
+"""
+)
 SLOW = STEPS + ("  second: {use: work.slow, in: {numbers: first.numbers}, params: {steps: 2000}}\n")
 
 
@@ -40,6 +51,7 @@ class Around:
     number: int
     file_limit: int
     cores: int
+    spins_log2: int
 
 
 _numbers = itertools.count()
@@ -79,6 +91,26 @@ def test_the_next_run_finds_the_server_and_libraries_that_steps_loaded(world: Wo
             break
     else:
         pytest.fail("no step ever found the library that those before it had loaded")
+
+
+def test_what_compared_steps_loaded_is_loaded_before_the_next_one_not_beside_it(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Of no other test: a server of its own, which has loaded nothing.
+    monkeypatch.setenv("OPENBLAS_LOOP", "1")
+    outcome = world.run(COMPARED)
+    loaded = [world.values(outcome, f"second@second={name}")[3] for name in ("one", "two")]
+    assert loaded == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("turns", ["20", "26"], ids=["by default", "as somebody wants it"])
+def test_the_threads_of_algebra_spin_hardly_or_as_long_as_is_said(
+    world: World, monkeypatch: pytest.MonkeyPatch, turns: str
+) -> None:
+    monkeypatch.delenv("OPENBLAS_THREAD_TIMEOUT", raising=False)
+    if turns != "20":
+        monkeypatch.setenv("OPENBLAS_THREAD_TIMEOUT", turns)
+    assert around(world).spins_log2 == int(turns)
 
 
 def test_steps_have_what_the_coordinator_has_when_they_start(
