@@ -178,11 +178,13 @@ def rotation_of(values: Sequence[float], path: Path, whose: str) -> NDArray[np.f
         InputError: they are far from one.
     """
     matrix = np.array(values, dtype=np.float64).reshape(3, 3)
-    left, _, right = np.linalg.svd(matrix)
-    rotation: NDArray[np.float64] = left @ right
-    if np.abs(rotation - matrix).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0.0:
-        raise damaged(path, f"the rotation of {whose} is no rotation matrix")
-    return rotation
+    # LAPACK may look for the singular values of infinity for ever.
+    if (np.abs(matrix) <= 1.0 + _ORTHONORMAL).all():
+        left, _, right = np.linalg.svd(matrix)
+        rotation: NDArray[np.float64] = left @ right
+        if np.abs(rotation - matrix).max() <= _ORTHONORMAL and np.linalg.det(rotation) > 0.0:
+            return rotation
+    raise damaged(path, f"the rotation of {whose} is no rotation matrix")
 
 
 def checked_lens(lens: Intrinsics, path: Path, whose: str) -> Intrinsics:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError
-from orthoflow.files.containers import image_format, is_webp, stated_size
+from orthoflow.files.containers import image_format, is_cut_off, is_webp, stated_size
 from orthoflow.files.exif import without_orientation
 from orthoflow.geometry.levels import Colours, eight_bits
 
@@ -83,7 +83,9 @@ def _decoded(encoded: bytes, name: str, *, is_deep: bool) -> NDArray[np.generic]
     """Decode an image: RGB of 8 bits, or BGR of its own depth."""
     import cv2
 
-    if image_format(encoded) is None and not is_webp(encoded):
+    # OpenCV makes room for a chunk of a PNG as long as it says that it is.
+    is_cut_png = image_format(encoded) == "PNG" and is_cut_off(encoded)
+    if is_cut_png or (image_format(encoded) is None and not is_webp(encoded)):
         raise InputError(_not_an_image(encoded, name))
     size = stated_size(encoded)
     if size is not None and size[0] * size[1] > MOST_PIXELS:

@@ -440,7 +440,7 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
         ({"b.out": "1 0\n", "l.txt": "a.jpg", "m.txt": "a.jpg"}, "there are 2 such files"),
         ({"b.json": "{}", "c.json": "{}"}, "b.json, c.json holds no cameras"),
         ({f"{n}.jpg": "" for n in "abc"}, "a.jpg, b.jpg, c.jpg holds no cameras"),
-        ({f"{n}.jpg": "" for n in "abcd"}, r"a.jpg, b.jpg, c.jpg \.\.\. holds no cameras"),
+        ({f"{n}.jpg": "" for n in "abcd"}, r"a.jpg, b.jpg, c.jpg and 1 more holds no cameras"),
         ({"c.json": cameras_json(lambda e: e.update(width=0))}, "a.jpg is 0 x 480 pixels"),
         ({"c.json": cameras_json(lambda e: e.update(height=0))}, "a.jpg is 640 x 0 pixels"),
         ({"c.json": cameras_json(lambda e: e.update(K=[[1, 0, 0], [0, -2, 0], [0, 0, 1]]))},
@@ -455,6 +455,11 @@ CAMERA = f"1 PINHOLE {WIDTH} {HEIGHT} 500 500 320 240\n"
         # A mirror is no turn.
         ({"c.json": cameras_json(
             lambda e: e.update(R_camera_from_world=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]))},
+         "the rotation of a.jpg is no rotation matrix"),
+        # LAPACK never ended with it.
+        ({"c.json": cameras_json(
+            lambda e: e.update(R_camera_from_world=[[1, 0, 0], [7.5, 1, 0], [0, 0, 1]])
+        ).replace("7.5", "1e309")},
          "the rotation of a.jpg is no rotation matrix"),
         ({"c.csv": HEAD + "a.jpg,1,2,3,0,0,0,0,0,0,0,0,0,0,0,0\n"},
          "c.csv:2: the focal length of a.jpg must be positive, got 0"),

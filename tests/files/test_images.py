@@ -90,6 +90,18 @@ def test_what_is_no_image_is_told_with_its_size(encoded: bytes) -> None:
         images.decode_image(encoded)
 
 
+def test_no_room_is_made_for_what_a_png_only_says_that_it_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = images.encode_png(blocks(16, 16))
+    at = whole.index(b"IDAT") - 4
+    monkeypatch.setattr("cv2.imdecode", lambda *_: pytest.fail("it was handed to the decoder"))
+    for stated in (2**31 - 1, 3_332_046_943):
+        hostile = whole[:at] + struct.pack(">I", stated) + whole[at + 4 :]
+        with pytest.raises(InputError, match="expected a whole JPEG, PNG or TIFF file"):
+            images.decode_image(hostile)
+
+
 def test_the_first_percentile_is_black_and_the_last_one_white() -> None:
     values = np.append(np.arange(101.0), np.nan)
     grey = images.stretch_to_grey(values)

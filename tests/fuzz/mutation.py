@@ -79,6 +79,12 @@ _BINARY: Final = (
 )
 
 
+# Documents with more places than a thousand copies of one make are not multiplied again, and what
+# a place is replaced by is put in as often as makes this many bytes.
+_MANY_PLACES: Final = 500
+_LONGEST: Final = 20_000_000
+
+
 def mutate_bytes(content: bytes, rng: Random, others: Sequence[bytes]) -> bytes:
     """Change a binary file, its first bytes as often as all the others."""
     return _in_rounds(content, rng, others, _BYTE_STEPS)
@@ -275,11 +281,14 @@ def _changed_tree(text: str, rng: Random) -> bytes:
                 raws.append(rng.choice((b"[" * 50_000 + b"]" * 50_000, b"[" * 70 + b"]" * 70)))
                 container[key] = f"@{len(raws) - 1}@"
             case _:
-                container[key] = [container[key]] * rng.choice((0, 1, 5, 1000))
+                # A thousand times a thousand times a thousand would be the harness's own end.
+                count = rng.choice((0, 1, 5, 1000))
+                container[key] = [container[key]] * (5 if len(places) > _MANY_PLACES else count)
         places = _places(tree)
     dumped = json.dumps(tree[""]).encode()
     for index, raw in enumerate(raws):
-        dumped = dumped.replace(f'"@{index}@"'.encode(), raw)
+        most = max(1, _LONGEST // len(raw))
+        dumped = dumped.replace(f'"@{index}@"'.encode(), raw, most)
     return dumped
 
 

