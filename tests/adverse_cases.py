@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from orthoflow.files.images import encode_png
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.products import Intrinsics, Photo, Ties, TieWall
+from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
 
 WALL_M: Final = (4.0, 3.0)
@@ -115,16 +116,11 @@ def adverse_case(kind: str, seed: int) -> AdverseCase:
 
 def _ties_of(draft: _Draft) -> Ties:
     n, shift = len(draft.pixels), np.array(draft.shift_m)
-    return Ties(
-        photo_names=("a.png",),
-        photo=np.zeros(n, np.int32),
-        wall=np.zeros(n, np.int32),
-        pixels_photo=draft.pixels,
+    return samples.ties(
+        draft.pixels,
         points_world=draft.points + shift,
         sigma_px=np.full(n, NOISE_PX),
         sigma_m=np.full(n, NOISE_M),
-        role=np.zeros(n, np.uint8),
-        residual_px=np.full((n, 2), np.nan),
         walls=(
             TieWall(
                 gsd_m=GSD_M,
@@ -150,7 +146,9 @@ def _draft(
     centre = foot + rng.uniform(2.4, 3.2) * (aside - np.array([0.0, 1.0, 0.0]))
     rotation = looking_at(centre, foot, np.array([0.0, 0.0, 1.0]))
     focal = rng.uniform(1000.0, 1300.0)
-    camera = ViewingCamera(
+    camera = samples.camera(
+        rotation,
+        centre,
         width=SIZE_PX[0],
         height=SIZE_PX[1],
         fx=focal,
@@ -159,8 +157,6 @@ def _draft(
         cy=SIZE_PX[1] / 2 + rng.uniform(-8.0, 8.0),
         distortion=np.array([-0.08, 0.02, 0.0, 0.0, 0.0])
         + np.array([0.01, 0.005, 0.0005, 0.0005, 0.0]) * rng.uniform(-1.0, 1.0, 5),
-        rotation=rotation,
-        translation=-rotation @ centre,
     )
     places = rng.uniform(-0.5, 0.5, (12 * n, 2)) * WALL_M
     depth = relief_m * (np.floor(places[:, 0] / 0.4) % 3.0 == 0.0)

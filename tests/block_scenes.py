@@ -10,6 +10,7 @@ import numpy as np
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Photos, Ties, TieWall
 from orthoflow.testing import photographed as ms
+from tests import samples
 
 _VIEWS = (
     ((0.8, -2.4, 1.1), (1.3, 0.0, 1.0), 0.0),
@@ -70,16 +71,13 @@ def scan_ties(
         points.append(true[chosen] + noise_m * rng.normal(size=(n, 3)))
     shift = np.zeros(3) if shift_m is None else shift_m
     n_all = n * len(viewers())
-    return Ties(
+    return samples.ties(
+        np.vstack(pixels),
         photo_names=names(),
         photo=np.concatenate(owner),
-        wall=np.zeros(n_all, np.int32),
-        pixels_photo=np.vstack(pixels),
         points_world=np.vstack(points) + shift,
         sigma_px=np.full(n_all, noise_px),
         sigma_m=np.full(n_all, noise_m),
-        role=np.zeros(n_all, np.uint8),
-        residual_px=np.full((n_all, 2), np.nan),
         walls=(
             TieWall(
                 gsd_m=ms.GSD_M,

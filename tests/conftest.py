@@ -9,7 +9,7 @@ import tempfile
 from base64 import b64decode
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import pytest
 from _pytest.doctest import DoctestModule
@@ -18,6 +18,9 @@ from hypothesis import HealthCheck, settings
 from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
 from tests.long_loops import IS_LONG
+
+if TYPE_CHECKING:
+    from tests.engine_world import World
 
 _ROOT = Path(__file__).resolve().parents[1]
 
@@ -99,6 +102,14 @@ def shared_data() -> Path:
     if not _SHARED.is_dir():
         pytest.skip("the real test data beside the checkout (../shared/data) are not here")
     return _SHARED
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    from tests.engine_world import toy_world
+
+    with toy_world(tmp_path) as opened:
+        yield opened
 
 
 @pytest.fixture(scope="session")

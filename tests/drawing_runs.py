@@ -26,6 +26,7 @@ from orthoflow.products import (
 )
 from orthoflow.products.inspections import Finding
 from orthoflow.products.product import Product
+from tests import samples
 from tests.provenance_records import ProductShelf
 from tests.report_runs import cell, metrics, record
 
@@ -69,14 +70,12 @@ def box_planes() -> Planes:
     seen = whole - GAP_M * np.sign(np.round(whole - middle, 9))
     normal = inwards @ AXES
     corners = np.array([box_points(quad) for quad in seen])
-    return Planes(
+    return samples.planes(
         normal=normal,
         offset=np.einsum("ki,ki->k", normal, corners.mean(axis=1)),
         corners=corners,
-        covariance=np.zeros((6, 4, 4)),
         n_points=np.arange(6000, 0, -1000, dtype=np.int64),
         rms_m=np.full(6, 0.002),
-        up=np.array([0.0, 0.0, 1.0]),
         names=("floor 0", "ceiling 1", "wall 2", "wall 3", "wall 4", "wall 5"),
     )
 
@@ -198,14 +197,12 @@ def _image(frame: WallFrame) -> Orthoimage:
     mask[:, -10:] = OrthoMask.NONE
     rgb = np.stack([columns // 2, rows, np.full(frame.shape, 128)], axis=2).astype(np.uint8)
     rgb[:, -10:] = 0
-    return Orthoimage(
-        frame=frame,
-        wall=0,
+    return samples.orthoimage(
+        frame,
         name=f"wall {WALL}",
         rgb=rgb,
         mask=mask,
         source=np.where(mask == OrthoMask.PAINTED, 0, -1).astype(np.int16),
-        sources=("a.jpg",),
         plane_index=WALL,
     )
 

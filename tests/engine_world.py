@@ -88,6 +88,16 @@ def toy_world(folder: Path) -> Iterator[World]:
         forget_toys()
 
 
+def digests(outcome: RunOutcome) -> dict[str, str]:
+    """Digests of the products of a run that came to its end, by `cell.port`."""
+    assert outcome.status == "ok", {a: r.error_message for a, r in outcome.failed.items()}
+    return {
+        f"{address}.{port}": ref.digest
+        for address, result in outcome.results.items()
+        for port, ref in result.outputs.items()
+    }
+
+
 def start_coordinator(world: World, steps: str, into: str) -> subprocess.Popen[bytes]:
     """Run a workflow in a process of its own, which tests may kill."""
     (world.folder / "steps.txt").write_text(steps)

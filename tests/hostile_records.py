@@ -20,6 +20,8 @@ from orthoflow_provenance.encoding import (
 from orthoflow_provenance.layout import PUBLISHED
 from orthoflow_provenance.seal import SEAL_ATTRIBUTE, SEAL_DATASET, seal_file
 
+from orthoflow.engine.file_digests import file_sha256
+
 PNG = b"\x89PNG\r\n\x1a\n picture"
 FILES = (("name", str), ("size_bytes", int), ("sha256", str))
 PATHS = (("path", str), ("size_bytes", int), ("sha256", str))
@@ -101,3 +103,17 @@ def name_published(file: h5py.File, *paths: str) -> None:
     rows = [(path, 0, "0" * 64) for path in paths]
     del file[PUBLISHED]
     write_table(file, PUBLISHED, PATHS, rows)
+
+
+def publish_again(run: Path) -> None:
+    """Let the record of a run name the published files as they are now."""
+
+    def name(file: h5py.File) -> None:
+        rows = [
+            (path, (run / path).stat().st_size, file_sha256(run / path))
+            for path, _, _ in read_table(file, PUBLISHED, PATHS)
+        ]
+        del file[PUBLISHED]
+        write_table(file, PUBLISHED, PATHS, rows)
+
+    reseal(run / "run.h5", name)

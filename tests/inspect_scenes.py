@@ -32,6 +32,7 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
+from tests import samples
 from tests.raster_scenes import UP
 
 GSD_M = 0.004
@@ -41,15 +42,7 @@ BUFFER_M = 0.15
 
 def frame(*, gsd_m: float = GSD_M, shape: tuple[int, int] = SHAPE) -> WallFrame:
     """A wall that faces -y."""
-    return WallFrame(
-        origin_world=np.array([1.0, 2.0, 3.0]),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=gsd_m,
-        width=shape[1],
-        height=shape[0],
-    )
+    return samples.facing_south(gsd_m, shape[1], shape[0], (1.0, 2.0, 3.0))
 
 
 def painted_layer(
@@ -86,10 +79,8 @@ def walls(*, source: IntensitySource = "laser", where: WallFrame | None = None) 
     intensity = np.clip(seen, 0.0, 1.0).astype(np.float32)
     intensity[100:130, 200:240] = np.nan
     known = np.isfinite(intensity)
-    wall = Wall(
-        frame=where or frame(),
-        plane_index=0,
-        name="wall 0",
+    wall = samples.wall(
+        where or frame(),
         depth_m=np.where(known, 0.0, np.nan).astype(np.float32),
         sigma_m=np.full(SHAPE, np.nan, dtype=np.float32),
         count=known.astype(np.uint32),
@@ -108,13 +99,9 @@ def walls(*, source: IntensitySource = "laser", where: WallFrame | None = None) 
 def image_of(grey: NDArray[np.float64], where: WallFrame | None = None) -> Orthoimage:
     """A grey orthoimage that shows something everywhere."""
     level = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-    return Orthoimage(
-        frame=where or frame(shape=(grey.shape[0], grey.shape[1])),
-        wall=0,
-        name="wall 0",
+    return samples.orthoimage(
+        where or frame(shape=(grey.shape[0], grey.shape[1])),
         rgb=np.repeat(level[:, :, None], 3, axis=2),
-        mask=np.full(grey.shape, OrthoMask.PAINTED, dtype=np.uint8),
-        source=np.zeros(grey.shape, dtype=np.int16),
         sources=("photo",),
     )
 
@@ -157,15 +144,7 @@ def checkpoint_inputs() -> Mapping[str, Orthoimages | Walls | CheckPoints]:
 
 # A wall of 1.2 m x 0.8 m that faces -y, a board 6 cm before it and a chair 40 cm before it. All
 # rims lie on borders of cells, between the rays that look at them. The frame lies 3 mm before it.
-TRUE_FRAME = WallFrame(
-    origin_world=np.array([0.0, -0.003, 0.8]),
-    u_world=np.array([1.0, 0.0, 0.0]),
-    v_world=np.array([0.0, 0.0, -1.0]),
-    normal_world=np.array([0.0, -1.0, 0.0]),
-    gsd_m=0.008,
-    width=150,
-    height=100,
-)
+TRUE_FRAME = samples.facing_south(0.008, 150, 100, (0.0, -0.003, 0.8))
 
 
 def truth_scene() -> Scene:
@@ -198,14 +177,12 @@ def true_planes(*, lift_m: float = 0.0) -> Planes:
             [[0.16, -0.06, 0.56], [0.16, -0.06, 0.24], [0.4, -0.06, 0.24], [0.4, -0.06, 0.56]],
         ]
     )
-    return Planes(
+    return samples.planes(
         normal=np.tile([0.0, -1.0, 0.0], (2, 1)),
         offset=np.array([0.0, 0.06]) + lift_m,
         corners=corners - np.array([0.0, lift_m, 0.0]),
-        covariance=np.zeros((2, 4, 4)),
         n_points=np.array([600, 200]),
         rms_m=np.full(2, 0.001),
-        up=UP,
         names=("main wall", "board"),
         viewpoint="stations",
     )
@@ -261,13 +238,7 @@ def truth_inputs() -> Mapping[str, Product]:
             stations=np.array([[0.5, -2.0, 0.3]]),
         ),
         "orthoimages": Orthoimages(images=(image,)),
-        "walls": Walls(
-            walls=(wall,),
-            up=UP,
-            intensity_source="none",
-            buffer_front_m=BUFFER_M,
-            buffer_behind_m=BUFFER_M,
-        ),
+        "walls": samples.walls(wall, buffer_m=BUFFER_M),
         "planes": true_planes(lift_m=0.004),
         "labels": PointLabels(plane_index=found.astype(np.int16)),
     }

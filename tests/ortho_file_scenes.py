@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from orthoflow.files.ortho_files import OrthoFile, ortho_files
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame
-from orthoflow.products import Orthoimage, Orthoimages
+from orthoflow.products import Orthoimages
+from tests import samples
 
 CORNER = np.array([691_000.25, 5_334_000.5, 523.0])
 UP = np.array([0.0, 0.0, 1.0])
@@ -55,14 +56,12 @@ def room(folder: Path) -> tuple[OrthoFile, ...]:
     masks = [np.ones(frame.shape, np.uint8) for frame in frames]
     masks[0][100:300, 200:500] = 0
     images = tuple(
-        Orthoimage(
-            frame=frame,
+        samples.orthoimage(
+            frame,
             wall=k,
             name=("wall </script> 0", "floor 1")[k],
             rgb=colours(frame.shape) * mask[:, :, None],
             mask=mask,
-            source=np.zeros(frame.shape, np.int16),
-            sources=("a.jpg",),
         )
         for k, (frame, mask) in enumerate(zip(frames, masks, strict=True))
     )

@@ -22,10 +22,9 @@ from orthoflow.products import (
     Photo,
     Photos,
     PointCloud,
-    SurfaceMask,
-    Wall,
     Walls,
 )
+from tests import samples
 from tests.raster_scenes import SURVEY, UP, cloud_of
 
 GSD_M = 0.004
@@ -74,7 +73,9 @@ def camera(
     target = where.world_from_wall(middle)[0]
     centre = target + 2.0 * where.normal_world + aside_m * where.u_world - 0.1 * where.v_world
     rotation = looking_at(centre, target, UP)
-    return ViewingCamera(
+    return samples.camera(
+        rotation,
+        centre,
         width=width,
         height=width * 4 // 5,
         fx=1.5 * width,
@@ -82,8 +83,6 @@ def camera(
         cx=0.51 * width,
         cy=0.39 * width,
         distortion=DISTORTION if distorted else np.zeros(5),
-        rotation=rotation,
-        translation=-rotation @ centre,
     )
 
 
@@ -180,22 +179,10 @@ def depth_m() -> NDArray[np.float32]:
 def walls(where: WallFrame, depths: NDArray[np.float32] | None = None) -> Walls:
     """The wall as a raster."""
     surface = depth_m() if depths is None else depths
-    wall = Wall(
-        frame=where,
-        plane_index=0,
-        name="wall 0",
-        depth_m=surface,
-        sigma_m=np.full(surface.shape, np.nan, dtype=np.float32),
-        count=np.ones(surface.shape, dtype=np.uint32),
-        mask=np.where(np.isnan(surface), SurfaceMask.VOID, SurfaceMask.MEASURED).astype(np.uint8),
+    wall = samples.wall(
+        where, depth_m=surface, sigma_m=np.full(surface.shape, np.nan, dtype=np.float32)
     )
-    return Walls(
-        walls=(wall,),
-        up=UP,
-        intensity_source="none",
-        buffer_front_m=BUFFER_M,
-        buffer_behind_m=BUFFER_M,
-    )
+    return samples.walls(wall, buffer_m=BUFFER_M)
 
 
 def cloud(where: WallFrame, *, spacing_cells: float = 0.9, n_outliers: int = 0) -> PointCloud:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthoflow.geometry import wall_axes
 from orthoflow.products import Planes, PointCloud
 from orthoflow.sdk import StepContext
+from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 SURVEY = np.array([634512.347, 486215.781, 112.193])
@@ -43,14 +44,11 @@ class KnownWall:
     def planes(self, *, name: str = "wall 0") -> Planes:
         rows, columns = self.shape
         outline = np.array([[0, 0], [0, rows], [columns, rows], [columns, 0]], dtype=np.float64)
-        return Planes(
+        return samples.planes(
             normal=self.normal[np.newaxis],
             offset=np.array([self.normal @ self.top_left]),
             corners=self.world(outline[:, 0], outline[:, 1], np.zeros(4))[np.newaxis],
-            covariance=np.zeros((1, 4, 4)),
             n_points=np.array([1]),
-            rms_m=np.zeros(1),
-            up=UP,
             names=(name,),
         )
 

@@ -19,32 +19,21 @@ from orthoflow_provenance.model import (
 )
 
 from orthoflow.files.images import encode_png, encode_webp
-from orthoflow.geometry import WallFrame
 from orthoflow.products import (
     Camera,
     Cameras,
     Inspection,
     Intrinsics,
-    Orthoimage,
     Orthoimages,
     TieRole,
-    Ties,
-    Wall,
     Walls,
 )
 from orthoflow.products.product import Payload, Product
-from orthoflow.records import Run
+from orthoflow.records import ComparedMetric, ProductDistance, Run
+from orthoflow.records.comparison import Distance
+from tests import samples
 
-FRAME = WallFrame(
-    # As far from the origin as survey coordinates are.
-    origin_world=np.array([4.0e5, 5.0e6, 3.0]),
-    u_world=np.array([1.0, 0.0, 0.0]),
-    v_world=np.array([0.0, 0.0, -1.0]),
-    normal_world=np.array([0.0, -1.0, 0.0]),
-    gsd_m=0.01,
-    width=120,
-    height=80,
-)
+FRAME = samples.facing_south(0.01, 120, 80, (4.0e5, 5.0e6, 3.0))
 # Looks at the middle of the wall from 2 m away: x right, y down, z forward.
 ROTATION = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 CENTRE = FRAME.origin_world + np.array([0.6, -2.0, -0.4])
@@ -220,13 +209,10 @@ def picture(shift: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 def walls_product() -> Walls:
     depth_m = np.full(FRAME.shape, 0.002, dtype=np.float32)
-    wall = Wall(
-        frame=FRAME,
-        plane_index=0,
-        name="wall 0",
+    wall = samples.wall(
+        FRAME,
         depth_m=depth_m,
         sigma_m=depth_m,
-        count=np.ones(FRAME.shape, dtype=np.uint32),
         mask=np.ones(FRAME.shape, dtype=np.uint8),
         intensity=np.linspace(0, 1, FRAME.width * FRAME.height, dtype=np.float32).reshape(
             FRAME.shape
@@ -244,13 +230,10 @@ def walls_product() -> Walls:
 def orthoimages_product(shift: int) -> Orthoimages:
     return Orthoimages(
         images=(
-            Orthoimage(
-                frame=FRAME,
-                wall=0,
-                name="wall 0",
+            samples.orthoimage(
+                FRAME,
                 rgb=picture(shift),
                 mask=np.ones(FRAME.shape, dtype=np.uint8),
-                source=np.zeros(FRAME.shape, dtype=np.int16),
                 sources=("cloud",),
             ),
         )
@@ -273,11 +256,9 @@ def cameras_product() -> Cameras:
     pixels_wall = rng.uniform((5, 5), (115, 75), (n_ties, 2))
     points_world = FRAME.world_from_wall(pixels_wall)
     role = np.array([TieRole.CONTROL, TieRole.CHECK, TieRole.REJECTED] * 10, dtype=np.uint8)
-    ties = Ties(
+    ties = samples.ties(
+        np.zeros((n_ties, 2)),
         photo_names=("a.jpg",),
-        photo=np.zeros(n_ties, dtype=np.int32),
-        wall=np.zeros(n_ties, dtype=np.int32),
-        pixels_photo=np.zeros((n_ties, 2)),
         points_world=points_world,
         sigma_px=np.ones(n_ties),
         sigma_m=np.ones(n_ties),
@@ -296,4 +277,25 @@ def inspection_product() -> Inspection:
         kind=np.zeros(2, dtype=np.uint8),
         kinds=("patch",),
         findings=(),
+    )
+
+
+def metric(value: float, *, is_cost: bool = False) -> ComparedMetric:
+    """A metric of one of two runs that are compared."""
+    return ComparedMetric(
+        value=value, unit="mm", is_cost=is_cost, is_cached=False, environment="e1"
+    )
+
+
+def distance(port: str, verdict: str, reason: str = "", *parts: Distance) -> ProductDistance:
+    """How far a product of two runs is apart."""
+    return ProductDistance(
+        cell="a",
+        port=port,
+        type_name="planes",
+        verdict=verdict,  # type: ignore[arg-type]
+        left="1",
+        right="2",
+        distances=parts,
+        reason=reason,
     )

@@ -17,6 +17,18 @@ from orthoflow.records import Run, open_run
 from tests.workshop_runs import WORKSHOP, write_studio
 
 
+def asked(*arguments: object) -> Result:
+    """Give a command and wait for its end."""
+    return CliRunner().invoke(program, [str(argument) for argument in arguments])
+
+
+def said(*arguments: object, code: int = 0) -> str:
+    """Give a command that ends with a code, and take what it prints."""
+    result = asked(*arguments)
+    assert result.exit_code == code, result.output
+    return result.output
+
+
 @dataclass(frozen=True)
 class Studio:
     """A folder with a workflow of two steps; commands run in it."""
@@ -24,10 +36,8 @@ class Studio:
     folder: Path
 
     def __call__(self, *arguments: object) -> Result:
-        words = [str(argument) for argument in arguments]
-        if words[0] in ("run", "replay"):
-            words += ["--executor", "inline"]
-        return CliRunner().invoke(program, words)
+        more = ("--executor", "inline") if arguments[0] in ("run", "replay") else ()
+        return asked(*arguments, *more)
 
     def run(self, name: str, *arguments: object) -> Run:
         """Run the workflow into a folder of that name."""

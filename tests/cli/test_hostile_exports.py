@@ -7,17 +7,13 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import rasterio
 from affine import Affine
 from click.testing import CliRunner, Result
-from orthoflow_provenance.encoding import read_table, write_table
-from orthoflow_provenance.layout import PUBLISHED
 
 from orthoflow.cli.program import program
-from orthoflow.engine.file_digests import file_sha256
 from orthoflow.files.geotiff import RasterParts
 from tests import hostile_records as hostile
 from tests.drawing_runs import WALL, write_drawing_run
@@ -50,20 +46,6 @@ def check_refused(run: Path, target: str, code: int, *said: str) -> None:
     assert [path.name for path in run.parent.iterdir()] == [run.name]
 
 
-def publish_again(run: Path) -> None:
-    """Let the record name the published files as they are now."""
-
-    def name(file: h5py.File) -> None:
-        rows = [
-            (path, (run / path).stat().st_size, file_sha256(run / path))
-            for path, _, _ in read_table(file, PUBLISHED, hostile.PATHS)
-        ]
-        del file[PUBLISHED]
-        write_table(file, PUBLISHED, hostile.PATHS, rows)
-
-    hostile.reseal(run / "run.h5", name)
-
-
 def exchange_ortho(run: Path, width: int, height: int, gsd_m: float = 0.01, **tags: str) -> None:
     """Write an orthoimage of empty cells, which take no room, in the place of the true one."""
     placed = Affine(gsd_m, 0.0, 0.0, 0.0, -gsd_m, 0.0)
@@ -74,7 +56,7 @@ def exchange_ortho(run: Path, width: int, height: int, gsd_m: float = 0.01, **ta
         run / ORTHO, "w", "GTiff", transform=placed, SPARSE_OK=True, **shape, **layout
     ) as raster:
         raster.update_tags(ns="OVERVIEWS", **tags)
-    publish_again(run)
+    hostile.publish_again(run)
 
 
 @pytest.mark.parametrize(("width", "height"), [(100_000, 100_000), (1_000_000, 30)])

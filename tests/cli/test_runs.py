@@ -10,23 +10,12 @@ from pathlib import Path
 
 import h5py
 import pytest
-from click.testing import CliRunner, Result
 from orthoflow_provenance.model import RecordedFile, RecordedInput
 from orthoflow_provenance.writer import write_record
 
-from orthoflow.cli.program import program
 from tests.hostile_records import reseal, set_attribute
 from tests.report_runs import cell, metrics, record
-
-
-def asked(*arguments: object) -> Result:
-    return CliRunner().invoke(program, [str(argument) for argument in arguments])
-
-
-def said(*arguments: object) -> str:
-    result = asked(*arguments)
-    assert result.exit_code == 0, result.output
-    return result.output
+from tests.studios import asked, said
 
 
 def write(folder: Path, hour: int, cell_m: float, rmse_u_mm: float, **more: object) -> Path:

@@ -8,23 +8,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from click.testing import CliRunner
 
 from orthoflow import engine
 from orthoflow.cli.plan import _as_json, _summary
-from orthoflow.cli.program import program
 from orthoflow.cli.verify import _summary as verified
 from orthoflow.engine import GarbageReport
 from orthoflow.records import Verification
 from tests.provenance_records import write_sample
+from tests.studios import said
 
 KIB = 1024
-
-
-def said(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(program, [str(argument) for argument in arguments])
-    assert result.exit_code == code, result.output
-    return result.output
 
 
 def test_a_run_is_shown_completely(tmp_path: Path) -> None:

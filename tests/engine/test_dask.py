@@ -20,7 +20,7 @@ from orthoflow.engine.events import CellProgress, RunEvent, RunListener
 from orthoflow.engine.executors import Capacity
 from orthoflow.engine.method_versions import methods_text, misfit
 from orthoflow.errors import ArgumentError, CancelledStepError, ClusterError, PluginError
-from tests.engine_world import World, has_ended, toy_world
+from tests.engine_world import World, digests, has_ended, toy_world
 
 STEPS = """
 steps:
@@ -50,7 +50,7 @@ class Office:
 
     world: World
     cluster: LocalCluster
-    quiet: list[str]
+    quiet: dict[str, str]
     n_runs: int = 0
 
     def plan(self, *, sets: Sequence[str] = (), **options: object) -> RunPlan:
@@ -91,11 +91,6 @@ def office(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Office]:
         quiet = digests(world.run(STEPS, executor="inline"))
         with cluster(2, **{CORES: 1}) as opened:
             yield Office(world, opened, quiet)
-
-
-def digests(outcome: RunOutcome) -> list[str]:
-    assert outcome.status == "ok", {a: r.error_message for a, r in outcome.failed.items()}
-    return [result.outputs["numbers"].digest for result in outcome.results.values()]
 
 
 def test_a_cluster_gives_the_same_digests_and_says_how_far_it_is(office: Office) -> None:

@@ -31,12 +31,6 @@ from tests.engine_world import World, has_ended, toy_world
 MIB = 1 << 20
 
 
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
-
-
 def company(bad: str, timeout: str = "") -> str:
     """A bad method beside good ones, with a step behind each."""
     limit = f", timeout: {timeout}" if timeout else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from orthoflow.engine import CellStarted, RunOutcome, Store, check_store, collec
 from orthoflow.engine.events import RunEvent
 from orthoflow.engine.results import CellResult, result_from_json, result_to_json
 from orthoflow.errors import DamageError, StoreError
-from tests.engine_world import World, toy_world
+from tests.engine_world import World, digests
 
 STEPS = """
 steps:
@@ -27,12 +27,6 @@ MORE = """\
   more: {use: work.draws, in: {numbers: noise.numbers}}
   other: {use: thin.means, in: {scan: scan.scan}}
 """
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
 
 
 def run(world: World, steps: str, **options: Any) -> RunOutcome:
@@ -51,14 +45,6 @@ def flip(path: Path, place: int = -8) -> None:
     content[place] ^= 0x10
     path.write_bytes(content)
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-
-
-def digests(outcome: RunOutcome) -> dict[str, str]:
-    return {
-        f"{address}.{port}": ref.digest
-        for address, result in outcome.results.items()
-        for port, ref in result.outputs.items()
-    }
 
 
 def computed(outcome: RunOutcome) -> set[str]:

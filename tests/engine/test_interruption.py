@@ -7,14 +7,13 @@ import os
 import random
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from orthoflow.engine import RunOutcome, collect_garbage, execute
 from orthoflow.errors import CancelledStepError, StoreError
-from tests.engine_world import World, start_coordinator, toy_world
+from tests.engine_world import World, digests, start_coordinator, toy_world
 from tests.long_loops import IS_LONG
 
 STEPS = """
@@ -24,17 +23,6 @@ steps:
   third: {use: work.noise, in: {numbers: second.numbers}}
   fourth: {use: work.draws, in: {numbers: third.numbers}}
 """
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
-
-
-def digests(outcome: RunOutcome) -> list[str]:
-    assert outcome.status == "ok"
-    return [result.outputs["numbers"].digest for result in outcome.results.values()]
 
 
 def events(world: World, folder: str) -> list[dict[str, object]]:
@@ -63,7 +51,7 @@ def is_alive(process_id: int) -> bool:
 
 
 @pytest.fixture(scope="module")
-def quiet(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def quiet(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Digests of an undisturbed run."""
     with toy_world(tmp_path_factory.mktemp("quiet")) as world:
         return digests(world.run(STEPS, executor="inline"))
@@ -72,7 +60,7 @@ def quiet(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 @pytest.mark.long  # twice in a normal run
 @pytest.mark.parametrize("attempt", range(10 if IS_LONG else 2))
 def test_a_run_killed_at_any_moment_resumes_with_the_same_digests(
-    world: World, quiet: list[str], attempt: int
+    world: World, quiet: dict[str, str], attempt: int
 ) -> None:
     rng = random.Random(attempt)
     for _ in range(2 if IS_LONG else 1):
@@ -152,7 +140,7 @@ def test_an_inline_run_can_be_interrupted_too(world: World) -> None:
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_two_runs_share_a_store_at_once(world: World, quiet: list[str]) -> None:
+def test_two_runs_share_a_store_at_once(world: World, quiet: dict[str, str]) -> None:
     processes = [start_coordinator(world, STEPS, name) for name in ("one", "two")]
     for process in processes:
         said = process.communicate(timeout=120)[0].decode()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,15 +14,9 @@ from orthoflow.engine import loading, running
 from orthoflow.engine.loading import LoadingMeter
 from orthoflow.engine.memory import MemorySampler
 from orthoflow.engine.results import CellResult
-from tests.engine_world import World, toy_world
+from tests.engine_world import World
 
 STEPS = "steps: {{a: {{use: make.range}}, b: {{use: work.{0}, in: {{numbers: a.numbers}}{1}}}}}"
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
 
 
 def metric(result: CellResult, name: str) -> float:

@@ -21,7 +21,7 @@ from orthoflow.engine import RunOutcome, execute
 from orthoflow.engine.dask_executor import CORES
 from orthoflow.engine.events import CellProgress, RunEvent
 from orthoflow.errors import OrthoflowError
-from tests.engine_world import World, toy_world
+from tests.engine_world import World, digests
 from tests.long_loops import IS_LONG
 
 pytestmark = [
@@ -94,19 +94,8 @@ class Machines:
 
 
 @pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
-
-
-@pytest.fixture
-def quiet(world: World) -> list[str]:
+def quiet(world: World) -> dict[str, str]:
     return digests(world.run(steps(1), into="quiet", executor="inline"))
-
-
-def digests(outcome: RunOutcome) -> list[str]:
-    assert outcome.status == "ok", {a: r.error_message for a, r in outcome.failed.items()}
-    return [result.outputs["numbers"].digest for result in outcome.results.values()]
 
 
 @contextmanager
@@ -170,7 +159,7 @@ def ended(world: World, machines: Machines, listen: Callable[[RunEvent], None]) 
 
 @pytest.mark.parametrize("off_s", [20.0, None])
 def test_a_worker_that_is_cut_off_is_done_without(
-    world: World, quiet: list[str], off_s: float | None
+    world: World, quiet: dict[str, str], off_s: float | None
 ) -> None:
     shutil.rmtree(world.folder / "store")
     with cable() as set_link, machines(world, HERE) as office:
@@ -191,7 +180,7 @@ def test_a_worker_that_is_cut_off_is_done_without(
 
 
 def test_a_shared_folder_that_goes_away_for_a_while_loses_nothing(
-    world: World, quiet: list[str]
+    world: World, quiet: dict[str, str]
 ) -> None:
     disk, shared = world.folder / "disk", world.folder / "store"
     shutil.rmtree(shared)
@@ -219,7 +208,9 @@ def test_a_shared_folder_that_goes_away_for_a_while_loses_nothing(
 
 
 @pytest.mark.parametrize("run", range(N_RUNS))
-def test_workers_killed_at_random_cost_no_result(world: World, quiet: list[str], run: int) -> None:
+def test_workers_killed_at_random_cost_no_result(
+    world: World, quiet: dict[str, str], run: int
+) -> None:
     shutil.rmtree(world.folder / "store")
     chance = random.Random(f"kills {run}")
     with machines(world) as office:

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from orthoflow.engine import RunOutcome
 from orthoflow.engine.results import CellResult
-from tests.engine_world import World, has_ended, toy_world
+from tests.engine_world import World, has_ended
 
 WHO = "method work.{} of toy-plugin 1.0"
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
 
 
 def all_of(world: World, *names: str, **options: object) -> RunOutcome:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from orthoflow.engine.results import ProductRef
 from orthoflow.engine.store import Preimage, Store
 from orthoflow.errors import ArgumentError, InputError
 from orthoflow.workflow.cells import Cell, WorkflowInput
-from tests.engine_world import World, forget_toys, toy_world
+from tests.engine_world import World, forget_toys
 
 CHAIN = """
 steps:
@@ -32,12 +31,6 @@ steps:
   first: {use: make.file, in: {files: inputs.data}}
   second: {use: work.add, in: {numbers: first.numbers}}
 """
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
 
 
 def statuses(world: World, steps: str, **options: object) -> dict[str, str]:

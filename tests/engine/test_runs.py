@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ from orthoflow.engine.executors import compiled_code_in
 from orthoflow.engine.results import CellResult
 from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import ArgumentError, InputError, StoreError
-from tests.engine_world import World, toy_world
+from tests.engine_world import World, digests
 
 CHAIN = """
 steps:
@@ -27,25 +26,11 @@ steps:
 """
 
 
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
-
-
 def one(method: str, params: str = "{}") -> str:
     return (
         f"steps: {{a: {{use: make.range}}, "
         f"b: {{use: work.{method}, in: {{numbers: a.numbers}}, params: {params}}}}}"
     )
-
-
-def digests(outcome: RunOutcome) -> dict[str, str]:
-    return {
-        f"{address}.{port}": ref.digest
-        for address, result in outcome.results.items()
-        for port, ref in result.outputs.items()
-    }
 
 
 def journal(world: World, folder: str = "run") -> list[dict[str, object]]:

@@ -10,13 +10,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from tests.engine_world import World, has_ended, start_coordinator, toy_world
+from tests.engine_world import World, has_ended, start_coordinator
 
 STEPS = "steps:\n  first: {use: make.range}\n"
 AROUND = STEPS + "  second: {use: work.around, in: {numbers: first.numbers}}\n"
@@ -32,12 +31,6 @@ compare: {design: product}
 """
 )
 SLOW = STEPS + ("  second: {use: work.slow, in: {numbers: first.numbers}, params: {steps: 2000}}\n")
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
 
 
 @dataclass(frozen=True)

@@ -23,13 +23,13 @@ from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.results import (
     FigureRef,
     Metric,
-    RecordedEnvironment,
     result_from_json,
     result_to_json,
 )
 from orthoflow.engine.store import Publisher, digest_of
 from orthoflow.errors import ArgumentError, DamageError, InputError, ProductError, StoreError
 from orthoflow.products.product import Product
+from tests.report_runs import environment
 
 PREIMAGE = '{"v":1}'
 KEY = hashlib.sha256(PREIMAGE.encode()).hexdigest()
@@ -219,16 +219,7 @@ def test_a_result_comes_back_equal(store: Store) -> None:
             ),
         ),
         warnings=("half of it is missing",),
-        environment=RecordedEnvironment(
-            id="sha256:0",
-            python="3",
-            os="Linux",
-            cpu="any",
-            cores=2,
-            threads=1,
-            git_commit="",
-            packages={"numpy": "2"},
-        ),
+        environment=environment(),
         log="λ\nline",
         seed=2**53 - 1,
     )

@@ -14,7 +14,6 @@ import pytest
 from orthoflow.errors import InputError
 from orthoflow.files import geotiff, images, publishing
 from orthoflow.files.sidecars import frame_of_raster, number, numbers
-from orthoflow.geometry import WallFrame
 from orthoflow.products import (
     Camera,
     Cameras,
@@ -27,18 +26,11 @@ from orthoflow.products import (
     Wall,
     Walls,
 )
+from tests import samples
 
 DIGEST = "sha256:" + "ab" * 32
 UP = np.array([0.0, 0.0, 1.0])
-FRAME = WallFrame(
-    origin_world=np.array([10.0, 20.0, 30.0]),
-    u_world=np.array([0.0, 1.0, 0.0]),
-    v_world=np.array([0.0, 0.0, -1.0]),
-    normal_world=np.array([1.0, 0.0, 0.0]),
-    gsd_m=0.5,
-    width=3,
-    height=2,
-)
+FRAME = samples.facing_east(0.5, 3, 2, (10.0, 20.0, 30.0))
 PLACED: dict[str, Any] = {
     "origin_world": [10.0, 20.0, 30.0],
     "u_world": [0.0, 1.0, 0.0],

@@ -25,28 +25,19 @@ from orthoflow.products import (
     Layers,
     Orthoimage,
     Orthoimages,
-    Planes,
     ResidualRow,
     TieRole,
     Ties,
-    Wall,
     Walls,
 )
+from tests import samples
 
 DIGEST = "sha256:" + "ab" * 32
 
 
 @pytest.fixture
 def frame() -> WallFrame:
-    return WallFrame(
-        origin_world=np.array([634512.347, 486215.781, 114.5]),
-        u_world=np.array([0.0, 1.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([1.0, 0.0, 0.0]),
-        gsd_m=0.01,
-        width=700,
-        height=40,
-    )
+    return samples.facing_east(0.01, 700, 40, (634512.347, 486215.781, 114.5))
 
 
 def orthoimage(frame: WallFrame, wall: int = 3) -> Orthoimage:
@@ -67,16 +58,7 @@ def orthoimage(frame: WallFrame, wall: int = 3) -> Orthoimage:
 def walls(frame: WallFrame, intensity: NDArray[np.float32] | None) -> Walls:
     depth = np.full(frame.shape, np.nan, dtype=np.float32)
     depth[5:, 10:] = np.linspace(-0.1, 0.2, 690, dtype=np.float32)
-    wall = Wall(
-        frame=frame,
-        plane_index=2,
-        name="wall 2",
-        depth_m=depth,
-        sigma_m=np.zeros(frame.shape, np.float32),
-        count=np.ones(frame.shape, np.uint32),
-        mask=np.isfinite(depth).astype(np.uint8),
-        intensity=intensity,
-    )
+    wall = samples.wall(frame, plane_index=2, name="wall 2", depth_m=depth, intensity=intensity)
     return Walls(
         walls=(wall,),
         up=np.array([0.0, 0.0, 1.0]),
@@ -258,14 +240,12 @@ def test_depth_keeps_its_bits_and_its_nothing(tmp_path: Path, frame: WallFrame) 
 
 def test_planes_are_published_with_the_agreed_keys(tmp_path: Path) -> None:
     corners = np.array([[[3.0, 0, 2], [3.0, 0, 0], [3.0, 4, 0], [3.0, 4, 2]]])
-    product = Planes(
+    product = samples.planes(
         normal=np.array([[1.0, 0.0, 0.0]]),
         offset=np.array([3.0]),
         corners=corners,
-        covariance=np.zeros((1, 4, 4)),
         n_points=np.array([1234], np.int64),
         rms_m=np.array([np.nan]),
-        up=np.array([0.0, 0.0, 1.0]),
         names=("wall 0",),
         part_corners=np.concatenate([corners, corners + 1.0]),
         part_plane=np.array([0, 0], np.int32),

@@ -19,7 +19,6 @@ from orthoflow.engine.results import (
     FigureRef,
     Metric,
     ProductRef,
-    RecordedEnvironment,
     result_to_json,
 )
 from orthoflow.engine.run_folder import JOURNAL, CellBegan, CellEnded, Journal
@@ -38,7 +37,7 @@ from orthoflow.testing.trials import Trial, run_trial
 from orthoflow.workflow import expand_cells, load_workflow, resolved_json
 from orthoflow.workflow.recipes import shipped_workflows
 from orthoflow.workflow.resolved import workflow_from_resolved
-from tests import photo_files, scan_files
+from tests import photo_files, samples, scan_files
 from tests.fuzz.harness import Target
 from tests.fuzz.mutation import (
     mutate_e57,
@@ -47,6 +46,7 @@ from tests.fuzz.mutation import (
     mutate_text,
     mutate_yaml,
 )
+from tests.report_runs import environment
 
 _N: Final = 40
 
@@ -243,15 +243,7 @@ FIGURE = Target(seeds=_figure_files, read=_read_figure)
 
 
 def _frame() -> WallFrame:
-    return WallFrame(
-        origin_world=np.array([1.0, 2.0, 3.0]),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=0.01,
-        width=64,
-        height=48,
-    )
+    return samples.facing_south(0.01, 64, 48, (1.0, 2.0, 3.0))
 
 
 def _write_image(path: Path) -> None:
@@ -441,16 +433,7 @@ def _result() -> CellResult:
         seed=2**70,
         metrics=(Metric(name="n", value=4.0, unit="1"),),
         warnings=("a warning",),
-        environment=RecordedEnvironment(
-            id="e",
-            python="3.11",
-            os="Linux",
-            cpu="a",
-            cores=2,
-            threads=2,
-            git_commit="",
-            packages={"numpy": "2.4"},
-        ),
+        environment=environment(),
         outputs={
             "numbers": ProductRef(type_name="checkpoints", encoding_version=1, digest=_DIGEST)
         },

@@ -18,12 +18,9 @@ from typing import Any, Final
 
 import numpy as np
 from orthoflow_provenance.digests import sha256_text
-from orthoflow_provenance.encoding import read_table, write_table
-from orthoflow_provenance.layout import PUBLISHED
 from orthoflow_provenance.model import RecordedProduct
 from orthoflow_provenance.writer import write_record
 
-from orthoflow.engine.file_digests import file_sha256
 from orthoflow.geometry import WallFrame
 from orthoflow.products import (
     Camera,
@@ -37,10 +34,9 @@ from orthoflow.products import (
     PointLabels,
     Product,
     TieRole,
-    Ties,
 )
 from orthoflow.products.product import Payload
-from tests import drawing_runs, photo_files
+from tests import drawing_runs, photo_files, samples
 from tests import hostile_records as hostile
 from tests.fuzz.harness import Target
 from tests.fuzz.hostile_files import changed_json
@@ -122,11 +118,9 @@ def _cameras(frame: WallFrame) -> Cameras:
         translation_camera_from_world=-rotation @ (middle + 2.5 * frame.normal_world),
     )
     places = np.random.default_rng(6).uniform((50, 50), (300, 200), (12, 2))
-    ties = Ties(
+    ties = samples.ties(
+        places,
         photo_names=("a.jpg",),
-        photo=np.zeros(12, dtype=np.int32),
-        wall=np.zeros(12, dtype=np.int32),
-        pixels_photo=places,
         points_world=frame.world_from_wall(places),
         sigma_px=np.ones(12),
         sigma_m=np.full(12, 0.001),
@@ -262,20 +256,6 @@ def _changed_array(array: np.ndarray[Any, Any], random: Random) -> np.ndarray[An
     return changed
 
 
-def _name_published(run: Path) -> None:
-    """Let the record name the published files as they are now."""
-
-    def name(file: Any) -> None:  # Any: h5py has no types
-        rows = [
-            (path, (run / path).stat().st_size, file_sha256(run / path))
-            for path, _, _ in read_table(file, PUBLISHED, hostile.PATHS)
-        ]
-        del file[PUBLISHED]
-        write_table(file, PUBLISHED, hostile.PATHS, rows)
-
-    hostile.reseal(run / "run.h5", name)
-
-
 def _damage_file(run: Path, random: Random) -> None:
     """Change a published file and let the record name it so, or put something else there."""
     files = sorted(path for path in (run / "products").rglob("*") if path.is_file())
@@ -288,10 +268,10 @@ def _damage_file(run: Path, random: Random) -> None:
         os.mkfifo(path)
     elif path.suffix == ".json":
         path.write_text(changed_json(path.read_bytes(), random))
-        _name_published(run)
+        hostile.publish_again(run)
     else:
         path.write_bytes(mutate_bytes(path.read_bytes(), random, [path.read_bytes()]))
-        _name_published(run)
+        hostile.publish_again(run)
 
 
 _MARK: Final = b"\ndamage "

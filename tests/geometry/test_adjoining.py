@@ -21,6 +21,7 @@ from orthoflow.geometry.adjoining import (
 from orthoflow.geometry.outlines import room_outline
 from orthoflow.geometry.planes import Plane
 from orthoflow.products import Planes
+from tests import samples
 from tests.drawing_runs import CORNER, GAP_M, SIZE_M, box_planes, box_points
 
 # Survey coordinates of 5e6 m have 1e-9 m in float64; solving a system loses a little.
@@ -182,14 +183,10 @@ def _crossing_planes(count: int) -> Planes:
     across /= np.linalg.norm(across, axis=1)[:, None]
     down = np.cross(normals, across)
     signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-    return Planes(
+    return samples.planes(
         normal=normals,
         offset=np.zeros(count),
         corners=np.stack([4.0 * (a * across + b * down) for a, b in signs], axis=1),
-        covariance=np.zeros((count, 4, 4)),
-        n_points=np.full(count, 100),
-        rms_m=np.zeros(count),
-        up=np.array([0.0, 0.0, 1.0]),
         names=tuple(f"wall {index}" for index in range(count)),
     )
 

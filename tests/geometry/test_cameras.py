@@ -13,6 +13,7 @@ from orthoflow.geometry.camera_kernels import project_point
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.compiling import interpreted
 from orthoflow.geometry.lenses import LensFreedom, linearised, stepped
+from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -22,7 +23,9 @@ def camera(seed: int, *, distorted: bool = True) -> ViewingCamera:
     centre = rng.uniform(-1.0, 1.0, 3) - [0.0, 4.0, 0.0]
     rotation = looking_at(centre, rng.uniform(-0.3, 0.3, 3), UP)
     distortion = np.array([-0.11, 0.04, 1.2e-3, -8e-4, -5e-3]) if distorted else np.zeros(5)
-    return ViewingCamera(
+    return samples.camera(
+        rotation,
+        centre,
         width=3000,
         height=2000,
         fx=2500.0 + rng.uniform(-100, 100),
@@ -30,8 +33,6 @@ def camera(seed: int, *, distorted: bool = True) -> ViewingCamera:
         cx=1510.3,
         cy=992.7,
         distortion=distortion,
-        rotation=rotation,
-        translation=-rotation @ centre,
     )
 
 
@@ -128,12 +129,9 @@ def test_points_behind_the_camera_are_not_seen() -> None:
 
 
 def test_a_point_beyond_the_fold_of_the_lens_does_not_come_back_into_the_image() -> None:
-    rotation = looking_at(np.array([0.0, -4.0, 0.0]), np.zeros(3), UP)
-    viewer = ViewingCamera(
-        width=3000, height=2000, fx=1500.0, fy=1500.0, cx=1500.0, cy=1000.0,
-        distortion=np.array([-0.35, 0.0, 0.0, 0.0, 0.0]),
-        rotation=rotation, translation=-rotation @ np.array([0.0, -4.0, 0.0]),
-    )  # fmt: skip
+    lens = {"fx": 1500.0, "fy": 1500.0, "cx": 1500.0, "cy": 1000.0, "width": 3000, "height": 2000}
+    centre, bent = np.array([0.0, -4.0, 0.0]), np.array([-0.35, 0.0, 0.0, 0.0, 0.0])
+    viewer = samples.camera(looking_at(centre, np.zeros(3), UP), centre, distortion=bent, **lens)
     # r (1 - 0.35 r^2) turns back at r = 0.976; r = 1.6 would appear at 0.17, near the centre.
     seen = viewer.project(np.array([[4.0 * 1.6, 0.0, 0.0], [4.0 * 0.9, 0.0, 0.0]]))
     assert np.isnan(seen[0, 0])

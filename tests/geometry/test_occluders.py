@@ -19,7 +19,7 @@ from orthoflow.geometry.occluders import (
     nothing_in_the_way,
     occluders_in,
 )
-from tests import scenes
+from tests import samples, scenes
 from tests.plane_scenes import cloud_of
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
@@ -50,9 +50,9 @@ def expected_around(points: NDArray[np.float64]) -> NDArray[np.int64]:
 def camera() -> ViewingCamera:
     """At the cloud's origin, looking up along z, turned a little."""
     turn = scenes.rotation_about(np.array([0.3, 0.9, 0.1]), 4.0)
-    return ViewingCamera(
-        rotation=turn,
-        translation=-turn @ ORIGIN,
+    return samples.camera(
+        turn,
+        ORIGIN,
         fx=90.0,
         fy=110.0,
         cx=50.0,

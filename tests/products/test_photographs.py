@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import ProductError
-from orthoflow.geometry import WallFrame
 from orthoflow.products import (
     Camera,
     Cameras,
@@ -19,8 +18,8 @@ from orthoflow.products import (
     TieRole,
     Ties,
     TieWall,
-    Wall,
 )
+from tests import samples
 
 CORNERS = [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 0.0, 2.0]]
 WALL = TieWall(
@@ -165,24 +164,10 @@ def test_the_table_of_residuals_comes_back() -> None:
 
 
 def test_what_ties_say_of_a_wall_is_what_its_raster_says() -> None:
-    frame = WallFrame(
-        origin_world=np.array([1.0, 2.0, 3.0]),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=0.01,
-        width=4,
-        height=3,
-    )
+    frame = samples.facing_south(0.01, 4, 3, (1.0, 2.0, 3.0))
     raster = np.zeros(frame.shape, np.float32)
-    wall = Wall(
-        frame=frame,
-        plane_index=0,
-        name="north",
-        depth_m=raster,
-        sigma_m=raster,
-        count=np.ones(frame.shape, np.uint32),
-        mask=np.zeros(frame.shape, np.uint8),
+    wall = samples.wall(
+        frame, name="north", depth_m=raster, sigma_m=raster, mask=np.zeros(frame.shape, np.uint8)
     )
     found = TieWall.of(wall)
     assert (found.name, found.gsd_m, found.normal_world) == ("north", 0.01, (0.0, -1.0, 0.0))

@@ -16,17 +16,16 @@ from orthoflow.products import (
     Spread,
     Thickness,
 )
+from tests import samples
 
 
 def two_planes() -> Planes:
-    return Planes(
+    return samples.planes(
         normal=np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]),
         offset=np.array([-2.0, 0.0]),
         corners=np.zeros((2, 4, 3)),
-        covariance=np.zeros((2, 4, 4)),
         n_points=np.array([1200, 800]),
         rms_m=np.array([0.002, 0.003]),
-        up=np.array([0.0, 0.0, 1.0]),
         names=("wall 0", "floor"),
     )
 

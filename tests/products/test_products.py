@@ -25,22 +25,14 @@ from orthoflow.products import (
     PointCloud,
     PointLabels,
     Product,
-    Wall,
     Walls,
 )
+from tests import samples
 from tests.drawing_runs import box_planes, box_products
 
 
 def frame(width: int = 4, height: int = 3) -> WallFrame:
-    return WallFrame(
-        origin_world=np.array([1.0, 2.0, 3.0]),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=0.01,
-        width=width,
-        height=height,
-    )
+    return samples.facing_south(0.01, width, height, (1.0, 2.0, 3.0))
 
 
 def cloud(n_points: int = 5) -> PointCloud:
@@ -61,19 +53,15 @@ def cloud(n_points: int = 5) -> PointCloud:
 
 def walls() -> Walls:
     raster = frame()
-    wall = Wall(
-        frame=raster,
+    wall = samples.wall(
+        raster,
         plane_index=2,
-        name="wall 0",
         depth_m=np.full(raster.shape, np.nan, np.float32),
-        sigma_m=np.zeros(raster.shape, np.float32),
-        count=np.ones(raster.shape, np.uint32),
         mask=np.zeros(raster.shape, np.uint8),
     )
-    return Walls(
-        walls=(wall, dataclasses.replace(wall, name="floor")),
-        up=np.array([0.0, 0.0, 1.0]),
-        intensity_source="none",
+    return samples.walls(
+        wall,
+        dataclasses.replace(wall, name="floor"),
         buffer_front_m=0.15,
         buffer_behind_m=0.2,
         details={"n_void": 3, "shares": [0.5, 0.25]},

@@ -9,32 +9,16 @@ import pytest
 from numpy.typing import NDArray
 
 from orthoflow.errors import ProductError
-from orthoflow.geometry import WallFrame
 from orthoflow.products import Wall, Walls
+from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def wall_at(x_m: float, name: str) -> Wall:
     """2 m x 1 m at an x, seen from the east; its lower edge at z = 0, from y = 0 on."""
-    frame = WallFrame(
-        origin_world=np.array([x_m, 0.0, 1.0]),
-        u_world=np.array([0.0, 1.0, 0.0]),
-        v_world=-UP,
-        normal_world=np.array([1.0, 0.0, 0.0]),
-        gsd_m=0.5,
-        width=4,
-        height=2,
-    )
-    return Wall(
-        frame=frame,
-        plane_index=0,
-        name=name,
-        depth_m=np.zeros(frame.shape, dtype=np.float32),
-        sigma_m=np.zeros(frame.shape, dtype=np.float32),
-        count=np.ones(frame.shape, dtype=np.uint32),
-        mask=np.ones(frame.shape, dtype=np.uint8),
-    )
+    frame = samples.facing_east(0.5, 4, 2, (x_m, 0.0, 1.0))
+    return samples.wall(frame, name=name)
 
 
 def walls(*given: Wall) -> Walls:
@@ -71,15 +55,7 @@ def test_a_reach_belongs_to_each_wall() -> None:
 def test_the_nearest_wall_is_that_of_the_nearest_rectangle(
     point_world: list[float], index: int
 ) -> None:
-    turned = WallFrame(
-        origin_world=np.array([2.0, 10.0, 1.0]),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=-UP,
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=0.5,
-        width=4,
-        height=2,
-    )
+    turned = samples.facing_south(0.5, 4, 2, (2.0, 10.0, 1.0))
     room = walls(
         wall_at(0.0, "west"), wall_at(8.0, "east"), replace(wall_at(0.0, "north"), frame=turned)
     )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +10,7 @@ from orthoflow.engine import RunOptions, Store, execute, plan_run
 from orthoflow.records import ProductDistance, Run, RunProducts, product_distances, write_run
 from orthoflow.records.replaying import UnreplayableRunError, plan_replay
 from orthoflow.workflow import expand_cells, load_workflow
-from tests.engine_world import World, forget_toys, toy_world
+from tests.engine_world import World, forget_toys
 
 WORKFLOW = """
 orthoflow: 1
@@ -36,12 +34,6 @@ NEWER = """
         metadata["remark"] = metadata.pop("note")
         return dataclasses.replace(payload, encoding_version=2, metadata=metadata)
 """
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
 
 
 @pytest.fixture

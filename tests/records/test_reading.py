@@ -22,7 +22,6 @@ from orthoflow.products import Planes
 from orthoflow.records import (
     Metric,
     RecordedCell,
-    RecordedEnvironment,
     RecordedFigure,
     RecordedFile,
     RecordedInput,
@@ -34,31 +33,22 @@ from orthoflow.records import (
 )
 from orthoflow.records.metrics import write_metrics_csv
 from orthoflow.records.published import publish_products
+from tests import samples
+from tests.report_runs import environment
 
 PNG = b"\x89PNG\r\n\x1a\n picture"
 PREIMAGE = '{"method":"plane.given"}'
-ENVIRONMENT = RecordedEnvironment(
-    id="sha256:" + "e" * 64,
-    python="3.11.7",
-    os="Linux 6",
-    cpu="a processor",
-    cores=2,
-    threads=2,
-    git_commit="",
-    packages={"numpy": "2.4.6"},
-)
+ENVIRONMENT = environment("sha256:" + "e" * 64)
 CLOUD_DIGEST = "sha256:" + "c" * 64
 
 
 def one_plane() -> Planes:
-    return Planes(
+    return samples.planes(
         normal=np.array([[0.0, -1.0, 0.0]]),
         offset=np.array([-2.0]),
         corners=np.array([[[0, 2, 3], [0, 2, 0], [4, 2, 0], [4, 2, 3]]], dtype=np.float64),
-        covariance=np.zeros((1, 4, 4)),
         n_points=np.array([1200]),
         rms_m=np.array([0.002]),
-        up=np.array([0.0, 0.0, 1.0]),
         names=("wall 0",),
     )
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -12,7 +10,7 @@ from orthoflow.engine import RunOptions, RunOutcome, Store, execute, plan_run
 from orthoflow.records import Run, write_run
 from orthoflow.records.replaying import UnreplayableRunError, plan_replay
 from orthoflow.workflow import cells, expand_cells, load_workflow
-from tests.engine_world import World, toy_world
+from tests.engine_world import World
 
 WORKFLOW = """
 orthoflow: 1
@@ -29,12 +27,6 @@ steps:
 compare: {design: product, baseline: {draw: once}}
 """
 INLINE = RunOptions(executor="inline")
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with toy_world(tmp_path) as opened:
-        yield opened
 
 
 def recorded(world: World) -> Run:

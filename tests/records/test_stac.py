@@ -14,9 +14,10 @@ from pystac.validation import RegisteredValidator
 from orthoflow.errors import ArgumentError
 from orthoflow.files.publishing import publish_orthoimages
 from orthoflow.geometry import WallFrame
-from orthoflow.products import Orthoimage, Orthoimages
+from orthoflow.products import Orthoimages
 from orthoflow.records import Run
 from orthoflow.records.stac import write_stac
+from tests import samples
 from tests.report_runs import cell, record
 
 SOUTH, UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -47,14 +48,12 @@ def orthoimages() -> Orthoimages:
     )
     return Orthoimages(
         images=tuple(
-            Orthoimage(
-                frame=frame,
+            samples.orthoimage(
+                frame,
                 wall=k,
                 name=name,
                 rgb=np.full((*frame.shape, 3), 90, np.uint8),
                 mask=np.ones(frame.shape, np.uint8),
-                source=np.zeros(frame.shape, np.int16),
-                sources=("a.jpg",),
             )
             for k, (frame, name) in enumerate([(wall, "wall 0"), (floor, "floor 1")])
         )

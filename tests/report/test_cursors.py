@@ -10,6 +10,7 @@ import pytest
 
 from orthoflow.geometry import WallFrame
 from orthoflow.report.cursors import CoarseDepths, coarse_depths, cursor_places
+from tests import samples
 
 
 def test_few_depths_are_all_told_in_millimetres() -> None:
@@ -35,15 +36,7 @@ def test_many_depths_are_told_at_about_eight_thousand_places(shape: tuple[int, i
 
 
 def frame(width: int = 4, gsd_m: float = 0.5) -> WallFrame:
-    return WallFrame(
-        origin_world=np.array([1.0, 2.0, 3.0]),
-        u_world=np.array([0.0, 1.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([1.0, 0.0, 0.0]),
-        gsd_m=gsd_m,
-        width=width,
-        height=2,
-    )
+    return samples.facing_east(gsd_m, width, 2, (1.0, 2.0, 3.0))
 
 
 def picture(name: str, of: WallFrame | None, depths: CoarseDepths | None = None) -> Any:

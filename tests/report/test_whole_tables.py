@@ -9,10 +9,8 @@ import pytest
 
 from orthoflow.records import (
     CellFacts,
-    ComparedMetric,
     Pair,
     ParameterValue,
-    ProductDistance,
     RecordedFile,
     RunComparison,
 )
@@ -28,7 +26,16 @@ from orthoflow.report.diagrams import run_diagram
 from orthoflow.report.differences import Difference, ProductRow, differences
 from orthoflow.report.rankings import Sense, Value, badness, rank
 from orthoflow.report.summaries import Answer, Limit, answers, limits
-from tests.report_runs import HeldRun, cell, compared_resolved, given, metrics, record
+from tests.report_runs import (
+    HeldRun,
+    cell,
+    compared_resolved,
+    distance,
+    given,
+    metric,
+    metrics,
+    record,
+)
 
 
 def run(*cells: object, **more: object) -> HeldRun:
@@ -275,25 +282,6 @@ OTHER_FACTS = CellFacts(
     tools={"colmap": "4.2"},
     error="no plane",
 )
-
-
-def metric(value: float, *, is_cost: bool = False) -> ComparedMetric:
-    return ComparedMetric(
-        value=value, unit="mm", is_cost=is_cost, is_cached=False, environment="e1"
-    )
-
-
-def distance(port: str, verdict: str, reason: str = "", *parts: Distance) -> ProductDistance:
-    return ProductDistance(
-        cell="a",
-        port=port,
-        type_name="planes",
-        verdict=verdict,  # type: ignore[arg-type]
-        left="1",
-        right="2",
-        distances=parts,
-        reason=reason,
-    )
 
 
 def test_all_that_differs_between_two_runs_is_told() -> None:

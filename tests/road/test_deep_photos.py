@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Camera, Cameras, Intrinsics
+from tests import samples
 from tests.road.conftest import Shell
 
 WORKFLOW = """
@@ -49,16 +50,15 @@ def ramp(viewer: ViewingCamera) -> NDArray[np.uint16]:
 def straight_camera() -> ViewingCamera:
     """A camera 2 m before the middle of a wall of 1.2 x 0.8 m in y = 0, pixels of 2 mm."""
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    return ViewingCamera(
+    return samples.camera(
+        rotation,
+        np.array([0.6, -2.0, 0.4]),
         width=640,
         height=480,
         fx=1000.0,
         fy=1000.0,
         cx=320.3,
         cy=240.2,
-        distortion=np.zeros(5),
-        rotation=rotation,
-        translation=-rotation @ np.array([0.6, -2.0, 0.4]),
     )
 
 

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, Orthoimages, OrthoMask, Planes
+from orthoflow.products import Layer, LayerMask, Layers, Orthoimages, OrthoMask, Planes
 from orthoflow.testing import photographed, physics
 from orthoflow.testing.examples import example_room
+from tests import samples
 
 
 @pytest.fixture(scope="module")
@@ -150,15 +151,7 @@ def test_a_mosaic_paints_what_its_layers_show(hidden: float, passes: bool) -> No
         mask = np.full(left.frame.shape, OrthoMask.PAINTED, dtype=np.uint8)
         mask[: round(hidden * len(mask))] = OrthoMask.OCCLUDED
         assert left.frame.gsd_m == gsd_m
-        image = Orthoimage(
-            frame=left.frame,
-            wall=0,
-            name="wall 0",
-            rgb=rgb,
-            mask=mask,
-            source=np.zeros(mask.shape, dtype=np.int16),
-            sources=("left", "right"),
-        )
+        image = samples.orthoimage(left.frame, rgb=rgb, mask=mask, sources=("left", "right"))
         return SimpleNamespace(outputs={"orthoimages": Orthoimages(images=(image,))})
 
     from orthoflow_plugins.mosaic.seams import MosaicSeams

@@ -19,7 +19,7 @@ from orthoflow.workflow import (
     expand_cells,
     load_workflow,
 )
-from tests.laboratories import GOOD, laboratory_catalog, load
+from tests.laboratories import GOOD, load
 
 TWO_ORTHOS = """\
 orthoflow: 1
@@ -49,11 +49,6 @@ steps:
     in: {orthoimages: mosaic.orthoimages, walls: wall.walls, truth: room.truth}
 """
 COMPARE = "compare: {design: %s, baseline: {plane: ransac}}\n"
-
-
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
 
 
 @pytest.fixture

@@ -18,7 +18,6 @@ from orthoflow.workflow import (
     resolve_input_files,
 )
 from orthoflow.workflow.resolved import resolved_json, workflow_from_resolved
-from tests.laboratories import laboratory_catalog
 
 ROOMS = """\
 orthoflow: 1
@@ -40,11 +39,6 @@ steps:
   ties: {use: match.sift, in: {photos: shots.photos, walls: wall.walls}}
 """
 TWO = "datasets: {hall: {scan: hall.e57}, stairs: {scan: stairs.e57}}\n"
-
-
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
 
 
 @pytest.fixture

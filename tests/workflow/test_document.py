@@ -25,18 +25,6 @@ from tests.laboratories import (
 )
 
 
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
-
-
-@pytest.fixture
-def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The path of the workflow of a test, in the working directory."""
-    monkeypatch.chdir(tmp_path)
-    return Path("flow.yaml")
-
-
 def test_a_good_file_is_read_as_it_is_written(catalog: Catalog, write: Path) -> None:
     workflow = load(GOOD, write, catalog)
     assert (workflow.name, workflow.seed, workflow.source) == ("palace-room", 1729, GOOD)

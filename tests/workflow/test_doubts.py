@@ -8,12 +8,7 @@ import pytest
 
 from orthoflow.catalog import Catalog
 from orthoflow.workflow import doubts_about
-from tests.laboratories import GOOD, laboratory_catalog, load
-
-
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
+from tests.laboratories import GOOD, load
 
 
 @pytest.mark.parametrize(

@@ -10,28 +10,17 @@ import cv2
 import laspy
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.cli.program import program
 from orthoflow.foreign_text import shown
 from orthoflow.workflow import load_workflow, resolve_input_files
+from tests.studios import asked, said
 
 CALIBRATION = """cameras:
   "*": {width: 40, height: 30, fx: 50, fy: 50, cx: 20, cy: 15, distortion: [0, 0, 0, 0, 0]}
 """
 TIES = "photo,u_px,v_px,x,y,z\na.jpg,1,2,3,4,5\n"
 POINTS = "name,x,y,z\nP1,1,2,3\nP2,2,2,3\n"
-
-
-def asked(*arguments: object) -> Result:
-    return CliRunner().invoke(program, [str(argument) for argument in arguments])
-
-
-def said(*arguments: object) -> str:
-    result = asked(*arguments)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def write_scan(path: Path) -> Path:

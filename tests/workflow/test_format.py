@@ -15,14 +15,9 @@ from orthoflow.workflow import InvalidWorkflowError, load_workflow, workflow_sch
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import Key
 from tests import workflow_format
-from tests.laboratories import laboratory_catalog, with_steps
+from tests.laboratories import with_steps
 
 KEYS = dict(workflow_format.keys())
-
-
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
 
 
 def test_the_reference_is_made_of_the_declaration() -> None:

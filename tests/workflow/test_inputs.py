@@ -13,12 +13,6 @@ import pytest
 from orthoflow.catalog import Catalog
 from orthoflow.errors import InputError
 from orthoflow.workflow import load_workflow, present_inputs, resolve_input_files
-from tests.laboratories import laboratory_catalog
-
-
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
 
 
 @pytest.fixture

@@ -13,23 +13,9 @@ from orthoflow.workflow import (
 )
 from tests.laboratories import (
     GOOD,
-    laboratory_catalog,
     problems,
     with_steps,
 )
-
-
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
-
-
-@pytest.fixture
-def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The path of the workflow of a test, in the working directory."""
-    monkeypatch.chdir(tmp_path)
-    return Path("flow.yaml")
-
 
 STEP = "x: {use: plane.hough2d, in: {cloud: cloud.cloud}%s}"
 CASES = {

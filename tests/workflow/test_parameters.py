@@ -14,22 +14,8 @@ from orthoflow.workflow import (
 )
 from tests.laboratories import (
     GOOD,
-    laboratory_catalog,
     load,
 )
-
-
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
-
-
-@pytest.fixture
-def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The path of the workflow of a test, in the working directory."""
-    monkeypatch.chdir(tmp_path)
-    return Path("flow.yaml")
-
 
 SETS = {
     "plain": ("wall.gsd_m=0.002", "wall", "", "gsd_m", 0.002),

@@ -21,17 +21,6 @@ from orthoflow.workflow.mermaid import mermaid
 from tests.laboratories import GOOD, laboratory_catalog, load, write_distribution
 
 
-@pytest.fixture
-def catalog(monkeypatch: pytest.MonkeyPatch) -> Catalog:
-    return laboratory_catalog(monkeypatch)
-
-
-@pytest.fixture
-def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return Path("flow.yaml")
-
-
 def test_the_resolved_workflow_is_canonical_json_without_paths_of_this_machine(
     catalog: Catalog, write: Path, tmp_path: Path
 ) -> None:

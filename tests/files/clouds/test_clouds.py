@@ -27,6 +27,7 @@ from orthoflow.files.images import encode_png
 from orthoflow.geometry.frames import frame_over
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Intrinsics, Photo, Planes, PointCloud, PointLabels
+from tests import samples
 
 ORIGIN = np.array([500_000.0, 4_000_000.0, 100.0])
 # A corner: the wall x = 0, seen from x > 0, and the floor z = 0, seen from above; two scans.
@@ -58,14 +59,11 @@ def corner() -> PointCloud:
 def planes() -> Planes:
     normal = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     wall = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 2.0, 2.0]])
-    return Planes(
+    return samples.planes(
         normal=normal,
         offset=normal @ ORIGIN,
         corners=ORIGIN + np.array([wall, wall[:, [2, 1, 0]]]),
-        covariance=np.zeros((2, 4, 4)),
         n_points=np.array([1, 1]),
-        rms_m=np.zeros(2),
-        up=np.array([0.0, 0.0, 1.0]),
         names=("wall 0", "floor"),
     )
 

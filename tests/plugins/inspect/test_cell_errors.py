@@ -21,18 +21,17 @@ from orthoflow_plugins.inspect.cell_errors import (
 
 from orthoflow.geometry import frame_over
 from orthoflow.products import Orthoimage, OrthoMask, SurfaceMask
+from tests import samples
 
 
 def image(mask: np.ndarray) -> Orthoimage:
     rows, columns = mask.shape
     corners = np.array([[0, 0, rows], [0, 0, 0], [columns, 0, 0], [columns, 0, rows]]) * 0.01
-    return Orthoimage(
-        frame=frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.01),
-        wall=0,
+    return samples.orthoimage(
+        frame_over(corners, np.array([0.0, -1.0, 0.0]), gsd_m=0.01),
         name="wall",
         rgb=np.zeros((rows, columns, 3), dtype=np.uint8),
         mask=mask.astype(np.uint8),
-        source=np.zeros(mask.shape, dtype=np.int16),
         sources=("photo",),
     )
 

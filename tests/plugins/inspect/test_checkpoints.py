@@ -37,10 +37,9 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import StepContext
-from tests import inspect_scenes
+from tests import inspect_scenes, samples
 from tests.inspect_scenes import BUFFER_M, GSD_M, points_at
 from tests.long_loops import IS_LONG
-from tests.raster_scenes import UP
 
 
 def context(folder: Path) -> StepContext:
@@ -188,13 +187,11 @@ def test_points_of_a_simulated_room_are_found_by_its_truth(tmp_path: Path) -> No
         buffer_behind_m=BUFFER_M,
     )
     known = true.rectangle >= 0
-    image = Orthoimage(
-        frame=frame,
-        wall=0,
+    image = samples.orthoimage(
+        frame,
         name="main wall",
         rgb=np.nan_to_num(true.rgb).round().astype(np.uint8),
         mask=np.where(known, OrthoMask.PAINTED, OrthoMask.NO_SURFACE).astype(np.uint8),
-        source=np.zeros(frame.shape, dtype=np.int16),
         sources=("truth",),
     )
     wall = replace(
@@ -206,13 +203,7 @@ def test_points_of_a_simulated_room_are_found_by_its_truth(tmp_path: Path) -> No
         mask=known.astype(np.uint8),
         intensity=None,
     )
-    walls = Walls(
-        walls=(wall,),
-        up=UP,
-        intensity_source="none",
-        buffer_front_m=BUFFER_M,
-        buffer_behind_m=BUFFER_M,
-    )
+    walls = samples.walls(wall, buffer_m=BUFFER_M)
     metrics, found, _ = inspect(tmp_path, room.checkpoints, walls, image, room.truth)
     assert metrics["n_found"] >= 0.7 * metrics["n_points"]
     assert {"flat", "vertical edge"} == set(found.kinds)

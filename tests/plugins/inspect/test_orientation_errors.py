@@ -26,7 +26,7 @@ from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import TieRole
-from tests import scenes
+from tests import samples, scenes
 
 # Walls at y = 4, seen from the south.
 GSD_M: Final = 0.01
@@ -37,28 +37,12 @@ def frame_at(
     left_m: float, top_m: float, *, depth_m: float = 4.0, size_m: float = 2.0
 ) -> WallFrame:
     cells = round(size_m / GSD_M)
-    return WallFrame(
-        origin_world=np.array([left_m, depth_m, top_m]),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=GSD_M,
-        width=cells,
-        height=cells,
-    )
+    return samples.facing_south(GSD_M, cells, cells, (left_m, depth_m, top_m))
 
 
 def camera_at(centre: NDArray[np.float64], rotation: NDArray[np.float64] = FACING) -> ViewingCamera:
-    return ViewingCamera(
-        rotation=rotation,
-        translation=-rotation @ centre,
-        fx=800.0,
-        fy=820.0,
-        cx=500.0,
-        cy=400.0,
-        distortion=np.zeros(5),
-        width=1000,
-        height=800,
+    return samples.camera(
+        rotation, centre, fx=800.0, fy=820.0, cx=500.0, cy=400.0, width=1000, height=800
     )
 
 

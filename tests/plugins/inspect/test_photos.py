@@ -23,11 +23,10 @@ from orthoflow.products import (
     TieRole,
     Ties,
     Truth,
-    Wall,
 )
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
-from tests import scenes
+from tests import samples, scenes
 from tests.inspecting import BUFFER_M, inspect
 
 GSD_M = 0.02
@@ -112,13 +111,11 @@ def inspect_cameras(
     """Inspect an image, the true one unless given, on a wall whose depths are wrong by so much."""
     true = rendered(truth)
     shape = true.frame.shape
-    wall = Wall(
-        frame=true.frame,
-        plane_index=0,
+    wall = samples.wall(
+        true.frame,
         name="main wall",
         depth_m=true.depth_m + np.float32(lift_m),
         sigma_m=np.full(shape, 0.001, dtype=np.float32),
-        count=np.ones(shape, dtype=np.uint32),
         mask=np.where(true.rectangle >= 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(np.uint8),
     )
     shown = painted(true, truth) if image is None else image

@@ -10,6 +10,7 @@ from orthoflow_plugins.inspect import plane_errors
 
 from orthoflow.geometry import Plane
 from orthoflow.products import Finding, Planes
+from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -20,14 +21,10 @@ def floors(*heights_m: float, tilt_deg: float = 0.0) -> Planes:
     normal = np.array([0.0, -math.sin(turn), math.cos(turn)])
     square = np.array([[-1.0, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
     corners = np.array([square + np.array([0.0, 0.0, height]) for height in heights_m])
-    return Planes(
+    return samples.planes(
         normal=np.tile(normal, (len(heights_m), 1)),
         offset=np.array([normal[2] * height for height in heights_m]),
         corners=corners,
-        covariance=np.zeros((len(heights_m), 4, 4)),
-        n_points=np.full(len(heights_m), 100),
-        rms_m=np.zeros(len(heights_m)),
-        up=UP,
         names=tuple(f"floor {index}" for index in range(len(heights_m))),
     )
 

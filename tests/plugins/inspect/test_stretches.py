@@ -8,23 +8,15 @@ import numpy as np
 import pytest
 from orthoflow_plugins.inspect.image_quality import cells_per_pixel, stretch_findings
 
-from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Camera, Cameras, Intrinsics, Orthoimage, OrthoMask, Wall
+from orthoflow.products import Camera, Cameras, Intrinsics, Orthoimage, Wall
+from tests import samples
 
 SIDE = 40
 GSD_M = 0.01
 UP = np.array([0.0, 0.0, 1.0])
 # u along x, v down; the viewer stands at negative y. Far from the origin, as surveys are.
-FRAME = WallFrame(
-    origin_world=np.array([5.0e6, 4.0e5, 100.0]),
-    u_world=np.array([1.0, 0.0, 0.0]),
-    v_world=np.array([0.0, 0.0, -1.0]),
-    normal_world=np.array([0.0, -1.0, 0.0]),
-    gsd_m=GSD_M,
-    width=SIDE,
-    height=SIDE,
-)
+FRAME = samples.facing_south(GSD_M, SIDE, SIDE, (5.0e6, 4.0e5, 100.0))
 MIDDLE = FRAME.world_from_wall(np.array([[SIDE / 2, SIDE / 2]]))[0]
 DISTANCE_M = 100.0
 
@@ -43,15 +35,7 @@ def wall(depth_m: np.ndarray) -> Wall:
 
 
 def image() -> Orthoimage:
-    return Orthoimage(
-        frame=FRAME,
-        wall=0,
-        name="wall",
-        rgb=np.zeros((*FRAME.shape, 3), dtype=np.uint8),
-        mask=np.full(FRAME.shape, OrthoMask.PAINTED, dtype=np.uint8),
-        source=np.zeros(FRAME.shape, dtype=np.int16),
-        sources=("a.jpg",),
-    )
+    return samples.orthoimage(FRAME, name="wall", rgb=np.zeros((*FRAME.shape, 3), dtype=np.uint8))
 
 
 def camera(turn_deg: float, cells_per_pixel: float) -> tuple[Intrinsics, ViewingCamera]:

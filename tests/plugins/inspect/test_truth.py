@@ -35,7 +35,7 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import StepContext
-from tests import scenes
+from tests import samples, scenes
 from tests.inspecting import BUFFER_M, inspect
 
 GSD_M = 0.014
@@ -68,26 +68,22 @@ def rendered(truth: Truth, shift_cells: tuple[float, float] = (0.0, 0.0)) -> Tru
 
 def painted(image: TrueOrthoimage) -> Orthoimage:
     known = image.rectangle >= 0
-    return Orthoimage(
-        frame=image.frame,
-        wall=0,
+    return samples.orthoimage(
+        image.frame,
         name="main wall",
         rgb=np.nan_to_num(image.rgb).round().astype(np.uint8),
         mask=np.where(known, OrthoMask.PAINTED, OrthoMask.NO_SURFACE).astype(np.uint8),
-        source=np.zeros(image.frame.shape, dtype=np.int16),
         sources=("truth",),
     )
 
 
 def walled(image: TrueOrthoimage) -> Wall:
     shape = image.frame.shape
-    return Wall(
-        frame=image.frame,
-        plane_index=0,
+    return samples.wall(
+        image.frame,
         name="main wall",
         depth_m=image.depth_m,
         sigma_m=np.full(shape, 0.001, dtype=np.float32),
-        count=np.ones(shape, dtype=np.uint32),
         mask=np.where(image.rectangle >= 0, SurfaceMask.MEASURED, SurfaceMask.VOID).astype(
             np.uint8
         ),

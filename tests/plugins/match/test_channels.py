@@ -9,8 +9,8 @@ from orthoflow_plugins.match import channels
 from orthoflow_plugins.match.channels import Channels
 from scipy.ndimage import gaussian_filter
 
-from orthoflow.geometry import WallFrame
 from orthoflow.products import Wall
+from tests import samples
 
 
 def texture(seed: int = 1, shape: tuple[int, int] = (90, 120)) -> NDArray[np.float32]:
@@ -21,15 +21,7 @@ def texture(seed: int = 1, shape: tuple[int, int] = (90, 120)) -> NDArray[np.flo
 def wall(count: NDArray[np.uint32], depth_m: NDArray[np.float32], intensity: bool = True) -> Wall:
     rows, columns = count.shape
     return Wall(
-        frame=WallFrame(
-            origin_world=np.zeros(3),
-            u_world=np.array([1.0, 0.0, 0.0]),
-            v_world=np.array([0.0, 0.0, -1.0]),
-            normal_world=np.array([0.0, -1.0, 0.0]),
-            gsd_m=0.01,
-            width=columns,
-            height=rows,
-        ),
+        frame=samples.facing_south(0.01, columns, rows),
         plane_index=0,
         name="wall",
         depth_m=depth_m,

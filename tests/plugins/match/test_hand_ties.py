@@ -14,6 +14,7 @@ from orthoflow.errors import MethodError
 from orthoflow.products import Ties, Walls
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
+from tests import samples
 
 SCENE = ms.textured_wall(0)
 CAMERA = ms.camera_before(SCENE, centre=(1.3, -2.6, 1.1))
@@ -22,16 +23,14 @@ PHOTOS = ms.photos(ms.photo_of(SCENE, CAMERA))
 
 def measured(*names: str) -> Ties:
     count = len(names)
-    return Ties(
+    return samples.ties(
+        np.arange(2.0 * count).reshape(count, 2),
         photo_names=("stranger.png", "a.png"),
         photo=np.array([("stranger.png", "a.png").index(name) for name in names], dtype=np.int32),
         wall=np.full(count, -1, np.int32),
-        pixels_photo=np.arange(2.0 * count).reshape(count, 2),
         points_world=np.array([[0.5 + 0.1 * k, 0.3, 1.0] for k in range(count)]),
         sigma_px=np.ones(count),
         sigma_m=np.full(count, 0.002),
-        role=np.zeros(count, np.uint8),
-        residual_px=np.full((count, 2), np.nan),
         by_hand=np.ones(count, np.uint8),
     )
 

@@ -12,8 +12,8 @@ from orthoflow_plugins.match import pictures
 
 from orthoflow.errors import MethodError
 from orthoflow.files.images import encode_png
-from orthoflow.geometry import WallFrame
 from orthoflow.products import Photo, Photos, Wall, Walls
+from tests import samples
 
 GSD_M = 0.01
 UP = np.array([0.0, 0.0, 1.0])
@@ -21,15 +21,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def wall(depth_m: NDArray[np.float32], *, intensity: NDArray[np.float32] | None = None) -> Wall:
     rows, columns = depth_m.shape
-    frame = WallFrame(
-        origin_world=np.zeros(3),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=-UP,
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=GSD_M,
-        width=columns,
-        height=rows,
-    )
+    frame = samples.facing_south(GSD_M, columns, rows)
     return Wall(
         frame=frame,
         plane_index=0,

@@ -12,6 +12,7 @@ from orthoflow_plugins.match.sides import FaceByPhotos
 from orthoflow.products import Photos, Planes, PointCloud
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
+from tests import samples
 
 FLOOR = 1
 
@@ -43,13 +44,11 @@ def planes_of(scene: ms.TexturedWall, cloud: PointCloud, *, viewpoint: str = "gu
     below[1:3] += frame.normal_world
     up = np.array([0.0, 0.0, 1.0])
     floor = np.array([0.0, 0.0, 1.0])
-    return Planes(
+    return samples.planes(
         normal=np.array([frame.normal_world, floor]),
         offset=np.array([frame.plane.offset_m, float(floor @ below[0])]),
         corners=np.array([corners, below]),
-        covariance=np.zeros((2, 4, 4)),
         n_points=np.array([len(cloud), 10]),
-        rms_m=np.zeros(2),
         up=up,
         names=("wall 0", "floor"),
         part_corners=np.array([corners, below]),

@@ -11,11 +11,11 @@ from orthoflow_plugins.match import warping
 from orthoflow_plugins.match.warping import Projection
 
 from orthoflow.files.images import encode_png
-from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.geometry.occluders import occluders_before
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Photo, PointCloud, Wall
+from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 GSD_M = 0.01
@@ -23,40 +23,16 @@ GSD_M = 0.01
 
 def wall_at(y_m: float, *, width: int = 100, height: int = 80, x_m: float = -0.5) -> Wall:
     """A wall that looks to -y, its middle at z = 0."""
-    frame = WallFrame(
-        origin_world=np.array([x_m, y_m, 0.5 * height * GSD_M]),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=-UP,
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=GSD_M,
-        width=width,
-        height=height,
-    )
-    return Wall(
-        frame=frame,
-        plane_index=0,
-        name="wall",
-        depth_m=np.zeros(frame.shape, dtype=np.float32),
-        sigma_m=np.zeros(frame.shape, dtype=np.float32),
-        count=np.ones(frame.shape, dtype=np.uint32),
-        mask=np.ones(frame.shape, dtype=np.uint8),
-    )
+    frame = samples.facing_south(GSD_M, width, height, (x_m, y_m, 0.5 * height * GSD_M))
+    return samples.wall(frame, name="wall")
 
 
 def camera_at(x_m: float = 0.0, y_m: float = -2.0, *, size: int = 800) -> ViewingCamera:
     """Looks along y, with 400 px per radian; a wall's cell is 2 px wide 2 m away."""
     centre = np.array([x_m, y_m, 0.0])
     rotation = looking_at(centre, centre + np.array([0.0, 1.0, 0.0]), UP)
-    return ViewingCamera(
-        width=size,
-        height=size,
-        fx=400.0,
-        fy=400.0,
-        cx=0.5 * size,
-        cy=0.5 * size,
-        distortion=np.zeros(5),
-        rotation=rotation,
-        translation=-rotation @ centre,
+    return samples.camera(
+        rotation, centre, width=size, height=size, fx=400.0, fy=400.0, cx=0.5 * size, cy=0.5 * size
     )
 
 

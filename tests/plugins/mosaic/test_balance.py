@@ -12,8 +12,8 @@ from orthoflow_plugins.mosaic.exposures import Radii, estimate
 from orthoflow_plugins.mosaic.light import BlockLight, light_of_levels, lit
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
-from orthoflow.products import Layer, Layers, Orthoimages, Wall, Walls
-from tests import inspect_scenes
+from orthoflow.products import Layer, Layers, Orthoimages, Walls
+from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes
 
 SHAPE = (120, 240)
@@ -125,15 +125,7 @@ def test_without_gains_colours_stay_untouched(tmp_path: Path) -> None:
 
 def surface(depth_m: NDArray[np.float32]) -> Walls:
     frame = inspect_scenes.frame(shape=SHAPE)
-    wall = Wall(
-        frame=frame,
-        plane_index=0,
-        name="wall 0",
-        depth_m=depth_m,
-        sigma_m=np.zeros(SHAPE, dtype=np.float32),
-        count=np.ones(SHAPE, dtype=np.uint32),
-        mask=np.ones(SHAPE, dtype=np.uint8),
-    )
+    wall = samples.wall(frame, depth_m=depth_m, mask=np.ones(SHAPE, dtype=np.uint8))
     return replace(inspect_scenes.walls(), walls=(wall,))
 
 

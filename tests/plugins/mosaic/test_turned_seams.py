@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from orthoflow_plugins.mosaic.seams import MosaicSeams
 
-from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, Wall, Walls
-from tests import inspect_scenes
+from orthoflow.products import Layer, LayerMask, Layers, Orthoimage, Walls
+from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes
 from tests.turns import TURNS, Turn
 
@@ -41,22 +41,10 @@ def layers_and_walls(shape: tuple[int, int], turn: Turn) -> tuple[Layers, Walls]
         )
     is_near = np.hypot(rows - 0.5 * shape[0], columns - 0.4 * shape[1]) < 0.2 * min(shape)
     depth_m = np.where(is_near, np.float32(0.05), np.float32(0.0))
-    wall = Wall(
-        frame=frame,
-        plane_index=0,
-        name="wall 0",
-        depth_m=turn.raster(depth_m),
-        sigma_m=np.zeros(frame.shape, dtype=np.float32),
-        count=np.ones(frame.shape, dtype=np.uint32),
-        mask=np.ones(frame.shape, dtype=np.uint8),
+    wall = samples.wall(
+        frame, depth_m=turn.raster(depth_m), mask=np.ones(frame.shape, dtype=np.uint8)
     )
-    walls = Walls(
-        walls=(wall,),
-        up=scenes.UP,
-        intensity_source="none",
-        buffer_front_m=0.1,
-        buffer_behind_m=0.1,
-    )
+    walls = samples.walls(wall, buffer_m=0.1)
     return Layers(layers=tuple(layers), names=("wall 0",)), walls
 
 

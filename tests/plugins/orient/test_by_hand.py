@@ -18,6 +18,7 @@ from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Camera, Cameras, Intrinsics, Photos, TieRole, Ties, TieWall
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
+from tests import samples
 from tests.plugins.orient.test_pnp import PIXEL, known_ties
 
 SCENE = ms.textured_wall(0)
@@ -49,16 +50,11 @@ def clicked(
     pixels = CAMERA.project(points)[:, :2] + rng.normal(0.0, SIGMA_PX, (n, 2))
     if blunder is not None:
         pixels[-1] += blunder
-    return Ties(
-        photo_names=("a.png",),
-        photo=np.zeros(n, np.int32),
-        wall=np.zeros(n, np.int32),
-        pixels_photo=pixels,
+    return samples.ties(
+        pixels,
         points_world=points,
         sigma_px=np.full(n, SIGMA_PX),
         sigma_m=np.full(n, 1e-4),
-        role=np.zeros(n, np.uint8),
-        residual_px=np.full((n, 2), np.nan),
         by_hand=np.ones(n, np.uint8),
         walls=(
             TieWall(

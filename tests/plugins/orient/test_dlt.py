@@ -26,6 +26,7 @@ from orthoflow.geometry.resection import SeenPoints
 from orthoflow.products import Cameras, Photo, Photos, Ties, TieWall
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
+from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
 
 SIZE_PX = (4000, 3000)
@@ -37,7 +38,9 @@ def camera(*, k1: float = -0.08, full: bool = False) -> ViewingCamera:
     """A wide camera 2.6 m before the middle of a wall in the plane y = 0."""
     centre = np.array([0.15, -2.6, 0.1])
     rotation = looking_at(centre, np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-    return ViewingCamera(
+    return samples.camera(
+        rotation,
+        centre,
         width=SIZE_PX[0],
         height=SIZE_PX[1],
         fx=3200.0,
@@ -45,8 +48,6 @@ def camera(*, k1: float = -0.08, full: bool = False) -> ViewingCamera:
         cx=2012.0,
         cy=1490.0,
         distortion=np.array([k1, 0.03, 4e-4, -3e-4, 0.0] if full else [k1, 0.0, 0.0, 0.0, 0.0]),
-        rotation=rotation,
-        translation=-rotation @ centre,
     )
 
 
@@ -74,16 +75,11 @@ def ties_of(
     points = points_in_view(viewer, n, relief_m=relief_m, rng=rng)
     pixels = viewer.project(points)[:, :2] + noise_px * rng.normal(size=(n, 2))
     half = (1.9, 1.5)
-    return Ties(
-        photo_names=("a.png",),
-        photo=np.zeros(n, np.int32),
-        wall=np.zeros(n, np.int32),
-        pixels_photo=pixels,
+    return samples.ties(
+        pixels,
         points_world=points + noise_m * rng.normal(size=points.shape),
         sigma_px=np.full(n, max(noise_px, 0.01)),
         sigma_m=np.full(n, max(noise_m, 1e-5)),
-        role=np.zeros(n, np.uint8),
-        residual_px=np.full((n, 2), np.nan),
         walls=(
             TieWall(
                 gsd_m=0.003,

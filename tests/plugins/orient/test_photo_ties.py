@@ -7,6 +7,7 @@ import pytest
 from orthoflow_plugins.orient.photo_ties import _off_line_px
 
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -14,16 +15,8 @@ UP = np.array([0.0, 0.0, 1.0])
 def camera(centre: tuple[float, float, float], *, focal_px: float) -> ViewingCamera:
     where = np.array(centre)
     rotation = looking_at(where, np.array([0.2, 5.0, 0.3]), UP)
-    return ViewingCamera(
-        width=1000,
-        height=800,
-        fx=focal_px,
-        fy=focal_px,
-        cx=500.0,
-        cy=400.0,
-        distortion=np.zeros(5),
-        rotation=rotation,
-        translation=-rotation @ where,
+    return samples.camera(
+        rotation, where, width=1000, height=800, fx=focal_px, fy=focal_px, cx=500.0, cy=400.0
     )
 
 

@@ -22,6 +22,7 @@ from orthoflow.geometry.resection import SeenPoints, adjust
 from orthoflow.products import Camera, Cameras, Intrinsics, Photo, Photos, TieRole, Ties, TieWall
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
+from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
 
 PIXEL = Photo(
@@ -57,16 +58,11 @@ def known_ties(
     pixels[:n_wrong] = rng.uniform([0, 0], [900, 640], (n_wrong, 2))
     shift = np.zeros(3) if shift_m is None else shift_m
     corners = scene.frame.corners_world() + shift
-    return Ties(
-        photo_names=("a.png",),
-        photo=np.zeros(len(chosen), np.int32),
-        wall=np.zeros(len(chosen), np.int32),
-        pixels_photo=pixels,
+    return samples.ties(
+        pixels,
         points_world=points + shift,
         sigma_px=np.full(len(chosen), 0.5),
         sigma_m=np.full(len(chosen), 1e-4),
-        role=np.zeros(len(chosen), np.uint8),
-        residual_px=np.full((len(chosen), 2), np.nan),
         walls=(
             TieWall(
                 gsd_m=ms.GSD_M,
@@ -532,16 +528,8 @@ def reference_camera(folder: Path, name: str) -> ViewingCamera:
     rows = [line.split() for line in (folder / f"{name}.jpg.camera").read_text().splitlines()]
     rotation = np.array(rows[4:7], dtype=np.float64).T
     centre = np.array(rows[7], dtype=np.float64)
-    return ViewingCamera(
-        width=3072,
-        height=2048,
-        fx=2759.48,
-        fy=2764.16,
-        cx=1521.19,
-        cy=1007.31,
-        distortion=np.zeros(5),
-        rotation=rotation,
-        translation=-rotation @ centre,
+    return samples.camera(
+        rotation, centre, width=3072, height=2048, fx=2759.48, fy=2764.16, cx=1521.19, cy=1007.31
     )
 
 

@@ -15,21 +15,20 @@ from orthoflow_plugins.orient.single_photo import ByHand, Oriented
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Photo, Photos, TieRole, Ties
+from tests import samples
 
 
 def ties(n: int = 12) -> Ties:
     """Ties of two photos in turn, their pixels numbered."""
     at = np.arange(n)
-    return Ties(
+    return samples.ties(
+        np.column_stack([at, 10.0 * at]).astype(np.float64),
         photo_names=("a", "b"),
         photo=(at % 2).astype(np.int32),
-        wall=np.zeros(n, dtype=np.int32),
-        pixels_photo=np.column_stack([at, 10.0 * at]).astype(np.float64),
         points_world=np.zeros((n, 3)),
         sigma_px=0.1 + at,
         sigma_m=0.001 + at,
         role=np.full(n, TieRole.CONTROL, dtype=np.uint8),
-        residual_px=np.full((n, 2), np.nan),
     )
 
 

@@ -13,28 +13,21 @@ from orthoflow_plugins.ortho.pointcloud_direct import PointcloudDirect
 
 from orthoflow.errors import MethodError, ProductError
 from orthoflow.geometry import frame_over
-from orthoflow.products import Layer, LayerMask, PointCloud, Wall, Walls
+from orthoflow.products import Layer, LayerMask, PointCloud, Walls
 from tests import raster_scenes as scenes
+from tests import samples
 
 
 def bare_walls(known: scenes.KnownWall, *, buffer_m: float = 0.15) -> Walls:
     frame = frame_over(known.planes().corners[0], known.normal, gsd_m=known.gsd_m)
-    wall = Wall(
-        frame=frame,
-        plane_index=0,
-        name="wall 0",
+    wall = samples.wall(
+        frame,
         depth_m=np.full(frame.shape, np.nan, dtype=np.float32),
         sigma_m=np.full(frame.shape, np.nan, dtype=np.float32),
         count=np.zeros(frame.shape, dtype=np.uint32),
         mask=np.zeros(frame.shape, dtype=np.uint8),
     )
-    return Walls(
-        walls=(wall,),
-        up=scenes.UP,
-        intensity_source="none",
-        buffer_front_m=buffer_m,
-        buffer_behind_m=buffer_m,
-    )
+    return samples.walls(wall, buffer_m=buffer_m)
 
 
 def painted(cloud: PointCloud, walls: Walls, folder: Path, **params: object) -> Layer:

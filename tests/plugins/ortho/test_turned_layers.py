@@ -13,8 +13,9 @@ from orthoflow_plugins.ortho.sampling import CellFootprint, Resampling, sample
 from orthoflow_plugins.ortho.views import TileVisibility
 
 from orthoflow.geometry import frame_over
-from orthoflow.products import Layer, LayerMask, Wall, Walls
+from orthoflow.products import Layer, LayerMask, Walls
 from tests import raster_scenes as scenes
+from tests import samples
 from tests.turns import TURNS, Turn
 
 SHAPE = (30, 41)
@@ -22,22 +23,8 @@ SHAPE = (30, 41)
 
 def bare_walls(known: scenes.KnownWall) -> Walls:
     frame = frame_over(known.planes().corners[0], known.normal, gsd_m=known.gsd_m)
-    wall = Wall(
-        frame=frame,
-        plane_index=0,
-        name="wall 0",
-        depth_m=np.zeros(frame.shape, dtype=np.float32),
-        sigma_m=np.zeros(frame.shape, dtype=np.float32),
-        count=np.ones(frame.shape, dtype=np.uint32),
-        mask=np.ones(frame.shape, dtype=np.uint8),
-    )
-    return Walls(
-        walls=(wall,),
-        up=scenes.UP,
-        intensity_source="none",
-        buffer_front_m=0.15,
-        buffer_behind_m=0.15,
-    )
+    wall = samples.wall(frame)
+    return samples.walls(wall)
 
 
 def painted(turn: Turn, folder: Path, **params: object) -> Layer:

@@ -36,6 +36,7 @@ from orthoflow_plugins.plane.surface_voxels import Neighbourhood, surface_voxels
 
 from orthoflow.geometry import wall_axes
 from orthoflow.products import Planes, Spread, Thickness
+from tests import samples
 from tests.plane_scenes import Rectangle, cloud_of, context, sampled
 
 ORIGIN: Final = (100.0, 200.0, 50.0)
@@ -62,14 +63,12 @@ def planes_of(*, count: int = 3, parts: bool = False) -> Planes:
     box = np.array(corners)
     halves = box.copy()
     halves[:, 2:] = 0.5 * (box[:, 2:] + box[:, [1, 0]])
-    return Planes(
+    return samples.planes(
         normal=np.array(normals),
         offset=np.array(offsets),
         corners=box,
-        covariance=np.zeros((count, 4, 4)),
         n_points=np.arange(count, 0, -1) * 1000,
         rms_m=np.full(count, 0.002),
-        up=UP,
         names=tuple(f"{NAMES[k % 3]}{'' if k < 3 else k}" for k in range(count)),
         part_corners=np.concatenate([halves[:1], box[:1], box[1:]]) if parts else None,
         part_plane=np.array([0, 0, *range(1, count)], dtype=np.int32) if parts else None,

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from orthoflow_plugins.raster.balancing import balanced
 
-from orthoflow.geometry import WallFrame
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes
+from tests import samples
 from tests.plane_scenes import cloud_of
 
 STATIONS = np.array([[-1.5, -3.0, 0.2], [2.0, -1.5, -0.3], [0.2, -5.0, 0.0]])
@@ -24,15 +24,7 @@ ORIGIN = (1000.0, 2000.0, 100.0)
 
 def slab() -> Slab:
     """The wall y = 0 of 4 x 3 m, seen from the south."""
-    frame = WallFrame(
-        origin_world=np.array([-2.0, 0.0, 1.5]) + ORIGIN,
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=0.01,
-        width=400,
-        height=300,
-    )
+    frame = samples.facing_south(0.01, 400, 300, np.array([-2.0, 0.0, 1.5]) + ORIGIN)
     return Slab(frame=frame, front_m=0.05, behind_m=0.03)
 
 

@@ -11,6 +11,7 @@ from orthoflow_plugins.raster.grid import RasterGrid
 
 from orthoflow.products import Planes, PointCloud, Walls
 from tests import raster_scenes as scenes
+from tests import samples
 
 # The wall is seen along +y at y = 0, 4 m wide and 3 m high; depth is -y.
 WIDTH_M, HEIGHT_M = 4.0, 3.0
@@ -51,14 +52,12 @@ def planes_of(
     normals = np.array([[0.0, -1.0, 0.0], *(normal for normal, _ in adjoining)])
     corners = np.array([outline, *(rectangle for _, rectangle in adjoining)])
     count = len(normals)
-    return Planes(
+    return samples.planes(
         normal=normals,
         offset=np.einsum("ij,ij->i", normals, corners[:, 0]),
         corners=corners,
-        covariance=np.zeros((count, 4, 4)),
         n_points=np.full(count, int((x[1] - x[0]) * (z[1] - z[0]) / STEP_M**2)),
         rms_m=np.full(count, NOISE_M),
-        up=scenes.UP,
         names=tuple(f"plane {k}" for k in range(count)),
     )
 

@@ -14,6 +14,7 @@ from orthoflow_plugins.raster.walls import scan_step_m
 from orthoflow.errors import MethodError, OrthoflowError
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
 from tests import raster_scenes as scenes
+from tests import samples
 
 SURFACES = ["median", "centre", "topmost", "mean"]
 
@@ -264,14 +265,11 @@ def three_planes() -> Planes:
     ]
     normals = np.array([[0.0, 0, 1], [0, -1, 0], [0, -1, 0]])
     corners = np.array(rectangles, dtype=np.float64)
-    return Planes(
+    return samples.planes(
         normal=normals,
         offset=np.einsum("ki,ki->k", normals, corners[:, 0]),
         corners=corners,
-        covariance=np.zeros((3, 4, 4)),
         n_points=np.array([30, 20, 10]),
-        rms_m=np.zeros(3),
-        up=scenes.UP,
         names=("floor", "wall 0", "wall 1"),
     )
 

@@ -20,6 +20,7 @@ from orthoflow.geometry.frames import WallFrame, frame_over
 from orthoflow.geometry.rotations import rotation_from_vector
 from orthoflow.products import Planes
 from tests import raster_scenes as scenes
+from tests import samples
 from tests.scenes import SURVEY_SHIFT_M
 
 GSD = 0.1
@@ -34,12 +35,10 @@ def level(tilt_rad: float = 0.0, *, down: bool = False, up: np.ndarray = UP) -> 
     normal = turn @ UP
     if down:
         normal, corners = -normal, corners[[3, 2, 1, 0]]
-    return Planes(
+    return samples.planes(
         normal=normal[None],
         offset=np.array([normal @ corners[0]]),
         corners=corners[None],
-        covariance=np.zeros((1, 4, 4)),
-        n_points=np.array([100]),
         rms_m=np.array([0.001]),
         up=up,
         names=("floor 1",),

@@ -12,9 +12,9 @@ from orthoflow_plugins.raster.emptiness import Emptiness
 from orthoflow_plugins.raster.walls import WallRaster
 
 from orthoflow.files.images import decode_image
-from orthoflow.geometry import WallFrame
 from orthoflow.products import SurfaceMask, Wall
 from orthoflow.sdk import StepContext, StepEvent
+from tests import samples
 
 
 def wall(
@@ -22,15 +22,7 @@ def wall(
 ) -> Wall:
     counts = np.array(count, dtype=np.uint32)
     rows, columns = counts.shape
-    frame = WallFrame(
-        origin_world=np.zeros(3),
-        u_world=np.array([1.0, 0.0, 0.0]),
-        v_world=np.array([0.0, 0.0, -1.0]),
-        normal_world=np.array([0.0, -1.0, 0.0]),
-        gsd_m=0.005,
-        width=columns,
-        height=rows,
-    )
+    frame = samples.facing_south(0.005, columns, rows)
     states = (counts > 0).astype(np.uint8) if mask is None else np.array(mask, dtype=np.uint8)
     return Wall(
         frame=frame,

@@ -11,6 +11,7 @@ from orthoflow_plugins.raster.selection import WallChoice, chosen_planes
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Planes
+from tests import samples
 
 CHOICE = WallChoice(
     constraint="any",
@@ -34,14 +35,11 @@ def planes(*walls: tuple[float, float, float, float]) -> Planes:
         normals.append(normal)
         offsets.append(normal @ start)
     count = len(walls)
-    return Planes(
+    return samples.planes(
         normal=np.array(normals),
         offset=np.array(offsets),
         corners=np.array(corners),
-        covariance=np.zeros((count, 4, 4)),
         n_points=np.arange(count, 0, -1),
-        rms_m=np.zeros(count),
-        up=np.array([0.0, 0.0, 1.0]),
         names=tuple(f"wall {k}" for k in range(count)),
     )
 

@@ -12,8 +12,9 @@ import pytest
 from orthoflow_plugins.simulate import deliverables
 
 from orthoflow.files.images import decode_image, encode_png
-from orthoflow.products import Photo, Photos, Planes, PointCloud
+from orthoflow.products import Photo, Photos, PointCloud
 from orthoflow.sdk import StepContext
+from tests import samples
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -29,14 +30,11 @@ def scanned(step_m: float, *, side_m: float = 2.0, hole: bool = False) -> tuple[
     points = np.vstack([np.column_stack([u, np.zeros(u.size), v]), beside])
     x, y, z = points.T.astype(np.float32)
     corners = np.array([[0.0, 0, side_m], [0, 0, 0], [side_m, 0, 0], [side_m, 0, side_m]])
-    planes = Planes(
+    planes = samples.planes(
         normal=np.array([[0.0, -1.0, 0.0]]),
         offset=np.zeros(1),
         corners=corners[None],
-        covariance=np.zeros((1, 4, 4)),
         n_points=np.array([u.size]),
-        rms_m=np.zeros(1),
-        up=UP,
         names=("wall",),
     )
     labels = np.append(np.zeros(u.size, dtype=np.int16), np.full(50, -1, dtype=np.int16))

@@ -1,0 +1,120 @@
+"""Grids and products as tests want them: what a test does not say is plain."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.products import Orthoimage, OrthoMask, Planes, SurfaceMask, Ties, Wall, Walls
+
+UP = np.array([0.0, 0.0, 1.0])
+DOWN, SOUTH = np.array([0.0, 0.0, -1.0]), np.array([0.0, -1.0, 0.0])
+EAST, NORTH = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+
+
+def facing_south(
+    gsd_m: float, width: int, height: int, corner: ArrayLike = (0.0, 0.0, 0.0)
+) -> WallFrame:
+    """The grid of an upright wall, seen along +y: u along x."""
+    return _upright(EAST, SOUTH, gsd_m, (width, height), corner)
+
+
+def facing_east(
+    gsd_m: float, width: int, height: int, corner: ArrayLike = (0.0, 0.0, 0.0)
+) -> WallFrame:
+    """The grid of an upright wall, seen along -x: u along y."""
+    return _upright(NORTH, EAST, gsd_m, (width, height), corner)
+
+
+def _upright(
+    u_world: NDArray[np.float64],
+    normal_world: NDArray[np.float64],
+    gsd_m: float,
+    size: tuple[int, int],
+    corner: ArrayLike,
+) -> WallFrame:
+    return WallFrame(
+        origin_world=np.array(corner, dtype=np.float64),
+        u_world=u_world.copy(),
+        v_world=DOWN.copy(),
+        normal_world=normal_world.copy(),
+        gsd_m=gsd_m,
+        width=size[0],
+        height=size[1],
+    )
+
+
+# Any: fields of the camera or product, each of its own type.
+def camera(
+    rotation: NDArray[np.float64], centre: NDArray[np.float64], **known: Any
+) -> ViewingCamera:
+    """A camera that stands at a place, without distortion."""
+    lens = {"distortion": np.zeros(5), **known}
+    return ViewingCamera(rotation=rotation, translation=-rotation @ centre, **lens)
+
+
+def wall(frame: WallFrame, **known: Any) -> Wall:
+    """A raster of one point per cell, flat and void where the depth is NaN."""
+    depth_m = known.get("depth_m", np.zeros(frame.shape, dtype=np.float32))
+    is_void = np.isnan(depth_m)
+    plain = {
+        "plane_index": 0,
+        "name": "wall 0",
+        "depth_m": depth_m,
+        "sigma_m": np.zeros(frame.shape, dtype=np.float32),
+        "count": np.ones(frame.shape, dtype=np.uint32),
+        "mask": np.where(is_void, SurfaceMask.VOID, SurfaceMask.MEASURED).astype(np.uint8),
+    }
+    return Wall(frame=frame, **{**plain, **known})
+
+
+def walls(*rasters: Wall, buffer_m: float = 0.15, **known: Any) -> Walls:
+    """Rasters without intensity, the same buffer before and behind them, z up."""
+    plain = {
+        "up": UP.copy(),
+        "intensity_source": "none",
+        "buffer_front_m": buffer_m,
+        "buffer_behind_m": buffer_m,
+    }
+    return Walls(walls=rasters, **{**plain, **known})
+
+
+def planes(**known: Any) -> Planes:
+    """Planes that their points lie on exactly, z up."""
+    count = len(known["normal"])
+    plain = {
+        "covariance": np.zeros((count, 4, 4)),
+        "n_points": np.full(count, 100),
+        "rms_m": np.zeros(count),
+        "up": UP.copy(),
+    }
+    return Planes(**{**plain, **known})
+
+
+def orthoimage(frame: WallFrame, **known: Any) -> Orthoimage:
+    """An image of the first wall that one photo paints everywhere."""
+    plain = {
+        "wall": 0,
+        "name": "wall 0",
+        "mask": np.full(frame.shape, OrthoMask.PAINTED, dtype=np.uint8),
+        "source": np.zeros(frame.shape, dtype=np.int16),
+        "sources": ("a.jpg",),
+    }
+    return Orthoimage(frame=frame, **{**plain, **known})
+
+
+def ties(pixels_photo: NDArray[np.float64], **known: Any) -> Ties:
+    """Ties of one photo with the first wall, before an orientation."""
+    count = len(pixels_photo)
+    plain = {
+        "photo_names": ("a.png",),
+        "photo": np.zeros(count, np.int32),
+        "wall": np.zeros(count, np.int32),
+        "role": np.zeros(count, np.uint8),
+        "residual_px": np.full((count, 2), np.nan),
+    }
+    return Ties(pixels_photo=pixels_photo, **{**plain, **known})
