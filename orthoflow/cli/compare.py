@@ -19,7 +19,6 @@ from orthoflow.cli.tables import counted, echo, echo_distances, echo_json, echo_
 
 if TYPE_CHECKING:
     from orthoflow.records import (
-        CellFacts,
         ComparedMetric,
         Pair,
         ParameterValue,
@@ -99,7 +98,7 @@ def _print(comparison: RunComparison) -> None:
     else:
         echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join)
-    _print_pairs("cells", comparison.cells, _facts_text)
+    _print_pairs("cells", comparison.cells, str)
     _print_pairs("parameters (* set, others are defaults)", comparison.parameters, _parameter_text)
     _print_pairs("environment", comparison.environment, str)
     _print_metrics(comparison.metrics)
@@ -127,23 +126,7 @@ def _print_pairs(title: str, rows: Sequence[Pair[Value]], text: Callable[[Value]
 
 
 def _files_text(files: Sequence[RecordedFile]) -> str:
-    if not files:
-        return "not given"
-    return first_few([f"{file.name} {file.sha256[:12]}" for file in files])
-
-
-def _facts_text(facts: CellFacts) -> str:
-    parts = [facts.status, f"{facts.method} result version {facts.result_version}"]
-    parts.append(facts.distribution)
-    if facts.code:
-        codes = " ".join(f"{name} {digest[:8]}" for name, digest in facts.code.items())
-        parts.append(f"code {codes}")
-    parts += [f"{name} {version}" for name, version in facts.tools.items()]
-    if facts.seed is not None:
-        parts.append(f"seed {facts.seed}")
-    if facts.error:
-        parts.append(facts.error)
-    return ", ".join(parts)
+    return first_few([f"{file.name} {file.sha256[:12]}" for file in files]) or "not given"
 
 
 def _parameter_text(parameter: ParameterValue) -> str:
@@ -154,7 +137,7 @@ def _parameter_text(parameter: ParameterValue) -> str:
 
 def _print_metrics(rows: Sequence[Pair[ComparedMetric]]) -> None:
     """Print every metric that differs; time and memory always do, so they are not counted."""
-    is_measured = [not _side(row).is_cost for row in rows]
+    is_measured = [not row.either.is_cost for row in rows]
     is_different = [_value(row.left) != _value(row.right) for row in rows]
     n_different = sum(a and b for a, b in zip(is_measured, is_different, strict=True))
     echo("", f"metrics: {n_different} of {sum(is_measured)} differ, time and memory left aside")
@@ -170,18 +153,11 @@ def _print_metrics(rows: Sequence[Pair[ComparedMetric]]) -> None:
                 ""
                 if row.left is None or row.right is None
                 else number(row.right.value - row.left.value),
-                _side(row).unit,
+                row.either.unit,
             )
             for row in itertools.compress(rows, is_different)
         ],
     )
-
-
-def _side(row: Pair[ComparedMetric]) -> ComparedMetric:
-    side = row.left or row.right
-    if side is None:
-        raise AssertionError("a row stands for something that a run has")
-    return side
 
 
 def _value(side: ComparedMetric | None) -> float | None:

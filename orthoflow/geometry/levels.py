@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 Colours: TypeAlias = NDArray[np.uint8 | np.uint16]
 Level: TypeAlias = type[np.uint8] | type[np.uint16]
 
+# Grey of red, green and blue as they are (luma of Rec. 601), as OpenCV makes it.
+REC_601: Final = np.array([0.299, 0.587, 0.114])
 # Levels of 16 bits for one of 8.
 DEEPER: Final = 257
 

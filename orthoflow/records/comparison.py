@@ -51,6 +51,14 @@ class Pair(Generic[Side]):
         """Whether both say the same."""
         return self.left == self.right
 
+    @property
+    def either(self) -> Side:
+        """What one of them says, the first where it does."""
+        side = self.right if self.left is None else self.left
+        if side is None:
+            raise AssertionError("a pair stands for something that a run has")
+        return side
+
 
 @dataclass(frozen=True, kw_only=True)
 class ParameterValue:
@@ -90,6 +98,18 @@ class CellFacts:
     code: Mapping[str, str]
     tools: Mapping[str, str]
     error: str
+
+    def __str__(self) -> str:
+        parts = (
+            self.status,
+            f"{self.method} result version {self.result_version}",
+            self.distribution,
+            *(f"code of {name} {digest[:8]}" for name, digest in self.code.items()),
+            *(f"{name} {version}" for name, version in self.tools.items()),
+            "" if self.seed is None else f"seed {self.seed}",
+            self.error,
+        )
+        return ", ".join(part for part in parts if part)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,8 +187,7 @@ class RunComparison:
             left, right = (
                 math.nan if side is None else side.value for side in (row.left, row.right)
             )
-            unit = next(side.unit for side in (row.left, row.right) if side is not None)
-            rows.append((row.cell, row.name, left, right, right - left, unit))
+            rows.append((row.cell, row.name, left, right, right - left, row.either.unit))
         columns = ["cell", "metric", "left", "right", "difference", "unit"]
         return pd.DataFrame(rows, columns=columns)
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from orthoflow.records import (
-    CellFacts,
     ComparedMetric,
     Pair,
     ParameterValue,
@@ -87,7 +86,7 @@ def differences(comparison: RunComparison) -> Differences:
         tables=(
             _table("Inputs", comparison.inputs, _files_text),
             _table("Options", [comparison.overrides], " ".join),
-            _table("Steps", comparison.cells, _facts_text),
+            _table("Steps", comparison.cells, str),
             _table("Parameters", comparison.parameters, _parameter_text),
             _table("Environment", comparison.environment, str),
             _metric_table(comparison.metrics),
@@ -120,7 +119,7 @@ def _table(title: str, pairs: Sequence[Pair[Side]], text: Callable[[Side], str])
 
 def _metric_table(pairs: Sequence[Pair[ComparedMetric]]) -> DifferenceTable:
     """Metrics that differ; time and memory always do, and stand in the comparison table."""
-    measured = [pair for pair in pairs if not _either(pair).is_cost]
+    measured = [pair for pair in pairs if not pair.either.is_cost]
     rows = []
     for pair in measured:
         left, right = pair.left, pair.right
@@ -138,13 +137,6 @@ def _metric_table(pairs: Sequence[Pair[ComparedMetric]]) -> DifferenceTable:
     return DifferenceTable(
         title="Metrics, time and memory left aside", n_compared=len(measured), rows=tuple(rows)
     )
-
-
-def _either(pair: Pair[ComparedMetric]) -> ComparedMetric:
-    side = pair.left or pair.right
-    if side is None:
-        raise AssertionError("a pair stands for something that a run has")
-    return side
 
 
 def _product_row(distance: ProductDistance) -> ProductRow:
@@ -165,22 +157,6 @@ def _product_row(distance: ProductDistance) -> ProductRow:
 def _files_text(files: Sequence[RecordedFile]) -> str:
     named = [f"{file.name} {file.sha256[:_DIGEST_LETTERS]}" for file in files]
     return ", ".join(named) or "not given"
-
-
-def _facts_text(facts: CellFacts) -> str:
-    code = [f"code of {name} {digest[:8]}" for name, digest in facts.code.items()]
-    tools = [f"{name} {version}" for name, version in facts.tools.items()]
-    seed = [] if facts.seed is None else [f"seed {facts.seed}"]
-    parts = [
-        facts.status,
-        f"{facts.method} result version {facts.result_version}",
-        facts.distribution,
-        *code,
-        *tools,
-        *seed,
-        facts.error,
-    ]
-    return ", ".join(part for part in parts if part)
 
 
 def _parameter_text(parameter: ParameterValue) -> str:

@@ -179,13 +179,13 @@ def _folders_of_photos(items: Sequence[Recognised]) -> list[Path]:
         inside = [p for p in path.parent.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES]
         whole = path.suffix.lower() in PHOTO_SUFFIXES and set(inside) <= set(paths)
         # A folder among whose files are scans would bring these along.
-        whole = whole and len(inside) > 1 and _holds_only(path.parent, PHOTO_SUFFIXES)
+        whole = whole and len(inside) > 1 and _holds_photos_only(path.parent)
         places[path.parent if whole else path] = None
     return list(places)
 
 
-def _holds_only(folder: Path, suffixes: Sequence[str]) -> bool:
-    return all(path.suffix.lower() in suffixes for path in folder.iterdir() if path.is_file())
+def _holds_photos_only(folder: Path) -> bool:
+    return all(path.suffix.lower() in PHOTO_SUFFIXES for path in folder.iterdir() if path.is_file())
 
 
 def _described(items: Sequence[Recognised]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from orthoflow.errors import ArgumentError, PluginError, WorkflowError
+from orthoflow.errors import ArgumentError, OrthoflowError, PluginError, WorkflowError
 
 if TYPE_CHECKING:
     from orthoflow.files.yaml_positions import Position
@@ -54,28 +54,24 @@ class Problem:
         return f"    {shown.strip()}\n    {caret}"
 
 
-class InvalidWorkflowError(WorkflowError):
-    """A workflow file has problems; `problems` holds them for tools."""
+class _ProblemsError(OrthoflowError):
+    """Some problems, a line each or more; `problems` holds them for tools."""
 
     def __init__(self, problems: tuple[Problem, ...]) -> None:
         self.problems = problems
         super().__init__("\n".join(str(problem) for problem in problems))
 
 
-class UnusablePluginError(PluginError):
+class InvalidWorkflowError(_ProblemsError, WorkflowError):
+    """A workflow file has problems."""
+
+
+class UnusablePluginError(_ProblemsError, PluginError):
     """A workflow is fine, but plugins it needs are not; `problems` says where it needs them."""
 
-    def __init__(self, problems: tuple[Problem, ...]) -> None:
-        self.problems = problems
-        super().__init__("\n".join(str(problem) for problem in problems))
 
-
-class InvalidArgumentsError(ArgumentError):
-    """Command-line options do not fit the workflow; `problems` holds them for tools."""
-
-    def __init__(self, problems: tuple[Problem, ...]) -> None:
-        self.problems = problems
-        super().__init__("\n".join(str(problem) for problem in problems))
+class InvalidArgumentsError(_ProblemsError, ArgumentError):
+    """Command-line options do not fit the workflow."""
 
 
 @dataclass

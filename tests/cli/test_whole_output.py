@@ -24,17 +24,15 @@ from orthoflow.errors import ArgumentError
 from orthoflow.products import PointCloud
 from orthoflow.records import (
     CellFacts,
-    ComparedMetric,
     Pair,
     ParameterValue,
-    ProductDistance,
     RecordedFile,
     RunComparison,
 )
 from orthoflow.records.comparison import Distance
 from orthoflow.sdk import MethodParams, Ports
 from tests.laboratories import laboratory_catalog
-from tests.report_runs import cell, record
+from tests.report_runs import cell, distance, metric, record
 
 
 def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
@@ -58,19 +56,6 @@ def test_counts_are_said_with_their_noun() -> None:
 
 
 # --- comparisons ---
-
-
-def distance(port: str, verdict: str, reason: str = "", *parts: Distance) -> ProductDistance:
-    return ProductDistance(
-        cell="a",
-        port=port,
-        type_name="planes",
-        verdict=verdict,  # type: ignore[arg-type]
-        left="1",
-        right="2",
-        distances=parts,
-        reason=reason,
-    )
 
 
 def part(field: str, unit: str, largest: float | None) -> Distance:
@@ -111,12 +96,6 @@ def facts(**more: Any) -> CellFacts:
         "error": "",
     }
     return CellFacts(**(plain | more))
-
-
-def metric(value: float, *, is_cost: bool = False) -> ComparedMetric:
-    return ComparedMetric(
-        value=value, unit="mm", is_cost=is_cost, is_cached=False, environment="e1"
-    )
 
 
 def runs() -> tuple[RunRecord, RunRecord]:
@@ -200,8 +179,8 @@ def test_all_that_differs_is_printed(capsys: pytest.CaptureFixture[str]) -> None
     three = f"{first}, b.jpg 1123456789ab, c.jpg 2123456789ab"
     fine = "ok, plane.a result version 1, toys 1.0"
     failed = (
-        "failed, plane.a result version 1, toys 1.0, code toys abcdef01 more 11111111, colmap 4.2, "
-        "seed 0, no plane"
+        "failed, plane.a result version 1, toys 1.0, code of toys abcdef01, "
+        "code of more 11111111, colmap 4.2, seed 0, no plane"
     )
     assert printed(capsys) == [
         *HEADS,

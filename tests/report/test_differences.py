@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-from orthoflow.records import Pair
+from orthoflow.records import CellFacts, Pair
 from orthoflow.report import differences
 from orthoflow.report.differences import Difference
 
@@ -32,11 +33,11 @@ def metric(value: float, unit: str = "mm", *, is_cost: bool = False) -> Any:
 
 def test_metrics_that_differ_say_by_how_much_and_costs_are_left_aside() -> None:
     pairs: list[Any] = [
-        SimpleNamespace(cell="a", name="rms_mm", left=metric(1.5), right=metric(1.25)),
-        SimpleNamespace(cell="a", name="same_mm", left=metric(1.5), right=metric(1.5)),
-        SimpleNamespace(cell="a", name="wall_s", left=metric(9.0, "s", is_cost=True), right=None),
-        SimpleNamespace(cell="b", name="new", left=None, right=metric(3.0, "1")),
-        SimpleNamespace(cell="c", name="old", left=metric(3.0, "1"), right=None),
+        Pair(cell="a", name="rms_mm", left=metric(1.5), right=metric(1.25)),
+        Pair(cell="a", name="same_mm", left=metric(1.5), right=metric(1.5)),
+        Pair(cell="a", name="wall_s", left=metric(9.0, "s", is_cost=True), right=None),
+        Pair(cell="b", name="new", left=None, right=metric(3.0, "1")),
+        Pair(cell="c", name="old", left=metric(3.0, "1"), right=None),
     ]
     table = differences._metric_table(pairs)
     assert table.n_compared == 4
@@ -69,23 +70,23 @@ def test_a_product_says_how_far_each_field_lies_apart_and_why() -> None:
 
 
 def test_facts_of_a_step_are_said_as_far_as_there_are_any() -> None:
-    facts: Any = SimpleNamespace(
+    facts = CellFacts(
         status="ok",
         method="plane.ransac",
         result_version=3,
         distribution="orthoflow 1.0",
+        determinism="seeded",
         code={"orthoflow": "0123456789abcdef"},
         tools={"open3d": "0.19"},
         seed=5,
         error="",
     )
-    assert differences._facts_text(facts) == (
+    assert str(facts) == (
         "ok, plane.ransac result version 3, orthoflow 1.0, code of orthoflow 01234567, "
         "open3d 0.19, seed 5"
     )
-    facts.seed, facts.error, facts.distribution = None, "no plane", ""
-    facts.code, facts.tools = {}, {}
-    assert differences._facts_text(facts) == "ok, plane.ransac result version 3, no plane"
+    few = replace(facts, seed=None, error="no plane", distribution="", code={}, tools={})
+    assert str(few) == "ok, plane.ransac result version 3, no plane"
 
 
 def test_files_are_named_with_the_beginning_of_their_digest() -> None:

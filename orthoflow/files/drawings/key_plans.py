@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -79,15 +78,9 @@ def _check_counts(planes: Planes) -> None:
         )
 
 
-def key_plan(planes: Planes, frame: WallFrame, outlines: Sequence[RoomOutline] = ()) -> KeyPlan:
-    """Draw planes from above, and mark where a raster lies.
-
-    Args:
-        planes: of the room.
-        frame: of the raster.
-        outlines: the outline, if it is known already.
-    """
-    outline = outlines[0] if outlines else outline_of(planes)
+def key_plan(planes: Planes, frame: WallFrame) -> KeyPlan:
+    """Draw planes from above, and mark where a raster lies."""
+    outline = outline_of(planes)
     basis = basis_from_up(planes.up)
     corners = frame.corners_world()
     near = corners.mean(axis=0)

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.geometry.levels import eight_bits
+from orthoflow.geometry.levels import REC_601, eight_bits
 from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
 from orthoflow.products import Finding, Orthoimage, OrthoMask, SurfaceMask, Wall
 from orthoflow_plugins.inspect.findings import rms
-from orthoflow_plugins.inspect.image_quality import LUMINANCE, shown
+from orthoflow_plugins.inspect.image_quality import shown
 from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_shifts
 
 if TYPE_CHECKING:
@@ -286,8 +286,8 @@ def _shifts(image: Orthoimage, true: TrueOrthoimage, known: NDArray[np.bool_]) -
     # Two centimetres is far beyond any fair error; further off is reported as gross colour.
     reach = int(np.clip(np.ceil(0.02 / true.frame.gsd_m), 3, 8))
     greys = np.zeros((2, *known.shape))
-    greys[0][known] = eight_bits(image.rgb[known]) @ LUMINANCE
-    greys[1][known] = true.rgb[known].astype(np.float64) @ LUMINANCE
+    greys[0][known] = eight_bits(image.rgb[known]) @ REC_601
+    greys[1][known] = true.rgb[known].astype(np.float64) @ REC_601
     return measure_shifts(
         GreyImage(grey=greys[0], valid=painted & known, region=(painted | filled) & known),
         GreyImage(grey=greys[1], valid=known, region=known),

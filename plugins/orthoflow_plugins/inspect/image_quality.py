@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.geometry.levels import eight_bits
+from orthoflow.geometry.levels import REC_601, eight_bits
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Wall
 from orthoflow_plugins.inspect.patches import GreyImage
 
-# Rec. 601 luma on the values as they are.
-LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 # A pixel drawn over more cells than this, in the direction where it is widest.
 _STRETCHED_CELLS: Final = 2.0
 _SMEARED_CELLS: Final = 5.0
@@ -49,7 +47,7 @@ _LOW, _HIGH = 0.1, 0.9
 def grey_of(image: Orthoimage) -> GreyImage:
     """The grey of what an orthoimage shows, 0 elsewhere."""
     shows = shown(image)
-    grey = np.where(shows, eight_bits(image.rgb) @ LUMINANCE, 0.0)
+    grey = np.where(shows, eight_bits(image.rgb) @ REC_601, 0.0)
     return GreyImage(grey=grey, valid=shows, region=shows)
 
 

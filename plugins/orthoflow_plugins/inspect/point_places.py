@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.levels import REC_601
 from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import CheckPoints, Orthoimage, Truth, Wall, Walls
-from orthoflow_plugins.inspect.image_quality import LUMINANCE
 from orthoflow_plugins.inspect.patches import (
     PATCH_CELLS,
     GreyImage,
@@ -219,7 +219,7 @@ def find_by_truth(
     )
     known = np.asarray(np.isfinite(true.rgb).all(axis=2), dtype=np.bool_)
     reference = GreyImage(
-        grey=np.where(known, np.nan_to_num(true.rgb) @ LUMINANCE, 0.0), valid=known, region=known
+        grey=np.where(known, np.nan_to_num(true.rgb) @ REC_601, 0.0), valid=known, region=known
     )
     shown = picture.square(corner, side)
     whole = _whole_shift(shown, reference, rim, search_cells)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.geometry.frames import LEVEL_LIMIT_DEG, WallFrame, frame_over
+from orthoflow.geometry.levels import REC_601
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import (
     Photo,
@@ -36,7 +37,6 @@ from orthoflow_plugins.match.pictures import filled_smoothly, photo_grey, photo_
 _SPACINGS_PER_CELL: Final = 0.6
 _FILLED_CELLS: Final = 2
 _CELLS_MOST: Final = 4_000_000
-_REC_601: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 _POINTS_LEAST: Final = 3
 
 
@@ -215,7 +215,8 @@ def _grey_on(
     if cloud.intensity is not None:
         grey[has_point] = cloud.intensity[points]
     elif cloud.rgb is not None:
-        grey[has_point] = cloud.rgb[points].astype(np.float32) @ _REC_601 / np.float32(255.0)
+        weights = REC_601.astype(np.float32)
+        grey[has_point] = cloud.rgb[points].astype(np.float32) @ weights / np.float32(255.0)
     return _filled_between(grey.reshape(frame.shape))
 
 

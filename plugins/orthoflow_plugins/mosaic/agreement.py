@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.bands import row_bands
-from orthoflow.geometry.levels import eight_bits
+from orthoflow.geometry.levels import REC_601, eight_bits
 from orthoflow.products import Layer, LayerMask
 from orthoflow_plugins.mosaic.depth_edges import depth_edges
 
@@ -22,7 +22,6 @@ _PATCHES_MOST: Final = 200
 # Flat patches show no displacement, and weak peaks show chance.
 _CONTRAST_LEAST_GREY: Final = 3.0
 _RESPONSE_LEAST: Final = 0.15
-_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 _ROWS_AT_ONCE: Final = 1024
 
 
@@ -130,7 +129,7 @@ def seam_steps(
                 first[is_mine] = shown(owner, rows[chosen][is_mine], columns[chosen][is_mine])
             firsts.append(first)
     one, another = np.concatenate(firsts), np.concatenate(seconds)
-    grey = (one.astype(np.float64) - another) @ _LUMINANCE
+    grey = (one.astype(np.float64) - another) @ REC_601
     return SeamSteps(
         grey=grey, delta_e=np.linalg.norm(_lab(one) - _lab(another), axis=1).astype(np.float64)
     )

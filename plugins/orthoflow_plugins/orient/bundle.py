@@ -11,15 +11,20 @@ import numpy as np
 from pydantic import Field
 
 from orthoflow.errors import GeometryError
-from orthoflow.products import Cameras, JsonValue, Photo, Photos, Ties
-from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow.products import JsonValue, Photo, Ties
+from orthoflow.sdk import Method, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.acceptance import reason_to_leave_out
 from orthoflow_plugins.orient.block import correlation_notes, lens_statistics, lenses_json
 from orthoflow_plugins.orient.block_adjustment import Adjusted, Trusted, adjust_block
 from orthoflow_plugins.orient.estimation import estimate_pose
 from orthoflow_plugins.orient.lenses import Refined, Sharing, lens_groups
-from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientParams
+from orthoflow_plugins.orient.parameters import (
+    ORIENTATION_METRICS,
+    OrientIn,
+    OrientOut,
+    OrientParams,
+)
 from orthoflow_plugins.orient.photo_ties import (
     PhotoTies,
     no_features,
@@ -98,18 +103,10 @@ class OrientColmapBundle(Method):
             default=1000, ge=0, description="Points at most that tie photos to each other."
         )
 
-    class In(Ports):
-        """Ties with the walls, and the photos they are in."""
+    In = OrientIn
+    Out = OrientOut
 
-        ties: Ties
-        photos: Photos
-
-    class Out(Ports):
-        """One orientation per photo."""
-
-        cameras: Cameras
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
         """Orient each photo, then all of them together."""
         ties, photos = inputs.ties, inputs.photos.photos
         require(ties, inputs.photos)
@@ -135,7 +132,7 @@ class OrientColmapBundle(Method):
                 candidate = candidate_of(item.tied, ties, params, estimate)
                 found[at] = item.hand.or_alone(judged(item.tied, candidate))
         every = [found[nth] for nth in range(len(photos))]
-        return self.Out(cameras=hand_over(ctx, ties, photos, every, details))
+        return OrientOut(cameras=hand_over(ctx, ties, photos, every, details))
 
     @classmethod
     def tools(cls) -> dict[str, str]:

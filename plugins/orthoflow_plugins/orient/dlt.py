@@ -8,11 +8,15 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from orthoflow.products import Cameras, Photos, Ties
-from orthoflow.sdk import Method, Ports, StepContext
+from orthoflow.sdk import Method, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.direct_linear import Distortion, estimate_dlt
-from orthoflow_plugins.orient.parameters import ORIENTATION_METRICS, OrientParams
+from orthoflow_plugins.orient.parameters import (
+    ORIENTATION_METRICS,
+    OrientIn,
+    OrientOut,
+    OrientParams,
+)
 from orthoflow_plugins.orient.reporting import hand_over
 from orthoflow_plugins.orient.single_photo import each_by_itself
 
@@ -56,18 +60,10 @@ class OrientDlt(Method):
             "or none, the usual focal lengths tried in turn (markiewicz2015).",
         )
 
-    class In(Ports):
-        """Ties, and the photos they are in."""
+    In = OrientIn
+    Out = OrientOut
 
-        ties: Ties
-        photos: Photos
-
-    class Out(Ports):
-        """One orientation per photo."""
-
-        cameras: Cameras
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: OrientIn, params: Params, ctx: StepContext) -> OrientOut:
         """Orient the photos one after the other."""
         estimator = partial(
             estimate_dlt,
@@ -76,7 +72,7 @@ class OrientDlt(Method):
             forgets_lens=params.prior == "none",
         )
         found = each_by_itself(inputs.ties, inputs.photos, params, ctx, estimator)
-        return self.Out(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
+        return OrientOut(cameras=hand_over(ctx, inputs.ties, inputs.photos.photos, found))
 
     @classmethod
     def tools(cls) -> dict[str, str]:

@@ -80,7 +80,7 @@ def draw_ties(
 
     if len(ctx.figures) >= _FIGURES_MOST:
         return
-    name = _figure_name("ties", photo.name)
+    name = _figure_name(photo.name)
     if any(figure.name == name for figure in ctx.figures):
         name = f"{name}-{len(ctx.figures)}"
     rgb = decode_image(photo.encoded, f"photo {photo.name}")
@@ -204,10 +204,10 @@ def _draw_position(
     axes.annotate(candidate.photo.name, (x, y), fontsize=5.5)
 
 
-def _figure_name(prefix: str, photo_name: str) -> str:
+def _figure_name(photo_name: str) -> str:
     """Name of a photo's figure: letters, digits, `-` and `_`."""
     stem = photo_name.rpartition(".")[0] or photo_name
-    return f"{prefix}_{re.sub(r'[^A-Za-z0-9_-]', '-', stem)}"
+    return f"ties_{re.sub(r'[^A-Za-z0-9_-]', '-', stem)}"
 
 
 def _error_map(shares: NDArray[np.float64]) -> bytes:

@@ -15,7 +15,7 @@ from orthoflow.products import Camera, Cameras, JsonValue, Photo, Photos, Ties, 
 from orthoflow.sdk import Method, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.orient.by_hand import TIES_LEAST
-from orthoflow_plugins.orient.parameters import OrientParams
+from orthoflow_plugins.orient.parameters import OrientOut, OrientParams
 from orthoflow_plugins.orient.reporting import hand_over
 from orthoflow_plugins.orient.single_photo import Oriented, oriented_by_hand, tied_photo
 
@@ -54,12 +54,9 @@ class OrientGiven(Method):
         walls: Walls | None = None
         ties: Ties | None = None
 
-    class Out(Ports):
-        """One orientation per photo."""
+    Out = OrientOut
 
-        cameras: Cameras
-
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> OrientOut:
         """Take the poses, and check those that can be."""
         given = {camera.photo: camera for camera in inputs.cameras.cameras}
         if inputs.walls is not None:
@@ -71,7 +68,7 @@ class OrientGiven(Method):
         ]
         if inputs.ties is None:
             ctx.progress(1.0, "poses")
-            return self.Out(cameras=_as_they_are(ctx, taken))
+            return OrientOut(cameras=_as_they_are(ctx, taken))
         ties = _on_walls(inputs.ties, inputs.walls)
         found = []
         for nth, (photo, camera) in enumerate(zip(photos, taken, strict=True)):
@@ -79,7 +76,7 @@ class OrientGiven(Method):
             known = replace(photo, intrinsics=camera.intrinsics or photo.intrinsics)
             found.append(_oriented(known, camera, ties, params, ctx))
         unchecked = [item.camera.photo for item in found if item.numbers is None]
-        return self.Out(cameras=hand_over(ctx, ties, photos, found, _said(unchecked)))
+        return OrientOut(cameras=hand_over(ctx, ties, photos, found, _said(unchecked)))
 
 
 def _as_they_are(ctx: StepContext, cameras: Sequence[Camera]) -> Cameras:

@@ -1,4 +1,4 @@
-"""What every orientation lets its user choose: rejection, withheld share, and gates."""
+"""What every orientation takes and gives: ports, rejection, withheld share, and gates."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from typing import Final, Literal
 
 from pydantic import Field
 
-from orthoflow.sdk import MethodParams
+from orthoflow.products import Cameras, Photos, Ties
+from orthoflow.sdk import MethodParams, Ports
 from orthoflow_plugins.orient.acceptance import GateRule
 from orthoflow_plugins.orient.estimation import EstimationRule
 
@@ -18,6 +19,19 @@ ORIENTATION_METRICS: Final = (
     *("check_rmse_mm_median", "check_rmse_mm_worst"),
     *("sigma_wall_mm_median", "sigma_wall_mm_worst"),
 )
+
+
+class OrientIn(Ports):
+    """Ties with the walls, and the photos they are in."""
+
+    ties: Ties
+    photos: Photos
+
+
+class OrientOut(Ports):
+    """One orientation per photo."""
+
+    cameras: Cameras
 
 
 class OrientParams(MethodParams):

@@ -32,7 +32,7 @@ Accumulation = Literal["counts", "unit", "canny"]
 
 # A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
 # several bins until it is refined.
-_VOTE_CAUTION: Final = 0.25
+VOTE_CAUTION: Final = 0.25
 _NOT_AGAIN_ANGLES: Final = 2
 # Thresholds of the edge detector on the density image of 8 bits.
 _EDGE_LOW: Final = 60
@@ -106,7 +106,7 @@ class PlanProposer:
         self._voters: Voters | None = None
         self._grid = grid
         self._voting = voting
-        self._least_votes = _VOTE_CAUTION * voting.least_points
+        self._least_votes = VOTE_CAUTION * voting.least_points
         self._points_per_vote = cloud.sample.n_represented if voting.is_raw else 1.0
         n_angles = max(4, round(180.0 / voting.angle_step_deg))
         self._angles_rad = np.arange(n_angles, dtype=np.float64) * (math.pi / n_angles)

@@ -43,10 +43,10 @@ _CROWDED_LEAST: Final = 0.5
 # Surfaces rounder than this radius are no planes, when the rounding is what shows in their cells.
 _RADIUS_LEAST_M: Final = 5.0
 _BENT_SHARE: Final = 0.5
-# Passes over the sample that one plane may take, and the share of the fit tolerance by which a fit
+# Passes over the points that one plane may take, and the share of the fit tolerance by which a fit
 # may move without asking for another.
-_PASSES_MOST: Final = 3
-_SETTLED_SHARE: Final = 0.1
+PASSES_MOST: Final = 3
+SETTLED_SHARE: Final = 0.1
 # Planes of a sample are fitted to all points later.
 _SETTLED_ON_SAMPLE_M: Final = 2e-5
 # A candidate may miss a plane's share by this much before its cells are fitted.
@@ -157,9 +157,9 @@ def verify(candidate: Candidate, unassigned: Unassigned, rules: Rules) -> FoundP
         return None
     rough = surface_raster(refined.plane, corners, up, cell_m=refined.cell_m)
     found = _verified_on(rough, unassigned, rules, freedom)
-    for _ in range(_PASSES_MOST - 1):
+    for _ in range(PASSES_MOST - 1):
         # A plane that moved saw its points through a tolerance that lay askew: look again.
-        if found is None or found.adjusted.moved_m < _SETTLED_SHARE * rules.fit_m:
+        if found is None or found.adjusted.moved_m < SETTLED_SHARE * rules.fit_m:
             break
         rough = surface_raster(found.adjusted.plane, corners, up, cell_m=rough.cell_m)
         found = _verified_on(rough, unassigned, rules, freedom)

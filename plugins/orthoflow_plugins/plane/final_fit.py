@@ -18,6 +18,8 @@ from orthoflow.geometry.threads import in_threads
 from orthoflow_plugins.plane.assignment_kernels import assign_points, name_labels, sum_assigned
 from orthoflow_plugins.plane.block_kernels import BLOCK_POINTS, each_part, piece_of
 from orthoflow_plugins.plane.candidates import (
+    PASSES_MOST,
+    SETTLED_SHARE,
     FoundPlane,
     Rules,
     Verification,
@@ -27,9 +29,6 @@ from orthoflow_plugins.plane.candidates import (
 from orthoflow_plugins.plane.sample import PreparedCloud
 from orthoflow_plugins.plane.support import INNER_SHARE, CellSums, SurfaceRaster, cell_for
 
-_PASSES_MOST: Final = 3
-# A fit that moved by more than this share of the fit tolerance saw its points askew.
-_SETTLED_SHARE: Final = 0.1
 # Points that fix every plane better than its surface is plane; of larger clouds a part is fitted.
 _FITTED_MOST: Final = 12_000_000
 
@@ -44,7 +43,7 @@ def fit_to_all(found: list[FoundPlane], cloud: PreparedCloud, rules: Rules) -> l
     """
     every = max(1, len(cloud.claims) // _FITTED_MOST)
     unsettled = [True] * len(found)
-    for _ in range(_PASSES_MOST):
+    for _ in range(PASSES_MOST):
         rasters = [_raster(item, cloud, rules.find_m, every) for item in found]
         measured = _measured(found, rasters, unsettled, cloud, rules, every)
         n_least = rules.least_share * len(cloud.claims) / every
@@ -64,7 +63,7 @@ def fit_to_all(found: list[FoundPlane], cloud: PreparedCloud, rules: Rules) -> l
                         adjusted=verdict.adjusted,
                     )
                 )
-                moves.append(verdict.adjusted.moved_m > _SETTLED_SHARE * rules.fit_m)
+                moves.append(verdict.adjusted.moved_m > SETTLED_SHARE * rules.fit_m)
         found, unsettled = kept, moves
         if not any(unsettled):
             break

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from pydantic import Field
 from orthoflow.errors import MethodError
 from orthoflow.geometry import Plane
 from orthoflow.sdk import Method, StepContext
-from orthoflow_plugins.plane.open3d_ransac import open3d_version
+from orthoflow_plugins.plane.open3d_ransac import PART_SHARE, open3d_version
 from orthoflow_plugins.plane.parameters import (
     DETECTOR_METRICS,
     DetectorIn,
@@ -24,9 +24,6 @@ from orthoflow_plugins.plane.parameters import (
 if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Candidate, Rules
     from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
-
-# Points of a patch, as a share of those that a plane needs.
-_PART_SHARE: Final = 0.2
 
 
 class Open3dPatches(Method):
@@ -76,7 +73,7 @@ class Open3dPatches(Method):
         open3d = load_open3d(self.id)
 
         def proposer_of(_: PreparedCloud, unassigned: Unassigned, rules: Rules) -> PatchProposer:
-            least_points = _PART_SHARE * rules.least_share * len(unassigned.claims)
+            least_points = PART_SHARE * rules.least_share * len(unassigned.claims)
             points_m = unassigned.sample.offsets_m
             return patches(open3d, points_m, params, least_points=max(10, int(least_points)))
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from orthoflow_plugins.plane.candidates import Candidate, Family, Rules
     from orthoflow_plugins.plane.sample import PreparedCloud, Unassigned
 
-# Inliers of a candidate, as a share of the points that a plane needs.
-_PART_SHARE: Final = 0.2
+# Points of a candidate, as a share of those that a plane needs.
+PART_SHARE: Final = 0.2
 
 
 def open3d_version() -> Mapping[str, str]:
@@ -126,7 +126,7 @@ class SegmentProposer:
         model, inliers = cloud.segment_plane(self.tolerance_m, 3, self.n_iterations)
         normal = np.array(model[:3], dtype=np.float64)
         length = float(np.linalg.norm(normal))
-        if len(inliers) < _PART_SHARE * self.least_points or not length > 0.0:
+        if len(inliers) < PART_SHARE * self.least_points or not length > 0.0:
             return None
         self._last = free[np.asarray(inliers, dtype=np.int64)]
         return Candidate(

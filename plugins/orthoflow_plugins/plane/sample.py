@@ -228,8 +228,8 @@ def prepare(
     )
 
 
-def draw_sample(cloud: PointCloud, *, n_most: int = SAMPLE_POINTS) -> Sample:
-    """Take one point from each of `n_most` equal stretches of the cloud, or all of a small cloud.
+def draw_sample(cloud: PointCloud) -> Sample:
+    """Take one point from each of `SAMPLE_POINTS` equal stretches of the cloud, all of a small one.
 
     The place within a stretch follows the golden ratio: a fixed stride would fall in step with the
     columns of a scan, and random places would need a seed.
@@ -239,7 +239,7 @@ def draw_sample(cloud: PointCloud, *, n_most: int = SAMPLE_POINTS) -> Sample:
     """
     if len(cloud) < 3:
         cloud.require_points(3)
-    index = _spread_index(len(cloud), min(n_most, len(cloud)))
+    index = _spread_index(len(cloud), min(SAMPLE_POINTS, len(cloud)))
     offsets = read_only(cloud.x[index], cloud.y[index], cloud.z[index])
     offsets_m = np.column_stack(offsets).astype(np.float64)
     if not np.isfinite(offsets_m).all():

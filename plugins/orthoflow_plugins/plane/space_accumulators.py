@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthoflow.geometry import Plane, wall_axes
 from orthoflow.geometry.threads import in_threads
-from orthoflow_plugins.plane.accumulators import contrast, parabola
+from orthoflow_plugins.plane.accumulators import VOTE_CAUTION, contrast, parabola
 from orthoflow_plugins.plane.block_kernels import (
     BLOCK_POINTS,
     BlockedPoints,
@@ -43,9 +43,6 @@ from orthoflow_plugins.plane.voxel_kernels import (
 _SECTIONS_DEG: Final = (0.0, 45.0, 90.0)
 # A direction stands for another one that is nearer than this, in steps between directions.
 _STANDS_FOR_STEPS: Final = 1.5
-# A candidate's votes may fall short of the share a plane needs by this much: it may be smeared over
-# several bins until it is refined.
-_VOTE_CAUTION: Final = 0.25
 _NOT_AGAIN_STEPS: Final = 2.2
 # Slopes tried around a maximum, in steps between directions: first these, then closer ones.
 _FINE_STEPS: Final = ((-1.0, -0.5, 0.0, 0.5, 1.0), (-0.4, -0.2, 0.0, 0.2, 0.4))
@@ -122,7 +119,7 @@ class SpaceProposer:
             self._score()
         direction = int(np.argmax(self._scores))
         score = float(self._scores[direction]) / VOTE_SHARES * self._points_per_vote
-        if score < _VOTE_CAUTION * self._voting.least_points:
+        if score < VOTE_CAUTION * self._voting.least_points:
             return None
         self._last = (direction, int(self._places[direction]))
         return self._refined(direction, score)

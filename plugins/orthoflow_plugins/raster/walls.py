@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, bands_with_reach
+from orthoflow.geometry.levels import REC_601
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
 from orthoflow_plugins.raster.rules import RasterRule, Surface
@@ -20,8 +21,6 @@ from orthoflow_plugins.raster.rules import RasterRule, Surface
 if TYPE_CHECKING:
     from orthoflow_plugins.raster.surfaces import CellSurface
 
-# Rec. 601 luma on the sRGB values as they are: the grey of cv2.cvtColor.
-_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 # Bytes per cell: what a finished wall keeps, and what the passes over one wall hold on top.
 _BYTES_KEPT: Final = 25
 _BYTES_WORKING: Final = 90
@@ -230,6 +229,6 @@ def _where_known(
 def _grey(rgb: NDArray[np.uint8] | None, mask: NDArray[np.uint8]) -> NDArray[np.float32] | None:
     if rgb is None:
         return None
-    grey = rgb.astype(np.float32) @ _LUMA / np.float32(255.0)
+    grey = rgb.astype(np.float32) @ REC_601.astype(np.float32) / np.float32(255.0)
     grey[mask == SurfaceMask.VOID] = np.nan
     return grey.astype(np.float32)

@@ -13,6 +13,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.levels import REC_601
+
 RgbScale = Literal["0..1", "8 bit", "16 bit", "stated limit"]
 
 # A wider scale corrects a narrower one.
@@ -23,7 +25,6 @@ _SAMPLE: Final = 200_000
 # lion-takanawa, whose intensity is the grey of its colours, has 0.99997; laser intensity at
 # 532..1550 nm stays far below.
 LUMINANCE_CORRELATION: Final = 0.999
-_REC_601: Final = np.array([0.299, 0.587, 0.114])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +103,7 @@ def correlation_with_grey(intensity: NDArray[np.float32], rgb: NDArray[np.uint8]
     step = max(1, len(intensity) // _SAMPLE)
     values = intensity[::step].astype(np.float64)
     colours = rgb[::step].astype(np.float64)
-    greys = (colours @ _REC_601, colours.mean(axis=1))
+    greys = (colours @ REC_601, colours.mean(axis=1))
     return max(_correlation(values, grey) for grey in greys)
 
 
