@@ -14,7 +14,7 @@ from orthoflow.geometry.scene_views import render_frame
 from orthoflow.products import JsonValue, Photos, Planes, PointCloud, Truth
 from orthoflow.sdk import StepContext
 from orthoflow_plugins.simulate.building import TruePlane
-from orthoflow_plugins.simulate.photographs import Shot, taken_photos, true_cameras
+from orthoflow_plugins.simulate.photographs import Shot, true_cameras
 from orthoflow_plugins.simulate.room_model import Room
 from orthoflow_plugins.simulate.scanning import (
     HIGHEST_ELEVATION_DEG,
@@ -120,7 +120,7 @@ def truth_of(
         cameras=true_cameras(shots, delivery.world_from_room, delivery.shift_world_m)
         if shots
         else None,
-        photos=taken_photos(shots),
+        photos=tuple(shot.taken for shot in shots),
         details={"parameters": dict(parameters), "n_points": len(cloud)},
     )
 
@@ -162,8 +162,8 @@ def report_photos(photos: Photos, shots: tuple[Shot, ...], ctx: StepContext) -> 
         return
     ctx.metric("n_photos", len(photos.photos), "1")
     ctx.metric("photo_megapixels", sum(p.width * p.height for p in photos.photos) / 1e6, "1")
-    ctx.metric("photo_gsd_mm", float(np.mean([1000.0 * shot.gsd_m for shot in shots])), "mm")
-    ctx.metric("photo_obliquity_max_deg", max(shot.obliquity_deg for shot in shots), "deg")
+    ctx.metric("photo_gsd_mm", float(np.mean([1000.0 * shot.taken.gsd_m for shot in shots])), "mm")
+    ctx.metric("photo_obliquity_max_deg", max(shot.taken.obliquity_deg for shot in shots), "deg")
     ctx.figure(
         "photos",
         _contact_sheet(photos),

@@ -52,20 +52,12 @@ class Shot:
     """One photo to take.
 
     Attributes:
-        name: file name.
-        wall: name of the wall it is meant for.
+        taken: its name, and how it is taken.
         camera: the camera, room frame.
-        gsd_m: side of a pixel on the wall where the optical axis meets it.
-        obliquity_deg: angle between the optical axis and the wall's normal.
-        roll_deg: turn about the optical axis.
     """
 
-    name: str
-    wall: str
+    taken: TakenPhoto
     camera: ViewingCamera
-    gsd_m: float
-    obliquity_deg: float
-    roll_deg: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +175,7 @@ def take_photos(
             image *= np.float32(light[place] ** (1.0 / _GAMMA))
         photos.append(
             Photo(
-                name=shot.name,
+                name=shot.taken.photo,
                 encoded=encode_jpeg(_developed(image, film, rng), quality=_JPEG_QUALITY),
                 width=shot.camera.width,
                 height=shot.camera.height,
@@ -225,7 +217,7 @@ def true_cameras(
         rotation = shot.camera.rotation @ world_from_room.T
         cameras.append(
             Camera(
-                photo=shot.name,
+                photo=shot.taken.photo,
                 status="ok",
                 intrinsics=Intrinsics.of(shot.camera, source="truth"),
                 rotation_camera_from_world=rotation,
@@ -235,44 +227,22 @@ def true_cameras(
     return Cameras(cameras=tuple(cameras))
 
 
-def taken_photos(shots: tuple[Shot, ...]) -> tuple[TakenPhoto, ...]:
-    """Say of each photo how it was taken."""
-    return tuple(
-        TakenPhoto(
-            photo=shot.name,
-            wall=shot.wall,
-            gsd_m=shot.gsd_m,
-            obliquity_deg=shot.obliquity_deg,
-            roll_deg=shot.roll_deg,
-        )
-        for shot in shots
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Lens:
-    """Interior orientation: pixels, and k1, k2, p1, p2, k3."""
-
-    width: int
-    height: int
-    focal: float
-    cx: float
-    cy: float
-    distortion: NDArray[np.float64]
-
-
-def _lens(layout: _Layout, gsd_m: float, rng: np.random.Generator) -> _Lens:
+def _lens(layout: _Layout, gsd_m: float, rng: np.random.Generator) -> Intrinsics:
     width, height = (max(16, round(side / gsd_m)) for side in layout.footprint_m)
     off_centre = rng.uniform(-0.006, 0.006, 2) * width
-    scatter = rng.uniform(-1.0, 1.0, 4)
-    return _Lens(
+    scatter = np.append(rng.uniform(-1.0, 1.0, 4), 0.0)
+    distortion = np.array([-0.08, 0.02, 0.0, 0.0, 0.0])
+    distortion += np.array([0.01, 0.005, 0.0005, 0.0005, 0.0]) * scatter
+    focal_px = layout.distance_m / gsd_m
+    return Intrinsics(
         width=width,
         height=height,
-        focal=layout.distance_m / gsd_m,
-        cx=width / 2 + off_centre[0],
-        cy=height / 2 + off_centre[1],
-        distortion=np.array([-0.08, 0.02, 0.0, 0.0, 0.0])
-        + np.array([0.01, 0.005, 0.0005, 0.0005, 0.0]) * np.append(scatter, 0.0),
+        fx=focal_px,
+        fy=focal_px,
+        cx=float(width / 2 + off_centre[0]),
+        cy=float(height / 2 + off_centre[1]),
+        distortion=tuple(distortion.tolist()),
+        source="truth",
     )
 
 
@@ -281,7 +251,7 @@ def _shot(
     layout: _Layout,
     target: tuple[int, float, float],
     sides: Sequence[Side],
-    lens: _Lens,
+    lens: Intrinsics,
     obliquity_deg: float,
     rng: np.random.Generator,
 ) -> Shot:
@@ -296,24 +266,14 @@ def _shot(
     centre = _where_one_can_stand(wanted)
     roll_deg = float(rng.uniform(-_WORST_ROLL_DEG, _WORST_ROLL_DEG))
     rotation = _rolled(looking_at(centre, aim, _UP), roll_deg)
-    return Shot(
-        name=name,
+    taken = TakenPhoto(
+        photo=name,
         wall=_WALL_NAMES[wall],
-        camera=ViewingCamera(
-            width=lens.width,
-            height=lens.height,
-            fx=lens.focal,
-            fy=lens.focal,
-            cx=lens.cx,
-            cy=lens.cy,
-            distortion=lens.distortion,
-            rotation=rotation,
-            translation=-rotation @ centre,
-        ),
-        gsd_m=float(np.linalg.norm(aim - centre)) / lens.focal,
+        gsd_m=float(np.linalg.norm(aim - centre)) / lens.fx,
         obliquity_deg=math.degrees(math.acos(min(1.0, float(-rotation[2] @ side.normal)))),
         roll_deg=roll_deg,
     )
+    return Shot(taken=taken, camera=lens.posed(rotation, -rotation @ centre))
 
 
 def _where_one_can_stand(wanted: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -229,9 +229,9 @@ def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int)
     ways /= np.linalg.norm(ways, axis=1)[:, None]
     for shot in planned_shots(plan, np.random.default_rng(seed)):
         hits = views.cast(shot.camera.centre_world, ways)
-        assert hits.t.min() > 0.1, shot.name
+        assert hits.t.min() > 0.1, shot.taken.photo
         # Straight up there is the ceiling or a moulding, not the inside of a box.
-        assert scene.role[hits.rectangle[0]] != SurfaceRole.OBJECT, shot.name
+        assert scene.role[hits.rectangle[0]] != SurfaceRole.OBJECT, shot.taken.photo
 
 
 def test_survey_coordinates_and_another_up_change_no_byte_of_a_photo(tmp_path: Path) -> None:
