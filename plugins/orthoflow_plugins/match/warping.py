@@ -159,9 +159,12 @@ def _hidden(
         mask = np.zeros(wall.frame.shape, dtype=np.uint8)
         if projection is not None:
             seen = np.isfinite(projection.u)
+            # Within a rounding of the photo's far border a single-precision pixel lies on it.
             rows, columns = (
-                (pixels[seen] / buffer.reduction).astype(np.intp)
-                for pixels in (projection.v, projection.u)
+                np.minimum((pixels[seen] / buffer.reduction).astype(np.intp), length - 1)
+                for pixels, length in zip(
+                    (projection.v, projection.u), buffer.nearest.shape, strict=True
+                )
             )
             # How far along its ray from the camera to the cell the nearest point is, 0 to 1.
             along = np.minimum(buffer.nearest[rows, columns] / projection.distance[seen], 1.0)

@@ -135,7 +135,7 @@ def test_six_cells_behind_a_surface_are_hidden(apart_cells: float, is_hidden: bo
     assert np.isnan(behind.u[40, 50]) == is_hidden
 
 
-def test_what_only_the_cloud_holds_hides_the_wall_and_cells_near_it() -> None:
+def board_before(wall: Wall, camera: ViewingCamera) -> warping.Before:
     # A board half a metre before the left half of the wall, in no wall's raster.
     across, down = np.meshgrid(np.arange(-0.35, -0.05, 0.005), np.arange(-0.5, 0.5, 0.005))
     x = across.ravel().astype(np.float32)
@@ -146,7 +146,6 @@ def test_what_only_the_cloud_holds_hides_the_wall_and_cells_near_it() -> None:
         z=down.ravel().astype(np.float32),
         up=UP,
     )
-    camera, wall = camera_at(), wall_at(0.0)
     occluders = occluders_before(
         cloud,
         [Slab(frame=wall.frame, front_m=0.1, behind_m=0.1)],
@@ -156,16 +155,25 @@ def test_what_only_the_cloud_holds_hides_the_wall_and_cells_near_it() -> None:
         n_least=6,
         threads=1,
     )
-    photo = Photo(
+    return warping.Before(occluders=occluders, front_m=(0.1,))
+
+
+def grey_photo() -> Photo:
+    return Photo(
         name="a.png",
         encoded=encode_png(np.full((800, 800), 90, dtype=np.uint8)),
         width=800,
         height=800,
     )
+
+
+def test_what_only_the_cloud_holds_hides_the_wall_and_cells_near_it() -> None:
+    camera, wall = camera_at(), wall_at(0.0)
+    before = board_before(wall, camera)
     x_m = -0.5 + GSD_M * (np.arange(100) + 0.5)
     inside = (x_m > -0.35 * 4 / 3 - 0.02) & (x_m < -0.05 * 4 / 3 + 0.02)
     outside = (x_m < -0.35 * 4 / 3 - 0.08) | (x_m > -0.05 * 4 / 3 + 0.08)
-    before = warping.Before(occluders=occluders, front_m=(0.1,))
+    photo = grey_photo()
     view = warping.view_of(0, photo, camera, [wall], before)
     for looked in (view, view.posed(camera_at(0.01), [wall])):
         shown = looked.projections[0]
@@ -176,6 +184,14 @@ def test_what_only_the_cloud_holds_hides_the_wall_and_cells_near_it() -> None:
     everywhere = warping.view_of(0, photo, camera, [wall]).projections[0]
     assert everywhere is not None
     assert np.isfinite(everywhere.u).all()
+
+
+def test_a_cell_that_rounds_onto_the_far_border_of_the_photo_is_in_it() -> None:
+    # The last row of cells lies 79 px below the middle, a millionth of a pixel inside the photo.
+    camera, wall = replace(camera_at(), cy=721.0 - 1e-6), wall_at(0.0)
+    shown = warping.view_of(0, grey_photo(), camera, [wall], board_before(wall, camera))
+    assert shown.projections[0] is not None
+    assert np.nanmax(shown.projections[0].v) == 800.0
 
 
 def flat_projection(pixels_per_cell: float, corner_px: float = 0.0) -> Projection:
