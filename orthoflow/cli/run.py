@@ -108,13 +108,14 @@ class Call:
 
     def go(self) -> int:
         """Execute, record, report and say what came out."""
+        from orthoflow.engine.run_folder import LOGS
         from orthoflow.errors import DiskSpaceError
         from orthoflow.records import REPORT_FILE
 
         made = self.make()
         folder = made.run.folder
         report = folder / REPORT_FILE
-        _print_failures(made.run.record.cells)
+        _print_failures(made.run.record.cells, folder / LOGS)
         if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
             say_error(f"with more room on the disk, the same command with -o {folder} goes on")
         try:
@@ -188,11 +189,15 @@ class Call:
             say_error(f"report of what there is so far: {report}")
 
 
-def _print_failures(cells: Iterable[RecordedCell]) -> None:
-    """Write one sentence per failed cell to standard error."""
+def _print_failures(cells: Iterable[RecordedCell], logs: Path) -> None:
+    """Write one sentence per failed cell to standard error, and where the traceback of a bug is."""
+    from orthoflow.engine.run_folder import cell_file_name
+
     for cell in cells:
         if cell.status == "failed":
-            say_error(f"{cell.address} failed: {cell.error_message}")
+            is_bug = "Traceback (most recent call last)" in cell.log
+            where = f"; traceback: {logs / cell_file_name(cell.address)}.log" if is_bug else ""
+            say_error(f"{cell.address} failed: {cell.error_message}{where}")
 
 
 def _print_summary(made: WrittenRun, report: Path) -> None:

@@ -88,7 +88,11 @@ def run_task(
         is_users = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
         if isinstance(error, KeyboardInterrupt) and is_users:
             raise
-        result = failed_result(task, explain_failure(task, error), _trace(error))
+        trace = _trace(error)
+        if not isinstance(error, OrthoflowError):
+            # Into the log, and with it into the record: there an author looks for what went wrong.
+            news.listen(StepEvent(kind="log", text=trace))
+        result = failed_result(task, explain_failure(task, error), trace)
     return dataclasses.replace(
         result,
         started=started,

@@ -177,6 +177,11 @@ def test_a_failed_cell_leaves_a_record_a_report_and_its_exit_code(
     run = open_run(tmp_path / "r")
     assert run.record.status == "failed"
     assert [cell.status for cell in run.record.cells] == ["ok", "failed"]
+    # What the method itself got wrong is told where it can be read, here and in the record.
+    has_trace = method == "paint.lacking"
+    log = (tmp_path / "r" / "logs" / "paint.log").read_text()
+    assert ("; traceback: r/logs/paint.log" in done.stderr) == has_trace
+    assert ("Traceback" in log) == ("Traceback" in run.cells["paint"].log) == has_trace
     assert (tmp_path / "r" / "report.html").is_file()
     assert orthoflow(tmp_path, "verify", "r").returncode == 0
 

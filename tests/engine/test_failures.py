@@ -113,6 +113,7 @@ RAISED = {
         1,
     ),
 }
+BUGS = ("raises", "needs_library", "changes_input", "leave")
 
 
 @pytest.mark.parametrize("bad", RAISED)
@@ -121,6 +122,8 @@ def test_what_a_method_raises_becomes_one_sentence(world: World, bad: str) -> No
     assert (result.error_type, result.error_message, result.exit_code) == RAISED[bad]
     assert "Traceback" in result.traceback
     assert "Traceback" not in result.error_message
+    # What is none of our errors is for the method's author, who finds it in log and record.
+    assert ("Traceback" in result.log) == (bad in BUGS)
 
 
 def test_running_out_of_memory_in_an_allocation_is_a_sentence(world: World) -> None:
