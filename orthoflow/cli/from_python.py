@@ -41,20 +41,18 @@ def run(
         output: folder of the run; `runs/<name>-<run id>` without one.
         store: folder of stored results.
         **options: the command's `jobs`, `executor`, `only`, `from_`, `until`, `force`, `scheduler`,
-            `retries` and `embed`.
+            `retries` and `embed`; `set_files`, one or several YAML files of
+            `step.parameter: value`, before which goes what `set` says.
 
     Raises:
         WorkflowError: something is wrong with the workflow, or with what was set; says all of it.
         InputError: files are missing.
         ArgumentError: the folder holds a finished run, or an option is none.
     """
-    given = [
-        f"{name}={path}"
-        for name, value in (inputs or {}).items()
-        for path in ([value] if isinstance(value, str | Path) else value)
-    ]
+    given = [f"{name}={path}" for name, value in (inputs or {}).items() for path in _several(value)]
     changes = Changes(
         sets=tuple(f"{name}={json.dumps(value)}" for name, value in (set or {}).items()),
+        set_files=_several(options.pop("set_files", ())),
         inputs=tuple(given),
         datasets=str(datasets),
         only_data=tuple(only_data),
@@ -66,3 +64,8 @@ def run(
     from orthoflow.report.notebooks import open_run
 
     return open_run(made.run.path)
+
+
+def _several(paths: str | Path | Sequence[str | Path]) -> tuple[str, ...]:
+    """One path or many, as texts."""
+    return (str(paths),) if isinstance(paths, str | Path) else tuple(map(str, paths))

@@ -133,4 +133,8 @@ def test_what_is_wrong_with_a_workflow_is_raised(
         orthoflow.run("direct.yaml", set={"wall.gsd": 1})
     with pytest.raises(WorkflowError, match="did you mean direct"):
         orthoflow.run("dirct.yaml")
+    (tmp_path / "fine.yaml").write_text("wall.gsd_m: 0.004\nwall.gsd: 1\n")
+    for files in ("fine.yaml", [tmp_path / "fine.yaml"]):
+        with pytest.raises(OrthoflowError, match=r"fine\.yaml:2:1: .*there is no parameter gsd in"):
+            orthoflow.run("direct.yaml", set_files=files)
     assert not (tmp_path / "runs").exists()
