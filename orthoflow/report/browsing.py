@@ -19,6 +19,7 @@ from orthoflow.records import RECORD_FILE, Run, cell_metrics, open_run
 from orthoflow.records.datasets import parts_of
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.summaries import QUALITY
+from orthoflow.workflow.format import DATA
 
 RunState: TypeAlias = Literal["ok", "failed", "unfinished", "damaged"]
 
@@ -43,8 +44,9 @@ class RunSummary:
         started: ISO 8601 UTC; empty where nothing says it.
         metrics: numbers of the baseline by `step.metric`, and by `metric` alone as the last step
             has it; of several datasets the median.
-        facts: what may differ between runs, as JSON: parameters by `cell.parameter`, `seed`,
-            `orthoflow` (its version), and inputs by `input <name>`.
+        facts: what may differ between runs, as JSON: parameters by `cell.parameter`, those of the
+            baseline by `step.parameter` and its methods by `step.use`; `seed`, `orthoflow` (its
+            version), and inputs by `input <name>`.
     """
 
     folder: Path
@@ -137,9 +139,20 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
     facts: dict[str, JsonValue] = {"seed": record.seed, "orthoflow": record.created_by}
     for given in record.inputs:
         facts[f"input {given.name}"] = [f"{file.name} {file.sha256[:8]}" for file in given.files]
+    # Those whose numbers are shown are named by their step, whatever their variant is called.
+    names = {
+        cell.address: f"{cell.step}@data={cell.assignment[DATA]}"
+        if DATA in cell.assignment
+        else cell.step
+        for part in parts_of(run).values() or (run,)
+        for cell in baseline_cells(part)
+    }
     for cell in record.cells:
         if cell.repeat == 0 and cell.status != "skipped":
-            facts |= {f"{cell.address}.{name}": value for name, value in cell.params.items()}
+            name = names.get(cell.address, cell.address)
+            facts |= {f"{name}.{parameter}": value for parameter, value in cell.params.items()}
+            if cell.address in names:
+                facts[f"{name}.use"] = cell.method
     return RunSummary(
         folder=folder,
         state=record.status,

@@ -95,6 +95,28 @@ def test_runs_are_chosen_and_ordered(runs: Path) -> None:
     assert "1 run, 4 others left out" in said("runs", "--workflow", "court")
 
 
+def test_a_sweep_differs_from_a_single_run_in_what_its_baseline_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder, variants, method in [
+        ("alone", {"fine": 0.05}, "plane.toy"),
+        ("swept", {"fine-cell_m-0_02": 0.02, "fine-cell_m-0_05": 0.05}, "plane.other"),
+    ]:
+        (tmp_path / folder).mkdir()
+        cells = [
+            cell(f"plane@plane={variant}", params={"cell_m": cell_m}, method=method)
+            for variant, cell_m in variants.items()
+        ]
+        made = record(cells, name="hall")
+        write_record(tmp_path / folder / "run.h5", made, lambda _digest: None)
+    rows = {row["folder"]: row["differs"] for row in json.loads(said("runs", "--json"))}
+    assert rows == {
+        "alone": {"plane.cell_m": 0.05, "plane.use": "plane.toy"},
+        "swept": {"plane.cell_m": 0.02, "plane.use": "plane.other"},
+    }
+
+
 def test_json_and_csv_have_every_number(runs: Path) -> None:
     (row,) = json.loads(said("runs", "deep", "--json"))
     # A later step has the plain name.
