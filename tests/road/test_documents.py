@@ -1,0 +1,175 @@
+"""The documents followed to the letter: every command, in its order, in a folder of its own.
+
+Rooms are small, so that a run takes a second. `.ci/run --long` follows the tutorial as it stands.
+What every command must look like, quick or not, says tests/test_documented.py.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+
+import orthoflow
+from orthoflow.products import PointCloud
+from orthoflow.testing import example_room
+from tests.documented import ROOT, blocks, commands_of, documented_commands, written_files
+from tests.long_loops import IS_LONG
+from tests.road.conftest import Ended, Shell
+from tests.scan_files import write_las
+
+COARSE: Final = ("--set", "room.scan_step_m=0.05", "--set", "wall.gsd_m=0.05")
+
+
+@dataclass(frozen=True)
+class Story:
+    """How a document is followed.
+
+    Attributes:
+        coarse: what is put behind each `run` and `plan`, so that it is quick.
+        instead: words of the commands, and what stands for them.
+    """
+
+    coarse: Sequence[str] = ()
+    instead: Mapping[str, str] = field(default_factory=dict)
+
+    def follow(self, document: str, shell: Shell) -> dict[str, Ended]:
+        """Type the commands of the document's blocks one after the other."""
+        told = {}
+        for command in commands_of(ROOT / document):
+            if not command.is_block or command.words[0] != "orthoflow":
+                continue
+            words = [self.instead.get(word, word) for word in command.words[1:]]
+            if words[0] in ("run", "plan"):
+                words += self.coarse
+            if words[0] == "run":
+                words += ("--executor", "inline")  # loads libraries once for all steps
+            if words[0] in ("replay", "cache", "export"):
+                words += ("--store", str(shell.store))
+            told[command.text] = shell(*words, timeout_s=900)
+            assert told[command.text].code == 0, f"{command}: {told[command.text].said}"
+        assert told, f"{document} has no commands"
+        return told
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, store: Path) -> Path:
+    """The folder of a finished run, as a reader has one called `first`."""
+    shell = Shell(tmp_path_factory.mktemp("finished"), store)
+    ended = shell(
+        "run", "direct.yaml", *COARSE, "-o", "first", "--executor", "inline", timeout_s=900
+    )
+    assert ended.code == 0, ended.said
+    return shell.folder / "first"
+
+
+def test_the_tutorial(shell: Shell) -> None:
+    # The short way to an orthoimage in the place of the long one.
+    short = Story(coarse=COARSE, instead={"quickstart.yaml": "direct.yaml"})
+    told = short.follow("docs/tutorial.md", shell)
+    (promised,) = blocks(ROOT / "docs" / "tutorial.md", "text")
+    said = told["orthoflow run quickstart.yaml -o first"].out
+    assert [line for line in promised.splitlines() if line not in said.splitlines()] == []
+    assert (shell.folder / "first" / "products" / "metrics.csv").is_file()
+    assert "identical" in told["orthoflow replay first -o again"].out
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not IS_LONG, reason="computes the quickstart three times: .ci/run --long")
+def test_the_tutorial_as_it_stands(shell: Shell) -> None:
+    Story().follow("docs/tutorial.md", shell)
+
+
+def test_the_way_with_own_data(shell: Shell) -> None:
+    cloud, _ = example_room()
+    assert isinstance(cloud, PointCloud)
+    points = cloud.points_world()
+    grey = (32768 + 20000 * np.sin(3.0 * points.sum(axis=1))).astype(np.int64)
+    rgb = np.column_stack([grey, grey, grey])
+    write_las(shell.folder / "scan.laz", points, intensity=grey, rgb=rgb)
+    Story(coarse=("--set", "wall.gsd_m=0.05")).follow("docs/own-data.md", shell)
+    assert list((shell.folder / "mine" / "export" / "sheet").glob("wall_*_sheet_*.pdf"))
+
+
+def test_the_comparison(shell: Shell) -> None:
+    for name, text in written_files().items():
+        (shell.folder / name).write_text(text)
+    story = Story(coarse=("--set", "room.scan_step_m=0.08"))
+    told = story.follow("docs/comparing.md", shell)
+    swept = orthoflow.open_run(shell.folder / "swept").cells
+    assert sum("tolerance_m-0_02" in address for address in swept) > 1
+    assert (shell.folder / "both.html").is_file()
+    listed = told["orthoflow runs . --sort started"].out
+    assert [name for name in ("detectors", "swept", "fine") if name not in listed] == []
+
+
+def test_the_archive(finished: Path, shell: Shell) -> None:
+    shutil.copytree(finished, shell.folder / "first")
+    told = Story().follow("docs/archiving.md", shell)
+    replayed = told["orthoflow replay first-embedded -o repeated"].out
+    assert "identical" in replayed
+    assert (shell.folder / "first" / "export" / "ro-crate").is_dir()
+
+
+def test_the_signature(finished: Path, shell: Shell) -> None:
+    pytest.importorskip("cryptography", reason="the extra `sign` has cryptography")
+    if shutil.which("ssh-keygen") is None:
+        pytest.skip("OpenSSH is not installed")
+    shutil.copytree(finished, shell.folder / "runs" / "palace")
+    keygen = ["ssh-keygen", "-q", "-t", "ed25519", "-f", "jane", "-N", ""]
+    subprocess.run(keygen, cwd=shell.folder, check=True)
+    told = Story().follow("SECURITY.md", shell)
+    assert "jane" in told["orthoflow verify runs/palace --signer jane.pub"].said
+
+
+def test_the_lines_of_python(shell: Shell) -> None:
+    (block,) = blocks(ROOT / "docs" / "python.md", "python")
+    small = 'set={"room.scan_step_m": 0.05, "wall.gsd_m": 0.05}, store=STORE'
+    shown, n_runs = re.subn(r"set=\{.*?\}", small, block.replace("quickstart", "direct"))
+    assert n_runs == 1
+    done = subprocess.run(
+        [sys.executable, "-c", f"STORE = {str(shell.store)!r}\n{shown}\nprint(image.rgb.shape)"],
+        cwd=shell.folder,
+        env=shell.variables(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"\(\d+, \d+, 3\)\n", done.stdout)
+
+
+# Commands between backticks about a finished RUN that it is no run for, and who runs them.
+NOT_OF_A_PLAIN_RUN: Final = {
+    "orthoflow export RUN --to colmap": "of photos: tests/road/test_photos.py",
+    "orthoflow export RUN --split": "of datasets: tests/cli/test_datasets.py",
+    "orthoflow sign RUN --key FILE": "as SECURITY.md has it, above",
+    "orthoflow verify RUN --signer FILE.pub": "as SECURITY.md has it, above",
+    "orthoflow replay RUN": "as the tutorial has it, above",
+    "orthoflow export RUN --embed": "as docs/archiving.md has it, above",
+}
+
+
+def test_what_sentences_say_of_a_finished_run(finished: Path, shell: Shell) -> None:
+    shutil.copytree(finished, shell.folder / "RUN")
+    (shell.folder / "office.yaml").write_text("project: Palace\n")
+    sentences = {
+        command.text: command.words[1:]
+        for command in documented_commands()
+        if command.words[0] == "orthoflow" and "RUN" in command.words
+    }
+    assert set(NOT_OF_A_PLAIN_RUN) <= set(sentences), "a reason without a command"
+    for text, words in sentences.items():
+        if text not in NOT_OF_A_PLAIN_RUN:
+            filled = [{"FORMAT": "csv"}.get(word, word) for word in words]
+            store = ("--store", shell.store) if words[0] == "export" else ()
+            ended = shell(*filled, *store)
+            assert ended.code == 0, f"{text}: {ended.said}"

@@ -1,0 +1,350 @@
+"""Every command of the documents is one that the programs take: none names what is not there.
+
+What is quick is also run, by tests/road/test_documents.py, in the order in which it stands.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import re
+import runpy
+import sys
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from textwrap import indent
+from typing import Final, NoReturn
+
+import click
+import pytest
+
+from orthoflow.catalog import Catalog, discover_catalog
+from orthoflow.cli.options import Changes
+from orthoflow.cli.program import program
+from orthoflow.errors import OrthoflowError
+from orthoflow.files.calibration import intrinsics_for, read_calibration
+from orthoflow.workflow import load_workflow
+from tests.documented import (
+    ROOT,
+    TEXTS,
+    Documented,
+    blocks,
+    called,
+    documented_commands,
+    mentioned_options,
+    written_files,
+)
+
+# Programs that are not ours, or that do what no test may: why none of their words are looked at.
+NOT_OURS: Final[Mapping[str, str]] = {
+    ".": "enters an environment",
+    "ENV": "a line of a Dockerfile",
+    "RUN": "a line of a Dockerfile",
+    "cd": "goes elsewhere",
+    "chroot": "another machine",
+    "cp": "the shell's own",
+    "debootstrap": "another machine",
+    "lint-imports": "CI runs it",
+    "mypy": "CI runs it",
+    "ruff": "CI runs it",
+    "sed": "tests/test_plugin_readme.py runs it",
+    "ssh-keygen": "OpenSSH's own",
+}
+# Options of programs that are not ours.
+NOT_OUR_OPTIONS: Final[Mapping[str, str]] = {
+    "--long": "of .ci/run",
+    "--memory-limit": "of dask worker",
+    "--nthreads": "of dask worker",
+    "--resources": "of dask worker",
+}
+# Where documents leave the reader the choice of a workflow, or have it made in an earlier step.
+NO_WORKFLOW_OF_OURS: Final[Mapping[str, str]] = {
+    "FILE": "left to the reader",
+    "WORKFLOW": "left to the reader",
+    "comparison.yaml": "the reader's own",
+    "compare.yaml": "written by `plugins new`, or of an example",
+    "../beside-ours.yaml": "needs two plugins: tests/test_examples.py",
+    "mine.yaml": "written by `orthoflow new`: tests/road/test_documents.py",
+    "my.yaml": "the reader's own",
+}
+# What a reader has: files that the commands name.
+READERS: Final = (
+    *("room.e57", "photos/a.jpg", "calibration.yaml", "my_scan.laz", "site.ply", "ties.csv"),
+    *("scans/hall.e57", "scans/stairs.e57", "photos/hall/a.jpg", "photos/stairs/a.jpg"),
+    *("data/room.e57", "data/checkpoints.csv"),
+)
+# What workflows of ours need that a command leaves out, because the sentence around it says so.
+LEFT_OUT: Final[Mapping[str, tuple[str, ...]]] = {
+    "photos-on-scan.yaml": ("scan=room.e57", "photos=photos"),
+    "plan.yaml": ("scan=site.ply",),
+}
+
+
+@pytest.fixture(scope="module")
+def catalog() -> Catalog:
+    return discover_catalog()
+
+
+@pytest.fixture(scope="module")
+def readers_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the reader's files, and those that documents show in full."""
+    folder = tmp_path_factory.mktemp("reader")
+    for name in READERS:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    for name, text in written_files().items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_documents_have_the_commands_that_this_looks_at() -> None:
+    commands = documented_commands()
+    assert len(commands) > 150
+    assert len({command.path for command in commands}) > 15
+    assert sum(command.is_block for command in commands) > 60
+    first = {command.words[0] for command in commands}
+    assert set(NOT_OURS) <= first, "a reason without a command"
+
+
+@pytest.mark.parametrize("name", sorted({path.relative_to(ROOT).as_posix() for path in TEXTS}))
+def test_every_command_is_one(
+    name: str, catalog: Catalog, readers_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(readers_folder)
+    wrong = [
+        f"{command}: {said}"
+        for command in documented_commands()
+        if command.path == name and (said := problem(command, catalog, readers_folder))
+    ]
+    assert wrong == []
+
+
+def problem(command: Documented, catalog: Catalog, folder: Path) -> str:
+    """What is wrong with a command, in words; nothing where it is sound."""
+    first, *rest = command.words
+    judges: Mapping[str, Callable[[], str]] = {
+        "orthoflow": lambda: _of_orthoflow(command, catalog),
+        "python": lambda: _of_python(rest, folder),
+        "python3": lambda: _of_python(rest, folder),
+        "pip": lambda: _of_pip(rest),
+        "pytest": lambda: _of_pytest(rest),
+        "dask": lambda: _of_dask(rest),
+        ".ci/run": lambda: "" if (ROOT / ".ci" / "run").is_file() else "is not there",
+    }
+    if first in judges:
+        return judges[first]()
+    return "" if first in NOT_OURS else f"nobody says whether there is a program {first}"
+
+
+def _of_orthoflow(command: Documented, catalog: Catalog) -> str:
+    try:
+        call = called(command.words[1:])
+    except click.ClickException as error:
+        return error.format_message()
+    workflow = call.values.get("workflow")
+    if isinstance(workflow, tuple):  # `warm` takes several
+        workflow = workflow[0] if workflow else None
+    if workflow is None or workflow in NO_WORKFLOW_OF_OURS or "..." in command.words:
+        return ""
+    name = str(workflow)
+    path = ROOT / name if (ROOT / name).is_file() else Path(name)
+    inputs = tuple(map(str, call.values.get("inputs") or ()))
+    if not inputs and not call.values.get("datasets"):
+        inputs = LEFT_OUT.get(name, ())
+    try:
+        Changes(
+            sets=tuple(map(str, call.values.get("sets") or ())),
+            inputs=inputs,
+            datasets=str(call.values.get("datasets") or ""),
+            only_data=(),
+            set_files=tuple(map(str, call.values.get("set_files") or ())),
+        ).load(str(path), catalog)
+    except OrthoflowError as error:
+        return str(error)
+    return ""
+
+
+def _of_python(words: list[str], folder: Path) -> str:
+    if words[:2] == ["-m", "venv"]:
+        return ""
+    if words[:2] == ["-m", "pip"]:
+        return _of_pip(words[2:])
+    if words[:2] == ["-m", "pytest"]:
+        return _of_pytest(words[2:])
+    if words[0] == "-m":
+        path = ROOT / f"{words[1].replace('.', '/')}.py"
+        return _of_script(path, words[2:], folder)
+    return _of_script(ROOT / words[0], words[1:], folder)
+
+
+def _of_script(path: Path, words: list[str], folder: Path) -> str:
+    """Let a script read its words, and go no further."""
+    if not path.is_file():
+        return f"there is no {path.relative_to(ROOT)}"
+    if "argparse" not in path.read_text():
+        return f"takes no {words[0]}" if words else ""
+    said: list[str] = []
+
+    class UnderstoodError(Exception):
+        pass
+
+    def understand(self: argparse.ArgumentParser, *_: object) -> NoReturn:
+        filled = ["1" if word == "N" else word for word in words]
+        known(self, filled)
+        raise UnderstoodError
+
+    def refuse(_: argparse.ArgumentParser, message: str) -> NoReturn:
+        said.append(message)
+        raise UnderstoodError
+
+    known = argparse.ArgumentParser.parse_args
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(argparse.ArgumentParser, "parse_args", understand)
+        patch.setattr(argparse.ArgumentParser, "error", refuse)
+        patch.setattr(sys, "path", [str(ROOT), str(path.parent), *sys.path])
+        patch.setattr(sys, "argv", [str(path), *words])
+        patch.chdir(folder)
+        with pytest.raises(UnderstoodError):
+            runpy.run_path(str(path), run_name="__main__")
+    return "; ".join(said)
+
+
+def _of_pip(words: list[str]) -> str:
+    (wanted,) = [word for word in words[1:] if not word.startswith("-")]
+    found = re.fullmatch(r"(?:\.|orthoflow-tls)(?:\[([\w,]+)\])?", wanted)
+    if words[0] != "install" or found is None:
+        return f"installs {wanted}"
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = set(found[1].split(",")) if found[1] else set()
+    missing = extras - set(project["optional-dependencies"])
+    return f"there is no extra {missing}" if missing else ""
+
+
+def _of_pytest(words: list[str]) -> str:
+    texts = ""
+    for word in words:
+        if "/" in word or word == "tests":
+            if not (ROOT / word).exists():
+                return f"there is no {word}"
+            paths = [ROOT / word] if word.endswith(".py") else (ROOT / word).rglob("test_*.py")
+            texts += "".join(path.read_text() for path in paths)
+    if "-k" in words and (name := words[words.index("-k") + 1]) != "NAME":
+        texts = texts or "".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+        if re.search(rf"def test_\w*{name}|class \w*{name}|{name}\w*\.py", texts) is None:
+            return f"no test is called {name}"
+    return ""
+
+
+def _of_dask(words: list[str]) -> str:
+    """Let dask's own commands read their words."""
+    pytest.importorskip("distributed", reason="the extra `dask` has distributed")
+    module = importlib.import_module(f"distributed.cli.dask_{words[0]}")
+    try:
+        module.main.make_parser(click.Context(module.main)).parse_args(words[1:])
+    except click.ClickException as error:
+        return error.format_message()
+    return ""
+
+
+def test_every_option_that_a_sentence_names_is_one() -> None:
+    known: set[str] = {"--help"}
+    targets: set[str] = set()
+
+    def collect(command: click.Command, context: click.Context) -> None:
+        if isinstance(command, click.Group):
+            for name in command.list_commands(context):
+                found = command.get_command(context, name)
+                assert found is not None
+                collect(found, context)
+        for option in command.params:
+            known.update(option.opts, option.secondary_opts)
+            if "--to" in option.opts:
+                assert isinstance(option.type, click.Choice)
+                targets.update(option.type.choices)
+
+    collect(program, click.Context(program))
+    # A benchmark's options stand in its own text.
+    scripts = "".join(path.read_text() for path in (ROOT / "benchmarks").glob("*.py"))
+    used = set()
+    for path, option, value in mentioned_options():
+        used.add(option)
+        is_known = option in known or option in NOT_OUR_OPTIONS or f'"{option}"' in scripts
+        assert is_known, f"{path}: no command takes {option}"
+        if option == "--to" and value and value != "FORMAT":
+            assert value in targets, f"{path}: no export is called {value}"
+    assert set(NOT_OUR_OPTIONS) <= used, "a reason without an option"
+
+
+def test_every_piece_of_a_workflow_is_one(catalog: Catalog, readers_folder: Path) -> None:
+    n_whole = n_pieces = 0
+    for path in TEXTS:
+        for block in blocks(path, "yaml"):
+            first = block.split(":")[0].strip()
+            if first == "orthoflow":
+                n_whole += 1
+                text = block
+            elif first == "plane":
+                n_pieces += 1
+                # A step of a workflow that has a cloud.
+                step = block if block.startswith(" ") else indent(block, "  ")
+                text = f"orthoflow: 1\nsteps:\n  cloud: {{use: simulate.room}}\n{step}"
+            elif first == "datasets":
+                n_pieces += 1
+                text = written_files()["detectors.yaml"] + block
+            else:
+                # A calibration, a file of parameters, the first line of an editor.
+                assert first in ("cameras", "plane.hough2d.tolerance_m", "# yaml-language-server")
+                continue
+            (readers_folder / "block.yaml").write_text(text)
+            load_workflow(readers_folder / "block.yaml", catalog)
+    assert (n_whole, n_pieces) == (2, 3)
+
+
+def test_the_calibration_of_the_readme_is_read(readers_folder: Path) -> None:
+    (block,) = blocks(ROOT / "README.md", "yaml", start="cameras:")
+    (readers_folder / "shown.yaml").write_text(block)
+    lens = intrinsics_for(read_calibration(readers_folder / "shown.yaml"), "IMG_1.jpg", 6000, 4000)
+    assert lens is not None
+    assert lens.fx == 4210.5
+
+
+PYTHON_RUN_BY: Final = {
+    "docs/python.md": "tests/road/test_documents.py",
+    "docs/plugin-authors.md": "below",
+    "plugins/README.md": "tests/test_plugin_readme.py",
+}
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_block_of_python_is_python(path: Path) -> None:
+    name = path.relative_to(ROOT).as_posix()
+    for block in blocks(path, "python"):
+        compile(block + " ...\n" * block.rstrip().endswith(":"), name, "exec")
+        assert name in PYTHON_RUN_BY, f"nothing runs the Python of {name}"
+
+
+def test_what_authors_of_plugins_are_shown_works(tmp_path: Path) -> None:
+    """The blocks of docs/plugin-authors.md, about a method that is there."""
+    import numpy as np
+    from orthoflow_plugins.plane.hough2d import Hough2d
+
+    from orthoflow import sdk, testing
+
+    known = {name: getattr(home, name) for home in (sdk, testing) for name in home.__all__}
+    known |= {
+        "np": np,
+        "pytest": pytest,
+        "Path": Path,
+        "Mine": Hough2d,
+        "my_inputs": {},
+        "__file__": str(tmp_path / "test_mine.py"),
+    }
+    for block in blocks(ROOT / "docs" / "plugin-authors.md", "python"):
+        shown = block.replace("plane.mine", "plane.hough2d").replace("check-name", "results-repeat")
+        exec(shown + " ...\n" * shown.rstrip().endswith(":"), known)
+    assert known["FlatWalls"].id.partition(".")[0] in discover_catalog().kinds
+    assert len(known["CASES"]) > 10
+    assert known["orthoflow_kinds"]()[0].name == "segment"
+    assert known["orthoflow_products"]()[0].type_name == "segments"
+    known["test_the_floor_is_found"](tmp_path)
