@@ -302,7 +302,13 @@ def test_axe_finds_nothing_that_keeps_people_out(page: Page, width: int, theme: 
 def test_on_paper_numbers_and_parameters_are_unfolded(page: Page) -> None:
     page.show_as(1440)
     page.open(Path(page.evaluate("location.pathname")))
+    # As it stands where more than four things limit the result.
+    page.evaluate(
+        "document.querySelector('.warnings').insertAdjacentHTML('beforeend',"
+        " '<details><summary>1 more</summary>a fifth</details>')"
+    )
     page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
+    assert page.evaluate("document.querySelectorAll('.warnings details:not([open])').length") == 0
     assert page.evaluate(
         "document.querySelectorAll('main details.numbers:not([open])').length"
     ) == (page.evaluate("document.querySelectorAll('.way details.numbers').length"))
@@ -312,6 +318,7 @@ def test_on_paper_numbers_and_parameters_are_unfolded(page: Page) -> None:
     assert wide
     assert max(wide) <= 6
     page.evaluate("window.dispatchEvent(new Event('afterprint'))")
+    assert page.evaluate("document.querySelectorAll('.warnings details[open]').length") == 0
     assert page.evaluate("document.querySelectorAll('.on-paper').length") == 0
 
 
