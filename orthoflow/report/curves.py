@@ -26,8 +26,9 @@ _MOST_LINES: Final = 6
 _LARGEST: Final = 1e100
 _FEWEST_VALUES: Final = 3
 _LOGARITHMIC_RATIO: Final = 20.0
-_WIDTH, _HEIGHT = 460.0, 290.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 14.0, 12.0, 46.0
+_WIDTH, _HEIGHT = 460.0, 318.0
+# Above, the button that enlarges lies over the drawing.
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 14.0, 40.0, 46.0
 _LETTER: Final = 6.2  # width of one, at the size of the drawing's text
 
 
