@@ -28,6 +28,7 @@ from orthoflow_provenance.model import (
 from orthoflow_provenance.reader import read_record
 from orthoflow_provenance.writer import write_record
 
+from orthoflow.alike import first_few
 from orthoflow.engine.durability import sync_folder, sync_tree, writing_to
 from orthoflow.engine.file_digests import FileDigests
 from orthoflow.engine.results import CellResult
@@ -419,7 +420,7 @@ def _published(outcome: RunOutcome, store: Store) -> dict[str, dict[str, Mapping
 
 def _check_products(run: Run, store: Store) -> None:
     missing = [
-        f"{address}.{port} ({output.digest})"
+        f"{address}.{port}"
         for address, cell in run.cells.items()
         for port, output in cell.outputs.items()
         if not output.embedded and store.product_file(output.digest) is None
@@ -427,7 +428,7 @@ def _check_products(run: Run, store: Store) -> None:
     if missing:
         raise StoreError(
             f"neither the record {run.path} nor the store {store.folder} has "
-            f"{', '.join(missing)}: name the store of the run with --store, or replay the run"
+            f"{first_few(missing)}: name the store of the run with --store, or replay the run"
         )
 
 

@@ -127,7 +127,7 @@ def test_the_signature(finished: Path, shell: Shell) -> None:
     keygen = ["ssh-keygen", "-q", "-t", "ed25519", "-f", "jane", "-N", ""]
     subprocess.run(keygen, cwd=shell.folder, check=True)
     told = Story().follow("SECURITY.md", shell)
-    assert "jane" in told["orthoflow verify runs/palace --signer jane.pub"].said
+    assert "signed with SHA256:" in told["orthoflow verify runs/palace --signer jane.pub"].out
 
 
 def test_the_lines_of_python(shell: Shell) -> None:
