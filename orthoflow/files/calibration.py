@@ -4,11 +4,15 @@
 cameras:
   "IMG_00*.jpg": {width: 6000, height: 4000, fx: 4210.5, fy: 4211.2, cx: 2996.1, cy: 2003.7,
                   distortion: [-0.08, 0.05, 0.0002, -0.0001, 0.0]}
+  "GOPR*": {model: fisheye, width: 4000, height: 3000, fx: 1750.0, fy: 1750.0, cx: 1999.5,
+            cy: 1499.5, distortion: [0.04, 0.01, -0.01, 0.002]}
   "*": {width: 4000, height: 3000, fx: 3004.2, fy: 3004.2, cx: 1999.5, cy: 1499.5}
 ```
 
-The first entry that matches a photo holds. Pixels in the file count from the centre of the first
-pixel; inside, that centre is at (0.5, 0.5), and only this module converts.
+The first entry that matches a photo holds. Of `model: fisheye` (`cv2.fisheye`) the distortion is
+k1, k2, k3, k4, and `field_of_view_deg` the whole angle to use, 180 where it is missing. Pixels in
+the file count from the centre of the first pixel; inside, that centre is at (0.5, 0.5), and only
+this module converts.
 """
 
 from __future__ import annotations
@@ -16,7 +20,8 @@ from __future__ import annotations
 import difflib
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
@@ -24,6 +29,7 @@ from typing import Final
 import numpy as np
 
 from orthoflow.errors import GeometryError, InputError
+from orthoflow.files.fisheyes import WIDEST_DEG, FisheyeLens, problem_of
 from orthoflow.files.regular_files import text_of_file
 from orthoflow.files.sidecars import write_text
 from orthoflow.files.yaml_positions import (
@@ -51,7 +57,12 @@ _CENTRES: Final = ("cx", "cy")
 _DISTORTION: Final = "distortion"
 _SKEW: Final = "skew"
 _REQUIRED: Final = (*_SIZES, *_FOCALS, *_CENTRES)
-_N_DISTORTION: Final = 5
+_TERMS: Final = ("k1", "k2", "p1", "p2", "k3")
+_MODEL: Final = "model"
+_FISHEYE: Final = "fisheye"
+_FIELD: Final = "field_of_view_deg"
+_FISHEYE_TERMS: Final = ("k1", "k2", "k3", "k4")
+_COUNTED: Final = {4: "four", 5: "five"}
 _START: Final = Position(line=1, column=1)
 _DIALECT: Final = Dialect(
     is_strict=False,
@@ -61,7 +72,20 @@ _DIALECT: Final = Dialect(
 )
 
 
-def read_calibration(path: Path) -> Calibration:
+@dataclass(frozen=True, kw_only=True)
+class CalibratedLenses:
+    """What a calibration file says; the first pattern that matches a photo holds.
+
+    Attributes:
+        patterns: photo names or shell patterns.
+        lenses: one per pattern.
+    """
+
+    patterns: tuple[str, ...]
+    lenses: tuple[Intrinsics | FisheyeLens, ...]
+
+
+def read_calibration(path: Path) -> CalibratedLenses:
     """Read a calibration file.
 
     Raises:
@@ -106,24 +130,24 @@ def calibration_text(calibration: Calibration) -> str:
     return "\n".join(lines) + "\n"
 
 
-def matching_pattern(calibration: Calibration, photo_name: str) -> str | None:
+def matching_pattern(patterns: Sequence[str], photo_name: str) -> str | None:
     """Give the first pattern that is the photo's name, or matches it as in a shell.
 
     The case of letters counts. A name that holds brackets matches itself.
     """
-    for pattern in calibration.patterns:
+    for pattern in patterns:
         if photo_name == pattern or fnmatchcase(photo_name, pattern):
             return pattern
     return None
 
 
-def intrinsics_for(
-    calibration: Calibration, photo_name: str, width: int, height: int
-) -> Intrinsics | None:
-    """Give the calibrated camera of a photo; None when no entry matches its name.
+def lens_for(
+    calibration: CalibratedLenses, photo_name: str, width: int, height: int
+) -> Intrinsics | FisheyeLens | None:
+    """Give the calibrated lens of a photo; None when no entry matches its name.
 
     Args:
-        calibration: the calibrated cameras.
+        calibration: the calibrated lenses.
         photo_name: file name of the photo.
         width: pixels of its stored array.
         height: pixels.
@@ -131,10 +155,10 @@ def intrinsics_for(
     Raises:
         InputError: the photo has another size than the calibration.
     """
-    pattern = matching_pattern(calibration, photo_name)
+    pattern = matching_pattern(calibration.patterns, photo_name)
     if pattern is None:
         return None
-    camera = calibration.intrinsics[calibration.patterns.index(pattern)]
+    camera = calibration.lenses[calibration.patterns.index(pattern)]
     if (camera.width, camera.height) == (width, height):
         return camera
     way_out = (
@@ -172,7 +196,7 @@ class _Reader:
         self.file_name = file_name
         self.problems: list[tuple[Position, str]] = []
 
-    def read(self, text: str) -> Calibration | None:
+    def read(self, text: str) -> CalibratedLenses | None:
         document = read_yaml(text, self, _DIALECT)
         if document is None:
             return None
@@ -195,19 +219,19 @@ class _Reader:
                 "of one camera one entry, by a pattern",
             )
             return None
-        cameras: dict[str, Intrinsics] = {}
+        cameras: dict[str, Intrinsics | FisheyeLens] = {}
         for entry in section.value:
             camera = self._camera(entry)
             if camera is not None:
                 cameras[entry.key] = camera
-        return Calibration(patterns=tuple(cameras), intrinsics=tuple(cameras.values()))
+        return CalibratedLenses(patterns=tuple(cameras), lenses=tuple(cameras.values()))
 
     def add(self, position: Position, path: str, message: str) -> None:
         """Keep a problem of the YAML; places are told by line and column."""
         del path
         self._add(position, message)
 
-    def _camera(self, entry: Entry) -> Intrinsics | None:
+    def _camera(self, entry: Entry) -> Intrinsics | FisheyeLens | None:
         name, values = entry.key, entry.value
         if not entry.is_text:
             self._add(
@@ -219,8 +243,10 @@ class _Reader:
             self._add(entry.position, f"{path}: expected {', '.join(_REQUIRED)} [, {_DISTORTION}]")
             return None
         n_before = len(self.problems)
-        self._refuse_unknown(values, (*_REQUIRED, _DISTORTION, _SKEW), path + ".")
         given = {item.key: item for item in values}
+        is_fisheye = self._is_fisheye(given.get(_MODEL), path)
+        more = (_MODEL, _FIELD) if is_fisheye else (_MODEL,)
+        self._refuse_unknown(values, (*_REQUIRED, _DISTORTION, _SKEW, *more), path + ".")
         missing = [key for key in _REQUIRED if key not in given]
         if missing:
             self._add(entry.position, f"{path}: {', '.join(missing)} missing")
@@ -229,14 +255,35 @@ class _Reader:
         }
         numbers: dict[str, float] = {
             key: self._number(given[key], f"{path}.{key}", given[key].value)
-            for key in (*_FOCALS, *_CENTRES, _SKEW)
+            for key in (*_FOCALS, *_CENTRES, _SKEW, _FIELD)
             if key in given
         }
-        distortion = self._distortion(given.get(_DISTORTION), path)
+        terms = _FISHEYE_TERMS if is_fisheye else _TERMS
+        distortion = self._distortion(given.get(_DISTORTION), path, terms)
         if len(self.problems) == n_before:
             self._check_pixels(given, path, sizes, numbers)
         if len(self.problems) > n_before:
             return None
+        if is_fisheye:
+            fisheye = FisheyeLens(
+                width=sizes["width"],
+                height=sizes["height"],
+                fx=numbers["fx"],
+                fy=numbers["fy"],
+                cx=numbers["cx"] + HALF_PIXEL,
+                cy=numbers["cy"] + HALF_PIXEL,
+                radial=distortion,
+                skew=numbers.get(_SKEW, 0.0),
+                field_of_view_deg=numbers.get(_FIELD, WIDEST_DEG),
+            )
+            problem = problem_of(fisheye)
+            if problem:
+                self._add(
+                    entry.position,
+                    f"{path}: the fisheye lens is none: {problem}; expected {', '.join(terms)} of "
+                    f"a calibration that covers the image, or a smaller {_FIELD}",
+                )
+            return None if problem else fisheye
         camera = Intrinsics(
             width=sizes["width"],
             height=sizes["height"],
@@ -255,6 +302,18 @@ class _Reader:
                 "covers the whole image",
             )
         return camera
+
+    def _is_fisheye(self, entry: Entry | None, path: str) -> bool:
+        if entry is None:
+            return False
+        value = plain(entry.value)
+        if value != _FISHEYE:
+            self._add(
+                entry.position,
+                f"{path}.{_MODEL}: expected {_FISHEYE}, or no {_MODEL} for other lenses, got "
+                f"{describe(entry.value)}",
+            )
+        return bool(value == _FISHEYE)
 
     def _size(self, entry: Entry, path: str) -> int:
         value = plain(entry.value)
@@ -277,17 +336,19 @@ class _Reader:
             return 0.0
         return number
 
-    def _distortion(self, entry: Entry | None, path: str) -> tuple[float, ...]:
+    def _distortion(
+        self, entry: Entry | None, path: str, terms: Sequence[str]
+    ) -> tuple[float, ...]:
         path = f"{path}.{_DISTORTION}"
         if entry is None:
-            return (0.0,) * _N_DISTORTION
+            return (0.0,) * len(terms)
         values = entry.value
-        if not isinstance(values, Listing) or len(values.items) != _N_DISTORTION:
+        if not isinstance(values, Listing) or len(values.items) != len(terms):
             got = f"{len(values.items)} values" if isinstance(values, Listing) else describe(values)
             self._add(
                 entry.position,
-                f"{path}: expected the five numbers [k1, k2, p1, p2, k3], got {got}; fill up with "
-                "0, other lens models are not read",
+                f"{path}: expected the {_COUNTED[len(terms)]} numbers [{', '.join(terms)}], got "
+                f"{got}; fill up with 0, other lens models are not read",
             )
             return ()
         return tuple(

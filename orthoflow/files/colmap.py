@@ -12,12 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import ArgumentError, InputError
+from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
     GivenCamera,
@@ -59,10 +60,18 @@ _COLUMNS: Final = {
         *("k3", "k4", "k5", "k6"),
     ),
 }
+# Of those that bend as OpenCV's fisheyes do.
+_FISHEYES: Final = {
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+}
 # More than a camera of any model has.
 _MOST_WORDS: Final = 30
 # u, v and the number of the point.
 _OBSERVATION_BYTES: Final = 24
+
+_Lens: TypeAlias = Intrinsics | FisheyeLens | str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,8 +230,8 @@ def read_colmap_model(cameras: Path, images: Path) -> tuple[GivenCamera, ...]:
     return tuple(found)
 
 
-def _text_lenses(path: Path) -> dict[int, Intrinsics | str]:
-    lenses: dict[int, Intrinsics | str] = {}
+def _text_lenses(path: Path) -> dict[int, _Lens]:
+    lenses: dict[int, _Lens] = {}
     for number, line in enumerate(lines_of(path), start=1):
         words = line.split(maxsplit=_MOST_WORDS)
         if not words or words[0].startswith("#"):
@@ -253,9 +262,9 @@ def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
         next(lines, None)
 
 
-def _binary_lenses(path: Path) -> dict[int, Intrinsics | str]:
+def _binary_lenses(path: Path) -> dict[int, _Lens]:
     data = _Bytes(path)
-    lenses: dict[int, Intrinsics | str] = {}
+    lenses: dict[int, _Lens] = {}
     for _ in range(data.count()):
         camera_id, model, width, height = data.values("<IiQQ")
         if not 0 <= model < len(_MODELS):
@@ -267,7 +276,7 @@ def _binary_lenses(path: Path) -> dict[int, Intrinsics | str]:
     return lenses
 
 
-def _check_count(lenses: dict[int, Intrinsics | str], path: Path) -> None:
+def _check_count(lenses: dict[int, _Lens], path: Path) -> None:
     if len(lenses) > MOST_CAMERAS:
         raise InputError(f"{path.name} holds more than {MOST_CAMERAS} cameras: split it")
 
@@ -314,11 +323,9 @@ class _Bytes:
             raise damaged(self._path, "it ends too early, it is cut off")
 
 
-def _lens_of(
-    model: str, size: tuple[int, int], params: list[float], path: Path
-) -> Intrinsics | str:
+def _lens_of(model: str, size: tuple[int, int], params: list[float], path: Path) -> _Lens:
     """A camera's lens, or why there is none."""
-    columns = _COLUMNS.get(model)
+    columns = _COLUMNS.get(model) or _FISHEYES.get(model)
     if columns is None:
         return (
             f"its camera is of the model {model}, which OpenCV's has not: undistort the model "
@@ -327,9 +334,19 @@ def _lens_of(
     if len(params) != len(columns):
         raise damaged(path, f"a camera {model} has {len(columns)} parameters, got {len(params)}")
     values = dict(zip(columns, params, strict=True))
+    focal = values.get("f", 0.0)
+    if model in _FISHEYES:
+        return FisheyeLens(
+            width=size[0],
+            height=size[1],
+            fx=values.get("fx", focal),
+            fy=values.get("fy", focal),
+            cx=values["cx"],
+            cy=values["cy"],
+            radial=tuple(values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")),
+        )
     if any(values.get(name, 0.0) for name in ("k4", "k5", "k6")):
         return "its camera has k4, k5 or k6, which orthoflow does not take: refine it as OPENCV"
-    focal = values.get("f", 0.0)
     lens = Intrinsics(
         width=size[0],
         height=size[1],

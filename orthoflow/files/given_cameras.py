@@ -11,7 +11,7 @@ import csv
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path, PureWindowsPath
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
+from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses, problem_of
 from orthoflow.files.images import MOST_PIXELS
 from orthoflow.files.json_texts import parse_json
 from orthoflow.files.regular_files import open_file, text_of_file
@@ -86,11 +87,31 @@ class GivenCamera:
     """
 
     name: str
-    lens: Intrinsics | CentredLens | None = None
+    lens: Intrinsics | CentredLens | FisheyeLens | None = None
     rotation: NDArray[np.float64] | None = None
     translation: NDArray[np.float64] | None = None
     sigma_wall_m: float | None = None
     reason: str = ""
+
+    def of_face(self, face: str) -> GivenCamera:
+        """Give the camera of a face of the cube that a fisheye's photo becomes."""
+        if not isinstance(self.lens, FisheyeLens) or self.rotation is None:
+            return self
+        problem = problem_of(self.lens)
+        if problem or face not in face_lenses(self.lens):
+            return GivenCamera(
+                name=self.name,
+                reason=f"its fisheye lens is none: {problem}"
+                if problem
+                else "its fisheye lens does not show that face",
+            )
+        axes = FACE_FROM_CAMERA[face]
+        return replace(
+            self,
+            lens=face_lenses(self.lens)[face],
+            rotation=axes @ self.rotation,
+            translation=axes @ np.asarray(self.translation, dtype=np.float64),
+        )
 
 
 def text_of(path: Path) -> str:

@@ -8,7 +8,7 @@ from it to the chunk, whose own transform leads to the world.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path, PurePath
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
+from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import (
     MOST_CAMERAS,
     GivenCamera,
@@ -30,13 +31,12 @@ from orthoflow.files.given_cameras import (
     text_of,
 )
 from orthoflow.files.images import MOST_PIXELS
-from orthoflow.files.panoramas import FACES, face_lens, face_name
+from orthoflow.files.panoramas import FACES, PANORAMA_FROM_CAMERA, face_lens, face_name
 from orthoflow.products import Intrinsics
 
 MOST_TAGS: Final = 2_000_000
-# A panorama's directions are x forwards, y left, z up.
-_PANORAMA_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _UNKNOWN_TERMS: Final = ("k4", "p3", "p4")
+_UNKNOWN_TO_FISHEYES: Final = ("p3", "p4")
 _SINCE: Final = "Metashape 1.2 or newer writes f, cx, cy, k1 ... for each sensor"
 
 
@@ -118,14 +118,14 @@ def _some(words: list[str], count: int, path: Path, what: str) -> list[float]:
     return numbers_of(words, path, f"the {what} of the chunk")
 
 
-def _lens(sensor: ET.Element, path: Path) -> Intrinsics | str:
+def _lens(sensor: ET.Element, path: Path) -> Intrinsics | FisheyeLens | str:
     """A sensor's lens, or why there is none."""
     label = sensor.get("label", sensor.get("id", ""))
     kind = sensor.get("type", "frame")
     if kind == "spherical":
         return face_lens(_size(sensor, label, path)[0])
-    if kind != "frame":
-        return f"its sensor {label} is of type {kind}; orthoflow takes frame and spherical"
+    if kind not in ("frame", "fisheye"):
+        return f"its sensor {label} is of type {kind}; orthoflow takes frame, fisheye and spherical"
     calibrations = sensor.findall("calibration")
     adjusted = [each for each in calibrations if each.get("class") == "adjusted"]
     if not calibrations:
@@ -136,7 +136,7 @@ def _lens(sensor: ET.Element, path: Path) -> Intrinsics | str:
         return f"its sensor {label} has no focal length f ({_SINCE})"
     has_own_size = calibration.find("resolution") is not None
     size = _size(calibration if has_own_size else sensor, label, path)
-    return _intrinsics(values, size, path, label)
+    return (_fisheye if kind == "fisheye" else _intrinsics)(values, size, path, label)
 
 
 def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
@@ -149,18 +149,52 @@ def _size(owner: ET.Element, label: str, path: Path) -> tuple[int, int]:
     return round(values[0]), round(values[1])
 
 
+class _Terms:
+    """The numbers of a calibration by their names; those that it leaves out are zero."""
+
+    def __init__(self, values: Mapping[str, str], path: Path, label: str) -> None:
+        self._values, self._path, self._label = values, path, label
+
+    def __call__(self, name: str) -> float:
+        what = f"{name} of sensor {self._label}"
+        return numbers_of([self._values.get(name, "0")], self._path, what)[0]
+
+    def unknown(self, names: Sequence[str]) -> str:
+        """What is said of terms that our lenses have not; empty where there are none."""
+        there = [name for name in names if self(name) != 0.0]
+        if not there:
+            return ""
+        return (
+            f"its sensor {self._label} has {', '.join(there)}, which OpenCV's model has not: "
+            "optimise the cameras without them and export again"
+        )
+
+
+def _fisheye(
+    values: Mapping[str, str], size: tuple[int, int], path: Path, label: str
+) -> FisheyeLens | str:
+    value = _Terms(values, path, label)
+    focal = value("f")
+    return value.unknown(_UNKNOWN_TO_FISHEYES) or FisheyeLens(
+        width=size[0],
+        height=size[1],
+        fx=focal + value("b1"),
+        fy=focal,
+        cx=0.5 * size[0] + value("cx"),
+        cy=0.5 * size[1] + value("cy"),
+        radial=(value("k1"), value("k2"), value("k3"), value("k4")),
+        tangential=(value("p2"), value("p1")),
+        skew=value("b2"),
+    )
+
+
 def _intrinsics(
     values: Mapping[str, str], size: tuple[int, int], path: Path, label: str
 ) -> Intrinsics | str:
-    def value(name: str) -> float:
-        return numbers_of([values.get(name, "0")], path, f"{name} of sensor {label}")[0]
-
-    unknown = [name for name in _UNKNOWN_TERMS if value(name) != 0.0]
+    value = _Terms(values, path, label)
+    unknown = value.unknown(_UNKNOWN_TERMS)
     if unknown:
-        return (
-            f"its sensor {label} has {', '.join(unknown)}, which OpenCV's model has not: optimise "
-            "the cameras without them and export again"
-        )
+        return unknown
     focal = value("f")
     lens = Intrinsics(
         width=size[0],
@@ -184,15 +218,18 @@ def _faces(given: GivenCamera) -> list[GivenCamera]:
         replace(
             given,
             name=face_name(PurePath(given.name).stem, face),
-            rotation=axes @ _PANORAMA_FROM_CAMERA @ given.rotation,
-            translation=axes @ _PANORAMA_FROM_CAMERA @ given.translation,
+            rotation=axes @ PANORAMA_FROM_CAMERA @ given.rotation,
+            translation=axes @ PANORAMA_FROM_CAMERA @ given.translation,
         )
         for face, axes in FACES.items()
     ]
 
 
 def _camera(
-    camera: ET.Element, lenses: Mapping[str, Intrinsics | str], world: _Similarity, path: Path
+    camera: ET.Element,
+    lenses: Mapping[str, Intrinsics | FisheyeLens | str],
+    world: _Similarity,
+    path: Path,
 ) -> GivenCamera:
     name = bare_name(camera.get("label", ""))
     lens = lenses.get(camera.get("sensor_id", ""), "it names no sensor")

@@ -29,6 +29,8 @@ FACES: Final[Mapping[str, NDArray[np.float64]]] = {
     "up": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     "down": np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
 }
+# From the axes of a camera that looks forwards: x right, y down, z forward.
+PANORAMA_FROM_CAMERA: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # What OpenCV can look up.
 MOST_PX: Final = 32_766
 
@@ -57,12 +59,14 @@ class PanoramaFace:
         panorama: the panorama's file, as it is.
         face: which of `FACES`.
         width: columns of the panorama.
+        used: mask of the panorama (rows, columns), True where it may be used; None: all.
     """
 
     name: str
     panorama: bytes
     face: str
     width: int
+    used: NDArray[np.bool_] | None = None
 
     @property
     def lens(self) -> Intrinsics:
@@ -73,9 +77,25 @@ class PanoramaFace:
         """The photo as a PNG file."""
         return encode_png(face_picture(decode_levels(self.panorama, self.name), self.face))
 
+    def mask(self) -> NDArray[np.bool_] | None:
+        """Which pixels (height, width) may be used; None where all may."""
+        if self.used is None:
+            return None
+        whole = face_picture(np.where(self.used, np.uint8(255), np.uint8(0)), self.face)
+        used: NDArray[np.bool_] = whole == np.uint8(255)
+        return None if used.all() else used
 
-def faces_of(panorama: bytes, stem: str, width: int) -> tuple[PanoramaFace, ...]:
+
+def faces_of(
+    panorama: bytes, stem: str, width: int, used: NDArray[np.bool_] | None = None
+) -> tuple[PanoramaFace, ...]:
     """Give the faces of a panorama as photos `<stem>_<face>.png`.
+
+    Args:
+        panorama: the file's bytes.
+        stem: of its name.
+        width: columns.
+        used: mask of the panorama (rows, columns), True where it may be used; None: all.
 
     Raises:
         InputError: it has more columns than can be looked up.
@@ -83,7 +103,9 @@ def faces_of(panorama: bytes, stem: str, width: int) -> tuple[PanoramaFace, ...]
     if not 1 <= width <= MOST_PX:
         raise InputError(f"panorama {stem} has {width} columns, at most {MOST_PX} can be read")
     return tuple(
-        PanoramaFace(name=face_name(stem, face), panorama=panorama, face=face, width=width)
+        PanoramaFace(
+            name=face_name(stem, face), panorama=panorama, face=face, width=width, used=used
+        )
         for face in FACES
     )
 
@@ -91,6 +113,12 @@ def faces_of(panorama: bytes, stem: str, width: int) -> tuple[PanoramaFace, ...]
 def face_name(stem: str, face: str) -> str:
     """Name of the photo that a panorama's face becomes."""
     return f"{stem}_{face}.png"
+
+
+def face_in(name: str) -> tuple[str, str] | None:
+    """Stem and face in the name of a photo that may be a face; None where it is none."""
+    stem, _, face = name.removesuffix(".png").rpartition("_")
+    return (stem, face) if stem and face in FACES and name == face_name(stem, face) else None
 
 
 def face_picture(panorama: Colours, name: str) -> Colours:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,22 +10,30 @@ import pytest
 
 from orthoflow.errors import InputError
 from orthoflow.files.calibration import (
+    CalibratedLenses,
     calibration_text,
-    intrinsics_for,
+    lens_for,
     matching_pattern,
     read_calibration,
     write_calibration,
 )
+from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.products import Calibration, Intrinsics
 
 GOOD = "width: 4000, height: 3000, fx: 3000, fy: 3001.5, cx: 1999.5, cy: 1500"
 
 
-def read(folder: Path, text: str) -> Calibration:
+def read(folder: Path, text: str) -> CalibratedLenses:
     path = folder / "calibration.yaml"
     path.write_text(text)
     return read_calibration(path)
+
+
+def the_lens(calibration: CalibratedLenses) -> Intrinsics:
+    (lens, *_) = calibration.lenses
+    assert isinstance(lens, Intrinsics)
+    return lens
 
 
 def refusal(folder: Path, text: str) -> str:
@@ -51,7 +60,7 @@ def test_pixels_are_converted_from_opencv_to_ours(tmp_path: Path) -> None:
     calibration = read(
         tmp_path, 'cameras: {"*": {' + GOOD + ", distortion: [-0.1, 0.02, 1e-3, -2e-3, 0.001]}}"
     )
-    ours = calibration.intrinsics[0]
+    ours = the_lens(calibration)
     assert (ours.cx, ours.cy, ours.source) == (2000.0, 1500.5, "calibration")
     viewing = ViewingCamera(
         width=4000,
@@ -75,7 +84,7 @@ def test_pixels_are_converted_from_opencv_to_ours(tmp_path: Path) -> None:
 
 def test_a_calibration_without_distortion_has_none(tmp_path: Path) -> None:
     calibration = read(tmp_path, 'cameras: {"*": {' + GOOD + "}}")
-    assert calibration.intrinsics[0].distortion == (0.0, 0.0, 0.0, 0.0, 0.0)
+    assert the_lens(calibration).distortion == (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def test_what_was_written_is_read_again(tmp_path: Path) -> None:
@@ -85,15 +94,34 @@ def test_what_was_written_is_read_again(tmp_path: Path) -> None:
     )
     path = tmp_path / "calibration.yaml"
     write_calibration(path, calibration)
-    assert read_calibration(path) == calibration
+    found = read_calibration(path)
+    assert (found.patterns, found.lenses) == (calibration.patterns, calibration.intrinsics)
     assert path.read_text() == calibration_text(calibration)
+
+
+def test_a_fisheye_has_terms_of_its_own(tmp_path: Path) -> None:
+    entry = "{model: fisheye, " + GOOD + ", distortion: [0.04, 0.01, -0.01, 0.002]}"
+    wide = entry.replace("}", ", field_of_view_deg: 200, skew: 2}")
+    calibration = read(tmp_path, f"cameras:\n  a.jpg: {entry}\n  b.jpg: {wide}\n")
+    plain = FisheyeLens(
+        width=4000,
+        height=3000,
+        fx=3000.0,
+        fy=3001.5,
+        cx=2000.0,
+        cy=1500.5,
+        radial=(0.04, 0.01, -0.01, 0.002),
+    )
+    assert calibration.lenses == (plain, replace(plain, skew=2.0, field_of_view_deg=200.0))
+    without = read(tmp_path, "cameras: {a: {model: fisheye, " + GOOD + "}}").lenses
+    assert without == (replace(plain, radial=(0.0, 0.0, 0.0, 0.0)),)
 
 
 def test_values_may_be_shared_between_cameras(tmp_path: Path) -> None:
     text = "cameras:\n  a.jpg: &c {" + GOOD + "}\n  b.jpg: *c\n  c.jpg: {<<: *c, fx: 2900}\n"
     calibration = read(tmp_path, text)
-    assert [item.fx for item in calibration.intrinsics] == [3000.0, 3000.0, 2900.0]
-    assert [item.fy for item in calibration.intrinsics] == [3001.5] * 3
+    assert [item.fx for item in calibration.lenses] == [3000.0, 3000.0, 2900.0]
+    assert [item.fy for item in calibration.lenses] == [3001.5] * 3
 
 
 def test_shared_values_stand_behind_own_ones_and_only_without_quotes(tmp_path: Path) -> None:
@@ -103,7 +131,7 @@ def test_shared_values_stand_behind_own_ones_and_only_without_quotes(tmp_path: P
     text = f"cameras:\n  <<: {shared}\n  b*: {own}\n"
     calibration = read(tmp_path, text)
     assert calibration.patterns == ("b*", "a.jpg", "c*")
-    assert [item.fx for item in calibration.intrinsics] == [2900.0, 3000.0, 3000.0]
+    assert [item.fx for item in calibration.lenses] == [2900.0, 3000.0, 3000.0]
     quoted = 'cameras:\n  a.jpg: {"<<": {fx: 3}, ' + GOOD + "}"
 
     assert '2:11: cameras."a.jpg".<<: unknown key' in refusal(tmp_path, quoted)
@@ -134,7 +162,7 @@ def test_each_number_arrives_in_its_own_place(tmp_path: Path, moved: str) -> Non
     given = {key: f"{value:.0f}" if value > 1.0 else repr(value) for key, value in values.items()}
     lens = ", ".join(given.pop(key) for key in ("k1", "k2", "p1", "p2", "k3"))
     entry = ", ".join(f"{key}: {value}" for key, value in given.items())
-    (camera,) = read(tmp_path, f"cameras: {{a.jpg: {{{entry}, distortion: [{lens}]}}}}").intrinsics
+    (camera,) = read(tmp_path, f"cameras: {{a.jpg: {{{entry}, distortion: [{lens}]}}}}").lenses
     k1, k2, p1, p2, k3 = camera.distortion
     assert values == {
         "width": camera.width,
@@ -176,7 +204,7 @@ def test_a_lens_is_refused_just_where_its_radius_turns_back(tmp_path: Path, plac
         if is_refused:
             assert "the lens model folds back inside the image" in refusal(tmp_path, text)
         else:
-            assert read(tmp_path, text).intrinsics[0].distortion == tuple(lens)
+            assert the_lens(read(tmp_path, text)).distortion == tuple(lens)
 
 
 @pytest.mark.parametrize(("dip", "is_refused"), [(-0.1, True), (0.05, False)])
@@ -192,7 +220,7 @@ def test_a_lens_that_folds_and_unfolds_again_is_refused(
     if is_refused:
         assert "the lens model folds back inside the image" in refusal(tmp_path, text)
     else:
-        assert read(tmp_path, text).intrinsics[0].distortion == (k1, k2, 0.0, 0.0, k3)
+        assert the_lens(read(tmp_path, text)).distortion == (k1, k2, 0.0, 0.0, k3)
 
 
 def test_a_calibration_may_hold_more_values_than_a_workflow(tmp_path: Path) -> None:
@@ -212,29 +240,28 @@ def test_a_calibration_may_hold_more_values_than_a_workflow(tmp_path: Path) -> N
 )
 def test_the_first_entry_that_matches_holds(name: str, pattern: str) -> None:
     patterns = ("a.jpg", "x[1].jpg", "IMG_00*.jpg", "*", "never")
-    calibration = Calibration(patterns=patterns, intrinsics=(camera(),) * len(patterns))
-    assert matching_pattern(calibration, name) == pattern
-    assert matching_pattern(Calibration(patterns=("b*",), intrinsics=(camera(),)), name) is None
+    assert matching_pattern(patterns, name) == pattern
+    assert matching_pattern(("b*",), name) is None
 
 
 def test_a_photo_that_no_entry_matches_is_not_calibrated() -> None:
-    calibration = Calibration(patterns=("b*",), intrinsics=(camera(),))
-    assert intrinsics_for(calibration, "a.jpg", 4000, 3000) is None
-    assert intrinsics_for(calibration, "b.jpg", 4000, 3000) == camera()
+    calibration = CalibratedLenses(patterns=("b*",), lenses=(camera(),))
+    assert lens_for(calibration, "a.jpg", 4000, 3000) is None
+    assert lens_for(calibration, "b.jpg", 4000, 3000) == camera()
 
 
 def test_another_size_is_refused_and_a_turned_one_named() -> None:
-    calibration = Calibration(patterns=("*",), intrinsics=(camera(),))
+    calibration = CalibratedLenses(patterns=("*",), lenses=(camera(),))
     with pytest.raises(
         InputError,
         match=r'photo a\.jpg has 2000 x 1500 pixels, but its calibration "\*" is for 4000 x 3000; '
         "calibrate at the size of the photos",
     ):
-        intrinsics_for(calibration, "a.jpg", 2000, 1500)
+        lens_for(calibration, "a.jpg", 2000, 1500)
     with pytest.raises(
         InputError, match=r"it seems to be for the turned photo.*as they are stored"
     ):
-        intrinsics_for(calibration, "a.jpg", 3000, 4000)
+        lens_for(calibration, "a.jpg", 3000, 4000)
 
 
 @pytest.mark.parametrize(
@@ -275,6 +302,26 @@ def test_another_size_is_refused_and_a_turned_one_named() -> None:
         (
             'cameras: {"*": {' + GOOD + ", distortion: [0.1, 0, 0, 0]}}",
             "expected the five numbers [k1, k2, p1, p2, k3], got 4 values",
+        ),
+        (
+            'cameras: {"*": {model: fisheye, ' + GOOD + ", distortion: [0.1, 0, 0, 0, 0]}}",
+            "expected the four numbers [k1, k2, k3, k4], got 5 values",
+        ),
+        (
+            "cameras:\n  a.jpg: {model: fish, " + GOOD + "}\n",
+            '2:11: cameras."a.jpg".model: expected fisheye, or no model for other lenses, got the',
+        ),
+        (
+            'cameras: {"*": {field_of_view_deg: 90, ' + GOOD + "}}",
+            'cameras."*".field_of_view_deg: unknown key',
+        ),
+        (
+            'cameras: {"*": {model: fisheye, field_of_view_deg: 400, ' + GOOD + "}}",
+            "the fisheye lens is none: a field of view of 400 degrees, expected one below 360",
+        ),
+        (
+            'cameras: {"*": {model: fisheye, ' + GOOD + ", distortion: [-0.8, 0, 0, 0]}}",
+            "share a pixel; expected k1, k2, k3, k4 of a calibration that covers the image, or a",
         ),
         (
             'cameras: {"*": {' + GOOD + ", distortion: [0.1, 0, x, 0, 0]}}",

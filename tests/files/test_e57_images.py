@@ -18,6 +18,7 @@ from orthoflow.geometry.rotations import quaternion_from_rotation
 from orthoflow.products import Cameras, InputFiles, Photos
 from orthoflow.sdk import StepContext
 from tests import photo_files, scan_files, scenes
+from tests.wide_lenses import directions_of_panorama
 
 PICTURE = photo_files.picture(64, 48)
 NUMBERS = {
@@ -104,12 +105,7 @@ def coloured(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def panorama(width: int, height: int) -> NDArray[np.uint8]:
-    """E2807: azimuth (width / 2 - x) * pixel width, counter-clockwise; elevation alike."""
-    azimuth = (width / 2 - (np.arange(width) + 0.5)) * (2 * np.pi / width)
-    elevation = ((height / 2 - (np.arange(height) + 0.5)) * (np.pi / height))[:, None]
-    level = np.cos(elevation)
-    directions = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth]
-    return np.rint(coloured(np.stack(directions, axis=-1))).astype(np.uint8)
+    return np.rint(coloured(directions_of_panorama(width, height))).astype(np.uint8)
 
 
 def spherical(width: int = 720, height: int = 360, **more: Any) -> dict[str, Any]:
@@ -186,6 +182,21 @@ def test_a_size_that_is_not_the_photos_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path, pinhole(numbers=NUMBERS | {"imageWidth": 65}))
     with pytest.raises(InputError, match="has 64 x 48 pixels, but its file says 65 x 48"):
         read(path)
+
+
+def test_a_calibration_of_a_fisheye_cannot_be_for_a_photo_inside(tmp_path: Path) -> None:
+    path = written(tmp_path, pinhole())
+    calibration = tmp_path / "calibration.yaml"
+    calibration.write_text(
+        "cameras: {'*': {model: fisheye, width: 64, height: 48, fx: 20, fy: 20, cx: 31, cy: 23}}"
+    )
+    inputs = ReadPhotos.In(
+        files=InputFiles(name="photos", paths=(path,)),
+        calibration=InputFiles(name="calibration", paths=(calibration,)),
+    )
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    with pytest.raises(InputError, match=r"room_000\.jpg is inside an E57 file, but its calib"):
+        ReadPhotos().run(inputs, ReadPhotos.Params(), ctx)
 
 
 def test_a_lens_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.colmap import write_colmap_model
+from orthoflow.files.fisheyes import FACE_FROM_CAMERA, FisheyeLens, face_lenses
 from orthoflow.files.given_cameras import MOST_BYTES, MOST_MODEL_BYTES, CentredLens, GivenCamera
 from orthoflow.files.metashape import MOST_TAGS
 from orthoflow.files.panoramas import face_picture
@@ -42,7 +44,7 @@ def pixels(given: GivenCamera, points_world: NDArray[np.float64]) -> NDArray[np.
     lens = given.lens
     if isinstance(lens, CentredLens):
         lens = lens.of_size(WIDTH, HEIGHT)
-    assert lens is not None
+    assert isinstance(lens, Intrinsics)
     assert lens.source == "given"
     return lens.posed(given.rotation, given.translation).project(points_world)[:, :2]
 
@@ -236,7 +238,7 @@ def test_metashape_cameras_project_as_its_manual_says(tmp_path: Path, where: str
     found = pixels(given["a"], seen_world(rotation, centre))
     np.testing.assert_allclose(found, metashape_pixels(POINTS, LENS), atol=1e-8)
     assert given["b.jpg"].reason == "Metashape did not align it"
-    assert "of type fisheye" in given["c.jpg"].reason
+    assert given["c.jpg"].reason == "its sensor Theta has no calibration"
 
 
 def test_metashape_panoramas_give_the_cameras_of_their_faces(tmp_path: Path) -> None:
@@ -591,9 +593,8 @@ def test_rational_distortion_of_colmap_is_said_and_not_left_out(tmp_path: Path, 
 
 
 def test_models_of_colmap_that_bend_otherwise_are_told_by_their_number(tmp_path: Path) -> None:
-    counts = {5: 8, 7: 5, 8: 4, 9: 5, 10: 12, 11: 16}
-    names = ["OPENCV_FISHEYE", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE",
-             "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"]  # fmt: skip
+    counts = {7: 5, 10: 12, 11: 16}
+    names = ["FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"]
     cameras, images = struct.pack("<Q", len(counts)), struct.pack("<Q", len(counts))
     for number, count in counts.items():
         cameras += struct.pack(f"<IiQQ{count}d", number, number, WIDTH, HEIGHT, *[0.1] * count)
@@ -603,12 +604,57 @@ def test_models_of_colmap_that_bend_otherwise_are_told_by_their_number(tmp_path:
     assert said == [f"model {name}" for name in names]
 
 
-def test_a_fisheye_of_colmap_is_said_and_not_bent(tmp_path: Path) -> None:
+FISHEYES: dict[str, tuple[int, list[float]]] = {
+    "OPENCV_FISHEYE": (5, [300, 305, 321, 239, -0.05, 0.02, 1e-3, -2e-3]),
+    "SIMPLE_RADIAL_FISHEYE": (8, [300, 321, 239, -0.05]),
+    "RADIAL_FISHEYE": (9, [300, 321, 239, -0.05, 0.02]),
+}
+
+
+@pytest.mark.parametrize("model", FISHEYES)
+@pytest.mark.parametrize("form", ["txt", "bin"])
+def test_fisheyes_of_colmap_project_as_colmap_does(tmp_path: Path, model: str, form: str) -> None:
+    import pycolmap
+
+    number, params = FISHEYES[model]
+    files: dict[str, str | bytes]
+    if form == "txt":
+        files = {
+            "cameras.txt": f"2 {model} {WIDTH} {HEIGHT} {words(params)}\n",
+            "images.txt": "1 1 0 0 0 0 0 0 2 b.jpg\n\n",
+        }
+    else:
+        lens = struct.pack(f"<QIiQQ{len(params)}d", 1, 2, number, WIDTH, HEIGHT, *params)
+        image = struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 2) + b"b.jpg\0" + bytes(8)
+        files = {"cameras.bin": lens, "images.bin": image}
+    (given,) = read_given_cameras(write(tmp_path, files))
+    assert isinstance(given.lens, FisheyeLens)
+    theirs = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)
+    points = POINTS * [3.0, 3.0, 1.0]
+    np.testing.assert_allclose(given.lens.project(points), theirs.img_from_cam(points), atol=1e-9)
+
+
+def test_the_faces_of_a_fisheye_have_its_place_and_their_own_directions(tmp_path: Path) -> None:
+    _, params = FISHEYES["OPENCV_FISHEYE"]
+    rotation, centre = pose(1)
     files: dict[str, str | bytes] = {
-        "cameras.txt": CAMERA + f"2 OPENCV_FISHEYE {WIDTH} {HEIGHT} {words([1] * 8)}\n",
-        "images.txt": "1 1 0 0 0 0 0 0 1 a.jpg\n\n2 1 0 0 0 0 0 0 2 b.jpg\n\n",
+        "cameras.txt": f"2 OPENCV_FISHEYE {WIDTH} {HEIGHT} {words(params)}\n",
+        "images.txt": f"1 {words(quaternion_from_rotation(rotation.T))} "
+        f"{words(-rotation.T @ centre)} 2 b.jpg\n\n",
     }
-    plain, fisheye = read_given_cameras(write(tmp_path, files))
-    assert plain.rotation is not None
-    assert fisheye.rotation is None
-    assert "its camera is of the model OPENCV_FISHEYE, which OpenCV's has not" in fisheye.reason
+    (given,) = read_given_cameras(write(tmp_path, files))
+    assert isinstance(given.lens, FisheyeLens)
+    for face in face_lenses(given.lens):
+        camera = given.of_face(face)
+        assert isinstance(camera.lens, Intrinsics)
+        viewing = camera.lens.posed(camera.rotation, camera.translation)
+        np.testing.assert_allclose(viewing.centre_world, centre, atol=1e-9)
+        places = np.array([[1.5, 2.5], [20.5, 9.5]])
+        own = camera.lens.posed().rays_world(places)
+        # Through the axes of the fisheye on the one hand, through the world on the other.
+        np.testing.assert_allclose(
+            viewing.rays_world(places) @ rotation, own @ FACE_FROM_CAMERA[face], atol=1e-9
+        )
+    assert given.of_face("back").reason == "its fisheye lens does not show that face"
+    folding = replace(given, lens=replace(given.lens, radial=(-0.9, 0.0, 0.0, 0.0)))
+    assert folding.of_face("front").reason.startswith("its fisheye lens is none: it folds back")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import InputError
+from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import GivenCamera
 from orthoflow.files.metashape import read_metashape_xml
 from orthoflow.products import Intrinsics
@@ -81,17 +82,48 @@ def test_the_last_calibration_holds_an_adjusted_one_before_others(
     [
         (SENSOR.replace(ADJUSTED, ""), "its sensor NIKON has no calibration"),
         (SENSOR.replace("<f>500</f>", "<k1>0</k1>"), "has no focal length f (Metashape 1.2 or"),
-        (SENSOR.replace('"frame"', '"fisheye"', 1), "orthoflow takes frame and spherical"),
+        (SENSOR.replace('"frame"', '"rpc"', 1), "orthoflow takes frame, fisheye and spherical"),
+        (
+            SENSOR.replace('"frame"', '"fisheye"', 1).replace("</f>", "</f><p3>1e-3</p3>"),
+            "its sensor NIKON has p3, which OpenCV's model has not",
+        ),
         (SENSOR.replace(' label="NIKON"', "").replace(ADJUSTED, ""), "its sensor 0 has no calib"),
         ("", "it names no sensor"),
     ],
-    ids=["no-calibration", "no-focal-length", "fisheye", "no-label", "no-sensor"],
+    ids=[
+        "no-calibration",
+        "no-focal-length",
+        "satellite",
+        "fisheye-terms",
+        "no-label",
+        "no-sensor",
+    ],
 )
 def test_a_camera_without_a_lens_says_why(tmp_path: Path, sensor: str, reason: str) -> None:
     (given,) = read(tmp_path, document(sensors=sensor))
     assert reason in given.reason
     assert given.name == "a.jpg"
     assert (given.lens, given.rotation, given.translation) == (None, None, None)
+
+
+def test_a_fisheye_sensor_has_all_terms_that_its_formula_has(tmp_path: Path) -> None:
+    terms = {"cx": 3, "cy": -2, "b1": 1, "b2": 0.5, "p1": 1e-3, "p2": 2e-3}
+    radial = {"k1": 0.04, "k2": 0.03, "k3": 0.02, "k4": 0.01}
+    said = "".join(f"<{name}>{value}</{name}>" for name, value in {**terms, **radial}.items())
+    sensor = SENSOR.replace('"frame"', '"fisheye"').replace("</f>", f"</f>{said}")
+    (given,) = read(tmp_path, document(sensors=sensor))
+    assert given.lens == FisheyeLens(
+        width=640,
+        height=480,
+        fx=501.0,
+        fy=500.0,
+        cx=323.0,
+        cy=238.0,
+        radial=(0.04, 0.03, 0.02, 0.01),
+        tangential=(2e-3, 1e-3),
+        skew=0.5,
+    )
+    assert given.rotation is not None
 
 
 def test_a_sensor_without_a_type_is_a_frame(tmp_path: Path) -> None:

@@ -400,7 +400,7 @@ def test_estimated_lenses_are_published_as_a_calibration_file(tmp_path: Path) ->
     publishing.publish_cameras(Cameras(cameras=cameras), tmp_path, DIGEST)
     found = read_calibration(tmp_path / "calibration.yaml")
     assert found.patterns == ("a[1].jpg",)
-    assert found.intrinsics == (replace(lens, source="calibration"),)
+    assert found.lenses == (replace(lens, source="calibration"),)
 
 
 def test_calibrated_lenses_are_not_published_again(tmp_path: Path) -> None:

@@ -11,7 +11,9 @@ from pydantic import Field
 
 from orthoflow.errors import InputError
 from orthoflow.files.camera_formats import read_given_cameras
+from orthoflow.files.fisheyes import FisheyeLens
 from orthoflow.files.given_cameras import CentredLens, GivenCamera
+from orthoflow.files.panoramas import face_in
 from orthoflow.geometry.frames import FARTHEST_M
 from orthoflow.products import Camera, Cameras, InputFiles, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
@@ -25,11 +27,14 @@ class ReadCameras(Method):
 
     They must be in the frame of the scan; `orient.given` says when they show no wall. Photos are
     found by their file names, with or without suffix. A photo that the files say nothing of, or
-    whose lens OpenCV's model has not, is not oriented, and the reason is said.
+    whose lens OpenCV's models have not, is not oriented, and the reason is said.
+
+    The photo of a fisheye lens must have become the faces of a cube, as `read.photos` does it that
+    knows the lens; each face has the pose of the whole.
     """
 
     id = "read.cameras"
-    result_version = 1
+    result_version = 2
     determinism = "exact"
     metrics = (
         "n_photos",
@@ -65,7 +70,7 @@ class ReadCameras(Method):
         ctx.progress(0.0, inputs.files.name)
         given = read_given_cameras(inputs.files.paths)
         photos = inputs.photos.photos
-        by_name = _ByName(given)
+        by_name = GivenByName(given)
         cameras = tuple(_camera(photo, by_name, UNITS_M[params.unit]) for photo in photos)
         n_oriented = sum(camera.status == "ok" for camera in cameras)
         if not n_oriented:
@@ -85,13 +90,19 @@ class ReadCameras(Method):
         return self.Out(cameras=Cameras(cameras=cameras, details={"given": True}))
 
 
-def _camera(photo: Photo, given: _ByName, unit_m: float) -> Camera:
+def _camera(photo: Photo, given: GivenByName, unit_m: float) -> Camera:
     found = given.of_photo(photo.name)
     if found is None:
         return Camera(photo=photo.name, status="the files of given cameras say nothing of it")
     if found.lens is None or found.rotation is None or found.translation is None:
         return Camera(photo=photo.name, status=found.reason)
     lens = found.lens
+    if isinstance(lens, FisheyeLens):
+        return Camera(
+            photo=photo.name,
+            status="its lens is a fisheye: wire the same files to read.photos as cameras, which "
+            "makes photos of it that can be painted from",
+        )
     if isinstance(lens, CentredLens):
         lens = lens.of_size(photo.width, photo.height)
     if (lens.width, lens.height) != (photo.width, photo.height):
@@ -117,29 +128,52 @@ def _camera(photo: Photo, given: _ByName, unit_m: float) -> Camera:
     )
 
 
-class _ByName:
+class GivenByName:
     """Given cameras by the names of their photos."""
 
     def __init__(self, given: Sequence[GivenCamera]) -> None:
         self._exact: dict[str, list[GivenCamera]] = {}
         self._lower: dict[str, list[GivenCamera]] = {}
+        self._fisheyes: dict[str, list[GivenCamera]] = {}
         for camera in given:
             self._exact.setdefault(camera.name, []).append(camera)
             self._lower.setdefault(camera.name.lower(), []).append(camera)
+            if isinstance(camera.lens, FisheyeLens):
+                stem = PurePath(camera.name).stem.lower()
+                self._fisheyes.setdefault(stem, []).append(camera)
 
     def of_photo(self, name: str) -> GivenCamera | None:
         """Give the camera of a photo: of its name, or else of its name without suffix.
 
+        A photo NAME_front.png may be a face of NAME, whose lens is a fisheye.
+
         Raises:
             InputError: several cameras have that name.
         """
+        found, face = self._named(name), face_in(name)
+        if found is None and face is not None:
+            whole = self._of_stem(face[0])
+            return whole.of_face(face[1]) if whole is not None else None
+        return found
+
+    def _of_stem(self, stem: str) -> GivenCamera | None:
+        """The fisheye camera of a photo that has this name but for its suffix."""
+        fisheyes = self._fisheyes.get(stem.lower(), [])
+        exact = [camera for camera in fisheyes if PurePath(camera.name).stem == stem]
+        return _only(exact or fisheyes, stem)
+
+    def _named(self, name: str) -> GivenCamera | None:
         for wanted in (name, PurePath(name).stem):
             found = self._exact.get(wanted) or self._lower.get(wanted.lower(), [])
-            if len(found) > 1:
-                raise InputError(
-                    f"the files of given cameras have {len(found)} cameras {found[0].name}: photo "
-                    f"{name} must have one"
-                )
             if found:
-                return found[0]
+                return _only(found, name)
         return None
+
+
+def _only(found: Sequence[GivenCamera], photo: str) -> GivenCamera | None:
+    if len(found) > 1:
+        raise InputError(
+            f"the files of given cameras have {len(found)} cameras {found[0].name}: photo {photo} "
+            "must have one"
+        )
+    return found[0] if found else None

@@ -9,25 +9,37 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import ClassVar, Final
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import InputError
-from orthoflow.files.calibration import intrinsics_for, matching_pattern, read_calibration
+from orthoflow.files.calibration import (
+    CalibratedLenses,
+    lens_for,
+    matching_pattern,
+    read_calibration,
+)
+from orthoflow.files.camera_formats import read_given_cameras
 from orthoflow.files.containers import image_format, is_cut_off, stated_bits
 from orthoflow.files.e57_images import SUFFIX as E57_SUFFIX
 from orthoflow.files.e57_images import E57Image, read_e57_images
 from orthoflow.files.exif import Exif, FocalLength, focal_length, read_exif
+from orthoflow.files.fisheyes import FisheyeFace, FisheyeLens, fisheye_faces
 from orthoflow.files.images import (
     HOW_TO_DEVELOP,
     PHOTO_SUFFIXES,
     RAW_SUFFIXES,
     decode_image,
     decode_levels,
+    encode_png,
 )
 from orthoflow.files.panoramas import PanoramaFace, faces_of
+from orthoflow.files.photo_masks import decode_mask
 from orthoflow.geometry.levels import eight_bits
-from orthoflow.products import Calibration, InputFiles, Intrinsics, Photo, Photos
+from orthoflow.products import InputFiles, Intrinsics, Photo, Photos
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.read.cameras import GivenByName
 from orthoflow_plugins.read.figures import ContactSheet
 from orthoflow_plugins.read.masks import Masks, beside_photos
 
@@ -41,7 +53,8 @@ class ReadPhotos(Method):
     """Read JPEG, PNG and TIFF photos as they are, also from inside E57 files, ordered by name.
 
     A panorama, in an E57 file or named in `panoramas`, becomes six photos, the faces of a cube, as
-    PNG; their lenses are exact.
+    PNG; their lenses are exact. So does a photo whose lens is a fisheye, as the calibration or the
+    given cameras say (OpenCV's fisheye model), but of faces only what it shows.
 
     The files' bytes are kept and never encoded again. Pixels are those of the stored array: the
     EXIF orientation is written down, not applied. Every photo is decoded once, so that a damaged
@@ -49,11 +62,12 @@ class ReadPhotos(Method):
 
     What is black in a mask, or within polygons, is used of a photo neither for ties nor for
     colours: pictures NAME_mask.png beside NAME.jpg, or files of the input masks, named likewise or
-    as the photo, or GeoJSON with polygons in pixels.
+    as the photo, or GeoJSON with polygons in pixels. Masks of a panorama or a fisheye hold for its
+    faces.
     """
 
     id = "read.photos"
-    result_version = 2
+    result_version = 3
     determinism = "exact"
     metrics = (
         "n_photos",
@@ -65,6 +79,7 @@ class ReadPhotos(Method):
         "CIPA DC-008, Exchangeable image file format for digital still cameras (Exif)",
         "CIPA DCG-001, 35 mm equivalent focal length over the diagonal",
         "Brown 1971, Close-range camera calibration, Photogrammetric Engineering 37(8)",
+        "kannala2006: A generic camera model ... for fish-eye lenses, doi:10.1109/TPAMI.2006.153",
     )
 
     class Params(MethodParams):
@@ -78,10 +93,14 @@ class ReadPhotos(Method):
         )
 
     class In(Ports):
-        """The photos, and a calibration file and masks if there are any."""
+        """The photos, and a calibration file, masks and given cameras if there are any.
+
+        Of given cameras only those count here whose lenses are fisheyes.
+        """
 
         files: InputFiles
         calibration: InputFiles | None = None
+        cameras: InputFiles | None = None
         masks: InputFiles | None = None
 
     class Out(Ports):
@@ -94,13 +113,19 @@ class ReadPhotos(Method):
         ctx.progress(0.0, inputs.files.name)
         beside = beside_photos(inputs.files.paths)
         masks = Masks.of(sorted(beside), () if inputs.masks is None else inputs.masks.paths)
-        sources = _sources(ctx, inputs.files, beside, params.panoramas)
         calibration = _calibration(inputs.calibration)
+        cubes = _Cubes(
+            panoramas=params.panoramas,
+            calibration=calibration,
+            given=_given(inputs.cameras),
+            masks=masks,
+        )
+        sources = _sources(ctx, inputs.files, beside, cubes)
         sheet = ContactSheet(len(sources))
         read = []
         for index, source in enumerate(sources):
             ctx.progress(index / len(sources), source.name)
-            read.append(_masked(_read_photo(source, calibration, sheet), masks))
+            read.append(_masked(_read_photo(source, calibration, sheet), source, masks))
             ctx.log(_described(read[-1]))
         masks.warn_of_unused(ctx)
         _warn(ctx, read, calibration)
@@ -115,6 +140,7 @@ class _ReadPhoto:
     photo: Photo
     exif: Exif
     focal: FocalLength
+    whole: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,13 +149,16 @@ class _Source:
 
     Attributes:
         name: of the photo.
-        content: a file of its own, or what makes one of an E57 file or a panorama.
+        content: a file of its own, or what makes one of an E57 file, a panorama or a fisheye's
+            photo.
         lens: what that file says of its lens.
+        whole: name of the photo that it is a face of, whose lens nobody else knows; or "".
     """
 
     name: str
-    content: Path | E57Image | PanoramaFace
+    content: Path | E57Image | PanoramaFace | FisheyeFace
     lens: Intrinsics | None = None
+    whole: str = ""
 
     def encoded(self) -> bytes:
         """The bytes of the photo as they are."""
@@ -145,18 +174,82 @@ def _bytes_of(path: Path) -> bytes:
         raise InputError(f"photo {path.name} cannot be read: {error.strerror}") from error
 
 
-def _of_panorama(path: Path) -> list[_Source]:
+@dataclass(frozen=True, kw_only=True)
+class _Cubes:
+    """What becomes faces of a cube when it is read.
+
+    Attributes:
+        panoramas: names or patterns of photos that are panoramas.
+        calibration: lenses by the names of photos, or None.
+        given: cameras of other programs, or None.
+        masks: of the photos.
+    """
+
+    panoramas: Sequence[str]
+    calibration: CalibratedLenses | None
+    given: GivenByName | None
+    masks: Masks
+
+    def sources(self, path: Path) -> list[_Source]:
+        """A photo of a file of its own, or its faces."""
+        if any(fnmatchcase(path.name, pattern) for pattern in self.panoramas):
+            return self._of_panorama(path)
+        lens = self._fisheye(path.name)
+        return [_Source(name=path.name, content=path)] if lens is None else self._faces(path, lens)
+
+    def _fisheye(self, name: str) -> FisheyeLens | None:
+        """The lens of a photo where it is a fisheye: as the cameras say, else the calibration."""
+        camera = None if self.given is None else self.given.of_photo(name)
+        if camera is not None and isinstance(camera.lens, FisheyeLens):
+            return camera.lens
+        if self.calibration is None:
+            return None
+        pattern = matching_pattern(self.calibration.patterns, name)
+        if pattern is None:
+            return None
+        lens = self.calibration.lenses[self.calibration.patterns.index(pattern)]
+        return lens if isinstance(lens, FisheyeLens) else None
+
+    def _of_panorama(self, path: Path) -> list[_Source]:
+        encoded, (width, height) = _whole_photo(path)
+        if width != 2 * height:
+            raise InputError(
+                f"photo {path.name} is named in panoramas, but has {width} x {height} pixels: a "
+                "panorama over the whole sphere is twice as wide as high"
+            )
+        used = self._used(path.name, (width, height))
+        return _of_faces(faces_of(encoded, path.stem, width, used), path.name)
+
+    def _faces(self, path: Path, lens: FisheyeLens) -> list[_Source]:
+        encoded, size = _whole_photo(path)
+        if size != (lens.width, lens.height):
+            raise InputError(
+                f"photo {path.name} has {size[0]} x {size[1]} pixels, but its fisheye lens is for "
+                f"{lens.width} x {lens.height}: calibrate at the size of the photos as they are "
+                "stored, without the EXIF rotation"
+            )
+        faces = fisheye_faces(encoded, path.stem, lens, self._used(path.name, size))
+        return _of_faces(faces, path.name)
+
+    def _used(self, name: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+        mask = self.masks.encoded(name, size)
+        return None if mask is None else decode_mask(mask, f"the mask of {name}")
+
+
+def _whole_photo(path: Path) -> tuple[bytes, tuple[int, int]]:
+    """Bytes of a photo, and its width and height."""
     encoded = _bytes_of(path)
     _require_whole(path.name, encoded)
     height, width = decode_image(encoded, f"photo {path.name}").shape[:2]
-    if width != 2 * height:
-        raise InputError(
-            f"photo {path.name} is named in panoramas, but has {width} x {height} pixels: a "
-            "panorama over the whole sphere is twice as wide as high"
-        )
+    return encoded, (width, height)
+
+
+def _of_faces(faces: Sequence[PanoramaFace | FisheyeFace], whole: str) -> list[_Source]:
+    """Faces of which masks leave something."""
     return [
-        _Source(name=face.name, content=face, lens=face.lens)
-        for face in faces_of(encoded, path.stem, width)
+        _Source(name=face.name, content=face, lens=face.lens, whole=whole)
+        for face in faces
+        if (mask := face.mask()) is None or mask.any()
     ]
 
 
@@ -166,33 +259,34 @@ def _inside_e57(path: Path) -> list[_Source]:
             name=image.name,
             content=image,
             lens=image.camera.lens if isinstance(image.camera.lens, Intrinsics) else None,
+            whole=path.name if isinstance(image.content, PanoramaFace) else "",
         )
         for image in read_e57_images(path)
     ]
 
 
-def _masked(read: _ReadPhoto, masks: Masks) -> _ReadPhoto:
+def _masked(read: _ReadPhoto, source: _Source, masks: Masks) -> _ReadPhoto:
     """Give a photo with its mask, where it has one."""
     photo = read.photo
     mask = masks.encoded(photo.name, (photo.width, photo.height))
+    of_face = None if isinstance(source.content, Path | E57Image) else source.content.mask()
+    if of_face is not None:
+        if mask is not None:
+            of_face = of_face & decode_mask(mask, f"the mask of {photo.name}")
+        mask = encode_png(np.where(of_face, np.uint8(255), np.uint8(0)))
     return read if mask is None else replace(read, photo=replace(photo, mask=mask))
 
 
-def _sources(
-    ctx: StepContext, files: InputFiles, masks: Set[Path], panoramas: Sequence[str]
-) -> list[_Source]:
+def _sources(ctx: StepContext, files: InputFiles, masks: Set[Path], cubes: _Cubes) -> list[_Source]:
     """Photos ordered by name; says which other files there are."""
     if not files.paths:
         raise InputError(f"the input {files.name} names no files: expected photos")
     sources, others = [], []
     for path in files.paths:
-        is_photo = path.suffix.lower() in PHOTO_SUFFIXES
         if path in masks:
             continue
-        if is_photo and any(fnmatchcase(path.name, pattern) for pattern in panoramas):
-            sources += _of_panorama(path)
-        elif is_photo:
-            sources.append(_Source(name=path.name, content=path))
+        if path.suffix.lower() in PHOTO_SUFFIXES:
+            sources += cubes.sources(path)
         elif path.suffix.lower() == E57_SUFFIX:
             sources += _inside_e57(path)
         else:
@@ -239,7 +333,14 @@ def _refuse_raw(input_name: str, photos: Sequence[str], others: Sequence[str]) -
         )
 
 
-def _calibration(files: InputFiles | None) -> Calibration | None:
+def _given(files: InputFiles | None) -> GivenByName | None:
+    """Cameras of other programs; an E57 file has panoramas, but no fisheyes."""
+    if files is None or all(path.suffix.lower() == E57_SUFFIX for path in files.paths):
+        return None
+    return GivenByName(read_given_cameras(files.paths))
+
+
+def _calibration(files: InputFiles | None) -> CalibratedLenses | None:
     if files is None:
         return None
     if len(files.paths) != 1:
@@ -269,7 +370,7 @@ def _require_whole(name: str, encoded: bytes) -> None:
 
 
 def _read_photo(
-    source: _Source, calibration: Calibration | None, sheet: ContactSheet
+    source: _Source, calibration: CalibratedLenses | None, sheet: ContactSheet
 ) -> _ReadPhoto:
     name, encoded = source.name, source.encoded()
     _require_whole(name, encoded)
@@ -279,8 +380,14 @@ def _read_photo(
     exif = read_exif(encoded)
     focal = focal_length(exif, width, height)
     intrinsics = source.lens
-    if calibration is not None:
-        intrinsics = intrinsics_for(calibration, name, width, height) or intrinsics
+    if calibration is not None and not source.whole:
+        calibrated = lens_for(calibration, name, width, height)
+        if isinstance(calibrated, FisheyeLens):
+            raise InputError(
+                f"photo {name} is inside an E57 file, but its calibration is that of a fisheye: "
+                "give the photo as a file of its own"
+            )
+        intrinsics = calibrated or intrinsics
     if intrinsics is not None and (intrinsics.width, intrinsics.height) != (width, height):
         raise InputError(
             f"photo {name} has {width} x {height} pixels, but its file says "
@@ -296,7 +403,7 @@ def _read_photo(
         intrinsics=intrinsics,
     )
     sheet.add(name, eight_bits(pixels))
-    return _ReadPhoto(photo=photo, exif=exif, focal=focal)
+    return _ReadPhoto(photo=photo, exif=exif, focal=focal, whole=source.whole)
 
 
 def _described(read: _ReadPhoto) -> str:
@@ -320,7 +427,9 @@ def _described(read: _ReadPhoto) -> str:
     return ", ".join(parts)
 
 
-def _warn(ctx: StepContext, read: Sequence[_ReadPhoto], calibration: Calibration | None) -> None:
+def _warn(
+    ctx: StepContext, read: Sequence[_ReadPhoto], calibration: CalibratedLenses | None
+) -> None:
     deep = [item.photo.name for item in read if (stated_bits(item.photo.encoded) or 0) > _BITS]
     if deep:
         ctx.warn(
@@ -350,12 +459,12 @@ def _warn(ctx: StepContext, read: Sequence[_ReadPhoto], calibration: Calibration
 
 
 def _warn_of_matches(
-    ctx: StepContext, read: Sequence[_ReadPhoto], calibration: Calibration
+    ctx: StepContext, read: Sequence[_ReadPhoto], calibration: CalibratedLenses
 ) -> None:
     without = [item.photo.name for item in read if item.photo.intrinsics is None]
     if without:
         ctx.warn(f"the calibration has no entry for {_counted(without)}; the others are calibrated")
-    used = {matching_pattern(calibration, item.photo.name) for item in read}
+    used = {matching_pattern(calibration.patterns, item.whole or item.photo.name) for item in read}
     unused = [pattern for pattern in calibration.patterns if pattern not in used]
     if unused:
         ctx.warn(

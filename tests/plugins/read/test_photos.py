@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from orthoflow_plugins.read.cameras import ReadCameras
 from orthoflow_plugins.read.photos import ReadPhotos
 from rasterio.transform import Affine
 
@@ -163,6 +164,115 @@ def test_a_panorama_that_is_cut_off_is_refused(tmp_path: Path, read: Reader) -> 
     files = {"a.jpg": encode_jpeg(made.picture(128, 64))[:-40]}
     with pytest.raises(InputError, match=r"photo a\.jpg is cut off"):
         read(*made.write(tmp_path, files), panoramas=("*",))
+
+
+FISHEYE = (
+    "{model: fisheye, width: 64, height: 48, fx: 20, fy: 20, cx: 31.5, cy: 23.5, "
+    "distortion: [0, 0, 0, 0]}"
+)
+
+
+def test_a_fisheye_becomes_the_faces_that_it_shows(tmp_path: Path, read: Reader) -> None:
+    files = {
+        "a.jpg": encode_jpeg(made.picture()),
+        "b.jpg": encode_jpeg(made.picture()),
+        "360.png": encode_png(made.picture(128, 64)),
+    }
+    text = f"cameras:\n  b.jpg: {CAMERA}\n  '*': {FISHEYE}\n"
+    photos = read(*made.write(tmp_path, files), calibration=text, panoramas=("360.png",))
+    # A panorama has a lens of its own, whatever the calibration says of all photos.
+    assert [photo.name for photo in photos if not photo.name.startswith("360_")] == [
+        *(f"a_{face}.png" for face in ("down", "front", "left", "right", "up")),
+        "b.jpg",
+    ]
+    assert len(photos) == 12
+    by_name = {photo.name: photo for photo in photos}
+    front = by_name["a_front.png"]
+    assert front.intrinsics is not None
+    # 40 pixels for a right angle in the middle, of which the photo has no more than 64 x 48.
+    assert (front.width, front.intrinsics.fx, front.intrinsics.cx) == (40, 20.0, 20.0)
+    assert front.mask is None
+    assert by_name["a_left.png"].mask is not None
+    assert by_name["b.jpg"].intrinsics is not None
+    assert read.warnings == ""
+
+
+def test_a_mask_of_a_fisheye_or_a_panorama_holds_for_its_faces(
+    tmp_path: Path, read: Reader
+) -> None:
+    used = np.full((48, 64), 255, dtype=np.uint8)
+    used[:, :40] = 0
+    half = np.full((64, 128), 255, dtype=np.uint8)
+    half[:, :64] = 0
+    own = np.full((40, 40), 255, dtype=np.uint8)
+    own[:20] = 0
+    files = {
+        "a.jpg": encode_jpeg(made.picture()),
+        "a_mask.png": encode_png(used),
+        "360.png": encode_png(made.picture(128, 64)),
+        "360_mask.png": encode_png(half),
+    }
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    (masks / "a_front.png").write_bytes(encode_png(own))
+    paths = made.write(tmp_path, files)
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    calibration = tmp_path / "calibration.yaml"
+    calibration.write_text(f"cameras: {{a.jpg: {FISHEYE}}}")
+    inputs = ReadPhotos.In(
+        files=InputFiles(name="photos", paths=paths),
+        calibration=InputFiles(name="calibration", paths=(calibration,)),
+        masks=InputFiles(name="masks", paths=(masks / "a_front.png",)),
+    )
+    params = ReadPhotos.Params(panoramas=("360.png",))
+    photos = {photo.name: photo for photo in ReadPhotos().run(inputs, params, ctx).photos.photos}
+    # What is masked whole is no photo.
+    assert "a_left.png" not in photos
+    assert "360_left.png" not in photos
+    assert photos["360_right.png"].mask is None
+    mask = photos["a_front.png"].mask
+    assert mask is not None
+    shown = decode_image(mask).max(axis=2) > 0
+    assert not shown[:20].any()
+    assert not shown[:, :27].any()
+    assert shown[20:, 33:].all()
+    assert ctx.warnings == []
+
+
+def test_a_fisheye_of_another_size_is_refused(tmp_path: Path, read: Reader) -> None:
+    paths = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture(48, 64))})
+    with pytest.raises(InputError, match=r"a\.jpg has 48 x 64 pixels, but its fisheye lens is for"):
+        read(*paths, calibration=f"cameras: {{'*': {FISHEYE}}}")
+
+
+def test_a_fisheye_that_cameras_speak_of_needs_no_calibration(tmp_path: Path) -> None:
+    (path,) = made.write(tmp_path, {"a.jpg": encode_jpeg(made.picture())})
+    model = made.write(
+        tmp_path,
+        {
+            "cameras.txt": b"1 OPENCV_FISHEYE 64 48 20 20 32 24 0 0 0 0\n",
+            "images.txt": b"1 1 0 0 0 0 0 0 1 a.jpg\n\n",
+        },
+    )
+    photos, given = (InputFiles(name="x", paths=paths) for paths in ((path,), model))
+
+    def run(cameras: InputFiles | None) -> tuple[str, ...]:
+        first, second = (
+            StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path) for _ in range(2)
+        )
+        read = ReadPhotos().run(
+            ReadPhotos.In(files=photos, cameras=cameras), ReadPhotos.Params(), first
+        )
+        found = ReadCameras().run(
+            ReadCameras.In(files=given, photos=read.photos), ReadCameras.Params(), second
+        )
+        return tuple(f"{camera.photo}: {camera.status}" for camera in found.cameras.cameras)
+
+    faces = ("down", "front", "left", "right", "up")
+    assert run(given) == tuple(f"a_{face}.png: ok" for face in faces)
+    # Whoever wires the poses only is told what is missing.
+    with pytest.raises(InputError, match="its lens is a fisheye: wire the same files to read"):
+        run(None)
 
 
 def test_damaged_exif_data_are_said(tmp_path: Path, read: Reader) -> None:

@@ -1,0 +1,302 @@
+"""Photos of fisheye lenses as photos of a cube's faces, which every method can take.
+
+The lens is OpenCV's (`cv2.fisheye`; Kannala and Brandt 2006): what lies theta off the axis is seen
+theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal lengths from the principal
+point. Metashape's fisheye has tangential terms and a skew besides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.images import MOST_PIXELS, decode_levels, encode_png
+from orthoflow.files.panoramas import FACES, MOST_PX, PANORAMA_FROM_CAMERA, face_name
+from orthoflow.geometry.levels import Colours
+from orthoflow.geometry.opencv_border import HALF_PIXEL
+from orthoflow.products import Intrinsics
+
+WIDEST_DEG: Final = 180.0
+_FULL_TURN_DEG: Final = 360.0
+# Rows: right, down and forwards of each face, in the axes of the camera.
+FACE_FROM_CAMERA: Final[Mapping[str, NDArray[np.float64]]] = {
+    face: axes @ PANORAMA_FROM_CAMERA for face, axes in FACES.items()
+}
+# Directions per side by which the part of a face that the lens sees is found.
+_TRIED: Final = 65
+# A face that shows less than this share of what the largest shows is not worth a photo.
+_LEAST_SHARE: Final = 0.02
+_ANGLES_TRIED: Final = 2000
+
+
+@dataclass(frozen=True, kw_only=True)
+class FisheyeLens:
+    """A fisheye lens; pixels as ours, the first one's centre at (0.5, 0.5).
+
+    Attributes:
+        width: pixels.
+        height: pixels.
+        fx: focal length in pixels along u; fy along v.
+        cx: principal point in pixels; cy along v.
+        radial: k1, k2, k3, k4.
+        tangential: p1, p2, of the direction as no distortion has bent it.
+        skew: pixels along u per unit along v.
+        field_of_view_deg: the whole angle that the lens shows; beyond it photos are not used.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    radial: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    tangential: tuple[float, ...] = (0.0, 0.0)
+    skew: float = 0.0
+    field_of_view_deg: float = WIDEST_DEG
+
+    def project(self, rays_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels (..., 2) of directions (..., 3); NaN beyond the field of view."""
+        x, y, z = np.moveaxis(rays_camera, -1, 0)
+        across = np.hypot(x, y)
+        theta = np.arctan2(across, z)
+        with np.errstate(all="ignore"):
+            # As no distortion has bent it; straight ahead it is zero.
+            scale = np.where(across > 0.0, theta / np.where(across > 0.0, across, 1.0), 0.0)
+            a, b = x * scale, y * scale
+            radial, (p1, p2) = _radial(self.radial, theta), self.tangential
+            r2 = theta * theta
+            bent_a = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
+            bent_b = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
+        pixels = np.stack(
+            [self.fx * bent_a + self.skew * bent_b + self.cx, self.fy * bent_b + self.cy], axis=-1
+        )
+        pixels[theta > self.limit_rad] = np.nan
+        return pixels
+
+    def sees(self, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which pixels (..., 2) lie inside the image; NaN does not."""
+        u, v = pixels[..., 0], pixels[..., 1]
+        inside: NDArray[np.bool_] = (u >= 0.0) & (u < self.width) & (v >= 0.0) & (v < self.height)
+        return inside
+
+    @property
+    def limit_rad(self) -> float:
+        """Angle off the axis up to which the lens is used."""
+        return min(math.radians(0.5 * self.field_of_view_deg), _fold_rad(self.radial))
+
+    def finest_px(self, theta_rad: float) -> float:
+        """Pixels per radian at an angle off the axis of at most a right one, where most."""
+        theta = min(theta_rad, self.limit_rad)
+        around = _bent(self, theta) / math.sin(theta) if theta > 0.0 else 1.0
+        with np.errstate(all="ignore"):
+            along = float(_growth(self.radial, np.array(theta)))
+        return max(self.fx, self.fy) * max(along, around)
+
+
+def problem_of(lens: FisheyeLens) -> str:
+    """Why a lens is none, or "" where it can be one."""
+    return _problem_of_numbers(lens) or _problem_of_faces(lens)
+
+
+def _problem_of_numbers(lens: FisheyeLens) -> str:
+    values = (lens.fx, lens.fy, lens.cx, lens.cy, lens.skew, *lens.radial, *lens.tangential)
+    if not all(map(math.isfinite, values)) or min(lens.fx, lens.fy) <= 0.0:
+        return f"focal length {lens.fx:g}, {lens.fy:g}"
+    if not (1 <= lens.width <= MOST_PX and 1 <= lens.height <= MOST_PX):
+        return f"a photo of 1 to {MOST_PX} columns and rows is expected"
+    if not 0.0 < lens.field_of_view_deg < _FULL_TURN_DEG:
+        return f"a field of view of {lens.field_of_view_deg:g} degrees, expected one below 360"
+    return ""
+
+
+def _problem_of_faces(lens: FisheyeLens) -> str:
+    fold = _fold_rad(lens.radial)
+    if fold < math.radians(0.5 * lens.field_of_view_deg) and _bent(lens, fold) < _farthest(lens):
+        return (
+            f"it folds back {math.degrees(fold):.1f} degrees off the axis, inside the image, so "
+            "that two directions share a pixel"
+        )
+    finest = max(lens.finest_px(0.0), lens.finest_px(0.5 * math.pi))
+    if not finest < MOST_PX:
+        return f"{finest:.0f} pixels per radian, at most {MOST_PX} are taken"
+    faces = face_lenses(lens)
+    large = [face for face in faces.values() if not _is_small(face)]
+    if large:
+        return f"its faces would have {large[0].width} x {large[0].height} pixels"
+    return "" if faces else "it shows nothing inside the image"
+
+
+def _is_small(face: Intrinsics) -> bool:
+    return max(face.width, face.height) <= MOST_PX and face.width * face.height <= MOST_PIXELS
+
+
+def _radial(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Bent over unbent angle."""
+    k1, k2, k3, k4 = radial
+    t2 = theta * theta
+    return 1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))
+
+
+def _growth(radial: tuple[float, ...], theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    """By how much the bent angle grows with the unbent one."""
+    k1, k2, k3, k4 = radial
+    t2 = theta * theta
+    return 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+
+
+@cache
+def _fold_rad(radial: tuple[float, ...]) -> float:
+    """Angle off the axis where a lens model stops growing; a straight one where it never does."""
+    angles = np.linspace(0.0, math.pi, _ANGLES_TRIED)
+    with np.errstate(all="ignore"):
+        # The other way round, so that NaN does not pass.
+        stops = ~(_growth(radial, angles) > 0.0)
+    return float(angles[max(int(np.argmax(stops)) - 1, 0)]) if stops.any() else math.pi
+
+
+def _bent(lens: FisheyeLens, theta_rad: float) -> float:
+    with np.errstate(all="ignore"):
+        return theta_rad * float(_radial(lens.radial, np.array(theta_rad)))
+
+
+def _farthest(lens: FisheyeLens) -> float:
+    """Distance of the image's farthest corner from the principal point, in focal lengths."""
+    across = max(lens.cx, lens.width - lens.cx) / lens.fx
+    down = max(lens.cy, lens.height - lens.cy) / lens.fy
+    return math.hypot(across, down)
+
+
+@cache
+def face_lenses(lens: FisheyeLens) -> Mapping[str, Intrinsics]:
+    """Lenses of the faces that a fisheye shows, each cut to what it shows of the face."""
+    steps = np.linspace(-1.0, 1.0, _TRIED)
+    right, down = np.meshgrid(steps, steps)
+    rays = np.stack([right, down, np.ones_like(right)], axis=-1)
+    shown = {face: lens.sees(lens.project(rays @ axes)) for face, axes in FACE_FROM_CAMERA.items()}
+    most = max(float(seen.mean()) for seen in shown.values())
+    return {
+        face: _cut(lens, face, seen)
+        for face, seen in shown.items()
+        if seen.any() and seen.mean() >= _LEAST_SHARE * most
+    }
+
+
+def _cut(lens: FisheyeLens, face: str, seen: NDArray[np.bool_]) -> Intrinsics:
+    """Lens of the part of a face between the outermost directions that are seen, and a step more.
+
+    A face is as fine as the photo is in the middle of it, so that nothing is lost there.
+    """
+    off_axis = 0.0 if face == "front" else 0.5 * math.pi
+    side = max(1, round(2.0 * lens.finest_px(off_axis)))
+    ends = []
+    for axis in (0, 1):
+        there = np.flatnonzero(seen.any(axis=axis))
+        first, last = int(there[0]) - 1, int(there[-1]) + 1
+        ends += [
+            max(0, math.floor(side * first / (_TRIED - 1))),
+            min(side, math.ceil(side * last / (_TRIED - 1))),
+        ]
+    left, right, top, bottom = ends
+    return Intrinsics(
+        width=right - left,
+        height=bottom - top,
+        fx=0.5 * side,
+        fy=0.5 * side,
+        cx=0.5 * side - left,
+        cy=0.5 * side - top,
+        source="given",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FisheyeFace:
+    """A face of a cube around a fisheye's photo, as a photo.
+
+    Attributes:
+        name: of the photo.
+        photo: the fisheye's photo, as it is.
+        face: which of `FACE_FROM_CAMERA`.
+        fisheye: its lens.
+        used: mask of the fisheye's photo (height, width), True where it may be used; None: all.
+    """
+
+    name: str
+    photo: bytes
+    face: str
+    fisheye: FisheyeLens
+    used: NDArray[np.bool_] | None = None
+
+    @property
+    def lens(self) -> Intrinsics:
+        """Its lens, which is exact."""
+        return face_lenses(self.fisheye)[self.face]
+
+    def encoded(self) -> bytes:
+        """The photo as a PNG file, black where the fisheye shows nothing."""
+        return encode_png(self._looked_up(decode_levels(self.photo, self.name)))
+
+    def mask(self) -> NDArray[np.bool_] | None:
+        """Which pixels (height, width) may be used; None where all may."""
+        seen = self.fisheye.sees(self._pixels())
+        if self.used is not None:
+            whole = self._looked_up(np.where(self.used, np.uint8(255), np.uint8(0)))
+            seen &= whole == np.uint8(255)
+        return None if seen.all() else seen
+
+    def _pixels(self) -> NDArray[np.float64]:
+        """Pixels of the fisheye (height, width, 2) of those of the face."""
+        lens = self.lens
+        right = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
+        down = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
+        across, along = np.meshgrid(right, down)
+        rays = np.stack([across, along, np.ones_like(across)], axis=-1)
+        return self.fisheye.project(rays @ FACE_FROM_CAMERA[self.face])
+
+    def _looked_up(self, photo: Colours) -> Colours:
+        """Look the face up in the fisheye's photo, between its pixels linearly."""
+        import cv2
+
+        pixels = self._pixels()
+        pixels[~self.fisheye.sees(pixels)] = np.nan
+        # OpenCV counts from the centre of the first pixel; NaN it would take anywhere.
+        places = np.nan_to_num(pixels - HALF_PIXEL, nan=-9.0).astype(np.float32)
+        looked_up = cv2.remap(
+            photo,
+            places[..., 0],
+            places[..., 1],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        looked_up[np.isnan(pixels[..., 0])] = 0
+        return np.asarray(looked_up, dtype=photo.dtype)
+
+
+def fisheye_faces(
+    photo: bytes, stem: str, lens: FisheyeLens, used: NDArray[np.bool_] | None = None
+) -> tuple[FisheyeFace, ...]:
+    """Give what a fisheye's photo shows as photos `<stem>_<face>.png`.
+
+    Args:
+        photo: the file's bytes.
+        stem: of its name.
+        lens: its lens.
+        used: mask of the photo (height, width), True where it may be used; None: all.
+
+    Raises:
+        InputError: the lens is none.
+    """
+    problem = problem_of(lens)
+    if problem:
+        raise InputError(f"the fisheye lens of photo {stem} is none: {problem}")
+    return tuple(
+        FisheyeFace(name=face_name(stem, face), photo=photo, face=face, fisheye=lens, used=used)
+        for face in face_lenses(lens)
+    )

@@ -1,0 +1,212 @@
+"""Fisheye lenses as OpenCV has them, and the faces of a cube that their photos become."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.errors import InputError
+from orthoflow.files.fisheyes import (
+    FACE_FROM_CAMERA,
+    FisheyeFace,
+    FisheyeLens,
+    face_lenses,
+    fisheye_faces,
+    problem_of,
+)
+from orthoflow.files.images import decode_image, encode_png
+from orthoflow.files.panoramas import FACES, PanoramaFace, faces_of
+from tests.wide_lenses import directions_of
+
+# Wholly on its picture: a circle of 180 degrees is 464 pixels wide.
+LENS = FisheyeLens(
+    width=500,
+    height=480,
+    fx=150.0,
+    fy=151.0,
+    cx=252.5,
+    cy=238.0,
+    radial=(-0.02, 0.004, -0.002, 0.0003),
+)
+
+
+def coloured(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A colour for every direction, smooth on the sphere."""
+    return np.asarray(128.0 + 100.0 * directions)
+
+
+def picture(lens: FisheyeLens) -> NDArray[np.uint8]:
+    return np.rint(coloured(directions_of(lens))).astype(np.uint8)
+
+
+def random_directions(count: int, widest_deg: float) -> NDArray[np.float64]:
+    rng = np.random.default_rng(12)
+    theta = np.radians(rng.uniform(0.0, widest_deg, count))
+    around = rng.uniform(0.0, 2.0 * np.pi, count)
+    return np.column_stack(
+        [np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)]
+    )
+
+
+def test_a_fisheye_projects_as_opencv_does() -> None:
+    lens = replace(LENS, skew=3.0)
+    rays = random_directions(200, 80.0)
+    matrix = np.array([[lens.fx, 0.0, lens.cx - 0.5], [0.0, lens.fy, lens.cy - 0.5], [0, 0, 1.0]])
+    found, _ = cv2.fisheye.projectPoints(
+        (2.5 * rays)[:, None],
+        np.zeros(3),
+        np.zeros(3),
+        matrix,
+        np.array(lens.radial),
+        alpha=lens.skew / lens.fx,
+    )
+    np.testing.assert_allclose(lens.project(2.5 * rays), found[:, 0] + 0.5, atol=1e-9)
+
+
+def test_tangential_terms_and_skew_are_those_of_metashape() -> None:
+    lens = replace(LENS, tangential=(2e-3, -1e-3), skew=3.0)
+    rays = random_directions(200, 80.0)
+    # Its manual: x = x0 atan(r0) / r0 with x0 = X / Z, then as in a frame camera; P1 is p2.
+    x0, y0 = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+    r0 = np.hypot(x0, y0)
+    x, y = x0 * np.arctan(r0) / r0, y0 * np.arctan(r0) / r0
+    r2 = x * x + y * y
+    radial = 1.0 + sum(k * r2 ** (n + 1) for n, k in enumerate(lens.radial))
+    p2, p1 = lens.tangential
+    bent_x = x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y
+    bent_y = y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y
+    expected = [lens.cx + bent_x * lens.fx + bent_y * lens.skew, lens.cy + bent_y * lens.fy]
+    np.testing.assert_allclose(lens.project(rays), np.column_stack(expected), atol=1e-9)
+
+
+def test_each_direction_is_shown_once_and_where_it_is() -> None:
+    rays = random_directions(600, 88.0)
+    n_seen = np.zeros(len(rays), dtype=int)
+    faces = fisheye_faces(encode_png(picture(LENS)), "a", LENS)
+    assert [face.name for face in faces] == [
+        f"a_{face}.png" for face in ("front", "left", "right", "up", "down")
+    ]
+    for face in faces:
+        camera = face.lens.posed(FACE_FROM_CAMERA[face.face])
+        pixels = camera.project(rays)[:, :2]
+        seen = camera.sees(pixels)
+        mask = face.mask()
+        assert (mask is None) == (face.face == "front")
+        at = np.floor(pixels[seen]).astype(int)
+        assert mask is None or mask[at[:, 1], at[:, 0]].all()
+        n_seen += seen
+        shown = decode_image(face.encoded())[at[:, 1], at[:, 0]]
+        # Half a pixel beside the place, of 150 to a radian, and the rounding of the colours.
+        assert np.abs(shown - coloured(rays[seen])).max() < 100 * 0.75 / 150 + 1.5
+    assert (n_seen == 1).all()
+
+
+def test_beyond_the_field_of_view_nothing_is_used() -> None:
+    narrow = replace(LENS, field_of_view_deg=120.0)
+    assert np.isnan(narrow.project(random_directions(50, 10.0) @ np.diag([1, 1, -1]))).all()
+    for face in fisheye_faces(encode_png(picture(LENS)), "a", narrow):
+        mask, lens = face.mask(), face.lens
+        assert (mask is None) == (face.face == "front")
+        if mask is None:
+            continue
+        rows, columns = np.nonzero(mask)
+        rays = lens.posed().rays_camera(np.column_stack([columns + 0.5, rows + 0.5]))
+        theta = np.degrees(
+            np.arccos((rays @ FACE_FROM_CAMERA[face.face])[:, 2] / np.linalg.norm(rays, axis=1))
+        )
+        assert 59.0 < theta.max() <= 60.0
+        # What the field leaves of a face is cut out, but for the steps by which it is found.
+        assert (~mask).mean() < 0.5
+        assert not decode_image(face.encoded())[~mask].any()
+
+
+def test_masks_hold_for_the_faces() -> None:
+    used = np.ones((LENS.height, LENS.width), dtype=bool)
+    used[:, :260] = False
+    names = {}
+    for face in fisheye_faces(encode_png(picture(LENS)), "a", LENS, used):
+        mask = face.mask()
+        assert mask is not None
+        names[face.face] = mask
+        if face.face == "left":
+            continue
+        rows, columns = np.nonzero(mask)
+        rays = face.lens.posed().rays_camera(np.column_stack([columns + 0.5, rows + 0.5]))
+        assert LENS.project(rays @ FACE_FROM_CAMERA[face.face])[:, 0].min() > 260.0
+    assert not names["left"].any()
+    assert names["right"].mean() > 0.3
+    columns = np.flatnonzero(names["front"].any(axis=0))
+    # The middle of the picture is 252.5, and the front is as fine as the photo is there.
+    assert columns[0] == pytest.approx(face_lenses(LENS)["front"].cx + 7.5, abs=1.5)
+
+
+def test_masks_of_panoramas_hold_for_their_faces() -> None:
+    used = np.ones((64, 128), dtype=bool)
+    used[:, :64] = False  # all that is to the left
+    faces = {
+        face.face: face
+        for face in faces_of(encode_png(np.zeros((64, 128), np.uint8)), "p", 128, used)
+    }
+    assert set(faces) == set(FACES)
+    assert all(isinstance(face, PanoramaFace) for face in faces.values())
+    left, right, front = (faces[name].mask() for name in ("left", "right", "front"))
+    assert left is not None
+    assert not left.any()
+    assert right is None
+    assert front is not None
+    assert not front[:, :20].any()
+    assert front[:, 21:].all()
+
+
+def test_a_face_is_as_fine_as_the_photo_in_its_middle() -> None:
+    plain = replace(LENS, radial=(0.0, 0.0, 0.0, 0.0), fy=150.0)
+    faces = face_lenses(plain)
+    assert faces["front"].fx == pytest.approx(150.0, abs=0.5)
+    # A right angle off the axis a circle is pi / 2 focal lengths long per radian.
+    assert faces["left"].fx == pytest.approx(150.0 * np.pi / 2, abs=0.5)
+    # Half of each face beside is before the camera.
+    assert faces["left"].width == pytest.approx(faces["left"].height / 2, rel=0.06)
+    assert faces["up"].height == pytest.approx(faces["up"].width / 2, rel=0.06)
+
+
+def test_faces_that_show_hardly_anything_are_left_out() -> None:
+    assert set(face_lenses(replace(LENS, field_of_view_deg=60.0))) == {"front"}
+    assert set(face_lenses(replace(LENS, field_of_view_deg=92.0))) == {"front"}
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"fx": float("nan")}, "focal length nan, 151"),
+        ({"fy": 0.0}, "focal length 150, 0"),
+        ({"width": 40_000}, "a photo of 1 to 32766 columns and rows"),
+        ({"field_of_view_deg": 0.0}, "a field of view of 0 degrees"),
+        ({"field_of_view_deg": 360.0}, "a field of view of 360 degrees"),
+        ({"radial": (-0.3, 0.0, 0.0, 0.0)}, "it folds back 60"),
+        ({"radial": (float("inf"), 0.0, 0.0, 0.0)}, "focal length"),
+        ({"radial": (1e300, 0.0, 0.0, 0.0)}, "pixels per radian, at most 32766"),
+        ({"fx": 1e9, "fy": 1e9}, "pixels per radian, at most 32766"),
+        ({"cx": 1e5}, "it shows nothing inside the image"),
+    ],
+)
+def test_a_lens_that_is_none_says_why(change: dict[str, float], problem: str) -> None:
+    lens = replace(LENS, **change)  # type: ignore[arg-type]
+    assert problem in problem_of(lens)
+    with pytest.raises(InputError, match="the fisheye lens of photo a is none: "):
+        fisheye_faces(b"", "a", lens)
+
+
+def test_a_fold_outside_the_image_or_beyond_the_field_does_no_harm() -> None:
+    folding = replace(LENS, radial=(-0.3, 0.0, 0.0, 0.0))
+    assert problem_of(replace(folding, field_of_view_deg=110.0)) == ""
+    assert problem_of(replace(folding, width=140, height=140, cx=70.0, cy=70.0)) == ""
+
+
+def test_faces_say_what_their_photo_was() -> None:
+    (face, *_) = fisheye_faces(b"bytes", "a", LENS)
+    assert isinstance(face, FisheyeFace)
+    assert (face.photo, face.face, face.fisheye) == (b"bytes", "front", LENS)
