@@ -4,16 +4,14 @@
     python benchmarks/first_detection.py FOLDER [--methods plane.ransac ...] [--warm 2]
 
 Each method looks at the cloud of `FOLDER/1`, in a process that loads and compiles everything itself
-and then in processes that find its kernels compiled; each forked from one that has loaded numpy and
-scipy, as steps are, whose algebra then begins its threads anew. Printed are `first_plane_s` and
-`detection_s` as `StepContext.clock_s` gives them, but by the processor's clock: other work on the
-machine hardly moves that.
+and then in processes that find its kernels compiled. Printed are `first_plane_s` and `detection_s`
+as `StepContext.clock_s` gives them, but by the processor's clock: other work on the machine hardly
+moves that.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 import subprocess
 import sys
@@ -42,11 +40,7 @@ def main() -> None:
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.here:
-        importlib.import_module("scipy.linalg")
-        if os.fork() == 0:
-            print(measured(options.folder, options.methods[0]), flush=True)
-            os._exit(0)
-        os.wait()
+        print(measured(options.folder, options.methods[0]))
         return
     for method in options.methods:
         with tempfile.TemporaryDirectory() as kernels:

@@ -46,6 +46,9 @@ os.environ.setdefault(
     str(Path(tempfile.gettempdir()) / f"orthoflow-kernels-{os.getuid()}-{_kernels_digest()}"),
 )
 
+# What steps are told, for the processes of the tests, too: libraries read it when they are loaded.
+os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "20")
+
 # Containers set it to keep images small. Each command that a test starts would compile the sources
 # anew: 0.7 s instead of 0.5 to import what it needs.
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):

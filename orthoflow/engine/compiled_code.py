@@ -21,7 +21,7 @@ DONE: Final = ".foretold"
 
 
 def warm_folder() -> Path:
-    """Where kernels lie that every store of this user begins with: a folder per state of the code.
+    """Where kernels lie that every store of this user begins with: a folder per state of them.
 
     That is what `ORTHOFLOW_KERNELS` names, else a folder of the user's cache.
     """

@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import Final, cast
+from typing import Final, TypeAlias, cast
 
 from orthoflow.catalog import Catalog, MethodEntry
 from orthoflow.catalog.foreign_code import foreign_code
 from orthoflow.catalog.wording import describe_error
+from orthoflow.engine.kernel_sources import kernel_sources
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedFile
 from orthoflow.engine.store import canonical_json
 from orthoflow.errors import PluginError
@@ -33,6 +34,9 @@ _DISTRIBUTION: Final = "orthoflow-tls"
 # What a method's result can depend on in the framework; engine and command line cannot change it.
 _FRAMEWORK_PARTS: Final = ("errors.py", "files", "geometry", "products", "sdk")
 _BUILT_IN_PACKAGE: Final = "orthoflow_plugins"
+
+# Path, size and time of files.
+_States: TypeAlias = tuple[tuple[Path, int, int], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,19 +226,31 @@ def unreleased_code(entry: MethodEntry) -> dict[str, tuple[Path, ...]]:
 
 
 def compiled_digest(entry: MethodEntry) -> str:
-    """Digest of all code whose compiled kernels a method may use, one per plugin."""
-    both = files_digest(framework_files()) + files_digest(entry.source_files())
+    """Digest of all code that decides which kernels a method may use, one per plugin."""
+    own, framework = entry.source_files(), framework_files()
+    is_ours = entry.spec.target.startswith(f"{_BUILT_IN_PACKAGE}.")
+    sources = _kernel_sources(_states({*own, *framework}), () if is_ours else own)
+    both = files_digest(sources.intersection(framework)) + files_digest(sources.intersection(own))
     return hashlib.sha256(both.encode()).hexdigest()
+
+
+@lru_cache(maxsize=64)
+def _kernel_sources(files: _States, strangers: tuple[Path, ...]) -> frozenset[Path]:
+    return kernel_sources([path for path, _, _ in files], strangers)
 
 
 def files_digest(files: Iterable[Path]) -> str:
     """Digest of files with their names; computed once for as long as they stay as they are."""
+    return _digest(_states(files))
+
+
+def _states(files: Iterable[Path]) -> _States:
     stats = ((path, path.stat()) for path in sorted(files))
-    return _digest(tuple((path, stat.st_size, stat.st_mtime_ns) for path, stat in stats))
+    return tuple((path, stat.st_size, stat.st_mtime_ns) for path, stat in stats)
 
 
 @lru_cache(maxsize=256)
-def _digest(files: tuple[tuple[Path, int, int], ...]) -> str:
+def _digest(files: _States) -> str:
     digest = hashlib.sha256()
     root = os.path.commonpath([path.parent for path, _, _ in files]) if files else ""
     for path, _, _ in files:
