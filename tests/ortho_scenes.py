@@ -16,14 +16,13 @@ from orthoflow.files.images import encode_png
 from orthoflow.geometry import WallFrame, wall_axes
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
 from orthoflow.products import (
-    Camera,
     Cameras,
-    Intrinsics,
     Photo,
     Photos,
     PointCloud,
     Walls,
 )
+from orthoflow.testing import photographed as ms
 from tests import samples
 from tests.raster_scenes import SURVEY, UP, cloud_of
 
@@ -155,18 +154,7 @@ def photos(*pictures: NDArray[np.uint8]) -> Photos:
 
 def cameras(*viewers: ViewingCamera) -> Cameras:
     """Orientations of photos 0.png, 1.png ..."""
-    return Cameras(
-        cameras=tuple(
-            Camera(
-                photo=f"{k}.png",
-                status="ok",
-                intrinsics=Intrinsics.of(viewer),
-                rotation_camera_from_world=viewer.rotation,
-                translation_camera_from_world=viewer.translation,
-            )
-            for k, viewer in enumerate(viewers)
-        )
-    )
+    return ms.cameras(*(ms.oriented(viewer, name=f"{k}.png") for k, viewer in enumerate(viewers)))
 
 
 def depth_m() -> NDArray[np.float32]:

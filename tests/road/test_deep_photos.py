@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoflow.files.publishing import publish_cameras
 from orthoflow.geometry.cameras import ViewingCamera
-from orthoflow.products import Camera, Cameras, Intrinsics
+from orthoflow.testing import photographed as ms
 from tests import samples
 from tests.road.conftest import Shell
 
@@ -74,14 +74,7 @@ def site(tmp_path: Path, store: Path) -> Shell:
     (tmp_path / "photos").mkdir()
     deep = ramp(viewer)[..., ::-1]
     assert cv2.imwrite(str(tmp_path / "photos" / "a.tif"), np.ascontiguousarray(deep))
-    camera = Camera(
-        photo="a.tif",
-        status="ok",
-        intrinsics=Intrinsics.of(viewer),
-        rotation_camera_from_world=viewer.rotation,
-        translation_camera_from_world=viewer.translation,
-    )
-    publish_cameras(Cameras(cameras=(camera,)), tmp_path, "sha256:0")
+    publish_cameras(ms.cameras(ms.oriented(viewer, name="a.tif")), tmp_path, "sha256:0")
     (tmp_path / "deep.yaml").write_text(WORKFLOW)
     return Shell(tmp_path, store)
 

@@ -9,7 +9,8 @@ import pytest
 from orthoflow_plugins.inspect.image_quality import cells_per_pixel, stretch_findings
 
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Camera, Cameras, Intrinsics, Orthoimage, Wall
+from orthoflow.products import Orthoimage, Wall
+from orthoflow.testing import photographed as ms
 from tests import samples
 
 SIDE = 40
@@ -38,27 +39,18 @@ def image() -> Orthoimage:
     return samples.orthoimage(FRAME, name="wall", rgb=np.zeros((*FRAME.shape, 3), dtype=np.uint8))
 
 
-def camera(turn_deg: float, cells_per_pixel: float) -> tuple[Intrinsics, ViewingCamera]:
+def camera(turn_deg: float, cells_per_pixel: float) -> ViewingCamera:
     """Far away, so that the view is nearly parallel; to the right of the wall's normal."""
     turn = math.radians(turn_deg)
     centre = MIDDLE + DISTANCE_M * np.array([math.sin(turn), -math.cos(turn), 0.0])
-    rotation = looking_at(centre, MIDDLE, UP)
-    inner = Intrinsics(
-        fx=DISTANCE_M / (cells_per_pixel * GSD_M),
-        fy=DISTANCE_M / (cells_per_pixel * GSD_M),
-        cx=500.0,
-        cy=500.0,
-        distortion=(0.0, 0.0, 0.0, 0.0, 0.0),
-        width=1000,
-        height=1000,
-        source="calibration",
-    )
-    return inner, inner.posed(rotation, -rotation @ centre)
+    focal = DISTANCE_M / (cells_per_pixel * GSD_M)
+    lens = {"fx": focal, "fy": focal, "cx": 500.0, "cy": 500.0, "width": 1000, "height": 1000}
+    return samples.camera(looking_at(centre, MIDDLE, UP), centre, **lens)
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 30.0, 60.0])
 def test_a_flat_wall_is_stretched_by_the_cosine_of_the_view(turn_deg: float) -> None:
-    _, viewing = camera(turn_deg, 0.7)
+    viewing = camera(turn_deg, 0.7)
     spread = cells_per_pixel(image(), wall(np.zeros(FRAME.shape)), ("a.jpg", viewing))
     assert len(spread) == SIDE * SIDE
     # The wall is 0.4 m wide and 100 m away: 0.4 % of perspective.
@@ -70,7 +62,7 @@ def test_a_slope_is_stretched_by_its_own_view(slope_deg: float, turn_deg: float)
     # Stepping one cell to the right and tan(slope) forward moves cos(turn) - tan(slope) sin(turn)
     # cells along the photo, which is taken from the right.
     columns = np.arange(SIDE) * GSD_M * math.tan(math.radians(slope_deg))
-    _, viewing = camera(turn_deg, 1.0)
+    viewing = camera(turn_deg, 1.0)
     spread = cells_per_pixel(image(), wall(np.tile(columns, (SIDE, 1))), ("a.jpg", viewing))
     turn = math.radians(turn_deg)
     shown = math.cos(turn) - math.tan(math.radians(slope_deg)) * math.sin(turn)
@@ -81,7 +73,7 @@ def test_a_slope_is_stretched_by_its_own_view(slope_deg: float, turn_deg: float)
 def test_a_depth_step_is_no_slope() -> None:
     depth = np.zeros(FRAME.shape)
     depth[:, SIDE // 2 :] = 0.5
-    _, viewing = camera(45.0, 1.0)
+    viewing = camera(45.0, 1.0)
     spread = cells_per_pixel(image(), wall(depth), ("a.jpg", viewing))
     np.testing.assert_allclose(spread, math.sqrt(2.0), rtol=2e-2)
 
@@ -91,15 +83,7 @@ def test_shares_count_cells_of_pixels_over_two_and_over_five_cells() -> None:
     depth = np.zeros(FRAME.shape)
     depth[:, 10:20] = np.arange(10) * GSD_M * 3.0
     depth[:, 20:] = depth[0, 19]
-    inner, viewing = camera(45.0, 1.5)
-    known = Camera(
-        photo="a.jpg",
-        status="ok",
-        intrinsics=inner,
-        rotation_camera_from_world=viewing.rotation,
-        translation_camera_from_world=viewing.translation,
-    )
-    cameras = Cameras(cameras=(known,))
+    cameras = ms.cameras(ms.oriented(camera(45.0, 1.5), name="a.jpg"))
     found = {f.name: f.value for f in stretch_findings(image(), wall(depth), cameras)}
     # 1.5 cells over cos 45 are 2.1: everything is stretched, the slope is smeared.
     assert found["stretch_share"] == 1.0
