@@ -100,11 +100,13 @@ def load_workflow(
 
 def _read_text(path: Path, what: str = "a workflow file") -> str:
     try:
-        content = path.read_bytes()
+        # No more than is looked at: what was named by mistake may be a scan, or a device.
+        with path.open("rb") as stream:
+            content = stream.read(MOST_BYTES + 1)
     except OSError as error:
         raise WorkflowError(f"{path} cannot be read: {error.strerror}") from error
     if len(content) > MOST_BYTES:
-        raise WorkflowError(f"{path} has {len(content)} bytes; {what} has at most {MOST_BYTES}")
+        raise WorkflowError(f"{path} is too large: {what} has at most {MOST_BYTES} bytes")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -11,6 +11,7 @@ import pytest
 from orthoflow.catalog import Catalog
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.workflow import (
+    InvalidArgumentsError,
     InvalidWorkflowError,
     UnusablePluginError,
     load_workflow,
@@ -144,6 +145,12 @@ def test_a_file_of_megabytes_is_refused_before_it_is_parsed(catalog: Catalog, wr
     write.write_text("a" * 2_000_000)
     with pytest.raises(WorkflowError, match="a workflow file has at most 400000"):
         load_workflow(write, catalog)
+
+
+def test_of_a_device_no_more_is_read_than_a_file_may_have(catalog: Catalog, write: Path) -> None:
+    write.write_text(GOOD)
+    with pytest.raises(InvalidArgumentsError, match="/dev/zero is too large: a file of parameters"):
+        load_workflow(write, catalog, set_files=["/dev/zero"])
 
 
 @pytest.mark.parametrize("name", ["nowhere.yaml", "folder"])
