@@ -338,11 +338,9 @@ def _overview(run: Run, prefix: str, place: _Place, *, share: float) -> _Section
 def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
     # The baseline's stand first: they are what the numbers beside them are of.
     baseline = {cell.address for cell in baseline_cells(run)}
-    orthoimages = sorted(
-        orthoimage_pictures(run, share=share), key=lambda picture: picture.cell not in baseline
-    )
-    walls = sorted(
-        wall_pictures(run, share=share), key=lambda picture: picture.cell not in baseline
+    orthoimages, walls = (
+        sorted(pictures(run, share=share), key=lambda picture: picture.cell not in baseline)
+        for pictures in (orthoimage_pictures, wall_pictures)
     )
     # Files are named from where the page will lie.
     from_page = Path(os.path.relpath(run.folder, place.folder))
@@ -355,21 +353,11 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         for index, picture in enumerate([*orthoimages, *walls])
     ]
     orthoimages, walls = numbered[: len(orthoimages)], numbered[len(orthoimages) :]
-    grounds = {(picture.cell, picture.wall): picture.id for picture in reversed(walls)}
     every = _Part(
         cells=tuple(cell for cell in run.record.cells if cell.repeat == 0),
         orthoimages=tuple(orthoimages),
         walls=tuple(walls),
-        overlays=tuple(
-            _Ground(
-                svg=Markup(overlay.svg),
-                title=overlay.title,
-                caption=overlay.caption,
-                ground=grounds.get((overlay.walls_cell, overlay.wall), ""),
-                cell=overlay.cell,
-            )
-            for overlay in overlays(run, walls, share=share)
-        ),
+        overlays=_grounded(run, walls, share=share),
         planes=tuple(plane_tables(run)),
         figures=figure_groups(run, share=share, with_files=place.has_figures),
     )
@@ -401,6 +389,21 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         },
         title=place.title if place.whole else run.record.name,
         whole=place.whole,
+    )
+
+
+def _grounded(run: Run, walls: Sequence[Picture], *, share: float) -> tuple[_Ground, ...]:
+    """What is drawn over pictures of walls, each with the picture that it lies over."""
+    grounds = {(picture.cell, picture.wall): picture.id for picture in reversed(walls)}
+    return tuple(
+        _Ground(
+            svg=Markup(overlay.svg),
+            title=overlay.title,
+            caption=overlay.caption,
+            ground=grounds.get((overlay.walls_cell, overlay.wall), ""),
+            cell=overlay.cell,
+        )
+        for overlay in overlays(run, walls, share=share)
     )
 
 

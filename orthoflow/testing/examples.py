@@ -104,17 +104,6 @@ def example_room(
         corners.append(_corners(turn @ normal, distance, size[span]) + origin)
     offsets_m = np.concatenate(points).astype(np.float32)
     grey = rng.integers(60, 200, (len(offsets_m), 1)).astype(np.uint8)
-    cloud = PointCloud(
-        origin=origin,
-        x=np.ascontiguousarray(offsets_m[:, 0]),
-        y=np.ascontiguousarray(offsets_m[:, 1]),
-        z=np.ascontiguousarray(offsets_m[:, 2]),
-        up=up_vector("z"),
-        intensity=(grey[:, 0] / 255.0).astype(np.float32),
-        rgb=np.repeat(grey, 3, axis=1),
-        stations=origin[None, :].copy(),
-        stations_source="file",
-    )
     planes = Planes(
         normal=normals @ turn.T,
         offset=np.array(offsets),
@@ -126,7 +115,23 @@ def example_room(
         names=("wall 0", "wall 1", "wall 2", "wall 3", "floor 4", "ceiling 5"),
         viewpoint="stations",
     )
-    return cloud, planes
+    return _grey_cloud(offsets_m, grey, origin), planes
+
+
+def _grey_cloud(
+    offsets_m: NDArray[np.float32], grey: NDArray[np.uint8], origin: NDArray[np.float64]
+) -> PointCloud:
+    return PointCloud(
+        origin=origin,
+        x=np.ascontiguousarray(offsets_m[:, 0]),
+        y=np.ascontiguousarray(offsets_m[:, 1]),
+        z=np.ascontiguousarray(offsets_m[:, 2]),
+        up=up_vector("z"),
+        intensity=(grey[:, 0] / 255.0).astype(np.float32),
+        rgb=np.repeat(grey, 3, axis=1),
+        stations=origin[None, :].copy(),
+        stations_source="file",
+    )
 
 
 def few_points(coordinates: NDArray[np.float64]) -> PointCloud:

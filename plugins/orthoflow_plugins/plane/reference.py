@@ -170,11 +170,20 @@ def lay_references(
         fit_m=tolerance_m,
     )
     ordered = [references[at] for at in order.tolist()]
+    planes = _planes(ordered, cloud, deviations, tolerance_m)
+    n_guessed = sum(reference.viewpoint == "guess" for reference in ordered)
+    _report(ctx, planes, deviations, n_points=len(cloud), n_guessed=n_guessed)
+    return planes
+
+
+def _planes(
+    ordered: Sequence[Reference], cloud: PointCloud, deviations: Deviations, tolerance_m: float
+) -> Planes:
     normals = np.array([reference.plane.normal for reference in ordered])
     corners_m = np.array([reference.corners_m for reference in ordered])
     n_parts = [len(reference.part_corners_m) for reference in ordered]
     viewpoints = [reference.viewpoint for reference in ordered]
-    planes = Planes(
+    return Planes(
         normal=normals,
         offset=np.array(
             [
@@ -194,8 +203,6 @@ def lay_references(
         viewpoint="guess" if "guess" in viewpoints else viewpoints[0],
         tolerance_m=tolerance_m,
     )
-    _report(ctx, planes, deviations, n_points=len(cloud), n_guessed=viewpoints.count("guess"))
-    return planes
 
 
 def _slab(reference: Reference, cloud: PointCloud) -> NDArray[np.float64]:
