@@ -110,7 +110,7 @@ def test_an_example_installs_and_passes_its_tests(name: str, tmp_path: Path) -> 
     folder = tmp_path / name
     shutil.copytree(EXAMPLES / name, folder)
     succeed(folder, python, "-m", "pip", "install", "-q", ".")
-    succeed(folder, python, "-m", "pytest", "-q", "-p", "no:dash")
+    succeed(folder, python, "-m", "pytest", "-q")
 
 
 @pytest.mark.long

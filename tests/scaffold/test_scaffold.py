@@ -165,7 +165,7 @@ def test_a_new_plugin_installs_and_passes_its_tests_at_once(
             tmp_path / f"own-{kind}",
             [*run, "pip", "install", "-q", "--no-deps", "-e", "."],
         ),
-        (tmp_path / f"own-{kind}", [*run, "pytest", "-q", "-p", "no:dash", "-W", "error"]),
+        (tmp_path / f"own-{kind}", [*run, "pytest", "-q", "-W", "error"]),
     ]
     variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     for folder, command in steps:
