@@ -46,7 +46,10 @@ def run_diagram(run: Run, *, stands_alone: bool = False) -> str:
         stands_alone: give the text of an SVG file; on the page its style sheet colours the parts.
     """
     boxes = _boxes(run)
-    levels = _levels({name: box.before for name, box in boxes.items()})
+    loose = _loose(boxes)
+    levels = _levels({name: box.before for name, box in boxes.items() if name not in loose})
+    # For want of an input nobody takes part in them: rows of their own, behind the others.
+    levels += [loose[k : k + _ABREAST_MOST] for k in range(0, len(loose), _ABREAST_MOST)]
     is_down = max((len(names) for names in levels), default=0) <= _ABREAST_MOST
     places = _lay_out(levels, is_down=is_down)
     width = max(place.x for place in places.values()) + _BOX_WIDTH + 2 if places else 0
@@ -98,6 +101,16 @@ def _boxes(run: Run) -> dict[str, _Box]:
         )
         for name, cells in groups.items()
     }
+
+
+def _loose(boxes: Mapping[str, _Box]) -> list[str]:
+    """Boxes that were skipped, take nothing and hand nothing on."""
+    taken = {before for box in boxes.values() for before in box.before}
+    return [
+        name
+        for name, box in boxes.items()
+        if box.state == "skipped" and not box.before and name not in taken
+    ]
 
 
 def _cells_before(run: Run, cell: RecordedCell) -> list[str]:

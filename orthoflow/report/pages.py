@@ -358,7 +358,7 @@ def _section(run: Run, prefix: str, place: _Place, *, share: float) -> _Section:
         orthoimages=tuple(orthoimages),
         walls=tuple(walls),
         overlays=_grounded(run, walls, share=share),
-        planes=tuple(plane_tables(run)),
+        planes=plane_tables(run),
         figures=figure_groups(run, share=share, with_files=place.has_figures),
     )
     main = baseline_addresses(run)

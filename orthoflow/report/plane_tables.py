@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,16 +41,35 @@ class MaterialRow:
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneTable:
-    """The planes of one cell."""
+    """The planes of one cell.
+
+    Attributes:
+        cell: address of the cell.
+        viewpoint: where the side of the viewer comes from.
+        rows: a row per plane.
+        materials: thickness by place and material.
+        later: cells that hand the same planes on.
+    """
 
     cell: str
     viewpoint: str
     rows: tuple[PlaneRow, ...]
     materials: tuple[MaterialRow, ...]
+    later: tuple[str, ...] = ()
 
 
-def plane_tables(run: Run) -> Iterator[PlaneTable]:
-    """The planes of every cell that found some; equal planes of several cells once."""
+def plane_tables(run: Run) -> tuple[PlaneTable, ...]:
+    """The planes of every cell that found some; those that print alike once."""
+    found: dict[tuple[str, tuple[PlaneRow, ...], tuple[MaterialRow, ...]], PlaneTable] = {}
+    for told in _told(run):
+        key = (told.viewpoint, told.rows, told.materials)
+        first = found.setdefault(key, told)
+        if first is not told:
+            found[key] = replace(first, later=(*first.later, told.cell))
+    return tuple(found.values())
+
+
+def _told(run: Run) -> Iterator[PlaneTable]:
     places = embedded_products(run, "planes")
     for (address, _), payload in zip(places, run.payloads(places), strict=True):
         planes = Planes.from_payload(payload)

@@ -65,3 +65,22 @@ def test_thickness_and_materials_stand_in_the_tables() -> None:
             place="row 7 of scan 1, wall 0", material="plaster", n_points=90, thickness_mm=1.0
         ),
     )
+
+
+def test_planes_that_a_later_step_hands_on_stand_there_once() -> None:
+    planes = wall_and_floor()
+    moved = replace(planes, offset=np.array([-2.5, 0.0]))
+    seen = {"plane": planes, "sides": planes, "turned": replace(planes, viewpoint="photos")}
+    seen |= {"moved": moved}
+    cells = [
+        cell(name, outputs={"planes": given("", digest, "planes")})
+        for name, digest in zip(seen, "abcd", strict=True)
+    ]
+    products = {(name, "planes"): product for name, product in seen.items()}
+    tables = plane_tables(HeldRun(path=Path("run.h5"), record=record(cells), products=products))
+    told = [(table.cell, table.later, table.viewpoint) for table in tables]
+    assert told == [
+        ("plane", ("sides",), "stations"),
+        ("turned", (), "photos"),
+        ("moved", (), "stations"),
+    ]

@@ -411,6 +411,16 @@ def test_a_level_too_wide_for_a_page_is_drawn_from_left_to_right() -> None:
     assert '<path class="arrow" d="M221,24 C251,24 235,24 265,24"/>' in drawn
 
 
+def test_what_was_skipped_for_want_of_an_input_stands_below_and_widens_nothing() -> None:
+    cloud = given("scan.cloud", "1", "cloud")
+    skipped = [cell(f"read{index}", status="skipped") for index in range(7)]
+    drawn = run_diagram(run(cell("scan"), *skipped, cell("plane", inputs={"cloud": cloud})))
+    # Two levels and, of seven, rows of five and two.
+    assert drawn.startswith('<svg viewBox="0 0 1175 319" width="1175"')
+    tops = [drawn.count(f'y="{top}" width="220"') for top in (1, 91, 181, 271)]
+    assert tops == [1, 1, 5, 2]
+
+
 @pytest.mark.parametrize(("n_cells", "n_boxes"), [(24, 24), (25, 1)])
 def test_more_than_two_dozen_cells_become_a_box_per_step(n_cells: int, n_boxes: int) -> None:
     cells = [cell(f"plane@plane=v{k}", status="failed" if k < 3 else "ok") for k in range(n_cells)]
