@@ -23,7 +23,7 @@ from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.cli.options import Changes
 from orthoflow.cli.program import program
 from orthoflow.errors import OrthoflowError
-from orthoflow.files.calibration import intrinsics_for, read_calibration
+from orthoflow.files.calibration import lens_for, read_calibration
 from orthoflow.workflow import load_workflow
 from tests.documented import (
     ROOT,
@@ -304,7 +304,7 @@ def test_every_piece_of_a_workflow_is_one(catalog: Catalog, readers_folder: Path
 def test_the_calibration_of_the_readme_is_read(readers_folder: Path) -> None:
     (block,) = blocks(ROOT / "README.md", "yaml", start="cameras:")
     (readers_folder / "shown.yaml").write_text(block)
-    lens = intrinsics_for(read_calibration(readers_folder / "shown.yaml"), "IMG_1.jpg", 6000, 4000)
+    lens = lens_for(read_calibration(readers_folder / "shown.yaml"), "IMG_1.jpg", 6000, 4000)
     assert lens is not None
     assert lens.fx == 4210.5
 
