@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.opencv_border import from_opencv
+from orthoflow.geometry.threads import in_order
 from orthoflow_plugins.inspect.patches import (
     PATCH_CELLS,
     GreyImage,
@@ -56,6 +57,12 @@ class KeyPairs:
         return len(self.places)
 
 
+def no_pairs() -> KeyPairs:
+    """Give the pairs of pictures in which nothing was looked for."""
+    nothing = np.zeros((0, 2))
+    return KeyPairs(places=nothing, shift=nothing, found=nothing, n_points=(0, 0), n_matched=0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _KeyPoints:
     """SURF key points: places (n, 2), scale (n,), sign of the Laplacian (n,), descriptors."""
@@ -66,7 +73,9 @@ class _KeyPoints:
     descriptors: NDArray[np.float64]
 
 
-def find_key_pairs(shown: GreyImage, reference: GreyImage, *, radius_cells: float) -> KeyPairs:
+def find_key_pairs(
+    shown: GreyImage, reference: GreyImage, *, radius_cells: float, threads: int = 1
+) -> KeyPairs:
     """Find pairs within a radius.
 
     Both pictures are levelled to one contrast in their surroundings first, because laser and
@@ -78,14 +87,19 @@ def find_key_pairs(shown: GreyImage, reference: GreyImage, *, radius_cells: floa
         shown: the picture to judge.
         reference: what it should show.
         radius_cells: largest distance that is looked for.
+        threads: the pairs do not hang on their number.
     """
-    first, second = _levelled(shown), _levelled(reference)
-    points = (_key_points(first), _key_points(second))
+    first, second = in_order(_levelled, (shown, reference), threads=threads)
+    points = tuple(in_order(_key_points, (first, second), threads=threads))
     matches = _matches(points[0], points[1], radius_cells)
     places = points[0].places[matches[:, 0]]
     found = places - points[1].places[matches[:, 1]]
     refined = refine_shifts(
-        first, second, unrefined(np.round(places), found), sigma_most_cells=_SIGMA_MOST_CELLS
+        first,
+        second,
+        unrefined(np.round(places), found),
+        sigma_most_cells=_SIGMA_MOST_CELLS,
+        threads=threads,
     )
     alike = refined.correlation >= _LEAST_CORRELATION
     places, shift = refined.centre[alike], refined.shift[alike]

@@ -9,6 +9,8 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.threads import in_order
+
 PATCH_CELLS: Final = 32
 _SMOOTH_CELLS: Final = 1.0
 _LEAST_SHARE: Final = 0.3
@@ -114,7 +116,7 @@ def measure_shifts(shown: GreyImage, true: GreyImage, *, reach_cells: int) -> Pa
     start = _whole_cell_shifts(first, second, reach_cells)
     if len(start.centre) == 0:
         return start
-    return _refined(first, second, start, _SIGMA_LIMIT_CELLS, math.inf)
+    return _refined(first, _Sampler(second), start, _SIGMA_LIMIT_CELLS, math.inf)
 
 
 def refine_shifts(
@@ -124,6 +126,7 @@ def refine_shifts(
     *,
     sigma_most_cells: float,
     focus_cells: float = math.inf,
+    threads: int = 1,
 ) -> PatchShifts:
     """Refine displacements that are known to a cell or two, patch by patch.
 
@@ -134,23 +137,22 @@ def refine_shifts(
             displaced at first.
         sigma_most_cells: patches measured less exactly are left out.
         focus_cells: cells count by a Gaussian of this width about the patch's middle.
+        threads: so many parts of the patches are refined at once, each as if it were alone.
 
     Returns:
         The patches that converge within two cells of the start.
     """
-    first, second = _smoothed(shown), _smoothed(true)
-    parts = [
-        _refined(
-            first,
-            second,
-            unrefined(start.centre[k : k + _AT_ONCE], start.shift[k : k + _AT_ONCE]),
-            sigma_most_cells,
-            focus_cells,
-        )
-        for k in range(0, len(start.centre), _AT_ONCE)
-    ]
-    if not parts:
+    if not len(start.centre):
         return start
+    first, second = in_order(_smoothed, (shown, true), threads=threads)
+    sampler = _Sampler(second)
+
+    def refined(begin: int) -> PatchShifts:
+        part = slice(begin, begin + _AT_ONCE)
+        chosen = unrefined(start.centre[part], start.shift[part])
+        return _refined(first, sampler, chosen, sigma_most_cells, focus_cells)
+
+    parts = [*in_order(refined, range(0, len(start.centre), _AT_ONCE), threads=threads)]
     return PatchShifts(
         **{
             field.name: np.concatenate([getattr(part, field.name) for part in parts])
@@ -253,13 +255,12 @@ def _cut_patches(
 
 def _refined(
     shown: GreyImage,
-    true: GreyImage,
+    sampler: _Sampler,
     start: PatchShifts,
     sigma_most_cells: float,
     focus_cells: float,
 ) -> PatchShifts:
     patches = _cut_patches(shown, start.centre, focus_cells)
-    sampler = _Sampler(true)
     shift, step = start.shift.copy(), np.full(start.shift.shape, np.inf)
     sigma = np.full(start.shift.shape, np.inf)
     correlation = np.zeros(len(shift))

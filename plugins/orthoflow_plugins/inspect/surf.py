@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Final, Literal
 
 import numpy as np
@@ -29,7 +29,7 @@ from orthoflow_plugins.inspect.findings import (
     report,
 )
 from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
-from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs
+from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
 from orthoflow_plugins.inspect.patches import GreyImage
 from orthoflow_plugins.inspect.placing import on_walls, wall_of
 
@@ -110,7 +110,8 @@ class InspectSurf(Method):
         for place, image in enumerate(images if reason is None else ()):
             ctx.progress(place / len(images), image.name)
             wall = wall_of(image, inputs.walls)
-            verdicts.append(_compare(image, wall, inputs.cameras, params.radius_cells))
+            comparison = _Comparison(inputs.cameras, params.radius_cells, ctx.cores)
+            verdicts.append(comparison.of(image, wall))
         fit = [item for item in verdicts if len(item.pairs) >= _FEWEST_PAIRS]
         if reason is None and not fit:
             most = max(len(item.pairs) for item in verdicts)
@@ -138,8 +139,8 @@ class _Verdict:
     """The pairs of one wall, and those of its intensity with itself."""
 
     image: Orthoimage
-    pairs: KeyPairs
-    floor: KeyPairs
+    pairs: KeyPairs = field(default_factory=no_pairs)
+    floor: KeyPairs = field(default_factory=no_pairs)
     quality: tuple[Finding, ...] = ()
 
     def findings(self) -> list[Finding]:
@@ -183,53 +184,68 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
     return "the walls have neither intensity nor colour to compare with"
 
 
-def _compare(image: Orthoimage, wall: Wall, cameras: Cameras | None, radius: float) -> _Verdict:
-    if wall.intensity is None:
-        raise MethodError(f"{wall.name} has no intensity to compare with")
-    known = np.isfinite(wall.intensity)
-    picture = grey_of(image)
-    # Laser intensities span decades; their roots look more like what a camera sees.
-    intensity = GreyImage(
-        grey=255.0 * np.sqrt(np.where(known, np.maximum(wall.intensity, 0.0), 0.0)),
-        valid=known,
-        region=known,
-    )
-    pairs = find_key_pairs(picture, intensity, radius_cells=radius)
-    return _Verdict(
-        image=image,
-        pairs=pairs,
-        floor=_floor(intensity, radius),
-        quality=(
-            completeness(image, wall),
-            *quality_findings(image, wall, picture, cameras),
-        ),
-    )
+@dataclass(frozen=True)
+class _Comparison:
+    """How walls are compared: their cameras, the radius in cells, and so many threads."""
 
+    cameras: Cameras | None
+    radius: float
+    threads: int
 
-def _floor(intensity: GreyImage, radius: float) -> KeyPairs:
-    """Pairs of the intensity with itself laid aside, their errors as displacements."""
-    import cv2
+    def of(self, image: Orthoimage, wall: Wall) -> _Verdict:
+        """Give the pairs of a wall; nothing more where they are too few to say anything."""
+        if wall.intensity is None:
+            raise MethodError(f"{wall.name} has no intensity to compare with")
+        picture = grey_of(image)
+        if not picture.valid.any():
+            return _Verdict(image=image)
+        known = np.isfinite(wall.intensity)
+        # Laser intensities span decades; their roots look more like what a camera sees.
+        intensity = GreyImage(
+            grey=255.0 * np.sqrt(np.where(known, np.maximum(wall.intensity, 0.0), 0.0)),
+            valid=known,
+            region=known,
+        )
+        pairs = self._pairs(picture, intensity)
+        if len(pairs) < _FEWEST_PAIRS:
+            return _Verdict(image=image, pairs=pairs)
+        return _Verdict(
+            image=image,
+            pairs=pairs,
+            floor=self._floor(intensity),
+            quality=(
+                completeness(image, wall),
+                *quality_findings(image, wall, picture, self.cameras),
+            ),
+        )
 
-    # Some hundred pairs say what a floor is.
-    intensity = intensity.fullest_part(_FLOOR_CELLS)
-    right, down = _FLOOR_SHIFT_CELLS
-    rows, columns = intensity.grey.shape
-    move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
-    # Averaging two of four cells would smooth one image only; cubic keeps most of the detail.
-    grey = cv2.warpAffine(
-        intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC
-    )
-    whole = cv2.warpAffine(
-        intensity.valid.astype(np.float32), move, (columns, rows), flags=cv2.INTER_LINEAR
-    )
-    valid = np.asarray(whole) > 0.999
-    aside = GreyImage(grey=np.asarray(grey, dtype=np.float64), valid=valid, region=valid)
-    pairs = find_key_pairs(aside, intensity, radius_cells=radius)
-    return replace(
-        pairs,
-        shift=pairs.shift - _FLOOR_SHIFT_CELLS,
-        found=pairs.found - _FLOOR_SHIFT_CELLS,
-    )
+    def _pairs(self, shown: GreyImage, reference: GreyImage) -> KeyPairs:
+        return find_key_pairs(shown, reference, radius_cells=self.radius, threads=self.threads)
+
+    def _floor(self, intensity: GreyImage) -> KeyPairs:
+        """Pairs of the intensity with itself laid aside, their errors as displacements."""
+        import cv2
+
+        # Some hundred pairs say what a floor is.
+        intensity = intensity.fullest_part(_FLOOR_CELLS)
+        right, down = _FLOOR_SHIFT_CELLS
+        rows, columns = intensity.grey.shape
+        move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
+        # Averaging two of four cells would smooth one image only; cubic keeps most of the detail.
+        grey = cv2.warpAffine(
+            intensity.grey.astype(np.float32), move, (columns, rows), flags=cv2.INTER_CUBIC
+        )
+        whole = cv2.warpAffine(
+            intensity.valid.astype(np.float32), move, (columns, rows), flags=cv2.INTER_LINEAR
+        )
+        valid = np.asarray(whole) > 0.999
+        aside = GreyImage(grey=np.asarray(grey, dtype=np.float64), valid=valid, region=valid)
+        pairs = self._pairs(aside, intensity)
+        return replace(
+            pairs,
+            shift=pairs.shift - _FLOOR_SHIFT_CELLS,
+            found=pairs.found - _FLOOR_SHIFT_CELLS,
+        )
 
 
 def _numbers(items: list[_Verdict], wall: int, gsd_m: float) -> list[Finding]:

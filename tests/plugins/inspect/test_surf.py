@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_plugins.inspect import patches, surf
+from orthoflow_plugins.inspect.image_quality import grey_of
+from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
 from orthoflow_plugins.inspect.surf import InspectSurf
 
 from orthoflow.errors import MethodError
-from orthoflow.products import Inspection, Orthoimage, Orthoimages, Walls
+from orthoflow.products import Inspection, Orthoimage, Orthoimages, OrthoMask, Walls
 from orthoflow.sdk import StepContext
 from tests import inspect_scenes
 from tests.inspect_scenes import GSD_M, displaced
@@ -43,6 +46,38 @@ def test_a_displacement_is_told_to_a_tenth_of_a_cell(
         assert metrics[f"surf_floor_rmse_{axis}_mm"] > metrics[f"floor_rmse_{axis}_mm"]
     assert len(found.displacement_m) == metrics["n_pairs"]
     assert [figure.name for figure in context.figures] == ["wall_0_displacements"]
+
+
+def test_pairs_do_not_hang_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    # So that several parts are refined at once.
+    monkeypatch.setattr(patches, "_AT_ONCE", 20)
+    shown, true = grey_of(displaced(1.4, -0.6)), grey_of(displaced(0.0, 0.0))
+    one, two = (
+        find_key_pairs(shown, true, radius_cells=40.0, threads=threads) for threads in (1, 2)
+    )
+    assert len(one) >= 50
+    for name in ("places", "shift", "found"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_no_key_points_are_looked_for_where_nothing_is_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[object] = []
+
+    def find(*arguments: object, **_: object) -> KeyPairs:
+        looked.append(arguments)
+        return no_pairs()
+
+    monkeypatch.setattr(surf, "find_key_pairs", find)
+    image = displaced(0.0, 0.0)
+    blank = replace(image, mask=np.full_like(image.mask, OrthoMask.NONE))
+    metrics, _, context = inspect(tmp_path / "blank", blank, unfit="warn")
+    assert (metrics["n_walls_inspected"], looked) == (0.0, [])
+    assert "0 pairs of SURF key points in one wall" in context.warnings[0]
+    # Nor is a floor, where there are too few pairs for it to say anything.
+    inspect(tmp_path / "shown", image, unfit="warn")
+    assert len(looked) == 1
 
 
 def test_part_of_the_image_displaced_shows_beyond_twice_the_rmse(tmp_path: Path) -> None:
