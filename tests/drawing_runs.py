@@ -11,12 +11,15 @@ from orthoflow_provenance.writer import write_record
 
 from orthoflow.engine.file_digests import file_sha256
 from orthoflow.engine.store import digest_of
+from orthoflow.files.opening_files import publish_openings
 from orthoflow.files.publishing import publish_orthoimages, publish_planes, publish_walls
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.frames import frame_over
 from orthoflow.products import (
     CheckPoints,
     Inspection,
+    Opening,
+    Openings,
     Orthoimage,
     Orthoimages,
     OrthoMask,
@@ -99,9 +102,39 @@ def box_products() -> dict[str, Product]:
             buffer_behind_m=0.3,
         ),
         "mosaic": Orthoimages(images=(_image(frame),)),
+        "openings": box_openings(),
         "check": _inspection(frame),
         "points": _checkpoints(frame),
     }
+
+
+def box_openings() -> Openings:
+    """A niche of 0.8 x 1.2 m in the photographed wall, 0.5 m from its left edge and 0.6 from above.
+
+    Its second side was found in the photo, its third by nobody.
+    """
+    frame = wall_frame(box_planes())
+    places = np.array([[0.5, -0.6], [0.5, -1.8], [1.3, -1.8], [1.3, -0.6]])
+    return Openings(
+        openings=(
+            Opening(
+                wall=WALL,
+                wall_name=f"wall {WALL}",
+                kind="niche",
+                outline_m=places,
+                outline_world=frame.world_from_wall(places * [1.0, -1.0] / GSD_M),
+                side_sigma_m=np.array([0.003, 0.0015, np.nan, 0.003]),
+                side_source=np.array([0, 1, 2, 0], dtype=np.uint8),
+                depth_m=0.25,
+                area_m2=0.96,
+                width_m=0.8,
+                height_m=1.2,
+                sill_m=0.5,
+                seen_share=0.75,
+            ),
+        ),
+        walls=(WALL,),
+    )
 
 
 def publish_box(folder: Path) -> tuple[PublishedFile, ...]:
@@ -111,6 +144,7 @@ def publish_box(folder: Path) -> tuple[PublishedFile, ...]:
         ("plane", publish_planes),
         ("wall", publish_walls),
         ("mosaic", publish_orthoimages),
+        ("openings", publish_openings),
     ):
         into = folder / "products" / step
         into.mkdir(parents=True)
@@ -134,6 +168,7 @@ def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False
     taken = {
         "wall": {"planes": "plane"},
         "mosaic": {"walls": "wall"},
+        "openings": {"walls": "wall"},
         "check": {"orthoimages": "mosaic", "checkpoints": "points"},
     }
     cells = [
@@ -148,7 +183,7 @@ def write_drawing_run(folder: Path, *, gains: str = "none", differ: bool = False
             },
             outputs={given[step].type_name: given[step]},
         )
-        for step in ("points", "plane", "wall", "mosaic", "check")
+        for step in ("points", "plane", "wall", "openings", "mosaic", "check")
     ]
     made = record(cells, name="box", published=publish_box(folder), environments=())
     write_record(folder / "run.h5", made, shelf.find)

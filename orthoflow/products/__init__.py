@@ -3,6 +3,7 @@
 from orthoflow.products.cloud import PointCloud
 from orthoflow.products.input_files import InputFiles
 from orthoflow.products.inspections import CheckPoints, Finding, Inspection, TakenPhoto, Truth
+from orthoflow.products.openings import Opening, OpeningKind, Openings, OutlineSource
 from orthoflow.products.photographs import (
     Calibration,
     Camera,
@@ -53,9 +54,13 @@ __all__ = [
     "Layer",
     "LayerMask",
     "Layers",
+    "Opening",
+    "OpeningKind",
+    "Openings",
     "OrthoMask",
     "Orthoimage",
     "Orthoimages",
+    "OutlineSource",
     "Payload",
     "Photo",
     "Photos",

@@ -16,7 +16,7 @@ from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.sidecars import placed_raster, read_sidecar
 from orthoflow.geometry import WallFrame
-from orthoflow.products import CheckPoints, Inspection, Planes
+from orthoflow.products import CheckPoints, Inspection, Opening, Openings, Planes, Walls
 from orthoflow.records.published import published_files
 from orthoflow.records.runs import Run, record_errors
 from orthoflow.records.verification import require_unchanged
@@ -64,6 +64,7 @@ class RoomResults:
         planes: all planes, None where the record has none.
         checkpoints: surveyed points, None without.
         inspections: address -> displacements found in these pictures; its walls are numbers here.
+        openings: of these walls, by number, from the left.
     """
 
     address: str
@@ -71,6 +72,7 @@ class RoomResults:
     planes: Planes | None
     checkpoints: CheckPoints | None
     inspections: dict[str, Inspection]
+    openings: tuple[Opening, ...] = ()
 
 
 def content_digest(run: Run) -> str:
@@ -124,7 +126,25 @@ def room_results(run: Run, cell: str | None = None) -> RoomResults:
         planes=kept,
         checkpoints=CheckPoints.from_payload(run.payload(*points)) if points else None,
         inspections=inspections,
+        openings=_openings(run, upstream),
     )
+
+
+def _openings(run: Run, upstream: tuple[str, ...]) -> tuple[Opening, ...]:
+    """Those that the last cell found on the walls behind the pictures."""
+    walls = {
+        output.digest
+        for address in upstream
+        for output in run.cells[address].outputs.values()
+        if output.type_name == Walls.type_name
+    }
+    found: tuple[Opening, ...] = ()
+    for address, recorded in run.cells.items():
+        if walls & {item.digest for item in recorded.inputs.values()}:
+            for port, output in recorded.outputs.items():
+                if output.type_name == Openings.type_name and output.embedded:
+                    found = Openings.from_payload(run.payload(address, port)).openings
+    return tuple(sorted(found, key=lambda opening: opening.wall))
 
 
 def _pictured(run: Run, cell: str | None) -> str:

@@ -24,9 +24,12 @@ from orthoflow.products import (
     Layer,
     LayerMask,
     Layers,
+    Opening,
+    Openings,
     Orthoimage,
     Orthoimages,
     OrthoMask,
+    OutlineSource,
     Planes,
     PointCloud,
     PointLabels,
@@ -249,6 +252,33 @@ def _orthoimage(plane: int) -> Orthoimage:
     )
 
 
+@cache
+def _openings() -> Openings:
+    """The void of the first wall."""
+    wall = _walls().walls[0]
+    frame = wall.frame
+    rows, cols = frame.shape
+    top, bottom, left, right = rows // 3, rows // 2, cols // 2, 2 * cols // 3
+    cells = np.array([[left, top], [left, bottom], [right, bottom], [right, top]], dtype=np.float64)
+    size_m = frame.gsd_m * (cells[2] - cells[0])
+    opening = Opening(
+        wall=wall.plane_index,
+        wall_name=wall.name,
+        kind="no data",
+        outline_m=frame.gsd_m * cells * [1.0, -1.0],
+        outline_world=settled(frame.world_from_wall(cells)),
+        side_sigma_m=np.full(4, 1.0 / 64.0),
+        side_source=np.full(4, OutlineSource.DEPTH, dtype=np.uint8),
+        depth_m=None,
+        area_m2=float(size_m.prod()),
+        width_m=float(size_m[0]),
+        height_m=float(size_m[1]),
+        sill_m=frame.gsd_m * (rows - bottom),
+        seen_share=1.0,
+    )
+    return Openings(openings=(opening,), walls=(wall.plane_index,))
+
+
 SURVEYED: Final[Mapping[str, Callable[[], Product]]] = {
     "cloud": _cloud,
     "truth": _truth,
@@ -257,4 +287,5 @@ SURVEYED: Final[Mapping[str, Callable[[], Product]]] = {
     "walls": _walls,
     "layers": _layers,
     "orthoimages": _orthoimages,
+    "openings": _openings,
 }

@@ -77,6 +77,12 @@ def orthoflow_kinds() -> list[KindSpec]:
             outputs={"orthoimages": "orthoimages"},
         ),
         KindSpec(
+            name="segment",
+            summary="outline what is on the walls",
+            inputs={"walls": "walls", "cloud": "cloud", "orthoimages": "orthoimages"},
+            outputs={"openings": "openings"},
+        ),
+        KindSpec(
             name="inspect",
             summary="measure how good the orthoimages are",
             inputs={
@@ -88,6 +94,7 @@ def orthoflow_kinds() -> list[KindSpec]:
                 "planes": "planes",
                 "labels": "labels",
                 "cameras": "cameras",
+                "openings": "openings",
             },
             outputs={"inspection": "inspection"},
         ),
@@ -163,6 +170,12 @@ def orthoflow_products() -> list[ProductSpec]:
             target="orthoflow.products.walls:Orthoimages",
             summary="the finished orthoimages",
             publisher=f"{publish}:publish_orthoimages",
+        ),
+        ProductSpec(
+            type_name="openings",
+            target="orthoflow.products.openings:Openings",
+            summary="outlines of windows, doors and niches",
+            publisher="orthoflow.files.opening_files:publish_openings",
         ),
         ProductSpec(
             type_name="inspection",
@@ -315,6 +328,16 @@ def orthoflow_methods() -> list[MethodSpec]:
             id="mosaic.seams",
             target="orthoflow_plugins.mosaic.seams:MosaicSeams",
             summary="one orthoimage per wall from its layers",
+        ),
+        MethodSpec(
+            id="segment.openings",
+            target="orthoflow_plugins.segment.openings:SegmentOpenings",
+            summary="windows, doors and niches as outlines, by depth, lines of sight and picture",
+        ),
+        MethodSpec(
+            id="inspect.openings",
+            target="orthoflow_plugins.inspect.openings:InspectOpenings",
+            summary="compare outlines of openings with a simulated scene",
         ),
         MethodSpec(
             id="inspect.truth",

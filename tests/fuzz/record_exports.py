@@ -172,6 +172,7 @@ _TAKEN: Final[dict[str, Sequence[tuple[str, str]]]] = {
     "wall": (("plane", "planes"),),
     "orient": (("photos", "photos"),),
     "ortho": (("orient", "cameras"), ("photos", "photos")),
+    "openings": (("wall", "walls"),),
     "mosaic": (("wall", "walls"), ("ortho", "layers")),
     "check": (("mosaic", "orthoimages"), ("points", "checkpoints")),
 }

@@ -59,6 +59,7 @@ def test_words_tell_names_apart() -> None:
         ("n_rejected", "rejected_share"),
         ("rmse_x_mm", "rmse_x_cells"),
         ("rmse_y_mm", "rmse_y_cells"),
+        ("side_rmse_mm", "side_rmse_cells"),
         ("true_planes", "n_true_planes"),
         ("megapixels", "photo_megapixels"),
         ("void_*_share", "empty*_share"),

@@ -16,7 +16,7 @@ from orthoflow.products import Cameras, InputFiles, Product
 from orthoflow.testing import ConformanceCase, conformance_cases
 from orthoflow.testing.examples import example
 from orthoflow.testing.photographed import settled_camera
-from tests import inspect_scenes, ortho_scenes, photo_files
+from tests import inspect_scenes, ortho_scenes, photo_files, recess_scenes
 
 # Parameters that make a method quick on the suite's small examples; results stay meaningful.
 QUICK: dict[str, dict[str, object]] = {
@@ -99,6 +99,7 @@ SCENES: dict[str, Callable[[], Mapping[str, Product | InputFiles]]] = {
     "inspect.surf": inspect_scenes.surf_inputs,
     "inspect.checkpoints": inspect_scenes.checkpoint_inputs,
     "inspect.truth": inspect_scenes.truth_inputs,
+    "inspect.openings": recess_scenes.inputs,
     "register.similarity": inspect_scenes.register_inputs,
     "colour.photos": coloured_wall,
 }

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from orthoflow.cli.exports.choices import Choices
     from orthoflow.files.drawings.papers import Paper, Part, View
     from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines
-    from orthoflow.files.drawings.sheet_contents import SheetText, WallDrawing
+    from orthoflow.files.drawings.sheet_contents import MarkedArea, SheetText, WallDrawing
     from orthoflow.files.drawings.title_blocks import TitleBlock
     from orthoflow.products import Orthoimage
     from orthoflow.records import Run
@@ -88,6 +88,19 @@ def _drawing(
         scale=scale,
         grid_m=grid_m if math.isfinite(grid_m) else 0.0,
         interval_m=stretch_of(wall.rasters["depth"]).interval if "depth" in kinds else 0.0,
+        areas=_areas(results, wall),
+    )
+
+
+def _areas(results: RoomResults, wall: WallResult) -> tuple[MarkedArea, ...]:
+    """Openings of a wall, from the top-left corner of its raster."""
+    from orthoflow.files.drawings.sheet_contents import MarkedArea
+
+    corner_m = wall.frame.raster_corner_m
+    return tuple(
+        MarkedArea(text=opening.said, outline_m=(opening.outline_m - corner_m) * [1.0, -1.0])
+        for opening in results.openings
+        if opening.wall == wall.number
     )
 
 
@@ -176,7 +189,7 @@ def export_dxf(run: Run, folder: Path, chosen: Choices) -> str:
         image = f"wall_{wall.number}_ortho.png" if "ortho" in wall.rasters else ""
         if image:
             write_cad_picture(wall.rasters["ortho"], folder / image)
-        drawn.append(_drawn(wall, image))
+        drawn.append(_drawn(results, wall, image))
         write_wall_dxf(folder / f"wall_{wall.number}.dxf", drawn[-1], lines)
     if lines is None:
         return counted(len(walls), "wall")
@@ -198,7 +211,7 @@ def export_geojson(run: Run, folder: Path, chosen: Choices) -> str:
     lines = _lines(results)
     make_empty(folder)
     for wall in walls:
-        write_wall_geojson(folder / f"wall_{wall.number}.geojson", _drawn(wall, ""), lines)
+        write_wall_geojson(folder / f"wall_{wall.number}.geojson", _drawn(results, wall, ""), lines)
     for image in _images(run, results.address):
         if len(image.sources) > 1 and chosen.wall in {None, image.number}:
             write_seams_geojson(folder / f"wall_{image.number}_seams.geojson", image)
@@ -224,10 +237,10 @@ def _lines(results: RoomResults) -> RoomLines | None:
 
     if results.planes is None:
         return None
-    return room_lines(results.planes, results.checkpoints, results.inspections)
+    return room_lines(results.planes, results.checkpoints, results.inspections, results.openings)
 
 
-def _drawn(wall: WallResult, image: str) -> DrawnWall:
+def _drawn(results: RoomResults, wall: WallResult, image: str) -> DrawnWall:
     from orthoflow.files.drawings.room_lines import DrawnWall
 
     return DrawnWall(
@@ -236,6 +249,7 @@ def _drawn(wall: WallResult, image: str) -> DrawnWall:
         plane_index=wall.plane_index,
         frame=wall.frame,
         image=image,
+        openings=tuple(opening for opening in results.openings if opening.wall == wall.number),
     )
 
 
@@ -243,4 +257,5 @@ def _said(lines: RoomLines) -> str:
     return (
         f"{counted(len(lines.surfaces), 'plane')}, {counted(len(lines.edges), 'edge')}, "
         f"{counted(len(lines.corners), 'corner')}"
+        + (f", {counted(len(lines.openings), 'opening')}" if lines.openings else "")
     )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from orthoflow.errors import StoreError
 from orthoflow.files.drawings.room_lines import DrawnWall, Residuals, RoomLines, edges_of
 from orthoflow.foreign_text import shown
+from orthoflow.products import Opening
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
@@ -25,6 +26,7 @@ LAYERS: Final = {
     "PARTS": 9,
     "EDGES": 1,
     "CORNERS": 1,
+    "OPENINGS": 4,
     "OUTLINE": 5,
     "FACES": 252,
     "CHECKPOINTS": 6,
@@ -40,7 +42,7 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
     """Write a wall in the coordinates of its GeoTIFF, its picture in exact scale.
 
     Layers: IMAGE, FRAME of the cells, RECTANGLE of the plane's points, PARTS of it, EDGES to other
-    planes, CHECKPOINTS near it, RESIDUALS found on it (enlarged, as a text says).
+    planes, OPENINGS of it, CHECKPOINTS near it, RESIDUALS found on it (enlarged, as a text says).
 
     Raises:
         StoreError: it cannot be written.
@@ -53,6 +55,8 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
         definition = document.add_image_def(wall.image, (frame.width, frame.height))
         size = (frame.width * frame.gsd_m, frame.height * frame.gsd_m)
         space.add_image(definition, tuple(corners[1]), size, dxfattribs={"layer": "IMAGE"})
+    for opening in wall.openings:
+        _add_opening(space, opening, opening.outline_m)
     if lines is not None:
         if wall.plane_index is not None:
             _add_polygon(space, wall.place_m(lines.planes.corners[wall.plane_index]), "RECTANGLE")
@@ -80,8 +84,8 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
     """Write a room in the coordinates of its scan, with a coordinate system `wall_<k>` per wall.
 
     Layers: IMAGE of each wall in its place, RECTANGLE of each plane, PARTS, EDGES, CORNERS,
-    OUTLINE from above at the height of the floor, FACES of the walls between floor and ceiling,
-    CHECKPOINTS, RESIDUALS.
+    OPENINGS, OUTLINE from above at the height of the floor, FACES of the walls between floor and
+    ceiling, CHECKPOINTS, RESIDUALS.
 
     Raises:
         StoreError: it cannot be written.
@@ -100,6 +104,8 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
         space.add_line(tuple(begin), tuple(end), dxfattribs={"layer": "EDGES"})
     for corner in lines.corners:
         space.add_point(tuple(corner.point_world), dxfattribs={"layer": "CORNERS"})
+    for opening in lines.openings:
+        _add_opening(space, opening, opening.outline_world)
     _add_outline(space, lines)
     if lines.checkpoints is not None:
         _add_points(space, lines.checkpoints.names, lines.checkpoints.points_world)
@@ -155,6 +161,11 @@ def _add_outline(space: Modelspace, lines: RoomLines) -> None:
             space.add_polyline3d(points.tolist(), close=is_closed, dxfattribs=layer)
     for face in outline.faces_world:
         space.add_3dface(face.tolist(), dxfattribs={"layer": "FACES"})
+
+
+def _add_opening(space: Modelspace, opening: Opening, corners: NDArray[np.float64]) -> None:
+    _add_polygon(space, corners, "OPENINGS")
+    _add_text(space, opening.said, corners.mean(axis=0), "OPENINGS")
 
 
 def _add_polygon(space: Modelspace, corners: NDArray[np.float64], layer: str) -> None:

@@ -10,14 +10,14 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of
+from orthoflow.files.drawings.room_lines import DrawnWall, RoomLines, edges_of, numbered_openings
 from orthoflow.files.json_texts import json_bytes
 from orthoflow.files.polygons import outlines
-from orthoflow.files.sidecars import write_bytes
+from orthoflow.files.sidecars import numbers, write_bytes
 from orthoflow.geometry.adjoining import Edge
-from orthoflow.products import JsonValue, Orthoimage
+from orthoflow.products import JsonValue, Opening, Orthoimage, OutlineSource
 
-_Feature: TypeAlias = dict[str, JsonValue]
+Feature: TypeAlias = dict[str, JsonValue]
 _DIGITS: Final = 6
 _SEAM_CELLS_MOST: Final = 16_000_000
 
@@ -42,7 +42,8 @@ def write_wall_geojson(path: Path, wall: DrawnWall, lines: RoomLines | None) -> 
             near = np.flatnonzero(wall.near(lines.checkpoints.points_world))
             places = wall.place_m(lines.checkpoints.points_world[near])
             features += _points([lines.checkpoints.names[index] for index in near], places)
-    _write(path, features, wall.frame.map_crs)
+    features += [opening_feature(opening, place) for place, opening in enumerate(wall.openings)]
+    write_features(path, features, wall.frame.map_crs)
 
 
 def write_seams_geojson(path: Path, image: Orthoimage) -> None:
@@ -54,7 +55,7 @@ def write_seams_geojson(path: Path, image: Orthoimage) -> None:
     step = max(1, math.ceil(math.sqrt(image.source.size / _SEAM_CELLS_MOST)))
     source = np.ascontiguousarray(image.source[::step, ::step])
     corner_m = np.array(image.frame.raster_corner_m)
-    features: list[_Feature] = []
+    features: list[Feature] = []
     for index, rings in outlines(source):
         places = [
             (corner_m + step * image.frame.gsd_m * ring * [1.0, -1.0]).round(_DIGITS).tolist()
@@ -63,11 +64,11 @@ def write_seams_geojson(path: Path, image: Orthoimage) -> None:
         about: dict[str, JsonValue] = {"photo": image.sources[index], "wall": image.number}
         geometry: dict[str, JsonValue] = {"type": "Polygon", "coordinates": places}
         features.append({"type": "Feature", "properties": about, "geometry": geometry})
-    _write(path, features, image.frame.map_crs, indent=None)
+    write_features(path, features, image.frame.map_crs, indent=None)
 
 
 def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> None:
-    """Write a room in the coordinates of its scan: planes, edges, corners, outline, points."""
+    """Write a room in the coordinates of its scan: planes, edges, corners, outline, openings."""
     features = [
         _polygon(corners, {"kind": "rectangle", "plane": index, "name": lines.planes.names[index]})
         for index, corners in enumerate(lines.planes.corners)
@@ -87,7 +88,43 @@ def write_room_geojson(path: Path, lines: RoomLines, map_crs: str | None) -> Non
         )
     if lines.checkpoints is not None:
         features += _points(lines.checkpoints.names, lines.checkpoints.points_world)
-    _write(path, features, map_crs)
+    features += [
+        opening_feature(opening, place, in_world=True)
+        for place, opening in numbered_openings(lines.openings)
+    ]
+    write_features(path, features, map_crs)
+
+
+def opening_feature(opening: Opening, place: int, *, in_world: bool = False) -> Feature:
+    """Give an opening of a wall as a polygon, with all that is known of it.
+
+    Args:
+        opening: it.
+        place: among the openings of its wall, from the left.
+        in_world: in coordinates of the scan, x, y, z; else as the wall's GeoTIFF has them.
+    """
+    sources = [OutlineSource(source).name.lower() for source in opening.side_source.tolist()]
+    about: dict[str, JsonValue] = {
+        "kind": "opening",
+        "opening": opening.kind,
+        "wall": opening.wall,
+        "name": opening.wall_name,
+        "number": place,
+        "depth_m": _rounded(opening.depth_m),
+        "width_m": _rounded(opening.width_m),
+        "height_m": _rounded(opening.height_m),
+        "sill_m": _rounded(opening.sill_m),
+        "area_m2": _rounded(opening.area_m2),
+        "edge_sigma_m": _rounded(opening.edge_sigma_m),
+        "side_sigma_mm": numbers(np.round(1e3 * opening.side_sigma_m, 3)),
+        "side_source": list(sources),
+        "seen_share": _rounded(opening.seen_share),
+    }
+    return _polygon(opening.outline_world if in_world else opening.outline_m, about)
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, _DIGITS)
 
 
 def _about(edge: Edge, lines: RoomLines) -> Mapping[str, JsonValue]:
@@ -99,30 +136,49 @@ def _about(edge: Edge, lines: RoomLines) -> Mapping[str, JsonValue]:
     }
 
 
-def _points(names: Iterable[str], places: NDArray[np.float64]) -> list[_Feature]:
+def _points(names: Iterable[str], places: NDArray[np.float64]) -> list[Feature]:
     return [
         _feature("Point", place, {"kind": "check point", "name": name})
         for name, place in zip(names, places, strict=True)
     ]
 
 
-def _polygon(corners: NDArray[np.float64], about: Mapping[str, JsonValue]) -> _Feature:
+def _polygon(corners: NDArray[np.float64], about: Mapping[str, JsonValue]) -> Feature:
     """A ring that ends where it begins, as the format wants it."""
     return _feature("Polygon", np.vstack([corners, corners[:1]])[None], about)
 
 
 def _feature(
     kind: str, coordinates: NDArray[np.float64], about: Mapping[str, JsonValue]
-) -> _Feature:
+) -> Feature:
     places: JsonValue = np.round(coordinates, _DIGITS).tolist()
     geometry: dict[str, JsonValue] = {"type": kind, "coordinates": places}
     return {"type": "Feature", "properties": dict(about), "geometry": geometry}
 
 
-def _write(
-    path: Path, features: list[_Feature], map_crs: str | None, *, indent: int | None = 1
+def write_features(
+    path: Path,
+    features: list[Feature],
+    map_crs: str | None,
+    *,
+    indent: int | None = 1,
+    digest: str | None = None,
 ) -> None:
+    """Write a FeatureCollection.
+
+    Args:
+        path: the file.
+        features: in order.
+        map_crs: coordinate system; named in the file where it has an EPSG code.
+        indent: of the text; None for one line.
+        digest: of the product that it shows.
+
+    Raises:
+        StoreError: it cannot be written.
+    """
     content: dict[str, JsonValue] = {"type": "FeatureCollection", "name": path.stem}
+    if digest is not None:
+        content["product_digest"] = digest
     if map_crs is not None and map_crs.startswith("EPSG:"):
         # Not of RFC 7946, which knows degrees only, but what GIS programs read.
         name = f"urn:ogc:def:crs:EPSG::{map_crs.removeprefix('EPSG:')}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -21,7 +21,7 @@ from orthoflow.geometry.adjoining import (
     edges_between,
 )
 from orthoflow.geometry.outlines import RoomOutline
-from orthoflow.products import CheckPoints, Inspection, Planes
+from orthoflow.products import CheckPoints, Inspection, Opening, Planes
 
 # Residuals are drawn so much longer that those of this share of them have this length at most.
 _SHARE_PERCENT: Final = 95.0
@@ -60,6 +60,7 @@ class RoomLines:
         outline: of the room.
         checkpoints: surveyed points, None without.
         residuals: of inspections.
+        openings: of walls.
     """
 
     planes: Planes
@@ -69,6 +70,7 @@ class RoomLines:
     outline: RoomOutline
     checkpoints: CheckPoints | None
     residuals: tuple[Residuals, ...]
+    openings: tuple[Opening, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +83,7 @@ class DrawnWall:
         plane_index: its plane, None where it is unknown.
         frame: of its raster.
         image: file name of its picture, beside the drawing; empty without one.
+        openings: of it, from the left.
     """
 
     number: int
@@ -88,6 +91,7 @@ class DrawnWall:
     plane_index: int | None
     frame: WallFrame
     image: str = ""
+    openings: tuple[Opening, ...] = ()
 
     def place_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """X and Y (n, 2) of points (n, 3)."""
@@ -101,7 +105,10 @@ class DrawnWall:
 
 
 def room_lines(
-    planes: Planes, checkpoints: CheckPoints | None, inspections: dict[str, Inspection]
+    planes: Planes,
+    checkpoints: CheckPoints | None,
+    inspections: dict[str, Inspection],
+    openings: tuple[Opening, ...] = (),
 ) -> RoomLines:
     """Work out the lines of a room."""
     surfaces = surfaces_of(planes)
@@ -116,12 +123,21 @@ def room_lines(
         residuals=tuple(
             _residuals(address, inspection) for address, inspection in inspections.items()
         ),
+        openings=openings,
     )
 
 
 def edges_of(lines: RoomLines, plane_index: int | None) -> Sequence[Edge]:
     """Edges that lie on a plane."""
     return [edge for edge in lines.edges if plane_index in (edge.first, edge.second)]
+
+
+def numbered_openings(openings: Sequence[Opening]) -> Iterator[tuple[int, Opening]]:
+    """Openings with their places among those of their wall, as they come."""
+    counts: dict[int, int] = {}
+    for opening in openings:
+        counts[opening.wall] = counts.get(opening.wall, -1) + 1
+        yield counts[opening.wall], opening
 
 
 def _residuals(address: str, inspection: Inspection) -> Residuals:

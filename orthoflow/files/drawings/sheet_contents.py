@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthoflow.files.drawings.key_plans import KeyPlan
 from orthoflow.files.drawings.papers import Paper, Part, View
 from orthoflow.files.drawings.title_blocks import TitleBlock
@@ -46,6 +49,19 @@ class SheetText:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MarkedArea:
+    """An area that is outlined on the pictures of a wall.
+
+    Attributes:
+        text: written into it where it is wide enough, its parts (", ") below each other.
+        outline_m: (n, 2) metres to the right and down from the raster's top-left corner.
+    """
+
+    text: str
+    outline_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
 class WallDrawing:
     """A wall that is drawn, on one sheet or more.
 
@@ -58,6 +74,7 @@ class WallDrawing:
         scale: n of 1 : n.
         grid_m: distance of the crosses, 0 for none.
         interval_m: of the contours of depth.
+        areas: openings of the wall.
     """
 
     number: int
@@ -68,6 +85,7 @@ class WallDrawing:
     scale: int
     grid_m: float
     interval_m: float = 0.0
+    areas: tuple[MarkedArea, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

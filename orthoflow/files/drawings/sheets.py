@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import StoreError
 from orthoflow.files.drawings.papers import MARGIN_MM, Paper, View
-from orthoflow.files.drawings.pens import FONT, LABEL_MM, POINTS_PER_MM, THIN_MM, line, write_text
+from orthoflow.files.drawings.pens import (
+    FONT,
+    LABEL_MM,
+    POINTS_PER_MM,
+    THIN_MM,
+    font_points,
+    line,
+    write_text,
+)
 from orthoflow.files.drawings.printed_pictures import contours, picture_file, write_picture
 from orthoflow.files.drawings.sheet_columns import draw_column
 from orthoflow.files.drawings.sheet_contents import Axes, Sheet, WallDrawing
@@ -32,6 +40,7 @@ _THICK_MM: Final = 0.35
 _CROSS_MM: Final = 1.5
 _BEFORE: Final = (0.80, 0.25, 0.05)
 _BEHIND: Final = (0.05, 0.30, 0.75)
+_OPENING: Final = (0.0, 0.40, 0.45)
 
 
 def axes_of(frame: WallFrame, up: NDArray[np.float64] | None) -> Axes:
@@ -104,6 +113,7 @@ def _draw_view(canvas: Canvas, drawing: WallDrawing, view: View, picture: Path) 
     )
     if view.kind == "depth":
         _draw_contours(canvas, drawing, view)
+    _draw_areas(canvas, drawing, view)
     canvas.setStrokeColorRGB(0.0, 0.0, 0.0)
     if drawing.grid_m > 0.0:
         _draw_grid(canvas, drawing, view)
@@ -118,6 +128,45 @@ def _draw_contours(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
     for level, points in found:
         canvas.setStrokeColorRGB(*(_BEFORE if level > 0.0 else _BEHIND))
         line(canvas, [_on_paper(drawing, view, x, y) for x, y in points.tolist()], width_mm=0.13)
+
+
+def _draw_areas(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
+    """Outline openings, cut off where the picture ends."""
+    left, bottom = view.corner_mm
+    wide, high = (1e3 * edge / drawing.scale for edge in view.part.size_m)
+    canvas.saveState()
+    frame = canvas.beginPath()
+    frame.rect(*(POINTS_PER_MM * number for number in (left, bottom, wide, high)))
+    canvas.clipPath(frame, stroke=0, fill=0)
+    for area in drawing.areas:
+        outline = [_on_paper(drawing, view, x, y) for x, y in area.outline_m.tolist()]
+        # White below, so that the line is seen on any picture.
+        for colour, width_mm in (((1.0, 1.0, 1.0), 0.6), (_OPENING, 0.25)):
+            canvas.setStrokeColorRGB(*colour)
+            line(canvas, outline, width_mm=width_mm, is_closed=True)
+        xs, ys = zip(*outline, strict=True)
+        _write_inside(canvas, area.text, (min(xs), max(xs), max(ys)))
+    canvas.restoreState()
+
+
+def _write_inside(canvas: Canvas, text: str, limits_mm: tuple[float, float, float]) -> None:
+    """Write the parts of a text on white, from the top, where left and right are far enough."""
+    from reportlab.pdfbase.pdfmetrics import stringWidth
+
+    left, right, top = limits_mm
+    rows = shown(text).split(", ")
+    wide = max(stringWidth(row, FONT, font_points(LABEL_MM)) for row in rows) / POINTS_PER_MM
+    if right - left < wide + 2.0 * LABEL_MM:
+        return
+    high = 1.7 * LABEL_MM * len(rows)
+    box = (left + 0.5 * LABEL_MM, top - high - LABEL_MM, wide + LABEL_MM, high + 0.5 * LABEL_MM)
+    canvas.setFillColorRGB(1.0, 1.0, 1.0)
+    canvas.rect(*(POINTS_PER_MM * number for number in box), stroke=0, fill=1)
+    canvas.setFillColorRGB(*_OPENING)
+    for place, row in enumerate(rows):
+        at = (left + LABEL_MM, top - 0.5 * LABEL_MM - 1.7 * LABEL_MM * (place + 0.8))
+        write_text(canvas, row, at)
+    canvas.setFillColorRGB(0.0, 0.0, 0.0)
 
 
 def _draw_grid(canvas: Canvas, drawing: WallDrawing, view: View) -> None:

@@ -21,6 +21,7 @@ from tests.drawing_runs import (
     GSD_M,
     SIZE_M,
     WALL,
+    box_openings,
     box_planes,
     box_points,
     wall_frame,
@@ -190,7 +191,7 @@ def drawn(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("dxf") / "out"
     done = export(run, "dxf", folder)
     assert done.exit_code == 0, done.output
-    assert "1 wall, and the room: 6 planes, 12 edges, 8 corners" in done.output
+    assert "1 wall, and the room: 6 planes, 12 edges, 8 corners, 1 opening" in done.output
     return folder
 
 
@@ -280,6 +281,38 @@ def test_the_room_has_each_wall_in_its_place(drawn: Path) -> None:
     assert len(space.query('POINT[layer=="CORNERS"]')) == 8
 
 
+def test_openings_are_drawn_on_a_layer_of_the_wall_and_of_the_room(drawn: Path) -> None:
+    (opening,) = box_openings().openings
+    places = {f"wall_{WALL}.dxf": opening.outline_m, "room.dxf": opening.outline_world}
+    for name, expected in places.items():
+        layer = ezdxf.readfile(drawn / name).modelspace().query('*[layer=="OPENINGS"]')
+        (outline,) = layer.query("LWPOLYLINE POLYLINE")
+        assert outline.closed if name.startswith("wall") else outline.is_closed
+        points = outline.get_points() if name.startswith("wall") else outline.points()
+        corners = np.array([tuple(point)[: expected.shape[1]] for point in points])
+        np.testing.assert_allclose(corners, expected, atol=1e-6)
+        (said,) = layer.query("TEXT")
+        assert said.dxf.text == "niche 0.250 m deep, 0.80 x 1.20 m"
+
+
+def test_openings_are_outlined_on_sheets_in_scale(sheet: pdfplumber.page.Page) -> None:
+    (opening,) = box_openings().openings
+    ortho = sheet.images[0]
+    outlines = [
+        box
+        for box in (*sheet.rects, *sheet.curves)
+        if box["stroking_color"] == pytest.approx((0.0, 0.4, 0.45))
+    ]
+    # Beside the orthoimage its depth, with the same.
+    assert len(outlines) == 2
+    first = min(outlines, key=lambda box: float(box["x0"]))
+    left, top = opening.outline_m[0] * [20.0, -20.0]
+    assert (first["x0"] - ortho["x0"]) * MM == pytest.approx(left, abs=0.01)
+    assert (first["top"] - ortho["top"]) * MM == pytest.approx(top, abs=0.01)
+    assert first["width"] * MM == pytest.approx(20 * opening.width_m, abs=0.01)
+    assert first["height"] * MM == pytest.approx(20 * opening.height_m, abs=0.01)
+
+
 def test_names_from_a_record_are_harmless_in_drawings(drawn: Path) -> None:
     texts = [
         text.dxf.text for text in ezdxf.readfile(drawn / "room.dxf").modelspace().query("TEXT")
@@ -294,7 +327,8 @@ def test_vectors_are_geojson_of_rings_and_lines(run: Path, tmp_path: Path) -> No
     room = json.loads((tmp_path / "out" / "room.geojson").read_text())
     kinds = [feature["properties"]["kind"] for feature in room["features"]]
     counts = {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)}
-    assert counts == {"rectangle": 6, "edge": 12, "corner": 8, "outline": 1, "check point": 2}
+    expected_counts = {"rectangle": 6, "edge": 12, "corner": 8, "outline": 1, "check point": 2}
+    assert counts == expected_counts | {"opening": 1}
     (outline,) = [f for f in room["features"] if f["properties"]["kind"] == "outline"]
     ring = np.array(outline["geometry"]["coordinates"][0])
     assert len(ring) == 5

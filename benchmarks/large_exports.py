@@ -1,0 +1,111 @@
+"""How much memory exports of a large orthoimage take.
+
+`python -m benchmarks.large_exports --side 20000` writes a run with one wall of 400 million cells as
+a run leaves it (cloud-optimised GeoTIFF, layer in the store), then exports it in a process of its
+own for each format, and prints seconds of the processor and the largest memory of that process.
+`--to sheet` and others choose formats.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from orthoflow_provenance.model import PublishedFile, RecordedProduct
+from orthoflow_provenance.writer import write_record
+
+from benchmarks.tiled_orthoimage import GSD_M, large_orthoimage, largest_mib
+from orthoflow.cli.program import program
+from orthoflow.engine import Store
+from orthoflow.engine.file_digests import file_sha256
+from orthoflow.files.sidecars import placed_raster
+from orthoflow.products import Layer, LayerMask, Layers
+from tests.report_runs import cell, record
+
+FORMATS = ("sheet", "dxf", "tiles", "stac", "layers")
+
+
+def write_large_run(folder: Path, side: int) -> None:
+    """Write a run of one orthoimage, and its one layer into a store."""
+    run, store = folder / "run", Store(folder / "store")
+    published = run / "products" / "mosaic"
+    published.mkdir(parents=True)
+    path = large_orthoimage(published, side, side)
+    frame, _ = placed_raster(path)
+    shape = frame.shape
+    # Zeros of an empty file: what a layer holds does not change how it is read.
+    rgb = np.memmap(folder / "rgb", dtype=np.uint8, mode="w+", shape=(*shape, 3))
+    mask = np.memmap(folder / "mask", dtype=np.uint8, mode="w+", shape=shape)
+    quality = np.memmap(folder / "quality", dtype=np.float32, mode="w+", shape=shape)
+    for first in range(0, side, 512):
+        mask[first : first + 512] = LayerMask.PAINTED
+    layer = Layer(frame=frame, wall=0, source="a.jpg", rgb=rgb, mask=mask, quality=quality)
+    layers = Layers(layers=(layer,), names=("wall 0",), plane_indices=(0,))
+    with store.in_use():
+        digest = store.put_product(layers).digest
+    for name in ("rgb", "mask", "quality"):
+        (folder / name).unlink()
+    outputs = {
+        "ortho": {"layers": RecordedProduct(type_name="layers", encoding_version=2, digest=digest)},
+        "mosaic": {
+            "orthoimages": RecordedProduct(
+                type_name="orthoimages", encoding_version=2, digest=f"sha256:{'0' * 64}"
+            )
+        },
+    }
+    files = tuple(
+        PublishedFile(
+            path=file.relative_to(run).as_posix(),
+            size_bytes=file.stat().st_size,
+            sha256=file_sha256(file),
+        )
+        for file in sorted(published.iterdir())
+    )
+    cells = [cell(step, environment="", outputs=given) for step, given in outputs.items()]
+    made = record(cells, name="large", published=files, environments=())
+    write_record(run / "run.h5", made, lambda _: None)
+
+
+def export(folder: Path, target: str) -> None:
+    """Export and say what it took."""
+    words = ["export", str(folder / "run"), "--to", target, "-o", str(folder / "out" / target)]
+    first = time.process_time()
+    try:
+        program([*words, "--store", str(folder / "store")], standalone_mode=False)
+    except SystemExit as ended:
+        if ended.code:
+            print(f"{target} ended with {ended.code}", flush=True)
+            return
+    made = (folder / "out" / target).rglob("*")
+    size = sum(file.stat().st_size for file in made if file.is_file())
+    print(
+        f"{target}: {size / 1e6:.0f} MB, processor {time.process_time() - first:.0f} s, largest "
+        f"memory {largest_mib():.0f} MiB",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Write the run, then each export."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--side", type=int, default=20_000, help="cells of a side")
+    parser.add_argument("--to", action="append", choices=FORMATS, help="formats, all of them else")
+    given = parser.parse_args()
+    apart = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        print(f"{given.side**2 / 1e6:g} M cells of {1e3 * GSD_M:g} mm", flush=True)
+        steps = [(write_large_run, (folder, given.side))]
+        steps += [(export, (folder, target)) for target in given.to or FORMATS]
+        for work, arguments in steps:
+            worker = apart.Process(target=work, args=arguments)
+            worker.start()
+            worker.join()
+
+
+if __name__ == "__main__":
+    main()

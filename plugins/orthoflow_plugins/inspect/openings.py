@@ -1,0 +1,357 @@
+"""`inspect.openings`: outlines of windows, doors and niches against a simulated scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import MethodError
+from orthoflow.files.polygons import filled
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.scenes import Scene, SurfaceRole
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Finding, Inspection, Opening, Openings, OutlineSource, Truth, Walls
+from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.inspect.findings import rms
+
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import SceneCameras
+
+_NOTHING: Final = 255
+# Recesses of the scene may be so deep.
+_BEHIND_MOST_M: Final = 2.0
+# Of the cells about a recess, within two of it, so many are the face of the wall that it is in.
+_RIM_CELLS: Final = 5
+_RIM_LEAST: Final = 0.5
+# An outline is of an opening when they share so much of both together.
+_SAME_IOU: Final = 0.5
+# The true border is looked for so far to both sides of a found one, in steps, on so many lines.
+_REACH_CELLS: Final = 10.0
+_STEP_CELLS: Final = 1.0 / 16.0
+_LINES: Final = 33
+# The ends of a side belong to its corners.
+_ENDS_SHARE: Final = 0.1
+
+
+class InspectOpenings(Method):
+    """Compare outlines of openings with the recesses of a simulated scene.
+
+    True openings are the parts of a wall that show, seen squarely, a surface of a recess that lies
+    deep enough; what hangs together is one. An outline is of the opening with which it shares more
+    than half of both together, cell by cell. Each side that was seen is compared with the border
+    of the recess on rays square to the wall, a sixteenth of a cell apart; positive errors are
+    outwards.
+    """
+
+    id: ClassVar[str] = "inspect.openings"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "loose"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_true_openings",
+        "n_found_openings",
+        "n_false_openings",
+        "opening_iou_mean",
+        "opening_iou_min",
+        "opening_depth_error_max_mm",
+        "side_rmse_mm",
+        "side_mean_mm",
+        "side_max_mm",
+        "side_rmse_cells",
+        "side_error_over_sigma",
+        "n_stray_sides",
+    )
+
+    class Params(MethodParams):
+        """Which recesses are asked for."""
+
+        behind_m: float = Field(
+            default=0.05,
+            gt=0.0,
+            le=2.0,
+            description="Recesses so deep, or deeper, are openings.",
+        )
+        area_least_m2: float = Field(
+            default=0.1, gt=0.0, le=10_000.0, description="Smaller ones are not asked for."
+        )
+
+    class In(Ports):
+        """What to judge, on which walls, and the truth."""
+
+        truth: Truth
+        openings: Openings
+        walls: Walls
+
+    class Out(Ports):
+        """The verdict."""
+
+        inspection: Inspection
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Compare wall by wall."""
+        from orthoflow.geometry.scene_views import SceneCameras
+
+        places = {wall.plane_index: place for place, wall in enumerate(inputs.walls.walls)}
+        missing = [number for number in inputs.openings.walls if number not in places]
+        if missing:
+            raise MethodError(
+                f"openings of wall {missing[0]} are given, but the walls are "
+                f"{', '.join(map(str, places)) or 'none'}: wire the walls they were found on"
+            )
+        views = SceneCameras(inputs.truth.scene, cores=ctx.cores)
+        verdicts = []
+        for count, number in enumerate(inputs.openings.walls):
+            ctx.progress(count / len(inputs.openings.walls), f"wall {number}")
+            place = places[number]
+            wall = _true_wall(inputs, place, params, views, ctx.cores)
+            verdicts.append(_verdict(wall, inputs.openings.of_wall(number)))
+        findings = _findings(verdicts)
+        for finding in findings:
+            ctx.metric(finding.name, finding.value, finding.unit)
+        return self.Out(inspection=_inspection(verdicts, findings))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TrueWall:
+    """A wall as it is.
+
+    Attributes:
+        slab: its raster.
+        place: in `Walls`.
+        labels: (rows, cols) openings, from 1; 0 where none is.
+        face_m: depth of its face.
+        deep_m: depth from which on recesses are openings.
+        scene: it is in.
+        views: of the scene.
+    """
+
+    slab: Slab
+    place: int
+    labels: NDArray[np.int32]
+    face_m: float
+    deep_m: float
+    scene: Scene
+    views: SceneCameras
+
+    @property
+    def frame(self) -> WallFrame:
+        """Where its cells lie."""
+        return self.slab.frame
+
+    def depths_m(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (n,) of the opening seen at places (n, 2) = (column, row); NaN where none is."""
+        frame, front_m = self.frame, self.slab.front_m
+        starts = frame.world_from_wall(places, front_m) - self.scene.origin
+        hits = self.views.cast(starts, np.broadcast_to(-frame.normal_world, starts.shape))
+        depth_m = front_m - hits.t
+        is_open = (hits.rectangle >= 0) & (depth_m <= self.deep_m)
+        is_open &= self.scene.role[hits.rectangle] == SurfaceRole.RECESS
+        return np.where(is_open, depth_m, np.nan)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SideError:
+    """Of one side: where, how far outwards of the truth, and what it said of itself."""
+
+    point_world: NDArray[np.float64]
+    outwards: NDArray[np.float64]
+    error_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Verdict:
+    """What was found on one wall; shares have an entry per true opening, 0 where none was."""
+
+    place: int
+    gsd_m: float
+    ious: tuple[float, ...]
+    n_false: int
+    depth_errors_m: tuple[float, ...]
+    sides: tuple[_SideError, ...]
+    n_stray: int
+
+
+def _true_wall(
+    inputs: InspectOpenings.In,
+    place: int,
+    params: InspectOpenings.Params,
+    views: SceneCameras,
+    cores: int,
+) -> _TrueWall:
+    from orthoflow.geometry.scene_views import Rendering, render
+
+    scene, slab = inputs.truth.scene, inputs.walls.slab(place)
+    nowhere = np.zeros(slab.frame.shape, dtype=np.bool_)
+    rendering = Rendering(
+        buffer_front_m=slab.front_m,
+        buffer_behind_m=_BEHIND_MOST_M,
+        coloured=nowhere,
+        judged=nowhere,
+        cores=cores,
+    )
+    true = render(scene, slab.frame, rendering)
+    role = np.where(true.rectangle >= 0, scene.role[true.rectangle], _NOTHING)
+    of_face = true.depth_m[(role == SurfaceRole.WALL) & (true.depth_m >= -slab.behind_m)]
+    face_m = float(np.median(of_face)) if of_face.size else 0.0
+    deep_m = face_m - params.behind_m
+    with np.errstate(invalid="ignore"):
+        is_open = (role == SurfaceRole.RECESS) & (true.depth_m <= deep_m)
+        is_face = true.depth_m > deep_m
+    return _TrueWall(
+        slab=slab,
+        place=place,
+        labels=_labelled(is_open, is_face, params.area_least_m2 / slab.frame.gsd_m**2),
+        face_m=face_m,
+        deep_m=deep_m,
+        scene=scene,
+        views=views,
+    )
+
+
+def _labelled(
+    is_open: NDArray[np.bool_], is_face: NDArray[np.bool_], n_least: float
+) -> NDArray[np.int32]:
+    """Number the open areas that are large enough and have the wall's face about them."""
+    import cv2
+
+    n_areas, labels, boxes, _ = cv2.connectedComponentsWithStats(
+        is_open.astype(np.uint8), connectivity=4
+    )
+    # A recess of another wall, seen beside the edge of this one, is no opening of it.
+    about = np.ones((_RIM_CELLS, _RIM_CELLS), dtype=np.uint8)
+    names = np.zeros(n_areas, dtype=np.int32)
+    for label in np.flatnonzero(boxes[:, cv2.CC_STAT_AREA] >= n_least):
+        own = (labels == label).astype(np.uint8)
+        is_rim = (cv2.dilate(own, about) > own) & (labels != label)
+        if label and is_face[is_rim].mean() >= _RIM_LEAST:
+            names[label] = names.max() + 1
+    return np.asarray(names[labels])
+
+
+def _verdict(wall: _TrueWall, openings: Sequence[Opening]) -> _Verdict:
+    sizes = np.bincount(wall.labels.ravel())
+    ious = np.zeros(len(sizes))
+    depth_errors_m: list[float] = []
+    sides: list[_SideError] = []
+    n_false = n_stray = 0
+    for opening in openings:
+        cells = _cells_of(opening, wall.frame)
+        is_own = filled((cells,), wall.frame.shape)
+        shared = np.bincount(wall.labels[is_own], minlength=len(sizes))
+        shared[0] = 0
+        best = int(shared.argmax())
+        union = int(np.count_nonzero(is_own)) + int(sizes[best]) - int(shared[best])
+        iou = shared[best] / union if best else 0.0
+        if iou < _SAME_IOU:
+            n_false += 1
+            continue
+        ious[best] = max(ious[best], iou)
+        if opening.depth_m is not None:
+            centres = np.argwhere(wall.labels == best)[::7, ::-1].astype(np.float64) + 0.5
+            middle = wall.depths_m(centres)
+            true_m = wall.face_m - float(np.nanmedian(middle))
+            depth_errors_m.append(opening.depth_m - true_m)
+        for k in np.flatnonzero(opening.side_source != OutlineSource.UNSEEN):
+            found = _side_error(wall, cells[k], cells[(k + 1) % len(cells)])
+            if found is None:
+                n_stray += 1
+            else:
+                sigma_m = float(opening.side_sigma_m[k])
+                point, outwards, error = found
+                sides.append(
+                    _SideError(point_world=point, outwards=outwards, error_m=error, sigma_m=sigma_m)
+                )
+    return _Verdict(
+        place=wall.place,
+        gsd_m=wall.frame.gsd_m,
+        ious=tuple(ious[1:].tolist()),
+        n_false=n_false,
+        depth_errors_m=tuple(depth_errors_m),
+        sides=tuple(sides),
+        n_stray=n_stray,
+    )
+
+
+def _cells_of(opening: Opening, frame: WallFrame) -> NDArray[np.float64]:
+    """Corners (n, 2) as (column, row)."""
+    return frame.wall_from_world(opening.outline_world)[:, :2]
+
+
+def _side_error(
+    wall: _TrueWall, begin: NDArray[np.float64], end: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
+    """Middle (3,), direction outwards (2,) and error in metres of a side.
+
+    None where no true border is near most of it.
+    """
+    way = end - begin
+    length = float(np.linalg.norm(way))
+    if length <= 0.0:
+        return None
+    # Counter-clockwise for the viewer, with rows counted downwards.
+    outwards = np.array([-way[1], way[0]]) / length
+    along = np.linspace(_ENDS_SHARE, 1.0 - _ENDS_SHARE, _LINES)
+    offsets = np.arange(-_REACH_CELLS, _REACH_CELLS + _STEP_CELLS / 2, _STEP_CELLS)
+    places = begin + along[:, None, None] * way + offsets[None, :, None] * outwards
+    depths_m = wall.depths_m(places.reshape(-1, 2)).reshape(places.shape[:2])
+    is_open = np.isfinite(depths_m)
+    borders = []
+    for line in is_open:
+        ends = np.flatnonzero(line[:-1] & ~line[1:])
+        if len(ends):
+            middles = offsets[ends] + 0.5 * _STEP_CELLS
+            borders.append(float(middles[np.abs(middles).argmin()]))
+    if len(borders) < 0.5 * _LINES:
+        return None
+    middle = wall.frame.world_from_wall((0.5 * (begin + end))[None])[0]
+    return middle, outwards, -wall.frame.gsd_m * float(np.median(borders))
+
+
+def _findings(verdicts: Sequence[_Verdict]) -> tuple[Finding, ...]:
+    ious = [iou for verdict in verdicts for iou in verdict.ious]
+    sides = [side for verdict in verdicts for side in verdict.sides]
+    depth_errors_m = [error for verdict in verdicts for error in verdict.depth_errors_m]
+    numbers: list[tuple[str, float, str]] = [
+        ("n_true_openings", len(ious), "1"),
+        ("n_found_openings", sum(iou >= _SAME_IOU for iou in ious), "1"),
+        ("n_false_openings", sum(verdict.n_false for verdict in verdicts), "1"),
+        ("n_stray_sides", sum(verdict.n_stray for verdict in verdicts), "1"),
+    ]
+    if ious:
+        numbers += [
+            ("opening_iou_mean", float(np.mean(ious)), "1"),
+            ("opening_iou_min", min(ious), "1"),
+        ]
+    if depth_errors_m:
+        worst = float(np.abs(depth_errors_m).max())
+        numbers.append(("opening_depth_error_max_mm", 1e3 * worst, "mm"))
+    if sides:
+        errors_m = np.array([side.error_m for side in sides])
+        sigmas_m = np.array([side.sigma_m for side in sides])
+        cells = [side.error_m / verdict.gsd_m for verdict in verdicts for side in verdict.sides]
+        numbers += [
+            ("side_rmse_mm", 1e3 * rms(errors_m), "mm"),
+            ("side_mean_mm", 1e3 * float(errors_m.mean()), "mm"),
+            ("side_max_mm", 1e3 * float(np.abs(errors_m).max()), "mm"),
+            ("side_rmse_cells", rms(cells), "cells"),
+            ("side_error_over_sigma", rms(errors_m / sigmas_m), "1"),
+        ]
+    return tuple(Finding(name=name, value=value, unit=unit) for name, value, unit in numbers)
+
+
+def _inspection(verdicts: Sequence[_Verdict], findings: tuple[Finding, ...]) -> Inspection:
+    sides = [side for verdict in verdicts for side in verdict.sides]
+    walls = [verdict.place for verdict in verdicts for _ in verdict.sides]
+    return Inspection(
+        wall=np.array(walls, dtype=np.int32),
+        points_world=np.array([side.point_world for side in sides]).reshape(-1, 3),
+        displacement_m=np.array([side.error_m * side.outwards for side in sides]).reshape(-1, 2),
+        kind=np.zeros(len(sides), dtype=np.uint8),
+        kinds=("side of an opening",),
+        findings=findings,
+    )

@@ -1,0 +1,319 @@
+"""`segment.openings`: windows, doors and niches of walls as outlines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.levels import eight_bits
+from orthoflow.products import (
+    Opening,
+    Openings,
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    OutlineSource,
+    PointCloud,
+    Wall,
+    Walls,
+)
+from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
+from orthoflow_plugins.segment.areas import Area, AreaRule, Relief, open_areas, relief_of
+from orthoflow_plugins.segment.figures import CAPTION, outline_map
+from orthoflow_plugins.segment.image_edges import moved_to_edges
+from orthoflow_plugins.segment.outlines import Outline, outline_of
+from orthoflow_plugins.segment.sight_lines import sight_lines
+
+# Planes that lean more than this from upright are floors, ceilings and slopes.
+_UPRIGHT: Final = math.sin(math.radians(30.0))
+# What lies farther behind a plane is not the face of the same wall.
+_FACE_FARTHEST_M: Final = 0.3
+# Empty areas are openings by their shape alone: they fill so much of their rectangle, as round
+# windows do. Shadows do not.
+_FILLED_LEAST: Final = 0.7
+_COUNTED: Final = {"through": "n_through", "niche": "n_niche", "no data": "n_no_data"}
+
+
+class SegmentOpenings(Method):
+    """Find windows, doors and niches: what lies behind a wall's face, or shows nothing.
+
+    Cells of a wall that lie behind its face, or are empty, and hang together are an opening where
+    a square of some width fits in and the face was measured along most of the rim. The face is the
+    plane, or where more than half of the wall lies behind that, the middle of what does. With the
+    cloud, lines of sight are followed: an area through which some went is `through`; where they
+    ended before the wall it is hidden, and no opening. What is empty without either, and about as
+    compact as a round window, is `no data`, glass or a mirror most often; what has a measured back
+    is a `niche`, shut doors and windows set back among them.
+
+    Sides are lines through the borders of the cells along them. Each says how exact it is, by
+    cells, the spacing of the points and its own scatter. With orthoimages of photos, long sides
+    move to the edge of the picture that is surely the same, where the scan is too coarse for as
+    good a place.
+    """
+
+    id: ClassVar[str] = "segment.openings"
+    result_version: ClassVar[int] = 1
+    determinism: ClassVar[Determinism] = "exact"
+    metrics: ClassVar[tuple[str, ...]] = (
+        "n_openings",
+        "n_through",
+        "n_niche",
+        "n_no_data",
+        "openings_area_m2",
+        "openings_share",
+        "side_sigma_mm",
+        "image_side_share",
+        "n_unbounded",
+    )
+    citations: ClassVar[tuple[str, ...]] = (
+        "Pu and Vosselman 2009, doi:10.1016/j.isprsjprs.2009.04.001 (holes of walls as windows)",
+        "Tuttas and Stilla 2011, Window detection in sparse point clouds (PIA11)",
+    )
+
+    class Params(MethodParams):
+        """What counts as an opening."""
+
+        behind_m: float = Field(
+            default=0.05,
+            gt=0.0,
+            le=5.0,
+            description="What lies so far behind the wall's face, or farther, is not of it.",
+        )
+        width_least_m: float = Field(
+            default=0.25,
+            gt=0.0,
+            le=100.0,
+            description="A square of this side fits into an opening.",
+        )
+        area_least_m2: float = Field(
+            default=0.1, gt=0.0, le=10_000.0, description="Smallest area of an opening."
+        )
+        seen_least_share: float = Field(
+            default=0.5,
+            ge=0.0,
+            le=1.0,
+            description="Share of the outline along which the wall's face must be measured: less "
+            "is the end of what was scanned.",
+        )
+        level: bool = Field(default=False, description="Look at floors, ceilings and slopes, too.")
+
+    class In(Ports):
+        """Walls; the cloud tells what is hidden, orthoimages make sides more exact."""
+
+        walls: Walls
+        cloud: PointCloud | None = None
+        orthoimages: Orthoimages | None = None
+
+    class Out(Ports):
+        """What was found."""
+
+        openings: Openings
+
+    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+        """Look at wall after wall."""
+        walls = inputs.walls
+        chosen = [
+            place
+            for place, wall in enumerate(walls.walls)
+            if params.level or abs(float(wall.frame.normal_world @ walls.up)) < _UPRIGHT
+        ]
+        if not chosen:
+            raise MethodError(
+                f"none of the {len(walls.walls)} walls is upright: level: true looks at floors and "
+                "ceilings, too (segment.openings)"
+            )
+        if inputs.cloud is not None:
+            inputs.cloud.require_points(2)
+        else:
+            ctx.warn(
+                "without the cloud nothing tells an opening from a place that furniture hides, or "
+                "one that was looked through from one that gave nothing: wire it"
+            )
+        rule = AreaRule(
+            behind_m=params.behind_m,
+            width_least_m=params.width_least_m,
+            area_least_m2=params.area_least_m2,
+            seen_least=params.seen_least_share,
+        )
+        found: list[_Found] = []
+        for count, place in enumerate(chosen):
+            ctx.progress(count / len(chosen), walls.walls[place].name)
+            found.append(_found_on(inputs, place, rule, ctx))
+        openings = tuple(opening for of_wall in found for opening in of_wall.openings)
+        _report(openings, found, ctx)
+        crs = {wall.frame.map_crs for wall in walls.walls if wall.frame.map_crs is not None}
+        return self.Out(
+            openings=Openings(
+                openings=openings,
+                walls=tuple(of_wall.wall.plane_index for of_wall in found),
+                map_crs=crs.pop() if len(crs) == 1 else None,
+            )
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """Openings of one wall, and how many areas were none for want of a rim or of shape."""
+
+    wall: Wall
+    openings: tuple[Opening, ...]
+    n_unbounded: int
+
+
+def _found_on(inputs: SegmentOpenings.In, place: int, rule: AreaRule, ctx: StepContext) -> _Found:
+    wall, slab = inputs.walls.walls[place], inputs.walls.slab(place)
+    lines = None if inputs.cloud is None else sight_lines(inputs.cloud, slab)
+    relief = relief_of(wall, lines, rule)
+    if relief.face_m:
+        is_other = relief.face_m < -_FACE_FARTHEST_M
+        ctx.warn(
+            f"{wall.name}: most of it lies {-relief.face_m:.2f} m behind its plane, so "
+            + ("it is another surface, with no openings" if is_other else "openings begin there")
+        )
+        if is_other:
+            return _Found(wall=wall, openings=(), n_unbounded=0)
+    grey = _grey(inputs.orthoimages, wall, relief, ctx)
+    spacing_m = replace(inputs.walls, walls=(wall,), buffers_m=()).spacing_m()
+    openings: list[Opening] = []
+    n_unbounded = 0
+    for area in open_areas(relief, rule):
+        outline = outline_of(area, relief, spacing_m)
+        if outline is None or outline.seen_of_all < rule.seen_least:
+            n_unbounded += 1
+            continue
+        by_image = np.zeros(len(outline.corners), dtype=np.bool_)
+        if grey is not None:
+            moved = moved_to_edges(outline, grey)
+            outline, by_image = moved.outline, moved.by_image
+        opening = _opening(wall, relief, area, outline, by_image)
+        if opening.kind == "no data" and opening.area_m2 < _FILLED_LEAST * (
+            opening.width_m * opening.height_m
+        ):
+            n_unbounded += 1
+            continue
+        openings.append(opening)
+    openings.sort(key=lambda opening: float(opening.outline_m[:, 0].min()))
+    if openings:
+        _draw(wall, relief, grey, openings, ctx)
+    return _Found(wall=wall, openings=tuple(openings), n_unbounded=n_unbounded)
+
+
+def _opening(
+    wall: Wall, relief: Relief, area: Area, outline: Outline, by_image: NDArray[np.bool_]
+) -> Opening:
+    frame = wall.frame
+    # Of every nth cell; the first is the first.
+    cells = np.clip(relief.step * (outline.corners - 0.5) + 0.5, 0.0, [frame.width, frame.height])
+    places = _raster_places(frame, cells)
+    x, y = (places - places[0]).T
+    doubled = float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
+    spans_m = frame.gsd_m * (cells.max(axis=0) - cells.min(axis=0))
+    source = np.where(by_image, OutlineSource.IMAGE, OutlineSource.DEPTH)
+    return Opening(
+        wall=wall.plane_index,
+        wall_name=wall.name,
+        kind=area.kind,
+        outline_m=places,
+        outline_world=frame.world_from_wall(cells),
+        side_sigma_m=np.where(outline.is_seen, relief.gsd_m * outline.sigma, np.nan),
+        side_source=np.where(outline.is_seen, source, OutlineSource.UNSEEN).astype(np.uint8),
+        depth_m=area.depth_m,
+        area_m2=abs(0.5 * doubled),
+        width_m=float(spans_m[0]),
+        height_m=float(spans_m[1]),
+        sill_m=frame.gsd_m * float(frame.height - cells[:, 1].max()),
+        seen_share=outline.seen_of_all,
+        map_crs=frame.map_crs,
+    )
+
+
+def _raster_places(frame: WallFrame, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    """X and Y (n, 2) in the wall's GeoTIFF of places (n, 2) = (column, row)."""
+    corner_m = np.array(frame.raster_corner_m)
+    places: NDArray[np.float64] = corner_m + frame.gsd_m * cells * [1.0, -1.0]
+    return places
+
+
+def _grey(
+    images: Orthoimages | None, wall: Wall, relief: Relief, ctx: StepContext
+) -> NDArray[np.float32] | None:
+    """Grey (rows, cols) 0..255 of the wall's orthoimage on the relief's cells, None without."""
+    image = _image_of(images, wall)
+    # What the cloud painted has the edges of the cells that its points fell into, not finer ones.
+    if image is None or set(image.sources) <= {"cloud"}:
+        return None
+    if not image.frame.has_cells_of(wall.frame):
+        ctx.warn(
+            f"{wall.name}: its orthoimage has other cells than its depth, so sides are told by "
+            "depth alone"
+        )
+        return None
+    step = relief.step
+    grey = eight_bits(image.rgb[::step, ::step]).mean(axis=2, dtype=np.float32)
+    grey[image.mask[::step, ::step] != OrthoMask.PAINTED] = np.nan
+    return np.asarray(grey, dtype=np.float32)
+
+
+def _image_of(images: Orthoimages | None, wall: Wall) -> Orthoimage | None:
+    """Its orthoimage, by the number of the plane."""
+    for image in () if images is None else images.images:
+        if image.number == wall.plane_index:
+            return image
+    return None
+
+
+def _draw(
+    wall: Wall,
+    relief: Relief,
+    grey: NDArray[np.float32] | None,
+    openings: list[Opening],
+    ctx: StepContext,
+) -> None:
+    """Draw outlines over the orthoimage, or else what the laser saw."""
+    frame, step = wall.frame, relief.step
+    if grey is not None:
+        shown = grey / 255.0
+    elif wall.intensity is not None:
+        shown = wall.intensity[::step, ::step]
+    else:
+        shown = np.where(relief.is_face, np.float32(0.8), np.float32(0.2))
+    outlines = [
+        (
+            opening.kind,
+            (opening.outline_m - frame.raster_corner_m) * [1.0, -1.0] / relief.gsd_m,
+        )
+        for opening in openings
+    ]
+    ctx.figure(
+        f"wall_{wall.plane_index}_openings",
+        outline_map(np.asarray(shown, dtype=np.float32), outlines),
+        f"{wall.name}: openings, from left to right; {CAPTION}",
+    )
+
+
+def _report(openings: tuple[Opening, ...], found: list[_Found], ctx: StepContext) -> None:
+    ctx.metric("n_openings", len(openings), "1")
+    for kind, name in _COUNTED.items():
+        ctx.metric(name, sum(opening.kind == kind for opening in openings), "1")
+    area_m2 = sum(opening.area_m2 for opening in openings)
+    frames = [of_wall.wall.frame for of_wall in found]
+    whole_m2 = sum(frame.gsd_m**2 * frame.width * frame.height for frame in frames)
+    ctx.metric("openings_area_m2", area_m2, "m2")
+    ctx.metric("openings_share", area_m2 / whole_m2, "1")
+    ctx.metric("n_unbounded", sum(of_wall.n_unbounded for of_wall in found), "1")
+    sigma_m = np.concatenate([np.empty(0), *(opening.side_sigma_m for opening in openings)])
+    sources = np.concatenate(
+        [np.empty(0, dtype=np.uint8), *(opening.side_source for opening in openings)]
+    )
+    is_seen = sources != OutlineSource.UNSEEN
+    if is_seen.any():
+        ctx.metric("side_sigma_mm", 1e3 * float(np.median(sigma_m[is_seen])), "mm")
+        by_image = np.count_nonzero(sources == OutlineSource.IMAGE)
+        ctx.metric("image_side_share", by_image / np.count_nonzero(is_seen), "1")

@@ -1,0 +1,274 @@
+"""Outlines of areas of cells: straight sides where they are straight, and how exact each is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry.robust import median_deviation
+from orthoflow_plugins.segment.areas import Area, Relief
+
+# Corners nearer to the line between their neighbours are cells' and noise.
+_STRAIGHT_CELLS: Final = 2.0
+# Once sides are straight lines, so little is no corner.
+_JOINED_CELLS: Final = 1.0
+# Of shorter sides the corners are left where they are.
+_FITTED_CELLS: Final = 8.0
+# Sides that meet at a smaller angle keep the corner between them.
+_TURN_LEAST: Final = math.sin(math.radians(15.0))
+# The ends of a side belong to its corners, and what lies farther off than this is something else.
+_ENDS_CELLS: Final = 3.0
+_FAR_CELLS: Final = 3.0
+# How far beyond a side the wall's face is looked for, and how much of it is enough.
+_BESIDE_CELLS: Final = (2.0, 3.0, 4.0)
+_BESIDE_LEAST: Final = 0.5
+# Standard deviation of a place of which nothing is known but an interval of length 1.
+_UNIFORM: Final = 1.0 / math.sqrt(12.0)
+# The cell through which a border runs may be either side's, so it lies anywhere in two.
+_BORDER_CELLS: Final = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outline:
+    """An outline in cells of the relief.
+
+    Attributes:
+        corners: (n, 2) column and row, the centre of the first cell at (0.5, 0.5),
+            counter-clockwise for the viewer.
+        sigma: (n,) cells, across each side, from corner i to the next.
+        seen_share: (n,) of each side, along which the wall's face was measured beside it.
+    """
+
+    corners: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    seen_share: NDArray[np.float64]
+
+    @property
+    def lengths(self) -> NDArray[np.float64]:
+        """Length (n,) of each side, cells."""
+        ways = np.roll(self.corners, -1, axis=0) - self.corners
+        return np.asarray(np.hypot(ways[:, 0], ways[:, 1]))
+
+    @property
+    def is_seen(self) -> NDArray[np.bool_]:
+        """Sides (n,) beside which the wall was measured."""
+        return self.seen_share >= _BESIDE_LEAST
+
+    @property
+    def seen_of_all(self) -> float:
+        """Share of the whole outline beside which the wall was measured."""
+        return float(self.lengths @ self.seen_share / self.lengths.sum())
+
+
+def outline_of(area: Area, relief: Relief, spacing_m: float) -> Outline | None:
+    """Draw the outline of an area; None where nothing is left of it.
+
+    Args:
+        area: its cells.
+        relief: what it was found in.
+        spacing_m: of the scan's points, between which borders may lie anywhere.
+    """
+    ring = _ring(area.cells)
+    kept = _corner_places(ring)
+    sides = _without_short_cuts(
+        [_side(ring, int(kept[k]), int(kept[(k + 1) % len(kept)])) for k in range(len(kept))]
+    )
+    sides = _joined(ring, sides)
+    if len(sides) < 3:
+        return None
+    corners = _corners(sides) + np.array([area.corner[1], area.corner[0]], dtype=np.float64)
+    rows, columns = relief.is_face.shape
+    corners = np.clip(corners, 0.0, [columns, rows])
+    spacing = spacing_m / relief.gsd_m
+    sigma = np.array([_sigma(side, spacing) for side in sides])
+    return Outline(corners=corners, sigma=sigma, seen_share=_seen_shares(corners, relief.is_face))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Side:
+    """A piece of a ring, by the places of its ends, and the line through the middles along it.
+
+    `middle` and `direction` are None where it is too short for a line of its own.
+    """
+
+    first: int
+    last: int
+    begin: NDArray[np.float64]
+    end: NDArray[np.float64]
+    scatter: float
+    middle: NDArray[np.float64] | None = None
+    direction: NDArray[np.float64] | None = None
+
+    @property
+    def length(self) -> float:
+        """Its length, cells."""
+        return float(np.linalg.norm(self.end - self.begin))
+
+
+def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Middles (n, 2) of the cells' sides along the border, counter-clockwise for the viewer."""
+    from orthoflow.files.polygons import outlines
+
+    found = outlines(np.where(cells, 0, -1).astype(np.int16))
+    if len(found) != 1:
+        raise MethodError(f"an area of cells must hang together, got {len(found)} parts")
+    ring = found[0][1][0][:-1]
+    ways = np.roll(ring, -1, axis=0) - ring
+    steps = np.rint(np.abs(ways).sum(axis=1)).astype(np.int64)
+    along = np.concatenate([np.arange(count) + 0.5 for count in steps])
+    unit = ways / steps[:, None]
+    middles = np.repeat(ring, steps, axis=0) + along[:, None] * np.repeat(unit, steps, axis=0)
+    x, y = middles.T
+    # Rows count down, so that a positive sum is clockwise for the viewer.
+    doubled = float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
+    return np.asarray(middles[::-1] if doubled > 0.0 else middles, dtype=np.float64)
+
+
+def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Places in a ring where it turns (Douglas and Peucker)."""
+    import cv2
+
+    # Half cells are exact in whole numbers, by which the corners are found again.
+    doubled = np.rint(2.0 * ring).astype(np.int32)
+    simple = cv2.approxPolyDP(doubled[:, None, :], 2.0 * _STRAIGHT_CELLS, closed=True)[:, 0]
+    place_of = {(int(x), int(y)): place for place, (x, y) in enumerate(doubled)}
+    kept = sorted(place_of[(int(x), int(y))] for x, y in simple)
+    # Where it began to look, a corner is left that need not be one.
+    for place in list(kept):
+        at = kept.index(place)
+        before, after = ring[kept[at - 1]], ring[kept[(at + 1) % len(kept)]]
+        way = after - before
+        to = ring[place] - before
+        length = max(float(np.linalg.norm(way)), 1e-9)
+        off = abs(float(way[0] * to[1] - way[1] * to[0])) / length
+        if len(kept) > 3 and off <= _STRAIGHT_CELLS:
+            kept.remove(place)
+    return np.array(kept, dtype=np.int64)
+
+
+def _without_short_cuts(sides: list[_Side]) -> list[_Side]:
+    """Leave out short sides that only cut the corner in which their neighbours meet."""
+    kept = list(sides)
+    for side in sides:
+        at = kept.index(side)
+        before, after = kept[at - 1], kept[(at + 1) % len(kept)]
+        met = _meeting(before, after)
+        if len(kept) > 3 and side.middle is None and met is not None:
+            reach = max(np.linalg.norm(met - side.begin), np.linalg.norm(met - side.end))
+            if reach <= _FITTED_CELLS:
+                kept.pop(at)
+    return kept
+
+
+def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
+    """Lay a line through the middles between two corners, those far off left out."""
+    along = ring[first : last + 1] if first <= last else np.vstack([ring[first:], ring[: last + 1]])
+    begin, end = along[0], along[-1]
+    length = float(np.linalg.norm(end - begin))
+    direct = (end - begin) / max(length, 1e-9)
+    place = (along - along[0]) @ direct
+    ends = min(_ENDS_CELLS, 0.25 * length)
+    inner = along[(place >= ends) & (place <= length - ends)]
+    if length < _FITTED_CELLS or len(inner) < _FITTED_CELLS / 2:
+        return _Side(first=first, last=last, begin=begin, end=end, scatter=_STRAIGHT_CELLS)
+    across = np.array([-direct[1], direct[0]])
+    for _ in range(3):
+        middle = inner.mean(axis=0)
+        _, _, rows = np.linalg.svd(inner - middle, full_matrices=False)
+        across = np.array([-rows[0, 1], rows[0, 0]])
+        off = np.abs((inner - middle) @ across)
+        kept = off <= max(_FAR_CELLS * median_deviation(off), 0.75)
+        if kept.all() or np.count_nonzero(kept) < _FITTED_CELLS / 2:
+            break
+        inner = inner[kept]
+    scatter = float(np.sqrt(np.mean(((inner - inner.mean(axis=0)) @ across) ** 2)))
+    return _Side(
+        first=first,
+        last=last,
+        begin=begin,
+        end=end,
+        scatter=scatter,
+        middle=inner.mean(axis=0),
+        direction=np.array([across[1], -across[0]]),
+    )
+
+
+def _joined(ring: NDArray[np.float64], sides: list[_Side]) -> list[_Side]:
+    """Make one side of two between which the outline hardly turns."""
+    joined = list(sides)
+    while len(joined) > 3:
+        corners = _corners(joined)
+        before, after = np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0)
+        ways, to = after - before, corners - before
+        area = np.abs(ways[:, 0] * to[:, 1] - ways[:, 1] * to[:, 0])
+        off = area / np.maximum(np.hypot(ways[:, 0], ways[:, 1]), 1e-9)
+        at = int(off.argmin())
+        if off[at] > _JOINED_CELLS:
+            break
+        side = _side(ring, joined[at - 1].first, joined[at].last)
+        joined[at] = side
+        joined.pop(at - 1)
+    return joined
+
+
+def _corners(sides: list[_Side]) -> NDArray[np.float64]:
+    """Corners (n, 2) at which sides begin."""
+    return np.array([_corner(sides[k - 1], sides[k]) for k in range(len(sides))])
+
+
+def _corner(before: _Side, after: _Side) -> NDArray[np.float64]:
+    """Where two sides meet; near the place where the cells have their corner."""
+    met = _meeting(before, after)
+    if met is not None and np.linalg.norm(met - after.begin) <= _FITTED_CELLS:
+        return met
+    for side in (after, before):
+        if side.middle is not None and side.direction is not None:
+            return side.middle + ((after.begin - side.middle) @ side.direction) * side.direction
+    return after.begin
+
+
+def _meeting(first: _Side, second: _Side) -> NDArray[np.float64] | None:
+    if first.middle is None or second.middle is None:
+        return None
+    if first.direction is None or second.direction is None:
+        return None
+    matrix = np.column_stack([first.direction, -second.direction])
+    if abs(float(np.linalg.det(matrix))) < _TURN_LEAST:
+        return None
+    share = np.linalg.solve(matrix, second.middle - first.middle)
+    met: NDArray[np.float64] = first.middle + share[0] * first.direction
+    return met
+
+
+def _sigma(side: _Side, spacing: float) -> float:
+    """Of a side: a cell's own and that of the points, whose lines may run along it, and scatter."""
+    scatter = side.scatter
+    if side.middle is not None:
+        scatter /= math.sqrt(max(1.0, side.length / spacing))
+    return math.hypot(_BORDER_CELLS * _UNIFORM, spacing * _UNIFORM, scatter)
+
+
+def _seen_shares(corners: NDArray[np.float64], is_face: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Share (n,) of each side beside which the wall's face was measured."""
+    rows, columns = is_face.shape
+    shares = np.zeros(len(corners))
+    for k, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
+        way = end - begin
+        length = float(np.linalg.norm(way))
+        if length <= 0.0:
+            continue
+        # Counter-clockwise for the viewer with rows downwards: outside is to the right of the way.
+        outwards = np.array([-way[1], way[0]]) / length
+        at = begin + ((np.arange(math.ceil(length)) + 0.5) / math.ceil(length))[:, None] * way
+        found = np.zeros(len(at), dtype=np.bool_)
+        for aside in _BESIDE_CELLS:
+            cells = np.floor(at + aside * outwards).astype(np.int64)
+            inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
+            found[inside] |= is_face[cells[inside, 1], cells[inside, 0]]
+        shares[k] = found.mean()
+    return shares

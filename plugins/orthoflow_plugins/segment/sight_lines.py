@@ -1,0 +1,119 @@
+"""Where lines of sight crossed a wall, or ended before it: what makes an empty cell an opening."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import PointCloud
+
+# Rays are counted on tiles of about this side, which hold many.
+_TILE_M: Final = 0.05
+# Of larger clouds one point of every so many is asked, spread by chance (Fibonacci hashing).
+_POINTS_MOST: Final = 1 << 22
+_TURN: Final = np.uint64(0x9E3779B97F4A7C15)
+_BLOCK: Final = 1 << 18
+# Without stations, what lies so far behind or before an empty place, square to the wall, tells.
+_BEHIND_MOST_M: Final = 4.0
+_BEFORE_MOST_M: Final = 1.5
+# Single points far off are gross errors of the scanner: of the rays at a tile, so many must agree.
+_RAYS_LEAST: Final = 2
+_SHARE_LEAST: Final = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class SightLines:
+    """What lines of sight tell of a wall, on tiles of its raster.
+
+    Attributes:
+        side: cells of the wall that a tile is wide and high.
+        crossed: (rows, cols) bool, rays went through the wall here.
+        stopped: (rows, cols) bool, rays ended before it here, and none went through.
+    """
+
+    side: int
+    crossed: NDArray[np.bool_]
+    stopped: NDArray[np.bool_]
+
+    def over(self, tiles: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """Give tiles as cells of the wall's raster."""
+        return np.kron(tiles, np.ones((self.side, self.side), dtype=np.bool_))[
+            : shape[0], : shape[1]
+        ]
+
+
+def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
+    """Follow the rays of a cloud to a wall.
+
+    Where it is known from which station each point was seen, it is the end of a ray that is
+    followed from there to the wall's plane, or prolonged to it. Otherwise the wall is looked at
+    squarely.
+
+    Args:
+        cloud: the points.
+        slab: the wall's raster, and how far before and behind its plane points belong to it.
+    """
+    frame = slab.frame
+    side = max(1, min(round(_TILE_M / frame.gsd_m), *frame.shape))
+    rows, columns = (-(-count // side) for count in frame.shape)
+    tiles = replace(frame, gsd_m=side * frame.gsd_m, width=columns, height=rows)
+    counts = np.zeros((3, rows * columns), dtype=np.int64)
+    for ends, starts in _rays(cloud):
+        places = tiles.wall_from_world(ends)
+        depth_m = places[:, 2].copy()
+        if starts is None:
+            asked = (depth_m > -_BEHIND_MOST_M) & (depth_m < _BEFORE_MOST_M)
+        else:
+            from_station = tiles.wall_from_world(starts)
+            # Seen from behind, or along the plane, a ray tells nothing.
+            asked = (from_station[:, 2] > np.maximum(depth_m, 0.0)) & (from_station[:, 2] > 0.0)
+            fall = np.where(asked, from_station[:, 2] - depth_m, 1.0)
+            share = np.where(asked, from_station[:, 2] / fall, 0.0)[:, None]
+            places = from_station + share * (places - from_station)
+        tile = np.floor(places[:, :2])
+        asked &= ((tile >= 0) & (tile < (columns, rows))).all(axis=1)
+        cells = (tile[asked, 1] * columns + tile[asked, 0]).astype(np.int64)
+        of_rays = depth_m[asked]
+        for what, chosen in enumerate(
+            (
+                of_rays < -slab.behind_m,
+                of_rays > slab.front_m,
+                (of_rays >= -slab.behind_m) & (of_rays <= slab.front_m),
+            )
+        ):
+            counts[what] += np.bincount(cells[chosen], minlength=rows * columns)
+    crossed, stopped, met = counts.reshape(3, rows, columns)
+    is_crossed = (crossed >= _RAYS_LEAST) & (crossed >= _SHARE_LEAST * (crossed + met))
+    return SightLines(
+        side=side,
+        crossed=is_crossed,
+        stopped=~is_crossed
+        & (stopped >= _RAYS_LEAST)
+        & (stopped >= _SHARE_LEAST * (stopped + met)),
+    )
+
+
+def _rays(
+    cloud: PointCloud,
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64] | None]]:
+    """Ends (n, 3) of rays, block by block, and where they began where that is known."""
+    # Without the scan of each point, some scans may have been taken from elsewhere.
+    stations = cloud.stations if cloud.stations_source == "file" else None
+    scan = cloud.scan
+    every = -(-len(cloud) // _POINTS_MOST)
+    for first in range(0, len(cloud), _BLOCK * every):
+        index = np.arange(first, min(first + _BLOCK * every, len(cloud)), every)
+        if every > 1:
+            chance = (index.astype(np.uint64) * _TURN) >> np.uint64(32)
+            index = np.minimum(index + (chance % np.uint64(every)).astype(np.int64), len(cloud) - 1)
+        starts = None
+        if stations is not None and scan is not None:
+            of_scan = scan[index].astype(np.int64)
+            known = of_scan < len(stations)
+            index, starts = index[known], stations[of_scan[known]]
+        yield cloud.points_world(index), starts

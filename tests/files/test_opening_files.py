@@ -1,0 +1,99 @@
+"""Files of openings as GIS programs and spreadsheets read them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from orthoflow.files.opening_files import publish_openings
+from orthoflow.products import Opening, Openings
+from tests.drawing_runs import WALL, box_openings
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("openings")
+    found = box_openings()
+    other = replace(found.openings[0], wall=WALL + 1, wall_name="wall 3", kind="through")
+    unseen = replace(other, depth_m=None, side_sigma_m=np.full(4, np.nan))
+    publish_openings(
+        replace(found, openings=(*found.openings, unseen), walls=(WALL, WALL + 1, WALL + 2)),
+        folder,
+        "sha256:12",
+    )
+    return folder
+
+
+def features(path: Path) -> list[dict[str, object]]:
+    content = json.loads(path.read_text())
+    assert content["type"] == "FeatureCollection"
+    assert content["product_digest"] == "sha256:12"
+    found: list[dict[str, object]] = content["features"]
+    return found
+
+
+def test_walls_without_openings_have_no_file(folder: Path) -> None:
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "openings.csv",
+        "openings.geojson",
+        f"wall_{WALL}_openings.geojson",
+        f"wall_{WALL + 1}_openings.geojson",
+    ]
+
+
+def test_outlines_are_closed_rings_in_the_coordinates_of_the_wall(folder: Path) -> None:
+    (opening,) = box_openings().openings
+    (feature,) = features(folder / f"wall_{WALL}_openings.geojson")
+    geometry, about = feature["geometry"], feature["properties"]
+    assert isinstance(geometry, dict)
+    assert isinstance(about, dict)
+    ring = np.array(geometry["coordinates"][0])
+    np.testing.assert_allclose(ring, np.vstack([opening.outline_m, opening.outline_m[:1]]))
+    assert (about["kind"], about["opening"], about["number"]) == ("opening", "niche", 0)
+    assert about["depth_m"] == 0.25
+    assert about["side_source"] == ["depth", "image", "unseen", "depth"]
+    assert about["side_sigma_mm"] == [3.0, 1.5, None, 3.0]
+
+
+def test_the_room_has_all_of_them_in_space(folder: Path) -> None:
+    (opening,) = box_openings().openings
+    first, second = features(folder / "openings.geojson")
+    geometry = first["geometry"]
+    assert isinstance(geometry, dict)
+    ring = np.array(geometry["coordinates"][0])
+    np.testing.assert_allclose(ring[:4], opening.outline_world, atol=1e-6)
+    about = second["properties"]
+    assert isinstance(about, dict)
+    assert (about["wall"], about["depth_m"], about["edge_sigma_m"]) == (WALL + 1, None, None)
+
+
+def test_the_schedule_has_a_row_each(folder: Path) -> None:
+    with (folder / "openings.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["wall"], row["number"], row["kind"]) for row in rows] == [
+        (str(WALL), "0", "niche"),
+        (str(WALL + 1), "0", "through"),
+    ]
+    assert float(rows[0]["width_m"]) == 0.8
+    assert float(rows[0]["edge_sigma_mm"]) == pytest.approx(2.6, abs=0.01)
+    assert rows[1]["depth_m"] == rows[1]["edge_sigma_mm"] == ""
+
+
+def test_a_map_names_its_coordinate_system(tmp_path: Path) -> None:
+    publish_openings(replace(box_openings(), map_crs="EPSG:2180"), tmp_path, "sha256:0")
+    content = json.loads((tmp_path / "openings.geojson").read_text())
+    assert content["crs"]["properties"]["name"] == "urn:ogc:def:crs:EPSG::2180"
+    # The plane of an upright wall is none.
+    assert "crs" not in json.loads((tmp_path / f"wall_{WALL}_openings.geojson").read_text())
+
+
+def test_no_openings_are_an_empty_collection(tmp_path: Path) -> None:
+    none: tuple[Opening, ...] = ()
+    publish_openings(Openings(openings=none, walls=(1,)), tmp_path, "sha256:0")
+    assert json.loads((tmp_path / "openings.geojson").read_text())["features"] == []
+    assert len((tmp_path / "openings.csv").read_text().splitlines()) == 1

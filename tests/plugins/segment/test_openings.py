@@ -1,0 +1,250 @@
+"""Openings of a wall whose every cell and ray is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_plugins.segment.openings import SegmentOpenings
+
+from orthoflow.errors import MethodError
+from orthoflow.products import (
+    Opening,
+    Openings,
+    Orthoimage,
+    Orthoimages,
+    OrthoMask,
+    OutlineSource,
+    PointCloud,
+    Walls,
+)
+from orthoflow.sdk import StepContext
+from tests import opening_scenes as scenes
+from tests.raster_scenes import context
+
+
+def found(
+    folder: Path,
+    walls: Walls | None = None,
+    cloud: PointCloud | None = None,
+    images: Orthoimages | None = None,
+    **params: object,
+) -> tuple[Openings, StepContext]:
+    folder.mkdir(exist_ok=True)
+    ctx = context(folder)
+    inputs = SegmentOpenings.In(walls=walls or scenes.walls(), cloud=cloud, orthoimages=images)
+    outputs = SegmentOpenings().run(inputs, SegmentOpenings.Params.model_validate(params), ctx)
+    return outputs.openings, ctx
+
+
+def cells_of(opening: Opening) -> np.ndarray:
+    places: np.ndarray = opening.outline_m / [scenes.GSD_M, -scenes.GSD_M]
+    return places
+
+
+def test_each_area_is_what_the_rays_say(tmp_path: Path) -> None:
+    openings, ctx = found(tmp_path, cloud=scenes.cloud())
+    assert [opening.kind for opening in openings.openings] == ["niche", "through", "no data"]
+    assert openings.walls == (4,)
+    niche, window, mirror = openings.openings
+    assert niche.depth_m == pytest.approx(scenes.NICHE_M, abs=0.0005)
+    assert window.depth_m is None
+    assert mirror.depth_m is None
+    numbers = {metric.name: metric.value for metric in ctx.metrics}
+    assert (numbers["n_openings"], numbers["n_through"], numbers["n_no_data"]) == (3, 1, 1)
+    assert [figure.name for figure in ctx.figures] == ["wall_4_openings"]
+
+
+@pytest.mark.parametrize(
+    ("place", "corners"),
+    [(0, scenes.NICHE), (1, scenes.WINDOW), (2, scenes.MIRROR)],
+    ids=["turned niche", "window", "mirror"],
+)
+def test_corners_lie_where_the_borders_meet(
+    tmp_path: Path, place: int, corners: np.ndarray
+) -> None:
+    openings, _ = found(tmp_path, cloud=scenes.cloud())
+    opening = openings.openings[place]
+    cells = cells_of(opening)
+    assert len(cells) == 4
+    begin = int(np.linalg.norm(cells - corners[0], axis=1).argmin())
+    apart = np.abs(np.roll(cells, -begin, axis=0) - corners)
+    # Upright sides lie on borders of cells, half of one off at most; turned ones are told by many.
+    assert apart.max() <= (0.25 if place == 0 else 0.55)
+    size_m = scenes.GSD_M * (corners.max(axis=0) - corners.min(axis=0))
+    assert (opening.width_m, opening.height_m) == pytest.approx(tuple(size_m), abs=0.011)
+    assert opening.sill_m == pytest.approx(2.4 - scenes.GSD_M * corners[:, 1].max(), abs=0.006)
+    assert opening.seen_share > 0.9
+    sigma = opening.side_sigma_m / scenes.GSD_M
+    assert np.all((sigma >= (4.0 / 12.0) ** 0.5) & (sigma <= 0.7))
+
+
+def test_world_coordinates_are_those_of_the_wall(tmp_path: Path) -> None:
+    openings, _ = found(tmp_path, cloud=scenes.cloud())
+    where = scenes.frame()
+    for opening in openings.openings:
+        on_wall = where.wall_from_world(opening.outline_world)
+        np.testing.assert_allclose(on_wall[:, :2], cells_of(opening), atol=1e-6)
+        np.testing.assert_allclose(on_wall[:, 2], 0.0, atol=1e-8)
+        x, y = opening.outline_m.T
+        area_m2 = 0.5 * float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
+        # Counter-clockwise where Y points upwards.
+        assert area_m2 == pytest.approx(opening.area_m2, abs=1e-9)
+
+
+def test_what_a_screen_hides_is_an_opening_only_for_want_of_rays(tmp_path: Path) -> None:
+    openings, ctx = found(tmp_path)
+    assert [opening.kind for opening in openings.openings] == ["niche", *["no data"] * 3]
+    hidden = openings.openings[2]
+    assert OutlineSource.UNSEEN in hidden.side_source.tolist()
+    assert any("without the cloud" in warning for warning in ctx.warnings)
+    bounded, _ = found(tmp_path, seen_least_share=0.9)
+    assert [opening.kind for opening in bounded.openings] == ["niche", *["no data"] * 2]
+    # Looked at squarely, the screen stands before other places than it hides, but before some.
+    square, _ = found(tmp_path, cloud=scenes.cloud(knows_stations=False))
+    assert sum(opening.area_m2 for opening in square.openings) < sum(
+        opening.area_m2 for opening in openings.openings
+    )
+
+
+def test_an_empty_area_as_shadows_have_it_is_none(tmp_path: Path) -> None:
+    walls = scenes.walls()
+    (wall,) = walls.walls
+    rows, columns = np.indices(scenes.SHAPE)
+    # Under the mirror, with the wall all round.
+    is_shadow = (rows > 130) & (columns > 290 + (rows - 130)) & (columns < 380)
+    is_plain = np.zeros(scenes.SHAPE, dtype=np.bool_)
+    is_plain[110:, 285:] = True
+    depth = np.where(is_plain, np.float32(0.0), wall.depth_m)
+    mask = np.where(is_plain, np.uint8(1), wall.mask)
+    depth[is_shadow], mask[is_shadow] = np.nan, 0
+    shaded = replace(walls, walls=(replace(wall, depth_m=depth, mask=mask),))
+    openings, ctx = found(tmp_path, walls=shaded)
+    assert [opening.kind for opening in openings.openings] == ["niche", "no data", "no data"]
+    assert {metric.name: metric.value for metric in ctx.metrics}["n_unbounded"] == 1
+
+
+def test_a_plane_before_most_of_the_wall_is_not_its_face(tmp_path: Path) -> None:
+    openings, ctx = found(tmp_path, walls=scenes.walls(face_m=-0.1), cloud=scenes.cloud())
+    assert [opening.kind for opening in openings.openings] == ["niche", "through", "no data"]
+    assert openings.openings[0].depth_m == pytest.approx(scenes.NICHE_M, abs=0.001)
+    assert any("lies 0.10 m behind its plane" in warning for warning in ctx.warnings)
+
+
+def test_a_plane_far_before_a_wall_is_of_something_else(tmp_path: Path) -> None:
+    openings, ctx = found(tmp_path, walls=scenes.walls(face_m=-0.35), cloud=scenes.cloud())
+    assert openings.openings == ()
+    assert openings.walls == (4,)
+    assert any("it is another surface, with no openings" in text for text in ctx.warnings)
+
+
+@pytest.mark.parametrize(
+    ("params", "kinds"),
+    [
+        ({"behind_m": 0.25}, ["through", "no data"]),
+        ({"width_least_m": 0.6}, ["niche", "through"]),
+        ({"area_least_m2": 0.5}, ["niche", "through"]),
+    ],
+    ids=["deeper", "wider", "larger"],
+)
+def test_parameters_leave_out_what_is_less(
+    tmp_path: Path, params: dict[str, float], kinds: list[str]
+) -> None:
+    openings, _ = found(tmp_path, cloud=scenes.cloud(), **params)
+    assert [opening.kind for opening in openings.openings] == kinds
+
+
+def test_of_large_walls_every_nth_cell_places_the_same_outlines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fine, _ = found(tmp_path, cloud=scenes.cloud())
+    monkeypatch.setattr("orthoflow_plugins.segment.areas._CELLS_TOLD", scenes.SHAPE[0] * 200)
+    coarse, _ = found(tmp_path, cloud=scenes.cloud())
+    assert len(coarse.openings) == len(fine.openings)
+    for small, large in zip(fine.openings, coarse.openings, strict=True):
+        assert large.kind == small.kind
+        assert large.area_m2 == pytest.approx(small.area_m2, rel=0.03)
+        sigma_m = (large.edge_sigma_m or 0.0, small.edge_sigma_m or 0.0)
+        assert sigma_m[0] > 1.3 * sigma_m[1]
+
+
+def image(source: str, out_cells: float = 0.35) -> Orthoimages:
+    """The window dark on a grey wall, its border so much farther out than that of the depth."""
+    places = scenes.centres()
+    grown = scenes.WINDOW + out_cells * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+    # Means over cells: a sixteenth of a cell apart.
+    steps = (np.arange(16) + 0.5) / 16.0 - 0.5
+    along = [
+        np.mean(
+            [
+                (places[..., axis] + step >= low) & (places[..., axis] + step <= high)
+                for step in steps
+            ],
+            axis=0,
+        )
+        for axis, (low, high) in enumerate(zip(grown.min(axis=0), grown.max(axis=0), strict=True))
+    ]
+    rng = np.random.default_rng(5)
+    grey = 170.0 - 110.0 * along[0] * along[1] + 3.0 * rng.normal(size=scenes.SHAPE)
+    level = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    return Orthoimages(
+        images=(
+            Orthoimage(
+                frame=scenes.frame(),
+                wall=0,
+                name="wall 4",
+                rgb=np.repeat(level[:, :, None], 3, axis=2),
+                mask=np.full(scenes.SHAPE, OrthoMask.PAINTED, dtype=np.uint8),
+                source=np.zeros(scenes.SHAPE, dtype=np.int16),
+                sources=(source,),
+                plane_index=4,
+            ),
+        )
+    )
+
+
+def test_photos_place_sides_that_the_scan_is_too_coarse_for(tmp_path: Path) -> None:
+    openings, ctx = found(
+        tmp_path, walls=scenes.walls(sparse=True), cloud=scenes.cloud(), images=image("a.jpg")
+    )
+    niche, window, _ = openings.openings
+    assert set(window.side_source.tolist()) == {OutlineSource.IMAGE}
+    assert set(niche.side_source.tolist()) == {OutlineSource.DEPTH}
+    cells = cells_of(window)
+    sides = (cells.min(axis=0), cells.max(axis=0))
+    true = (scenes.WINDOW.min(axis=0) - 0.35, scenes.WINDOW.max(axis=0) + 0.35)
+    np.testing.assert_allclose(sides, true, atol=0.15)
+    assert (window.side_sigma_m / scenes.GSD_M).max() <= 0.55
+    assert (niche.side_sigma_m / scenes.GSD_M).min() >= 0.7
+    numbers = {metric.name: metric.value for metric in ctx.metrics}
+    assert numbers["image_side_share"] == pytest.approx(4 / 12)
+
+
+@pytest.mark.parametrize("far_cells", [2.0, -2.0])
+def test_an_edge_that_is_elsewhere_moves_no_side(tmp_path: Path, far_cells: float) -> None:
+    openings, _ = found(tmp_path, cloud=scenes.cloud(), images=image("a.jpg", far_cells))
+    assert set(openings.openings[1].side_source.tolist()) == {OutlineSource.DEPTH}
+
+
+def test_what_the_cloud_painted_moves_no_side(tmp_path: Path) -> None:
+    without, _ = found(tmp_path, cloud=scenes.cloud())
+    painted, _ = found(tmp_path, cloud=scenes.cloud(), images=image("cloud"))
+    for one, other in zip(without.openings, painted.openings, strict=True):
+        np.testing.assert_array_equal(one.outline_m, other.outline_m)
+
+
+def test_floors_alone_are_refused_and_looked_at_when_asked(tmp_path: Path) -> None:
+    walls = scenes.walls()
+    level = Walls(
+        walls=walls.walls,
+        up=walls.walls[0].frame.normal_world,
+        intensity_source="laser",
+        buffer_front_m=scenes.FRONT_M,
+        buffer_behind_m=scenes.BEHIND_M,
+    )
+    with pytest.raises(MethodError, match="none of the 1 walls is upright: level: true"):
+        found(tmp_path, walls=level)
+    openings, _ = found(tmp_path, walls=level, level=True)
+    assert openings.openings

@@ -1,0 +1,52 @@
+"""Openings as products: kept whole, refused where they make no sense."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthoflow.errors import ProductError
+from orthoflow.products import Openings
+from tests.drawing_runs import WALL, box_openings
+
+
+def test_openings_come_back_from_their_payload() -> None:
+    found = box_openings()
+    again = Openings.from_payload(found.to_payload())
+    (opening,) = found.openings
+    (same,) = again.openings
+    np.testing.assert_array_equal(same.outline_world, opening.outline_world)
+    np.testing.assert_array_equal(same.side_sigma_m, opening.side_sigma_m)
+    assert (same.kind, same.depth_m, same.said) == (opening.kind, opening.depth_m, opening.said)
+    assert again.of_wall(WALL) == (same,)
+    assert again.of_wall(WALL + 1) == ()
+
+
+def test_what_it_is_is_said_in_a_line() -> None:
+    (opening,) = box_openings().openings
+    assert opening.said == "niche 0.250 m deep, 0.80 x 1.20 m"
+    assert replace(opening, kind="through", depth_m=0.1).said == "through, 0.80 x 1.20 m"
+
+
+def test_the_error_of_all_sides_counts_those_that_were_seen() -> None:
+    (opening,) = box_openings().openings
+    assert opening.edge_sigma_m == pytest.approx(np.sqrt((9 + 2.25 + 9) / 3) * 1e-3)
+    assert replace(opening, side_sigma_m=np.full(4, np.nan)).edge_sigma_m is None
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"outline_world": np.zeros((3, 3))}, "opening.outline_world must have shape"),
+        ({"side_source": np.zeros(3, dtype=np.uint8)}, "opening.side_source must have shape"),
+        ({"outline_m": np.full((4, 2), np.nan)}, "needs 3 corners or more, of numbers"),
+        ({"kind": "hole"}, "an opening is through, niche, no data, got 'hole'"),
+        ({"side_source": np.full(4, 9, dtype=np.uint8)}, "opening.side_source must be at most 2"),
+    ],
+    ids=["corners", "sides", "not finite", "kind", "source"],
+)
+def test_what_does_not_go_together_is_refused(change: dict[str, object], said: str) -> None:
+    with pytest.raises(ProductError, match=said):
+        replace(box_openings().openings[0], **change)  # type: ignore[arg-type] # wrong on purpose
