@@ -3,9 +3,10 @@
 A plugin's package may hold `kernels.json`: for each of its methods the kernels that Python calls,
 with the types of their arguments. Those of the methods that a run still has before it are compiled
 by a process of lowest priority into the folder that the steps read. A step that comes too early
-compiles for itself, or waits for the one kernel that is being compiled (`geometry.kept_kernels`).
-Beside a step whose times are compared nothing is compiled: its core shares memory and cache.
-`python -m orthoflow.engine.compiling_ahead` is that process; it ends with the coordinator.
+compiles for itself, or waits for the one kernel that is being compiled (`geometry.kept_kernels`);
+what else it needs is left to it from then on, or both would go through one list, one waiting for
+the other. Beside a step whose times are compared nothing is compiled: its core shares memory and
+cache. `python -m orthoflow.engine.compiling_ahead` is that process; it ends with the coordinator.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -60,6 +61,13 @@ class AheadCompiler:
             if orders:
                 with suppress(OSError):
                     self._processes.append(_start(folder, orders))
+
+    def leave(self, method: str) -> None:
+        """Leave what is not begun of a method's kernels to its step, which begins now."""
+        for process in self._processes:
+            assert process.stdin is not None  # noqa: S101 - it is a pipe
+            with suppress(OSError):
+                os.write(process.stdin.fileno(), f"{method}\n".encode())
 
     def hold(self) -> None:
         """End them until a later `begin`; a kernel that is half compiled is begun anew then."""
@@ -124,7 +132,9 @@ def _start(folder: Path, orders: Mapping[str, list[_Kernel]]) -> subprocess.Pope
         )
 
 
-def compile_all(folder: Path, orders: Mapping[str, list[_Kernel]]) -> None:
+def compile_all(
+    folder: Path, orders: Mapping[str, list[_Kernel]], left: Collection[str] = ()
+) -> None:
     """Compile the kernels of each method, and say of each that it is done.
 
     A kernel that is not there as it was foretold is left to the step that needs it.
@@ -132,32 +142,38 @@ def compile_all(folder: Path, orders: Mapping[str, list[_Kernel]]) -> None:
     Args:
         folder: where this process keeps what it compiles.
         orders: name of the file to leave -> kernels.
+        left: methods whose steps have begun, which may become more meanwhile.
     """
     from orthoflow.geometry.kernel_types import type_of  # noqa: PLC0415 - loads the compiler
 
     for name, kernels in orders.items():
+        method = name.removesuffix(DONE).rpartition(".")[0]
         for module, kernel, arguments in kernels:
+            if method in left:
+                break
             with suppress(Exception):
                 found = getattr(importlib.import_module(module), kernel)
                 found.compile(tuple(map(type_of, arguments)))
-        with suppress(OSError):
-            (folder / name).touch()
+        else:
+            with suppress(OSError):
+                (folder / name).touch()
 
 
-def _end_with(pipe: int) -> None:
-    """End this process when nobody holds the other end of its pipe any more."""
-    while os.read(pipe, 1):
-        pass
+def _listen(left: set[str]) -> None:
+    """Hear which methods are left; end this process when nobody is there who could tell."""
+    for line in sys.stdin:
+        left.add(line.rstrip("\n"))
     os._exit(0)
 
 
 def main(arguments: list[str]) -> None:
     """Compile what the coordinator orders."""
     os.nice(_LOWEST)
-    threading.Thread(target=_end_with, args=(sys.stdin.fileno(),), daemon=True).start()
+    left: set[str] = set()
+    threading.Thread(target=_listen, args=(left,), daemon=True).start()
     with os.fdopen(int(arguments[0]), "rb") as stream:
         orders = json.load(stream)
-    compile_all(Path(os.environ[COMPILED_CODE]), orders)
+    compile_all(Path(os.environ[COMPILED_CODE]), orders, left)
 
 
 if __name__ == "__main__":

@@ -382,6 +382,7 @@ class _Run:
         self._listen(CellStarted(address=cell.address))
         if task.is_compared:
             self._ahead.hold()
+        self._ahead.leave(task.method)
         executor.start(task)
         if self._ahead.is_wanted and not self._compared.intersection(self._running):
             later = (item.cell for item in self._waiting.values())

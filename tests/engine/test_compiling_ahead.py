@@ -15,6 +15,7 @@ import pytest
 
 from orthoflow.catalog import discover_catalog
 from orthoflow.engine import compiling_ahead, execute
+from orthoflow.engine.compiled_code import DONE
 from orthoflow.engine.compiling_ahead import FORETOLD, AheadCompiler
 from orthoflow.engine.events import CellFinished, RunEvent
 from orthoflow.engine.keys import MethodFacts, method_facts
@@ -102,6 +103,37 @@ def test_one_that_is_held_begins_anew(tmp_path: Path, facts: MethodFacts) -> Non
         wait_for(done)
     finally:
         ahead.close()
+
+
+WAITS = """
+import pathlib, time
+while not pathlib.Path("GO").exists():
+    time.sleep(0.01)
+time.sleep(0.2)
+"""
+
+
+def test_what_is_not_begun_of_a_method_is_left_to_its_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "waits.py").write_text(WAITS.replace("GO", str(tmp_path / "go")))
+    (tmp_path / "unwanted.py").write_text(f"open({str(tmp_path / 'loaded')!r}, 'w')")
+    first, second = (f"{name}.0123abcd{DONE}" for name in ("toy.begun", "toy.later"))
+    ahead = AheadCompiler(is_wanted=False)
+    orders = {first: [["waits", "f", []], ["unwanted", "f", []]], second: []}
+    ahead._processes.append(compiling_ahead._start(tmp_path, orders))
+    try:
+        ahead.leave("toy.begun")
+        (tmp_path / "go").touch()
+        wait_for(tmp_path / second)
+        ahead._processes[0].wait(_LONGEST_S)
+        # Nobody is there to hear it any more.
+        ahead.leave("toy.later")
+    finally:
+        ahead.close()
+    assert not (tmp_path / first).exists()
+    assert not (tmp_path / "loaded").exists()
 
 
 COMPARED = """
