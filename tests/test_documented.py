@@ -68,17 +68,6 @@ NO_WORKFLOW_OF_OURS: Final[Mapping[str, str]] = {
     "mine.yaml": "written by `orthoflow new`: tests/road/test_documents.py",
     "my.yaml": "the reader's own",
 }
-# What a reader has: files that the commands name.
-READERS: Final = (
-    *("room.e57", "photos/a.jpg", "calibration.yaml", "my_scan.laz", "site.ply", "ties.csv"),
-    *("scans/hall.e57", "scans/stairs.e57", "photos/hall/a.jpg", "photos/stairs/a.jpg"),
-    *("data/room.e57", "data/checkpoints.csv"),
-)
-# What workflows of ours need that a command leaves out, because the sentence around it says so.
-LEFT_OUT: Final[Mapping[str, tuple[str, ...]]] = {
-    "photos-on-scan.yaml": ("scan=room.e57", "photos=photos"),
-    "plan.yaml": ("scan=site.ply",),
-}
 
 
 @pytest.fixture(scope="module")
@@ -88,11 +77,8 @@ def catalog() -> Catalog:
 
 @pytest.fixture(scope="module")
 def readers_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the reader's files, and those that documents show in full."""
+    """A folder with the files that documents show in full; scans and photos are a reader's own."""
     folder = tmp_path_factory.mktemp("reader")
-    for name in READERS:
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).touch()
     for name, text in written_files().items():
         (folder / name).write_text(text)
     return folder
@@ -149,13 +135,10 @@ def _of_orthoflow(command: Documented, catalog: Catalog) -> str:
         return ""
     name = str(workflow)
     path = ROOT / name if (ROOT / name).is_file() else Path(name)
-    inputs = tuple(map(str, call.values.get("inputs") or ()))
-    if not inputs and not call.values.get("datasets"):
-        inputs = LEFT_OUT.get(name, ())
     try:
         Changes(
             sets=tuple(map(str, call.values.get("sets") or ())),
-            inputs=inputs,
+            inputs=tuple(map(str, call.values.get("inputs") or ())),
             datasets=str(call.values.get("datasets") or ""),
             only_data=(),
             set_files=tuple(map(str, call.values.get("set_files") or ())),
