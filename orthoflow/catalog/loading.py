@@ -17,6 +17,7 @@ from orthoflow.sdk.methods import (
     MethodParams,
     Ports,
     PortSpec,
+    mapped_port,
     port_specs,
 )
 
@@ -64,7 +65,7 @@ def load_method(
     complaint = _class_complaint(method, spec)
     if not complaint:
         try:
-            complaint = _port_complaint(method, kind, product_types)
+            complaint = _port_complaint(method, kind, product_types) or _mapping_complaint(method)
         except (PluginError, NameError, TypeError) as error:
             complaint = f"its ports cannot be read: {describe_error(error)}"
     if complaint:
@@ -92,7 +93,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
         f"citations must be a tuple of texts, got {citations!r}": (
             isinstance(citations, tuple) and all(isinstance(item, str) for item in citations)
         ),
-        "it has no run": method.run is not Method.run,
+        "it has no run": method.run is not Method.run or bool(method.maps_over),
     }
     return next((complaint for complaint, is_kept in rules.items() if not is_kept), "")
 
@@ -117,6 +118,14 @@ def _port_complaint(method: type[Method], kind: KindSpec, product_types: frozens
         return (
             f"its outputs must be {_join(kind.outputs)} as in kind {kind.name}, got {_join(given)}"
         )
+    return ""
+
+
+def _mapping_complaint(method: type[Method]) -> str:
+    try:
+        mapped_port(method)
+    except PluginError as error:
+        return str(error)
     return ""
 
 

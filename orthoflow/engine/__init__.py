@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from orthoflow.engine.results import CellResult, ProductRef
     from orthoflow.engine.scheduling import RunOutcome, execute
     from orthoflow.engine.soundness import Soundness, check_store
-    from orthoflow.engine.store import Store, StoredResult, list_results
+    from orthoflow.engine.store import Store
+    from orthoflow.engine.stored_results import StoredResult, list_results
 
 __all__ = [
     "CellFinished",
@@ -71,11 +72,11 @@ _HOMES = {
     "RunStarted": "events",
     "Soundness": "soundness",
     "Store": "store",
-    "StoredResult": "store",
+    "StoredResult": "stored_results",
     "check_store": "soundness",
     "collect_garbage": "garbage",
     "execute": "scheduling",
-    "list_results": "store",
+    "list_results": "stored_results",
     "plan_run": "plan",
 }
 

@@ -24,7 +24,7 @@ from orthoflow.engine.store import canonical_json
 from orthoflow.errors import PluginError
 from orthoflow.files.json_texts import parse_json
 from orthoflow.products.product import JsonValue
-from orthoflow.sdk.methods import Method, port_specs
+from orthoflow.sdk.methods import MappedPort, Method, mapped_port, port_specs
 from orthoflow.workflow.cells import Cell
 
 _WHAT: Final = "orthoflow/cell"
@@ -51,6 +51,7 @@ class MethodFacts(MethodIdentity):
         inputs: port -> product type.
         outputs: port -> product type.
         sources: the files behind `code`.
+        maps_over: where the items are that it may compute in parts, if it does.
     """
 
     target: str
@@ -60,6 +61,7 @@ class MethodFacts(MethodIdentity):
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
     sources: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
+    maps_over: MappedPort | None = None
 
     def is_code_unchanged(self) -> bool:
         """Whether the code on the disk is still the one in the keys."""
@@ -101,6 +103,7 @@ def method_facts(method_id: str, catalog: Catalog) -> MethodFacts:
         compiled_digest=compiled_digest(entry),
         inputs={name: port.type_name for name, port in port_specs(cls.In).items()},
         outputs={name: port.type_name for name, port in port_specs(cls.Out).items()},
+        maps_over=mapped_port(cls),
     )
 
 

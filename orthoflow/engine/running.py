@@ -33,7 +33,7 @@ from orthoflow.engine.results import (
     shared_fields,
 )
 from orthoflow.engine.store import Publisher, Store, digest_of
-from orthoflow.engine.tasks import Task, TaskFile, TaskInput
+from orthoflow.engine.tasks import PART, Task, TaskFile, TaskInput, TaskPart
 from orthoflow.errors import (
     DiskSpaceError,
     InputError,
@@ -47,7 +47,7 @@ from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
-from orthoflow.sdk.methods import Method
+from orthoflow.sdk.methods import Method, Part, Ports, checked_part
 from orthoflow.system import children_processor_s
 
 # Inputs up to this size are digested again after the run: they must not have changed.
@@ -228,9 +228,10 @@ class _Call:
         cls = cast("type[Method]", load_target(self.task.target))
         inputs = {port: self._read(given) for port, given in self.task.inputs.items()}
         params = self._params(cls)
+        parts = tuple(self._read_part(cls, part) for part in self.task.parts)
         wall_s, cpu_s, process = self._meter.clock_s(), self._cpu_s(), os.getpid()
         try:
-            outputs = cls().run(cls.In(**inputs), params, self._context)
+            outputs = self._compute(cls(), cls.In(**inputs), parts, params)
         finally:
             if os.getpid() != process:
                 # The method forked, and this is not the process whose result counts.
@@ -242,12 +243,25 @@ class _Call:
         self._check_inputs(inputs)
         result = dataclasses.replace(
             blank_result(self.task),
-            outputs=self._keep(self._products(cls, outputs)),
+            outputs=self._keep_part(outputs) or self._keep(self._products(cls, outputs)),
             metrics=tuple(self._context.metrics),
             figures=self._keep_figures(),
         )
-        self._stored_mib = round(self._store.size_bytes(result) / MIB, 3)
+        if self.task.part is None:
+            self._stored_mib = round(self._store.size_bytes(result) / MIB, 3)
         return result
+
+    def _compute(
+        self, method: Method, inputs: Ports, parts: tuple[Part, ...], params: object
+    ) -> object:
+        part = self.task.part
+        if part is not None:
+            items = range(part.first, part.end)
+            return checked_part(method, inputs, items, params, self._context)
+        # Any: what a method returns is judged afterwards.
+        if parts:
+            return cast("object", method.join(inputs, parts, params, self._context))
+        return cast("object", method.run(inputs, params, self._context))
 
     def _cpu_s(self) -> float:
         """Processor seconds of this process and its children, without loading and samples."""
@@ -260,6 +274,19 @@ class _Call:
             return InputFiles(name=given.input_name, paths=paths)
         cls = cast("type[Product]", load_target(given.target))
         return self._store.get_product(given.ref.digest, cls, is_checked=True)
+
+    def _parts_store(self) -> Store:
+        return Store(Path(self.task.parts_store), workspace=Path(self.task.folder))
+
+    def _read_part(self, cls: type[Method], part: TaskPart) -> Part:
+        assert part.ref is not None  # noqa: S101 - only parts that are there are joined
+        return self._parts_store().get_product(part.ref.digest, cls.PartOut)
+
+    def _keep_part(self, output: object) -> dict[str, ProductRef]:
+        """Keep a part; nothing where a whole step has run."""
+        if self.task.part is None:
+            return {}
+        return {PART: self._parts_store().put_product(cast("Part", output))}
 
     def _params(self, cls: type[Method]) -> object:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -12,10 +11,8 @@ from pathlib import Path
 from typing import Final, Literal
 
 from orthoflow.engine.clock import now
-from orthoflow.engine.compiled_code import begun_with_warm, leave_for_others
 from orthoflow.engine.compiling_ahead import AheadCompiler
 from orthoflow.engine.durability import remove_tree, writing_to
-from orthoflow.engine.environment import environment
 from orthoflow.engine.events import (
     CellFinished,
     CellLogged,
@@ -30,7 +27,7 @@ from orthoflow.engine.executor_choice import executor_of
 from orthoflow.engine.executors import Capacity, Executor, TaskEnd, Tell
 from orthoflow.engine.failures import Failures
 from orthoflow.engine.interruptions import Interruption, watching_interruptions
-from orthoflow.engine.keys import CellKey, MethodFacts, cell_key
+from orthoflow.engine.keys import CellKey, cell_key
 from orthoflow.engine.locks import exclusive_lock, is_locked
 from orthoflow.engine.plan import (
     PlannedInput,
@@ -46,10 +43,11 @@ from orthoflow.engine.run_folder import (
     CellEnded,
     Journal,
     RunWent,
-    cell_file_name,
 )
+from orthoflow.engine.splitting import Splits
 from orthoflow.engine.store import Store
-from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput
+from orthoflow.engine.task_making import TaskMaker
+from orthoflow.engine.tasks import Task
 from orthoflow.errors import (
     ArgumentError,
     CancelledStepError,
@@ -60,7 +58,7 @@ from orthoflow.errors import (
 from orthoflow.sdk.context import StepEvent
 from orthoflow.sdk.lines import one_line, text_of_path
 from orthoflow.system import HAS_STEP_PROCESSES
-from orthoflow.workflow.cells import Cell, CellOutput, WorkflowInput, compared_cells
+from orthoflow.workflow.cells import Cell, CellOutput, compared_cells
 
 _POLL_S: Final = 0.25
 _CODE_CHANGED: Final = (
@@ -160,15 +158,16 @@ def execute(
             )
         )
         with _scratch(store, journal.run_id) as scratch, watching_interruptions() as interruption:
-            tasks = _TaskMaker(
+            tasks = TaskMaker(
                 plan=plan,
                 store=store,
                 scratch=scratch,
                 logs=folder / LOGS,
                 run_id=journal.run_id,
             )
+            splits = Splits(store)
             executor = executor_of(
-                plan, scratch, _passing_on(listen), lambda: interruption.is_asked
+                plan, scratch, _passing_on(listen, splits), lambda: interruption.is_asked
             )
             # Of other executors, one computes in this process, and others on other machines.
             ahead = AheadCompiler(
@@ -176,7 +175,7 @@ def execute(
                 and plan.options.executor == "local"
                 and plan.options.all_cores > 1
             )
-            run = _Run(tasks, journal, listen, ahead)
+            run = _Run(tasks, splits, journal, listen, ahead)
             try:
                 with closing(executor), tasks.sharing_kernels(), closing(ahead):
                     run.go(executor, interruption)
@@ -199,9 +198,15 @@ class _Run:
     """The state of one run; used from one thread."""
 
     def __init__(
-        self, tasks: _TaskMaker, journal: Journal, listen: RunListener, ahead: AheadCompiler
+        self,
+        tasks: TaskMaker,
+        splits: Splits,
+        journal: Journal,
+        listen: RunListener,
+        ahead: AheadCompiler,
     ) -> None:
         self._tasks = tasks
+        self._splits = splits
         self._ahead = ahead
         self._plan = tasks.plan
         self._store = tasks.store
@@ -224,7 +229,7 @@ class _Run:
         Raises:
             CancelledStepError: interrupted.
         """
-        while self._waiting or self._running:
+        while self._waiting or self._running or self._splits.addresses:
             if interruption.is_asked:
                 self._break_off(executor)
             self._advance(executor)
@@ -271,9 +276,11 @@ class _Run:
 
     def _advance(self, executor: Executor) -> None:
         """Settle or start every cell whose inputs are known, as far as the cores go."""
+        self._go_on_in_parts(executor)
         for address, planned in list(self._waiting.items()):
             if address not in self._ready:
                 self._prepare(planned.cell)
+        for address, planned in list(self._waiting.items()):
             ready = self._ready.get(address)
             if ready is None or self._is_under_way(ready.key):
                 continue
@@ -362,7 +369,8 @@ class _Run:
 
     def _is_under_way(self, key: CellKey) -> bool:
         """Whether an equal cell runs already; its result will then serve both."""
-        return any(task.key == key.key for task in self._running.values())
+        is_running = any(task.key == key.key for task in self._running.values())
+        return is_running or self._splits.has_key(key.key)
 
     def _has_room(self, cell: Cell, capacity: Capacity) -> bool:
         if not self._running:
@@ -377,29 +385,63 @@ class _Run:
             is_compared=cell.address in self._compared,
         )
         del self._waiting[cell.address]
-        self._running[cell.address] = task
         self._journal.write(CellBegan(time=now(), address=cell.address, key=task.key))
         self._listen(CellStarted(address=cell.address))
         if task.is_compared:
             self._ahead.hold()
         self._ahead.leave(task.method)
-        executor.start(task)
+        facts, n_parts = self._plan.methods[cell.method], self._n_parts(task, executor.capacity)
+        is_forced = cell.step in self._plan.options.force and not self._journal.is_resumed
+        if self._splits.begin(task, facts, n_parts, is_forced=is_forced):
+            self._go_on_in_parts(executor)
+        else:
+            self._run(task, executor)
         if self._ahead.is_wanted and not self._compared.intersection(self._running):
             later = (item.cell for item in self._waiting.values())
             self._ahead.begin(self._tasks.kernels_of(later))
 
+    def _run(self, task: Task, executor: Executor) -> None:
+        self._running[task.address] = task
+        executor.start(task)
+
+    def _n_parts(self, task: Task, capacity: Capacity) -> int:
+        """In how many parts to compute a step, if it can be: as many as would keep all busy."""
+        options = self._plan.options
+        # Times of steps in parts hold what each part prepares.
+        if options.parts or options.executor != "dask" or task.is_compared:
+            return options.parts or 1
+        n_others = sum(1 for address in self._waiting if address in self._ready)
+        return (capacity.n_tasks - len(self._running)) // (n_others + 1)
+
+    def _go_on_in_parts(self, executor: Executor) -> None:
+        """Start parts of cells, and what joins them, as far as the cores go."""
+        for address in self._splits.addresses:
+            cell = next(item.cell for item in self._plan.cells if item.cell.address == address)
+            while self._has_room(cell, executor.capacity):
+                task = self._splits.next_task(address)
+                if task is None:
+                    break
+                self._run(task, executor)
+
     def _take(self, end: TaskEnd) -> None:
-        task = self._running.pop(end.address)
-        planned = next(item for item in self._plan.cells if item.cell.address == end.address)
-        cell, result = planned.cell, end.result
-        remove_tree(Path(task.folder))
+        ended = self._running.pop(end.address)
+        remove_tree(Path(ended.folder))
+        over = self._splits.take(ended, end)
+        if over is None:
+            return
+        task, result = over
+        planned = next(item for item in self._plan.cells if item.cell.address == task.address)
+        cell = planned.cell
         if self._is_to_repeat(cell, task, result):
             self._waiting[cell.address] = planned
+            # Another run may have given the result meanwhile.
+            self._ready.pop(cell.address, None)
             return
         if result.status == "ok" and self._plan.methods[cell.method].is_code_unchanged():
             self._made.add(task.key)
             self._store.put_result(task.key, result, cell.step)
             self._store.trust(result)
+            self._splits.forget(task.key)
             self._failures.forget(task.key)
         elif result.status == "ok":
             # Kept under its key it would pass for what the code of that key computes.
@@ -465,10 +507,11 @@ def _cores(cell: Cell, capacity: Capacity) -> int:
     return min(cell.cores or capacity.share, capacity.cores_of_one)
 
 
-def _passing_on(listen: RunListener) -> Tell:
-    def tell(address: str, event: StepEvent) -> None:
+def _passing_on(listen: RunListener, splits: Splits) -> Tell:
+    def tell(task: str, event: StepEvent) -> None:
+        address, fraction = splits.said_by(task, event.fraction)
         if event.kind == "progress":
-            listen(CellProgress(address=address, fraction=event.fraction, text=event.text))
+            listen(CellProgress(address=address, fraction=fraction, text=event.text))
         elif event.kind == "warning":
             listen(CellWarned(address=address, text=event.text))
         else:
@@ -499,98 +542,3 @@ def _scratch(store: Store, run_id: str) -> Iterator[Path]:
 
 def _lock_of(folder: Path) -> Path:
     return folder.with_name(f"{folder.name}.lock")
-
-
-@dataclass(frozen=True, kw_only=True)
-class _TaskMaker:
-    """Makes the tasks of one run.
-
-    Attributes:
-        plan: of the run.
-        store: where products and results go.
-        scratch: folder of the run for work in progress, on the store's file system.
-        logs: folder for the logs of steps.
-        run_id: of the run.
-    """
-
-    plan: RunPlan
-    store: Store
-    scratch: Path
-    logs: Path
-    run_id: str
-
-    def make(self, cell: Cell, key: CellKey, refs: Mapping[str, ProductRef], cores: int) -> Task:
-        """Give the task of a cell.
-
-        Args:
-            cell: the cell.
-            key: its key.
-            refs: port -> product.
-            cores: threads it may use.
-        """
-        facts = self.plan.methods[cell.method]
-        return Task(
-            address=cell.address,
-            run_id=self.run_id,
-            target=facts.target,
-            key=key.key,
-            key_preimage=key.preimage,
-            params=cell.params,
-            seed=cell.seed,
-            inputs={port: self._input(cell, port, ref) for port, ref in refs.items()},
-            outputs=self._outputs(facts),
-            cores=cores,
-            timeout_s=cell.timeout_s,
-            store=str(self.store.folder),
-            folder=str(self.scratch / uuid.uuid4().hex[:12]),
-            log=str(self.logs / f"{cell_file_name(cell.address)}.log"),
-            numba_folder=str(self._kernels(facts)),
-            publisher_tag=self.plan.publisher_tag,
-            environment=environment(cores),
-            **shared_fields(facts, MethodIdentity),
-        )
-
-    def kernels_of(self, cells: Iterable[Cell]) -> dict[Path, list[MethodFacts]]:
-        """Give folders for compiled kernels -> the methods of cells, each once."""
-        folders: dict[Path, list[MethodFacts]] = {}
-        for method in dict.fromkeys(cell.method for cell in cells if not cell.skip_reason):
-            facts = self.plan.methods[method]
-            folders.setdefault(self._kernels(facts), []).append(facts)
-        return folders
-
-    def _kernels(self, facts: MethodFacts) -> Path:
-        return begun_with_warm(self.store.numba_folder(facts.compiled_digest))
-
-    @contextmanager
-    def sharing_kernels(self) -> Iterator[None]:
-        """Give stores that begin later what is compiled while the block runs."""
-        since_ns = time.time_ns()
-        try:
-            yield
-        finally:
-            for digest in {facts.compiled_digest for facts in self.plan.methods.values()}:
-                leave_for_others(self.store.numba_folder(digest), since_ns)
-
-    def _input(self, cell: Cell, port: str, ref: ProductRef) -> TaskInput:
-        source = cell.inputs[port]
-        if not isinstance(source, WorkflowInput):
-            return TaskInput(ref=ref, target=self.plan.products[ref.type_name].target)
-        given = self.plan.inputs[source.name]
-        return TaskInput(ref=ref, input_name=source.name, files=_task_files(given) if given else ())
-
-    def _outputs(self, facts: MethodFacts) -> dict[str, TaskOutput]:
-        return {
-            port: TaskOutput(
-                type_name=type_name,
-                target=self.plan.products[type_name].target,
-                publisher=self.plan.products[type_name].publisher,
-            )
-            for port, type_name in facts.outputs.items()
-        }
-
-
-def _task_files(given: PlannedInput) -> tuple[TaskFile, ...]:
-    return tuple(
-        TaskFile(path=str(path.absolute()), identity=file.identity, sha256=file.sha256)
-        for path, file in zip(given.paths, given.files, strict=True)
-    )

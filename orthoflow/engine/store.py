@@ -11,6 +11,7 @@ Layout below the store's folder:
     digests.json                    memory of input files' digests; disposable
     numba/<source digest>/          compiled kernels; disposable
     scratch/<run id>/               work in progress; removed with its run
+    parts/<key>/                    a store of what parts of a step gave (`splitting`); disposable
     lock                            shared by runs, exclusive for garbage collection
     damaged.lock                    held by who sets something aside
 
@@ -36,7 +37,6 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 from orthoflow_provenance.digests import canonical_json, payload_digest, sha256_text
 from orthoflow_provenance.errors import RecordFormatError
 
-from orthoflow.engine.clock import time_of_file
 from orthoflow.engine.durability import (
     folder_size,
     place_folder,
@@ -67,7 +67,7 @@ from orthoflow.engine.results import CellResult, ProductRef, result_from_json, r
 from orthoflow.engine.store_folder import make_store
 from orthoflow.errors import DamageError, ProductError, StoreError
 from orthoflow.files.json_texts import parse_json
-from orthoflow.products.product import Payload, Product
+from orthoflow.products.product import JsonValue, Payload, Product
 
 if TYPE_CHECKING:
     from orthoflow_provenance.payloads import StoredPayload
@@ -76,11 +76,9 @@ __all__ = [
     "Preimage",
     "Publisher",
     "Store",
-    "StoredResult",
     "TakenResult",
     "canonical_json",
     "digest_of",
-    "list_results",
 ]
 
 _READ_RETRY_S: Final = 0.05
@@ -94,30 +92,6 @@ class Publisher(Protocol):
     def __call__(self, product: Product, folder: Path, digest: str, /) -> object:
         """Write the files into an existing empty folder."""
         raise AssertionError("a protocol is never called")
-
-
-@dataclass(frozen=True, kw_only=True)
-class StoredResult:
-    """A result in the store.
-
-    Attributes:
-        key: cache key.
-        method: method id.
-        run_id: the run that computed it.
-        ended: ISO 8601 UTC.
-        last_used: ISO 8601 UTC, when a run last took or made it.
-        size_bytes: of its products with their published files; equal products of several results
-            count for each.
-        is_complete: all its products and figures are there.
-    """
-
-    key: str
-    method: str
-    run_id: str
-    ended: str
-    last_used: str
-    size_bytes: int
-    is_complete: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,6 +232,23 @@ class Store:
                 raise StoreError(f"cannot read {path}: {error.strerror}") from error
             raise DamageError(f"{damaged} ({error})") from error
         return cls.from_payload(_as_payload(stored))
+
+    def product_metadata(self, digest: str) -> Mapping[str, JsonValue]:
+        """What a product holds besides its arrays, which are not read.
+
+        Raises:
+            DamageError: it is not there, or is damaged.
+        """
+        from orthoflow_provenance.payloads import read_product_metadata  # noqa: PLC0415 - as above
+
+        path = self.product_file(digest)
+        try:
+            if path is not None:
+                return read_product_metadata(path)
+        except (OSError, ValueError, KeyError, RuntimeError) as error:
+            if isinstance(error, OSError) and error.errno in SHORTAGES:
+                raise StoreError(f"cannot read {path}: {error.strerror}") from error
+        raise DamageError(f"the store {self.folder} has no sound product {digest}")
 
     def product_file(self, digest: str) -> Path | None:
         """The HDF5 file of a product, None when it is not there or is damaged."""
@@ -544,29 +535,6 @@ class Store:
                 f"cannot be set aside: {error}"
             ) from error
         return True
-
-
-def list_results(store: Store) -> tuple[StoredResult, ...]:
-    """List the results of a store, last used first; unreadable ones are left out."""
-    found: list[StoredResult] = []
-    for path in store.results.glob("*.json"):
-        try:
-            result = result_from_json(path.read_text(encoding="utf-8"), path.name)
-            used = time_of_file(path.stat().st_mtime)
-        except (StoreError, OSError, UnicodeDecodeError):
-            continue
-        found.append(
-            StoredResult(
-                key=path.stem,
-                method=result.method,
-                run_id=result.run_id,
-                ended=result.ended,
-                last_used=used,
-                size_bytes=store.size_bytes(result),
-                is_complete=store.result(path.stem) is not None,
-            )
-        )
-    return tuple(sorted(found, key=lambda item: (item.last_used, item.key), reverse=True))
 
 
 def digest_of(product: Product) -> str:

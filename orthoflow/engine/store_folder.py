@@ -14,8 +14,8 @@ _MADE: Final = ("scratch", "results", "objects", "preimages")
 # What else may come first: compiled kernels before any result, a lock before the folders. A disk
 # of its own has `lost+found`, and systems leave hidden files everywhere.
 _OURS: Final = frozenset(
-    {*_MADE, "failures", "damaged", "numba", "matplotlib", "digests.json", "lock", "damaged.lock"}
-    | {"lost+found"}
+    {*_MADE, "failures", "damaged", "numba", "parts", "matplotlib", "digests.json", "lock"}
+    | {"damaged.lock", "lost+found"}
 )
 
 

@@ -7,12 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Final
 
 from pydantic import JsonValue, TypeAdapter, ValidationError
 
 from orthoflow.engine.durability import write_whole
 from orthoflow.engine.results import MethodIdentity, ProductRef, RecordedEnvironment
 from orthoflow.errors import StoreError
+
+# The output port of a part.
+PART: Final = "part"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +61,23 @@ class TaskOutput:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TaskPart:
+    """Some of the items that a method maps over.
+
+    Attributes:
+        first: index of the first one.
+        end: index behind the last one.
+        ref: what the part came to; None before it ran.
+    """
+
+    first: int
+    end: int
+    ref: ProductRef | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Task(MethodIdentity):
-    """One method call.
+    """One method call: of a whole step, of a part of one, or the one that joins parts.
 
     Attributes:
         address: of the cell.
@@ -79,6 +98,9 @@ class Task(MethodIdentity):
         publisher_tag: version of what writes published files.
         environment: where it will run.
         is_compared: whether its times stand beside those of others.
+        part: the part to compute; None for a whole step.
+        parts: the parts to join, in order; empty where there are none.
+        parts_store: folder of the store that has them.
     """
 
     address: str
@@ -99,6 +121,9 @@ class Task(MethodIdentity):
     publisher_tag: str = ""
     environment: RecordedEnvironment | None = None
     is_compared: bool = False
+    part: TaskPart | None = None
+    parts: tuple[TaskPart, ...] = ()
+    parts_store: str = ""
 
     @property
     def who(self) -> str:

@@ -123,6 +123,7 @@ class Photos(Product):
 
     type_name: ClassVar[str] = "photos"
     embedded: ClassVar[bool] = False
+    items: ClassVar[str] = "photos"
 
     photos: tuple[Photo, ...]
 
@@ -380,6 +381,8 @@ class Cameras(Product):
         "covariance": Tolerance(limit=1e-4, unit="1"),
         "residual_px": Tolerance(limit=0.05, unit="px"),
     }
+    items: ClassVar[str] = "cameras"
+    item_name: ClassVar[str] = "photo"
 
     cameras: tuple[Camera, ...]
     ties: Ties | None = None

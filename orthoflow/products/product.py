@@ -8,6 +8,7 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cache
 from typing import ClassVar, Final, Literal, Self, TypeAlias, Union
 
@@ -60,8 +61,8 @@ class Payload:
 class Product:
     """Base of all product types; subclasses are frozen dataclasses.
 
-    Fields may be numpy arrays, bytes, JSON values, other dataclasses and tuples of dataclasses;
-    each may be None where its annotation says so. `None` means absent.
+    Fields may be numpy arrays, bytes, JSON values, members of an `IntEnum`, other dataclasses and
+    tuples of these; each may be None where its annotation says so. `None` means absent.
 
     Attributes:
         type_name: identity in workflows, store and record; never changes.
@@ -70,6 +71,8 @@ class Product:
             of more than 2 GiB is).
         embedded: put the arrays into the record, not only their digest.
         tolerances: field name -> how far replays may differ; fields not named must be equal.
+        items: name of the field, a tuple, whose entries a method may map over; empty for none.
+        item_name: name of the field of an entry that says which one it is, for people.
     """
 
     type_name: ClassVar[str]
@@ -77,6 +80,8 @@ class Product:
     mapped: ClassVar[bool] = False
     embedded: ClassVar[bool] = True
     tolerances: ClassVar[Mapping[str, Tolerance]] = {}
+    items: ClassVar[str] = ""
+    item_name: ClassVar[str] = "name"
 
     def to_payload(self) -> Payload:
         """Give the product as named arrays and JSON; arrays are not copied."""
@@ -156,6 +161,8 @@ def _encode(value: object, name: str, arrays: dict[str, Array]) -> JsonValue:
 def _json_scalar(value: object, name: str) -> JsonValue:
     if isinstance(value, np.bool_ | np.integer | np.floating):
         value = value.item()
+    if isinstance(value, IntEnum):
+        value = int(value)
     if isinstance(value, float) and not math.isfinite(value):
         raise ProductError(f"{name} must be finite to be stored as JSON, got {value}")
     if value is None or isinstance(value, bool | int | float | str):
@@ -210,7 +217,16 @@ def _decode(hint: object, stored: JsonValue, name: str, arrays: Mapping[str, Arr
                 )
                 for i, item in enumerate(stored)
             )
+        if isinstance(candidate, type) and issubclass(candidate, IntEnum) and type(stored) is int:
+            return _member(candidate, stored, name)
     return _of_kind(hint, stored, name)
+
+
+def _member(kind: type[IntEnum], stored: int, name: str) -> IntEnum:
+    try:
+        return kind(stored)
+    except ValueError as error:
+        raise ProductError(f"the stored {name} must be a {kind.__name__}, got {stored}") from error
 
 
 def _of_kind(hint: object, value: object, name: str) -> object:

@@ -127,6 +127,7 @@ class Walls(Product):
         "v_world": Tolerance(limit=1e-6, unit="1"),
         "normal_world": Tolerance(limit=1e-6, unit="1"),
     }
+    items: ClassVar[str] = "walls"
 
     walls: tuple[Wall, ...]
     up: NDArray[np.float64]
@@ -244,6 +245,8 @@ class Layers(Product):
         "quality": Tolerance(limit=1e-3, unit="1"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),
     }
+    items: ClassVar[str] = "layers"
+    item_name: ClassVar[str] = "source"
 
     layers: tuple[Layer, ...]
     names: tuple[str, ...] = ()
@@ -318,6 +321,7 @@ class Orthoimages(Product):
         "rgb": Tolerance(limit=2, unit="grey"),
         "origin_world": Tolerance(limit=1e-3, unit="m"),
     }
+    items: ClassVar[str] = "images"
 
     images: tuple[Orthoimage, ...]
     icc_profile: bytes | None = None

@@ -30,6 +30,12 @@ steps:
   third: {use: work.noise, in: {numbers: second.numbers}}
 """
 
+ROWS = """
+steps:
+  first: {use: make.rows, params: {count: 6}}
+  told: {use: tell.sums, in: {rows: first.rows}}
+"""
+
 
 @contextmanager
 def cluster(n_workers: int, **resources: float) -> Iterator[LocalCluster]:
@@ -105,6 +111,35 @@ def test_workers_of_its_own_give_the_same_digests(office: Office) -> None:
     assert digests(office.world.run(STEPS, into="own", executor="dask", force=("second",))) == (
         office.quiet
     )
+
+
+def test_idle_workers_share_the_items_of_a_step(office: Office) -> None:
+    outcome, _ = office.run(ROWS)
+    alone = office.world.run(ROWS, into="alone", executor="inline")
+    told, whole = outcome.results["told"], alone.results["told"]
+    assert told.outputs == whole.outputs
+    assert told.metrics == whole.metrics
+    assert "part 2 of 2 (row3 to row5)" in told.log
+    assert "part " not in whole.log
+
+
+def test_a_part_whose_worker_is_killed_runs_again(office: Office) -> None:
+    killed: set[int] = set()
+
+    def listen(event: RunEvent) -> None:
+        if isinstance(event, CellProgress) and event.text == "row1" and not killed:
+            killed.update(worker.pid for worker in office.cluster.workers.values())
+            os.kill(min(killed), signal.SIGKILL)
+
+    world = office.world
+    address = office.cluster.scheduler_address
+    plan = world.plan(
+        ROWS, sets=("told.wait_s=0.3",), executor="dask", scheduler=address, force=("told",)
+    )
+    outcome = execute(plan, world.folder / "part-lost", world.store, listen)
+    alone = world.run(ROWS, into="whole", executor="inline", force=("told",))
+    assert killed
+    assert outcome.results["told"].outputs == alone.results["told"].outputs
 
 
 def test_steps_fail_on_workers_as_they_do_here(office: Office) -> None:

@@ -22,7 +22,8 @@ from orthoflow.engine.results import (
     result_to_json,
 )
 from orthoflow.engine.run_folder import JOURNAL, CellBegan, CellEnded, Journal
-from orthoflow.engine.store import Store, list_results
+from orthoflow.engine.store import Store
+from orthoflow.engine.stored_results import list_results
 from orthoflow.engine.tasks import Task, TaskFile, TaskInput, TaskOutput, read_task, write_task
 from orthoflow.files.containers import icc_profile, is_cut_off
 from orthoflow.files.drawings.title_blocks import read_title_block

@@ -7,7 +7,7 @@ systematic error of the orientation, so it is taken off where the upscaling is l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -52,6 +52,10 @@ class Features:
             angles_deg=self.angles_deg[chosen],
             descriptors=self.descriptors[chosen],
         )
+
+    def undescribed(self) -> Features:
+        """Give places and sizes without the descriptors, which are most of the bytes."""
+        return replace(self, descriptors=self.descriptors[:, :0].copy())
 
     def strongest(self, n_most: int) -> Features:
         """Give the first ones, without copying them."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -9,9 +11,13 @@ from pydantic import Field, model_validator
 
 from orthoflow.errors import MethodError
 from orthoflow.products import Camera, Cameras, JsonValue, Photos, PointCloud, Ties, Walls
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, Part, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
-from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
+from orthoflow_plugins.match.hand_ties import (
+    is_by_hand_alone,
+    ties_by_hand_alone,
+    with_ties_by_hand,
+)
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.paper import (
     footprints,
@@ -22,8 +28,10 @@ from orthoflow_plugins.match.paper import (
 )
 from orthoflow_plugins.match.pictures import require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, ties_of
+from orthoflow_plugins.match.traced_photos import TracedPhoto, TracedPhotos
 
 if TYPE_CHECKING:
+    from orthoflow_plugins.match.channels import WallTarget
     from orthoflow_plugins.match.tracing import Trace, TracingRule
     from orthoflow_plugins.match.warping import Before
 
@@ -135,64 +143,97 @@ class MatchGuided(Method):
 
         ties: Ties
 
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Trace every oriented photo on the walls."""
-        from orthoflow_plugins.match.channels import target_of
-        from orthoflow_plugins.match.recovering import recovered_traces
+    maps_over: ClassVar[str] = "photos"
+    PartOut: ClassVar[type[Part]] = TracedPhotos
+    # What this very object laid out for its parts, if it computed any.
+    _desk: _Desk | None = None
+
+    def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> TracedPhotos:
+        """Trace oriented photos on the walls."""
         from orthoflow_plugins.match.tracing import trace_photo
 
-        photos, walls = inputs.photos, inputs.walls
-        require_photos(photos)
+        photos, walls = inputs.photos.photos, inputs.walls
+        require_photos(inputs.photos)
         if inputs.cloud is not None:
             inputs.cloud.require_points(3)
+        if is_by_hand_alone(inputs.hand, walls):
+            return TracedPhotos()
+        oriented = _oriented(inputs.cameras)
+        indices = [index for index in items if photos[index].name in oriented]
+        if params.preset == "paper":
+            ratio = largest_ratio(params.ratio)
+            return _masked(inputs.photos, walls, (oriented, indices), ratio, ctx)
+        ctx.progress(0.0, "walls")
+        rule = _rule(params, max(1, ctx.cores // max(1, len(indices))))
+        desk = self._desk = _laid_out(inputs)
+
+        def trace(index: int) -> Trace:
+            photo = photos[index]
+            camera = oriented[photo.name].viewing()
+            return trace_photo(index, photo, camera, desk.targets, rule, desk.before)
+
+        is_any_missing = params.finds_missing and not _has_all(inputs.photos, oriented)
+        traced: list[TracedPhoto] = []
+        for index, found in zip(indices, one_by_one(trace, indices, ctx.cores), strict=True):
+            name = photos[index].name
+            traced.append(TracedPhoto.of(found, oriented[name].viewing()))
+            if is_any_missing:
+                desk.traces[index] = found
+            ctx.progress(len(traced) / (len(indices) + 1), name)
+            if not any(len(piece) for piece in found.pieces):
+                ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
+        return TracedPhotos(photos=tuple(traced))
+
+    def join(
+        self, inputs: In, parts: Sequence[TracedPhotos], params: Params, ctx: StepContext
+    ) -> Out:
+        """Find the photos without a pose on what the others show, and make ties."""
+        photos, walls = inputs.photos, inputs.walls
         alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
         if alone is not None:
             return self.Out(ties=alone)
-        oriented = _oriented(inputs.cameras)
         if params.preset == "paper":
-            ties = _masked(photos, walls, oriented, largest_ratio(params.ratio), ctx)
+            of_paper = [piece for part in parts for piece in part.pieces]
+            ties = ties_of(of_paper, photos, walls, {"intensity_source": walls.intensity_source})
+            _report(ctx, ties, {})
             return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
-        ctx.progress(0.0, "walls")
-        targets = [target_of(wall) for wall in walls.walls]
-        indices = [k for k, photo in enumerate(photos.photos) if photo.name in oriented]
-        rule = _rule(params, max(1, ctx.cores // len(indices)))
-        before = _before(inputs, [oriented[photos.photos[k].name] for k in indices])
-
-        def trace(index: int) -> Trace:
-            photo = photos.photos[index]
-            camera = oriented[photo.name].viewing()
-            return trace_photo(index, photo, camera, targets, rule, before)
-
-        pieces: list[TiePiece] = []
-        traces: dict[str, Trace] = {}
-        for nth, (index, found) in enumerate(
-            zip(indices, one_by_one(trace, indices, ctx.cores), strict=True)
-        ):
-            name = photos.photos[index].name
-            ctx.progress((nth + 1) / (len(indices) + 1), name)
-            traces[name] = found
-            pieces += found.pieces
-            if not any(len(piece) for piece in found.pieces):
-                ctx.warn(f"photo {name}: nothing on the walls agrees with it at its pose")
+        traced = [found for part in parts for found in part.photos]
+        traces = {photos.photos[found.photo].name: found for found in traced}
         if params.finds_missing:
-            recovered = recovered_traces(
-                photos, oriented, targets, list(traces.values()), rule, before
-            )
-            for name, found in recovered.items():
-                ctx.log(f"photo {name}: found by what other photos show of the walls")
-                traces[name] = found
-                pieces += found.pieces
+            traces |= self._recovered(inputs, traced, params, ctx)
         ties = ties_of(
-            pieces,
+            [piece for found in traces.values() for piece in found.pieces],
             photos,
             walls,
             {
-                "photos": {name: _note(trace) for name, trace in traces.items()},
+                "photos": {name: _note(found) for name, found in traces.items()},
                 "intensity_source": walls.intensity_source,
             },
         )
         _report(ctx, ties, traces)
         return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
+
+    def _recovered(
+        self, inputs: In, traced: Sequence[TracedPhoto], params: Params, ctx: StepContext
+    ) -> dict[str, TracedPhoto]:
+        """Trace the photos without a pose that others help to find, by name."""
+        from orthoflow_plugins.match.recovering import recovered_traces
+
+        photos, oriented = inputs.photos, _oriented(inputs.cameras)
+        if _has_all(photos, oriented):
+            return {}
+        desk = self._desk or _laid_out(inputs)
+        walls = inputs.walls.walls
+        known = [
+            desk.traces.get(found.photo)
+            or found.trace(photos.photos[found.photo], walls, desk.before)
+            for found in traced
+        ]
+        rule = _rule(params, max(1, ctx.cores // len(traced)))
+        recovered = recovered_traces(photos, oriented, desk.targets, known, rule, desk.before)
+        for name in recovered:
+            ctx.log(f"photo {name}: found by what other photos show of the walls")
+        return {name: TracedPhoto.of(found, found.view.camera) for name, found in recovered.items()}
 
     @classmethod
     def tools(cls) -> dict[str, str]:
@@ -200,25 +241,54 @@ class MatchGuided(Method):
         return opencv_version()
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Desk:
+    """What photos are laid on: the walls as targets, and what stands before them.
+
+    Attributes:
+        targets: the walls.
+        before: what stands free before them, where the cloud is wired.
+        traces: by index, of photos that lie there still, for those that are looked for with them.
+    """
+
+    targets: list[WallTarget]
+    before: Before | None
+    traces: dict[int, Trace] = field(default_factory=dict)
+
+
+def _laid_out(inputs: MatchGuided.In) -> _Desk:
+    """Prepare the walls, and what any oriented photo has before them."""
+    from orthoflow_plugins.match.channels import target_of
+
+    oriented = _oriented(inputs.cameras)
+    names = [photo.name for photo in inputs.photos.photos if photo.name in oriented]
+    return _Desk(
+        targets=[target_of(wall) for wall in inputs.walls.walls],
+        before=_before(inputs, [oriented[name] for name in names]),
+    )
+
+
+def _has_all(photos: Photos, oriented: dict[str, Camera]) -> bool:
+    return all(photo.name in oriented for photo in photos.photos)
+
+
 def _masked(
     photos: Photos,
     walls: Walls,
-    oriented: dict[str, Camera],
+    which: tuple[dict[str, Camera], list[int]],
     ratio_most: float,
     ctx: StepContext,
-) -> Ties:
+) -> TracedPhotos:
     """Match as markiewicz2015 did, within the footprint of each oriented photo."""
+    oriented, indices = which
     on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
     pieces: list[TiePiece] = []
-    for index, photo in enumerate(photos.photos):
-        if photo.name not in oriented:
-            continue
-        ctx.progress(index / len(photos.photos), photo.name)
+    for nth, index in enumerate(indices):
+        photo = photos.photos[index]
+        ctx.progress(nth / len(indices), photo.name)
         masks = footprints(oriented[photo.name].viewing(), walls)
         pieces += paper_pieces(index, photo, on_walls, walls, masks, ratio_most=ratio_most)
-    ties = ties_of(pieces, photos, walls, {"intensity_source": walls.intensity_source})
-    _report(ctx, ties, {})
-    return ties
+    return TracedPhotos(pieces=tuple(pieces))
 
 
 def _oriented(cameras: Cameras) -> dict[str, Camera]:
@@ -274,7 +344,7 @@ def _rule(params: MatchGuided.Params, threads: int) -> TracingRule:
     )
 
 
-def _note(trace: Trace) -> JsonValue:
+def _note(trace: TracedPhoto) -> JsonValue:
     return {
         "n_ties": trace.n_ties,
         "n_measured": trace.n_measured,
@@ -284,7 +354,7 @@ def _note(trace: Trace) -> JsonValue:
     }
 
 
-def _report(ctx: StepContext, ties: Ties, traces: dict[str, Trace]) -> None:
+def _report(ctx: StepContext, ties: Ties, traces: dict[str, TracedPhoto]) -> None:
     per_photo = np.bincount(ties.photo, minlength=len(ties.photo_names))
     n_measured = sum(trace.n_measured for trace in traces.values())
     n_outliers = sum(trace.n_outliers for trace in traces.values())

@@ -12,6 +12,18 @@ from orthoflow_plugins.match.pictures import require_intensity
 from orthoflow_plugins.match.tie_pieces import ties_of
 
 
+def is_by_hand_alone(hand: Ties | None, walls: Walls) -> bool:
+    """Whether the walls show nothing that a photo could be matched with, but there are ties.
+
+    Raises:
+        MethodError: the walls show nothing, and nobody measured a tie.
+    """
+    if hand is None or any(wall.intensity is not None for wall in walls.walls):
+        require_intensity(walls)
+        return False
+    return True
+
+
 def ties_by_hand_alone(
     hand: Ties | None, photos: Photos, walls: Walls, ctx: StepContext
 ) -> Ties | None:
@@ -23,8 +35,7 @@ def ties_by_hand_alone(
     Raises:
         MethodError: the walls show nothing, and nobody measured a tie.
     """
-    if hand is None or any(wall.intensity is not None for wall in walls.walls):
-        require_intensity(walls)
+    if not is_by_hand_alone(hand, walls):
         return None
     ctx.warn(
         "the scan has neither intensity nor colour that a photo could be matched with: only the "

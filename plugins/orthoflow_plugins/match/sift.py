@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from orthoflow.products import JsonValue, Photos, TieRole, Ties, Walls
-from orthoflow.sdk import Method, MethodParams, Ports, StepContext
+from orthoflow.sdk import Method, MethodParams, Part, Ports, StepContext
 from orthoflow.sdk.methods import Determinism
 from orthoflow_plugins.match.features import FeatureRule, Features
-from orthoflow_plugins.match.hand_ties import ties_by_hand_alone, with_ties_by_hand
+from orthoflow_plugins.match.hand_ties import (
+    is_by_hand_alone,
+    ties_by_hand_alone,
+    with_ties_by_hand,
+)
 from orthoflow_plugins.match.mixtures import LEAST, pair_in_colours
 from orthoflow_plugins.match.opencv import one_by_one, opencv_version
 from orthoflow_plugins.match.pairing import Pair, PairingRule, PhotoPairs, pair_photo, wall_features
@@ -25,9 +31,22 @@ from orthoflow_plugins.match.pictures import photo_grey, require_photos
 from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from orthoflow_plugins.match.placing import Placed
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedPhotos(Part):
+    """What some of the photos share with the walls.
+
+    Attributes:
+        photos: of each photo, without descriptors.
+        pieces: ties of all of them, of `preset: paper`, which pairs none.
+        walls: key points per wall, without descriptors; None where it shows nothing.
+    """
+
+    photos: tuple[PhotoPairs, ...] = ()
+    pieces: tuple[TiePiece, ...] = ()
+    walls: tuple[Features | None, ...] = ()
 
 
 class MatchSift(Method):
@@ -140,34 +159,50 @@ class MatchSift(Method):
 
         ties: Ties
 
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
-        """Match every photo with every wall."""
-        photos, walls = inputs.photos, inputs.walls
-        require_photos(photos)
-        alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
-        if alone is not None:
-            return self.Out(ties=alone)
+    maps_over: ClassVar[str] = "photos"
+    PartOut: ClassVar[type[Part]] = PairedPhotos
+
+    def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> PairedPhotos:
+        """Match photos with every wall."""
+        photos, walls = inputs.photos.photos, inputs.walls
+        require_photos(inputs.photos)
+        if is_by_hand_alone(inputs.hand, walls):
+            return PairedPhotos()
         if params.preset == "paper":
-            ties = _paper(photos, walls, largest_ratio(params.ratio), ctx)
-            return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
+            return _paper(inputs.photos, walls, items, largest_ratio(params.ratio), ctx)
         rule = _rule(params)
         ctx.progress(0.0, "key points of the walls")
         on_walls = list(one_by_one(lambda wall: wall_features(wall, rule), walls.walls, ctx.cores))
+
+        def pair(index: int) -> PhotoPairs:
+            if params.tries_colours:
+                return pair_in_colours(photos[index], on_walls, rule)
+            return pair_photo(photo_grey(photos[index]), on_walls, rule)
+
+        paired: list[PhotoPairs] = []
+        for index, pairs in zip(items, one_by_one(pair, items, ctx.cores), strict=True):
+            paired.append(replace(pairs, features=pairs.features.undescribed()))
+            ctx.progress(len(paired) / (len(items) + 1), photos[index].name)
+        return PairedPhotos(photos=tuple(paired), walls=_undescribed(on_walls))
+
+    def join(
+        self, inputs: In, parts: Sequence[PairedPhotos], params: Params, ctx: StepContext
+    ) -> Out:
+        """Place photos that show no wall clearly with the help of the others, and make ties."""
+        photos, walls = inputs.photos, inputs.walls
+        alone = ties_by_hand_alone(inputs.hand, photos, walls, ctx)
+        if alone is not None:
+            return self.Out(ties=alone)
+        on_walls = parts[0].walls
+        if params.preset == "paper":
+            of_paper = [piece for part in parts for piece in part.pieces]
+            ties = ties_of(of_paper, photos, walls, {"intensity_source": walls.intensity_source})
+            _report(ctx, ties, on_walls)
+            return self.Out(ties=with_ties_by_hand(ties, inputs.hand, walls, ctx))
+        paired = [pairs for part in parts for pairs in part.photos]
         pieces: list[TiePiece] = []
         notes: dict[str, JsonValue] = {}
         radii_px: list[float] = []
-
-        def pair(index: int) -> PhotoPairs:
-            photo = photos.photos[index]
-            if params.tries_colours:
-                return pair_in_colours(photo, on_walls, rule)
-            return pair_photo(photo_grey(photo), on_walls, rule)
-
-        n_photos = len(photos.photos)
-        paired: list[PhotoPairs] = []
-        for pairs in one_by_one(pair, range(n_photos), ctx.cores):
-            paired.append(pairs)
-            ctx.progress(len(paired) / (n_photos + 1), photos.photos[len(paired) - 1].name)
         placed = _placed(photos, walls, paired, params, ctx)
         for index, (photo, pairs) in enumerate(zip(photos.photos, paired, strict=True)):
             place = placed.get(index)
@@ -193,15 +228,20 @@ class MatchSift(Method):
         return opencv_version()
 
 
-def _paper(photos: Photos, walls: Walls, ratio_most: float, ctx: StepContext) -> Ties:
+def _paper(
+    photos: Photos, walls: Walls, items: range, ratio_most: float, ctx: StepContext
+) -> PairedPhotos:
     on_walls = list(one_by_one(paper_wall_features, walls.walls, ctx.cores))
     pieces: list[TiePiece] = []
-    for index, photo in enumerate(photos.photos):
-        ctx.progress(index / len(photos.photos), photo.name)
+    for nth, index in enumerate(items):
+        photo = photos.photos[index]
+        ctx.progress(nth / len(items), photo.name)
         pieces += paper_pieces(index, photo, on_walls, walls, None, ratio_most=ratio_most)
-    ties = ties_of(pieces, photos, walls, {"intensity_source": walls.intensity_source})
-    _report(ctx, ties, on_walls)
-    return ties
+    return PairedPhotos(pieces=tuple(pieces), walls=_undescribed(on_walls))
+
+
+def _undescribed(on_walls: Sequence[Features | None]) -> tuple[Features | None, ...]:
+    return tuple(None if found is None else found.undescribed() for found in on_walls)
 
 
 def _placed(
@@ -271,7 +311,7 @@ def _rule(params: MatchSift.Params) -> PairingRule:
 
 
 def _pieces(
-    photo: int, pairs: PhotoPairs, on_walls: list[Features | None], walls: Walls
+    photo: int, pairs: PhotoPairs, on_walls: Sequence[Features | None], walls: Walls
 ) -> list[TiePiece]:
     shown = without_twins(
         [_piece(photo, pairs, pair, on_walls, walls) for pair in pairs.pairs if pair.is_shown]
@@ -286,7 +326,7 @@ def _piece(
     photo: int,
     pairs: PhotoPairs,
     pair: Pair,
-    on_walls: list[Features | None],
+    on_walls: Sequence[Features | None],
     walls: Walls,
 ) -> TiePiece:
     features = on_walls[pair.wall]
@@ -327,7 +367,7 @@ def _note(
     }
 
 
-def _report(ctx: StepContext, ties: Ties, on_walls: list[Features | None]) -> None:
+def _report(ctx: StepContext, ties: Ties, on_walls: Sequence[Features | None]) -> None:
     kept = ties.role != TieRole.REJECTED
     per_photo = np.bincount(ties.photo[kept], minlength=len(ties.photo_names))
     ctx.metric("n_ties", int(kept.sum()), "1")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -13,8 +13,15 @@ from pydantic import Field
 
 from orthoflow.geometry.bands import Allocate, holds_cells
 from orthoflow.products import Layer, LayerMask, Layers
-from orthoflow.sdk import Determinism, Method, Ports, StepContext
-from orthoflow_plugins.ortho.layers import LayerStack
+from orthoflow.sdk import Determinism, Method, Part, Ports, StepContext
+from orthoflow_plugins.ortho.layers import (
+    CellCounts,
+    LayerStack,
+    PaintedPart,
+    count_shown,
+    joined_layers,
+    total_seconds,
+)
 from orthoflow_plugins.ortho.photos_on_walls import (
     OpenedPhoto,
     PhotosOnWalls,
@@ -22,6 +29,7 @@ from orthoflow_plugins.ortho.photos_on_walls import (
     level_of_all,
     oriented_photos,
     pixels_of,
+    places_in_part,
     shared_profile,
 )
 
@@ -29,6 +37,21 @@ if TYPE_CHECKING:
     from orthoflow_plugins.ortho.painting import Painting
     from orthoflow_plugins.ortho.sampling import CellFootprint
     from orthoflow_plugins.ortho.surfaces import Surface
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaintedTiles(PaintedPart):
+    """What some of the photos paint, and how they see the tiles that they paint.
+
+    Attributes:
+        n_cells: (n,) int64 painted cells of each tile.
+        photo_gsd_m: (n,) float64 size of a photo pixel, square to the ray.
+        obliquity_deg: (n,) float64 between the ray and the wall's normal.
+    """
+
+    n_cells: NDArray[np.int64]
+    photo_gsd_m: NDArray[np.float64]
+    obliquity_deg: NDArray[np.float64]
 
 
 class DsmBackward(Method):
@@ -93,7 +116,10 @@ class DsmBackward(Method):
 
         layers: Layers
 
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    maps_over: ClassVar[str] = "cameras"
+    PartOut: ClassVar[type[Part]] = PaintedTiles
+
+    def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> PaintedTiles:
         """Take photo by photo, and lay each onto every wall it sees."""
         from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
@@ -106,38 +132,60 @@ class DsmBackward(Method):
         surfaces = surfaces_of(inputs.walls, params, ctx, hides=hides)
         seconds: defaultdict[str, float] = defaultdict(float)
         started = ctx.clock_s()
+        # Of all photos, whichever are painted: which points are outliers hangs on all cameras.
         viewers = [camera.viewing() for _, camera in oriented]
         occluders = occluders_of(inputs, viewers, params, ctx, method=self.id) if hides else None
         seconds["occluders_s"] += ctx.clock_s() - started
-        stack = LayerStack(inputs.walls, surfaces, ctx)
+        stack = LayerStack(inputs.walls, ctx)
         footprints: list[CellFootprint] = []
-        for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
-            ctx.progress(place / len(oriented), photo.name)
+        places = places_in_part(inputs.cameras, items)
+        for nth, place in enumerate(places):
+            (photo, camera), viewer = oriented[place], viewers[place]
+            ctx.progress(nth / len(places), photo.name)
             started = ctx.clock_s()
             pixels = pixels_of(photo, camera, level)
             decoded = ctx.clock_s()
             buffer = depth_buffer_of(occluders, viewer, photo)
             looked = ctx.clock_s()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
-            footprints += _lay(opened, stack, params, threads=ctx.cores)
+            footprints += _lay(opened, surfaces, stack, params, threads=ctx.cores)
             seconds["decoding_s"] += decoded - started
             seconds["occluders_s"] += looked - decoded
             seconds["painting_s"] += ctx.clock_s() - looked
             # The next photo is decoded without this one in memory.
             del pixels, buffer, opened
+        return PaintedTiles(
+            layers=tuple(stack.painted),
+            reached=stack.reached,
+            seconds=dict(seconds),
+            n_cells=np.array([tile.n_cells for tile in footprints], dtype=np.int64),
+            photo_gsd_m=np.array([tile.photo_gsd_m for tile in footprints], dtype=np.float64),
+            obliquity_deg=np.array([tile.obliquity_deg for tile in footprints], dtype=np.float64),
+        )
+
+    def join(
+        self, inputs: In, parts: Sequence[PaintedTiles], params: Params, ctx: StepContext
+    ) -> Out:
+        """Put the layers of all photos in order."""
+        oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
         profile = shared_profile([photo for photo, _ in oriented], ctx)
-        layers = stack.complete()
-        _report(ctx, stack, layers, footprints, seconds)
+        layers = joined_layers(inputs.walls, parts, ctx)
+        _report(ctx, count_shown(inputs.walls, layers), parts)
         return self.Out(layers=replace(layers, icc_profile=profile))
 
 
 def _lay(
-    photo: OpenedPhoto, stack: LayerStack, params: DsmBackward.Params, *, threads: int
+    photo: OpenedPhoto,
+    surfaces: Sequence[Surface],
+    stack: LayerStack,
+    params: DsmBackward.Params,
+    *,
+    threads: int,
 ) -> list[CellFootprint]:
     """Lay a photo onto all walls; give how it sees the tiles that it paints."""
     footprints: list[CellFootprint] = []
     with stack.painting_from(photo.name):
-        for index, surface in enumerate(stack.surfaces):
+        for index, surface in enumerate(surfaces):
             allocate = stack.allocator(index)
             painting = _painting(photo, surface, params, allocate, threads=threads)
             if painting is None:
@@ -193,24 +241,17 @@ def _layer(painting: Painting, source: str, surface: Surface, wall: int) -> Laye
     )
 
 
-def _report(
-    ctx: StepContext,
-    stack: LayerStack,
-    layers: Layers,
-    footprints: Sequence[CellFootprint],
-    seconds: dict[str, float],
-) -> None:
-    counts = stack.count_cells(layers)
-    ctx.metric("n_layers", len(stack.painted), "1")
+def _report(ctx: StepContext, counts: CellCounts, parts: Sequence[PaintedTiles]) -> None:
+    ctx.metric("n_layers", sum(len(part.layers) for part in parts), "1")
     ctx.metric("painted_share", counts.n_painted / max(1, counts.n_surface), "1")
     ctx.metric("occluded_share", counts.n_hidden / max(1, counts.n_surface), "1")
-    n_cells = np.array([footprint.n_cells for footprint in footprints])
-    gsds = np.array([footprint.photo_gsd_m for footprint in footprints])
-    angles = np.array([footprint.obliquity_deg for footprint in footprints])
+    n_cells = np.concatenate([part.n_cells for part in parts])
+    gsds = np.concatenate([part.photo_gsd_m for part in parts])
+    angles = np.concatenate([part.obliquity_deg for part in parts])
     ctx.metric("photo_gsd_mm", 1e3 * _weighted_median(gsds, n_cells), "mm")
     ctx.metric("obliquity_deg", _weighted_median(angles, n_cells), "deg")
-    for name, value in seconds.items():
-        ctx.metric(name, value, "s")
+    for name in ("occluders_s", "decoding_s", "painting_s"):
+        ctx.metric(name, total_seconds(parts, name), "s")
 
 
 def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.int64]) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -21,8 +22,15 @@ from orthoflow.geometry.bands import (
 )
 from orthoflow.geometry.levels import level_of
 from orthoflow.products import Layer, LayerMask, Layers
-from orthoflow.sdk import Determinism, Method, Ports, StepContext
-from orthoflow_plugins.ortho.layers import LayerStack
+from orthoflow.sdk import Determinism, Method, Part, Ports, StepContext
+from orthoflow_plugins.ortho.layers import (
+    CellCounts,
+    LayerStack,
+    PaintedPart,
+    count_shown,
+    joined_layers,
+    total_seconds,
+)
 from orthoflow_plugins.ortho.photos_on_walls import (
     OpenedPhoto,
     PhotosOnWalls,
@@ -30,6 +38,7 @@ from orthoflow_plugins.ortho.photos_on_walls import (
     level_of_all,
     oriented_photos,
     pixels_of,
+    places_in_part,
     shared_profile,
 )
 
@@ -84,37 +93,52 @@ class DsmForward(Method):
 
         layers: Layers
 
-    def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
+    maps_over: ClassVar[str] = "cameras"
+    PartOut: ClassVar[type[Part]] = PaintedPart
+
+    def run_part(self, inputs: In, items: range, params: Params, ctx: StepContext) -> PaintedPart:
         """Take photo by photo, and throw each onto every wall it sees."""
         from orthoflow_plugins.ortho.occlusion import depth_buffer_of, occluders_of
         from orthoflow_plugins.ortho.surfaces import surfaces_of
 
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
         level = level_of_all([photo for photo, _ in oriented], ctx)
+        # Of all photos, whichever are thrown: which points are outliers hangs on all cameras.
         viewers = [camera.viewing() for _, camera in oriented]
         seconds: defaultdict[str, float] = defaultdict(float)
         started = ctx.clock_s()
         occluders = occluders_of(inputs, viewers, params, ctx, method=self.id)
         seconds["occluders_s"] = ctx.clock_s() - started
         surfaces = surfaces_of(inputs.walls, params, ctx)
-        stack = LayerStack(inputs.walls, surfaces, ctx)
-        for place, ((photo, camera), viewer) in enumerate(zip(oriented, viewers, strict=True)):
-            ctx.progress(place / len(oriented), photo.name)
+        stack = LayerStack(inputs.walls, ctx)
+        places = places_in_part(inputs.cameras, items)
+        for nth, place in enumerate(places):
+            (photo, camera), viewer = oriented[place], viewers[place]
+            ctx.progress(nth / len(places), photo.name)
             pixels = pixels_of(photo, camera, level)
             started = ctx.clock_s()
             buffer = depth_buffer_of(occluders, viewer, photo)
             looked = ctx.clock_s()
             opened = OpenedPhoto(name=photo.name, pixels=pixels, viewer=viewer, buffer=buffer)
             with stack.painting_from(photo.name):
-                for index in range(len(surfaces)):
-                    layer = _layer(opened, stack, index, params, threads=ctx.cores)
+                for index, surface in enumerate(surfaces):
+                    layer = _layer(opened, surface, stack, index, params, threads=ctx.cores)
                     if layer is not None:
                         stack.add(layer)
             seconds["occluders_s"] += looked - started
             seconds["painting_s"] += ctx.clock_s() - looked
+        return PaintedPart(
+            layers=tuple(stack.painted), reached=stack.reached, seconds=dict(seconds)
+        )
+
+    def join(
+        self, inputs: In, parts: Sequence[PaintedPart], params: Params, ctx: StepContext
+    ) -> Out:
+        """Put the layers of all photos in order."""
+        oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
         profile = shared_profile([photo for photo, _ in oriented], ctx)
-        layers = stack.complete()
-        _report(ctx, stack, layers, seconds)
+        layers = joined_layers(inputs.walls, parts, ctx)
+        _report(ctx, count_shown(inputs.walls, layers), parts)
         return self.Out(layers=replace(layers, icc_profile=profile))
 
 
@@ -140,13 +164,18 @@ class _Thrown:
 
 
 def _layer(
-    photo: OpenedPhoto, stack: LayerStack, wall: int, params: DsmForward.Params, *, threads: int
+    photo: OpenedPhoto,
+    surface: Surface,
+    stack: LayerStack,
+    wall: int,
+    params: DsmForward.Params,
+    *,
+    threads: int,
 ) -> Layer | None:
     """Throw a photo onto one wall; None where no pixel meets it."""
     from orthoflow_plugins.ortho.forward_kernels import throw_pixels
     from orthoflow_plugins.ortho.surfaces import is_before, view_of
 
-    surface = stack.surfaces[wall]
     view = view_of(photo.viewer, surface, params, is_exact=True)
     if not is_before(view, surface):
         return None
@@ -293,14 +322,14 @@ def _seen(
     return seen, np.maximum(quality, 0.0)
 
 
-def _report(ctx: StepContext, stack: LayerStack, layers: Layers, seconds: dict[str, float]) -> None:
-    counts = stack.count_cells(layers)
+def _report(ctx: StepContext, counts: CellCounts, parts: Sequence[PaintedPart]) -> None:
+    painted = [layer for part in parts for layer in part.layers]
     n_filled = sum(
-        int(np.count_nonzero(layer.filled)) for layer in stack.painted if layer.filled is not None
+        int(np.count_nonzero(layer.filled)) for layer in painted if layer.filled is not None
     )
-    n_shown = sum(count_cells(layer.mask, LayerMask.PAINTED) for layer in stack.painted)
-    ctx.metric("n_layers", len(stack.painted), "1")
+    n_shown = sum(count_cells(layer.mask, LayerMask.PAINTED) for layer in painted)
+    ctx.metric("n_layers", len(painted), "1")
     ctx.metric("painted_share", counts.n_painted / max(1, counts.n_surface), "1")
     ctx.metric("filled_share", n_filled / max(1, n_shown), "1")
-    for name, value in seconds.items():
-        ctx.metric(name, value, "s")
+    for name in ("occluders_s", "painting_s"):
+        ctx.metric(name, total_seconds(parts, name), "s")

@@ -1,12 +1,12 @@
-"""The layers that photos make on walls, collected while they are painted."""
+"""The layers that photos make on walls: collected while they are painted, and joined."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -14,11 +14,8 @@ from numpy.typing import DTypeLike, NDArray
 from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import Allocate, count_known, row_bands
 from orthoflow.geometry.levels import Level
-from orthoflow.products import Layer, LayerMask, Layers, Walls
-from orthoflow.sdk import StepContext
-
-if TYPE_CHECKING:
-    from orthoflow_plugins.ortho.surfaces import Surface
+from orthoflow.products import Layer, LayerMask, Layers, Wall, Walls
+from orthoflow.sdk import Part, StepContext
 
 NO_SOURCE: Final = "no photo"
 UNSEEN_WALLS: Final = (
@@ -42,22 +39,54 @@ class CellCounts:
     n_hidden: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class ReachedWall:
+    """What photos reach of a wall on which they paint nothing.
+
+    Attributes:
+        wall: its index.
+        mask: (rows, cols) uint8 `LayerMask`.
+    """
+
+    wall: int
+    mask: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaintedPart(Part):
+    """What some of the photos paint.
+
+    Attributes:
+        layers: photo by photo.
+        reached: walls on which none of them paints.
+        seconds: what took how long.
+    """
+
+    layers: tuple[Layer, ...]
+    reached: tuple[ReachedWall, ...]
+    seconds: dict[str, float]
+
+
 class LayerStack:
     """Layers of walls, added photo by photo.
 
     Attributes:
-        surfaces: the walls.
         painted: layers of photos, as they were added.
     """
 
-    def __init__(self, walls: Walls, surfaces: list[Surface], ctx: StepContext) -> None:
-        self.surfaces = surfaces
+    def __init__(self, walls: Walls, ctx: StepContext) -> None:
         self.painted: list[Layer] = []
         self._names = tuple(wall.name for wall in walls.walls)
-        self._plane_indices = tuple(wall.plane_index for wall in walls.walls)
         self._ctx = ctx
         # What photos reach of walls that none has painted so far.
         self._reached: dict[int, NDArray[np.uint8]] = {}
+
+    @property
+    def reached(self) -> tuple[ReachedWall, ...]:
+        """What photos reach of walls on which none paints."""
+        return tuple(
+            ReachedWall(wall=wall, mask=mask) for wall, mask in sorted(self._reached.items())
+        )
 
     def allocator(self, wall: int) -> Allocate:
         """Give what gives the arrays of the next layer; a large one lies in files."""
@@ -98,62 +127,85 @@ class LayerStack:
         """
         if any(layer.wall == wall for layer in self.painted):
             return
-        if wall not in self._reached:
-            kept = self._ctx.allocate("layers", f"{wall}.reached", mask.shape, np.uint8)
-            self._reached[wall] = np.asarray(kept, np.uint8)
-            self._reached[wall][...] = mask
+        if wall in self._reached:
+            _add_hidden(mask, self._reached[wall])
             return
-        for rows in row_bands(mask.shape):
-            is_hidden = mask[rows] == LayerMask.OCCLUDED
-            self._reached[wall][rows][is_hidden] = LayerMask.OCCLUDED
+        kept = self._ctx.allocate("layers", f"{wall}.reached", mask.shape, np.uint8)
+        self._reached[wall] = np.asarray(kept, np.uint8)
+        self._reached[wall][...] = mask
 
-    def complete(self) -> Layers:
-        """Order the layers by wall, and add an empty one for each wall that nothing paints.
 
-        Raises:
-            MethodError: no photo paints any wall.
-        """
-        if not self.painted:
-            raise MethodError(UNSEEN_WALLS)
-        painted = {layer.wall for layer in self.painted}
-        bare = [wall for wall in range(len(self._names)) if wall not in painted]
-        if bare:
-            names = ", ".join(self._names[wall] for wall in bare)
-            self._ctx.warn(f"no photo shows {names}: the orthoimage stays empty")
-        layers = [*self.painted, *(self._bare_layer(wall) for wall in bare)]
-        layers.sort(key=lambda layer: layer.wall)
-        return Layers(layers=tuple(layers), names=self._names, plane_indices=self._plane_indices)
+def joined_layers(walls: Walls, parts: Sequence[PaintedPart], ctx: StepContext) -> Layers:
+    """Order the layers of all photos by wall, and add an empty one for each unpainted wall.
 
-    def count_cells(self, layers: Layers) -> CellCounts:
-        """Count the cells of all walls by what the layers show of them."""
-        n_surface = n_painted = n_hidden = 0
-        for wall, surface in enumerate(self.surfaces):
-            masks = [layer.mask for layer in layers.layers if layer.wall == wall]
-            n_surface += count_known(surface.relief.depth)
-            for rows in row_bands(surface.frame.shape):
-                is_painted = np.logical_or.reduce([m[rows] == LayerMask.PAINTED for m in masks])
-                is_hidden = np.logical_or.reduce([m[rows] == LayerMask.OCCLUDED for m in masks])
-                n_painted += int(np.count_nonzero(is_painted))
-                n_hidden += int(np.count_nonzero(is_hidden & ~is_painted))
-        return CellCounts(n_surface=n_surface, n_painted=n_painted, n_hidden=n_hidden)
+    Raises:
+        MethodError: no photo paints any wall.
+    """
+    layers = [layer for part in parts for layer in part.layers]
+    if not layers:
+        raise MethodError(UNSEEN_WALLS)
+    level: Level = np.uint16 if layers[0].rgb.dtype == np.uint16 else np.uint8
+    painted = {layer.wall for layer in layers}
+    bare = [place for place in range(len(walls.walls)) if place not in painted]
+    if bare:
+        names = ", ".join(walls.walls[place].name for place in bare)
+        ctx.warn(f"no photo shows {names}: the orthoimage stays empty")
+    for place in bare:
+        reached = [found.mask for part in parts for found in part.reached if found.wall == place]
+        layers.append(_bare_layer(walls.walls[place], place, reached, level, ctx))
+    layers.sort(key=lambda layer: layer.wall)
+    return Layers(
+        layers=tuple(layers),
+        names=tuple(wall.name for wall in walls.walls),
+        plane_indices=tuple(wall.plane_index for wall in walls.walls),
+    )
 
-    def _bare_layer(self, wall: int) -> Layer:
-        """The layer of a wall that no photo paints."""
-        surface = self.surfaces[wall]
-        shape = surface.frame.shape
-        new = partial(self._ctx.allocate, "layers")
-        mask = self._reached.get(wall)
-        if mask is None:
-            mask = np.asarray(new(f"{wall}.bare.mask", shape, np.uint8), np.uint8)
-            for rows in row_bands(shape):
-                is_void = np.isnan(surface.relief.depth[rows])
-                mask[rows] = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE)
-        level: Level = np.uint16 if self.painted[0].rgb.dtype == np.uint16 else np.uint8
-        return Layer(
-            frame=surface.frame,
-            wall=wall,
-            source=NO_SOURCE,
-            rgb=np.asarray(new(f"{wall}.bare.rgb", (*shape, 3), level), level),
-            mask=mask,
-            quality=np.asarray(new(f"{wall}.bare.quality", shape, np.float32), np.float32),
-        )
+
+def count_shown(walls: Walls, layers: Layers) -> CellCounts:
+    """Count the cells of all walls by what the layers show of them."""
+    n_surface = n_painted = n_hidden = 0
+    for place, wall in enumerate(walls.walls):
+        masks = [layer.mask for layer in layers.layers if layer.wall == place]
+        n_surface += count_known(wall.depth_m)
+        for rows in row_bands(wall.frame.shape):
+            is_painted = np.logical_or.reduce([m[rows] == LayerMask.PAINTED for m in masks])
+            is_hidden = np.logical_or.reduce([m[rows] == LayerMask.OCCLUDED for m in masks])
+            n_painted += int(np.count_nonzero(is_painted))
+            n_hidden += int(np.count_nonzero(is_hidden & ~is_painted))
+    return CellCounts(n_surface=n_surface, n_painted=n_painted, n_hidden=n_hidden)
+
+
+def total_seconds(parts: Sequence[PaintedPart], name: str) -> float:
+    """How long something took for all photos."""
+    return sum(part.seconds.get(name, 0.0) for part in parts)
+
+
+def _bare_layer(
+    wall: Wall, place: int, reached: Sequence[NDArray[np.uint8]], level: Level, ctx: StepContext
+) -> Layer:
+    """The layer of a wall that no photo paints, as parts of the photos reach it."""
+    shape = wall.frame.shape
+    new = partial(ctx.allocate, "layers")
+    mask = np.asarray(new(f"{place}.bare.mask", shape, np.uint8), np.uint8)
+    if reached:
+        mask[...] = reached[0]
+        for other in reached[1:]:
+            _add_hidden(other, mask)
+    else:
+        for rows in row_bands(shape):
+            is_void = np.isnan(wall.depth_m[rows])
+            mask[rows] = np.where(is_void, LayerMask.NO_SURFACE, LayerMask.OUTSIDE)
+    return Layer(
+        frame=wall.frame,
+        wall=place,
+        source=NO_SOURCE,
+        rgb=np.asarray(new(f"{place}.bare.rgb", (*shape, 3), level), level),
+        mask=mask,
+        quality=np.asarray(new(f"{place}.bare.quality", shape, np.float32), np.float32),
+    )
+
+
+def _add_hidden(other: NDArray[np.uint8], mask: NDArray[np.uint8]) -> None:
+    """Mark what is hidden from another photo, too, in a mask."""
+    for rows in row_bands(mask.shape):
+        mask[rows][other[rows] == LayerMask.OCCLUDED] = LayerMask.OCCLUDED

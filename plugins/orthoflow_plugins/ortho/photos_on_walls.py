@@ -101,6 +101,12 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
     return [(by_name[camera.photo], camera) for camera in posed]
 
 
+def places_in_part(cameras: Cameras, items: range) -> list[int]:
+    """Give the places among the oriented photos of those whose cameras belong to a part."""
+    posed = [index for index, camera in enumerate(cameras.cameras) if camera.status == "ok"]
+    return [place for place, index in enumerate(posed) if index in items]
+
+
 def level_of_all(photos: Sequence[Photo], ctx: StepContext) -> Level:
     """Say in which bits photos are laid onto walls: 16 where any of them has more than 8.
 

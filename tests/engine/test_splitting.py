@@ -1,0 +1,225 @@
+"""Steps whose methods map over items come out the same in parts, and go on where they stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from orthoflow.engine import RunOutcome, collect_garbage, execute
+from orthoflow.engine.events import CellFinished, CellProgress, CellStarted, RunEvent
+from orthoflow.engine.results import CellResult
+from orthoflow.engine.splitting import _parts, parts_folder
+from orthoflow.errors import CancelledStepError
+from tests.engine_world import World, toy_world
+
+STEPS = """
+steps:
+  first: {use: make.rows, params: {count: 5}}
+  told: {use: tell.sums, in: {rows: first.rows}}
+  last: {use: work.add, in: {numbers: told.numbers}}
+"""
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with toy_world(tmp_path) as opened:
+        yield opened
+
+
+def in_parts(
+    world: World, n_parts: int, *sets: str, into: str = "", **options: object
+) -> CellResult:
+    """Give the result of the step that maps, computed in so many parts."""
+    options = {"executor": "inline", **options}
+    outcome = world.run(STEPS, sets=sets, into=into or f"run{n_parts}", parts=n_parts, **options)
+    return outcome.results["told"]
+
+
+def rows_computed(result: CellResult) -> list[str]:
+    """What each part printed or logged of its rows."""
+    return [line for line in result.log.splitlines() if line.startswith("part ")]
+
+
+def without_costs(result: CellResult) -> dict[str, object]:
+    said = dataclasses.asdict(result)
+    for name in ("wall_s", "cpu_s", "compile_s", "peak_rss_mib", "started", "ended", "log"):
+        del said[name]
+    return said
+
+
+def test_any_number_of_parts_gives_what_one_gives(world: World) -> None:
+    whole = in_parts(world, 1)
+    assert whole.status == "ok"
+    assert world.values(world.run(STEPS, executor="inline", into="again"), "told")[:2] == (
+        pytest.approx([2.4142, 4.1463], abs=1e-4)
+    )
+    for n_parts in (2, 3, 5, 9):
+        result = in_parts(world, n_parts, force=("told",))
+        assert result.outputs == whole.outputs
+        assert result.metrics == whole.metrics
+        assert result.key == whole.key
+        assert result.warnings == ("rows are short", "sums are sums")
+        assert len(rows_computed(result)) == min(n_parts, 5)
+
+
+def test_processes_of_their_own_give_what_one_gives(world: World) -> None:
+    whole = in_parts(world, 1)
+    result = in_parts(world, 2, force=("told",), executor="local", jobs=2)
+    said, expected = without_costs(result), without_costs(whole)
+    for one in (said, expected):
+        del one["run_id"], one["environment"]
+    assert said == expected
+    assert "rows 0 2\n" in result.log
+    assert "rows 2 5\n" in result.log
+    assert "joined:\n" in result.log
+    log = world.folder / "run2" / "logs" / "told.log"
+    assert log.read_text() == result.log
+
+
+def test_one_step_is_shown_whatever_it_was_computed_in(world: World) -> None:
+    in_parts(world, 5)
+    events = world.events
+    started = [event.address for event in events if isinstance(event, CellStarted)]
+    ended = [event.address for event in events if isinstance(event, CellFinished)]
+    assert started == ended == ["first", "told", "last"]
+    fractions = [e.fraction for e in events if isinstance(e, CellProgress) and e.address == "told"]
+    assert fractions == sorted(fractions)
+    assert 0.0 < fractions[len(fractions) // 2] < 1.0 == fractions[-1]
+    assert not list(parts_folder(world.store).iterdir())
+
+
+def test_costs_are_those_of_all_parts(world: World) -> None:
+    result = in_parts(world, 5, "told.wait_s=0.02")
+    assert 0.1 <= result.wall_s < 5.0
+    assert result.stored_mib is not None
+
+
+def test_a_part_that_fails_is_named_and_nothing_else_begins(world: World) -> None:
+    result = in_parts(world, 3, "told.bad=row2")
+    assert result.status == "failed"
+    assert result.error_message == "part 2 of 3 (row1 to row2): no sum is large enough"
+    assert result.error_type == "MethodError"
+    assert rows_computed(result) == [line for line in rows_computed(result) if "part 1" in line]
+    plan = world.plan(STEPS, sets=("told.bad=row2",))
+    assert "part 2 of 3" in plan.cells[1].reason
+
+
+def test_parts_that_cannot_be_joined_fail_the_step(world: World) -> None:
+    result = in_parts(world, 3, "told.bad_join=true")
+    assert (result.status, result.error_message) == ("failed", "these do not go together")
+
+
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        ("row2 metric", "reports metrics or figures of a part; it must do that in join"),
+        ("row2 gives", "must give its PartOut for a part, got Rows"),
+    ],
+)
+@pytest.mark.parametrize("n_parts", [1, 3])
+def test_what_a_part_must_not_do_is_told_whole_or_not(
+    world: World, bad: str, said: str, n_parts: int
+) -> None:
+    assert said in in_parts(world, n_parts, f"told.bad={bad}").error_message
+
+
+def test_warnings_come_in_the_order_of_the_parts(world: World) -> None:
+    result = in_parts(world, 5, "told.bad=row3 warns")
+    assert result.warnings == ("rows are short", "row3 is odd", "sums are sums")
+
+
+def interrupted(world: World, **options: object) -> RunOutcome | None:
+    """Run in five parts and stop as soon as the third one speaks."""
+
+    def listen(event: RunEvent) -> None:
+        if isinstance(event, CellProgress) and event.text == "row2":
+            raise KeyboardInterrupt
+
+    plan = world.plan(STEPS, executor="inline", parts=5, **options)
+    with pytest.raises((KeyboardInterrupt, CancelledStepError)):
+        execute(plan, world.folder / "run", world.store, listen)
+    return None
+
+
+@pytest.mark.parametrize("n_parts", [5, 2, 1])
+def test_a_run_that_goes_on_takes_the_parts_that_are_there(world: World, n_parts: int) -> None:
+    whole = in_parts(world, 1, into="whole")
+    world.store.results.joinpath(f"{whole.key}.json").unlink()
+    interrupted(world)
+    (folder,) = parts_folder(world.store).iterdir()
+    assert folder.name == whole.key
+    assert len(list((folder / "results").iterdir())) == 2
+    result = in_parts(world, n_parts, into="run")
+    assert result.outputs == whole.outputs
+    spoken = [e.text for e in world.events if isinstance(e, CellProgress) and e.address == "told"]
+    assert [name for name in spoken if name.startswith("row")] == ["row2", "row3", "row4"]
+
+
+def test_forced_steps_take_no_parts_of_other_runs(world: World) -> None:
+    interrupted(world)
+    result = in_parts(world, 5, into="other", force=("told",))
+    assert result.status == "ok"
+    spoken = [e.text for e in world.events if isinstance(e, CellProgress) and e.address == "told"]
+    assert "row0" in spoken
+
+
+@pytest.mark.parametrize("file", ["objects/*/product.h5", "results/*.json"])
+def test_a_damaged_part_is_computed_again(world: World, file: str) -> None:
+    whole = in_parts(world, 1, into="whole")
+    world.store.results.joinpath(f"{whole.key}.json").unlink()
+    interrupted(world)
+    damaged = min(parts_folder(world.store).glob(f"*/{file}"))
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2] ^= 1
+    damaged.write_bytes(content)
+    assert in_parts(world, 5, into="run").outputs == whole.outputs
+
+
+def test_a_part_that_takes_too_long_is_named(world: World) -> None:
+    steps = STEPS.replace("in: {rows: first.rows}}", "in: {rows: first.rows}, timeout: 1s}")
+    outcome = world.run(steps, sets=("told.wait_s=9",), parts=2, jobs=2)
+    said = outcome.results["told"].error_message
+    assert said.startswith("part ")
+    assert "ran past its timeout of 1 s and was stopped" in said
+
+
+def test_a_result_that_another_run_has_given_meanwhile_is_taken(world: World) -> None:
+    plan = world.plan(STEPS, executor="inline", parts=5)
+    ran: list[str] = []
+
+    def listen(event: RunEvent) -> None:
+        if isinstance(event, CellProgress) and event.text == "row4" and not ran:
+            ran.append(execute(plan, world.folder / "other", world.store).run_id)
+
+    outcome = execute(plan, world.folder / "run", world.store, listen)
+    assert outcome.status == "ok"
+    assert outcome.cached["told"] == ran[0]
+
+
+def test_garbage_collection_removes_parts(world: World) -> None:
+    interrupted(world)
+    assert list(parts_folder(world.store).iterdir())
+    collect_garbage(world.store)
+    assert not list(parts_folder(world.store).iterdir())
+
+
+def test_parts_fill_what_is_missing() -> None:
+    there = dict.fromkeys((range(2, 3), range(6, 8)))
+    assert list(_parts(10, 3, there)) == [
+        range(2),
+        range(2, 3),
+        range(3, 6),
+        range(6, 8),
+        range(8, 10),
+    ]
+    assert list(_parts(0, 3, {})) == []
+    assert list(_parts(4, 9, {})) == [range(nth, nth + 1) for nth in range(4)]
+    for n_items in range(1, 30):
+        for n_parts in range(1, 12):
+            parts = list(_parts(n_items, n_parts, {}))
+            assert [item for part in parts for item in part] == list(range(n_items))
+            assert len(parts) <= n_parts
+            assert max(map(len, parts)) - min(map(len, parts)) <= 1
