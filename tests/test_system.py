@@ -13,6 +13,8 @@ import pytest
 from orthoflow import system
 from orthoflow.system import FileLock, file_lock, flags
 
+ROOT = Path(__file__).resolve().parents[1]
+
 # Our code finds neither these modules nor these names; libraries may have theirs.
 WITHOUT = """
 import os, sys
@@ -30,8 +32,20 @@ sys.meta_path.insert(0, Forbidden())
 for name in ("fork", "killpg", "setsid", "pidfd_open", "sched_getaffinity", "getresuid", "O_PATH"):
     if hasattr(os, name):
         delattr(os, name)
-from orthoflow.cli import main
-main()
+"""
+COMMAND = f"{WITHOUT}\nfrom orthoflow.cli import main\nmain()\n"
+
+# Every module of ours is loaded as a system without these would load it.
+EVERYTHING = f"""{WITHOUT}
+import importlib, pkgutil
+import orthoflow, orthoflow_plugins, orthoflow_provenance
+n_loaded = 0
+for package in (orthoflow, orthoflow_plugins, orthoflow_provenance):
+    for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not found.name.endswith("__main__"):
+            importlib.import_module(found.name)
+            n_loaded += 1
+print(n_loaded)
 """
 
 WORKFLOW = """
@@ -46,7 +60,7 @@ inputs:
 
 def without_linux(folder: Path, *arguments: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT, *arguments],
+        [sys.executable, "-c", COMMAND, *arguments],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -68,6 +82,25 @@ def test_a_workflow_runs_where_there_are_neither_kernel_locks_nor_forks(tmp_path
     assert "verified" in without_linux(tmp_path, "verify", "run")
     again = without_linux(tmp_path, "run", "elsewhere.yaml", "-o", "again")
     assert "cloud: cached (1 of 1)" in again
+
+
+def test_every_module_loads_without_what_only_linux_has() -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error::ImportWarning", "-c", EVERYTHING],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    sources = [
+        path
+        for package in ("orthoflow", "plugins/orthoflow_plugins", "provenance/orthoflow_provenance")
+        for path in (ROOT / package).rglob("*.py")
+        if path.name != "__main__.py" and path.parent != ROOT / package
+    ]
+    # As many modules as there are sources in folders, and those beside them.
+    assert int(done.stdout) >= len(sources)
 
 
 def locks(path: Path, n: int, monkeypatch: pytest.MonkeyPatch, *, twin: bool) -> list[FileLock]:

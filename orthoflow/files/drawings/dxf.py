@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from orthoflow.errors import StoreError
 from orthoflow.files.drawings.room_lines import DrawnWall, Residuals, RoomLines, edges_of
 from orthoflow.foreign_text import shown
-from orthoflow.products import Opening
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
@@ -56,7 +55,11 @@ def write_wall_dxf(path: Path, wall: DrawnWall, lines: RoomLines | None) -> None
         size = (frame.width * frame.gsd_m, frame.height * frame.gsd_m)
         space.add_image(definition, tuple(corners[1]), size, dxfattribs={"layer": "IMAGE"})
     for opening in wall.openings:
-        _add_opening(space, opening, opening.outline_m)
+        _add_polygon(space, opening.outline_m, "OPENINGS")
+        left, top = opening.outline_m[:, 0].min(), opening.outline_m[:, 1].max()
+        for row, part in enumerate(opening.said.split(", "), start=1):
+            place = np.array([left + _TEXT_M, top - 2.0 * row * _TEXT_M])
+            _add_text(space, part, place, "OPENINGS")
     if lines is not None:
         if wall.plane_index is not None:
             _add_polygon(space, wall.place_m(lines.planes.corners[wall.plane_index]), "RECTANGLE")
@@ -105,7 +108,8 @@ def write_room_dxf(path: Path, walls: Sequence[DrawnWall], lines: RoomLines) -> 
     for corner in lines.corners:
         space.add_point(tuple(corner.point_world), dxfattribs={"layer": "CORNERS"})
     for opening in lines.openings:
-        _add_opening(space, opening, opening.outline_world)
+        _add_polygon(space, opening.outline_world, "OPENINGS")
+        _add_text(space, opening.said, opening.outline_world.mean(axis=0), "OPENINGS")
     _add_outline(space, lines)
     if lines.checkpoints is not None:
         _add_points(space, lines.checkpoints.names, lines.checkpoints.points_world)
@@ -161,11 +165,6 @@ def _add_outline(space: Modelspace, lines: RoomLines) -> None:
             space.add_polyline3d(points.tolist(), close=is_closed, dxfattribs=layer)
     for face in outline.faces_world:
         space.add_3dface(face.tolist(), dxfattribs={"layer": "FACES"})
-
-
-def _add_opening(space: Modelspace, opening: Opening, corners: NDArray[np.float64]) -> None:
-    _add_polygon(space, corners, "OPENINGS")
-    _add_text(space, opening.said, corners.mean(axis=0), "OPENINGS")
 
 
 def _add_polygon(space: Modelspace, corners: NDArray[np.float64], layer: str) -> None:

@@ -311,3 +311,16 @@ def test_a_photo_colours_only_what_it_sees() -> None:
     left = shown & (a < -0.02)
     assert (colours.rgb[:n_wall][left] == (200, 40, 40)).all()
     assert (colours.photo[n_wall:] == 0).all()
+
+
+@pytest.mark.usefixtures("_open3d")
+def test_open3d_reads_a_ply_with_colours_and_normals(tmp_path: Path) -> None:
+    from orthoflow.files.open3d_guard import load_open3d
+
+    write_ply(tmp_path / "cloud.ply", dressed())
+    open3d = load_open3d("this test")
+    found = open3d.io.read_point_cloud(str(tmp_path / "cloud.ply"))
+    other = read_ply(tmp_path / "cloud.ply")
+    np.testing.assert_array_equal(np.asarray(found.points), other.world)
+    np.testing.assert_array_equal(np.rint(255.0 * np.asarray(found.colors)), other.rgb)
+    np.testing.assert_allclose(np.asarray(found.normals), other.normal, atol=1e-6)
