@@ -12,6 +12,7 @@ import runpy
 import sys
 import tomllib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import indent
 from typing import Final, NoReturn
@@ -25,6 +26,7 @@ from orthoflow.cli.program import program
 from orthoflow.errors import OrthoflowError
 from orthoflow.files.calibration import lens_for, read_calibration
 from orthoflow.workflow import load_workflow
+from orthoflow.workflow.recipes import shipped_workflow
 from tests.documented import (
     ROOT,
     TEXTS,
@@ -275,13 +277,18 @@ def test_every_piece_of_a_workflow_is_one(catalog: Catalog, readers_folder: Path
             elif first == "datasets":
                 n_pieces += 1
                 text = written_files()["detectors.yaml"] + block
+            elif "{use: " in block:
+                n_pieces += 1
+                # A step more, behind those of the main job.
+                text = shipped_workflow("photos-on-scan").read_text() + indent(block, "  ")
             else:
                 # A calibration, a file of parameters, the first line of an editor.
                 assert first in ("cameras", "plane.hough2d.tolerance_m", "# yaml-language-server")
                 continue
             (readers_folder / "block.yaml").write_text(text)
             load_workflow(readers_folder / "block.yaml", catalog)
-    assert (n_whole, n_pieces) == (2, 3)
+    assert n_whole >= 2
+    assert n_pieces >= 4
 
 
 def test_the_calibration_of_the_readme_is_read(readers_folder: Path) -> None:
@@ -312,10 +319,12 @@ def test_what_authors_of_plugins_are_shown_works(tmp_path: Path) -> None:
     import numpy as np
     from orthoflow_plugins.plane.hough2d import Hough2d
 
-    from orthoflow import sdk, testing
+    from orthoflow import products, sdk, testing
 
-    known = {name: getattr(home, name) for home in (sdk, testing) for name in home.__all__}
+    homes = (products, sdk, testing)
+    known = {name: getattr(home, name) for home in homes for name in home.__all__}
     known |= {
+        "dataclass": dataclass,
         "np": np,
         "pytest": pytest,
         "Path": Path,
