@@ -98,8 +98,8 @@ def relief_of(wall: Wall, lines: SightLines | None, rule: AreaRule) -> Relief:
     is_empty = np.ascontiguousarray(wall.mask[::step, ::step] == SurfaceMask.VOID)
     is_crossed = is_hidden = np.zeros(is_empty.shape, dtype=np.bool_)
     if lines is not None:
-        is_crossed = lines.over(lines.crossed, wall.mask.shape)[::step, ::step] & is_empty
-        is_hidden = lines.over(lines.stopped, wall.mask.shape)[::step, ::step] & is_empty
+        is_crossed = lines.over(lines.crossed, wall.frame.shape, step) & is_empty
+        is_hidden = lines.over(lines.stopped, wall.frame.shape, step) & is_empty
     face_m = _face_m(depth_m[~is_empty], rule.behind_m)
     with np.errstate(invalid="ignore"):
         is_behind = ~is_empty & (depth_m <= face_m - rule.behind_m)

@@ -40,11 +40,12 @@ class SightLines:
     crossed: NDArray[np.bool_]
     stopped: NDArray[np.bool_]
 
-    def over(self, tiles: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """Give tiles as cells of the wall's raster."""
-        return np.kron(tiles, np.ones((self.side, self.side), dtype=np.bool_))[
-            : shape[0], : shape[1]
-        ]
+    def over(
+        self, tiles: NDArray[np.bool_], shape: tuple[int, int], step: int
+    ) -> NDArray[np.bool_]:
+        """Give tiles as cells of the wall's raster (rows, cols), of every nth row and column."""
+        rows, columns = (np.arange(0, count, step) // self.side for count in shape)
+        return tiles[np.ix_(rows, columns)]
 
 
 def sight_lines(cloud: PointCloud, slab: Slab) -> SightLines:
