@@ -12,6 +12,7 @@ import axe_core_python
 import pytest
 from orthoflow_provenance.model import Metric, RecordedCell, RecordedFigure
 
+from orthoflow.files.survey_points import read_measured_ties, read_survey_points
 from orthoflow.report import write_report
 from tests.browser import PROGRAM, BrowserError, Page, browser
 from tests.report_runs import HeldRun, compared_run
@@ -118,43 +119,70 @@ def test_the_world_under_the_cursor_of_an_orthoimage_is_told(page: Page) -> None
     assert y == pytest.approx(5.0e6 - (float(depth[0]) if depth else 0.0), abs=2e-3)
 
 
-def test_clicks_are_saved_as_check_points_and_as_ties(page: Page) -> None:
+def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path) -> None:
     page.evaluate(
         "(() => { window.saved = []; URL.createObjectURL = blob => {"
         " blob.text().then(text => window.saved.push(text)); return '#'; };"
         " HTMLAnchorElement.prototype.click = function () { window.file = this.download; }; })()"
     )
-    points = "document.querySelector('.points')"
-    assert page.evaluate(f"{points}.querySelector('[data-part=ties]').disabled") is True
+    panel = "document.querySelector('.points')"
+    assert page.evaluate(f"{panel}.querySelector('[data-part=ties]').disabled") is True
     for x in (0.25, 0.75, 0.5):
         page.evaluate(f"({POINTER})('click', {x}, 0.5)")
-    page.evaluate(f"{points}.querySelectorAll('[aria-label=\"remove point 2\"]')[0].click()")
-    page.evaluate(f"{points}.querySelector('[data-part=checkpoints]').click()")
+    page.evaluate(f"{panel}.querySelectorAll('[aria-label=\"remove point 2\"]')[0].click()")
+    page.evaluate(f"{panel}.querySelector('[data-part=checkpoints]').click()")
     assert page.evaluate("window.file") == "checkpoints.csv"
     saved = page.evaluate("new Promise(done => setTimeout(() => done(window.saved.pop()), 50))")
+    (tmp_path / "checkpoints.csv").write_text(saved)
+    points = read_survey_points(tmp_path / "checkpoints.csv")
+    assert [(point.name, point.wall) for point in points] == [("P1", 0), ("P3", 0)]
+    assert points[1].pixel_wall == pytest.approx((60.0, 40.0), abs=0.6)
     header, first, second = csv.reader(saved.splitlines())
     assert header == ["name", "x", "y", "z", "wall", "u_px", "v_px"]
     assert (first[0], second[0]) == ("P1", "P3")
     assert float(first[1]) == pytest.approx(4.0e5 + 0.01 * float(first[5]), abs=1e-3)
     assert float(second[5]) == pytest.approx(60.0, abs=0.6)
-    page.evaluate(f"{points}.querySelector('[data-part=ties]').click()")
-    told = f"{points}.querySelector('[data-part=told]').innerText"
+    page.evaluate(f"{panel}.querySelector('[data-part=ties]').click()")
+    told = f"{panel}.querySelector('[data-part=told]').innerText"
     assert page.evaluate(told).startswith("0 ties; 2 points lack a photo")
     page.evaluate(
-        f"(() => {{ const row = {points}.querySelector('[data-part=list] > div');"
+        f"(() => {{ const row = {panel}.querySelector('[data-part=list] > div');"
         " const [, photo, u, v] = row.querySelectorAll('input');"
         " photo.value = 'a, b.jpg'; u.value = '12.5'; v.value = '7'; })()"
     )
-    page.evaluate(f"{points}.querySelector('[data-part=ties]').click()")
+    page.evaluate(f"{panel}.querySelector('[data-part=ties]').click()")
     saved = page.evaluate("new Promise(done => setTimeout(() => done(window.saved.pop()), 50))")
     header, tie = csv.reader(saved.splitlines())
     assert header == ["photo", "u_px", "v_px", "x", "y", "z"]
     assert tie == ["a, b.jpg", "12.5", "7", *first[1:4]]
+    (tmp_path / "ties.csv").write_text(saved)
+    (read,) = read_measured_ties(tmp_path / "ties.csv")
+    assert (read.photo, read.pixel) == ("a, b.jpg", (12.5, 7.0))
+    assert read.position == points[0].position
     assert (
         page.evaluate(told)
         == "1 ties; 1 points lack a photo or where it shows them, and are left out"
     )
     assert page.complaints == []
+
+
+def test_a_click_is_where_the_pointer_was_told_to_be(page: Page) -> None:
+    # Pointers know fractions of the screen's pixels, clicks do not.
+    page.evaluate(f"({POINTER})('pointermove', 0.4567, 0.5678)")
+    page.evaluate(
+        f"(() => {{ const image = {FIGURE}.querySelector('img');"
+        " const box = image.getBoundingClientRect();"
+        " image.dispatchEvent(new MouseEvent('click', { bubbles: true,"
+        " clientX: Math.floor(box.left + image.clientLeft + 0.4567 * image.clientWidth),"
+        " clientY: Math.floor(box.top + image.clientTop + 0.5678 * image.clientHeight) })); })()"
+    )
+    told = page.evaluate(f"{FIGURE}.querySelector('.readout').innerText")
+    collected = "[...document.querySelectorAll('.points [data-part=list] > div')].pop()"
+    assert page.evaluate(f"{collected}.innerText").startswith(f"wall 0, {told}")
+    # One that no pointer made, by a script or a keyboard, stays where it is itself.
+    page.evaluate(f"({POINTER})('click', 0.25, 0.5)")
+    u = re.findall(r"u ([0-9.]+) px", page.evaluate(f"{collected}.innerText"))
+    assert float(u[0]) == pytest.approx(30.0, abs=0.6)
 
 
 def test_vectors_lie_over_the_intensity_of_their_wall(page: Page) -> None:

@@ -349,12 +349,18 @@
       readout.className = "readout";
       readout.textContent = "move over the picture for coordinates";
       figure.querySelector("figcaption").append(readout);
-      image.addEventListener("pointermove", (event) => {
+      let pointer = null;
+      const follow = (event) => {
         const point = under(place, image, event);
+        pointer = { clientX: event.clientX, clientY: event.clientY };
         if (point) readout.textContent = words(point);
-      });
+      };
+      image.addEventListener("pointermove", follow);
+      image.addEventListener("pointerdown", follow);
       image.addEventListener("click", (event) => {
-        const point = under(place, image, event);
+        // A click is told in whole pixels of the screen; the pointer that made it knows its place within one.
+        const isIts = pointer && Math.abs(pointer.clientX - event.clientX) < 1 && Math.abs(pointer.clientY - event.clientY) < 1;
+        const point = under(place, image, isIts ? pointer : event);
         if (point) collect(point);
       });
     }
