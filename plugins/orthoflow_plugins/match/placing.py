@@ -24,6 +24,7 @@ from orthoflow_plugins.match.channels import Channels
 from orthoflow_plugins.match.displacements import Displacements, SearchRule, measure
 from orthoflow_plugins.match.pictures import photo_rgb, points_on_wall
 from orthoflow_plugins.match.structures import (
+    PHOTO_SIDE_PX,
     Place,
     WallStructure,
     likely_places,
@@ -62,7 +63,12 @@ _EXIF_SIGMA: Final = 0.05
 _UNKNOWN_SIGMA: Final = 0.3
 # Quarter turns, anticlockwise, that bring a photo upright, by EXIF's orientation.
 _QUARTERS: Final = {3: 2, 4: 2, 5: 3, 6: 3, 7: 1, 8: 1}
-_OTHERWISE: Final = (1, 3, 2)
+# Turns of a photo of which nobody says how it was held, anticlockwise from upright in degrees: as
+# cameras are held first. Structure is found up to some 9 degrees off.
+_QUARTERS_DEG: Final = (0.0, 90.0, -90.0, 180.0)
+_TURNS_DEG: Final = tuple(
+    quarter + roll for roll in (0.0, 15.0, -15.0, 30.0, -30.0, 45.0) for quarter in _QUARTERS_DEG
+)
 # Two poses whose photo centres lie nearer on the wall are one place, as a share of the width.
 _SAME_SHARE: Final = 0.1
 
@@ -89,6 +95,64 @@ class Placed:
     is_clear: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class TurnedPhoto:
+    """The middle of a photo, turned in its plane.
+
+    Attributes:
+        rgb: (height, width, 3) of it.
+        size_px: its width and height in pixels of the photo.
+        axes: (2, 2) right and down in the photo, each as right and down of what is turned.
+        middle_px: (2,) column and row of the photo that it is turned about.
+    """
+
+    rgb: NDArray[np.uint8]
+    size_px: tuple[float, float]
+    axes: NDArray[np.float64]
+    middle_px: tuple[float, float]
+
+    def pixels_photo(self, shares: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels (n, 2) of the photo where shares (n, 2) of width and height are."""
+        pixels: NDArray[np.float64] = (shares - 0.5) * self.size_px @ self.axes.T + self.middle_px
+        return pixels
+
+
+def turned(rgb: NDArray[np.uint8], degrees: float) -> TurnedPhoto:
+    """Turn a photo (height, width, 3) anticlockwise; of other turns than quarters give the middle.
+
+    What is cut has the shape that the whole would have when turned by the nearest quarters.
+    """
+    import cv2
+
+    quarters = round(degrees / 90.0)
+    roll_deg = degrees - 90.0 * quarters
+    whole = np.ascontiguousarray(np.rot90(rgb, quarters % 4))
+    height, width = whole.shape[:2]
+    angle = np.radians(degrees)
+    # Quarters are exact.
+    cos, sin = np.round([np.cos(angle), np.sin(angle)], 15)
+    size_px = (float(width), float(height))
+    if roll_deg:
+        along, across = abs(np.cos(np.radians(roll_deg))), abs(np.sin(np.radians(roll_deg)))
+        share = min(
+            width / (width * along + height * across), height / (width * across + height * along)
+        )
+        shrink = min(1.0, PHOTO_SIDE_PX / max(width, height))
+        small = cv2.resize(whole, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        rows, columns = small.shape[:2]
+        size = (max(1, int(share * columns)), max(1, int(share * rows)))
+        matrix = cv2.getRotationMatrix2D((0.5 * columns - 0.5, 0.5 * rows - 0.5), roll_deg, 1.0)
+        matrix[:, 2] += [0.5 * (size[0] - columns), 0.5 * (size[1] - rows)]
+        whole = np.asarray(cv2.warpAffine(small, matrix, size), dtype=np.uint8)
+        size_px = (size[0] * width / columns, size[1] * height / rows)
+    return TurnedPhoto(
+        rgb=whole,
+        size_px=size_px,
+        axes=np.array([[cos, -sin], [sin, cos]]),
+        middle_px=(0.5 * rgb.shape[1], 0.5 * rgb.shape[0]),
+    )
+
+
 @dataclass(kw_only=True)
 class PlacedWalls:
     """Walls that photos are placed on, prepared when the first photo asks."""
@@ -108,8 +172,8 @@ class PlacedWalls:
 def places_of(index: int, photo: Photo, walls: PlacedWalls) -> list[Placed]:
     """Give the places on the walls where a photo may be, the best first.
 
-    Only the first may be clear. A photo of which no EXIF says how it was held is tried in all four
-    ways, unless a clear place is found before.
+    Only the first may be clear. A photo of which no EXIF says how it was held is tried in all ways,
+    unless a clear place is found before.
 
     Args:
         index: of the photo.
@@ -118,10 +182,9 @@ def places_of(index: int, photo: Photo, walls: PlacedWalls) -> list[Placed]:
     """
     rgb = photo_rgb(photo)
     upright = _QUARTERS.get(photo.exif_orientation, 0)
-    is_told = photo.exif_orientation != 1 or photo.exif_focal_px is not None
     best: list[Placed] = []
-    for turn in (0,) if is_told else (0, *_OTHERWISE):
-        found = _places_turned((index, photo, rgb), walls, (upright + turn) % 4)
+    for turn_deg in _turns_deg(photo):
+        found = _places_turned((index, photo, rgb), walls, turned(rgb, 90.0 * upright + turn_deg))
         if not best or (found and found[0].share > best[0].share):
             best = found
         if best and best[0].is_clear:
@@ -129,22 +192,30 @@ def places_of(index: int, photo: Photo, walls: PlacedWalls) -> list[Placed]:
     return best
 
 
+def _turns_deg(photo: Photo) -> Sequence[float]:
+    """Turns from upright in which a photo is tried, in this order."""
+    if photo.exif_orientation != 1 or photo.exif_focal_px is not None:
+        return (0.0,)
+    # Faces of a panorama have no EXIF, and many show no wall: each turn costs as much as the first.
+    is_face = photo.intrinsics is not None and photo.intrinsics.source == "given"
+    return _QUARTERS_DEG if is_face else _TURNS_DEG
+
+
 def _places_turned(
-    shot: tuple[int, Photo, NDArray[np.uint8]], walls: PlacedWalls, quarters: int
+    shot: tuple[int, Photo, NDArray[np.uint8]], walls: PlacedWalls, upright: TurnedPhoto
 ) -> list[Placed]:
-    """Places of a photo that stands upright when turned by so many quarters, anticlockwise."""
+    """Places of a photo that stands upright when it is turned so."""
     index, photo, rgb = shot
-    turned = np.ascontiguousarray(np.rot90(rgb, quarters))
     likely = [
         (at, structure, place)
         for at, structure in enumerate(walls.structures())
         if structure is not None
-        for place in likely_places(turned, structure, n_most=_PLACES)
+        for place in likely_places(upright.rgb, structure, n_most=_PLACES)
     ]
     found: list[Placed] = []
     for at, structure, place in sorted(likely, key=lambda each: -each[2].lead)[:_PLACES]:
         lens, freedom = _lens_before(photo)
-        camera = _camera_at(place, structure.wall, lens, quarters)
+        camera = _camera_at(place, structure.wall, lens, upright)
         if camera is not None:
             placed = _tied((index, at), rgb, (camera, freedom), structure)
             if placed is not None:
@@ -190,21 +261,14 @@ def _lens_before(photo: Photo) -> tuple[ViewingCamera, LensFreedom]:
 
 
 def _camera_at(
-    place: Place, wall: Wall, lens: ViewingCamera, quarters: int
+    place: Place, wall: Wall, lens: ViewingCamera, upright: TurnedPhoto
 ) -> ViewingCamera | None:
     """Pose by the places of the photo's parts, from straight before the wall."""
     frame = wall.frame
-    right, down = frame.u_world, frame.v_world
-    x, y = place.parts_photo.T
-    axes, parts = (
-        ((right, down), (x, y)),
-        ((-down, right), (1.0 - y, x)),
-        ((-right, -down), (1.0 - x, 1.0 - y)),
-        ((down, -right), (y, 1.0 - x)),
-    )[quarters]
+    axes = upright.axes @ np.array([frame.u_world, frame.v_world])
     # Right, down and into the wall.
     rotation = np.array([*axes, -frame.normal_world])
-    px_per_m = (lens.height if quarters % 2 else lens.width) / place.width_m
+    px_per_m = upright.size_px[0] / place.width_m
     # Around the wall: survey coordinates would cost digits.
     origin = frame.origin_world
     middle = frame.world_from_wall(place.centre_m[None] / frame.gsd_m)[0] - origin
@@ -218,7 +282,7 @@ def _camera_at(
     # On the plane where the wall is void.
     points = np.where(lifted.known[:, None], lifted.points_world, frame.world_from_wall(pixels))
     seen = SeenPoints(
-        pixels_photo=np.column_stack(parts) * [lens.width, lens.height],
+        pixels_photo=upright.pixels_photo(place.parts_photo),
         points_world=points - origin,
         sigma_px=np.full(len(points), frame.gsd_m * px_per_m),
         sigma_m=np.full(len(points), frame.gsd_m),

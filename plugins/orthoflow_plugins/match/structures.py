@@ -44,7 +44,7 @@ _STRONGEST: Final = 3.0
 # Parts that lie mostly beside the wall must not win by what little they show.
 _ENERGY_LEAST: Final = 0.25
 # Longer side to which a photo is shrunk first: no size needs more.
-_PHOTO_SIDE_PX: Final = 1200
+PHOTO_SIDE_PX: Final = 1200
 # Another place begins so far off, as a share of the photo's width, or at such another size (log).
 _ELSEWHERE: Final = (0.25, 0.25)
 
@@ -174,7 +174,7 @@ def likely_places(rgb: NDArray[np.uint8], wall: WallStructure, *, n_most: int) -
     """
     import cv2
 
-    shrink = min(1.0, _PHOTO_SIDE_PX / max(rgb.shape[:2]))
+    shrink = min(1.0, PHOTO_SIDE_PX / max(rgb.shape[:2]))
     small = cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     found = []
     for width in _widths_cells(rgb.shape, wall.wall.frame.shape):

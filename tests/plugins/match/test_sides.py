@@ -146,7 +146,7 @@ def test_walls_are_seen_from_the_side_of_their_photos_whichever_way_their_planes
         tolerance_m=0.15,
     )
     wanted = right.turned(behind.index(True))
-    for turned in ((), (0,), (1,), (0, 1)):
+    for turned in ((), (0, 1)):
         guessed = right
         for index in turned:
             guessed = guessed.turned(index)
