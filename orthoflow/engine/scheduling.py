@@ -410,8 +410,10 @@ class _Run:
         # Times of steps in parts hold what each part prepares.
         if options.parts or options.executor != "dask" or task.is_compared:
             return options.parts or 1
+        # Workers of its own share the cores of this machine.
+        n_most = capacity.n_tasks if options.scheduler else min(capacity.n_tasks, options.all_cores)
         n_others = sum(1 for address in self._waiting if address in self._ready)
-        return (capacity.n_tasks - len(self._running)) // (n_others + 1)
+        return (n_most - len(self._running)) // (n_others + 1)
 
     def _go_on_in_parts(self, executor: Executor) -> None:
         """Start parts of cells, and what joins them, as far as the cores go."""

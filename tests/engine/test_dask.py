@@ -123,6 +123,14 @@ def test_idle_workers_share_the_items_of_a_step(office: Office) -> None:
     assert "part " not in whole.log
 
 
+def test_workers_that_share_one_core_share_no_step(office: Office) -> None:
+    fresh = World(folder=office.world.folder / "one-core", site=office.world.site)
+    fresh.folder.mkdir()
+    outcome = fresh.run(ROWS, executor="dask", jobs=2, cores=1)
+    assert outcome.status == "ok"
+    assert "part " not in outcome.results["told"].log
+
+
 def test_a_part_whose_worker_is_killed_runs_again(office: Office) -> None:
     killed: set[int] = set()
 
