@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import InputError, ProductError, StoreError
+from orthoflow.files.rasterio_guard import let_go_of_foreign_text
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import Colours
 
@@ -588,6 +589,7 @@ def quiet() -> Iterator[None]:
     """
     import rasterio
 
+    let_go_of_foreign_text()
     alone = rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR")
     with warnings.catch_warnings(), alone:
         warnings.simplefilter("ignore")

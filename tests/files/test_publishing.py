@@ -6,6 +6,7 @@ import base64
 import csv
 import dataclasses
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,6 +102,20 @@ def test_an_orthoimage_file_gives_back_every_pixel_and_shows_painted_and_filled_
     assert read.tags["product_digest"] == DIGEST
     assert json.loads(read.tags["plane"])["offset_m"] == pytest.approx(634512.347, abs=1e-9)
     assert json.loads(read.tags["frame"])["v_world"] == [0.0, 0.0, -1.0]
+
+
+def test_no_traceback_is_printed_for_text_in_a_file_that_is_not_utf_8(
+    tmp_path: Path, frame: WallFrame, capfd: pytest.CaptureFixture[str]
+) -> None:
+    publishing.publish_orthoimages(Orthoimages(images=(orthoimage(frame),)), tmp_path, DIGEST)
+    path = tmp_path / "wall_3_ortho.tif"
+    content = path.read_bytes()
+    assert b"<GDALMetadata>" in content
+    # GDAL quotes the name of the element that is not closed, and rasterio stumbles over it.
+    path.write_bytes(content.replace(b"<GDALMetadata>", b"<GDALM\xea\x8c\xa09Y>)F", 1))
+    with suppress(InputError):
+        geotiff.read_raster(path)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_geotiffs_lie_in_metres_with_rows_downwards(tmp_path: Path, frame: WallFrame) -> None:

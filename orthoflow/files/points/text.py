@@ -34,6 +34,8 @@ from orthoflow.files.points.tables import (
 
 FORMAT: Final = "text"
 HEADER_LINES: Final = 200
+# Of the number of points; a number that is longer counts nothing.
+_MOST_DIGITS: Final = 20
 SAMPLE_LINES: Final = 1000
 
 
@@ -112,7 +114,7 @@ def _read_head(path: Path, columns: Columns | None) -> TextHead:
             return TextHead(n_header_lines=index, n_stated=n_stated, layout=layout, columns=chosen)
         bare = line.lstrip("#/ \t")
         header = columns_of_header(split_fields(bare)[0]) or header
-        if line.isdigit():
+        if line.isascii() and line.isdigit() and len(line) <= _MOST_DIGITS:
             n_stated = int(line)
     raise InputError(
         f"{path.name} has no line that begins with three numbers among its first "

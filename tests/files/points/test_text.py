@@ -111,6 +111,13 @@ def test_more_columns_named_than_there_are_is_refused(tmp_path: Path) -> None:
         open_scan(path, columns_of_text("x y z r"))
 
 
+@pytest.mark.parametrize("count", ["9" * 5000, "\u00b2"])
+def test_what_counts_no_points_is_passed_over(tmp_path: Path, count: str) -> None:
+    path = tmp_path / "a.xyz"
+    path.write_text(f"{count}\n1 2 3\n4 5 6\n", encoding="utf-8")
+    assert len(read_points(path)) == 2
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
