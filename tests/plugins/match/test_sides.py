@@ -16,6 +16,7 @@ from orthoflow.products import Photos, Planes, PointCloud
 from orthoflow.sdk import StepContext
 from orthoflow.testing import photographed as ms
 from tests import samples
+from tests.long_loops import IS_LONG
 
 FLOOR = 1
 
@@ -115,7 +116,20 @@ def merged(room: tuple[ms.TexturedWall, ...]) -> PointCloud:
     return PointCloud(origin=first.origin, x=x, y=y, z=z, up=first.up, intensity=intensity)
 
 
-@pytest.mark.parametrize("behind", [(False, True), (True, False)], ids=["second", "first"])
+@pytest.mark.parametrize(
+    "behind",
+    [
+        (True, False),
+        pytest.param(
+            (False, True),
+            marks=[
+                pytest.mark.long,
+                pytest.mark.skipif(not IS_LONG, reason="more of it: .ci/run --long"),
+            ],
+        ),
+    ],
+    ids=["first", "second"],
+)
 def test_walls_are_seen_from_the_side_of_their_photos_whichever_way_their_planes_point(
     room: tuple[ms.TexturedWall, ...],
     merged: PointCloud,
