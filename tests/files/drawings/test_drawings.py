@@ -82,6 +82,17 @@ def test_pictures_lie_on_the_paper_as_they_do_on_the_wall(sheet: pdfplumber.page
     np.testing.assert_allclose(heights, (np.arange(100.5, 102.5, 0.5) - 100.1) * 20, atol=0.01)
 
 
+def test_crosses_of_the_grid_are_three_millimetres(sheet: pdfplumber.page.Page) -> None:
+    ortho, _ = sheet.images
+    arms = [
+        (line["x1"] - line["x0"]) * MM
+        for line in sheet.lines
+        if line["top"] == line["bottom"] and ortho["x0"] < line["x0"] < line["x1"] < ortho["x1"]
+    ]
+    assert len(arms) > 10
+    np.testing.assert_allclose(arms, 3.0, atol=1e-3)
+
+
 def test_a_sheet_says_what_the_record_says(run: Path, sheet: pdfplumber.page.Page) -> None:
     text = " ".join(sheet.extract_text().split())
     for said in (
@@ -133,6 +144,9 @@ def test_a_wall_that_does_not_fit_takes_several_sheets_and_an_index(
     with pdfplumber.open(tmp_path / "out" / f"wall_{WALL}_index.pdf") as pdf:
         assert f"index of {count} sheets" in pdf.pages[0].extract_text()
         assert "scale 1:25" in pdf.pages[0].extract_text()
+        # Each sheet's part is framed, all round.
+        red = [box for box in pdf.pages[0].rects if box["stroking_color"] == (0.8, 0.0, 0.0)]
+        assert len(red) == count
 
 
 @pytest.mark.parametrize(
