@@ -48,6 +48,25 @@ def test_other_ways_to_vote_find_the_same_room(options: dict[str, Any], tmp_path
     assert all(has(planes, truth) for truth in ROOM)
 
 
+@pytest.mark.parametrize(("search", "coarser"), [("coarse-to-fine", 2.0), ("full", 1.0)])
+def test_the_first_search_is_as_coarse_as_it_says(
+    search: str, coarser: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[SpaceVoting] = []
+
+    def proposer(cloud: Any, voting: SpaceVoting) -> SpaceProposer:
+        asked.append(voting)
+        return SpaceProposer(cloud, voting)
+
+    monkeypatch.setattr("orthoflow_plugins.plane.space_accumulators.SpaceProposer", proposer)
+    cloud = cloud_of(sampled(), stations=STATION)
+    params = {"cell_m": 0.04, "angle_step_deg": 3.0, "min_share": 0.05, "n_planes_max": 1}
+    detect(cloud, tmp_path, search=search, **params)
+    assert asked[0].cell_m == pytest.approx(0.04 * coarser)
+    assert asked[0].angle_step_deg == pytest.approx(3.0 * coarser)
+    assert asked[0].least_points == pytest.approx(0.05 * len(cloud))
+
+
 def test_floor_and_ceiling_are_found_once_each(tmp_path: Path) -> None:
     planes = detect(cloud_of(sampled(ROOM[4:6])), tmp_path, stop_unclassified_share=0.0).planes
     assert sorted(planes.names) == ["ceiling 1", "floor 0"]
