@@ -283,6 +283,7 @@ def _rms_m(cloud: PointCloud, planes: Planes, labels: NDArray[np.int16]) -> NDAr
             distances = Plane(
                 normal=planes.normal[index], offset_m=float(offsets[index])
             ).distances_m(points[label == index].astype(np.float64))
-            sums[index] += float(distances @ distances)
+            # Not as a product: BLAS adds in another order with another number of threads.
+            sums[index] += float(np.square(distances).sum())
     rms: NDArray[np.float64] = np.sqrt(sums / np.maximum(planes.n_points, 1))
     return rms
