@@ -58,6 +58,7 @@ TOLERANCES = {
     "orthoimages": {"rgb": "2 grey", "origin_world": "0.001 m"},
     "checkpoints": {},
     "truth": {},
+    "openings": dict.fromkeys(("outline_m", "outline_world", "side_sigma_m", "depth_m"), "0.001 m"),
     "inspection": {"points_world": "0.001 m", "displacement_m": "0.0001 m"},
 }
 

@@ -52,8 +52,13 @@ class Story:
                 words += self.coarse
             if words[0] == "run":
                 words += ("--executor", "inline")  # loads libraries once for all steps
-            if words[0] in ("replay", "cache", "export"):
+            if words[0] in ("replay", "export"):
                 words += ("--store", str(shell.store))
+            if words[0] == "cache":
+                # That of the session is in use by other tests.
+                own = shell.folder / "kept"
+                own.mkdir(exist_ok=True)
+                words += ("--store", str(own))
             told[command.text] = shell(*words, timeout_s=900)
             assert told[command.text].code == 0, f"{command}: {told[command.text].said}"
         assert told, f"{document} has no commands"

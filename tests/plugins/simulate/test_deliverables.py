@@ -126,7 +126,7 @@ def test_a_thumb_has_every_so_manieth_pixel(width: int, shown: int) -> None:
 def test_photos_are_reported_by_their_shots(tmp_path: Path) -> None:
     context = StepContext(rng=np.random.default_rng(1), cores=1, scratch=tmp_path)
     shots: Any = tuple(
-        SimpleNamespace(gsd_m=gsd_m, obliquity_deg=obliquity)
+        SimpleNamespace(taken=SimpleNamespace(gsd_m=gsd_m, obliquity_deg=obliquity))
         for gsd_m, obliquity in ((0.002, 5.0), (0.004, 30.0))
     )
     deliverables.report_photos(Photos(photos=(photo("a"), photo("b"))), shots, context)
