@@ -8,7 +8,12 @@ from pathlib import Path
 import pytest
 
 from orthoflow.errors import InputError
-from orthoflow.files.survey_points import SurveyPoint, read_survey_points
+from orthoflow.files.survey_points import (
+    MeasuredTie,
+    SurveyPoint,
+    read_measured_ties,
+    read_survey_points,
+)
 
 KNOWN = "known are name, x, y, z, class, wall, u_px, v_px, map_x, map_y"
 NAMES_EXPECTED = "expected the names of the columns, name,x,y,z[,class][,wall,u_px,v_px]"
@@ -206,3 +211,20 @@ def test_half_or_double_measurements_are_refused(tmp_path: Path, text: str, prob
     with pytest.raises(InputError) as caught:
         read(tmp_path, text)
     assert str(caught.value).splitlines() == [problem]
+
+
+def test_ties_know_how_exactly_they_were_measured_where_somebody_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text("photo,u_px,v_px,x,y,z,sigma_px\na.jpg,1.5,2,3,4,5,0.4\nb c.jpg,6,7,8,9,10,\n")
+    first, second = read_measured_ties(path)
+    assert first == MeasuredTie(
+        where="t.csv:2", photo="a.jpg", pixel=(1.5, 2.0), position=(3.0, 4.0, 5.0), sigma_px=0.4
+    )
+    assert (second.photo, second.sigma_px) == ("b c.jpg", None)
+    path.write_text("photo,u_px,v_px,x,y,z,sigma_px\na.jpg,1,2,3,4,5,-1\n,1,2,3,4,5,1\n")
+    with pytest.raises(InputError) as caught:
+        read_measured_ties(path)
+    assert str(caught.value).splitlines() == [
+        "t.csv:2: sigma_px must be positive, got -1",
+        "t.csv:3: the name of the photo is missing",
+    ]
