@@ -261,6 +261,15 @@ def test_rounded_coordinates_are_noticed(step: float, points: NDArray[np.float64
     assert rounding_m(points, 1.0) == 0.0
 
 
+def test_rounded_coordinates_are_warned_of_and_others_are_not(
+    tmp_path: Path, read: Reader, points: NDArray[np.float64]
+) -> None:
+    read(write_text(tmp_path / "a.xyz", points))
+    assert "rounded" not in read.warnings
+    read(write_text(tmp_path / "b.xyz", np.round(points, 2)))
+    assert "the coordinates of b.xyz are rounded to 10 mm" in read.warnings
+
+
 def test_rounding_is_told_in_metres_whatever_the_unit(
     tmp_path: Path, read: Reader, points: NDArray[np.float64]
 ) -> None:
