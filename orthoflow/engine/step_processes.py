@@ -69,7 +69,7 @@ _READ_AT_LOADING: Final = (
 _READ_LATER: Final = (COMPILED_CODE, "MPLCONFIGDIR", "PYTHONPATH")
 # Threads of OpenBLAS, of which numpy and scipy bring a set each, spin for 2**26 turns of the clock
 # when they begin and after each product: some 0.05 s of processor time. 2**20 are less than 1 ms.
-_SLEEPS_SOON: Final = ("OPENBLAS_THREAD_TIMEOUT", "20")
+_SLEEPS_SOON: Final = {"OPENBLAS_THREAD_TIMEOUT": "20"}
 _START_S: Final = 120.0
 _SILENT_S: Final = 30.0
 _LIMITS: Final = tuple(
@@ -274,7 +274,7 @@ def _start_server(variables: Mapping[str, str], log: int) -> _Server:
 
 def _variables(task: Task) -> dict[str, str]:
     """Environment variables for the process of a task."""
-    variables = dict([_SLEEPS_SOON]) | dict(os.environ)
+    variables = _SLEEPS_SOON | dict(os.environ)
     variables |= dict.fromkeys(_THREAD_VARIABLES, str(task.cores))
     return variables | {
         "PYTHONPATH": python_path(),

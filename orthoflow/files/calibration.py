@@ -24,7 +24,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Final
+from typing import Final, TypedDict
 
 import numpy as np
 
@@ -189,6 +189,28 @@ def _text_of(path: Path) -> str:
         raise InputError(f"{path.name} cannot be read: {error.strerror}") from error
 
 
+class _Pixels(TypedDict):
+    """What lenses of all models say of their pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+def _pixels(sizes: Mapping[str, int], numbers: Mapping[str, float]) -> _Pixels:
+    return _Pixels(
+        width=sizes["width"],
+        height=sizes["height"],
+        fx=numbers["fx"],
+        fy=numbers["fy"],
+        cx=numbers["cx"] + HALF_PIXEL,
+        cy=numbers["cy"] + HALF_PIXEL,
+    )
+
+
 class _Reader:
     """Turns the text into cameras and collects everything that is wrong with it."""
 
@@ -265,34 +287,9 @@ class _Reader:
         if len(self.problems) > n_before:
             return None
         if is_fisheye:
-            fisheye = FisheyeLens(
-                width=sizes["width"],
-                height=sizes["height"],
-                fx=numbers["fx"],
-                fy=numbers["fy"],
-                cx=numbers["cx"] + HALF_PIXEL,
-                cy=numbers["cy"] + HALF_PIXEL,
-                radial=distortion,
-                skew=numbers.get(_SKEW, 0.0),
-                field_of_view_deg=numbers.get(_FIELD, WIDEST_DEG),
-            )
-            problem = problem_of(fisheye)
-            if problem:
-                self._add(
-                    entry.position,
-                    f"{path}: the fisheye lens is none: {problem}; expected {', '.join(terms)} of "
-                    f"a calibration that covers the image, or a smaller {_FIELD}",
-                )
-            return None if problem else fisheye
+            return self._fisheye(entry, sizes, numbers, distortion)
         camera = Intrinsics(
-            width=sizes["width"],
-            height=sizes["height"],
-            fx=numbers["fx"],
-            fy=numbers["fy"],
-            cx=numbers["cx"] + HALF_PIXEL,
-            cy=numbers["cy"] + HALF_PIXEL,
-            distortion=distortion,
-            skew=numbers.get(_SKEW) or None,
+            **_pixels(sizes, numbers), distortion=distortion, skew=numbers.get(_SKEW) or None
         )
         if _folds(camera):
             self._add(
@@ -302,6 +299,29 @@ class _Reader:
                 "covers the whole image",
             )
         return camera
+
+    def _fisheye(
+        self,
+        entry: Entry,
+        sizes: Mapping[str, int],
+        numbers: Mapping[str, float],
+        radial: tuple[float, ...],
+    ) -> FisheyeLens | None:
+        lens = FisheyeLens(
+            **_pixels(sizes, numbers),
+            radial=radial,
+            skew=numbers.get(_SKEW, 0.0),
+            field_of_view_deg=numbers.get(_FIELD, WIDEST_DEG),
+        )
+        problem = problem_of(lens)
+        if problem:
+            self._add(
+                entry.position,
+                f'cameras."{entry.key}": the fisheye lens is none: {problem}; expected '
+                f"{', '.join(_FISHEYE_TERMS)} of a calibration that covers the image, or a smaller "
+                f"{_FIELD}",
+            )
+        return None if problem else lens
 
     def _is_fisheye(self, entry: Entry | None, path: str) -> bool:
         if entry is None:

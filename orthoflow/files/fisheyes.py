@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthoflow.errors import InputError
 from orthoflow.files.images import MOST_PIXELS, decode_levels, encode_png
-from orthoflow.files.panoramas import FACES, MOST_PX, PANORAMA_FROM_CAMERA, face_name
+from orthoflow.files.panoramas import FACES, MOST_PX, PANORAMA_FROM_CAMERA, face_name, face_rays
 from orthoflow.geometry.levels import Colours
 from orthoflow.geometry.opencv_border import HALF_PIXEL
 from orthoflow.products import Intrinsics
@@ -253,12 +253,7 @@ class FisheyeFace:
 
     def _pixels(self) -> NDArray[np.float64]:
         """Pixels of the fisheye (height, width, 2) of those of the face."""
-        lens = self.lens
-        right = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
-        down = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
-        across, along = np.meshgrid(right, down)
-        rays = np.stack([across, along, np.ones_like(across)], axis=-1)
-        return self.fisheye.project(rays @ FACE_FROM_CAMERA[self.face])
+        return self.fisheye.project(face_rays(self.lens) @ FACE_FROM_CAMERA[self.face])
 
     def _looked_up(self, photo: Colours) -> Colours:
         """Look the face up in the fisheye's photo, between its pixels linearly."""

@@ -50,6 +50,14 @@ def face_lens(width: int) -> Intrinsics:
     )
 
 
+def face_rays(lens: Intrinsics) -> NDArray[np.float64]:
+    """Directions (height, width, 3) of the pixels of a face, z = 1, in the axes of its camera."""
+    right = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
+    down = (np.arange(lens.height) + 0.5 - lens.cy) / lens.fy
+    across, along = np.meshgrid(right, down)
+    return np.stack([across, along, np.ones_like(across)], axis=-1)
+
+
 @dataclass(frozen=True, kw_only=True)
 class PanoramaFace:
     """A face of a panorama as a photo.
@@ -127,9 +135,7 @@ def face_picture(panorama: Colours, name: str) -> Colours:
 
     height, width = panorama.shape[:2]
     lens = face_lens(width)
-    steps = (np.arange(lens.width) + 0.5 - lens.cx) / lens.fx
-    right, down = np.meshgrid(steps, steps)
-    rays = np.stack([right, down, np.ones_like(right)], axis=-1) @ FACES[name]
+    rays = face_rays(lens) @ FACES[name]
     azimuth = np.arctan2(rays[..., 1], rays[..., 0])
     elevation = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
     # OpenCV counts from the centre of the first pixel.

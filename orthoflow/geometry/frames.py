@@ -109,6 +109,20 @@ class WallFrame:
             ]
         )
 
+    def raster_from_wall(self, pixels_wall: NDArray[np.float64]) -> NDArray[np.float64]:
+        """X and Y (n, 2), metres, in the raster's GeoTIFF of wall positions (n, 2)."""
+        places: NDArray[np.float64] = np.array(self.raster_corner_m) + (
+            self.gsd_m * pixels_wall * [1.0, -1.0]
+        )
+        return places
+
+    def wall_from_raster(self, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Wall positions (n, 2) = (column, row) of X and Y (n, 2) in the raster's GeoTIFF."""
+        pixels: NDArray[np.float64] = (
+            (places_m - np.array(self.raster_corner_m)) * [1.0, -1.0] / self.gsd_m
+        )
+        return pixels
+
     def distances_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance (n,) of world points (n, 3) from the raster's rectangle, on either side."""
         on_wall = self.wall_from_world(points_world)

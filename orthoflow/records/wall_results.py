@@ -74,6 +74,10 @@ class RoomResults:
     inspections: dict[str, Inspection]
     openings: tuple[Opening, ...] = ()
 
+    def openings_of(self, wall: WallResult) -> tuple[Opening, ...]:
+        """Openings of one of the walls."""
+        return tuple(opening for opening in self.openings if opening.wall == wall.number)
+
 
 def content_digest(run: Run) -> str:
     """The digest that seals the record of a run, 64 hexadecimal digits."""

@@ -123,6 +123,17 @@ def test_world_and_wall_coordinates_are_inverse(seed: int) -> None:
     np.testing.assert_allclose(frame.wall_from_world(world), wall, atol=1e-6)
 
 
+def test_places_in_the_raster_count_up_from_its_corner_or_its_place_on_the_map() -> None:
+    frame = framed(4.0, 3.0, 0.5)
+    pixels = np.array([[0.0, 0.0], [2.0, 5.0]])
+    np.testing.assert_allclose(frame.raster_from_wall(pixels), [[0.0, 0.0], [1.0, -2.5]])
+    mapped = replace(frame, map_crs="site", origin_world=np.array([634512.0, 486215.0, 112.0]))
+    places = mapped.raster_from_wall(pixels)
+    np.testing.assert_allclose(places, [[634512.0, 486215.0], [634513.0, 486212.5]])
+    for of in (frame, mapped):
+        np.testing.assert_allclose(of.wall_from_raster(of.raster_from_wall(pixels)), pixels)
+
+
 def test_the_corners_of_a_frame_are_those_of_its_rectangle() -> None:
     normal = np.array([0.0, -1.0, 0.0])
     corners = rectangle(normal, 3.0, 2.1)

@@ -99,8 +99,7 @@ def _areas(results: RoomResults, wall: WallResult) -> tuple[MarkedArea, ...]:
     corner_m = wall.frame.raster_corner_m
     return tuple(
         MarkedArea(text=opening.said, outline_m=(opening.outline_m - corner_m) * [1.0, -1.0])
-        for opening in results.openings
-        if opening.wall == wall.number
+        for opening in results.openings_of(wall)
     )
 
 
@@ -249,7 +248,7 @@ def _drawn(results: RoomResults, wall: WallResult, image: str) -> DrawnWall:
         plane_index=wall.plane_index,
         frame=wall.frame,
         image=image,
-        openings=tuple(opening for opening in results.openings if opening.wall == wall.number),
+        openings=results.openings_of(wall),
     )
 
 

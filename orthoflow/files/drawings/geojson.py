@@ -54,12 +54,10 @@ def write_seams_geojson(path: Path, image: Orthoimage) -> None:
     # Of very large walls, corners are good to some cells.
     step = max(1, math.ceil(math.sqrt(image.source.size / _SEAM_CELLS_MOST)))
     source = np.ascontiguousarray(image.source[::step, ::step])
-    corner_m = np.array(image.frame.raster_corner_m)
     features: list[Feature] = []
     for index, rings in outlines(source):
         places = [
-            (corner_m + step * image.frame.gsd_m * ring * [1.0, -1.0]).round(_DIGITS).tolist()
-            for ring in rings
+            image.frame.raster_from_wall(step * ring).round(_DIGITS).tolist() for ring in rings
         ]
         about: dict[str, JsonValue] = {"photo": image.sources[index], "wall": image.number}
         geometry: dict[str, JsonValue] = {"type": "Polygon", "coordinates": places}

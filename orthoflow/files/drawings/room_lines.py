@@ -95,9 +95,7 @@ class DrawnWall:
 
     def place_m(self, points_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """X and Y (n, 2) of points (n, 3)."""
-        across, down, _ = self.frame.wall_from_world(points_world).T
-        left, top = self.frame.raster_corner_m
-        return np.column_stack([left + self.frame.gsd_m * across, top - self.frame.gsd_m * down])
+        return self.frame.raster_from_wall(self.frame.wall_from_world(points_world)[:, :2])
 
     def near(self, points_world: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Which of some points (n, 3) lie on the raster's rectangle, or near it."""

@@ -106,8 +106,7 @@ class PointFinder:
         expected = frame.wall_from_world(world[None])[0, :2]
         measured = points.pixels_wall[index]
         if points.places_m is not None and np.isfinite(points.places_m[index]).all():
-            right, up = points.places_m[index] - np.array(frame.raster_corner_m)
-            measured = np.array([right, -up]) / frame.gsd_m
+            measured = frame.wall_from_raster(points.places_m[index])
         if np.isfinite(measured).all():
             return ShownPoint(
                 how="measured",

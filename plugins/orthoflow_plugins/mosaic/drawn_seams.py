@@ -86,11 +86,9 @@ def seams_of(
     ]
     if not mine:
         return None
-    corner_m = np.array(frame.raster_corner_m)
     return DrawnSeams(
         rings=tuple(
-            tuple((ring - corner_m) * [1.0, -1.0] / frame.gsd_m for ring in polygon.rings)
-            for polygon in mine
+            tuple(frame.wall_from_raster(ring) for ring in polygon.rings) for polygon in mine
         ),
         layers=tuple(sources.index(polygon.name) for polygon in mine),
         n_columns=frame.width,

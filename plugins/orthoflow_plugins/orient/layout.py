@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.rings import signed_area
+
 _STRATA: Final = 6
 # Cells per side of a photo within which ties may err together. On simulated rooms ties agree in
 # their errors up to some 60 px of 1200: with 6 cells more of that crosses the borders, with 4 too
@@ -61,8 +63,7 @@ def hull_area(pixels: NDArray[np.float64]) -> float:
     lower = _chain(unique)
     upper = _chain(unique[::-1])
     ring = np.vstack([lower[:-1], upper[:-1]])
-    x, y = ring.T
-    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+    return abs(signed_area(ring))
 
 
 def _chain(ordered: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import row_bands
+from orthoflow.geometry.rings import signed_area
 from orthoflow.products import SurfaceMask, Wall
 
 Rectangle = tuple[float, float, float, float]
@@ -39,12 +40,11 @@ def outline_m(crop: Rectangle | Polygon) -> NDArray[np.float64]:
 
 
 def area_m2(crop: Rectangle | Polygon) -> float:
-    """Area of a crop (Gauss's formula); 0 where its corners span none."""
+    """Area of a crop; 0 where its corners span none."""
     corners = outline_m(crop)
     if len(corners) < 3:
         return 0.0
-    x, y = (corners - corners[0]).T
-    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+    return abs(signed_area(corners - corners[0]))
 
 
 def cropped(frame: WallFrame, crop: Rectangle | Polygon) -> CroppedFrame | None:

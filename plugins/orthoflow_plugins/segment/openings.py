@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry import WallFrame
 from orthoflow.geometry.levels import eight_bits
+from orthoflow.geometry.rings import signed_area
 from orthoflow.products import (
     Opening,
     Openings,
@@ -211,9 +211,7 @@ def _opening(
     frame = wall.frame
     # Of every nth cell; the first is the first.
     cells = np.clip(relief.step * (outline.corners - 0.5) + 0.5, 0.0, [frame.width, frame.height])
-    places = _raster_places(frame, cells)
-    x, y = (places - places[0]).T
-    doubled = float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
+    places = frame.raster_from_wall(cells)
     spans_m = frame.gsd_m * (cells.max(axis=0) - cells.min(axis=0))
     source = np.where(by_image, OutlineSource.IMAGE, OutlineSource.DEPTH)
     return Opening(
@@ -225,20 +223,13 @@ def _opening(
         side_sigma_m=np.where(outline.is_seen, relief.gsd_m * outline.sigma, np.nan),
         side_source=np.where(outline.is_seen, source, OutlineSource.UNSEEN).astype(np.uint8),
         depth_m=area.depth_m,
-        area_m2=abs(0.5 * doubled),
+        area_m2=abs(signed_area(places - places[0])),
         width_m=float(spans_m[0]),
         height_m=float(spans_m[1]),
         sill_m=frame.gsd_m * float(frame.height - cells[:, 1].max()),
         seen_share=outline.seen_of_all,
         map_crs=frame.map_crs,
     )
-
-
-def _raster_places(frame: WallFrame, cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """X and Y (n, 2) in the wall's GeoTIFF of places (n, 2) = (column, row)."""
-    corner_m = np.array(frame.raster_corner_m)
-    places: NDArray[np.float64] = corner_m + frame.gsd_m * cells * [1.0, -1.0]
-    return places
 
 
 def _grey(
@@ -287,7 +278,7 @@ def _draw(
     outlines = [
         (
             opening.kind,
-            (opening.outline_m - frame.raster_corner_m) * [1.0, -1.0] / relief.gsd_m,
+            frame.wall_from_raster(opening.outline_m) / step,
         )
         for opening in openings
     ]

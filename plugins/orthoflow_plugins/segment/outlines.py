@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.rings import signed_area
 from orthoflow.geometry.robust import median_deviation
 from orthoflow_plugins.segment.areas import Area, Relief
 
@@ -123,10 +124,8 @@ def _ring(cells: NDArray[np.bool_]) -> NDArray[np.float64]:
     along = np.concatenate([np.arange(count) + 0.5 for count in steps])
     unit = ways / steps[:, None]
     middles = np.repeat(ring, steps, axis=0) + along[:, None] * np.repeat(unit, steps, axis=0)
-    x, y = middles.T
-    # Rows count down, so that a positive sum is clockwise for the viewer.
-    doubled = float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum())
-    return np.asarray(middles[::-1] if doubled > 0.0 else middles, dtype=np.float64)
+    # Rows count down, so that a positive area is clockwise for the viewer.
+    return np.asarray(middles[::-1] if signed_area(middles) > 0.0 else middles, dtype=np.float64)
 
 
 def _corner_places(ring: NDArray[np.float64]) -> NDArray[np.int64]:
