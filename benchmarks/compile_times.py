@@ -9,16 +9,19 @@ once; a run compiles those that a step needs in each step's process.
 from __future__ import annotations
 
 import argparse
+import atexit
 import os
+import shutil
 import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-kernels = tempfile.TemporaryDirectory(prefix="orthoflow-compile-times-")
-os.environ["NUMBA_CACHE_DIR"] = kernels.name
-os.environ["ORTHOFLOW_KERNELS"] = kernels.name
+kernels = tempfile.mkdtemp(prefix="orthoflow-compile-times-")
+atexit.register(shutil.rmtree, kernels, ignore_errors=True)
+os.environ["NUMBA_CACHE_DIR"] = kernels
+os.environ["ORTHOFLOW_KERNELS"] = kernels
 
 from numba.core import event  # noqa: E402 - it reads the variable
 

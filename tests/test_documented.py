@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import re
 import runpy
 import sys
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from textwrap import indent
 from typing import Final, NoReturn
+from unittest import mock
 
 import click
 import pytest
@@ -184,7 +186,8 @@ def _of_script(path: Path, words: list[str], folder: Path) -> str:
         raise UnderstoodError
 
     known = argparse.ArgumentParser.parse_args
-    with pytest.MonkeyPatch.context() as patch:
+    # Some set what the compiler reads; the tests that follow must not.
+    with pytest.MonkeyPatch.context() as patch, mock.patch.dict(os.environ):
         patch.setattr(argparse.ArgumentParser, "parse_args", understand)
         patch.setattr(argparse.ArgumentParser, "error", refuse)
         patch.setattr(sys, "path", [str(ROOT), str(path.parent), *sys.path])

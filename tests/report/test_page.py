@@ -168,13 +168,16 @@ def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path
 
 def test_a_click_is_where_the_pointer_was_told_to_be(page: Page) -> None:
     # Pointers know fractions of the screen's pixels, clicks do not.
-    page.evaluate(f"({POINTER})('pointermove', 0.4567, 0.5678)")
+    # At once: the page may still be moving from what was done before.
     page.evaluate(
         f"(() => {{ const image = {FIGURE}.querySelector('img');"
         " const box = image.getBoundingClientRect();"
+        " const x = box.left + image.clientLeft + 0.4567 * image.clientWidth;"
+        " const y = box.top + image.clientTop + 0.5678 * image.clientHeight;"
+        " image.dispatchEvent(new PointerEvent('pointermove', { bubbles: true,"
+        " clientX: x, clientY: y }));"
         " image.dispatchEvent(new MouseEvent('click', { bubbles: true,"
-        " clientX: Math.floor(box.left + image.clientLeft + 0.4567 * image.clientWidth),"
-        " clientY: Math.floor(box.top + image.clientTop + 0.5678 * image.clientHeight) })); })()"
+        " clientX: Math.floor(x), clientY: Math.floor(y) })); })()"
     )
     told = page.evaluate(f"{FIGURE}.querySelector('.readout').innerText")
     collected = "[...document.querySelectorAll('.points [data-part=list] > div')].pop()"
@@ -301,7 +304,6 @@ def test_rows_are_filtered_columns_chosen_and_the_table_turned(page: Page) -> No
 
 
 def test_what_stands_behind_a_row_opens_from_it(page: Page) -> None:
-    page.evaluate("location.reload()")
     page.open(Path(page.evaluate("location.pathname")))
     way = "document.querySelector('.way')"
     assert not page.evaluate(f"{way}.open")
