@@ -1,0 +1,206 @@
+"""Areas of a relief whose cells are set one by one: which are openings, and of which kind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.segment import areas
+from orthoflow_plugins.segment.areas import Area, AreaRule, Relief, open_areas, relief_of
+from orthoflow_plugins.segment.sight_lines import SightLines
+
+from orthoflow.products import Wall
+from tests import samples
+
+GSD_M = 0.02
+SHAPE = (60, 80)
+RULE = AreaRule(behind_m=0.05, width_least_m=0.2, area_least_m2=0.05, seen_least=0.5)
+
+
+def wall(depth_m: NDArray[np.float32]) -> Wall:
+    rows, columns = depth_m.shape
+    return samples.wall(samples.facing_south(GSD_M, columns, rows), depth_m=depth_m)
+
+
+def flat(depth_m: float = 0.0) -> NDArray[np.float32]:
+    return np.full(SHAPE, depth_m, dtype=np.float32)
+
+
+def relief(is_open: NDArray[np.bool_], **changes: object) -> Relief:
+    """A relief of which the open cells lie 0.1 m behind a face at 0."""
+    nothing = np.zeros(is_open.shape, dtype=np.bool_)
+    made = Relief(
+        gsd_m=GSD_M,
+        step=1,
+        is_face=~is_open,
+        is_open=is_open,
+        is_empty=nothing,
+        is_crossed=nothing,
+        depth_m=np.where(is_open, np.float32(-0.1), np.float32(0.0)),
+        face_m=0.0,
+    )
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def block(top: int, bottom: int, left: int, right: int) -> NDArray[np.bool_]:
+    cells = np.zeros(SHAPE, dtype=np.bool_)
+    cells[top:bottom, left:right] = True
+    return cells
+
+
+def whole(area: Area) -> NDArray[np.bool_]:
+    """An area's cells in the raster."""
+    cells = np.zeros((SHAPE[0] + 2, SHAPE[1] + 2), dtype=np.bool_)
+    top, left = area.corner[0] + 1, area.corner[1] + 1
+    cells[top : top + area.cells.shape[0], left : left + area.cells.shape[1]] = area.cells
+    return cells[1:-1, 1:-1]
+
+
+@pytest.mark.parametrize(
+    ("behind_m", "is_behind"), [(0.049, False), (0.051, True), (0.3, True), (-0.2, False)]
+)
+def test_cells_farther_behind_the_face_than_asked_are_open(
+    behind_m: float, is_behind: bool
+) -> None:
+    depth = flat()
+    depth[10:30, 20:50] = -behind_m
+    found = relief_of(wall(depth), None, RULE)
+    expected = block(10, 30, 20, 50) if is_behind else block(0, 0, 0, 0)
+    # Its corners are rounded by the median of 5 x 5 cells, by three cells each.
+    assert np.count_nonzero(found.is_open ^ expected) == (12 if is_behind else 0)
+    np.testing.assert_array_equal(found.is_face, ~expected)
+    assert found.face_m == 0.0
+    assert (found.gsd_m, found.step) == (GSD_M, 1)
+    assert not found.is_empty.any()
+
+
+def test_single_cells_decide_nothing_and_holes_of_three_by_five_do() -> None:
+    depth = flat()
+    depth[10, 10] = depth[20, 20:24] = np.nan
+    depth[30:33, 30:35] = -1.0
+    found = relief_of(wall(depth), None, RULE)
+    assert found.is_open[31, 32]
+    found.is_open[28:36, 28:38] = False
+    assert not found.is_open.any()
+    assert found.is_empty.sum() == 5
+
+
+@pytest.mark.parametrize(("n_deep_rows", "face_m"), [(30, 0.0), (31, -0.2)])
+def test_the_face_is_what_more_than_half_of_the_wall_is_on(n_deep_rows: int, face_m: float) -> None:
+    depth = flat()
+    depth[:n_deep_rows] = -0.2
+    found = relief_of(wall(depth), None, RULE)
+    assert found.face_m == pytest.approx(face_m, abs=1e-6)
+    # Open is what lies behind the face.
+    assert found.is_open[5, 40] == (face_m == 0.0)
+    # Cells without depth are of neither half.
+    depth[-10:] = np.nan
+    assert relief_of(wall(depth), None, RULE).face_m == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_empty_cells_are_open_unless_hidden_and_crossed_only_where_empty() -> None:
+    depth = flat()
+    depth[10:30, 10:30] = depth[10:30, 50:70] = np.nan
+    tiles = np.zeros((6, 8), dtype=np.bool_)
+    tiles[1:3, 1:3] = True
+    lines = SightLines(side=10, crossed=tiles, stopped=np.flip(tiles, axis=1))
+    found = relief_of(wall(depth), lines, RULE)
+    np.testing.assert_array_equal(found.is_crossed, block(10, 30, 10, 30))
+    assert found.is_open[20, 20]
+    assert not found.is_open[20, 60]
+    assert relief_of(wall(depth), None, RULE).is_open[20, 60]
+    assert not relief_of(wall(flat()), lines, RULE).is_crossed.any()
+
+
+def test_of_a_large_wall_every_nth_cell_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    depth = flat()
+    depth[9:30, 21:51] = -0.25
+    # 60 x 80 cells: a fourth of them is one too many, a ninth is not.
+    monkeypatch.setattr(areas, "_CELLS_TOLD", 1199)
+    found = relief_of(wall(depth), None, RULE)
+    assert (found.step, found.gsd_m) == (3, pytest.approx(3 * GSD_M))
+    np.testing.assert_array_equal(found.depth_m, depth[::3, ::3])
+    monkeypatch.setattr(areas, "_CELLS_TOLD", 1200)
+    assert relief_of(wall(depth), None, RULE).step == 2
+
+
+def test_areas_come_from_the_largest_with_a_rim_of_other_cells() -> None:
+    small, large = block(5, 20, 60, 75), block(10, 50, 10, 40)
+    found = list(open_areas(relief(small | large), RULE))
+    assert [np.count_nonzero(area.cells) for area in found] == [1200, 225]
+    for area, cells in zip(found, (large, small), strict=True):
+        np.testing.assert_array_equal(whole(area), cells)
+        rim = area.cells.copy()
+        rim[1:-1, 1:-1] = False
+        assert not rim.any()
+        assert area.cells[1:-1, 1:-1].all()
+    assert found[0].corner == (9, 9)
+
+
+def test_bars_across_an_opening_are_part_of_it() -> None:
+    cells = block(10, 50, 10, 40)
+    cells[28:31, 20:30] = False
+    (area,) = open_areas(relief(cells), RULE)
+    np.testing.assert_array_equal(whole(area), block(10, 50, 10, 40))
+
+
+@pytest.mark.parametrize(("neck", "n_areas"), [(2, 2), (3, 1), (4, 1)])
+def test_what_is_narrower_than_three_cells_joins_no_areas(neck: int, n_areas: int) -> None:
+    cells = block(10, 50, 5, 30) | block(10, 50, 45, 70) | block(20, 20 + neck, 30, 45)
+    assert len(list(open_areas(relief(cells), RULE))) == n_areas
+    # Nor does a corner that two have in common.
+    touching = block(5, 25, 5, 30) | block(25, 45, 30, 55)
+    assert len(list(open_areas(relief(touching), RULE))) == 2
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(("width", "is_opening"), [(9, False), (10, True)])
+def test_a_square_of_the_least_width_fits_into_an_opening(
+    axis: int, width: int, is_opening: bool
+) -> None:
+    # 0.2 m are ten cells; at the border of the raster, too.
+    cells = block(0, width, 10, 50) if axis else block(10, 50, 0, width)
+    assert len(list(open_areas(relief(cells), RULE))) == is_opening
+
+
+def test_the_least_area_is_that_of_an_opening() -> None:
+    # 0.05 m2 are 125 cells.
+    assert len(list(open_areas(relief(block(10, 20, 10, 22)), RULE))) == 0
+    assert len(list(open_areas(relief(block(10, 20, 10, 23)), RULE))) == 1
+    exactly = replace(RULE, area_least_m2=120 * GSD_M**2)
+    assert len(list(open_areas(relief(block(10, 20, 10, 22)), exactly))) == 1
+
+
+@pytest.mark.parametrize(
+    ("n_crossed", "n_empty", "kind"),
+    [
+        (40, 40, "through"),
+        (39, 39, "niche"),
+        (39, 200, "no data"),
+        (0, 199, "niche"),
+        (400, 400, "through"),
+    ],
+)
+def test_the_kind_is_told_by_the_share_of_cells(n_crossed: int, n_empty: int, kind: str) -> None:
+    # 400 cells; rows beside the area tell nothing.
+    cells = block(10, 30, 10, 30)
+
+    def first(count: int) -> NDArray[np.bool_]:
+        some = ~block(10, 30, 10, 30)
+        some[10:30, 10:30] = (np.arange(400) < count).reshape(20, 20)
+        return some
+
+    depth = np.where(cells, np.float32(-0.3), np.float32(7.0))
+    depth[10:12, 10:30] = -5.0
+    made = relief(
+        cells, is_crossed=first(n_crossed), is_empty=first(n_empty), depth_m=depth, face_m=0.1
+    )
+    (area,) = open_areas(made, RULE)
+    assert area.kind == kind
+    if n_empty == 400:
+        assert area.depth_m is None
+    else:
+        # The middle of what was measured, from the face.
+        assert area.depth_m == pytest.approx(0.4, abs=1e-6)

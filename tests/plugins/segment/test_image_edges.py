@@ -1,0 +1,209 @@
+"""Sides of outlines beside edges that were painted at known places, finer than cells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.segment.image_edges import Moved, moved_to_edges
+from orthoflow_plugins.segment.outlines import Outline
+
+SHAPE = (100, 120)
+# The left side of the outline; its edge is painted so many cells beside it.
+LEFT, TOP, RIGHT, BOTTOM = 40.0, 20.0, 100.0, 80.0
+CORNERS = np.array([[LEFT, TOP], [LEFT, BOTTOM], [RIGHT, BOTTOM], [RIGHT, TOP]])
+HEIGHT = 60.0
+# No side is known better than half a cell by the picture.
+SIGMA = 0.5
+
+
+def outline(
+    corners: NDArray[np.float64] = CORNERS,
+    *,
+    sigma: float | NDArray[np.float64] = 1.0,
+    seen: float | NDArray[np.float64] = 1.0,
+) -> Outline:
+    count = len(corners)
+    return Outline(
+        corners=corners,
+        sigma=np.broadcast_to(np.asarray(sigma, dtype=np.float64), count).copy(),
+        seen_share=np.broadcast_to(np.asarray(seen, dtype=np.float64), count).copy(),
+    )
+
+
+def step_at(column: float, height: float = HEIGHT) -> NDArray[np.float64]:
+    """A row of cells (columns,): `height` right of a place, 0 left of it, its own cell in part."""
+    return height * np.clip(np.arange(1, SHAPE[1] + 1) - column, 0.0, 1.0)
+
+
+def picture(*rows: NDArray[np.float64], grey: float = 60.0) -> NDArray[np.float32]:
+    """All rows alike, the sum of some, on a grey."""
+    return np.tile(grey + np.sum(rows, axis=0), (SHAPE[0], 1)).astype(np.float32)
+
+
+def left_side(moved: Moved) -> float | None:
+    """How far outwards, to the left, the left side has moved; None where it stayed."""
+    if not moved.by_image[0]:
+        np.testing.assert_array_equal(moved.outline.corners[:2], CORNERS[:2])
+        return None
+    shifts = LEFT - moved.outline.corners[:2, 0]
+    assert shifts[0] == pytest.approx(shifts[1], abs=1e-9)
+    return float(shifts[0])
+
+
+@pytest.mark.parametrize("way", ["rises", "falls"])
+@pytest.mark.parametrize("place", [-0.8, -0.25, 0.0, 0.1, 0.3, 0.9])
+def test_a_side_moves_to_where_the_edge_was_painted(place: float, way: str) -> None:
+    sign = 1.0 if way == "rises" else -1.0
+    moved = moved_to_edges(outline(), picture(sign * step_at(LEFT + place), grey=120.0))
+    # A tenth of a cell: of cells that are covered in part a share is lost.
+    assert left_side(moved) == pytest.approx(-place, abs=0.1)
+    assert moved.by_image.tolist() == [True, False, False, False]
+    assert moved.outline.sigma[0] == pytest.approx(SIGMA, abs=1e-9)
+    np.testing.assert_array_equal(moved.outline.sigma[1:], 1.0)
+    np.testing.assert_allclose(moved.outline.corners[2:], CORNERS[2:], atol=1e-9)
+
+
+def test_a_blurred_edge_is_found_in_its_middle() -> None:
+    from scipy.ndimage import gaussian_filter1d
+
+    for place in (-0.1, 0.1, 0.2):
+        soft = gaussian_filter1d(step_at(LEFT + place, 150.0), 0.9)
+        moved = moved_to_edges(outline(), picture(soft))
+        assert left_side(moved) == pytest.approx(-place, abs=0.08)
+
+
+def test_every_side_moves_outwards_alike() -> None:
+    # A bright square, a little smaller on the left, larger on the right, and so on.
+    left, top, right, bottom = 30.2, 20.8, 80.3, 70.9
+    rows = np.clip(np.arange(1, 101) - top, 0, 1) - np.clip(np.arange(1, 101) - bottom, 0, 1)
+    columns = np.clip(np.arange(1, 101) - left, 0, 1) - np.clip(np.arange(1, 101) - right, 0, 1)
+    square = (50.0 + 100.0 * np.outer(rows, columns)).astype(np.float32)
+    corners = np.array([[30.0, 20.0], [30.0, 70.0], [80.0, 70.0], [80.0, 20.0]])
+    moved = moved_to_edges(outline(corners), square)
+    assert moved.by_image.all()
+    expected = np.array([[left, top], [left, bottom], [right, bottom], [right, top]])
+    np.testing.assert_allclose(moved.outline.corners, expected, atol=0.1)
+    for turns in range(1, 4):
+        corners, expected = quarter(corners), quarter(expected)
+        turned = moved_to_edges(outline(corners), np.rot90(square, turns).copy())
+        np.testing.assert_allclose(turned.outline.corners, expected, atol=0.1)
+
+
+def quarter(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places in a picture of 100 x 100 cells after numpy has turned it by a quarter."""
+    return np.column_stack([places[:, 1], 100.0 - places[:, 0]])
+
+
+@pytest.mark.parametrize(("length", "is_moved"), [(19.5, False), (20.5, True)])
+def test_sides_of_twenty_cells_and_more_are_long_enough(length: float, is_moved: bool) -> None:
+    corners = CORNERS.copy()
+    corners[1:3, 1] = TOP + length
+    moved = moved_to_edges(outline(corners), picture(step_at(LEFT)))
+    assert bool(moved.by_image[0]) == is_moved
+
+
+def test_sides_that_were_not_seen_stay() -> None:
+    grey = picture(step_at(LEFT + 0.3))
+    assert left_side(moved_to_edges(outline(seen=np.array([0.4, 1, 1, 1])), grey)) is None
+    assert left_side(moved_to_edges(outline(seen=np.array([0.6, 0, 0, 0])), grey)) is not None
+
+
+@pytest.mark.parametrize(("sigma", "is_moved"), [(0.49, False), (0.501, True)])
+def test_a_side_that_depth_places_better_stays(sigma: float, is_moved: bool) -> None:
+    moved = moved_to_edges(outline(sigma=sigma), picture(step_at(LEFT)))
+    assert (left_side(moved) is not None) == is_moved
+
+
+@pytest.mark.parametrize(("sigma", "is_moved"), [(0.8, False), (1.0, True), (2.0, True)])
+@pytest.mark.parametrize("place", [-1.35, 1.35])
+def test_an_edge_farther_off_than_depth_errs_is_of_something_else(
+    place: float, sigma: float, is_moved: bool
+) -> None:
+    moved = moved_to_edges(outline(sigma=sigma), picture(step_at(LEFT + place)))
+    assert (left_side(moved) is not None) == is_moved
+
+
+@pytest.mark.parametrize(("height", "is_moved"), [(3.9, False), (4.1, True), (-4.1, True)])
+def test_paler_edges_than_four_grey_levels_are_stains(height: float, is_moved: bool) -> None:
+    moved = moved_to_edges(outline(), picture(step_at(LEFT, height)))
+    assert (left_side(moved) is not None) == is_moved
+
+
+@pytest.mark.parametrize(("height", "is_moved"), [(15.0, False), (25.0, True)])
+def test_an_edge_is_three_times_as_steep_as_what_is_around(height: float, is_moved: bool) -> None:
+    # Ten grey levels a cell everywhere, and those of the step on top.
+    slope = 1.0 * np.arange(SHAPE[1]) * 10.0
+    moved = moved_to_edges(outline(), picture(step_at(LEFT, height), slope, grey=-300.0))
+    assert (left_side(moved) is not None) == is_moved
+
+
+@pytest.mark.parametrize("aside", [-3.0, -2.0, 2.0, 3.0])
+@pytest.mark.parametrize(("share", "is_moved"), [(0.5, True), (0.7, False)])
+def test_of_two_edges_nearly_as_strong_none_is_taken(
+    aside: float, share: float, is_moved: bool
+) -> None:
+    second = share * step_at(LEFT + aside)
+    moved = moved_to_edges(outline(), picture(step_at(LEFT), second))
+    assert (left_side(moved) is not None) == is_moved
+    # Beyond reach there may be any.
+    far = 3.0 * step_at(LEFT + np.sign(aside) * 6.0)
+    assert left_side(moved_to_edges(outline(), picture(step_at(LEFT), far))) is not None
+
+
+@pytest.mark.parametrize(("n_pieces", "is_moved"), [(5, True), (4, True), (3, False)])
+def test_four_pieces_of_five_must_show_an_edge(n_pieces: int, is_moved: bool) -> None:
+    grey = picture(step_at(LEFT))
+    # Pieces of ten rows and a half between four cells from either end.
+    first = round(TOP + 4.0 + 10.4 * n_pieces)
+    grey[first:] = 60.0
+    assert (left_side(moved_to_edges(outline(), grey)) is not None) == is_moved
+
+
+@pytest.mark.parametrize(("share", "is_moved"), [(0.45, False), (0.55, True)])
+def test_half_of_a_side_must_be_shown(share: float, is_moved: bool) -> None:
+    grey = picture(step_at(LEFT))
+    grey[round(TOP + 4.0 + 52.0 * share) :, 38:] = np.nan
+    assert (left_side(moved_to_edges(outline(), grey)) is not None) == is_moved
+
+
+def test_the_ends_of_a_side_and_what_lies_beyond_do_not_count() -> None:
+    grey = picture(step_at(LEFT + 0.3))
+    grey[: round(TOP) + 3, :] = np.nan
+    grey[round(BOTTOM) - 3 :, :] = 255.0
+    moved = moved_to_edges(outline(), grey)
+    assert left_side(moved) == pytest.approx(-0.3, abs=0.03)
+    # All profiles are whole: nothing of the void has come into one.
+    assert moved.outline.sigma[0] == pytest.approx(SIGMA, abs=1e-9)
+
+
+def test_an_edge_that_wanders_is_as_exact_as_the_mean_of_its_pieces() -> None:
+    slope = 0.03
+    rows = np.arange(SHAPE[0]) + 0.5
+    grey = np.stack([60.0 + step_at(LEFT + slope * (row - 50.0), 100.0) for row in rows])
+    moved = moved_to_edges(outline(), grey.astype(np.float32))
+    assert left_side(moved) == pytest.approx(0.0, abs=0.03)
+    # Middles of five pieces, 10.4 rows from one to the next.
+    off = slope * 10.4 * np.arange(-2.0, 3.0)
+    expected = np.hypot(SIGMA, np.std(off, ddof=1) / np.sqrt(5.0))
+    assert moved.outline.sigma[0] == pytest.approx(expected, abs=0.004)
+
+
+@pytest.mark.parametrize(("turn_deg", "is_met"), [(12.0, False), (18.0, True), (-18.0, True)])
+def test_corners_lie_on_the_moved_sides_unless_these_run_on_in_one_line(
+    turn_deg: float, is_met: bool
+) -> None:
+    # The left side goes down to a corner in which it turns a little, and then on.
+    turn = np.radians(turn_deg)
+    second = np.array([LEFT, 70.0]) + 10.0 * np.array([np.sin(turn), np.cos(turn)])
+    corners = np.array([[LEFT, TOP], [LEFT, 70.0], second, [100.0, 70.0], [100.0, TOP]])
+    moved = moved_to_edges(outline(corners), picture(step_at(LEFT + 0.3)))
+    assert moved.by_image.tolist() == [True, False, False, False, False]
+    shift = moved.outline.corners[1] - corners[1]
+    if is_met:
+        # On the moved side, and on the next one, which stayed.
+        assert shift[0] == pytest.approx(0.3, abs=0.05)
+        assert shift[0] * np.cos(turn) == pytest.approx(shift[1] * np.sin(turn), abs=1e-9)
+    else:
+        np.testing.assert_allclose(shift, [0.15, 0.0], atol=0.02)
+    np.testing.assert_array_equal(moved.outline.corners[2:4], corners[2:4])

@@ -1,0 +1,246 @@
+"""Outlines of areas whose borders are known: where corners come to lie, and how exact sides are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.segment.areas import Area, Relief
+from orthoflow_plugins.segment.outlines import Outline, outline_of
+
+from orthoflow.errors import MethodError
+
+GSD_M = 0.01
+SHAPE = (120, 160)
+# Cells: corners of one area, counter-clockwise for the viewer, rows downwards.
+LEFT, TOP, RIGHT, BOTTOM = 30, 20, 130, 90
+CORNERS = np.array([[LEFT, TOP], [LEFT, BOTTOM], [RIGHT, BOTTOM], [RIGHT, TOP]], dtype=np.float64)
+# Standard deviation of a place of which an interval of length 1 is known.
+UNIFORM = 12.0**-0.5
+
+
+def block(
+    left: int = LEFT, top: int = TOP, right: int = RIGHT, bottom: int = BOTTOM
+) -> NDArray[np.bool_]:
+    cells = np.zeros(SHAPE, dtype=np.bool_)
+    cells[top:bottom, left:right] = True
+    return cells
+
+
+def outline(
+    cells: NDArray[np.bool_], *, is_face: NDArray[np.bool_] | None = None, spacing_m: float = GSD_M
+) -> Outline:
+    """The outline of cells of a relief; the wall's face is all around unless given."""
+    found = drawn(cells, is_face=is_face, spacing_m=spacing_m)
+    assert found is not None
+    return found
+
+
+def drawn(
+    cells: NDArray[np.bool_], *, is_face: NDArray[np.bool_] | None = None, spacing_m: float = GSD_M
+) -> Outline | None:
+    rows, columns = (np.flatnonzero(cells.any(axis=axis)) for axis in (1, 0))
+    part = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    area = Area(
+        corner=(int(rows[0]) - 1, int(columns[0]) - 1),
+        cells=np.pad(part, 1),
+        kind="niche",
+        depth_m=0.1,
+    )
+    nothing = np.zeros(cells.shape, dtype=np.bool_)
+    relief = Relief(
+        gsd_m=GSD_M,
+        step=1,
+        is_face=~cells if is_face is None else is_face,
+        is_open=cells,
+        is_empty=nothing,
+        is_crossed=nothing,
+        depth_m=np.zeros(cells.shape, dtype=np.float32),
+        face_m=0.0,
+    )
+    return outline_of(area, relief, spacing_m)
+
+
+def assert_corners(
+    found: Outline, corners: NDArray[np.float64], *, within_cells: float = 1e-6
+) -> None:
+    """Corners one by one in their order, from whichever the outline begins with."""
+    assert len(found.corners) == len(corners)
+    begin = int(np.linalg.norm(found.corners - corners[0], axis=1).argmin())
+    rolled = np.roll(found.corners, -begin, axis=0)
+    np.testing.assert_allclose(rolled, corners, atol=within_cells)
+
+
+def test_sides_of_a_rectangle_are_the_borders_of_its_cells() -> None:
+    found = outline(block(), spacing_m=3.0 * GSD_M)
+    assert_corners(found, CORNERS)
+    np.testing.assert_allclose(np.sort(found.lengths), [70.0, 70.0, 100.0, 100.0], atol=1e-6)
+    # A border lies anywhere in two cells, and between two points, three cells apart.
+    np.testing.assert_allclose(found.sigma, UNIFORM * np.hypot(2.0, 3.0), rtol=1e-9)
+    np.testing.assert_array_equal(found.seen_share, 1.0)
+    assert found.is_seen.all()
+    assert found.seen_of_all == pytest.approx(1.0)
+
+
+def turned(corners: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:
+    middle, turn = np.array([80.0, 60.0]), np.radians(degrees)
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return middle + (corners - middle) @ matrix.T
+
+
+def within(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Cells whose centres lie in a convex polygon in the order of outlines."""
+    rows, columns = np.indices(SHAPE) + 0.5
+    is_inside = np.ones(SHAPE, dtype=np.bool_)
+    for begin, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        way = end - begin
+        is_inside &= way[0] * (rows - begin[1]) - way[1] * (columns - begin[0]) <= 0.0
+    return is_inside
+
+
+@pytest.mark.parametrize("degrees", [3.0, 17.0, 45.0, -30.0])
+def test_turned_sides_lie_where_they_are_to_a_fraction_of_a_cell(degrees: float) -> None:
+    corners = turned(np.array([[45.2, 35.1], [45.2, 84.7], [113.9, 84.7], [113.9, 35.1]]), degrees)
+    found = outline(within(corners))
+    assert_corners(found, corners, within_cells=0.45)
+    # Cells' own staircase scatters, by a third of a cell at most, and along a side that averages.
+    assert np.all(found.sigma >= UNIFORM * np.hypot(2.0, 1.0))
+    assert np.all(found.sigma <= UNIFORM * np.hypot(2.0, 1.0) + 0.01)
+
+
+def test_a_triangle_keeps_its_three_corners() -> None:
+    corners = np.array([[30.0, 20.0], [30.0, 90.0], [130.0, 90.0]])
+    assert_corners(outline(within(corners)), corners, within_cells=1.0)
+
+
+def test_mirrored_cells_have_the_mirrored_outline() -> None:
+    cells = block()
+    cells[TOP : TOP + 25, LEFT : LEFT + 40] = False
+    cells[80:, 60:75] = False
+    there = outline(cells)
+    for axis, size in ((1, SHAPE[1]), (0, SHAPE[0])):
+        mirrored = outline(np.flip(cells, axis=axis))
+        expected = there.corners[::-1].copy()
+        expected[:, 1 - axis] = size - expected[:, 1 - axis]
+        assert_corners(mirrored, expected)
+    assert len(there.corners) == 10
+
+
+@pytest.mark.parametrize("at_row", [TOP, BOTTOM], ids=["above", "below"])
+@pytest.mark.parametrize(
+    ("height", "is_corner"), [(1, False), (2, False), (3, True), (-2, False), (-3, True)]
+)
+def test_steps_of_two_cells_are_no_corners_and_of_three_are(
+    at_row: int, height: int, is_corner: bool
+) -> None:
+    cells = block()
+    outwards = height if at_row == BOTTOM else -height
+    low, high = sorted((at_row, at_row + outwards))
+    cells[low:high, 60:100] = height > 0
+    assert (len(outline(cells).corners) > 4) == is_corner
+
+
+def test_what_sticks_out_of_a_side_a_little_does_not_move_it() -> None:
+    cells = block()
+    cells[TOP - 2 : TOP, 70:80] = True
+    cells[BOTTOM - 1, 50:58] = False
+    # Nor do bites of two cells out of the corners.
+    for row in (TOP, TOP + 1, BOTTOM - 2, BOTTOM - 1):
+        cells[row, [LEFT, LEFT + 1, RIGHT - 2, RIGHT - 1]] = False
+    assert_corners(outline(cells), CORNERS, within_cells=0.06)
+
+
+@pytest.mark.parametrize(("cut", "is_corner"), [(4, False), (5, False), (7, True), (15, True)])
+def test_a_corner_cut_short_is_put_back_and_a_long_cut_is_a_side(cut: int, is_corner: bool) -> None:
+    cells = block()
+    rows, columns = np.indices(SHAPE)
+    cells[(rows - TOP) + (columns - LEFT) < cut] = False
+    found = outline(cells)
+    if not is_corner:
+        assert_corners(found, CORNERS)
+    else:
+        cut_off = np.array([[LEFT + cut, TOP], [LEFT, TOP + cut]], dtype=np.float64)
+        assert_corners(found, np.vstack([cut_off, CORNERS[1:]]), within_cells=1.0)
+
+
+def test_a_short_side_stays_where_its_neighbours_meet_far_off() -> None:
+    corners = np.array([[77.0, 30.0], [60.0, 90.0], [100.0, 90.0], [83.0, 30.0]])
+    assert_corners(outline(within(corners)), corners, within_cells=3.0)
+
+
+def test_a_side_is_the_less_exact_the_more_it_scatters_and_the_fewer_points_it_has() -> None:
+    # Every other cell sticks out by one: middles lie at 0, 1/2, 1 and 1/2 of it.
+    cells = block()
+    cells[TOP - 1, LEFT + 1 : RIGHT - 1 : 2] = True
+    for spacing in (1.0, 4.0, 25.0, 400.0):
+        found = outline(cells, spacing_m=spacing * GSD_M)
+        at_top = int(np.abs(found.corners[:, 1] + np.roll(found.corners[:, 1], -1)).argmin())
+        scatter = np.sqrt(0.125) / np.sqrt(max(1.0, found.lengths[at_top] / spacing))
+        expected = np.sqrt((UNIFORM * 2.0) ** 2 + (UNIFORM * spacing) ** 2 + scatter**2)
+        assert found.sigma[at_top] ** 2 == pytest.approx(expected**2, abs=0.03 * scatter**2)
+        assert found.corners[at_top, 1] == pytest.approx(TOP - 0.5, abs=0.02)
+
+
+@pytest.mark.parametrize(("side", "is_short"), [(7, True), (20, False)])
+def test_short_sides_are_left_where_their_cells_end(side: int, is_short: bool) -> None:
+    found = outline(block(50, 50, 50 + side, 90))
+    assert len(found.corners) == 4
+    assert_corners(
+        found,
+        np.array([[50, 50], [50, 90], [50 + side, 90], [50 + side, 50]], dtype=np.float64),
+        within_cells=0.8 if is_short else 1e-6,
+    )
+    # Two cells: what corners are told by.
+    ends = found.sigma > UNIFORM * np.hypot(2.0, 1.0) + 0.1
+    assert np.count_nonzero(ends) == (2 if is_short else 0)
+    if is_short:
+        np.testing.assert_allclose(found.sigma[ends] ** 2, 5.0 / 12.0 + 4.0, rtol=1e-9)
+
+
+def test_of_a_single_cell_nothing_is_left() -> None:
+    assert drawn(block(50, 50, 51, 51)) is None
+
+
+def test_cells_that_do_not_hang_together_are_no_area() -> None:
+    cells = block()
+    cells[:, 70:80] = False
+    with pytest.raises(MethodError, match="must hang together, got 2 parts"):
+        outline(cells)
+
+
+def test_an_outline_ends_with_the_raster() -> None:
+    cells = np.zeros(SHAPE, dtype=np.bool_)
+    cells[:60, 100:] = True
+    found = outline(cells)
+    assert_corners(found, np.array([[100.0, 0.0], [100.0, 60.0], [160.0, 60.0], [160.0, 0.0]]))
+    begin = int(np.linalg.norm(found.corners - [100.0, 0.0], axis=1).argmin())
+    # Left and below there is face, beyond the raster nothing.
+    np.testing.assert_array_equal(np.roll(found.seen_share, -begin), [1.0, 1.0, 0.0, 0.0])
+    assert found.seen_of_all == pytest.approx((60.0 + 60.0) / 240.0)
+
+
+@pytest.mark.parametrize("cells_off", range(1, 8))
+def test_a_side_is_seen_where_there_is_face_two_to_four_cells_beside_it(cells_off: int) -> None:
+    # The face is a ring of one cell, its inner border so many cells off.
+    grown = block(
+        LEFT - cells_off - 1, TOP - cells_off - 1, RIGHT + cells_off + 1, BOTTOM + cells_off + 1
+    )
+    ring = grown & ~block(LEFT - cells_off, TOP - cells_off, RIGHT + cells_off, BOTTOM + cells_off)
+    found = outline(block(), is_face=ring)
+    begin = int(np.linalg.norm(found.corners - CORNERS[0], axis=1).argmin())
+    left, bottom, right, top = np.roll(found.seen_share, -begin)
+    # Borders lie between cells: the cell on one is the one below or right of it.
+    assert {left, top} == {1.0 if 1 <= cells_off <= 3 else 0.0}
+    assert {right, bottom} == {1.0 if 2 <= cells_off <= 4 else 0.0}
+
+
+@pytest.mark.parametrize(("n_cells", "is_seen"), [(34, False), (35, True), (36, True)])
+def test_a_side_half_of_which_has_face_beside_it_is_seen(n_cells: int, is_seen: bool) -> None:
+    face = np.zeros(SHAPE, dtype=np.bool_)
+    face[TOP : TOP + n_cells, :LEFT] = True
+    found = outline(block(), is_face=face)
+    begin = int(np.linalg.norm(found.corners - CORNERS[0], axis=1).argmin())
+    shares = np.roll(found.seen_share, -begin)
+    np.testing.assert_allclose(shares, [n_cells / 70.0, 0.0, 0.0, 0.0], atol=1e-9)
+    assert np.roll(found.is_seen, -begin).tolist() == [is_seen, False, False, False]
+    assert found.seen_of_all == pytest.approx(n_cells / 340.0)

@@ -1,0 +1,229 @@
+"""Walls of a family: whatever is drawn fits between floor, ceiling and neighbours, and varies."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from orthoflow_plugins.simulate.building import (
+    Extent,
+    Paint,
+    SceneDraft,
+    Side,
+    Surface,
+    TruePlane,
+    wall_side,
+)
+from orthoflow_plugins.simulate.drawn_walls import WallDrawing, WallPaints, draw_wall
+
+from orthoflow.geometry.scenes import SurfaceRole, TextureKind
+
+FULL: Extent = (-2.9, 2.9, -1.6, 1.7)
+SHOWN: Extent = (-2.7, 2.7, -1.5, 1.6)
+N_WALLS = 300
+GROUND, RELIEF, PANEL, DOOR = (
+    Paint(kind=TextureKind.PLAIN, rgb=(value, 0.0, 0.0), reflectance=0.5)
+    for value in (1.0, 2.0, 3.0, 4.0)
+)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A wall taken apart: depth and extent of what lies along it, by paint, and its holes."""
+
+    side: Side
+    wall: Surface
+    planes: list[TruePlane]
+    stone: list[tuple[float, Extent]]
+    panels: list[tuple[float, Extent]]
+    recesses: list[tuple[float, Extent, Paint]]
+
+
+def drawn(seed: int, *, relief: float = 1.0, shown: Extent = SHOWN) -> Drawn:
+    side = wall_side(SceneDraft(), omega_deg=90.0, phi_deg=0.0, distance_m=2.0)
+    paints = WallPaints(ground=GROUND, relief=RELIEF, panel=PANEL, door=DOOR)
+    drawing = WallDrawing(full=FULL, shown=shown, relief=relief, paints=paints)
+    draw_wall(side, "wall", drawing, np.random.default_rng(seed))
+    (wall,) = [item for item in side.draft.surfaces if item.role == SurfaceRole.WALL]
+
+    def along(role: SurfaceRole) -> list[tuple[float, Surface]]:
+        return [
+            (float((item.centre - side.foot) @ side.normal), item)
+            for item in side.draft.surfaces
+            if item.role == role and abs(float(item.axis_b @ side.normal)) < 0.5
+        ]
+
+    relief_of = along(SurfaceRole.RELIEF)
+    return Drawn(
+        side=side,
+        wall=wall,
+        planes=side.draft.planes,
+        stone=[(depth, item.extent) for depth, item in relief_of if item.paint is RELIEF],
+        panels=[(depth, item.extent) for depth, item in relief_of if item.paint is PANEL],
+        recesses=[(depth, item.extent, item.paint) for depth, item in along(SurfaceRole.RECESS)],
+    )
+
+
+@cache
+def all_drawn() -> tuple[Drawn, ...]:
+    return tuple(drawn(seed) for seed in range(N_WALLS))
+
+
+def is_cornice(extent: Extent) -> bool:
+    return extent[:2] == FULL[:2]
+
+
+def is_skirting(extent: Extent) -> bool:
+    return extent[3] < SHOWN[2] + 0.3
+
+
+def overlap(one: Extent, other: Extent) -> bool:
+    return (
+        one[0] < other[1] - 1e-9
+        and other[0] < one[1] - 1e-9
+        and one[2] < other[3] - 1e-9
+        and other[2] < one[3] - 1e-9
+    )
+
+
+def test_cornices_are_up_to_three_even_steps_up_to_the_ceiling() -> None:
+    counts: Counter[int] = Counter()
+    for found in all_drawn():
+        steps = [item for item in found.stone if is_cornice(item[1])]
+        counts[len(steps)] += 1
+        if not steps:
+            continue
+        height_m = SHOWN[3] - steps[0][1][2]
+        assert 0.1 < height_m < 0.46
+        for number, (depth, extent) in enumerate(steps):
+            assert depth == pytest.approx(steps[-1][0] * (number + 1) / len(steps))
+            low = SHOWN[3] - height_m * (1.0 - number / len(steps))
+            assert extent[2] == pytest.approx(low)
+            # On behind the ceiling, where nobody sees it end.
+            assert extent[3] == pytest.approx(FULL[3])
+    assert set(counts) == {0, 1, 2, 3}
+    # Each as likely: 75 of 300, give or take 7.5.
+    assert min(counts.values()) > 40
+
+
+def test_relief_and_recesses_are_as_deep_as_the_family_says() -> None:
+    outwards = np.array([depth for found in all_drawn() for depth, _ in found.stone])
+    niches = np.array([-d for w in all_drawn() for d, _, paint in w.recesses if paint is GROUND])
+    doors = np.array([-d for w in all_drawn() for d, _, paint in w.recesses if paint is DOOR])
+    # Up to 0.3 m before the wall and 0.45 m behind it, and nearly that now and then.
+    assert 0.28 < outwards.max() <= 0.3
+    assert 0.4 < doors.max() <= 0.45
+    assert 0.31 < niches.max() <= 0.35
+    assert doors.min() >= 0.05
+    assert niches.min() >= 0.05
+    assert min(doors.min(), niches.min()) < 0.07
+    assert {round(d, 9) for found in all_drawn() for d, _ in found.panels} == {0.03}
+
+
+def test_a_drawing_without_relief_keeps_its_recesses_alone() -> None:
+    for seed in range(20):
+        usual, flat, double = (drawn(seed, relief=scale) for scale in (1.0, 0.0, 2.0))
+        assert flat.stone == flat.panels == []
+        assert flat.recesses == usual.recesses == double.recesses
+        assert [extent for _, extent in double.stone] == [extent for _, extent in usual.stone]
+        for scaled, plain in zip(
+            double.stone + double.panels, usual.stone + usual.panels, strict=True
+        ):
+            assert scaled[0] == pytest.approx(2.0 * plain[0])
+
+
+def test_pilasters_are_alike_and_stand_from_the_floor_to_the_cornice() -> None:
+    counts: Counter[tuple[int, bool]] = Counter()
+    skirted = 0
+    for found in all_drawn():
+        cornice = [extent for _, extent in found.stone if is_cornice(extent)]
+        top = cornice[0][2] if cornice else SHOWN[3]
+        upright = [
+            item for item in found.stone if not is_cornice(item[1]) and not is_skirting(item[1])
+        ]
+        skirting = [item for item in found.stone if is_skirting(item[1])]
+        ends = [extent[:2] for _, extent in upright]
+        is_cornered = bool(ends) and ends[0][0] < SHOWN[0]
+        inner = ends[1:-1] if is_cornered else ends
+        counts[len(inner), is_cornered] += 1
+        skirted += bool(skirting)
+        assert len({round(depth, 9) for depth, _ in upright}) <= 1
+        for _, extent in upright:
+            assert extent[2:] == pytest.approx((FULL[2], top))
+        widths = [right - left for left, right in inner]
+        if is_cornered:
+            # Behind the adjoining walls, where nobody sees them end.
+            assert ends[0][0] == pytest.approx(SHOWN[0] - 0.1)
+            assert ends[-1][1] == pytest.approx(SHOWN[1] + 0.1)
+            widths += [ends[0][1] - SHOWN[0], SHOWN[1] - ends[-1][0]]
+        assert np.ptp(widths or [0.0]) < 1e-9
+        # Evenly spread, each moved by 15 cm at most.
+        even = np.linspace(SHOWN[0], SHOWN[1], len(inner) + 2)[1:-1]
+        middles = np.array([0.5 * (left + right) for left, right in inner])
+        assert np.all(np.abs(middles - even) <= 0.15)
+        # A skirting runs along each bay.
+        rests = [SHOWN[0], *(end for pair in ends for end in pair), SHOWN[1]]
+        rests = rests[2:-2] if is_cornered else rests
+        bays = list(zip(rests[::2], rests[1::2], strict=True))
+        if skirting:
+            np.testing.assert_allclose([extent[:2] for _, extent in skirting], bays)
+            assert [extent[2] for _, extent in skirting] == pytest.approx([FULL[2]] * len(bays))
+            assert len({round(depth, 9) for depth, _ in skirting}) == 1
+        # Nothing in a bay comes nearer to its ends than 12 cm.
+        inside = [extent for _, extent, _ in found.recesses]
+        inside += [extent for _, extent in found.panels]
+        for a0, a1, _, b1 in inside:
+            assert any(
+                left + 0.12 <= a0 + 1e-9 and a1 <= right - 0.12 + 1e-9 for left, right in bays
+            )
+            assert b1 <= top - 0.15
+    assert {number for number, _ in counts} == {0, 1, 2, 3}
+    corners = sum(count for (_, is_cornered), count in counts.items() if is_cornered)
+    # Half and three fifths of 300, give or take 9.
+    assert 110 < corners < 190
+    assert 140 < skirted < 220
+
+
+def test_recesses_are_holes_of_the_wall_with_planes_of_their_own() -> None:
+    kinds: Counter[str] = Counter()
+    for found in all_drawn():
+        holes = list(found.wall.holes)
+        assert holes == [extent for _, extent, _ in found.recesses]
+        whole, *planes = found.planes
+        assert whole.name == "wall"
+        assert found.wall.plane == 0
+        assert len({plane.name for plane in planes}) == len(planes) == len(holes)
+        for plane, (depth, extent, paint) in zip(planes, found.recesses, strict=True):
+            kind = plane.name.split(" in ")[0]
+            assert (kind == "niche") == (paint is GROUND)
+            assert kind in {"niche", "door"}
+            assert plane.name.split(" in ")[1].startswith("wall ")
+            expected = depth + float(whole.plane.distances_m(found.side.foot[None])[0])
+            assert float(whole.plane.distances_m(plane.outline)[0]) == pytest.approx(expected)
+            kinds[kind] += 1
+            # A door begins under the floor, a niche stands on a sill.
+            sill = extent[2] - SHOWN[2]
+            assert sill == pytest.approx(-0.1) if kind == "door" else 0.3 <= sill <= 0.7
+            assert extent[1] - extent[0] <= 1.3
+        kinds["panel"] += len(found.panels) // 4
+        for one, other in pairwise(holes):
+            assert not overlap(one, other)
+    # Each kind as likely; the fourth is bare.
+    assert max(kinds.values()) < 1.6 * min(kinds.values())
+
+
+def test_narrow_bays_stay_bare() -> None:
+    # 0.69 m between the adjoining walls: no bay is wider.
+    for seed in range(100):
+        found = drawn(seed, shown=(-0.345, 0.345, SHOWN[2], SHOWN[3]))
+        assert found.recesses == []
+        assert found.panels == []
+    wider = [drawn(seed, shown=(-0.36, 0.36, SHOWN[2], SHOWN[3])) for seed in range(100)]
+    assert sum(len(found.recesses) for found in wider) > 0
+    for found in wider:
+        for _, (a0, a1, _, _), _ in found.recesses:
+            assert a1 - a0 <= 0.72 - 0.24 + 1e-9

@@ -1,0 +1,348 @@
+"""The simulated room as a builder would check it: closed, nothing in the way, everything flush."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.simulate import room_model
+from orthoflow_plugins.simulate.building import Extent, SceneDraft
+from orthoflow_plugins.simulate.room_model import (
+    CEILING_M,
+    FLOOR_M,
+    MOST_TEXTILE,
+    Room,
+    RoomPlan,
+    build_room,
+    main_wall_axes,
+    wall_sides,
+)
+
+from orthoflow.geometry.scenes import SurfaceRole, TextureKind
+from tests.scene_rays import cast
+
+WALLS = ("main wall", "opposite wall", "right wall", "left wall")
+
+
+@cache
+def room(**changes: float) -> Room:
+    return build_room(RoomPlan(**changes))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Along:
+    """What lies along a wall: depth before it (n,), extent (n, 4), role and texture."""
+
+    depth_m: NDArray[np.float64]
+    extent: NDArray[np.float64]
+    role: NDArray[np.uint8]
+    texture: NDArray[np.int32]
+    holes: list[Extent]
+
+
+def along(built: Room, name: str) -> Along:
+    """Rectangles of a room along a wall, their extents from the wall's own foot."""
+    side = wall_sides(SceneDraft())[WALLS.index(name)]
+    scene = built.scene
+    parallel = np.abs(scene.normal @ side.normal) > 1.0 - 1e-9
+    parallel &= np.isclose(np.abs(scene.axis_a @ side.axis_a), 1.0)
+    off = (scene.centre - side.foot) @ side.normal
+    chosen = np.flatnonzero(parallel & (np.abs(off) < 0.5) & (scene.role != SurfaceRole.OBJECT))
+    (wall,) = (k for k in chosen if scene.role[k] == SurfaceRole.WALL and scene.extent[k, 1] > 2.8)
+    holes = scene.hole_extent[scene.hole_rectangle == wall]
+    return Along(
+        depth_m=off[chosen],
+        extent=scene.extent[chosen],
+        role=scene.role[chosen],
+        texture=scene.texture[chosen],
+        holes=[tuple(hole) for hole in holes],  # type: ignore[misc]
+    )
+
+
+def overlaps(one: NDArray[np.float64] | Extent, other: NDArray[np.float64] | Extent) -> bool:
+    slack = 1e-9
+    return bool(
+        one[0] < other[1] - slack
+        and other[0] < one[1] - slack
+        and one[2] < other[3] - slack
+        and other[2] < one[3] - slack
+    )
+
+
+def area_m2(extent: NDArray[np.float64] | Extent) -> float:
+    return float((extent[1] - extent[0]) * (extent[3] - extent[2]))
+
+
+def test_whoever_stands_in_the_room_sees_no_way_out() -> None:
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for start in ((0.0, 0.0, 0.0), (1.2, 0.9, 1.2), (-1.0, -1.2, -0.6)):
+        hits = cast(room().scene, np.tile(start, (4000, 1)), directions)
+        assert (hits.rectangle >= 0).all()
+        reached = start + hits.t[:, None] * directions
+        # A room of 5.4 m by 4.4 m by 3.1 m: nothing in it is farther off than its corners.
+        assert np.linalg.norm(reached, axis=1).max() < 4.2
+
+
+def test_no_wall_is_quite_square_to_the_next_and_the_main_one_leans() -> None:
+    sides = wall_sides(SceneDraft())
+    main = sides[0]
+    assert np.degrees(np.arctan2(*-main.normal[1::-1])) == pytest.approx(102.0)
+    assert np.degrees(np.arcsin(-main.normal[2])) == pytest.approx(0.8)
+    for one, other in itertools.combinations(sides, 2):
+        angle = np.degrees(np.arccos(one.normal @ other.normal))
+        off = min(abs(angle - 90.0), abs(angle - 180.0))
+        assert 0.05 < off < 1.5
+    axes = main_wall_axes()
+    np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(axes[0], main.axis_a)
+    assert axes[1] @ -main.normal > 0.999
+    assert axes[1, 2] == 0.0
+
+
+@pytest.mark.parametrize("name", WALLS)
+def test_every_hole_of_a_wall_is_closed_by_what_lies_in_or_behind_it(name: str) -> None:
+    found = along(room(), name)
+    for hole in found.holes:
+        behind = [
+            k
+            for k in range(len(found.depth_m))
+            if np.allclose(found.extent[k], hole) and found.depth_m[k] <= 1e-9
+        ]
+        assert len(behind) == 1
+        # Inside the wall, over the floor's edge at most.
+        assert hole[0] > -2.7
+        assert hole[1] < 2.7
+        assert hole[3] < CEILING_M
+    for one, other in itertools.combinations(found.holes, 2):
+        assert not overlaps(one, other)
+    assert len(found.holes) == {"main wall": 3, "opposite wall": 2}.get(name, 0)
+
+
+@pytest.mark.parametrize("name", WALLS)
+def test_nothing_stands_before_a_hole(name: str) -> None:
+    found = along(room(), name)
+    for depth, extent, role in zip(found.depth_m, found.extent, found.role, strict=True):
+        # The sill of the door is all but under the floor.
+        if role == SurfaceRole.RELIEF and depth > 0.0 and extent[3] > FLOOR_M + 0.03:
+            assert not any(overlaps(extent, hole) for hole in found.holes)
+
+
+@pytest.mark.parametrize("name", WALLS)
+def test_what_stands_out_is_even_or_wholly_within_something(name: str) -> None:
+    # Two mouldings may lie one on the other, and then one is within the other's width or height.
+    found = along(room(), name)
+    out = [
+        extent
+        for depth, extent, role in zip(found.depth_m, found.extent, found.role, strict=True)
+        if role == SurfaceRole.RELIEF and depth > 0.0 and extent[1] - extent[0] < 3.0
+    ]
+    for one, other in itertools.combinations(out, 2):
+        if overlaps(one, other):
+            across = min(one[1], other[1]) - max(one[0], other[0])
+            up = min(one[3], other[3]) - max(one[2], other[2])
+            narrow = min(one[1] - one[0], other[1] - other[0])
+            low = min(one[3] - one[2], other[3] - other[2])
+            assert across == pytest.approx(narrow) or up == pytest.approx(low)
+
+
+def test_frames_are_flush_with_what_they_frame() -> None:
+    found = along(room(), "main wall")
+    doors = [
+        extent
+        for depth, extent in zip(found.depth_m, found.extent, strict=True)
+        if depth < -0.01 and extent[3] - extent[2] > 2.0
+    ]
+    (door,) = doors
+    cloth = room_model._cloths(area_m2((-0.45, 0.65, -0.45, 1.0)) / 16.7)[0]
+    for inner in (door, np.array(cloth)):
+        beside = [
+            extent
+            for depth, extent in zip(found.depth_m, found.extent, strict=True)
+            if depth > 0.0 and extent[2] <= inner[2] + 1e-9 and extent[3] > inner[3]
+        ]
+        # A bar ends where it begins, on both sides, and one runs along its upper end.
+        assert any(extent[1] == pytest.approx(inner[0], abs=1e-6) for extent in beside)
+        assert any(extent[0] == pytest.approx(inner[1], abs=1e-6) for extent in beside)
+        assert any(
+            extent[2] == pytest.approx(inner[3], abs=1e-6)
+            and extent[0] == pytest.approx(inner[0], abs=1e-6)
+            and extent[1] == pytest.approx(inner[1], abs=1e-6)
+            for extent in found.extent
+        )
+    # Panels of the door lie in its leaf, one over the other.
+    panels = found.extent[(found.depth_m < -0.05) & (found.depth_m > -0.12 + 1e-9)]
+    assert len(panels) == 8
+    for panel in panels:
+        assert door[0] < panel[0]
+        assert panel[1] < door[1]
+        assert panel[3] < door[3]
+    np.testing.assert_allclose(panels[:, :2].min(), door[0] + (door[1] - panels[:, 1].max()))
+
+
+@pytest.mark.parametrize("name", WALLS)
+def test_pilasters_stand_from_the_floor_to_the_cornice_with_base_and_capital(name: str) -> None:
+    found = along(room(), name)
+    shafts = [
+        (depth, extent)
+        for depth, extent in zip(found.depth_m, found.extent, strict=True)
+        if depth > 0.0 and extent[3] - extent[2] > 2.5 and extent[1] - extent[0] < 0.4
+    ]
+    assert (
+        len(shafts) == {"main wall": 4, "opposite wall": 3, "right wall": 1, "left wall": 2}[name]
+    )
+    cornice = [
+        (depth, extent)
+        for depth, extent in zip(found.depth_m, found.extent, strict=True)
+        if depth > 0.0 and extent[1] - extent[0] > 5.0
+    ]
+    (low_depth, low), (high_depth, high) = sorted(cornice, key=lambda item: item[1][2])
+    assert low_depth < high_depth == pytest.approx(0.15)
+    assert low[3] == high[3] > CEILING_M
+    for depth, extent in shafts:
+        assert extent[2] < FLOOR_M
+        assert extent[3] == pytest.approx(low[2])
+        ends = [
+            (other_depth, other)
+            for other_depth, other in zip(found.depth_m, found.extent, strict=True)
+            if other_depth > depth and overlaps(other, extent)
+        ]
+        base, capital = sorted(ends, key=lambda item: item[1][2])
+        for other_depth, other in (base, capital):
+            # As much wider on both sides, and deeper.
+            assert extent[0] - other[0] == pytest.approx(other[1] - extent[1])
+            assert 0.0 < extent[0] - other[0] < 0.05
+            assert other_depth - depth < 0.05
+        assert base[1][2] == extent[2]
+        assert capital[1][3] == pytest.approx(extent[3])
+        assert base[1][3] - FLOOR_M < 0.5
+        assert capital[1][3] - capital[1][2] < 0.3
+
+
+def test_relief_scales_mouldings_and_nothing_else() -> None:
+    flat, usual, double = (room(relief=scale) for scale in (0.0, 1.0, 2.0))
+    for name in WALLS:
+        one, two = along(usual, name), along(double, name)
+        np.testing.assert_array_equal(one.extent, two.extent)
+        moulded = (one.role == SurfaceRole.RELIEF) & (one.depth_m > 0.0)
+        if name == "left wall":
+            # The fireplace and its hearth are no mouldings.
+            still = np.isclose(one.depth_m, 0.28) | np.isclose(one.depth_m, 0.03)
+            moulded &= ~still
+        np.testing.assert_allclose(two.depth_m[moulded], 2.0 * one.depth_m[moulded])
+        in_door = (one.depth_m < -0.05) & (one.depth_m > -0.115)
+        np.testing.assert_allclose(two.depth_m[in_door] + 0.12, 2.0 * (one.depth_m[in_door] + 0.12))
+        rest = ~moulded & ~in_door
+        np.testing.assert_allclose(two.depth_m[rest], one.depth_m[rest])
+        assert one.depth_m.max() == pytest.approx(0.28 if name == "left wall" else 0.15)
+        bare = along(flat, name)
+        assert not np.any(bare.depth_m > 0.3)
+        assert np.count_nonzero(bare.depth_m > 0.0) == (2 if name == "left wall" else 0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.04, 0.095, 0.15, 0.22, 0.3, MOST_TEXTILE])
+def test_cloth_covers_as_much_of_the_main_wall_as_asked(share: float) -> None:
+    found = along(room(textile_share=share), "main wall")
+    cloths = found.extent[found.texture == TextureKind.TEXTILE]
+    assert sum(map(area_m2, cloths)) == pytest.approx(share * 16.7, abs=1e-6)
+    for one, other in itertools.combinations(found.holes, 2):
+        assert not overlaps(one, other)
+    for cloth in cloths:
+        assert any(np.allclose(cloth, hole) for hole in found.holes)
+        assert area_m2(cloth) > 0.0
+    if share:
+        first = cloths[0]
+        design = np.array([-0.45, 0.65, -0.45, 1.0])
+        if share < 0.095:
+            # The design, smaller about its middle.
+            assert (first[1] - first[0]) / (first[3] - first[2]) == pytest.approx(1.1 / 1.45)
+            assert first[0] + first[1] == pytest.approx(design[0] + design[1])
+            assert first[2] + first[3] == pytest.approx(design[2] + design[3])
+        elif share > 0.1:
+            assert first[0] < design[0]
+            assert first[1] > design[1]
+
+
+def test_the_fireplace_is_closed_and_its_hearth_open_in_the_middle() -> None:
+    found = along(room(), "left wall")
+    (front,) = found.extent[np.isclose(found.depth_m, 0.28)]
+    (hearth,) = found.extent[np.isclose(found.depth_m, 0.03)]
+    scene = room().scene
+    holes = [tuple(hole) for hole in scene.hole_extent]
+    assert tuple(hearth) in holes
+    assert front[0] + front[1] == hearth[0] + hearth[1] == 0.0
+    assert front[2] == hearth[2] < FLOOR_M
+    assert front[0] < hearth[0]
+    assert hearth[3] < front[3] < 0.0
+    mirror = found.extent[np.isclose(found.depth_m, 0.05)]
+    assert len(mirror) == 1
+    assert mirror[0, 0] + mirror[0, 1] == 0.0
+    assert front[3] < mirror[0, 2] < mirror[0, 3] < 1.3
+
+
+@pytest.mark.parametrize("has_obstacle", [True, False])
+def test_what_stands_in_the_room_stands_on_the_floor_and_apart(has_obstacle: bool) -> None:
+    scene = room(obstacle=has_obstacle).scene
+    chosen = np.flatnonzero(scene.role == SurfaceRole.OBJECT)
+    assert len(chosen) == 5 * (2 + has_obstacle)
+    corners = [
+        scene.centre[k] + a * scene.axis_a[k] + b * scene.axis_b[k]
+        for k in chosen
+        for a in scene.extent[k, :2]
+        for b in scene.extent[k, 2:]
+    ]
+    blocks = np.array(corners).reshape(-1, 20, 3)
+    for block in blocks:
+        assert block[:, 2].min() == pytest.approx(FLOOR_M)
+        assert 0.5 < np.ptp(block[:, 2]) < 1.5
+        for side in wall_sides(SceneDraft()):
+            assert ((block - side.foot) @ side.normal).min() > 0.1
+    for one, other in itertools.combinations(blocks, 2):
+        assert np.linalg.norm(one[:, None, :2] - other[None, :, :2], axis=2).min() > 0.3
+    main = wall_sides(SceneDraft())[0]
+    if has_obstacle:
+        screen = blocks[0]
+        assert ((screen - main.foot) @ main.normal).mean() == pytest.approx(0.6, abs=0.03)
+    faces = scene.normal[chosen[scene.normal[chosen][:, 2] < 0.5]]
+    assert np.abs(faces @ main.normal).max() < np.cos(np.radians(3.0))
+
+
+def test_true_planes_reach_as_far_as_they_are_seen() -> None:
+    planes = {item.name: item for item in room().planes}
+    assert set(planes) == {*WALLS, "niche", "door", "floor", "ceiling"}
+    bounds = [item.plane for name, item in planes.items() if name not in {"niche", "door"}]
+    for item in planes.values():
+        top_left, bottom_left, bottom_right, _ = item.outline
+        np.testing.assert_allclose(item.plane.distances_m(item.outline), 0.0, atol=1e-9)
+        # Points of the plane, 2 cm apart, that lie before all that bounds it.
+        right, down = bottom_right - bottom_left, bottom_left - top_left
+        shares = np.linspace(-0.1, 1.1, 301)
+        inside = np.ones((301, 301), dtype=np.bool_)
+        points = (
+            top_left
+            + shares[None, :, None] * right[None, None]
+            + shares[:, None, None] * down[None, None]
+        )
+        for bound in bounds:
+            if abs(bound.normal @ item.plane.normal) < 0.9:
+                inside &= bound.distances_m(points.reshape(-1, 3)).reshape(301, 301) >= 0.0
+        if item.name in {"niche", "door"}:
+            continue
+        rows, columns = np.nonzero(inside)
+        found = [
+            shares[columns.min()],
+            shares[columns.max()],
+            shares[rows.min()],
+            shares[rows.max()],
+        ]
+        np.testing.assert_allclose(found, [0.0, 1.0, 0.0, 1.0], atol=0.005)
+    for name, depth_m in (("niche", -0.25), ("door", -0.12)):
+        off = planes["main wall"].plane.distances_m(planes[name].outline)
+        np.testing.assert_allclose(off, depth_m, atol=1e-9)
+    assert planes["door"].outline[:, 2].min() == pytest.approx(FLOOR_M, abs=0.01)
+    assert planes["niche"].outline[:, 2].min() > FLOOR_M + 0.3
