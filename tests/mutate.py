@@ -18,14 +18,16 @@ A place is a line with something to mutate. What is done to it:
 Left alone is what no test should hold: docstrings, annotations, decorators, what only type checkers
 read, messages and whatever else an exception is raised with, log and progress lines, `__repr__`,
 assertions of what cannot happen, version numbers of results, what changes speed or looks alone
-(threads, sizes of parts and caches, arguments of drawings, floats below a millionth that guard a
-division) and how often a search goes on at most: one that has converged moves no more.
+(threads, sizes of parts, bands and caches, arguments of drawings, colours, floats below a millionth
+that guard a division), how long another process is waited for at most, and how often a search goes
+on at most: one that has converged moves no more.
 
 The tests of `orthoflow/engine/x.py` are those in `tests/engine`, of a plugin's module those of its
 kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it. Doctests,
-a file of the module's own name and files that name the module go first, in a run of their own that
-has little to collect; then the conformance suite for modules of kinds; then the other files. The
-first failure ends a run.
+a file of the module's own name, files that name the module and, where `docs/limits.md` states a
+limit of it, the test of that table go first, in a run of their own that has little to collect; then
+the conformance suite for modules of kinds; then the other files, and files of other folders that
+import the module itself. The first failure ends a run.
 
 A test kills a mutation only when it passes without it: whatever failed is run once more on the
 source as it is. What fails there as well is left out from then on. A run that takes too long
@@ -46,6 +48,7 @@ import ast
 import hashlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -214,6 +217,23 @@ def folders_of(tree: Tree, path: str) -> list[str]:
     return found or ["tests/cli"]
 
 
+def _files_importing(root: Path, name: str) -> list[str]:
+    """Files of tests, wherever they stand, that import a module itself."""
+    parent, _, stem = name.rpartition(".")
+    imports = re.compile(
+        rf"^ *(from {re.escape(name)} import|import {re.escape(name)}\b"
+        rf"|from {re.escape(parent)} import (\(\s*([\w ]+,\s*)*)?[^()\n]*\b{stem}\b)",
+        re.MULTILINE,
+    )
+    return [file for file, text in _texts_of_tests(root).items() if imports.search(text)]
+
+
+@cache
+def _texts_of_tests(root: Path) -> dict[str, str]:
+    files = sorted((root / "tests").rglob("test_*.py"))
+    return {str(file.relative_to(root)): file.read_text(encoding="utf-8") for file in files}
+
+
 def _kind_modules(names: set[str]) -> set[str]:
     return {name for name in names if name.startswith("orthoflow_plugins.") and name.count(".") > 1}
 
@@ -243,8 +263,12 @@ def files_of(tree: Tree, path: str) -> tuple[list[str], list[str]]:
         # What holds for the methods of all kinds.
         shared = sorted((tree.root / "tests/plugins").glob("test_*.py"))
         ranked += [((4, 0, file.name), str(file.relative_to(tree.root))) for file in shared]
+    limits = tree.root / "docs/limits.md"
+    if limits.is_file() and f"`{name}." in limits.read_text(encoding="utf-8"):
+        ranked.append(((1, 0, "test_limits.py"), "tests/test_limits.py"))
     if ">>> " in (tree.root / path).read_text(encoding="utf-8"):
         ranked.append(((-1, 0, ""), path))
+    ranked += [((5, 0, file), file) for file in _files_importing(tree.root, name)]
     near = [file for (rank, *_), file in sorted(ranked) if rank <= 1]
     return list(dict.fromkeys(near)), list(
         dict.fromkeys(file for _, file in sorted(ranked) if file not in near)

@@ -82,6 +82,9 @@ def test_each_operator_changes_what_it_says(source: str, kind: str, lines: set[s
         "click.option('--a', show_default=True)",
         "_ROUNDS: Final = 20",
         "_STEPS_MOST: Final = 30",
+        "_BAND_CELLS: Final = 1 << 23",
+        "_ROW_RGB: Final = (235, 165, 20)",
+        "_CONNECT_S: Final = 15.0",
         "def f(*, cores: int = 1): ...",
         "class A:\n    cores: int = 1",
         "b.reshape(-1)",
@@ -145,6 +148,15 @@ def test_the_file_of_its_name_goes_first_and_kinds_follow_geometry(tree: mutate.
     folders = mutate.folders_of(tree, "orthoflow/geometry/threads.py")
     assert folders[0] == "tests/geometry"
     assert {"tests/plugins/plane", "tests/plugins/ortho"} <= set(folders)
+
+
+def test_a_table_of_limits_and_files_that_import_a_module_belong_to_it(tree: mutate.Tree) -> None:
+    near, others = mutate.files_of(tree, "orthoflow/files/survey_points.py")
+    assert near == ["tests/files/test_survey_points.py", "tests/test_limits.py"]
+    assert "tests/report/test_page.py" in others
+    # `from orthoflow.files.clouds import photo_colours as module`
+    _, others = mutate.files_of(tree, "orthoflow/files/clouds/photo_colours.py")
+    assert others[-1] == "tests/plugins/colour/test_photos.py"
 
 
 def test_importers_are_found_by_way_of_others(tree: mutate.Tree) -> None:

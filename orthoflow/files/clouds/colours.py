@@ -96,6 +96,6 @@ def grey_range(cloud: PointCloud) -> tuple[float, float]:
 
 
 def sampled_pieces(n_points: int) -> list[slice]:
-    """Short pieces all over a cloud."""
-    firsts = range(0, n_points, max(1, n_points // _PIECES))
+    """Short pieces all over a cloud, none of them over another; all of a small one."""
+    firsts = range(0, n_points, max(_PIECE, n_points // _PIECES))
     return [slice(k, min(k + _PIECE, n_points)) for k in firsts]

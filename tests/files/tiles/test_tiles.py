@@ -79,6 +79,23 @@ def test_halving_averages_what_is_shown() -> None:
     assert half[1, 2].tolist() == [7, 8, 9, 255]
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (5, 4), (6, 6), (7, 9)])
+def test_halving_is_a_loop_over_squares(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(sum(shape))
+    cells = rng.integers(0, 256, (*shape, 4)).astype(np.uint8)
+    cells[:, :, 3] = np.where(rng.random(shape) < 0.6, 255, 0)
+    half = halved(cells)
+    assert half.shape == (-(-shape[0] // 2), -(-shape[1] // 2), 4)
+    for row, column in np.ndindex(half.shape[:2]):
+        square = cells[2 * row : 2 * row + 2, 2 * column : 2 * column + 2].reshape(-1, 4)
+        shown = square[square[:, 3] == 255, :3].astype(int)
+        # Shown where at least half of what there is of the square is.
+        assert half[row, column, 3] == (255 if 2 * len(shown) >= len(square) else 0)
+        if len(shown):
+            mean = np.floor(shown.mean(axis=0) + 0.5).astype(int)
+            assert np.abs(half[row, column, :3] - mean).max() <= (len(shown) == 3)
+
+
 @pytest.mark.skipif(PROGRAM is None, reason="no chromium")
 def test_the_page_shows_and_measures_without_a_server(tiled: Path, tmp_path: Path) -> None:
     with browser(tmp_path / "profile") as page:

@@ -1,0 +1,202 @@
+"""Points that are chosen and dressed: by scan, box and wall; signs of normals; deviations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.files.clouds.neighbourhoods import Neighbourhoods, neighbourhoods_of
+from orthoflow.files.clouds.photo_colours import PointColours
+from orthoflow.geometry.frames import frame_over
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import Planes, PointCloud, PointLabels
+from tests import samples
+
+ORIGIN = np.array([500_000.0, 4_000_000.0, 100.0])
+NORMALS = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+N_SIDE = 24
+
+
+def corner(**more: Any) -> PointCloud:
+    """The wall x = 0 and the floor z = 0, two metres each, of two scans that take turns."""
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.3, 2.0, N_SIDE)] * 2))
+    zero = np.zeros(len(a))
+    offsets = np.vstack([np.column_stack([zero, a, b]), np.column_stack([a, b, zero])])
+    x, y, z = (np.ascontiguousarray(axis) for axis in offsets.T.astype(np.float32))
+    scan = (np.arange(len(offsets)) % 2).astype(np.uint16)
+    plain: dict[str, Any] = {"scan": scan, "up": np.array([0.0, 0.0, 1.0])}
+    return PointCloud(origin=ORIGIN, x=x, y=y, z=z, **(plain | more))
+
+
+CORNER = corner()
+IS_FLOOR = np.arange(len(CORNER)) >= N_SIDE**2
+NEAR = neighbourhoods_of(CORNER)
+
+
+def planes(sign: float = 1.0) -> Planes:
+    corners = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 2.0, 2.0]])
+    return samples.planes(
+        normal=sign * NORMALS,
+        offset=sign * (NORMALS @ ORIGIN),
+        corners=ORIGIN + np.array([corners, corners[:, [2, 1, 0]]]),
+        n_points=np.array([1, 1]),
+        names=("wall 0", "floor"),
+    )
+
+
+def dressed(
+    cloud: PointCloud = CORNER, *, near: Neighbourhoods = NEAR, **more: Any
+) -> DressedCloud:
+    return DressedCloud(cloud=cloud, colouring="intensity", neighbourhoods=near, **more)
+
+
+def normals(dress: DressedCloud, scan: int | None = None) -> NDArray[np.float32]:
+    return np.concatenate([block.normal for block in dress.blocks(scan)])
+
+
+def test_normals_look_at_the_scanner_of_their_scan() -> None:
+    # The second scan was taken from behind the wall and from below the floor.
+    stations = ORIGIN + np.array([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]])
+    cloud = corner(stations=stations, stations_source="file")
+    side = np.where(CORNER.scan == 0, 1.0, -1.0)
+    expected = side[:, None] * NORMALS[IS_FLOOR.astype(int)]
+    np.testing.assert_allclose(normals(dressed(cloud)), expected, atol=1e-5)
+    np.testing.assert_allclose(normals(dressed(cloud), 1), expected[CORNER.scan == 1], atol=1e-5)
+    # Without a number per point, all are of the first.
+    one = normals(dressed(replace(cloud, scan=None)))
+    np.testing.assert_allclose(one, np.abs(expected), atol=1e-5)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_normals_look_at_the_only_place_that_somebody_looked_from(side: float) -> None:
+    cloud = corner(stations=ORIGIN + side * np.ones((1, 3)), stations_source="view_from")
+    expected = side * NORMALS[IS_FLOOR.astype(int)]
+    np.testing.assert_allclose(normals(dressed(cloud, planes=planes(-side))), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_normals_look_where_those_of_their_planes_do_else_up(sign: float) -> None:
+    # Two places, and nobody knows which points are of which.
+    cloud = corner(stations=ORIGIN + np.ones((2, 3)), stations_source="view_from")
+    index = IS_FLOOR.astype(np.int16)
+    index[-N_SIDE:] = -1
+    dress = dressed(cloud, planes=planes(sign), labels=PointLabels(plane_index=index))
+    expected = sign * NORMALS[index]
+    expected[-N_SIDE:] = NORMALS[1]
+    np.testing.assert_allclose(normals(dress), expected, atol=1e-5)
+    up = normals(dressed(cloud))[IS_FLOOR]
+    np.testing.assert_allclose(up, np.tile(NORMALS[1], (len(up), 1)), atol=1e-5)
+
+
+def test_a_station_is_known_where_the_files_say_one_for_every_scan() -> None:
+    stations = ORIGIN + np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    told = dressed(corner(stations=stations, stations_source="file"))
+    assert told.scans == (0, 1)
+    np.testing.assert_array_equal([told.station(0), told.station(1)], stations)
+    assert dressed(corner(stations=stations, stations_source="view_from")).station(0) is None
+    assert dressed(corner(stations=stations[:1], stations_source="file")).station(0) is None
+    assert dressed().station(0) is None
+    single = dressed(corner(scan=None, stations=stations[:1], stations_source="file"))
+    assert single.scans == (0,)
+    np.testing.assert_array_equal(single.station(0), stations[0])
+
+
+def test_points_on_the_sides_of_a_box_are_in_it_scan_by_scan() -> None:
+    points = CORNER.points_world()
+    # Its sides go through points, as float32 has them.
+    box = np.array([points.min(axis=0), points[N_SIDE**2 + 5 * N_SIDE + 5]])
+    dress = dressed(box_world=box)
+    chosen = np.all((points >= box[0]) & (points <= box[1]), axis=1)
+    assert 0 < chosen.sum() < len(points)
+    for scan in (None, 0, 1):
+        own = chosen if scan is None else chosen & (CORNER.scan == scan)
+        (block,) = dress.blocks(scan)
+        np.testing.assert_array_equal(block.world, points[own])
+        assert len(block) == own.sum()
+        found = dress.bounds_world(scan)
+        np.testing.assert_array_equal(found, [points[own].min(axis=0), points[own].max(axis=0)])
+    far = dressed(box_world=box + 100.0)
+    assert far.bounds_world() is None
+    assert list(far.blocks()) == []
+
+
+@pytest.mark.parametrize(
+    ("corner_m", "is_inside"),
+    [
+        ([0.0, 0.5, 0.5], True),
+        ([0.0625, 1.5, 1.5], True),
+        ([-0.125, 0.5, 1.5], True),
+        ([0.0, 0.499, 1.0], False),
+        ([0.0, 1.501, 1.0], False),
+        ([0.0, 1.0, 0.499], False),
+        ([0.0, 1.0, 1.501], False),
+        ([0.063, 1.0, 1.0], False),
+        ([-0.126, 1.0, 1.0], False),
+    ],
+)
+def test_a_wall_has_the_points_over_it_as_far_before_and_behind_it_as_it_reaches(
+    corner_m: list[float], is_inside: bool
+) -> None:
+    square = np.array([[0.0, 0.5, 1.5], [0.0, 0.5, 0.5], [0.0, 1.5, 0.5], [0.0, 1.5, 1.5]])
+    slab = Slab(frame=frame_over(square, NORMALS[0], gsd_m=0.25), front_m=0.0625, behind_m=0.125)
+    far = CORNER.points_world() - ORIGIN + 50.0
+    x, y, z = np.vstack([[corner_m], far]).astype(np.float32).T
+    cloud = PointCloud(
+        origin=np.zeros(3),
+        x=np.ascontiguousarray(x),
+        y=np.ascontiguousarray(y),
+        z=np.ascontiguousarray(z),
+        up=np.array([0.0, 0.0, 1.0]),
+    )
+    dress = dressed(cloud, near=neighbourhoods_of(cloud), wall=slab, wall_plane=0)
+    found = [block.deviation_m for block in dress.blocks()]
+    assert len(found) == is_inside
+    if is_inside:
+        np.testing.assert_allclose(found[0], [corner_m[0]], atol=1e-6)
+
+
+def test_deviations_are_of_points_whose_plane_is_there() -> None:
+    index = np.full(len(CORNER), -1, dtype=np.int16)
+    index[[3, 4, 5, N_SIDE**2]] = [0, 1, 2, 1]
+    (block,) = dressed(planes=planes(), labels=PointLabels(plane_index=index)).blocks()
+    assert block.deviation_m is not None
+    assert np.flatnonzero(np.isfinite(block.deviation_m)).tolist() == [3, 4, N_SIDE**2]
+    # A point of the wall lies as far from the floor as it is high.
+    np.testing.assert_allclose(block.deviation_m[[3, 4]], [0.0, CORNER.z[4]], atol=1e-6)
+    for bare in (dressed(planes=planes()), dressed(labels=PointLabels(plane_index=index))):
+        assert [one.deviation_m for one in bare.blocks()] == [None]
+        assert bare.scale_m == 0.001
+
+
+@pytest.mark.parametrize(("n_far", "scale_m"), [(5, 0.05), (8, 1.0)])
+def test_ninety_nine_of_a_hundred_points_set_the_scale(n_far: int, scale_m: float) -> None:
+    # Of the 576 points of the wall; those of the floor are on no plane.
+    x = np.full(len(CORNER), 0.04, dtype=np.float32)
+    x[5 : 5 + 50 * n_far : 50] = -0.9
+    labels = PointLabels(plane_index=np.where(IS_FLOOR, -1, 0).astype(np.int16))
+    dress = dressed(replace(CORNER, x=x), planes=planes(), labels=labels)
+    assert dress.scale_m == scale_m
+
+
+def test_a_field_is_written_where_it_is_known() -> None:
+    intensity = np.linspace(-0.5, 1.5, len(CORNER), dtype=np.float32)
+    photo = (np.arange(len(CORNER)) % 3 - 1).astype(np.int16)
+    colours = PointColours(
+        rgb=np.full((len(CORNER), 3), 7, np.uint8), best=np.ones(len(CORNER), np.float32)
+    )
+    (bare,) = dressed(corner(scan=None)).blocks()
+    assert bare.fields() == {}
+    (full,) = dressed(
+        corner(intensity=intensity), photo_colours=replace(colours, photo=photo)
+    ).blocks()
+    assert sorted(full.fields()) == ["intensity", "photo", "scan"]
+    np.testing.assert_array_equal(full.fields()["intensity"], np.clip(intensity, 0.0, 1.0))
+    np.testing.assert_array_equal(full.fields()["photo"], photo)
+    assert (full.rgb == 7).all()
+    (unnumbered,) = dressed(photo_colours=colours).blocks()
+    assert "photo" not in unnumbered.fields()

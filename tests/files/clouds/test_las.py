@@ -1,0 +1,111 @@
+"""LAZ as laspy reads it: which extra bytes there are, the scale of coordinates, and the header."""
+
+from __future__ import annotations
+
+import datetime as dt
+from dataclasses import replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.files.clouds.las import write_laz
+from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
+from orthoflow.files.clouds.photo_colours import PointColours
+from orthoflow.files.geotiff import epsg_wkt
+from orthoflow.geometry.frames import frame_over
+from orthoflow.geometry.slabs import Slab
+from orthoflow.products import PointCloud, PointLabels
+from tests import samples
+
+NORMALS = ["NormalX", "NormalY", "NormalZ"]
+SQUARE = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 0.0, 2.0]])
+
+
+def floor(size_m: float = 1.0) -> PointCloud:
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.0, size_m, 12)] * 2))
+    x, y = (np.ascontiguousarray(axis, np.float32) for axis in (a, b))
+    up = np.array([0.0, 0.0, 1.0])
+    return PointCloud(origin=np.array([1e5, 2e5, 50.5]), x=x, y=y, z=np.zeros_like(x), up=up)
+
+
+def dressed(cloud: PointCloud) -> DressedCloud:
+    return DressedCloud(cloud=cloud, colouring="plane", neighbourhoods=neighbourhoods_of(cloud))
+
+
+def written(path: Path, dress: DressedCloud) -> laspy.LasData:
+    write_laz(path, dress)
+    return laspy.read(path)
+
+
+def test_extra_bytes_are_of_what_is_known(tmp_path: Path) -> None:
+    plain = dressed(floor())
+    n_points = len(plain.cloud)
+    labels = PointLabels(plane_index=np.zeros(n_points, np.int16))
+    colours = PointColours(
+        rgb=np.zeros((n_points, 3), np.uint8),
+        best=np.zeros(n_points, np.float32),
+        photo=np.arange(n_points, dtype=np.int16),
+    )
+    slab = Slab(
+        frame=frame_over(SQUARE + plain.cloud.origin, np.array([0.0, 1.0, 0.0]), gsd_m=0.1),
+        front_m=9.0,
+        behind_m=9.0,
+    )
+    planes = samples.planes(
+        normal=np.array([[0.0, 0.0, 1.0]]),
+        offset=np.zeros(1),
+        corners=SQUARE[None],
+        n_points=np.array([1]),
+        names=("floor",),
+    )
+    for more, names in (
+        ({}, []),
+        ({"labels": labels}, ["plane"]),
+        ({"planes": planes}, []),
+        ({"labels": labels, "planes": planes}, ["plane", "deviation"]),
+        ({"wall": slab}, ["deviation"]),
+        ({"photo_colours": colours}, ["photo"]),
+    ):
+        found = written(tmp_path / "a.laz", replace(plain, **more))  # type: ignore[arg-type]
+        assert list(found.point_format.extra_dimension_names) == [*NORMALS, *names]
+    np.testing.assert_array_equal(found["photo"], colours.photo)
+
+
+def test_every_point_is_the_only_return_of_its_pulse_in_a_file_of_no_day(tmp_path: Path) -> None:
+    found = written(tmp_path / "a.laz", dressed(floor()))
+    assert (found.header.version.major, found.header.version.minor) == (1, 4)
+    assert found.header.point_format.id == 7
+    assert set(np.asarray(found.return_number)) == {1}
+    assert set(np.asarray(found.number_of_returns)) == {1}
+    assert found.header.creation_date == dt.date(1970, 1, 1)
+    assert found.header.generating_software == "orthoflow"
+    # Of a whole metre, so that steps of coordinates are round.
+    assert found.header.offsets.tolist() == [1e5, 2e5, 50.0]
+
+
+@pytest.mark.parametrize("crs_wkt", ["", epsg_wkt(25832)], ids=["unknown", "known"])
+def test_a_header_says_that_its_coordinate_system_is_wkt_where_it_has_one(
+    tmp_path: Path, crs_wkt: str
+) -> None:
+    found = written(tmp_path / "a.laz", replace(dressed(floor()), crs_wkt=crs_wkt))
+    assert found.header.global_encoding.wkt == bool(crs_wkt)
+
+
+@pytest.mark.parametrize(
+    ("size_m", "scale_m"),
+    # 31 bits with a sign hold 214 km in steps of a tenth of a millimetre, and the origin may lie
+    # anywhere within.
+    [(1.0, 1e-4), (107_000.0, 1e-4), (108_000.0, 1e-3), (2_000_000.0, 1e-2)],
+)
+def test_coordinates_keep_a_tenth_of_a_millimetre_where_that_fits(
+    tmp_path: Path, size_m: float, scale_m: float
+) -> None:
+    cloud = floor(size_m)
+    # Of a mirrored cloud the farthest point has a negative offset.
+    for one in (cloud, replace(cloud, x=-cloud.x, y=np.zeros_like(cloud.y))):
+        found = written(tmp_path / "a.laz", dressed(one))
+        np.testing.assert_allclose(found.header.scales, scale_m, rtol=1e-9)
+        np.testing.assert_allclose(found.xyz, one.points_world(), atol=0.51 * scale_m)
