@@ -307,7 +307,7 @@ def test_what_stands_in_the_room_stands_on_the_floor_and_apart(has_obstacle: boo
     main = wall_sides(SceneDraft())[0]
     if has_obstacle:
         screen = blocks[0]
-        assert ((screen - main.foot) @ main.normal).mean() == pytest.approx(0.6, abs=0.03)
+        assert ((screen - main.foot) @ main.normal).mean() == pytest.approx(0.6, abs=0.05)
     faces = scene.normal[chosen[scene.normal[chosen][:, 2] < 0.5]]
     assert np.abs(faces @ main.normal).max() < np.cos(np.radians(3.0))
 
