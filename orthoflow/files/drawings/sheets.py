@@ -176,7 +176,8 @@ def _draw_grid(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
     rows = list(_marks(drawing.axes.down, part.top_m, part.bottom_m, drawing.grid_m))
     left, bottom = view.corner_mm
     right, top = _on_paper(drawing, view, part.right_m, part.top_m)
-    digits = max(0, math.ceil(-math.log10(drawing.grid_m) - 1e-9))
+    # A quarter of a metre needs two.
+    digits = len(f"{drawing.grid_m:.4f}".rstrip("0").partition(".")[2])
     for place, value in columns:
         x, _ = _on_paper(drawing, view, place, part.top_m)
         for y, end in ((bottom, bottom - 1.5), (top, top + 1.5)):
