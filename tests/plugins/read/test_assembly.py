@@ -1,0 +1,304 @@
+"""A cloud that grows block by block, against one that is made of all points at once."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.read.assembly import CloudAssembly, resolution_m, rounding_m
+
+from orthoflow.errors import InputError, StoreError
+from orthoflow.files.points.blocks import PointBlock, PointField, ScanFile
+from orthoflow.sdk import StepContext
+
+FIELDS: tuple[PointField, ...] = ("intensity", "rgb", "grid")
+HERE = np.array([634_512.25, 486_215.5, 101.75])
+
+
+def block(seed: int, n: int, *, scan: int = 0, **more: object) -> PointBlock:
+    rng = np.random.default_rng(seed)
+    plain: dict[str, object] = {
+        "points": HERE + rng.uniform(-5.0, 5.0, (n, 3)),
+        "scan": scan,
+        "n_read": n,
+        "intensity": rng.uniform(0.0, 2048.0, n).astype(np.float32),
+        "rgb": rng.integers(0, 256, (n, 3)).astype(np.uint8),
+        "row": rng.integers(0, 3000, n),
+        "column": rng.integers(0, 3000, n),
+    }
+    return PointBlock(**(plain | more))  # type: ignore[arg-type]
+
+
+def file(name: str, *blocks: PointBlock, fields: Sequence[PointField] = FIELDS) -> ScanFile:
+    return ScanFile(
+        name=name,
+        format_name="toy",
+        n_most=sum(len(one.points) for one in blocks),
+        fields=frozenset(fields),
+        read=lambda: iter(blocks),
+    )
+
+
+def context(folder: Path, progress: list[tuple[float, str]] | None = None) -> StepContext:
+    heard = [] if progress is None else progress
+    return StepContext(
+        rng=np.random.default_rng(0),
+        cores=1,
+        scratch=folder,
+        listen=lambda event: heard.append((event.fraction, event.text)),
+    )
+
+
+def assembled(
+    folder: Path, *files: ScanFile, unit_m: float = 1.0, box_m: NDArray[np.float64] | None = None
+) -> CloudAssembly:
+    folder.mkdir(exist_ok=True)
+    growing = CloudAssembly(context(folder), list(files), unit_m, box_m)
+    for one in files:
+        growing.add_file(one)
+    return growing
+
+
+def dirtied(clean: PointBlock) -> PointBlock:
+    """A block with each kind of point that cannot be used."""
+    points = clean.points.copy()
+    points[3, 1] = np.nan
+    points[5, 2] = np.inf
+    points[7, 0] = -2e9
+    points[8, 2] = 1e9
+    assert clean.intensity is not None
+    intensity = clean.intensity.copy()
+    intensity[0], intensity[1] = np.nan, np.inf
+    return replace(clean, points=points, intensity=intensity)
+
+
+@pytest.mark.parametrize("unit_m", [1.0, 0.001])
+@pytest.mark.parametrize("has_box", [False, True])
+def test_what_comes_in_blocks_is_what_there_is(
+    tmp_path: Path, unit_m: float, *, has_box: bool
+) -> None:
+    first, second, third = block(1, 40), dirtied(block(2, 30, scan=1)), block(3, 20)
+    blocks = [replace(one, points=one.points / unit_m) for one in (first, second, third)]
+    # The points of the bounds that a reader has already are not looked at again.
+    known = np.stack([blocks[0].points.min(axis=0), blocks[0].points.max(axis=0)])
+    blocks[0] = replace(blocks[0], bounds=known)
+    box_m = np.array([HERE - 2.0, HERE + 4.0]) if has_box else None
+    found = assembled(
+        tmp_path, file("a", *blocks[:2]), file("b", blocks[2]), unit_m=unit_m, box_m=box_m
+    )
+    points = np.vstack([one.points for one in blocks]) * unit_m
+    usable = (np.abs(points) < 1e9).all(axis=1)
+    inside = usable.copy()
+    if box_m is not None:
+        with np.errstate(invalid="ignore"):
+            inside &= ((points >= box_m[0]) & (points <= box_m[1])).all(axis=1)
+    assert 0 < inside.sum() <= usable.sum() == len(points) - 4
+    of_first = np.arange(len(points)) < 40
+    own = inside[of_first]
+    # Whole metres near the first points that are kept.
+    origin = np.floor(np.median(points[of_first][own], axis=0))
+    np.testing.assert_array_equal(found.origin, origin)
+    assert found.n_points == inside.sum()
+    expected = (points[inside] - origin).astype(np.float32)
+    np.testing.assert_array_equal(np.column_stack(found.offsets), expected)
+    for name in ("row", "column", "intensity"):
+        values = np.concatenate([getattr(one, name) for one in blocks])[inside]
+        np.testing.assert_array_equal(found.array(name), values)
+    np.testing.assert_array_equal(
+        found.array("rgb"), np.vstack([one.rgb for one in blocks if one.rgb is not None])[inside]
+    )
+    scans = np.repeat([0, 1, 2], [40, 30, 20])
+    np.testing.assert_array_equal(found.array("scan"), scans[inside])
+    intensity = np.concatenate([one.intensity for one in blocks if one.intensity is not None])
+    finite = intensity[inside & np.isfinite(intensity)]
+    assert found.intensity_range == (float(finite.min()), float(finite.max()))
+    assert found.n_intensity_lost == np.count_nonzero(inside & ~np.isfinite(intensity))
+    for scan, summary in enumerate(found.scans):
+        mine = points[inside & (scans == scan)]
+        np.testing.assert_array_equal([summary.low, summary.high], [mine.min(0), mine.max(0)])
+    a, b = found.files
+    assert (a.n_read, a.n_not_finite, a.n_far) == (70, 4, 2)
+    assert a.n_kept == np.count_nonzero(inside[:70])
+    assert a.n_outside == np.count_nonzero(usable[:70] & ~inside[:70])
+    assert a.first_far_m == pytest.approx(tuple(points[47]))
+    assert (b.n_read, b.n_kept, b.n_not_finite) == (20, np.count_nonzero(inside[70:]), 0)
+
+
+def test_what_a_reader_left_out_is_counted_file_by_file(tmp_path: Path) -> None:
+    left_out = block(1, 10, n_read=16, n_invalid=1, n_withheld=2, n_unwanted=3)
+    found = assembled(tmp_path, file("a", left_out, left_out), file("b", block(2, 5)))
+    counts = [
+        (one.n_read, one.n_kept, one.n_invalid, one.n_withheld, one.n_unwanted, one.n_outside)
+        for one in found.files
+    ]
+    assert counts == [(32, 20, 2, 4, 6, 0), (5, 5, 0, 0, 0, 0)]
+    assert [one.name for one in found.files] == ["a", "b"]
+
+
+def test_scans_are_numbered_through_all_files_and_keep_their_stations(tmp_path: Path) -> None:
+    station = np.array([1000.0, 2000.0, 3000.0])
+    blocks = [
+        block(1, 4, station=station),
+        block(2, 4, scan=1),
+        block(3, 4, scan=1, station=2 * station, station_is_posed=False),
+    ]
+    found = assembled(tmp_path, file("a", *blocks), file("b", block(4, 4)), unit_m=0.001)
+    assert len(found.scans) == 3
+    first, second, third = found.scans
+    np.testing.assert_allclose(first.station, station / 1000.0)
+    np.testing.assert_allclose(second.station, station / 500.0)
+    assert (first.is_posed, second.is_posed, third.station) == (True, False, None)
+    np.testing.assert_array_equal(found.array("scan"), np.repeat([0, 1, 1, 2], 4))
+
+
+def test_one_scan_needs_no_numbers_and_missing_fields_are_missing(tmp_path: Path) -> None:
+    found = assembled(tmp_path, file("a", block(1, 6)), fields_only())
+    assert found.fields == {"intensity"}
+    for name in ("rgb", "row", "column"):
+        assert found.array(name) is None
+    single = assembled(tmp_path / "other", file("a", block(1, 6)))
+    assert single.array("scan") is None
+
+
+def fields_only() -> ScanFile:
+    return file("b", block(2, 6), fields=("intensity",))
+
+
+def test_progress_is_the_share_of_the_points_that_may_come(tmp_path: Path) -> None:
+    told: list[tuple[float, str]] = []
+    files = [file("a", block(1, 30), block(2, 10)), file("b", block(3, 40))]
+    growing = CloudAssembly(context(tmp_path, told), files, 1.0)
+    for one in files:
+        growing.add_file(one)
+    assert told == [
+        (30 / 80, "a: 30 points"),
+        (40 / 80, "a: 40 points"),
+        (1.0, "b: 40 points"),
+    ]
+
+
+def test_a_file_without_a_point_that_can_be_used_is_refused_with_its_counts(tmp_path: Path) -> None:
+    lost = block(1, 4, points=np.full((4, 3), np.nan), n_read=9, n_invalid=3, n_withheld=2)
+    with pytest.raises(InputError) as caught:
+        assembled(tmp_path, file("a", lost))
+    assert str(caught.value) == (
+        "a holds no usable points: of 9, 3 are marked as invalid, 2 as deleted and 4 are not "
+        "finite; export it again"
+    )
+    # Points of other classes, or outside, are no damage.
+    for more in ({"n_unwanted": 5}, {}):
+        away = block(1, 4, **more)
+        box_m = np.array([HERE + 50.0, HERE + 60.0])
+        growing = assembled(tmp_path / f"{len(more)}", file("a", away), box_m=box_m)
+        assert growing.n_points == 0
+        with pytest.raises(InputError, match="no point is left") as caught:
+            growing.require_points()
+        low, high = (
+            ", ".join(f"{value:.2f}" for value in corner)
+            for corner in (away.points.min(axis=0), away.points.max(axis=0))
+        )
+        assert str(caught.value) == (
+            f"no point is left: {5 * len(more)} are of other classes than those asked for, 4 lie "
+            f"outside the box: the points reach from ({low}) to ({high}); change classes or box "
+            "(read.scan)"
+        )
+    kept = assembled(tmp_path / "kept", file("a", block(1, 1)))
+    kept.require_points()
+
+
+def test_more_points_than_a_header_states_are_refused(tmp_path: Path) -> None:
+    short = replace(file("a", block(1, 10), block(2, 10)), n_most=19)
+    with pytest.raises(InputError, match=r"^a holds more points than its header states$"):
+        assembled(tmp_path, short)
+    exact = replace(short, n_most=20)
+    assert assembled(tmp_path / "exact", exact).n_points == 20
+
+
+def test_rows_and_columns_beyond_32_bits_are_cut(tmp_path: Path) -> None:
+    odd = block(1, 3, row=np.array([-1, 7, 2**32 + 5]), column=np.array([2**32 - 1, 0, 1]))
+    found = assembled(tmp_path, file("a", odd))
+    assert found.array("row").tolist() == [0, 7, 2**32 - 1]  # type: ignore[union-attr]
+    assert found.array("column").tolist() == [2**32 - 1, 0, 1]  # type: ignore[union-attr]
+
+
+def test_sixteen_bits_number_the_scans(tmp_path: Path) -> None:
+    last = file("a", *(block(k, 1, scan=k) for k in range(2)))
+    growing = CloudAssembly(context(tmp_path), [last], 1.0)
+    growing._store_scan(65_535, slice(0, 1))
+    assert growing._scan is not None
+    assert growing._scan.tolist() == [65_535, 0]
+    with pytest.raises(InputError, match="more than 65536 scans"):
+        growing._store_scan(65_536, slice(0, 1))
+
+
+def test_there_is_room_for_every_array_of_a_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many = replace(file("a", block(1, 1)), n_most=1000)
+    # x, y, z, intensity, row and column of 4 bytes, three of colour, two of the scan: what is asked
+    # for is more than that, and not twice.
+    growing = CloudAssembly(context(tmp_path), [many], 1.0)
+    growing._store_scan(1, slice(0, 1))
+    n_bytes = sum(path.stat().st_size for path in (tmp_path / "allocated").iterdir())
+    assert n_bytes == 1000 * (6 * 4 + 3 + 2)
+    for free, is_enough in ((n_bytes, False), (2 * n_bytes, True)):
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        folder = tmp_path / f"{free}"
+        folder.mkdir()
+        if is_enough:
+            CloudAssembly(context(folder), [many], 1.0)
+        else:
+            with pytest.raises(StoreError, match="1000 points need"):
+                CloudAssembly(context(folder), [many], 1.0)
+            assert list(folder.iterdir()) == []
+
+
+# --- how coordinates are rounded ---
+
+
+@pytest.mark.parametrize("step", [0.005, 0.01, 0.02, 0.05, 0.1, 0.5, 1.0, 100.0, 0.0078125, 8.0])
+def test_a_coarse_step_is_found(step: float) -> None:
+    rng = np.random.default_rng(7)
+    rounded = step * rng.integers(0, 1000, (3000, 3)) + 12.0 * step
+    assert rounding_m(rounded, 1.0) == pytest.approx(step)
+    if step in (0.005, 0.01, 0.02, 0.05, 0.1, 0.5):
+        # In millimetres as well, in which half a metre is the coarsest that is looked for.
+        assert rounding_m(1000.0 * rounded, 0.001) == pytest.approx(step)
+
+
+def test_what_is_finer_than_five_millimetres_is_not_told() -> None:
+    rng = np.random.default_rng(8)
+    assert rounding_m(0.002 * rng.integers(0, 5000, (3000, 3)), 1.0) == 0.0
+    # 2 mm are five of a file in units of 0.4 mm.
+    assert rounding_m(rng.uniform(0.0, 5.0, (3000, 3)), 1.0) == 0.0
+
+
+def test_the_finest_axis_counts_and_ten_values_are_needed() -> None:
+    steps = np.array([0.5, 0.1, 0.02]) * np.arange(10)[:, None]
+    assert rounding_m(steps, 1.0) == pytest.approx(0.02)
+    # Of nine values an axis says nothing; those that are not finite are none.
+    few = steps.copy()
+    few[0, 2] = np.nan
+    assert rounding_m(few, 1.0) == pytest.approx(0.1)
+    assert rounding_m(steps[:9], 1.0) == 0.0
+
+
+def test_values_need_not_lie_exactly_on_their_step() -> None:
+    steps = 0.1 * np.tile(np.arange(20.0)[:, None], 3)
+    for off, found in ((0.0009, 0.1), (0.0011, 0.0)):
+        moved = steps.copy()
+        moved[7] += off
+        assert rounding_m(moved, 1.0) == pytest.approx(found)
+
+
+@pytest.mark.parametrize(
+    ("farthest_m", "apart_m"), [(1.5, 2.0**-23), (500.0, 2.0**-15), (513.0, 2.0**-14)]
+)
+def test_float32_is_coarser_far_away(farthest_m: float, apart_m: float) -> None:
+    assert resolution_m(farthest_m) == apart_m
