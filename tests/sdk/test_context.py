@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 from orthoflow.errors import ProductError
 from orthoflow.sdk import Method, MethodParams, Ports, StepContext, StepEvent
 from orthoflow.sdk.context import Drawing
+from orthoflow.sdk.lines import is_name, one_line
 
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(20)
@@ -176,6 +178,54 @@ def test_a_name_serves_once_and_there_are_only_so_many(
     with pytest.raises(ProductError, match="a step may report 1 figures, not more"):
         ctx.figure("b", PNG)
     assert [metric.name for metric in ctx.metrics] == ["a", "b"]
+
+
+def test_a_step_says_far_more_than_any_has_to_say_and_not_without_end(tmp_path: Path) -> None:
+    ctx = context(tmp_path)
+    for k in range(20_000):
+        ctx.metric(f"m{k}", float(k), "1")
+    with pytest.raises(ProductError, match="a step may report 20000 metrics, not more"):
+        ctx.metric("one_more", 1.0, "1")
+    ctx.figure("first", PNG)
+    (figure,) = ctx.figures
+    ctx.figures += [replace(figure, name=f"f{k}") for k in range(1998)]
+    ctx.figure("last", PNG)
+    with pytest.raises(ProductError, match="a step may report 2000 figures, not more"):
+        ctx.figure("one_more", PNG)
+    heard: list[StepEvent] = []
+    ctx.listen = heard.append
+    for k in range(203):
+        ctx.warn(f"warning {k}")
+    assert len(heard) == 200
+    assert ctx.warnings[199:] == ["warning 199", "3 more warnings, which are not kept"]
+
+
+class OfSize:
+    def __init__(self, n_bytes: int) -> None:
+        self.n_bytes = n_bytes
+
+    def savefig(self, path: Path) -> None:
+        with path.open("wb") as file:
+            file.truncate(self.n_bytes)  # without a byte on the disk
+
+
+@pytest.mark.usefixtures("charts")
+def test_a_figure_may_have_64_mebibytes(tmp_path: Path) -> None:
+    ctx = context(tmp_path)
+    ctx.figure("largest", OfSize(64 * 1024**2))
+    with pytest.raises(ProductError, match="figure larger must be a file of at most 64 MiB"):
+        ctx.figure("larger", OfSize(64 * 1024**2 + 1))
+    assert [figure.name for figure in ctx.figures] == ["largest"]
+
+
+def test_a_name_has_two_hundred_bytes_at_most() -> None:
+    names = ["n" * 200, "n" * 201, "ä" * 100, "ä" * 101]
+    assert [is_name(name) for name in names] == [True, False, True, False]
+
+
+def test_a_line_has_two_thousand_letters_and_tells_of_the_rest() -> None:
+    assert one_line("x" * 2000) == "x" * 2000
+    assert one_line("x" * 2001) == f"{'x' * 2000}... (2001 characters)"
 
 
 class LeadsElsewhere:

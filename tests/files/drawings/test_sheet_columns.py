@@ -347,8 +347,9 @@ def test_nothing_lies_over_another(drawn: Page, paper: tuple[float, float]) -> N
     right = paper[0] - 10.0
     left = right - at.paper.column_mm
     for text in drawn.texts:
-        assert left < text.left
-        assert text.left + text.width < right
+        # A few millimetres from the frame, as people leave them.
+        assert left + 2.0 < text.left
+        assert text.left + text.width < right - 2.0
         assert 10.0 < text.bottom < text.bottom + text.high < paper[1] - 10.0
     rules = [one for one in drawn.lines if len(one.points) == 2 and np.ptp(one.points[:, 0]) > 50]
     rules = [one for one in rules if abs(np.ptp(one.points[:, 0]) - at.paper.column_mm) < 1e-6]
@@ -367,6 +368,10 @@ def test_nothing_lies_over_another(drawn: Page, paper: tuple[float, float]) -> N
         assert all(not bottom < y < top for _, bottom, _, top in boxes)
     words = written(drawn)
     assert "sheets of wall 7" in words
+    assert 2.0 < min(text.left for text in drawn.texts) - left < 5.0
+    # Notes are the smallest of what is written in sentences, and still read at arm's length.
+    high = {text.text: text.high for text in drawn.texts}
+    assert 1.5 < high["first note"] < high["sheet 1 of 1"] < high["scale 1:50"]
     # From above to below: title, bar, notes, the key of the sheets, the plan.
     places = [words.index(word) for word in ("scale 1:50", "first note", "sheets of wall 7")]
     assert places == sorted(places)

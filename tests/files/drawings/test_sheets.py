@@ -161,6 +161,16 @@ def test_heights_are_told_of_walls_that_are_upright_to_a_degree() -> None:
     assert axes_of(wall, -up).down == (0.0, -1.0)
 
 
+def test_a_raster_in_a_map_has_the_coordinates_of_the_map() -> None:
+    frame = replace(samples.facing_east(0.5, 40, 20, (1.0, 2.0, 30.0)), map_crs="EPSG:25832")
+    found = axes_of(frame, np.array([0.0, 0.0, 1.0]))
+    # Three metres to the right and two down, as its GeoTIFF has them.
+    (place,) = frame.raster_from_wall(np.array([[6.0, 4.0]]))
+    told = [found.across[0] + 3.0 * found.across[1], found.down[0] + 2.0 * found.down[1]]
+    np.testing.assert_allclose(told, place)
+    assert found.said == "X east, Y north (EPSG:25832), m"
+
+
 # --- openings ---
 
 

@@ -1,0 +1,226 @@
+"""What an export of a cloud writes: which points, by which colours, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rasterio.crs import CRS
+
+from orthoflow.cli.exports import clouds as module
+from orthoflow.cli.exports.choices import Choices
+from orthoflow.errors import ArgumentError
+from orthoflow.files.clouds.dressing import DressedCloud
+from orthoflow.products import Planes, PointCloud, PointLabels, Product
+from tests import samples
+
+N_SIDE = 12
+
+
+def cloud(**more: Any) -> PointCloud:
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.0, 1.0, N_SIDE)] * 2))
+    x, y = (np.ascontiguousarray(axis, np.float32) for axis in (a, b))
+    plain = {"intensity": np.linspace(0.0, 1.0, len(x), dtype=np.float32)}
+    up = np.array([0.0, 0.0, 1.0])
+    return PointCloud(origin=np.zeros(3), x=x, y=y, z=np.zeros_like(x), up=up, **(plain | more))
+
+
+def planes() -> Planes:
+    corners = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]])
+    return samples.planes(
+        normal=np.array([[0.0, 0.0, 1.0]]),
+        offset=np.zeros(1),
+        corners=corners,
+        n_points=np.array([1]),
+        names=("floor",),
+    )
+
+
+def labels(n_points: int = N_SIDE**2) -> PointLabels:
+    return PointLabels(plane_index=np.zeros(n_points, np.int16))
+
+
+class ToyRun:
+    """Cells of products that lie in its record."""
+
+    def __init__(self, cells: dict[str, tuple[dict[str, str], dict[str, Product]]]) -> None:
+        """Make one.
+
+        Args:
+            cells: address -> the cell that gave each input, and the outputs.
+        """
+        self.record = SimpleNamespace(run_id="r1")
+        self._products: dict[tuple[str, str], Product] = {}
+        self.cells: dict[str, Any] = {}
+        for address, (taken, given) in cells.items():
+            outputs = {}
+            for port, product in given.items():
+                self._products[address, port] = product
+                outputs[port] = self._named(address, port)
+            inputs = {
+                port: self.cells[source].outputs[port.rstrip("2")] for port, source in taken.items()
+            }
+            self.cells[address] = SimpleNamespace(
+                outputs=outputs, inputs=inputs, assignment={}, repeat=0
+            )
+
+    def _named(self, address: str, port: str) -> Any:
+        return SimpleNamespace(
+            digest=f"{address}.{port}",
+            type_name=self._products[address, port].type_name,
+            embedded=True,
+        )
+
+    def cell(self, address: str) -> Any:
+        return self.cells[address]
+
+    def payload(self, address: str, port: str) -> Any:
+        return self._products[address, port].to_payload()
+
+
+def labelled(of: PointCloud | None = None, marks: PointLabels | None = None) -> Any:
+    return ToyRun(
+        {
+            "scan": ({}, {"cloud": of or cloud()}),
+            "plane": ({"cloud": "scan"}, {"planes": planes(), "labels": marks or labels()}),
+        }
+    )
+
+
+def exported(folder: Path, run: Any, **choices: Any) -> tuple[str, DressedCloud]:
+    """What is said, and what would be written."""
+    kept: list[DressedCloud] = []
+
+    def write(path: Path, dressed: DressedCloud) -> int:
+        kept.append(dressed)
+        path.touch()
+        return sum(len(block) for block in dressed.blocks())
+
+    said = module._export(run, folder, Choices(**choices), ("cloud.toy", write))
+    (dressed,) = kept
+    return said, dressed
+
+
+def test_the_labelled_cloud_is_written_with_its_planes(tmp_path: Path) -> None:
+    said, dressed = exported(tmp_path, labelled())
+    assert said == "cloud.toy: 144 points by intensity, cloud of plane"
+    assert dressed.labels is not None
+    assert dressed.planes is not None
+    assert (dressed.wall, dressed.wall_plane, dressed.box_world) == (None, -1, None)
+    assert (dressed.is_cleaned, dressed.crs_wkt, dressed.photo_names) == (False, "", ())
+    assert dressed.name == "scan.cloud"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.json", "cloud.toy"]
+
+
+def test_without_labels_the_cloud_itself_is_written(tmp_path: Path) -> None:
+    run = ToyRun({"scan": ({}, {"cloud": cloud()})})
+    said, dressed = exported(tmp_path, run, clean=True)
+    assert said == "cloud.toy: 144 points by intensity, cloud of scan"
+    assert (dressed.planes, dressed.labels, dressed.is_cleaned) == (None, None, True)
+
+
+def test_a_box_leaves_points_out_and_says_so(tmp_path: Path) -> None:
+    # Corners in any order.
+    said, dressed = exported(tmp_path, labelled(), box="0.5,1,1,0,0,-1")
+    assert said == "cloud.toy: 72 points of 144 by intensity, cloud of plane"
+    np.testing.assert_array_equal(dressed.box_world, [[0.0, 0.0, -1.0], [0.5, 1.0, 1.0]])
+    with pytest.raises(ArgumentError, match=r"^no point of the cloud of plane is left: choose"):
+        exported(tmp_path, labelled(), box="5,5,5,6,6,6")
+
+
+@pytest.mark.parametrize("box", ["", "1,2,3,4,5", "1,2,3,4,5,6,7", "a,2,3,4,5,6", "1,2,nan,4,5,6"])
+def test_a_box_is_six_numbers(box: str) -> None:
+    with pytest.raises(ArgumentError, match="--box takes six numbers in metres"):
+        module._box(box)
+
+
+@pytest.mark.parametrize(
+    ("more", "first", "others"),
+    [
+        ({"rgb": np.zeros((N_SIDE**2, 3), np.uint8)}, "rgb", ["intensity", "plane", "deviation"]),
+        ({}, "intensity", ["plane", "deviation"]),
+        ({"intensity": None}, "plane", ["deviation"]),
+    ],
+)
+def test_the_best_colours_that_there_are_come_first(
+    tmp_path: Path, more: dict[str, Any], first: str, others: list[str]
+) -> None:
+    run = labelled(replace(cloud(), **more))
+    assert exported(tmp_path, run)[1].colouring == first
+    for colour in others:
+        assert exported(tmp_path, run, colour=colour)[1].colouring == colour
+    with pytest.raises(ArgumentError) as caught:
+        exported(tmp_path, run, colour="photos")
+    assert str(caught.value) == (
+        "--colour photos: the run has nothing for it (plane); it has what is needed for "
+        + ", ".join([first, *others])
+    )
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    grey = ToyRun({"scan": ({}, {"cloud": replace(cloud(), intensity=None)})})
+    with pytest.raises(ArgumentError, match="of scan has no colours, intensities or planes"):
+        exported(folder, grey)
+    none = np.zeros(0, np.float32)
+    empty = PointCloud(origin=np.zeros(3), x=none, y=none, z=none, up=np.array([0.0, 0.0, 1.0]))
+    with pytest.raises(ArgumentError, match="the cloud of scan has no points"):
+        exported(folder, ToyRun({"scan": ({}, {"cloud": empty})}))
+    with pytest.raises(ArgumentError, match=r"^the labels are of 9 points, but the cloud has 144$"):
+        exported(folder, labelled(marks=labels(9)))
+    two = ToyRun(
+        {
+            "scan": ({}, {"cloud": cloud()}),
+            "plane": ({"cloud": "scan", "cloud2": "scan"}, {"labels": labels()}),
+        }
+    )
+    with pytest.raises(ArgumentError, match="plane labels no cloud of its own: it takes 2 clouds"):
+        exported(folder, two)
+    with pytest.raises(ArgumentError, match="--wall 3: the run has no wall 3; it has none"):
+        exported(folder, labelled(), wall=3)
+    assert not folder.exists()
+
+
+def test_one_wall_is_meant_by_the_number_of_its_plane() -> None:
+    assert module._wall(None, None) == (None, -1)
+    walls: Any = SimpleNamespace(
+        walls=[SimpleNamespace(plane_index=4), SimpleNamespace(plane_index=8)],
+        slab=lambda place: f"slab {place}",
+    )
+    assert module._wall(walls, 8) == ("slab 1", 8)
+    with pytest.raises(ArgumentError, match="--wall 1: the run has no wall 1; it has 4, 8"):
+        module._wall(walls, 1)
+
+
+def test_the_coordinate_system_is_written_where_all_walls_agree() -> None:
+    def walls(*names: str | None) -> Any:
+        return SimpleNamespace(
+            walls=[SimpleNamespace(frame=SimpleNamespace(map_crs=name)) for name in names]
+        )
+
+    assert module._crs_wkt(None) == ""
+    assert module._crs_wkt(walls(None, "site")) == ""
+    assert CRS.from_wkt(module._crs_wkt(walls("EPSG:25832", None))).to_epsg() == 25832
+    assert module._crs_wkt(walls("EPSG:25832", "EPSG:25833")) == ""
+
+
+def test_points_that_no_photo_sees_stay_grey(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def colour_points(_cloud: object, oriented: object, colours: Any) -> None:
+        assert oriented == ("the photos",)
+        colours.rgb[0], colours.photo[0] = (1, 2, 3), 0
+
+    monkeypatch.setattr("orthoflow.files.clouds.photo_colours.colour_points", colour_points)
+    found: Any = SimpleNamespace(cloud=cloud(), oriented=("the photos",))
+    colours = module._photo_colours(found, tmp_path)
+    assert colours.photo is not None
+    assert colours.rgb[0].tolist() == [1, 2, 3]
+    assert (colours.rgb[1:] == 128).all()
+    assert colours.photo.tolist() == [0] + [-1] * (N_SIDE**2 - 1)
+    assert (colours.best == 0.0).all()
+    assert colours.rgb.shape == (N_SIDE**2, 3)
