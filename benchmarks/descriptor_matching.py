@@ -31,7 +31,7 @@ def descriptors(n: int, seed: int) -> NDArray[np.float32]:
 
 
 def ours(photo: NDArray[np.float32], wall: NDArray[np.float32]) -> set[tuple[int, int]]:
-    found = mutual_matches(photo, wall, ratio_most=RATIO)
+    found = mutual_matches(photo, wall, ratio_most=RATIO, is_exact=True)
     return set(zip(found.first.tolist(), found.second.tolist(), strict=True))
 
 

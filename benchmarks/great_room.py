@@ -45,7 +45,9 @@ PANORAMA_SHARE = 1.0 / 3.0
 FLOOR_M, CEILING_M = -1.5, 3.5
 MIRROR_SHARE = 0.85
 STATION = np.array([-0.07, 1.31, 0.1])
-ERRORS = Errors(noise_m=0.0018, outlier_share=0.005, beam_m=0.0, colour_noise=0.0)
+ERRORS = Errors(
+    noise_m=0.0018, outlier_share=0.005, beam_m=0.0, colour_noise=0.0, inversion=0.0, band_seed=0
+)
 
 _PLASTER = Paint(kind=TextureKind.PLAIN, rgb=(210, 200, 180), reflectance=0.5)
 _CLOTH = Paint(kind=TextureKind.TEXTILE, rgb=(150, 60, 60), reflectance=0.35)

@@ -104,14 +104,24 @@ def detect(
     elif method.startswith("hough3d"):
         coarser = 1.0 if method == "hough3d-full" else 2.0
         space = SpaceVoting(
-            cell_m=coarser * CELL_M, angle_step_deg=coarser, least_points=SHARE * len(cloud)
+            cell_m=coarser * CELL_M,
+            angle_step_deg=coarser,
+            least_points=SHARE * len(cloud),
+            tilt_most_deg=10.0,
+            is_raw=False,
         )
 
         def proposer_of(cloud: PreparedCloud, _: Unassigned, __: Rules) -> Proposer:
             return SpaceProposer(cloud, space)
 
     else:
-        voting = Voting(angle_step_deg=1.0, least_points=SHARE * len(cloud))
+        voting = Voting(
+            angle_step_deg=1.0,
+            least_points=SHARE * len(cloud),
+            walls=True,
+            levels=True,
+            is_raw=False,
+        )
 
         def proposer_of(cloud: PreparedCloud, _: Unassigned, __: Rules) -> Proposer:
             return PlanProposer(cloud, voting)

@@ -76,6 +76,8 @@ def random_room(
         outlier_share=0.005,
         beam_m=float(rng.uniform(0.002, 0.008)),
         colour_noise=1.0,
+        inversion=0.0,
+        band_seed=0,
     )
     scan = scan_scene(draft.finished(spectral_gap=0.0), sweeps, errors, context(folder))
     cloud = PointCloud(

@@ -249,9 +249,7 @@ def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(edge, window), dtype=np.bool_)
 
 
-def sample_findings(
-    samples: WallSamples, wall: int, *, sources_are_traced: bool = False
-) -> list[Finding]:
+def sample_findings(samples: WallSamples, wall: int, *, sources_are_traced: bool) -> list[Finding]:
     """Numbers on the cells of one wall, or of all with wall -1; none for what has no samples.
 
     Displacements and ghosts bear a longer name when they also follow from the photos' cameras,

@@ -34,8 +34,6 @@ _STEP_SPREADS: Final = 6.0
 # Of so many cells in a line along the shadow of a step, more than so many are empty.
 _LINE_CELLS: Final = 9
 _LINE_SHARE: Final = 0.5
-# Depth that stands for none, beyond all walls.
-_FAR_M: Final = np.float32(1e6)
 # Places with texture lie so far apart, and are taken in turns from a grid of so many cells a side.
 _APART_CELLS: Final = 5
 _GRID: Final = 16
@@ -159,9 +157,9 @@ def _filled_at_steps(wall: Wall) -> NDArray[np.bool_]:
     if not empty.any():
         return np.asarray(empty, dtype=np.bool_)
     known = np.isfinite(wall.depth_m)
-    kernel = np.ones((3, 3), dtype=np.uint8)
-    high = cv2.dilate(np.where(known, wall.depth_m, -_FAR_M), kernel)
-    low = cv2.erode(np.where(known, wall.depth_m, _FAR_M), kernel)
+    kernel, inf = np.ones((3, 3), dtype=np.uint8), np.float32(np.inf)
+    high = cv2.dilate(np.where(known, wall.depth_m, -inf), kernel)
+    low = cv2.erode(np.where(known, wall.depth_m, inf), kernel)
     step_m = max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * usual_spread_m(wall))
     return np.asarray(empty & (high - low > step_m), dtype=np.bool_)
 

@@ -92,7 +92,7 @@ def mutual_matches(
     second: NDArray[np.float32],
     *,
     ratio_most: float,
-    is_exact: bool = True,
+    is_exact: bool,
 ) -> Matches:
     """Pair descriptors that are each other's nearest and clearly nearer than the next.
 

@@ -73,10 +73,10 @@ class Voting:
 
     angle_step_deg: float
     least_points: float
-    walls: bool = True
-    levels: bool = True
+    walls: bool
+    levels: bool
     accumulator: Accumulation = "counts"
-    is_raw: bool = False
+    is_raw: bool
 
 
 class PlanProposer:

@@ -102,9 +102,9 @@ class Rules:
     least_share: float
     stop_unclassified_share: float
     tilt_most_deg: float
-    stop_rest_share: float = 0.0
-    is_exact: bool = False
-    joins_parts: bool = True
+    stop_rest_share: float
+    is_exact: bool
+    joins_parts: bool
 
 
 @dataclass(frozen=True, kw_only=True)

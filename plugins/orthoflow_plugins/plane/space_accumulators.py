@@ -69,8 +69,8 @@ class SpaceVoting:
     angle_step_deg: float
     least_points: float
     family: Family = "any"
-    tilt_most_deg: float = 10.0
-    is_raw: bool = False
+    tilt_most_deg: float
+    is_raw: bool
 
 
 class SpaceProposer:

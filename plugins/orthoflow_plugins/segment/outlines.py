@@ -175,7 +175,6 @@ def _side(ring: NDArray[np.float64], first: int, last: int) -> _Side:
     inner = along[(place >= ends) & (place <= length - ends)]
     if length < _FITTED_CELLS or len(inner) < _FITTED_CELLS / 2:
         return _Side(first=first, last=last, begin=begin, end=end, scatter=_STRAIGHT_CELLS)
-    across = np.array([-direct[1], direct[0]])
     for _ in range(3):
         middle = inner.mean(axis=0)
         _, _, rows = np.linalg.svd(inner - middle, full_matrices=False)

@@ -89,7 +89,7 @@ class Film:
     noise_grey: float
     vignetting: float
     supersample: int
-    exposures: float = 0.0
+    exposures: float
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,9 +72,9 @@ class RoomPlan:
             `MOST_TEXTILE`.
     """
 
-    relief: float = 1.0
-    obstacle: bool = True
-    spectral_gap: float = 0.3
+    relief: float
+    obstacle: bool
+    spectral_gap: float
     textile_share: float = TEXTILE_BY_DESIGN
 
 

@@ -80,8 +80,8 @@ class Errors:
     outlier_share: float
     beam_m: float
     colour_noise: float
-    inversion: float = 0.0
-    band_seed: int = 0
+    inversion: float
+    band_seed: int
 
 
 @dataclass(frozen=True, kw_only=True)

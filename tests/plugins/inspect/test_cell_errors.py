@@ -167,8 +167,9 @@ def samples_of(**given: Any) -> WallSamples:
     return WallSamples(**{**usual, **given})
 
 
-def numbers_of(samples: WallSamples, **options: bool) -> dict[str, float]:
-    return {item.name: item.value for item in sample_findings(samples, 2, **options)}
+def numbers_of(samples: WallSamples, *, sources_are_traced: bool = False) -> dict[str, float]:
+    found = sample_findings(samples, 2, sources_are_traced=sources_are_traced)
+    return {item.name: item.value for item in found}
 
 
 def test_numbers_follow_their_definitions() -> None:
@@ -209,7 +210,7 @@ def test_numbers_follow_their_definitions() -> None:
         "ghost_share": 0.05,
     }
     assert found == {name: pytest.approx(value, rel=1e-3) for name, value in expected.items()}
-    assert {item.wall for item in sample_findings(samples, 2)} == {2}
+    assert {item.wall for item in sample_findings(samples, 2, sources_are_traced=False)} == {2}
     traced = numbers_of(samples, sources_are_traced=True)
     assert traced["patch_rmse_u_mm"] == found["rmse_u_mm"]
     assert traced["ghost_colour_share"] == 0.05

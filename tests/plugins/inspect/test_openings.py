@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +13,18 @@ from orthoflow_plugins.inspect.openings import InspectOpenings
 from orthoflow.errors import MethodError
 from orthoflow.products import Inspection, Opening, Openings
 from tests.raster_scenes import context
-from tests.recess_scenes import GSD_M, opening, scene
+from tests.recess_scenes import DEPTH_M, GSD_M, RECESS, opening, scene
 
 
-def judged(folder: Path, *openings: Opening) -> tuple[dict[str, float], Inspection]:
+def judged(
+    folder: Path, *openings: Opening, **params: float
+) -> tuple[dict[str, float], Inspection]:
     truth, walls = scene()
     ctx = context(folder)
     inputs = InspectOpenings.In(
         truth=truth, walls=walls, openings=Openings(openings=openings, walls=(3,))
     )
-    outputs = InspectOpenings().run(inputs, InspectOpenings.Params(), ctx)
+    outputs = InspectOpenings().run(inputs, InspectOpenings.Params.model_validate(params), ctx)
     return {metric.name: metric.value for metric in ctx.metrics}, outputs.inspection
 
 
@@ -77,3 +80,85 @@ def test_openings_of_other_walls_are_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(MethodError, match="openings of wall 7 are given, but the walls are 3"):
         InspectOpenings().run(inputs, InspectOpenings.Params(), context(tmp_path))
+
+
+# Of the recess, 0.8 m by 1.22 m.
+WIDTH_M, HEIGHT_M = RECESS[1] - RECESS[0], RECESS[3] - RECESS[2]
+
+
+@pytest.mark.parametrize(
+    ("params", "n_true"),
+    [
+        ({"behind_m": 0.19}, 1),
+        ({"behind_m": 0.21}, 0),
+        ({"area_least_m2": 0.95}, 1),
+        ({"area_least_m2": 1.0}, 0),
+    ],
+    ids=str,
+)
+def test_recesses_that_are_too_shallow_or_small_are_not_asked_for(
+    tmp_path: Path, params: dict[str, float], n_true: int
+) -> None:
+    numbers, _ = judged(tmp_path, opening(scene()[1]), **params)
+    assert numbers["n_true_openings"] == numbers["n_found_openings"] == n_true
+    assert numbers["n_false_openings"] == 1 - n_true
+
+
+@pytest.mark.parametrize(("right_m", "is_found"), [(0.24, True), (0.29, False), (-0.24, True)])
+def test_an_outline_is_of_what_it_shares_half_of_its_area_with(
+    tmp_path: Path, right_m: float, is_found: bool
+) -> None:
+    numbers, _ = judged(tmp_path, opening(scene()[1], right_m=right_m))
+    shared = (WIDTH_M - abs(right_m)) / (WIDTH_M + abs(right_m))
+    assert numbers["opening_iou_min"] == pytest.approx(shared if is_found else 0.0, abs=0.02)
+    assert (numbers["n_found_openings"], numbers["n_false_openings"]) == (is_found, not is_found)
+
+
+@pytest.mark.parametrize(("right_m", "n_stray"), [(0.19, 0), (0.21, 2), (-0.21, 2)])
+def test_sides_ten_cells_from_any_border_are_astray(
+    tmp_path: Path, right_m: float, n_stray: int
+) -> None:
+    numbers, inspection = judged(tmp_path, opening(scene()[1], right_m=right_m))
+    assert numbers["n_stray_sides"] == n_stray
+    assert len(inspection.wall) == 4 - n_stray
+    expected = 0.0 if n_stray else 1e3 * abs(right_m)
+    assert numbers["side_max_mm"] == pytest.approx(expected, abs=0.7)
+
+
+@pytest.mark.parametrize("stated_m", [0.15, 0.26])
+def test_a_depth_is_judged_from_the_face(tmp_path: Path, stated_m: float) -> None:
+    stated = replace(opening(scene()[1]), depth_m=stated_m)
+    numbers, _ = judged(tmp_path, stated)
+    expected = 1e3 * abs(stated_m - DEPTH_M)
+    assert numbers["opening_depth_error_max_mm"] == pytest.approx(expected, abs=0.01)
+    none, _ = judged(tmp_path, replace(stated, depth_m=None))
+    assert "opening_depth_error_max_mm" not in none
+    worst, _ = judged(tmp_path, opening(scene()[1]), stated)
+    assert worst["opening_depth_error_max_mm"] == pytest.approx(expected, abs=0.01)
+
+
+def test_of_two_outlines_of_one_recess_the_better_one_counts(tmp_path: Path) -> None:
+    walls = scene()[1]
+    worse, better = opening(walls, outwards_m=0.08), opening(walls, outwards_m=0.02)
+    for order in ((worse, better), (better, worse)):
+        numbers, inspection = judged(tmp_path, *order)
+        size = (WIDTH_M + 0.04) * (HEIGHT_M + 0.04)
+        assert numbers["opening_iou_mean"] == pytest.approx(WIDTH_M * HEIGHT_M / size, abs=0.02)
+        assert (numbers["n_found_openings"], numbers["n_false_openings"]) == (1, 0)
+        assert len(inspection.wall) == 8
+        assert numbers["side_mean_mm"] == pytest.approx(50.0, abs=0.7)
+        assert numbers["side_rmse_mm"] == pytest.approx(np.hypot(80.0, 20.0) / 2**0.5, abs=0.7)
+        assert numbers["side_max_mm"] == pytest.approx(80.0, abs=0.7)
+
+
+def test_an_arrow_stands_in_the_middle_of_its_side_and_points_outwards(tmp_path: Path) -> None:
+    walls = scene()[1]
+    moved = opening(walls, outwards_m=0.05)
+    _, inspection = judged(tmp_path, moved)
+    corners = moved.outline_world
+    middles = 0.5 * (corners + np.roll(corners, -1, axis=0))
+    np.testing.assert_allclose(inspection.points_world, middles, atol=1e-9)
+    assert inspection.wall.tolist() == [0, 0, 0, 0]
+    # u to the right and v downwards; from the top left corner down, and so on.
+    outwards = np.array([[-1.0, 0.0], [0.0, 1.0], [1.0, 0.0], [0.0, -1.0]])
+    np.testing.assert_allclose(inspection.displacement_m, 0.05 * outwards, atol=1e-3)

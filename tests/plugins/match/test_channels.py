@@ -128,16 +128,17 @@ def test_a_wall_without_intensity_is_no_target() -> None:
     [(0.001, 0.015, True), (0.001, 0.008, False), (0.004, 0.015, False), (0.004, 0.03, True)],
     ids=["step", "less-than-a-cell", "noise", "step-beyond-noise"],
 )
+@pytest.mark.parametrize("base_m", [0.0, 0.3, -0.3])
 def test_the_shadow_of_a_step_is_left_out_of_what_is_compared(
-    spread_m: float, step_m: float, is_left_out: bool
+    spread_m: float, step_m: float, is_left_out: bool, base_m: float
 ) -> None:
     count = np.full((30, 40), 3, dtype=np.uint32)
     # A column that no point fell into beside a step, another one where the wall is even.
     count[:, [20, 30]] = 0
     # Single cells are filled well enough, wherever they are.
     count[[5, 15], 19] = 0
-    depth_m = np.zeros((30, 40), dtype=np.float32)
-    depth_m[:, :20] = step_m
+    depth_m = np.full((30, 40), base_m, dtype=np.float32)
+    depth_m[:, :20] += np.float32(step_m)
     made = wall(count, depth_m)
     made.sigma_m[:] = spread_m
     grey = channels.target_of(made).grey
@@ -175,3 +176,39 @@ def test_places_are_the_strongest_five_cells_around() -> None:
     assert channels.textured_places(strength, usable, 1).tolist() == [[12, 10]]
     nothing = channels.textured_places(np.zeros((5, 5), np.float32), np.ones((5, 5), bool), 10)
     assert nothing.shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("aside", "is_apart"), [(1, False), (2, False), (3, True), (4, True)], ids=str
+)
+def test_places_three_cells_from_a_stronger_one_are_places_of_their_own(
+    aside: int, is_apart: bool
+) -> None:
+    for right, down in ((aside, 0), (-aside, 0), (0, aside), (0, -aside), (aside, -aside)):
+        strength = np.zeros((40, 60), dtype=np.float32)
+        strength[20, 30], strength[20 + down, 30 + right] = 3.0, 2.0
+        found = channels.textured_places(strength, np.ones((40, 60), dtype=np.bool_), 10)
+        assert len(found) == 1 + is_apart
+
+
+@pytest.mark.parametrize("n_most", [1, 40, 256, 300, 900])
+def test_the_strongest_of_each_part_come_before_the_second_strongest_of_any(n_most: int) -> None:
+    # Places every six cells over 16 x 16 parts of 17 x 15 cells; many parts hold six of them.
+    rng = np.random.default_rng(8)
+    strength = np.zeros((16 * 17, 16 * 15), dtype=np.float32)
+    rows, columns = (part.ravel() for part in np.mgrid[0:272:6, 0:240:6])
+    rows[-1], columns[-1] = 271, 239
+    strength[rows, columns] = rng.permutation(len(rows)) + 1.0
+    height, width = (int(np.ptp(part)) + 1 for part in (rows, columns))
+    part_of = (16 * rows // height) * 16 + 16 * columns // width
+    turn = np.array(
+        [
+            np.count_nonzero(
+                (part_of == part_of[k]) & (strength[rows, columns] > strength[rows[k], columns[k]])
+            )
+            for k in range(len(rows))
+        ]
+    )
+    order = np.lexsort((-strength[rows, columns], turn))[:n_most]
+    found = channels.textured_places(strength, np.ones(strength.shape, dtype=np.bool_), n_most)
+    assert found.tolist() == np.column_stack([columns, rows])[order].tolist()

@@ -92,7 +92,7 @@ def test_pairs_are_each_other_s_nearest_and_distinct(is_exact: bool) -> None:
     # In one direction alone the second of the two is paired, too.
     assert paired(best_matches(first, second, ratio_most=0.8)) == [(0, 4), (1, 4), (2, 9)]
     assert len(best_matches(first, second, ratio_most=1.0)) == 4
-    assert len(mutual_matches(first[:0], second, ratio_most=0.8)) == 0
+    assert len(mutual_matches(first[:0], second, ratio_most=0.8, is_exact=is_exact)) == 0
 
 
 def window(

@@ -103,7 +103,7 @@ def test_neighbours_are_those_of_brute_force(seed: int) -> None:
     second = np.vstack([first[:700] + rng.integers(-6, 7, (700, 128)), first[:300]]).astype(
         np.float32
     )
-    found = mutual_matches(first, second, ratio_most=0.8)
+    found = mutual_matches(first, second, ratio_most=0.8, is_exact=True)
     distance = cdist(first.astype(np.float64), second.astype(np.float64))
     order = np.argsort(distance, axis=1, kind="stable")
     rows = np.arange(len(first))
@@ -202,7 +202,10 @@ def test_neighbours_within_a_window_are_those_of_brute_force(seed: int) -> None:
 
 def test_nothing_matches_nothing() -> None:
     empty = np.empty((0, 128), dtype=np.float32)
-    assert len(mutual_matches(empty, np.ones((3, 128), np.float32), ratio_most=0.8)) == 0
+    assert (
+        len(mutual_matches(empty, np.ones((3, 128), np.float32), ratio_most=0.8, is_exact=True))
+        == 0
+    )
 
 
 def test_turning_an_image_turns_its_key_points(scene: ms.TexturedWall) -> None:
@@ -210,7 +213,7 @@ def test_turning_an_image_turns_its_key_points(scene: ms.TexturedWall) -> None:
     grey = decode_image(photo.encoded)[:, :, 0]
     upright = find_features(grey, RULE)
     turned = find_features(np.ascontiguousarray(grey[::-1, ::-1]), RULE)
-    pairs = mutual_matches(upright.descriptors, turned.descriptors, ratio_most=0.8)
+    pairs = mutual_matches(upright.descriptors, turned.descriptors, ratio_most=0.8, is_exact=True)
     back = np.array([photo.width, photo.height]) - turned.pixels[pairs.second]
     error = upright.pixels[pairs.first] - back
     error = error[np.linalg.norm(error, axis=1) < 2.0]
@@ -224,7 +227,7 @@ def test_mirrored_descriptors_are_those_of_the_mirrored_image(scene: ms.Textured
     upright = find_features(grey, RULE)
     flipped = find_features(np.ascontiguousarray(grey[:, ::-1]), RULE)
     expected = upright.mirrored(grey.shape[1])
-    pairs = mutual_matches(expected.descriptors, flipped.descriptors, ratio_most=0.8)
+    pairs = mutual_matches(expected.descriptors, flipped.descriptors, ratio_most=0.8, is_exact=True)
     error = np.linalg.norm(expected.pixels[pairs.first] - flipped.pixels[pairs.second], axis=1)
     turn = expected.angles_deg[pairs.first] - flipped.angles_deg[pairs.second]
     assert np.median(np.abs((turn + 180.0) % 360.0 - 180.0)) < 1.0
@@ -266,7 +269,7 @@ def test_a_second_look_finds_several_times_the_ties(scene: ms.TexturedWall) -> N
         angles_deg=np.tile(features.angles_deg, 2),
         descriptors=np.tile(features.descriptors, (2, 1)),
     )
-    none = mutual_matches(features.descriptors, double.descriptors, ratio_most=0.9)
+    none = mutual_matches(features.descriptors, double.descriptors, ratio_most=0.9, is_exact=True)
     assert len(none) == 0
     seeds = Matches(first=np.arange(20), second=np.arange(20), ratio=np.full(20, 0.5))
     found = rematched(

@@ -161,7 +161,10 @@ def test_what_was_rejected_bars_lines_like_it_from_both_sides(turn_deg: float) -
         parts=1,
         counts_plan=True,
     )
-    proposer = PlanProposer(cloud, Voting(angle_step_deg=1.0, least_points=1_000.0, levels=False))
+    proposer = PlanProposer(
+        cloud,
+        Voting(angle_step_deg=1.0, least_points=1_000.0, walls=True, levels=False, is_raw=False),
+    )
     candidate = proposer.propose(Unassigned.of(cloud))
     assert candidate is not None
     angle, place = proposer._last
@@ -188,7 +191,10 @@ def test_what_was_rejected_bars_the_heights_about_it() -> None:
         parts=1,
         counts_plan=True,
     )
-    proposer = PlanProposer(cloud, Voting(angle_step_deg=5.0, least_points=1_000.0, walls=False))
+    proposer = PlanProposer(
+        cloud,
+        Voting(angle_step_deg=5.0, least_points=1_000.0, walls=False, levels=True, is_raw=False),
+    )
     candidate = proposer.propose(Unassigned.of(cloud))
     assert candidate is not None
     _, storey = proposer._last

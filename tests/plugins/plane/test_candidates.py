@@ -25,7 +25,9 @@ def rules(*, is_exact: bool = True, tilt_most_deg: float = 10.0) -> Rules:
         least_share=0.1,
         stop_unclassified_share=0.05,
         tilt_most_deg=tilt_most_deg,
+        stop_rest_share=0.0,
         is_exact=is_exact,
+        joins_parts=True,
     )
 
 

@@ -206,7 +206,14 @@ def test_the_unit_accumulator_has_the_weaker_maximum(tmp_path: Path) -> None:
     prepared = prepare(cloud, np.eye(3), cell_m=0.02, least_share=0.005, parts=1, counts_plan=True)
     shares = []
     for accumulator in ("counts", "unit"):
-        voting = Voting(angle_step_deg=1.0, least_points=1.0, accumulator=accumulator)
+        voting = Voting(
+            angle_step_deg=1.0,
+            least_points=1.0,
+            walls=True,
+            levels=True,
+            accumulator=accumulator,
+            is_raw=False,
+        )
         proposer = PlanProposer(prepared, voting)
         proposer.propose(Unassigned.of(prepared))
         votes = proposer.first.votes

@@ -143,7 +143,9 @@ def test_voxels_grow_where_a_scene_would_have_too_many() -> None:
     points = rng.uniform(-300.0, 300.0, (20_000, 3))
     cloud = cloud_of(points)
     prepared = prepare(cloud, np.eye(3), cell_m=0.5, least_share=0.005, parts=1)
-    voting = SpaceVoting(cell_m=0.04, angle_step_deg=4.0, least_points=1_000)
+    voting = SpaceVoting(
+        cell_m=0.04, angle_step_deg=4.0, least_points=1_000, tilt_most_deg=10.0, is_raw=False
+    )
     proposer = SpaceProposer(prepared, voting)
     assert proposer._voxels.voxel_m > 0.3
     found = proposer.propose(Unassigned.of(prepared))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,7 +97,9 @@ def test_a_plane_is_proposed_where_it_is_and_not_again_once_rejected() -> None:
         20_000,
     )  # fmt: skip
     cloud = prepared_cloud(sampled((roof,), noise_m=0.002), np.eye(3))
-    voting = SpaceVoting(cell_m=0.04, angle_step_deg=3.0, least_points=2_000)
+    voting = SpaceVoting(
+        cell_m=0.04, angle_step_deg=3.0, least_points=2_000, tilt_most_deg=10.0, is_raw=False
+    )
     proposer = SpaceProposer(cloud, voting)
     unassigned = Unassigned.of(cloud)
     first = proposer.propose(unassigned)
@@ -136,7 +139,7 @@ def test_a_plane_is_proposed_where_it_is_and_not_again_once_rejected() -> None:
         proposer.reject(other)
     assert votes == sorted(votes, reverse=True)
     assert votes[1] < 0.95 * votes[0]
-    few = SpaceProposer(cloud, SpaceVoting(cell_m=0.04, angle_step_deg=3.0, least_points=200_000))
+    few = SpaceProposer(cloud, replace(voting, least_points=200_000))
     assert few.propose(unassigned) is None
 
 

@@ -181,6 +181,17 @@ def test_a_side_is_the_less_exact_the_more_it_scatters_and_the_fewer_points_it_h
         assert found.corners[at_top, 1] == pytest.approx(TOP - 0.5, abs=0.02)
 
 
+def test_what_is_far_off_even_for_a_rough_side_does_not_move_it() -> None:
+    # Middles scatter by half a cell, but ten cells lie one and a half off.
+    cells = block()
+    cells[TOP - 1, LEFT + 1 : RIGHT - 1 : 2] = True
+    cells[TOP - 2 : TOP, 70:80] = True
+    found = outline(cells)
+    begin = int(np.linalg.norm(found.corners - CORNERS[0], axis=1).argmin())
+    ends = np.roll(found.corners, -begin, axis=0)[[0, -1], 1]
+    np.testing.assert_allclose(ends, TOP - 0.5, atol=0.06)
+
+
 @pytest.mark.parametrize(("side", "is_short"), [(7, True), (20, False)])
 def test_short_sides_are_left_where_their_cells_end(side: int, is_short: bool) -> None:
     found = outline(block(50, 50, 50 + side, 90))

@@ -222,7 +222,7 @@ def test_a_block_overlaps_by_seventy_and_fifty_percent(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_nobody_stands_inside_furniture_or_walls(layout: PhotoLayout, seed: int) -> None:
     plan = ShotPlan(layout=layout, gsd_m=0.01, obliquity_deg=30.0)
-    scene = build_room(RoomPlan()).scene
+    scene = build_room(RoomPlan(relief=1.0, obstacle=True, spectral_gap=0.3)).scene
     views = SceneCameras(scene)
     ways = np.random.default_rng(0).normal(size=(500, 3))
     ways[0] = (0.0, 0.0, 1.0)

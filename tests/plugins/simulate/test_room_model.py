@@ -30,7 +30,8 @@ WALLS = ("main wall", "opposite wall", "right wall", "left wall")
 
 @cache
 def room(**changes: float) -> Room:
-    return build_room(RoomPlan(**changes))  # type: ignore[arg-type]
+    plan = {"relief": 1.0, "obstacle": True, "spectral_gap": 0.3, **changes}
+    return build_room(RoomPlan(**plan))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -255,6 +256,9 @@ def test_cloth_covers_as_much_of_the_main_wall_as_asked(share: float) -> None:
     for cloth in cloths:
         assert any(np.allclose(cloth, hole) for hole in found.holes)
         assert area_m2(cloth) > 0.0
+        # Over the skirting and under the cornice.
+        assert cloth[2] >= -1.32
+        assert cloth[3] <= 1.3
     if share:
         first = cloths[0]
         design = np.array([-0.45, 0.65, -0.45, 1.0])

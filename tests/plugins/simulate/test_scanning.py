@@ -16,6 +16,9 @@ NOISE_M = 0.002
 SIDE = 200
 # Radians; all rays of a sweep meet the surface at one distance and angle, to 2e-4 of either.
 STEP = 1e-6
+NO_ERRORS = Errors(
+    noise_m=0.0, outlier_share=0.0, beam_m=0.0, colour_noise=0.0, inversion=0.0, band_seed=0
+)
 
 
 def surface(
@@ -74,8 +77,7 @@ def scanned(scene: Scene, step: float = STEP, **errors: float) -> Scanned:
         rgb=np.zeros((n, 3), dtype=np.uint8),
         rectangle=np.zeros(n, dtype=np.int32),
     )
-    none = {"noise_m": 0.0, "outlier_share": 0.0, "beam_m": 0.0, "colour_noise": 0.0}
-    Scanner(scene, Errors(**(none | errors))).sweep(sweep, 0, SIDE, filled)
+    Scanner(scene, replace(NO_ERRORS, **errors)).sweep(sweep, 0, SIDE, filled)
     return filled
 
 
