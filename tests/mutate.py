@@ -18,9 +18,10 @@ A place is a line with something to mutate. What is done to it:
 Left alone is what no test should hold: docstrings, annotations, decorators, what only type checkers
 read, messages and whatever else an exception is raised with, log and progress lines, `__repr__`,
 assertions of what cannot happen, version numbers of results, what changes speed or looks alone
-(threads, sizes of parts, bands and caches, arguments of drawings, colours, floats below a millionth
-that guard a division), how long another process is waited for at most, and how often a search goes
-on at most: one that has converged moves no more.
+(threads, sizes of parts, bands and caches, from how many on, a hundred thousand or more, a part is
+looked at in place of all, arguments, margins and sizes of drawings, colours and paints, floats
+below a millionth that guard a division), which seed samples begin with, how long another process is
+waited for at most, and how often a search goes on at most: one that has converged moves no more.
 
 The tests of `orthoflow/engine/x.py` are those in `tests/engine`, of a plugin's module those of its
 kind, of `orthoflow/geometry` those in `tests/geometry` and of the kinds that import it. Doctests,

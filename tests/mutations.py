@@ -70,10 +70,16 @@ _UNSEEN_KEYWORDS: Final = re.compile(
 )
 _UNSEEN_NAMES: Final = re.compile(
     r"AT_ONCE|PER_RUN|CHUNK|BLOCK_(POINTS|BYTES)|PART_POINTS|(SCAN|CACHE|READ)_BYTES|IN_MEMORY|_POLL"
-    r"|BAND_(CELLS|PX)|_RGB$|^_?(INK|PAPER)$"
+    r"|BAND_(CELLS|PX)|_BLOCK(_ROWS|_ENTRIES)?$|_(LONGEST|SMALLEST|MAP)_PX$|PIXELS_MOST$"
+    r"|_RGB$|_BGR$|_SEED$|^_?(INK|PAPER)$"
     r"|(TIMEOUT|PATIENCE|CONNECT|STOPPING|CLOSE|GRACE|LOOK|LOOK_EVERY|SILENT|PAUSE|RETRY)_S$"
     r"|ITERATIONS|ROUNDS|(STEPS|PASSES|SWEEPS|PROCESSES)_MOST|^(result_version|citations|cores|threads)$"
 )
+# What lays out a drawing, and how a made-up surface looks.
+_LOOKS: Final = re.compile(r"^(Margins|Paint)$")
+# From how many on a part is looked at in place of all: no quick test has so many.
+_SIZES: Final = re.compile(r"(MOST|TOLD|ASKED|FIRST)$")
+_MANY: Final = 100_000
 _GUARD: Final = 1e-6
 _LARGE: Final = 100
 
@@ -155,7 +161,8 @@ class _Finder(ast.NodeVisitor):
         name = _name_of(node.func)
         # Any negative length means the one that is left.
         is_flat = name == "reshape" and any(ast.unparse(item) == "-1" for item in node.args)
-        if not _TOLD.match(name) and not name.endswith(("Error", "Warning")) and not is_flat:
+        is_told = _TOLD.match(name) or name.endswith(("Error", "Warning"))
+        if not is_told and not _LOOKS.match(name) and not is_flat:
             self.generic_visit(node)
 
     def visit_keyword(self, node: ast.keyword) -> None:
@@ -179,11 +186,11 @@ class _Finder(ast.NodeVisitor):
             self.visit(item)
 
     def visit_Assign(self, node: ast.Assign) -> None:
-        if not any(_UNSEEN_NAMES.search(_name_of(target)) for target in node.targets):
+        if not any(_is_unseen(target, node.value) for target in node.targets):
             self.visit(node.value)
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
-        if node.value is not None and not _UNSEEN_NAMES.search(_name_of(node.target)):
+        if node.value is not None and not _is_unseen(node.target, node.value):
             self.visit(node.value)
 
     # --- what is changed ---
@@ -289,6 +296,18 @@ def _name_of(node: ast.expr) -> str:
     if isinstance(node, ast.Attribute):
         return node.attr
     return node.id if isinstance(node, ast.Name) else ""
+
+
+def _is_unseen(target: ast.expr, value: ast.expr) -> bool:
+    """Whether what a name stands for changes speed, memory or looks alone."""
+    name = _name_of(target)
+    if _UNSEEN_NAMES.search(name):
+        return True
+    if isinstance(value, ast.BinOp) and isinstance(value.op, ast.LShift):
+        # 1 << 22
+        return bool(_SIZES.search(name))
+    number = value.value if isinstance(value, ast.Constant) else 0
+    return bool(_SIZES.search(name)) and isinstance(number, int) and number >= _MANY
 
 
 def _is_text(node: ast.expr) -> bool:

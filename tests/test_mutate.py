@@ -85,6 +85,13 @@ def test_each_operator_changes_what_it_says(source: str, kind: str, lines: set[s
         "_BAND_CELLS: Final = 1 << 23",
         "_ROW_RGB: Final = (235, 165, 20)",
         "_CONNECT_S: Final = 15.0",
+        "_POINTS_MOST: Final = 2_000_000",
+        "_CELLS_TOLD: Final = 1 << 25",
+        "_BLOCK_ROWS: Final = 1024",
+        "_LONGEST_PX: Final = 1400",
+        "_SEED: Final = 1",
+        "_WITH_NAMES: Final = Margins(left=0.7, right=0.1)",
+        "Paint(kind=k, rgb=(214, 206, 190), reflectance=0.7)",
         "def f(*, cores: int = 1): ...",
         "class A:\n    cores: int = 1",
         "b.reshape(-1)",
@@ -93,6 +100,20 @@ def test_each_operator_changes_what_it_says(source: str, kind: str, lines: set[s
 )
 def test_what_no_test_should_hold_is_left_alone(source: str) -> None:
     assert changes(source) == {}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "_PLACES_MOST: Final = 99_999",
+        "_SHARE_MOST: Final = 0.5",
+        "_BITS: Final = 1 << 22",
+        "N_FIRST = (1, 2)",
+        "LONGEST_SIDE_PX: Final = 1200",
+    ],
+)
+def test_what_small_data_meets_is_changed(source: str) -> None:
+    assert changes(source) != {}
 
 
 def test_an_expression_over_several_lines_is_changed_as_a_whole() -> None:
