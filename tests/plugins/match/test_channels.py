@@ -212,3 +212,50 @@ def test_the_strongest_of_each_part_come_before_the_second_strongest_of_any(n_mo
     order = np.lexsort((-strength[rows, columns], turn))[:n_most]
     found = channels.textured_places(strength, np.ones(strength.shape, dtype=np.bool_), n_most)
     assert found.tolist() == np.column_stack([columns, rows])[order].tolist()
+
+
+def test_columns_and_rows_count_alike() -> None:
+    grey = texture(5)
+    grey[60, 80] = np.nan
+    there, turned = channels.grey_channels(grey), channels.grey_channels(grey.T.copy())
+    np.testing.assert_allclose(turned.values[..., 0], there.values[..., 0].T, atol=1e-4)
+    np.testing.assert_array_equal(turned.known, there.known.T)
+    # The direction k across is k less than a right angle down: three steps of thirty degrees.
+    there, turned = channels.gradient_channels(grey), channels.gradient_channels(grey.T.copy())
+    mirrored = there.values[:, :, [3, 2, 1, 0, 5, 4]]
+    np.testing.assert_allclose(turned.values, mirrored.transpose(1, 0, 2), atol=1e-4)
+    strength = channels.texture(there, half_patch_cells=5)
+    np.testing.assert_allclose(
+        channels.texture(turned, half_patch_cells=5), strength.T, atol=1e-3 * strength.max()
+    )
+
+
+def test_an_edge_is_as_broad_as_noise_and_pooling_make_it() -> None:
+    from scipy.ndimage import convolve1d, gaussian_filter1d
+
+    edge = np.zeros((80, 80), dtype=np.float32)
+    edge[:, 40:] = 100.0
+    found = channels.gradient_channels(edge).values[40, 34:46, 0]
+    soft = gaussian_filter1d(edge[40].astype(np.float64), 0.8)
+    slope = np.abs(convolve1d(soft, [1.0, 0.0, -1.0]))
+    expected = gaussian_filter1d(slope, 0.8)[34:46]
+    np.testing.assert_allclose(found / found.max(), expected / expected.max(), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("aside", "is_even"), [(0, False), (12, False), (60, True)], ids=["there", "near", "far"]
+)
+def test_contrast_is_evened_out_over_a_dozen_cells(aside: int, is_even: bool) -> None:
+    # A strip of four times the contrast; beside it the faint texture is fainter still.
+    plain = texture(6, (90, 200))
+    strong = plain.copy()
+    strong[:, 60:80] = 100.0 + 4.0 * (plain[:, 60:80] - 100.0)
+    part = (slice(10, 80), slice(84 + aside, 96 + aside))
+    ratio = np.std(channels.grey_channels(strong).values[part]) / np.std(
+        channels.grey_channels(plain).values[part]
+    )
+    assert (abs(ratio - 1.0) < 0.05) == is_even
+    assert ratio < 1.05
+    if aside == 12:
+        # One standard deviation of the surroundings off, most of it is still felt.
+        assert 0.6 < ratio < 0.9

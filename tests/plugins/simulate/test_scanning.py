@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.simulate.scanning import SPOILT, Errors, Scanned, Scanner, Sweep
+from orthoflow_plugins.simulate.scanning import (
+    SPOILT,
+    Errors,
+    Scanned,
+    Scanner,
+    Sweep,
+    scan_scene,
+)
 
 from orthoflow.geometry.scenes import Scene, SurfaceRole, TextureKind
+from tests.raster_scenes import context
 
 NOISE_M = 0.002
 SIDE = 200
@@ -189,3 +198,58 @@ def test_depths_that_differ_little_do_not_mix() -> None:
     for far_m, mixes in ((3.07, False), (3.09, True)):
         points = scanned(step_in_depth(3.0, far_m), 2e-5, beam_m=0.006)
         assert bool((points.rectangle == SPOILT).any()) is mixes
+
+
+def test_scans_follow_each_other_without_the_rays_that_met_nothing(tmp_path: Path) -> None:
+    # A square of 2 m at 3 m; the second scan stands a metre nearer and to the left of the middle.
+    sweeps = [
+        Sweep(
+            station=np.array([0.0, 0.0, 0.0]),
+            azimuth=-0.4,
+            elevation=-0.45,
+            step=0.05,
+            n_columns=20,
+            n_rows=14,
+            seed=3,
+        ),
+        Sweep(
+            station=np.array([1.0, 0.5, 0.0]),
+            azimuth=-0.9,
+            elevation=-0.2,
+            step=0.1,
+            n_columns=15,
+            n_rows=6,
+            seed=4,
+        ),
+    ]
+    found = scan_scene(surface(3.0), sweeps, NO_ERRORS, context(tmp_path))
+    expected = []
+    for number, sweep in enumerate(sweeps):
+        for column in range(sweep.n_columns):
+            for row in range(sweep.n_rows):
+                azimuth = sweep.azimuth + column * sweep.step
+                elevation = sweep.elevation + row * sweep.step
+                away = 3.0 - sweep.station[0]
+                y = sweep.station[1] + away * math.tan(azimuth)
+                z = sweep.station[2] + away * math.tan(elevation) / math.cos(azimuth)
+                if max(abs(y), abs(z)) < 1.0:
+                    expected.append((number, column, row, 3.0, y, z))
+    numbers = np.array(expected)
+    assert 50 < len(numbers) < 20 * 14 + 15 * 6 - 50
+    points = found.points
+    got = [found.scan, found.column, found.row, points.x, points.y, points.z]
+    np.testing.assert_allclose(np.column_stack(got), numbers, atol=1e-6)
+    np.testing.assert_array_equal(found.stations, [sweep.station for sweep in sweeps])
+    assert {len(array) for array in (points.intensity, points.rgb, points.rectangle)} == {
+        len(numbers)
+    }
+    assert not points.rectangle.any()
+
+
+def test_of_a_scan_that_meets_something_everywhere_nothing_is_left_out(tmp_path: Path) -> None:
+    sweep = Sweep(
+        station=np.zeros(3), azimuth=0.0, elevation=0.0, step=0.01, n_columns=5, n_rows=3, seed=1
+    )
+    found = scan_scene(surface(3.0), [sweep], NO_ERRORS, context(tmp_path))
+    assert found.row.tolist() == [0, 1, 2] * 5
+    assert found.column.tolist() == np.repeat(np.arange(5), 3).tolist()
