@@ -1,0 +1,234 @@
+"""How exact ties should be before any pose, which may be chance, and whose calibration is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.orient import estimation
+from orthoflow_plugins.orient.estimation import (
+    Estimate,
+    EstimationRule,
+    estimate_pose,
+    expected_px,
+    metres_per_pixel,
+    posed,
+    undistorted_pixels,
+    unit_deviation,
+    without_chance,
+)
+
+from orthoflow.geometry.cameras import ViewingCamera
+from orthoflow.geometry.resection import SeenPoints
+from orthoflow.products import Intrinsics, Photo
+from orthoflow.testing import photographed as ms
+from tests.scenes import SURVEY_SHIFT_M
+
+RULE = EstimationRule(rejection_sigma=3.5, threshold_px=None, n_trials_most=1000, seed=1)
+
+
+def camera() -> ViewingCamera:
+    return ms.camera_before(ms.textured_wall(0))
+
+
+def seen_by(
+    viewer: ViewingCamera, n: int, *, noise_px: float = 0.0, seed: int = 1, sigma_px: float = 0.5
+) -> SeenPoints:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([0.2, -0.3, 0.2], [2.8, 0.1, 1.8], (6 * n, 3))
+    pixels = viewer.project(points)[:, :2]
+    inside = np.flatnonzero(viewer.sees(pixels))[:n]
+    assert len(inside) == n
+    return SeenPoints(
+        pixels_photo=pixels[inside] + noise_px * rng.normal(size=(n, 2)),
+        points_world=points[inside],
+        sigma_px=np.full(n, sigma_px),
+        sigma_m=np.full(n, 1e-4),
+    )
+
+
+def photo_by(viewer: ViewingCamera) -> Photo:
+    """A photo that claims to be calibrated by a camera."""
+    return Photo(
+        name="a.png",
+        encoded=b"",
+        width=viewer.width,
+        height=viewer.height,
+        intrinsics=Intrinsics.of(viewer),
+    )
+
+
+@pytest.mark.parametrize("scale", [0.2, 1.0, 2.9])
+def test_the_unit_deviation_is_that_of_normal_vectors(scale: float) -> None:
+    rng = np.random.default_rng(3)
+    lengths = np.hypot(*rng.normal(0.0, scale, (2, 40_000)))
+    assert unit_deviation(lengths) == pytest.approx(scale, rel=0.02)
+    lengths[:15_000] = 1e6
+    # A good third of wrong ones leaves it within reason.
+    assert unit_deviation(lengths) <= 3.0
+
+
+def test_a_unit_deviation_stays_between_a_tenth_and_three() -> None:
+    assert unit_deviation(np.full(9, 0.001)) == 0.1
+    assert unit_deviation(np.full(9, 0.11 * 1.1774)) == pytest.approx(0.11, rel=1e-3)
+    assert unit_deviation(np.full(9, 100.0)) == 3.0
+    assert unit_deviation(np.full(9, 2.9 * 1.1774)) == pytest.approx(2.9, rel=1e-3)
+    assert 0.5 < unit_deviation(np.zeros(0)) < 1.0
+
+
+def ring(inner: float, outer: float, count: int) -> NDArray[np.float64]:
+    """Lengths of vectors that lie evenly over a ring."""
+    shares = (np.arange(count) + 0.5) / count
+    return np.sqrt(inner**2 + shares * (outer**2 - inner**2))
+
+
+def test_a_limit_holds_where_hardly_any_tie_within_it_is_there_by_chance() -> None:
+    right = np.full(100, 0.5)
+    # Eighty wrong ones from one to three times the limit stand for ten within it: a tenth.
+    assert without_chance(np.append(right, ring(3.6, 10.4, 80)), 3.5) == 3.5
+    assert without_chance(np.append(right, ring(3.6, 10.4, 81)), 3.5) < 3.5
+    # Farther off, or not known at all, they tell nothing.
+    beyond = np.append(right, [10.6] * 500 + [np.nan] * 500 + [np.inf] * 500)
+    assert without_chance(beyond, 3.5) == 3.5
+
+
+@pytest.mark.parametrize("n_wrong", [100, 1000, 4000])
+def test_a_limit_is_tightened_until_chance_is_a_tenth(n_wrong: int) -> None:
+    right = np.hypot(*np.random.default_rng(4).normal(0.0, 0.3, (2, 300)))
+    lengths = np.append(right, ring(0.0, 30.0, n_wrong))
+    found = without_chance(lengths, 3.5)
+
+    def share(limit: float) -> float:
+        inside = np.count_nonzero(lengths <= limit)
+        around = np.count_nonzero(lengths <= 3.0 * limit) - inside
+        return around / 8.0 / inside
+
+    assert share(found) <= 0.1
+    # One step before it was not: a fifth less each time.
+    if found < 3.5:
+        assert share(found / 0.8) > 0.1
+        steps = np.log(found / 3.5) / np.log(0.8)
+        assert steps == pytest.approx(round(steps), abs=1e-9)
+
+
+def test_where_all_is_chance_a_limit_ends_at_a_quarter() -> None:
+    assert without_chance(ring(0.0, 30.0, 5000), 3.5) == pytest.approx(3.5 * 0.8**6)
+    assert without_chance(np.zeros(0), 3.5) == 3.5
+
+
+def test_what_is_expected_of_ties_follows_from_their_scale() -> None:
+    # A square of 2 m seen as 1000 px: 500 px for a metre.
+    rng = np.random.default_rng(5)
+    places = rng.uniform(-1.0, 1.0, (4000, 2))
+    points = np.column_stack([places[:, 0], np.zeros(4000), places[:, 1]])
+    seen = SeenPoints(
+        pixels_photo=500.0 * places,
+        points_world=points,
+        sigma_px=np.full(4000, 0.6),
+        sigma_m=np.full(4000, 0.002),
+    )
+    known = replace(seen, sigma_m=np.zeros(4000))
+    assert expected_px(known) == pytest.approx(0.6)
+    in_space = np.sqrt(expected_px(seen) ** 2 - 0.6**2)
+    # Half a metre lies in the middle of the places, seven tenths of it in that of the farther
+    # coordinate: 500 px become 707.
+    assert in_space == pytest.approx(0.002 * 500.0 * np.sqrt(2.0), rel=0.03)
+    for change, factor in (
+        ({"pixels_photo": 3.0 * seen.pixels_photo + 40.0}, 3.0),
+        ({"points_world": 2.0 * points + SURVEY_SHIFT_M}, 0.5),
+        ({"sigma_m": 5.0 * seen.sigma_m}, 5.0),
+    ):
+        moved = np.sqrt(expected_px(replace(seen, **change)) ** 2 - 0.6**2)
+        assert moved == pytest.approx(factor * in_space, rel=1e-6)
+
+
+def test_a_pixel_is_as_large_as_distance_over_focal_length() -> None:
+    viewer = camera()
+    ahead = viewer.centre_world + np.outer([1.0, 2.0, 4.0], viewer.rotation[2])
+    lens = replace(viewer, distortion=np.zeros(5))
+    expected = 2.0 / np.sqrt(lens.fx * lens.fy)
+    assert metres_per_pixel(lens, ahead) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_lens_takes_over_a_pose_and_nothing_else() -> None:
+    viewer = camera()
+    other = replace(ms.nudged(viewer, (0.05, -0.04, 0.06, 0.2, -0.3, 0.1)), fx=777.0)
+    found = posed(viewer, other)
+    np.testing.assert_array_equal(found.rotation, other.rotation)
+    np.testing.assert_array_equal(found.translation, other.translation)
+    assert found.fx == viewer.fx
+
+
+def test_undistorted_pixels_are_those_of_the_plain_lens() -> None:
+    viewer = replace(camera(), skew=3.0)
+    assert viewer.distortion.any()
+    plain = replace(viewer, distortion=np.zeros(5), skew=0.0)
+    seen = seen_by(viewer, 60)
+    found = undistorted_pixels(seen.pixels_photo, viewer)
+    np.testing.assert_allclose(found, plain.project(seen.points_world)[:, :2], atol=1e-6)
+    assert undistorted_pixels(seen.pixels_photo, plain) is seen.pixels_photo
+    skewed = replace(plain, skew=3.0)
+    straight = undistorted_pixels(skewed.project(seen.points_world)[:, :2], skewed)
+    np.testing.assert_allclose(straight, plain.project(seen.points_world)[:, :2], atol=1e-6)
+
+
+def test_a_pixel_beyond_the_lens_model_leaves_the_others_known() -> None:
+    # r (1 - 0.3 r^2) ends at two thirds of r = 1.05: pixels farther out belong to no ray.
+    lens = replace(camera(), distortion=np.array([-0.3, 0.0, 0.0, 0.0, 0.0]), skew=0.0)
+    near = np.array([lens.cx + 50.0, lens.cy - 30.0])
+    far = np.array([lens.cx + 0.9 * lens.fx, lens.cy])
+    found = undistorted_pixels(np.array([near, far, near]), lens)
+    np.testing.assert_array_equal(np.isnan(found), [[False] * 2, [True] * 2, [False] * 2])
+    np.testing.assert_allclose(found[0], undistorted_pixels(near[None], lens)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("off", "n_ties", "is_doubted"),
+    [
+        (0.025, 200, False),
+        (0.036, 200, True),
+        (-0.036, 200, True),
+        (0.10, 25, True),
+        (0.10, 24, False),
+    ],
+    ids=str,
+)
+def test_a_calibration_more_than_three_percent_off_is_of_another_lens(
+    off: float, n_ties: int, is_doubted: bool
+) -> None:
+    true = camera()
+    claimed = replace(true, fx=(1.0 + off) * true.fx, fy=(1.0 + off) * true.fy)
+    # Wide enough that no tie is rejected for the wrong focal length.
+    seen = seen_by(true, n_ties, sigma_px=6.0)
+    is_check = np.zeros(n_ties, dtype=np.bool_)
+    found = estimate_pose(photo_by(claimed), seen, is_check, RULE)
+    if not is_doubted:
+        assert isinstance(found, Estimate)
+        return
+    assert isinstance(found, str)
+    assert f"its calibration says {claimed.fx:.0f} px" in found
+    asked = float(found.split("focal length of ")[1].split(" px")[0])
+    assert asked == pytest.approx(true.fx, rel=0.01)
+
+
+def test_ties_at_four_places_make_no_pose() -> None:
+    true = camera()
+    seen = seen_by(true, 5)
+    for n_places in (4, 5):
+        places = seen.take(np.arange(40) % n_places)
+        start = estimation.robust_start(photo_by(true), places, np.zeros(40, dtype=np.bool_), RULE)
+        assert (start is not None) == (n_places == 5)
+
+
+def test_withheld_ties_have_no_say_in_the_start() -> None:
+    true = camera()
+    seen = seen_by(true, 60)
+    is_check = np.arange(60) % 2 == 0
+    wrong = replace(seen, pixels_photo=np.where(is_check[:, None], 10.0, seen.pixels_photo))
+    start = estimation.robust_start(photo_by(true), wrong, is_check, RULE)
+    assert start is not None
+    np.testing.assert_array_equal(start.agreeing, ~is_check)
+    assert start.source == "calibration"
+    np.testing.assert_allclose(start.camera.centre_world, true.centre_world, atol=1e-3)
