@@ -83,6 +83,10 @@ class Page:
     lines: list[Line] = field(default_factory=list)
     texts: list[Text] = field(default_factory=list)
     clips: list[NDArray[np.float64]] = field(default_factory=list)
+    images: dict[str, tuple[float, float, float, float]] = field(default_factory=dict)
+    said: dict[str, str] = field(default_factory=dict)
+    n_pages: int = 0
+    is_saved: bool = False
     state: dict[str, Any] = field(
         default_factory=lambda: {
             "fill": (0.0, 0.0, 0.0),
@@ -118,6 +122,24 @@ class Page:
 
     def rotate(self, degrees: float) -> None:
         self.state["turned"] = degrees
+
+    def setTitle(self, text: str) -> None:
+        self.said["title"] = text
+
+    def setAuthor(self, text: str) -> None:
+        self.said["author"] = text
+
+    def setSubject(self, text: str) -> None:
+        self.said["subject"] = text
+
+    def drawImage(self, path: str, x: float, y: float, wide: float, high: float) -> None:
+        self.images[path] = (x * MM, y * MM, wide * MM, high * MM)
+
+    def showPage(self) -> None:
+        self.n_pages += 1
+
+    def save(self) -> None:
+        self.is_saved = True
 
     def beginPath(self) -> _Way:
         return _Way()

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pdfplumber
 import pytest
 
 from orthoflow.files.drawings import sheets as module
@@ -14,7 +17,7 @@ from orthoflow.files.drawings.sheet_contents import Axes, MarkedArea, Sheet, She
 from orthoflow.files.drawings.sheets import axes_of
 from orthoflow.files.drawings.title_blocks import TitleBlock
 from tests import samples
-from tests.drawn_pages import Page, page
+from tests.drawn_pages import MM, Page, page
 
 # 6 x 4 m at 1:50 are 120 x 80 mm; the picture begins a metre beside and below the raster's corner.
 PART = Part(left_m=1.0, top_m=1.0, right_m=7.0, bottom_m=5.0)
@@ -247,6 +250,77 @@ def test_contours_before_the_plane_and_behind_it_have_two_colours(
 
 
 # --- sheets ---
+
+
+@pytest.fixture
+def _pictures_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures that nobody reads, and contours of nothing."""
+    monkeypatch.setattr(module, "write_picture", lambda *_args, **_kwargs: None)
+    monkeypatch.setattr(module, "picture_file", lambda path: path.with_suffix(".png"))
+    monkeypatch.setattr(
+        module, "contours", lambda *_args, **_kwargs: [(0.01, np.array([[2.0, 2.0], [3.0, 2.0]]))]
+    )
+
+
+@pytest.mark.usefixtures("_pictures_are_named")
+@pytest.mark.parametrize(("kind", "grid_m"), [("ortho", 0.0), ("ortho", 0.5), ("depth", 0.0)])
+def test_a_picture_lies_in_its_frame(drawn: Page, kind: str, grid_m: float) -> None:
+    view = replace(VIEW, kind=kind)
+    told = drawing(rasters={kind: Path("a.tif")}, grid_m=grid_m, interval_m=0.02)
+    module._draw_view(drawn, told, view, Path("picture_0"))  # type: ignore[arg-type]
+    # 6 x 4 m at 1:50.
+    assert list(drawn.images) == ["picture_0.png"]
+    np.testing.assert_allclose(drawn.images["picture_0.png"], (30.0, 40.0, 120.0, 80.0))
+    frame = drawn.lines[-1]
+    np.testing.assert_allclose(frame.points, [(30, 40), (150, 40), (150, 120), (30, 120)])
+    assert frame.is_closed
+    assert frame.colour == BLACK
+    assert (len(drawn.texts) > 0) is (grid_m > 0.0)
+    # Besides the frame: one contour of a depth, none of anything else.
+    assert (len(drawn.lines) == 2) is (kind == "depth")
+
+
+@pytest.mark.usefixtures("_pictures_are_named")
+@pytest.mark.parametrize("number", [0, 1])
+def test_only_an_index_shows_how_the_wall_is_cut(
+    tmp_path: Path, drawn: Page, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    @contextmanager
+    def canvas(_path: Path, _sheet: Sheet) -> Iterator[Page]:
+        yield drawn
+
+    monkeypatch.setattr(module, "_canvas", canvas)
+    paper = Paper(width_mm=420.0, height_mm=297.0)
+    numbered = ((1, PART), (2, replace(PART, right_m=4.0)))
+    sheet = Sheet(paper=paper, views=(VIEW,), number=number, count=2, numbered=numbered)
+    block = TitleBlock(project="Hall", author="A B")
+    told = drawing(rasters={"ortho": Path("a.tif")}, grid_m=0.0)
+    told = replace(told, text=replace(told.text, block=block))
+    module.write_sheet(tmp_path / "sheet.pdf", told, sheet)
+    cuts = [line for line in drawn.lines if line.colour == RED]
+    assert len(cuts) == (2 if number == 0 else 0)
+    assert drawn.said == {
+        "title": "Hall wall 7",
+        "author": "A B",
+        "subject": f"1:50; record sha256:{'0' * 64}",
+    }
+    assert (drawn.n_pages, drawn.is_saved) == (1, True)
+    # Frame and column are there.
+    assert any(np.allclose(line.points.min(axis=0), 10.0) for line in drawn.lines)
+    assert "provenance" in [text.text for text in drawn.texts]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_is_as_large_as_its_paper_and_the_same_on_another_day(tmp_path: Path) -> None:
+    sheet = Sheet(paper=Paper(width_mm=400.0, height_mm=250.0), views=())
+    for name in ("a.pdf", "b.pdf"):
+        with module._canvas(tmp_path / name, sheet) as canvas:
+            canvas.showPage()
+            canvas.save()
+    assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
+    with pdfplumber.open(tmp_path / "a.pdf") as pdf:
+        (page,) = pdf.pages
+        assert (page.width * MM, page.height * MM) == pytest.approx((400.0, 250.0), abs=1e-3)
 
 
 def test_an_index_shows_what_is_on_which_sheet(drawn: Page) -> None:

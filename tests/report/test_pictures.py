@@ -1,0 +1,315 @@
+"""Pictures of walls on the page: how large they are, what they say, and which share a place."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from orthoflow.files.images import decode_image
+from orthoflow.products import Orthoimages, OrthoMask, SurfaceMask, Walls
+from orthoflow.report import pictures as module
+from orthoflow.report.pictures import (
+    DIVERGING,
+    Picture,
+    depth_colours,
+    embedded_products,
+    frame_words,
+    orthoimage_pictures,
+    side_px,
+    sliders,
+    thumbnail,
+    wall_pictures,
+)
+from tests import samples
+from tests.report_runs import HeldRun, cell, compared_resolved, given, record
+
+# 1200 x 300 cells of a centimetre.
+FRAME = samples.facing_south(0.01, 1200, 300, (4.0e5, 5.0e6, 3.0))
+
+
+def shown(one: Picture) -> tuple[int, int]:
+    """Rows and columns of the picture that the page carries."""
+    head, _, text = one.uri.partition(",")
+    assert head == "data:image/webp;base64"
+    rows, columns = decode_image(base64.b64decode(text)).shape[:2]
+    return rows, columns
+
+
+def orthoimages(n_images: int = 1) -> Orthoimages:
+    mask = np.full(FRAME.shape, OrthoMask.PAINTED, dtype=np.uint8)
+    mask[:30] = OrthoMask.FILLED
+    mask[30:36] = OrthoMask.OCCLUDED
+    mask[36:45] = OrthoMask.NONE
+    return Orthoimages(
+        images=tuple(
+            samples.orthoimage(
+                FRAME,
+                rgb=np.full((*FRAME.shape, 3), 100, np.uint8),
+                mask=mask,
+                plane_index=4 + place,
+                wall=place,
+                name=f"wall {4 + place}",
+                source=np.where(mask == OrthoMask.PAINTED, 0, -1).astype(np.int16),
+            )
+            for place in range(n_images)
+        )
+    )
+
+
+def run(*products: Any, type_name: str = "orthoimages", variants: str = "fine coarse") -> HeldRun:
+    """A product per variant of `plane`, whose first is the baseline."""
+    cells, held = [], {}
+    for product, variant, digest in zip(products, variants.split(), "abcdef", strict=False):
+        address = f"mosaic@plane={variant}"
+        cells.append(cell(f"plane@plane={variant}"))
+        cells.append(cell(address, outputs={"out": given("", digest, type_name)}))
+        held[address, "out"] = product
+    told = record(cells, workflow_resolved=compared_resolved("plane.rms_mm"))
+    return HeldRun(path=Path("run") / "run.h5", record=told, products=held)
+
+
+# --- sizes ---
+
+
+@pytest.mark.parametrize(
+    ("n_pictures", "side"),
+    [(0, 1000), (1, 1000), (24, 1000), (25, 980), (96, 500), (234, 320), (10_000, 320)],
+)
+def test_two_dozen_pictures_are_large_and_more_share_their_bytes(
+    n_pictures: int, side: int
+) -> None:
+    assert side_px(n_pictures) == side
+
+
+def test_the_baseline_is_shown_down_to_its_cells() -> None:
+    found = list(orthoimage_pictures(run(orthoimages(), orthoimages())))
+    # The second variant is not the baseline: a thousand pixels.
+    assert [shown(one) for one in found] == [(300, 1200), (250, 1000)]
+    # Of a hundredth of a page's bytes, two products are like two hundred.
+    few = list(orthoimage_pictures(run(orthoimages(), orthoimages()), share=0.01))
+    # 120,000 cells for the baseline: four times as wide as high.
+    assert [shown(one)[1] for one in few] == [692, 346]
+    (one, two) = orthoimage_pictures(run(orthoimages(2)), share=0.01)
+    assert shown(one)[1] == shown(two)[1] == 489
+
+
+def test_a_wall_has_its_share_of_the_close_cells_by_its_form() -> None:
+    asked: list[int] = []
+
+    def drawing(width: int, height: int) -> module._Drawing:
+        frame = samples.facing_south(0.01, width, height)
+        picture = Picture(uri="", title="", caption="", frame=frame)
+        return module._Drawing(
+            draw=lambda side: asked.append(side) or b"", frame=frame, picture=picture
+        )
+
+    many = [drawing(300, 100), drawing(100, 300), drawing(100, 100)]
+    list(module._drawn(many, n_products=1000.0, close_cells=160_000.0))
+    assert sorted(asked) == [400, 692, 692]
+    asked.clear()
+    list(module._drawn(many, n_products=8.0, close_cells=160_000.0))
+    # 24 pictures: all of them full.
+    assert asked == [1000, 1000, 1000]
+
+
+# --- what is said ---
+
+
+def test_an_orthoimage_says_what_became_of_its_cells() -> None:
+    one, _ = orthoimage_pictures(run(orthoimages(), orthoimages()))
+    assert one.caption == (
+        "12.00 x 3.00 m at 10 mm, 1200 x 300 cells; of all cells 85.0 % painted, 10.0 % filled "
+        "from neighbours, 2.0 % hidden from every photo, 3.0 % in no photo"
+    )
+    assert (one.title, one.name, one.wall, one.number) == ("wall 4 (plane=fine)", "wall 4", 0, 4)
+    assert (one.cell, one.frame, one.file) == ("mosaic@plane=fine", FRAME, "")
+    assert one.width_m == pytest.approx(12.0)
+    # A bar of at most three tenths of it.
+    assert ">2 m</text>" in one.legend
+    assert one.layer == "orthoimage (plane=fine)"
+    assert Picture(uri="", title="error map", caption="").width_m == 0.0
+
+
+@pytest.mark.parametrize(
+    ("title", "layer"),
+    [
+        ("wall 4", "orthoimage"),
+        ("wall 4, depth", "depth"),
+        ("wall 4, depth (plane=fine)", "depth (plane=fine)"),
+        ("wall 4 (plane=fine)", "orthoimage (plane=fine)"),
+    ],
+)
+def test_layers_are_called_alike_for_all_walls(title: str, layer: str) -> None:
+    assert Picture(uri="", title=title, caption="", name="wall 4").layer == layer
+
+
+def test_what_cannot_be_seen_is_transparent() -> None:
+    (one,) = orthoimage_pictures(run(orthoimages()))
+    content = base64.b64decode(one.uri.partition(",")[2])
+    import cv2
+
+    alpha = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)[..., 3]
+    assert (alpha[:30] == 255).all()
+    assert (alpha[31:44] == 0).all()
+    assert (alpha[46:] == 255).all()
+
+
+def walls(*, has_intensity: bool = True, source: str = "laser") -> Walls:
+    depth_m = np.zeros(FRAME.shape, dtype=np.float32)
+    # One row of 300 is 5 cm before the plane: less than a hundredth of the cells.
+    depth_m[:2] = 0.05
+    depth_m[2] = np.nan
+    mask = np.ones(FRAME.shape, dtype=np.uint8)
+    mask[2:14] = SurfaceMask.VOID
+    wall = samples.wall(
+        FRAME,
+        depth_m=depth_m,
+        sigma_m=np.zeros_like(depth_m),
+        mask=mask,
+        intensity=np.linspace(0, 1, depth_m.size, dtype=np.float32).reshape(FRAME.shape)
+        if has_intensity
+        else None,
+        name="wall 8",
+        plane_index=8,
+    )
+    return Walls(
+        walls=(wall,),
+        up=np.array([0.0, 0.0, 1.0]),
+        intensity_source=source if has_intensity else "none",
+        buffer_front_m=0.1,
+        buffer_behind_m=0.1,
+    )
+
+
+def test_a_wall_has_pictures_of_its_intensity_and_its_depth() -> None:
+    told = run(walls(), type_name="walls", variants="fine")
+    intensity, depth = wall_pictures(told)
+    assert (intensity.title, depth.title) == (
+        *("wall 8, intensity (plane=fine)", "wall 8, depth (plane=fine)"),
+    )
+    assert intensity.caption == "laser intensity"
+    assert depth.caption == "96.0 % of the cells known"
+    for one in (intensity, depth):
+        assert (one.wall, one.number, one.name, one.frame) == (0, 8, "wall 8", FRAME)
+        assert one.cell == "mosaic@plane=fine"
+        assert ">2 m</text>" in one.legend
+        assert shown(one) == (250, 1000)
+    # 99 of 100 cells lie on the plane: the scale is the smallest that there is.
+    assert "-1 mm (behind)" in depth.legend
+    assert depth.depths is not None
+    assert intensity.depths is None
+    # Only half as large where a page gives them a fiftieth of its bytes: one product is fifty.
+    assert shown(next(wall_pictures(told, share=0.02)))[1] == 490
+    (alone,) = wall_pictures(run(walls(has_intensity=False), type_name="walls", variants="fine"))
+    assert alone.title == "wall 8, depth (plane=fine)"
+
+
+def test_grey_of_colours_is_no_laser_intensity() -> None:
+    told = run(walls(source="luminance"), type_name="walls", variants="fine")
+    assert next(wall_pictures(told)).caption == (
+        "no laser intensity in the scan: grey of its colours instead"
+    )
+
+
+@pytest.mark.parametrize(
+    ("share", "limit_m"), [(0.0, 0.001), (0.005, 0.001), (0.015, 0.05), (1.0, 0.05)]
+)
+def test_ninety_nine_of_a_hundred_depths_lie_within_the_scale(share: float, limit_m: float) -> None:
+    depth_m = np.full((100, 100), np.nan, dtype=np.float32)
+    depth_m[:50] = 0.0
+    depth_m.ravel()[: round(5000 * share)] = -0.05
+    assert module._depth_limit_m(depth_m) == pytest.approx(limit_m)
+    assert module._depth_limit_m(np.full((3, 3), np.nan, dtype=np.float32)) == 0.001
+
+
+def test_depths_take_the_colours_between_those_of_the_classes() -> None:
+    depth_m = np.linspace(-0.02, 0.02, 801, dtype=np.float32)
+    found = depth_colours(depth_m, 0.01).astype(float)
+    place = 2.0 + 2.0 * np.clip(depth_m / 0.01, -1.0, 1.0)
+    wanted = np.column_stack([np.interp(place, np.arange(5), channel) for channel in DIVERGING.T])
+    # A step of 254 is at most one and a half of a channel's 151.
+    assert np.abs(found - wanted).max() <= 2.0
+    np.testing.assert_array_equal(found[[0, 400, -1]], DIVERGING[[0, 2, 4]])
+    assert len(np.unique(found, axis=0)) > 200
+    assert (
+        depth_colours(np.full((2, 3), np.nan, np.float32), 0.01).tolist() == [[[247] * 3] * 3] * 2
+    )
+
+
+def test_a_raster_is_told_in_metres_and_millimetres() -> None:
+    frame = samples.facing_south(0.0025, 1234, 400)
+    assert frame_words(frame) == "3.08 x 1.00 m at 2.5 mm, 1234 x 400 cells"
+
+
+# --- which products ---
+
+
+def test_equal_products_and_repeats_are_shown_once() -> None:
+    out = given("", "a", "walls")
+    cells = [
+        cell("wall@plane=fine", outputs={"walls": out, "more": given("", "b", "walls")}),
+        cell("wall@plane=other", outputs={"walls": out}),
+        cell("wall@plane=fine#1", outputs={"walls": given("", "c", "walls")}),
+        cell(
+            "wall@plane=named", outputs={"walls": replace(given("", "d", "walls"), embedded=False)}
+        ),
+        cell("mosaic", outputs={"walls": given("", "e", "orthoimages")}),
+    ]
+    told = HeldRun(path=Path("run.h5"), record=record(cells))
+    assert embedded_products(told, "walls") == (
+        *(("wall@plane=fine", "walls"), ("wall@plane=fine", "more")),
+    )
+    assert embedded_products(told, "orthoimages") == (("mosaic", "walls"),)
+
+
+def test_a_thumbnail_is_the_last_of_some_cells() -> None:
+    told = run(orthoimages(), orthoimages())
+    both = {"mosaic@plane=fine", "mosaic@plane=coarse"}
+    small = thumbnail(told, both, longest_side_px=120)
+    assert shown(Picture(uri=small, title="", caption="")) == (30, 120)
+    assert thumbnail(told, {"plane@plane=fine"}, longest_side_px=120) == ""
+
+
+# --- one place ---
+
+
+def moved(metres: float) -> Any:
+    return replace(FRAME, origin_world=FRAME.origin_world + metres * FRAME.u_world)
+
+
+def turned(degrees: float, axis: str) -> Any:
+    about = {"u": FRAME.u_world, "normal": FRAME.normal_world}[axis]
+    turn = Rotation.from_rotvec(np.radians(degrees) * about)
+    centre = FRAME.world_from_wall(np.array([[600.0, 150.0]]))[0]
+    u, v, normal = (turn.apply(v) for v in (FRAME.u_world, FRAME.v_world, FRAME.normal_world))
+    origin = centre - 6.0 * u - 1.5 * v
+    return replace(FRAME, origin_world=origin, u_world=u, v_world=v, normal_world=normal)
+
+
+@pytest.mark.parametrize(
+    ("frame", "is_same"),
+    [
+        # A tenth of 12 m between their centres.
+        (moved(1.19), True),
+        (moved(1.21), False),
+        (turned(4.9, "u"), True),
+        (turned(5.1, "u"), False),
+        (turned(4.9, "normal"), True),
+        (turned(5.1, "normal"), False),
+    ],
+    ids=["near", "far", "tilted", "tilted-more", "rolled", "rolled-more"],
+)
+def test_rasters_of_one_wall_lie_within_five_degrees_and_a_tenth(
+    frame: Any, *, is_same: bool
+) -> None:
+    told = [
+        Picture(uri="", title=title, caption="", frame=one)
+        for title, one in (("wall 4", FRAME), ("wall 4, depth", frame))
+    ]
+    assert len(sliders(told, 1)) == is_same
