@@ -1,0 +1,207 @@
+"""Patches, seams and steps of colour against loops over cells."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.mosaic import agreement as module
+from orthoflow_plugins.mosaic.agreement import (
+    count_seams,
+    displacements_cells,
+    is_seam,
+    seam_steps,
+)
+from orthoflow_plugins.mosaic.depth_edges import depth_edges
+
+from orthoflow.products import Layer, LayerMask
+from tests import samples
+
+SHAPE = (150, 210)
+
+
+def layer(
+    quality: NDArray[np.float64] | float = 1.0,
+    *,
+    rgb: NDArray[np.uint8] | None = None,
+    mask: NDArray[np.uint8] | None = None,
+    shape: tuple[int, int] = SHAPE,
+) -> Layer:
+    if mask is None:
+        mask = np.full(shape, LayerMask.PAINTED, dtype=np.uint8)
+    return Layer(
+        frame=samples.facing_south(0.01, shape[1], shape[0]),
+        wall=0,
+        source="a.jpg",
+        rgb=np.zeros((*shape, 3), np.uint8) if rgb is None else rgb,
+        mask=mask,
+        quality=np.where(mask == LayerMask.PAINTED, quality, 0.0).astype(np.float32),
+        filled=None,
+    )
+
+
+# --- patches ---
+
+
+def test_the_two_best_layers_of_a_patch_are_those_that_paint_all_of_it() -> None:
+    rng = np.random.default_rng(1)
+    layers = []
+    for _ in range(4):
+        mask = np.full(SHAPE, LayerMask.PAINTED, dtype=np.uint8)
+        # A single cell of some patches is missing.
+        for row, column in rng.integers(0, (128, 192), (3, 2)):
+            mask[row, column] = LayerMask.OCCLUDED
+        layers.append(layer(rng.uniform(0.5, 1.0, SHAPE), mask=mask))
+    # Patches of 64 cells, as many as there is room for.
+    wanted = []
+    for row in (0, 64):
+        for column in (0, 64, 128):
+            part = np.s_[row : row + 64, column : column + 64]
+            means = {
+                k: float(one.quality[part].mean(dtype=np.float64))
+                for k, one in enumerate(layers)
+                if (one.mask[part] == LayerMask.PAINTED).all()
+            }
+            best = sorted(means, key=lambda k: -means[k])
+            if len(best) >= 2:
+                wanted.append((row, column, best[0], best[1]))
+    assert 2 < len(wanted) <= 6
+    assert module._best_pairs(layers) == wanted
+    assert module._best_pairs(layers[:1]) == []
+    small = [layer(shape=(63, 300)), layer(shape=(63, 300))]
+    assert module._best_pairs(small) == []
+    assert len(module._best_pairs([layer(shape=(64, 64))] * 2)) == 1
+
+
+def texture(spread_grey: float) -> NDArray[np.float64]:
+    """Blurred noise of 64 x 64 cells whose standard deviation is given, and some cells beside."""
+    noise = np.random.default_rng(2).normal(size=(64, 70))
+    blurred = cv2.GaussianBlur(noise, (0, 0), 1.0)
+    part = blurred[:, :64]
+    return 120.0 + spread_grey * (blurred - part.mean()) / part.std()
+
+
+@pytest.mark.parametrize(("spread_grey", "n_found"), [(2.5, 0), (4.0, 1), (30.0, 1)])
+def test_flat_patches_tell_no_displacement(spread_grey: float, n_found: int) -> None:
+    whole = np.rint(texture(spread_grey)).astype(np.uint8)
+    pair = [layer(rgb=np.dstack([whole[:, k : k + 64]] * 3), shape=(64, 64)) for k in (0, 2)]
+    found = displacements_cells(pair)
+    assert len(found) == n_found
+    if n_found:
+        np.testing.assert_allclose(found, [[-2.0, 0.0]], atol=0.4)
+
+
+def peak(pair: list[NDArray[np.uint8]]) -> float:
+    window = cv2.createHanningWindow((64, 64), cv2.CV_32F)
+    first, second = (part.astype(np.float32) for part in pair)
+    return float(cv2.phaseCorrelate(first, second, window)[1])
+
+
+def test_a_peak_of_a_fifth_tells_and_one_of_a_tenth_does_not() -> None:
+    rng = np.random.default_rng(4)
+    one = rng.integers(0, 256, (64, 64)).astype(np.uint8)
+    told: dict[str, int] = {}
+    # The same patch with more and more of others mixed in.
+    for weight in np.linspace(0.5, 1.0, 41):
+        other = rng.integers(0, 256, one.shape)
+        pair = [one, np.rint((1.0 - weight) * one + weight * other).astype(np.uint8)]
+        layers = [layer(rgb=np.dstack([part] * 3), shape=(64, 64)) for part in pair]
+        if 0.16 < peak(pair) < 0.28:
+            told["fifth"] = len(displacements_cells(layers))
+        elif 0.07 < peak(pair) < 0.14:
+            told["tenth"] = len(displacements_cells(layers))
+    assert told == {"fifth": 1, "tenth": 0}
+
+
+def test_two_hundred_patches_are_enough() -> None:
+    shape = (64, 64 * 240)
+    row = np.rint(texture(30.0)[:, :64]).astype(np.uint8)
+    same = layer(rgb=np.dstack([np.tile(row, (1, 240))] * 3), shape=shape)
+    found = displacements_cells([same, same])
+    assert len(found) == 200
+    np.testing.assert_allclose(found, 0.0, atol=0.05)
+
+
+# --- seams ---
+
+
+def sources(seed: int, shape: tuple[int, int] = (11, 9)) -> NDArray[np.int16]:
+    return np.random.default_rng(seed).integers(-1, 3, shape).astype(np.int16)
+
+
+@pytest.mark.parametrize("at_once", [1, 3, 11, 1024])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_seams_are_where_the_right_or_lower_neighbour_is_of_another(
+    monkeypatch: pytest.MonkeyPatch, seed: int, at_once: int
+) -> None:
+    monkeypatch.setattr(module, "_ROWS_AT_ONCE", at_once)
+    source = sources(seed)
+    rows, columns = source.shape
+    before: dict[int, list[tuple[int, int]]] = {0: [], 1: []}
+    for row, column in np.ndindex(source.shape):
+        for axis, (r, c) in enumerate(((row + 1, column), (row, column + 1))):
+            is_there = r < rows and c < columns
+            pair = {int(source[row, column]), int(source[r, c])} if is_there else set()
+            if len(pair) == 2 and -1 not in pair:
+                before[axis].append((row, column))
+    seam = np.zeros(source.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        found = module._before_seams(source, axis)
+        assert sorted(zip(*(part.tolist() for part in found), strict=True)) == before[axis]
+        seam[tuple(np.array(before[axis]).T)] = True
+    np.testing.assert_array_equal(is_seam(source), seam)
+    depth_m = np.random.default_rng(seed).uniform(0.0, 0.06, source.shape).astype(np.float32)
+    n_edges = np.count_nonzero(seam & depth_edges(depth_m))
+    assert count_seams(source, depth_m) == (seam.sum(), n_edges)
+    assert count_seams(source, None) == (seam.sum(), 0)
+
+
+class Brighter:
+    """A balance that adds ten levels per layer."""
+
+    def shown(
+        self, index: int, colours: NDArray[np.uint8], rows: object, columns: object
+    ) -> NDArray[np.uint8]:
+        del rows, columns
+        return (colours + 10 * index).astype(np.uint8)
+
+
+@pytest.mark.parametrize("balance", [None, Brighter()])
+def test_steps_are_told_in_cells_that_both_sources_paint(balance: Brighter | None) -> None:
+    rng = np.random.default_rng(5)
+    source = sources(4)
+    layers = []
+    for index in range(3):
+        mask = np.where(rng.random(source.shape) < 0.7, LayerMask.PAINTED, LayerMask.OCCLUDED)
+        mask[source == index] = LayerMask.PAINTED
+        rgb = rng.integers(0, 200, (*source.shape, 3)).astype(np.uint8)
+        layers.append(layer(rgb=rgb, mask=mask.astype(np.uint8), shape=source.shape))
+    wanted = []
+    for axis in (0, 1):
+        for row, column in zip(*module._before_seams(source, axis), strict=True):
+            other = int(source[row + (axis == 0), column + (axis == 1)])
+            if layers[other].mask[row, column] != LayerMask.PAINTED:
+                continue
+            own = int(source[row, column])
+            colours = [
+                layers[k].rgb[row, column].astype(int) + (0 if balance is None else 10 * k)
+                for k in (own, other)
+            ]
+            wanted.append(float((colours[0] - colours[1]) @ [0.299, 0.587, 0.114]))
+    found = seam_steps(source, layers, balance)  # type: ignore[arg-type]
+    assert len(wanted) > 10
+    np.testing.assert_allclose(np.sort(found.grey), np.sort(wanted), atol=1e-9)
+    assert len(found.delta_e) == len(found.grey)
+    alike = layer(rgb=np.full((*source.shape, 3), 9, np.uint8), shape=source.shape)
+    assert not seam_steps(source, [alike] * 3).delta_e.any()
+    nothing = seam_steps(np.zeros_like(source), layers)
+    assert (len(nothing.grey), len(nothing.delta_e)) == (0, 0)
+
+
+def test_black_and_white_are_a_hundred_apart() -> None:
+    source = np.array([[0, 1]], dtype=np.int16)
+    pair = [layer(rgb=np.full((1, 2, 3), value, np.uint8), shape=(1, 2)) for value in (0, 255)]
+    found = seam_steps(source, pair)
+    assert found.grey.tolist() == pytest.approx([-255.0])
+    assert found.delta_e.tolist() == pytest.approx([100.0], abs=1e-3)

@@ -1,0 +1,155 @@
+"""What is added to light: fields between their nodes, lenses, and the equations of overlaps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.mosaic import exposures as module
+from orthoflow_plugins.mosaic.exposures import Exposures, Radii, estimate
+from orthoflow_plugins.mosaic.light import BlockLight
+
+
+def light(rows: slice, columns: slice, seed: int, unknown: float = 0.0) -> BlockLight:
+    rng = np.random.default_rng(seed)
+    shape = (rows.stop - rows.start, columns.stop - columns.start)
+    logs = rng.normal(-1.0, 0.5, (*shape, 3)).astype(np.float32)
+    logs[rng.random(shape) < unknown] = np.nan
+    return BlockLight(box=(rows, columns), log_light=logs)
+
+
+def radii(of: BlockLight, seed: int, lens: int) -> Radii:
+    values = np.random.default_rng(seed).uniform(0.0, 1.0, of.log_light.shape[:2])
+    return Radii(values=values.astype(np.float32), lens=lens)
+
+
+LIGHTS = [
+    light(slice(0, 9), slice(0, 12), 1, 0.2),
+    light(slice(3, 14), slice(5, 20), 2, 0.2),
+    light(slice(2, 7), slice(8, 30), 3),
+    # Beside all others.
+    light(slice(40, 44), slice(0, 4), 4),
+]
+RADII: list[Radii | None] = [radii(LIGHTS[0], 5, 1), None, radii(LIGHTS[2], 6, 0), None]
+
+
+def some_exposures(seed: int) -> Exposures:
+    rng = np.random.default_rng(seed)
+    return Exposures(
+        exposures=rng.normal(size=(4, 3)),
+        lenses=rng.normal(size=(2, 2)),
+        nodes=rng.normal(size=(4, 4, 4, 3)),
+    )
+
+
+@pytest.mark.parametrize("size", [1, 3, 7, 40])
+def test_fields_are_straight_between_four_nodes_over_a_side(size: int) -> None:
+    nodes = np.array([0.3, -1.0, 2.0, 0.7])
+    # The first node lies on the side's beginning, the last one on its end.
+    middles = (np.arange(size) + 0.5) / size
+    wanted = np.interp(middles, [0.0, 1 / 3, 2 / 3, 1.0], nodes)
+    np.testing.assert_allclose(module._hats(np.arange(size), size) @ nodes, wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_light_gets_an_exposure_a_field_and_the_loss_of_a_lens(index: int) -> None:
+    found = some_exposures(7)
+    logs = found.logs(index, LIGHTS[index], RADII[index])
+    rows, columns = LIGHTS[index].log_light.shape[:2]
+    places = np.linspace(0.0, 1.0, 4)
+    for row, column in ((0, 0), (4, 7), (rows - 1, columns - 1)):
+        down, across = (row + 0.5) / rows, (column + 0.5) / columns
+        for channel in range(3):
+            sides = [np.interp(across, places, side) for side in found.nodes[index, :, :, channel]]
+            wanted = found.exposures[index, channel] + np.interp(down, places, sides)
+            seen = RADII[index]
+            if seen is not None:
+                square = float(seen.values[row, column]) ** 2
+                wanted += found.lenses[1] @ [square, square**2]
+            assert logs[row, column, channel] == pytest.approx(wanted, abs=1e-9)
+
+
+def test_overlaps_are_blocks_that_both_know_and_how_their_light_differs() -> None:
+    found = {item.layers: item for item in module._overlaps(LIGHTS)}
+    assert set(found) == {(0, 1), (0, 2), (1, 2)}
+    for (i, j), item in found.items():
+        logs = [np.full((50, 40, 3), np.nan) for _ in range(2)]
+        for k, whole in zip((i, j), logs, strict=True):
+            whole[LIGHTS[k].box] = LIGHTS[k].log_light
+        known = np.argwhere(np.isfinite(logs[0][..., 0]) & np.isfinite(logs[1][..., 0]))
+        assert len(known) == len(item.apart)
+        for k, places in zip((i, j), item.places, strict=True):
+            corner = [part.start for part in LIGHTS[k].box]
+            np.testing.assert_array_equal(places + corner, known)
+        rows, columns = known.T
+        np.testing.assert_allclose(item.apart, (logs[1] - logs[0])[rows, columns], atol=1e-6)
+
+
+@pytest.mark.parametrize(("n_shared", "n_taken"), [(3, 0), (4, 4), (200, 200), (300, 200)])
+def test_an_overlap_has_four_blocks_and_two_hundred_say_all(n_shared: int, n_taken: int) -> None:
+    one = light(slice(0, 1), slice(0, n_shared), 1)
+    other = light(slice(0, 1), slice(0, n_shared + 5), 2)
+    overlaps = module._overlaps([one, other])
+    assert sum(len(item.apart) for item in overlaps) == n_taken
+    if n_taken:
+        columns = overlaps[0].places[0][:, 1]
+        # Evenly, from end to end.
+        assert (columns[0], columns[-1]) == (0, n_shared - 1)
+        assert set(np.diff(columns)) <= {n_shared // n_taken, -(-n_shared // n_taken)}
+
+
+def test_the_equations_say_how_what_is_added_differs() -> None:
+    overlaps = module._overlaps(LIGHTS)
+    found = some_exposures(8)
+    left = (
+        module._exposure_columns(overlaps, 4) @ found.exposures
+        + (module._lens_columns(overlaps, RADII, 2) @ found.lenses.ravel())[:, None]
+        + module._field_columns(overlaps, LIGHTS) @ found.nodes.reshape(4 * 16, 3)
+    )
+    added = [found.logs(k, LIGHTS[k], RADII[k]) for k in range(4)]
+    right = np.concatenate(
+        [
+            added[item.layers[0]][tuple(item.places[0].T)]
+            - added[item.layers[1]][tuple(item.places[1].T)]
+            for item in overlaps
+        ]
+    )
+    np.testing.assert_allclose(left, right, atol=1e-9)
+
+
+def two(apart: NDArray[np.float64], n_columns: int = 40) -> list[BlockLight]:
+    """Two layers over the same blocks; the second is brighter by so much, in logarithms."""
+    box = (slice(0, 10), slice(0, n_columns))
+    logs = np.random.default_rng(3).normal(-1.0, 0.4, (10, n_columns, 3))
+    pair = (logs, logs + apart)
+    return [BlockLight(box=box, log_light=one.astype(np.float32)) for one in pair]
+
+
+def test_what_is_between_two_exposures_is_shared_alike() -> None:
+    found = estimate(two(np.array([0.4, 0.2, 0.3])), [None, None], is_local=False)
+    apart = found.exposures[0] - found.exposures[1]
+    np.testing.assert_allclose(apart, [0.4, 0.2, 0.3], atol=1e-3)
+    np.testing.assert_allclose(found.exposures[0], -found.exposures[1], atol=1e-3)
+    # Fields are held at nothing, and there is no lens.
+    assert np.abs(found.nodes).max() < 1e-6
+    assert found.lenses.shape == (0, 2)
+
+
+def test_what_no_exposure_explains_goes_into_smooth_fields() -> None:
+    # From left to right by a tenth, once as much on either side of the middle.
+    slope = np.linspace(-0.05, 0.05, 40)[None, :, None]
+    lights = two(np.broadcast_to(slope, (10, 40, 3)))
+    found = estimate(lights, [None, None])
+    added = found.logs(0, lights[0], None) - found.logs(1, lights[1], None)
+    np.testing.assert_allclose(added, np.broadcast_to(slope, added.shape), atol=0.015)
+    flat = estimate(lights, [None, None], is_local=False)
+    left = flat.logs(0, lights[0], None) - flat.logs(1, lights[1], None)
+    assert np.abs(left).max() < 0.01
+
+
+def test_a_moved_thing_does_not_count() -> None:
+    apart = np.full((10, 40, 3), 0.3)
+    # A fifth of the blocks shows something else.
+    apart[:, :8] = 1.5
+    found = estimate(two(apart), [None, None], is_local=False)
+    assert (found.exposures[0] - found.exposures[1]) == pytest.approx([0.3] * 3, abs=0.01)
