@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from orthoflow.report.curves import curves, curves_over, sweeps
-from tests.report_runs import HeldRun, cell, metrics, record
+from tests.report_runs import HeldRun, cell, compared_resolved, metrics, record
 
 
 def swept(*values: float, repeats: int = 1, other: object = 1, failed: int = -1) -> list[object]:
@@ -89,3 +91,180 @@ def test_far_apart_values_lie_on_a_logarithmic_axis(tmp_path: Path) -> None:
     assert "(logarithmic)" in curve.svg
     xs = [float(x) for x in re.findall(r'cx="([0-9.]+)"', curve.svg)]
     assert xs[1] - xs[0] == pytest.approx(xs[2] - xs[1], abs=0.2)
+
+
+# --- where things lie ---
+
+
+def numbers_of(pattern: str, svg: str) -> list[tuple[float, ...]]:
+    found = re.findall(pattern, svg)
+    return [tuple(map(float, one if isinstance(one, tuple) else (one,))) for one in found]
+
+
+def dots(svg: str) -> list[tuple[float, ...]]:
+    return numbers_of(r'cx="([\d.-]+)" cy="([\d.-]+)"', svg)
+
+
+def ticks(svg: str) -> list[tuple[float, ...]]:
+    """Place from above, and the number that stands beside."""
+    return numbers_of(r'y="([\d.-]+)" text-anchor="end">([\d.-]+)<', svg)
+
+
+def steps_across(svg: str) -> list[tuple[float, ...]]:
+    return numbers_of(r'<text x="([\d.-]+)" y="[\d.]+" text-anchor="middle">([\d.-]+)<', svg)
+
+
+def drawn(folder: Path, cells: list[object]) -> str:
+    (curve,) = curves(held(folder, cells))
+    return curve.svg
+
+
+def measured(folder: Path, pairs: dict[float, float]) -> str:
+    return drawn(
+        folder,
+        [
+            cell(
+                f"plane@plane=v{index}",
+                params={"tolerance_m": x},
+                metrics=metrics(rms_mm=y),
+            )
+            for index, (x, y) in enumerate(pairs.items())
+        ],
+    )
+
+
+VALUES = {1.0: 12.0, 2.0: 15.5, 4.0: 13.25, 5.0: 18.0}
+
+
+def test_points_stand_at_their_values_between_the_ticks(tmp_path: Path) -> None:
+    svg = measured(tmp_path, VALUES)
+    places = ticks(svg)
+    assert 4 <= len(places) <= 8
+    # Ticks at round numbers, evenly, the larger the higher.
+    heights, values = (np.array(side) for side in zip(*places, strict=True))
+    np.testing.assert_allclose(np.diff(heights), np.diff(heights)[0], atol=0.11)
+    step = float(np.diff(values)[0])
+    assert step > 0.0 > np.diff(heights)[0]
+    assert min(abs(step / 10.0 ** math.floor(math.log10(step)) - d) for d in (1, 2, 5)) < 1e-9
+    assert all(abs(value / step - round(value / step)) < 1e-9 for value in values)
+    per_unit = (heights[1] - heights[0]) / step
+    # Letters stand a little below their line.
+    offset = heights[0] - per_unit * values[0] - 4.0
+    for (x, y), (value, wanted) in zip(dots(svg), VALUES.items(), strict=True):
+        assert y == pytest.approx(offset + per_unit * wanted, abs=0.2)
+        under = [place for place, number in steps_across(svg) if number == value]
+        assert under == [pytest.approx(x, abs=0.06)]
+    # Alike steps are alike apart.
+    xs = [x for x, _ in dots(svg)]
+    assert xs[1] - xs[0] == pytest.approx(0.5 * (xs[2] - xs[1]), abs=0.1)
+
+
+def test_points_and_numbers_lie_within_the_drawing(tmp_path: Path) -> None:
+    svg = measured(tmp_path, VALUES)
+    ((width, height),) = numbers_of(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg)
+    ((left, top, floor, right),) = numbers_of(
+        r'class="axis" d="M([\d.]+) ([\d.]+)V([\d.]+)H([\d.]+)"', svg
+    )
+    assert 0 < left < right < width
+    assert 0 < top < floor < height
+    for x, y in dots(svg):
+        # With room for their size and for the end of a bar.
+        assert left + 4.0 < x < right - 4.0
+        assert top + 4.0 < y < floor - 4.0
+    for x, y in numbers_of(r'<text x="([\d.]+)" y="([\d.]+)"', svg):
+        assert 0 < x < width
+        assert 0 < y < height
+    for (y,) in numbers_of(r'class="grid" d="M[\d.]+ ([\d.]+)H', svg):
+        assert top - 0.1 <= y <= floor + 0.1
+
+
+@pytest.mark.parametrize(
+    ("values", "begins_at_zero"),
+    [
+        # From six tenths of the largest on, nothing is told by where the axis begins.
+        ((5.8, 7.0, 10.0), True),
+        ((6.2, 7.0, 10.0), False),
+        ((0.0, 7.0, 10.0), True),
+        ((-1.0, 7.0, 10.0), False),
+    ],
+)
+def test_an_axis_begins_at_zero_where_that_is_near(
+    tmp_path: Path, values: tuple[float, ...], *, begins_at_zero: bool
+) -> None:
+    svg = measured(tmp_path, dict(zip((1.0, 2.0, 3.0), values, strict=True)))
+    ((floor,),) = numbers_of(r'class="axis" d="M[\d.]+ [\d.]+V([\d.]+)H', svg)
+    zero = [y for y, value in ticks(svg) if value == 0.0]
+    assert (zero == [pytest.approx(floor + 4.0)]) is begins_at_zero
+
+
+@pytest.mark.parametrize(("largest", "is_logarithmic"), [(1.99, False), (2.0, True)])
+def test_values_twenty_times_apart_stand_on_a_logarithmic_axis(
+    tmp_path: Path, largest: float, *, is_logarithmic: bool
+) -> None:
+    svg = measured(tmp_path, {0.1: 1.0, 0.2: 2.0, largest: 3.0})
+    assert ("(logarithmic)" in svg) is is_logarithmic
+    xs = [x for x, _ in dots(svg)]
+    wanted = math.log(2.0) / math.log(20.0) if is_logarithmic else 0.1 / 1.89
+    assert (xs[1] - xs[0]) / (xs[2] - xs[0]) == pytest.approx(wanted, abs=0.001)
+    # What is not positive has no logarithm.
+    assert "(logarithmic)" not in measured(tmp_path, {0.0: 1.0, 0.2: 2.0, 50.0: 3.0})
+
+
+def test_numbers_under_the_axis_do_not_lie_on_each_other(tmp_path: Path) -> None:
+    svg = measured(tmp_path, {1000.0 + 0.5 * k: 1.0 + k for k in range(30)})
+    places = steps_across(svg)
+    assert 2 < len(places) < 15
+    assert len(dots(svg)) == 30
+    # About six units per letter.
+    for (left, one), (right, other) in itertools.pairwise(places):
+        room = 3.0 * (len(f"{one:g}") + len(f"{other:g}"))
+        assert right - left > room
+
+
+def test_bars_reach_as_far_as_values_scatter(tmp_path: Path) -> None:
+    cells = [
+        cell(
+            f"plane@plane=v{index}" + (f"#{repeat}" if repeat else ""),
+            params={"tolerance_m": float(index)},
+            metrics=metrics(rms_mm=10.0 + index + (repeat - 1) * 0.5 * index),
+        )
+        for index in range(1, 4)
+        for repeat in range(3)
+    ]
+    svg = drawn(tmp_path, cells)
+    ((way,),) = [re.findall(r'class="bar line-0" d="([^"]+)"', svg)]
+    bars = [tuple(map(float, one)) for one in re.findall(r"M([\d.]+) ([\d.]+)V([\d.]+)", way)]
+    heights, values = (np.array(side) for side in zip(*ticks(svg), strict=True))
+    per_unit = (heights[-1] - heights[0]) / (values[-1] - values[0])
+    for index, ((x, y), (bar_x, low, high)) in enumerate(zip(dots(svg), bars, strict=True), 1):
+        assert bar_x == x
+        # A standard deviation of half the value to either side.
+        for end, sign in ((low, -1.0), (high, 1.0)):
+            assert end - y == pytest.approx(sign * per_unit * 0.5 * index, abs=0.2)
+
+
+def test_a_page_has_twelve_curves_of_six_lines(tmp_path: Path) -> None:
+    def many(n_metrics: int, n_lines: int) -> HeldRun:
+        names = [f"rmse_{k}_mm" for k in range(n_metrics)]
+        cells = [
+            cell(
+                f"plane@plane=v{index}-{other}",
+                params={"tolerance_m": float(index), "mode": f"m{other}"},
+                metrics=metrics(**dict.fromkeys(names, float(index))),
+            )
+            for other in range(n_lines)
+            for index in range(3)
+        ]
+        asked = compared_resolved("plane.rmse_*")
+        return HeldRun(path=tmp_path / "run.h5", record=record(cells, workflow_resolved=asked))
+
+    assert len(curves(many(12, 1))) == 12
+    assert len(curves(many(13, 1))) == 12
+    for n_lines, n_drawn in ((6, 6), (7, 6)):
+        (curve,) = curves(many(1, n_lines))
+        assert len(re.findall(r'class="line line-\d+" d="M[\d.]+ [\d.]+L', curve.svg)) == n_drawn
+        # Each has its name, below each other.
+        names = re.findall(r'<text x="[\d.]+" y="([\d.]+)">mode=(m\d)<', curve.svg)
+        assert [name for _, name in names] == [f"m{k}" for k in range(n_drawn)]
+        tops = [float(top) for top, _ in names]
+        assert min(np.diff(tops)) >= 12.0
