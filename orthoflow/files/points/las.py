@@ -16,11 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import mmap
-import os
 import struct
-import subprocess
-import sys
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +34,7 @@ from orthoflow.files.points.blocks import (
     short_file_error,
 )
 from orthoflow.files.points.copc import Node, Wish, read_octree
+from orthoflow.files.points.decoders import Decoder, can_share_memory
 from orthoflow.files.points.libraries import guarded, load_library, reading
 
 FORMAT: Final = "LAS/LAZ"
@@ -56,8 +53,6 @@ _LAYERS: Final = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES: Final = 14
 MOST_FIXED_CHUNK: Final = 50_000_000
 _WORKER: Final = Path(__file__).with_name("las_worker.py")
-# Blocks that a process may be ahead.
-_SLOTS: Final = 2
 # Files with fewer blocks are read before other processes would be up.
 _BLOCKS_LEAST: Final = 8
 # Chunks much larger than a block would be decoded again for each block that begins within.
@@ -400,7 +395,7 @@ def _records(path: Path, laspy: Any, wanted: _Wanted) -> Iterator[Any]:
             yield from _nodes_decoded(path, laspy, reader.header, wanted.nodes, fields.to_lazrs())
             return
         # Where memory cannot be shared without a name, this process decodes all by itself.
-        is_shared_out = wanted.cores > 1 and hasattr(os, "memfd_create")
+        is_shared_out = wanted.cores > 1 and can_share_memory()
         layout = _layout(path, reader.header, wanted) if is_shared_out else None
         if layout is None:
             yield from reader.chunk_iterator(BLOCK_POINTS)
@@ -454,83 +449,26 @@ def _layout(path: Path, header: Any, wanted: _Wanted) -> _Layout | None:
     )
 
 
-class _Decoder:
-    """A process that decodes every n-th block into memory shared with it."""
-
-    def __init__(
-        self, path: Path, layout: _Layout, *, first: int, stride: int, n_points: int
-    ) -> None:
-        slot_bytes = layout.step * layout.point_bytes
-        shared = os.memfd_create("points")
-        try:
-            os.ftruncate(shared, _SLOTS * slot_bytes)
-            self._memory = mmap.mmap(shared, _SLOTS * slot_bytes)
-            self._process = subprocess.Popen(
-                [
-                    *(sys.executable, "-P", str(_WORKER), str(path), str(shared)),
-                    *(str(layout.start), str(int(layout.has_classes)), layout.record.hex()),
-                    *(str(slot_bytes), str(layout.step), str(layout.point_bytes)),
-                    *(str(first), str(stride), str(n_points)),
-                ],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                bufsize=0,
-                pass_fds=(shared,),
-                # It imports what this process would, wherever that came from.
-                env=dict(os.environ) | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            )
-        finally:
-            os.close(shared)
-        self._slot_bytes = slot_bytes
-        self._slot = 0
-        for _ in range(_SLOTS):
-            self.allow()
-
-    def allow(self) -> None:
-        """Let it decode one more block, since the oldest one is done with."""
-        assert self._process.stdin is not None  # noqa: S101 - of a pipe that was asked for
-        # Where it has ended, the next block says why.
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(b"\n")
-
-    def block(self, n_bytes: int) -> memoryview:
-        """Wait for its next block.
-
-        Raises:
-            ValueError: the decompressor failed, with what it said.
-        """
-        assert self._process.stdout is not None  # noqa: S101 - as above
-        said = self._process.stdout.readline().decode("utf-8", errors="replace").strip()
-        if said != "decoded":
-            raise ValueError(said or f"its decoder ended with {self._process.wait()}")
-        start = self._slot * self._slot_bytes
-        self._slot = (self._slot + 1) % _SLOTS
-        return memoryview(self._memory)[start : start + n_bytes]
-
-    def close(self) -> None:
-        """End the process."""
-        self._process.kill()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
-        self._process.wait()
-
-
 def _decoded_elsewhere(
     path: Path, laspy: Any, header: Any, layout: _Layout, n_processes: int
 ) -> Iterator[Any]:
+    slot_bytes = layout.step * layout.point_bytes
     with contextlib.ExitStack() as stack:
         decoders = []
         for first in range(n_processes):
-            decoder = _Decoder(
-                path, layout, first=first, stride=n_processes, n_points=header.point_count
-            )
+            told = [str(path), str(layout.start), str(int(layout.has_classes))]
+            told += [layout.record.hex(), str(layout.step), str(layout.point_bytes)]
+            told += [str(first), str(n_processes), str(header.point_count)]
+            decoder = Decoder(_WORKER, told, slot_bytes=slot_bytes)
             stack.callback(decoder.close)
             decoders.append(decoder)
         for block, start in enumerate(range(0, header.point_count, layout.step)):
             decoder = decoders[block % n_processes]
+            said = decoder.line()
+            if said != "decoded":
+                raise ValueError(said or f"its decoder ended with {decoder.ended_with()}")
             count = min(layout.step, header.point_count - start)
-            decoded = decoder.block(count * layout.point_bytes)
+            decoded = decoder.slot()[: count * layout.point_bytes]
             yield laspy.ScaleAwarePointRecord(
                 np.frombuffer(decoded, dtype=header.point_format.dtype()),
                 header.point_format,

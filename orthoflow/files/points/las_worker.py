@@ -13,8 +13,9 @@ import sys
 
 def main() -> None:
     """Decode until there are no more blocks, or nobody asks for them."""
-    path, shared, start, has_classes, record, *numbers = sys.argv[1:]
-    slot_bytes, step, point_bytes, first, stride, n_points = (int(text) for text in numbers)
+    shared, slot_bytes_text, path, start, has_classes, record, *numbers = sys.argv[1:]
+    slot_bytes = int(slot_bytes_text)
+    step, point_bytes, first, stride, n_points = (int(text) for text in numbers)
     try:
         lazrs = importlib.import_module("lazrs")
         memory = memoryview(mmap.mmap(int(shared), 0))

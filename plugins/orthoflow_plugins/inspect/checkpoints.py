@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.bands import IN_MEMORY_CELLS, in_memory, row_bands
 from orthoflow.products import (
     Cameras,
     CheckPoints,
@@ -37,8 +40,12 @@ from orthoflow_plugins.inspect.findings import (
     report,
     rms,
 )
-from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
-from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.image_quality import (
+    OrthoimageGrey,
+    completeness,
+    quality_findings,
+)
+from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 from orthoflow_plugins.inspect.placing import on_walls, wall_of
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
@@ -97,7 +104,7 @@ class InspectCheckpoints(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Find every point, then sum up."""
-        pictures = _pictures(inputs)
+        pictures = _pictures(inputs, ctx)
         finder = PointFinder(
             pictures=pictures,
             checkpoints=inputs.checkpoints,
@@ -148,13 +155,13 @@ class InspectCheckpoints(Method):
         )
 
 
-def _pictures(inputs: InspectCheckpoints.In) -> list[Picture]:
+def _pictures(inputs: InspectCheckpoints.In, ctx: StepContext) -> list[Picture]:
     if inputs.orthoimages is not None:
         pictures = [
             Picture(
                 wall=image.wall,
                 frame=image.frame,
-                grey=grey_of(image),
+                grey=OrthoimageGrey(image),
                 surface=wall_of(image, inputs.walls),
                 image=image,
             )
@@ -162,7 +169,7 @@ def _pictures(inputs: InspectCheckpoints.In) -> list[Picture]:
         ]
     else:
         pictures = [
-            _intensity_picture(index, wall, wall.intensity)
+            _intensity_picture(index, wall, wall.intensity, ctx)
             for index, wall in enumerate(inputs.walls.walls)
             if wall.intensity is not None
         ]
@@ -174,25 +181,59 @@ def _pictures(inputs: InspectCheckpoints.In) -> list[Picture]:
     return pictures
 
 
-def _intensity_picture(index: int, wall: Wall, intensity: NDArray[np.float32]) -> Picture:
-    known = np.isfinite(intensity)
-    grey = 255.0 * np.where(known, intensity, 0.0).astype(np.float64)
+@dataclass(frozen=True)
+class _IntensityGrey(GreyCells):
+    """Grey levels of an intensity (rows, cols) from 0 to 1, 0 where it is not known."""
+
+    intensity: NDArray[np.float32]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        rows, columns = self.intensity.shape
+        return rows, columns
+
+    def cut(self, part: tuple[slice, slice]) -> GreyImage:
+        known = np.isfinite(self.intensity[part])
+        grey = 255.0 * np.where(known, self.intensity[part], 0.0).astype(np.float64)
+        return GreyImage(grey=grey, valid=known, region=known)
+
+
+def _intensity_picture(
+    index: int, wall: Wall, intensity: NDArray[np.float32], ctx: StepContext
+) -> Picture:
+    cells, shape = _IntensityGrey(intensity), wall.frame.shape
+    is_large = wall.mask.size > IN_MEMORY_CELLS
+    allocate = partial(_allocated, ctx, index) if is_large else in_memory
+    rgb = np.asarray(allocate("rgb", (*shape, 3), np.uint8), np.uint8)
+    mask = np.asarray(allocate("mask", shape, np.uint8), np.uint8)
+    source = np.asarray(allocate("source", shape, np.int16), np.int16)
+    for rows in row_bands(shape):
+        part = cells.cut((rows, slice(0, shape[1])))
+        rgb[rows] = np.clip(part.grey, 0, 255).astype(np.uint8)[:, :, np.newaxis]
+        mask[rows] = part.valid
+        source[rows] = np.where(part.valid, 0, -1)
     return Picture(
         wall=index,
         frame=wall.frame,
-        grey=GreyImage(grey=grey, valid=known, region=known),
+        grey=cells,
         surface=wall,
         image=Orthoimage(
             frame=wall.frame,
             wall=index,
             name=wall.name,
-            rgb=np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[:, :, None], 3, axis=2),
-            mask=known.astype(np.uint8),
-            source=np.where(known, 0, -1).astype(np.int16),
+            rgb=rgb,
+            mask=mask,
+            source=source,
             sources=("intensity",),
             plane_index=wall.plane_index,
         ),
     )
+
+
+def _allocated(
+    ctx: StepContext, wall: int, name: str, shape: tuple[int, ...], dtype: DTypeLike
+) -> NDArray[np.generic]:
+    return ctx.allocate("inspection", f"{wall}.{name}", shape, dtype).view(np.ndarray)
 
 
 def _findings(shift_m: NDArray[np.float64], classes: Sequence[str], gsd_m: float) -> list[Finding]:
@@ -231,7 +272,7 @@ def _findings_of_images(pictures: Sequence[Picture], cameras: Cameras | None) ->
         for picture in pictures
         for finding in (
             completeness(picture.image, picture.surface),
-            *quality_findings(picture.image, picture.surface, picture.grey, cameras),
+            *quality_findings(picture.image, picture.surface, cameras),
         )
     ]
 

@@ -20,6 +20,8 @@ DISPLACEMENT_SPAN_CELLS: Final = 1.0
 _MAP_PX: Final = 900
 _LONGEST_PX: Final = 1100
 _SMALLEST_PX: Final = 500
+# Of larger images squares of cells are averaged before they are drawn.
+_WHOLE_CELLS: Final = 1 << 24
 # The longest usual arrow is drawn so long.
 _ARROW_PX: Final = 40.0
 _ARROWS_MOST: Final = 1500
@@ -61,10 +63,10 @@ def vector_map(
     import cv2
 
     scale = _scale(image)
-    grey = eight_bits(image.rgb).mean(axis=2, dtype=np.float32)
-    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
+    rows, columns = image.frame.shape
+    size = (max(1, round(columns * scale)), max(1, round(rows * scale)))
     way = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_NEAREST
-    pale = 0.5 * np.asarray(cv2.resize(grey, size, interpolation=way)) + 100.0
+    pale = 0.5 * np.asarray(cv2.resize(_grey_means(image), size, interpolation=way)) + 100.0
     picture = np.repeat(pale.astype(np.uint8)[:, :, None], 3, axis=2)
     length = np.linalg.norm(shift_cells, axis=1)
     middle = float(np.median(length)) if len(length) else 0.0
@@ -77,6 +79,25 @@ def vector_map(
         ends = [(round(float(x)), round(float(y))) for x, y in (tail, tip)]
         cv2.arrowedLine(picture, ends[0], ends[1], colour, 1, cv2.LINE_AA, tipLength=0.3)
     return encode_webp(picture)
+
+
+def _grey_means(image: Orthoimage) -> NDArray[np.float32]:
+    """Means of the three colours of cells; of a large image those of squares of cells.
+
+    Cells beyond a whole number of squares are left out.
+    """
+    factor = 1
+    if image.mask.size > _WHOLE_CELLS:
+        factor = max(1, max(image.frame.shape) // (2 * _LONGEST_PX))
+    if factor == 1:
+        return np.asarray(eight_bits(image.rgb).mean(axis=2, dtype=np.float32))
+    rows, columns = (size // factor for size in image.frame.shape)
+    means = np.empty((rows, columns), dtype=np.float32)
+    for row in range(rows):
+        squares = image.rgb[row * factor : (row + 1) * factor, : columns * factor]
+        grey = eight_bits(squares).reshape(factor, columns, factor * 3)
+        means[row] = grey.mean(axis=(0, 2), dtype=np.float32)
+    return means
 
 
 def enlargement(shift_cells: NDArray[np.float64], image: Orthoimage) -> float:

@@ -11,17 +11,18 @@ known exactly, whatever the picture shows.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
+from orthoflow.geometry.bands import count_cells, row_bands
 from orthoflow.geometry.cameras import ViewingCamera
 from orthoflow.geometry.levels import REC_601, eight_bits
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Wall
-from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 
 # A pixel drawn over more cells than this, in the direction where it is widest.
 _STRETCHED_CELLS: Final = 2.0
@@ -44,48 +45,67 @@ _END_CELLS: Final = 3.0
 _LOW, _HIGH = 0.1, 0.9
 
 
-def grey_of(image: Orthoimage) -> GreyImage:
+@dataclass(frozen=True)
+class OrthoimageGrey(GreyCells):
     """The grey of what an orthoimage shows, 0 elsewhere."""
-    shows = shown(image)
-    grey = np.where(shows, eight_bits(image.rgb) @ REC_601, 0.0)
-    return GreyImage(grey=grey, valid=shows, region=shows)
+
+    image: Orthoimage
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.image.frame.shape
+
+    def cut(self, part: tuple[slice, slice]) -> GreyImage:
+        """Some rows and columns, all of them within the image."""
+        shows = _shows(self.image.mask[part])
+        grey = np.where(shows, eight_bits(self.image.rgb[part]) @ REC_601, 0.0)
+        return GreyImage(grey=grey, valid=shows, region=shows)
 
 
 def shown(image: Orthoimage) -> NDArray[np.bool_]:
     """Cells that are painted or filled."""
-    shows: NDArray[np.bool_] = np.isin(image.mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
+    return _shows(image.mask)
+
+
+def _shows(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    shows: NDArray[np.bool_] = np.isin(mask, (OrthoMask.PAINTED, OrthoMask.FILLED))
     return shows
+
+
+def n_shown(image: Orthoimage) -> int:
+    """How many cells are painted or filled."""
+    return sum(count_cells(image.mask, state) for state in (OrthoMask.PAINTED, OrthoMask.FILLED))
 
 
 def completeness(image: Orthoimage, wall: Wall) -> Finding:
     """How much of the scanned surface the image shows; both lie on the same cells."""
-    surface = np.isfinite(wall.depth_m)
-    both = np.count_nonzero(surface & shown(image))
-    share = both / max(1, int(np.count_nonzero(surface)))
+    n_surface = n_both = 0
+    for rows in row_bands(image.mask.shape):
+        surface = np.isfinite(wall.depth_m[rows])
+        n_surface += int(np.count_nonzero(surface))
+        n_both += int(np.count_nonzero(surface & _shows(image.mask[rows])))
+    share = n_both / max(1, n_surface)
     return Finding(name="completeness", value=share, unit="1", wall=image.wall)
 
 
-def quality_findings(
-    image: Orthoimage, wall: Wall, grey: GreyImage, cameras: Cameras | None
-) -> list[Finding]:
+def quality_findings(image: Orthoimage, wall: Wall, cameras: Cameras | None) -> list[Finding]:
     """Sharpness, and the shares of what is shown that is filled, stretched or smeared.
 
     Args:
         image: the orthoimage.
         wall: the wall it is of, on the same cells.
-        grey: of the image, as `grey_of` gives it.
         cameras: of its photos; without them nothing is said of stretches.
     """
-    n_filled = int(np.count_nonzero(image.mask == OrthoMask.FILLED))
-    share = n_filled / max(1, int(np.count_nonzero(grey.valid)))
+    share = count_cells(image.mask, OrthoMask.FILLED) / max(1, n_shown(image))
     return [
         Finding(name="filled_share", value=share, unit="1", wall=image.wall),
-        *sharpness_findings(grey, image.wall),
+        *sharpness_findings(OrthoimageGrey(image), image.wall),
         *stretch_findings(image, wall, cameras),
     ]
 
 
-def sharpness_findings(image: GreyImage, wall: int) -> list[Finding]:
+def sharpness_findings(image: GreyCells, wall: int) -> list[Finding]:
     """Width of edges from 10 to 90 %, and the frequency at which contrast is halved.
 
     Profiles across the steepest places that have an even side each are brought to one contrast and
@@ -151,10 +171,7 @@ def cells_per_pixel(
     name, viewing = camera
     if name not in image.sources:
         return np.zeros(0)
-    painted = (image.mask == OrthoMask.PAINTED) & np.isfinite(wall.depth_m)
-    cells = np.flatnonzero(painted & (image.source == image.sources.index(name)))
-    cells = cells[:: max(1, len(cells) // _ASKED_MOST)]
-    rows, columns = np.divmod(cells, image.frame.width)
+    rows, columns = np.divmod(_asked_cells(image, wall, name), image.frame.width)
     # Survey coordinates would cost digits.
     near = replace(image.frame, origin_world=np.zeros(3))
     moved = viewing.shifted(image.frame.origin_world)
@@ -174,12 +191,31 @@ def cells_per_pixel(
     return known
 
 
-def _edge_profiles(image: GreyImage) -> NDArray[np.float64]:
+def _asked_cells(image: Orthoimage, wall: Wall, name: str) -> NDArray[np.int64]:
+    """Every so manyth of the cells (row * width + column) that a photo painted."""
+    source, width = image.sources.index(name), image.frame.width
+
+    def painted(rows: slice) -> NDArray[np.bool_]:
+        is_own: NDArray[np.bool_] = image.mask[rows] == OrthoMask.PAINTED
+        is_own &= (image.source[rows] == source) & np.isfinite(wall.depth_m[rows])
+        return is_own
+
+    bands = list(row_bands(image.mask.shape))
+    counts = [int(np.count_nonzero(painted(rows))) for rows in bands]
+    step, n_before, chosen = max(1, sum(counts) // _ASKED_MOST), 0, [np.zeros(0, dtype=np.int64)]
+    for rows, count in zip(bands, counts, strict=True):
+        cells = np.flatnonzero(painted(rows))
+        chosen.append(rows.start * width + cells[-n_before % step :: step])
+        n_before += count
+    return np.concatenate(chosen)
+
+
+def _edge_profiles(cells: GreyCells) -> NDArray[np.float64]:
     """Profiles (n, steps) across edges, 0 on the dark side and 1 on the bright one."""
     from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter
 
     # A few million cells have edges enough.
-    image = image.fullest_part(_TILE_CELLS)
+    image = cells.fullest_part(_TILE_CELLS)
     if not image.valid.any():
         return np.zeros((0, _ALONG.size))
     # Voids go on as what is nearest: neither do they make edges, nor do they ring into profiles.

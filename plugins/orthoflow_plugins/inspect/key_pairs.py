@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,8 +14,12 @@ from orthoflow.geometry.opencv_border import from_opencv
 from orthoflow.geometry.threads import in_order
 from orthoflow_plugins.inspect.patches import (
     PATCH_CELLS,
+    GreyCells,
     GreyImage,
+    PatchShifts,
+    joined_shifts,
     refine_shifts,
+    tiles,
     unrefined,
 )
 
@@ -22,7 +28,8 @@ _CELLS_PER_POINT: Final = 200
 _POINTS_LEAST, _POINTS_MOST = 500, 40_000
 _SCALES_DIFFER_MOST: Final = 1.5
 _RATIO_MOST: Final = 0.9
-_CONTRAST_CELLS: Final = 24.0
+# Half of the box that levels contrast, which passes twice.
+_LEVEL_REACH: Final = 12
 _LEAST_CONTRAST_GREY: Final = 2.0
 _LEAST_VALID_SHARE: Final = 0.6
 _LEAST_CORRELATION: Final = 0.6
@@ -33,6 +40,13 @@ _WITNESS_CELLS: Final = 8.0
 _AGREEING: Final = 2
 _AGREEING_SHARE: Final = 0.25
 _AGREE_CELLS: Final = 1.0
+_SURF_THRESHOLD: Final = 0.1
+# Larger pictures are worked on in tiles, which take two gigabytes with what is about them: what
+# the widest key points and their descriptors look at, or a patch wherever it may be displaced to.
+_WHOLE_CELLS: Final = 1 << 24
+_TILE_CELLS: Final = 3072
+_SURF_RIM_CELLS: Final = 512
+_RIM_CELLS: Final = 96
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,14 +88,15 @@ class _KeyPoints:
 
 
 def find_key_pairs(
-    shown: GreyImage, reference: GreyImage, *, radius_cells: float, threads: int = 1
+    shown: GreyCells, reference: GreyCells, *, radius_cells: float, threads: int = 1
 ) -> KeyPairs:
     """Find pairs within a radius.
 
     Both pictures are levelled to one contrast in their surroundings first, because laser and
     camera see different brightness. Descriptors are matched mutually among key points of like
     scale and sign; patches of 32 x 32 cells about a pair are then matched by least squares, and
-    pairs whose patches do not correlate, or that no neighbour agrees with, are left out.
+    pairs whose patches do not correlate, or that no neighbour agrees with, are left out. Large
+    pictures are worked on tile by tile.
 
     Args:
         shown: the picture to judge.
@@ -89,18 +104,19 @@ def find_key_pairs(
         radius_cells: largest distance that is looked for.
         threads: the pairs do not hang on their number.
     """
-    first, second = in_order(_levelled, (shown, reference), threads=threads)
-    points = tuple(in_order(_key_points, (first, second), threads=threads))
+    first: GreyCells = _Levelled(shown)
+    second: GreyCells = _Levelled(reference)
+    is_whole = len([*_tiles(shown.shape)]) == 1
+    if is_whole:
+        first, second = in_order(GreyCells.whole, (first, second), threads=threads)
+    # Large pictures one after the other: a tile takes the memory of both.
+    points = tuple(in_order(_key_points, (first, second), threads=threads if is_whole else 1))
     matches = _matches(points[0], points[1], radius_cells)
     places = points[0].places[matches[:, 0]]
     found = places - points[1].places[matches[:, 1]]
-    refined = refine_shifts(
-        first,
-        second,
-        unrefined(np.round(places), found),
-        sigma_most_cells=_SIGMA_MOST_CELLS,
-        threads=threads,
-    )
+    start = unrefined(np.round(places), found)
+    rim = math.ceil(radius_cells) + _RIM_CELLS
+    refined = _refined(first, second, start, rim=rim, threads=threads)
     alike = refined.correlation >= _LEAST_CORRELATION
     places, shift = refined.centre[alike], refined.shift[alike]
     kept = _agreed(places, shift)
@@ -135,8 +151,70 @@ def _agreed(places: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[
         agreed = kept
 
 
+def _refined(
+    first: GreyCells, second: GreyCells, start: PatchShifts, *, rim: int, threads: int
+) -> PatchShifts:
+    """Refine shifts, those of each tile by what lies within a rim of it."""
+    parts = [unrefined(*np.zeros((2, 0, 2)))]
+    for tile in _tiles(first.shape):
+        own = _lies_in(tile, start.centre)
+        if not own.any():
+            continue
+        window = _widened(tile, rim, first.shape)
+        corner = np.array([window[1].start, window[0].start])
+        one, other = first.cut(window), second.cut(window)
+        refined = refine_shifts(
+            one,
+            other,
+            unrefined(start.centre[own] - corner, start.shift[own]),
+            sigma_most_cells=_SIGMA_MOST_CELLS,
+            threads=threads,
+        )
+        parts.append(replace(refined, centre=refined.centre + corner))
+    return joined_shifts(parts)
+
+
+def _tiles(shape: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
+    """The tiles that a picture is worked on in: one unless it is large."""
+    return tiles(shape, max(shape) if math.prod(shape) <= _WHOLE_CELLS else _TILE_CELLS)
+
+
+def _widened(tile: tuple[slice, slice], rim: int, shape: tuple[int, int]) -> tuple[slice, slice]:
+    rows, columns = (
+        slice(max(0, part.start - rim), min(size, part.stop + rim))
+        for part, size in zip(tile, shape, strict=True)
+    )
+    return rows, columns
+
+
+def _lies_in(tile: tuple[slice, slice], places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which places (n, 2) = (column, row) lie in a tile."""
+    rows, columns = tile
+    low, end = (columns.start, rows.start), (columns.stop, rows.stop)
+    inside: NDArray[np.bool_] = np.all((places >= low) & (places < end), axis=1)
+    return inside
+
+
+@dataclass(frozen=True)
+class _Levelled(GreyCells):
+    """A picture whose local mean and spread of what is valid are 128 and 40; elsewhere 128."""
+
+    cells: GreyCells
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.cells.shape
+
+    def cut(self, part: tuple[slice, slice]) -> GreyImage:
+        window = _widened(part, 2 * _LEVEL_REACH, self.shape)
+        rows, columns = (
+            slice(inner.start - outer.start, inner.stop - outer.start)
+            for inner, outer in zip(part, window, strict=True)
+        )
+        return _levelled(self.cells.cut(window)).cut((rows, columns))
+
+
 def _levelled(image: GreyImage) -> GreyImage:
-    """Bring local mean and spread of what is valid to 128 and 40; elsewhere 128."""
     valid = image.valid.astype(np.float32)
     grey = np.where(image.valid, image.grey, 0.0).astype(np.float32)
     weight = np.maximum(_smooth(valid), np.float32(1e-3))
@@ -155,32 +233,70 @@ def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
     import cv2
 
     # Two passes of a box come near a Gaussian and cost nothing at any width.
-    side = 2 * round(0.5 * _CONTRAST_CELLS) + 1
+    side = 2 * _LEVEL_REACH + 1
     once = cv2.boxFilter(values, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
     twice = cv2.boxFilter(once, -1, (side, side), borderType=cv2.BORDER_CONSTANT)
     return np.asarray(twice, dtype=np.float32)
 
 
-def _key_points(image: GreyImage) -> _KeyPoints:
+def _key_points(cells: GreyCells) -> _KeyPoints:
     """Key points whose patch lies inside the picture and is mostly valid."""
+    rows, columns = cells.shape
+    half, parts = PATCH_CELLS // 2, []
+    for image, corner, found in _strongest(cells):
+        # mahotas gives y, x, scale, score, sign of the Laplacian, angle and 64 numbers; it counts
+        # cells from their centres, as OpenCV does.
+        places = from_opencv(found[:, 1::-1])
+        inside = np.all(
+            (places + corner > half) & (places + corner < (columns - half, rows - half)), axis=1
+        )
+        share = _patch_means(image.valid.astype(np.float32), places[inside])
+        kept = np.flatnonzero(inside)[share >= _LEAST_VALID_SHARE]
+        parts.append((places[kept] + corner, found[kept]))
+    found = np.concatenate([item[1] for item in parts])
+    return _KeyPoints(
+        places=np.concatenate([item[0] for item in parts]),
+        scale=found[:, 2],
+        sign=found[:, 4],
+        descriptors=found[:, 6:],
+    )
+
+
+def _strongest(
+    cells: GreyCells,
+) -> Iterator[tuple[GreyImage, NDArray[np.int64], NDArray[np.float64]]]:
+    """The strongest key points of a picture, tile by tile.
+
+    Yields:
+        What is about the tile, the (column, row) of its corner, and the key points (n, 70) of the
+        tile, their places counted from there.
+    """
     from mahotas.features import surf
 
-    n_most = int(np.clip(image.grey.size // _CELLS_PER_POINT, _POINTS_LEAST, _POINTS_MOST))
-    found = surf.surf(image.grey, threshold=0.1, max_points=n_most)
-    # mahotas gives y, x, scale, score, sign of the Laplacian, angle and 64 numbers; it counts cells
-    # from their centres, as OpenCV does.
-    places = from_opencv(found[:, 1::-1])
-    rows, columns = image.grey.shape
-    half = PATCH_CELLS // 2
-    inside = np.all((places > half) & (places < (columns - half, rows - half)), axis=1)
-    share = _patch_means(image.valid.astype(np.float32), places[inside])
-    kept = np.flatnonzero(inside)[share >= _LEAST_VALID_SHARE]
-    return _KeyPoints(
-        places=places[kept],
-        scale=found[kept, 2],
-        sign=found[kept, 4],
-        descriptors=found[kept, 6:],
-    )
+    n_cells = math.prod(cells.shape)
+    n_most = int(np.clip(n_cells // _CELLS_PER_POINT, _POINTS_LEAST, _POINTS_MOST))
+    windows = [(tile, _widened(tile, _SURF_RIM_CELLS, cells.shape)) for tile in _tiles(cells.shape)]
+    if len(windows) == 1:
+        image = cells.whole()
+        found = surf.surf(image.grey, threshold=_SURF_THRESHOLD, max_points=n_most)
+        yield image, np.zeros(2, dtype=np.int64), found
+        return
+    points = []
+    for tile, window in windows:
+        corner = np.array([window[1].start, window[0].start])
+        found = surf.interest_points(cells.cut(window).grey, threshold=_SURF_THRESHOLD)
+        place = from_opencv(found[:, 1::-1]) + corner
+        points.append(found[_lies_in(tile, place)])
+    strength = np.concatenate([found[:, 3] for found in points])
+    is_strong = np.zeros(len(strength), dtype=np.bool_)
+    is_strong[np.argsort(-strength, kind="stable")[:n_most]] = True
+    first = 0
+    for (_, window), found in zip(windows, points, strict=True):
+        chosen = found[is_strong[first : first + len(found)]]
+        first += len(found)
+        image = cells.cut(window)
+        corner = np.array([window[1].start, window[0].start])
+        yield image, corner, surf.descriptors(image.grey, chosen)
 
 
 def _patch_means(values: NDArray[np.float32], places: NDArray[np.float64]) -> NDArray[np.float32]:

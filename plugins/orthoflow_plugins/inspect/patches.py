@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Final, NamedTuple, TypeVar
 
@@ -26,9 +28,49 @@ _CELLS_PER_SAMPLE: Final = 4.0 * np.pi * _SMOOTH_CELLS**2
 _SIGMA_LIMIT_CELLS: Final = 0.15
 
 
+class GreyCells(ABC):
+    """A grey image of which some cells count, of which parts are given where they are asked for."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+
+    @abstractmethod
+    def cut(self, part: tuple[slice, slice]) -> GreyImage:
+        """Some rows and columns, all of them within the image."""
+
+    def whole(self) -> GreyImage:
+        """All rows and columns."""
+        return self.cut((slice(0, self.shape[0]), slice(0, self.shape[1])))
+
+    def fullest_part(self, side: int) -> GreyImage:
+        """The tile of at most so many rows and columns with most cells that count."""
+        best, most = None, -1
+        for tile in tiles(self.shape, side):
+            part = self.cut(tile)
+            n_valid = int(np.count_nonzero(part.valid))
+            if n_valid > most:
+                best, most = part, n_valid
+        return self.whole() if best is None else best
+
+    def square(self, corner: NDArray[np.int64], side: int) -> GreyImage:
+        """A square from a corner (2,) = column, row on; beyond the border 0 and not valid."""
+        grey, valid = np.zeros((side, side)), np.zeros((side, side), dtype=np.bool_)
+        first = np.clip(corner[::-1], 0, self.shape)
+        end = np.clip(corner[::-1] + side, first, self.shape)
+        rows, columns = (slice(int(one), int(other)) for one, other in zip(first, end, strict=True))
+        down, right = (int(step) for step in first - corner[::-1])
+        part = self.cut((rows, columns))
+        height, width = part.grey.shape
+        grey[down : down + height, right : right + width] = part.grey
+        valid[down : down + height, right : right + width] = part.valid
+        return GreyImage(grey=grey, valid=valid, region=valid)
+
+
 @dataclass(frozen=True, kw_only=True)
-class GreyImage:
-    """A grey image of which some cells count.
+class GreyImage(GreyCells):
+    """A grey image of which some cells count, in memory.
 
     Attributes:
         grey: (rows, cols) float64.
@@ -40,25 +82,25 @@ class GreyImage:
     valid: NDArray[np.bool_]
     region: NDArray[np.bool_]
 
-    def fullest_part(self, side: int) -> GreyImage:
-        """The tile of at most so many rows and columns with most cells that count."""
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
         rows, columns = self.grey.shape
-        tiles = [
-            (slice(row, row + side), slice(column, column + side))
-            for row in range(0, rows, side)
-            for column in range(0, columns, side)
-        ]
-        best = max(tiles, key=lambda tile: int(np.count_nonzero(self.valid[tile])))
-        return GreyImage(grey=self.grey[best], valid=self.valid[best], region=self.region[best])
+        return rows, columns
 
-    def square(self, corner: NDArray[np.int64], side: int) -> GreyImage:
-        """A square from a corner (2,) = column, row on; beyond the border 0 and not valid."""
-        rows, columns = self.grey.shape
-        down, right = corner[1] + np.arange(side), corner[0] + np.arange(side)
-        inside = ((down >= 0) & (down < rows))[:, None] & (right >= 0) & (right < columns)
-        cells = np.ix_(np.clip(down, 0, rows - 1), np.clip(right, 0, columns - 1))
-        valid = inside & self.valid[cells]
-        return GreyImage(grey=np.where(inside, self.grey[cells], 0.0), valid=valid, region=valid)
+    def cut(self, part: tuple[slice, slice]) -> GreyImage:
+        """Some rows and columns, all of them within the image."""
+        return GreyImage(grey=self.grey[part], valid=self.valid[part], region=self.region[part])
+
+
+def tiles(shape: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
+    """Cut a raster into tiles of at most so many rows and columns, row by row."""
+    for row in range(0, shape[0], side):
+        for column in range(0, shape[1], side):
+            yield (
+                slice(row, min(row + side, shape[0])),
+                slice(column, min(column + side, shape[1])),
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +194,13 @@ def refine_shifts(
         chosen = unrefined(start.centre[part], start.shift[part])
         return _refined(first, sampler, chosen, sigma_most_cells, focus_cells)
 
-    parts = [*in_order(refined, range(0, len(start.centre), _AT_ONCE), threads=threads)]
+    return joined_shifts(
+        [*in_order(refined, range(0, len(start.centre), _AT_ONCE), threads=threads)]
+    )
+
+
+def joined_shifts(parts: Sequence[PatchShifts]) -> PatchShifts:
+    """Put the displacements of several parts of an image together."""
     return PatchShifts(
         **{
             field.name: np.concatenate([getattr(part, field.name) for part in parts])

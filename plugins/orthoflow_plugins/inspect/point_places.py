@@ -15,6 +15,7 @@ from orthoflow.geometry.robust import median_deviation
 from orthoflow.products import CheckPoints, Orthoimage, Truth, Wall, Walls
 from orthoflow_plugins.inspect.patches import (
     PATCH_CELLS,
+    GreyCells,
     GreyImage,
     refine_shifts,
     unrefined,
@@ -66,7 +67,7 @@ class Picture:
 
     wall: int
     frame: WallFrame
-    grey: GreyImage
+    grey: GreyCells
     surface: Wall
     image: Orthoimage
 
@@ -181,7 +182,7 @@ class PointFinder:
 
 
 def find_by_truth(
-    picture: GreyImage,
+    picture: GreyCells,
     frame: WallFrame,
     expected: NDArray[np.float64],
     truth: Truth,

@@ -29,12 +29,18 @@ from orthoflow_plugins.inspect.findings import (
     of_walls,
     report,
 )
-from orthoflow_plugins.inspect.image_quality import completeness, grey_of, quality_findings
+from orthoflow_plugins.inspect.image_quality import (
+    OrthoimageGrey,
+    completeness,
+    n_shown,
+    quality_findings,
+)
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
-from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 from orthoflow_plugins.inspect.placing import on_walls, wall_of
 
-# The intensity is laid so far aside to see how exactly the comparison measures that.
+# The intensity is laid so far aside to see how exactly the comparison measures that; some hundred
+# pairs say so.
 _FLOOR_SHIFT_CELLS: Final = (0.5, 0.25)
 _FLOOR_CELLS: Final = 600
 _FEWEST_PAIRS: Final = 10
@@ -235,6 +241,30 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
 
 
 @dataclass(frozen=True)
+class _IntensityGrey(GreyCells):
+    """Laser intensity (rows, cols) as grey levels, 0 where it is not known.
+
+    It spans decades; its roots look more like what a camera sees.
+    """
+
+    intensity: NDArray[np.float32]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        rows, columns = self.intensity.shape
+        return rows, columns
+
+    def cut(self, part: tuple[slice, slice]) -> GreyImage:
+        values = self.intensity[part]
+        known = np.isfinite(values)
+        return GreyImage(
+            grey=255.0 * np.sqrt(np.where(known, np.maximum(values, 0.0), 0.0)),
+            valid=known,
+            region=known,
+        )
+
+
+@dataclass(frozen=True)
 class _Comparison:
     """How walls are compared: their cameras, the radius in cells, and so many threads."""
 
@@ -246,38 +276,26 @@ class _Comparison:
         """Give the pairs of a wall; nothing more where they are too few to say anything."""
         if wall.intensity is None:
             raise MethodError(f"{wall.name} has no intensity to compare with")
-        picture = grey_of(image)
-        if not picture.valid.any():
+        if not n_shown(image):
             return _Verdict(image=image)
-        known = np.isfinite(wall.intensity)
-        # Laser intensities span decades; their roots look more like what a camera sees.
-        intensity = GreyImage(
-            grey=255.0 * np.sqrt(np.where(known, np.maximum(wall.intensity, 0.0), 0.0)),
-            valid=known,
-            region=known,
-        )
-        pairs = self._pairs(picture, intensity)
+        intensity = _IntensityGrey(wall.intensity)
+        pairs = self._pairs(OrthoimageGrey(image), intensity)
         if len(pairs) < _FEWEST_PAIRS:
             return _Verdict(image=image, pairs=pairs)
         return _Verdict(
             image=image,
             pairs=pairs,
-            floor=self._floor(intensity),
-            quality=(
-                completeness(image, wall),
-                *quality_findings(image, wall, picture, self.cameras),
-            ),
+            floor=self._floor(intensity.fullest_part(_FLOOR_CELLS)),
+            quality=(completeness(image, wall), *quality_findings(image, wall, self.cameras)),
         )
 
-    def _pairs(self, shown: GreyImage, reference: GreyImage) -> KeyPairs:
+    def _pairs(self, shown: GreyCells, reference: GreyCells) -> KeyPairs:
         return find_key_pairs(shown, reference, radius_cells=self.radius, threads=self.threads)
 
     def _floor(self, intensity: GreyImage) -> KeyPairs:
         """Pairs of the intensity with itself laid aside, their errors as displacements."""
         import cv2
 
-        # Some hundred pairs say what a floor is.
-        intensity = intensity.fullest_part(_FLOOR_CELLS)
         right, down = _FLOOR_SHIFT_CELLS
         rows, columns = intensity.grey.shape
         move = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry.opencv_border import to_opencv
-from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 
 _ROUNDS: Final = 20
 _CONVERGED_CELLS: Final = 1e-3
@@ -20,7 +20,7 @@ _LEAST_WEIGHT: Final = 0.2
 
 
 def find_crossing(
-    picture: GreyImage, near: NDArray[np.float64], *, search_cells: float, radius_cells: float
+    picture: GreyCells, near: NDArray[np.float64], *, search_cells: float, radius_cells: float
 ) -> NDArray[np.float64] | None:
     """Find the centre of a target near a place.
 
@@ -51,7 +51,7 @@ def find_crossing(
     return None if min(alike, swapped) < _LEAST_ALIKE else place + corner
 
 
-def _window(picture: GreyImage, corner: NDArray[np.int64], side: int) -> GreyImage:
+def _window(picture: GreyCells, corner: NDArray[np.int64], side: int) -> GreyImage:
     """A square part, not valid beyond the border, its voids closed from around them."""
     part = picture.square(corner, side)
     return _closed(np.where(part.valid, part.grey, 0.0), part.valid)

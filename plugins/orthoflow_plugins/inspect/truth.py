@@ -42,7 +42,7 @@ from orthoflow_plugins.inspect.figures import (
     displacement_map,
 )
 from orthoflow_plugins.inspect.findings import IMAGE_QUALITY, of_walls, report
-from orthoflow_plugins.inspect.image_quality import grey_of, quality_findings
+from orthoflow_plugins.inspect.image_quality import quality_findings
 from orthoflow_plugins.inspect.orientation_errors import (
     PoseError,
     pose_details,
@@ -293,7 +293,7 @@ class _Judge:
         return _Verdict(
             errors=wall_errors(image, wall, true, chosen),
             sources=sources,
-            quality=tuple(quality_findings(image, wall, grey_of(image), inputs.cameras)),
+            quality=tuple(quality_findings(image, wall, inputs.cameras)),
         )
 
     def _true_orthoimage(self, image: Orthoimage, chosen: Sampling) -> TrueOrthoimage:

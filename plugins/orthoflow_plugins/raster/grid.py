@@ -28,7 +28,7 @@ from orthoflow_plugins.raster.crops import (
 from orthoflow_plugins.raster.emptiness import Emptiness, Sight, emptiness_of
 from orthoflow_plugins.raster.extents import Extent, Reach, extent_of
 from orthoflow_plugins.raster.maps import mapped
-from orthoflow_plugins.raster.reporting import report, report_empty, warn
+from orthoflow_plugins.raster.reporting import report, report_empty, warn, warn_of_wide_gaps
 from orthoflow_plugins.raster.rules import GapRule, RasterRule, Surface, SurfaceRule
 from orthoflow_plugins.raster.sampled_points import SampledPoints, sampled
 from orthoflow_plugins.raster.selection import (
@@ -252,6 +252,8 @@ class RasterGrid(Method):
         walls = tuple(raster.wall for raster in rasters)
         _require_points_near(walls, next(iter(slabs.values())))
         warn(ctx, rasters, source)
+        if params.surface == "tin":
+            warn_of_wide_gaps(ctx, walls)
         report(ctx, rasters)
         report_empty(ctx, walls, empty)
         return self.Out(
@@ -359,7 +361,7 @@ def _slabs(
         )
         for index, crop in crops.items()
     }
-    require_memory([slab.frame for slab in slabs.values()], params.surface)
+    require_memory([slab.frame for slab in slabs.values()])
     return slabs
 
 

@@ -21,6 +21,8 @@ _CELLS_ASKED: Final = 1 << 26
 _LONGEST_PX: Final = 1400
 # Causes of empty cells are told in words where so many of a wall are.
 _EMPTY_WORTH_WORDS: Final = 0.1
+# A net leaves a few cells void along the rim of every wall.
+_VOID_WORTH_WORDS: Final = 0.01
 
 _Number = TypeVar("_Number", np.float32, np.uint32)
 
@@ -41,6 +43,21 @@ def warn(ctx: StepContext, rasters: Sequence[WallRaster], intensity_source: str)
                 f"{wall.name}: cells of gsd_m = {gsd_m:g} m are finer than the scan, "
                 f"whose points lie about {raster.scan_step_m:.2g} m apart; {measured:.0%} of the "
                 "cells have a point"
+            )
+
+
+def warn_of_wide_gaps(ctx: StepContext, walls: Sequence[Wall]) -> None:
+    """Tell which gaps the surface tin leaves open on large walls."""
+    from orthoflow_plugins.raster.nets import SPAN_MOST_CELLS, VERTICES_MOST
+
+    for wall in walls:
+        n_measured = int(np.count_nonzero(wall.count))
+        n_void = count_cells(wall.mask, SurfaceMask.VOID)
+        if n_measured > VERTICES_MOST and n_void >= _VOID_WORTH_WORDS * wall.mask.size:
+            ctx.warn(
+                f"{wall.name}: surface tin spans no gap wider than about {SPAN_MOST_CELLS} cells "
+                f"({SPAN_MOST_CELLS * wall.frame.gsd_m:.3g} m) where more than {VERTICES_MOST} "
+                f"cells of a wall have points, here {n_measured}: raise gsd_m to close wider ones"
             )
 
 

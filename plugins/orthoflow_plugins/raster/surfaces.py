@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoflow.errors import MethodError
 from orthoflow.geometry.interpolation import Surroundings, cell_values, interpolate
 from orthoflow.geometry.point_kernels import read_only
 from orthoflow.geometry.raster_kernels import Entries, keep_nearest, keep_topmost
@@ -27,15 +26,13 @@ from orthoflow.geometry.threads import in_parts
 from orthoflow.products import PointCloud
 from orthoflow_plugins.raster import surface_kernels as kernels
 from orthoflow_plugins.raster.depth_filters import denoised, without_specks
+from orthoflow_plugins.raster.nets import NO_POINT, Net, Vertices, lay_net
 from orthoflow_plugins.raster.rules import SurfaceRule
 
 # What is made of cells for a moment is made of so many.
 CELLS_AT_ONCE: Final = 1 << 20
 # The depths of so many points are sorted at once: 256 MB.
 _POINTS_AT_ONCE: Final = 1 << 26
-# A net of triangles has at most so many, and is laid over so many rows at once.
-_VERTICES_MOST: Final = 2_000_000
-_ROWS_AT_ONCE: Final = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +59,19 @@ class CellSurface:
     percentiles_m: NDArray[np.float32] | None = None
 
 
-def surface_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
-    """Lay a cloud into the raster of a wall."""
+def surface_of(
+    cloud: PointCloud, slab: Slab, rule: SurfaceRule, net: Net | None = None
+) -> CellSurface:
+    """Lay a cloud into the raster of a wall.
+
+    Args:
+        cloud: the points.
+        slab: of the wall, or of a part of it.
+        rule: how.
+        net: of the surface tin over these cells, where the slab is a part; it is the surface's.
+    """
     if rule.is_of_one_point:
-        surface = _surface_of_winners(cloud, slab, rule)
+        surface = _surface_of_winners(cloud, slab, rule, net)
     else:
         surface = _surface_of_all(cloud, slab, rule)
     if not rule.percentiles:
@@ -96,7 +102,9 @@ def carried_to_centres(surface: CellSurface, slab: Slab, rule: SurfaceRule) -> C
     return replace(surface, intensity=intensity, rgb=rgb)
 
 
-def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:
+def _surface_of_winners(
+    cloud: PointCloud, slab: Slab, rule: SurfaceRule, net: Net | None
+) -> CellSurface:
     """One pass: the winning point gives depth, intensity and colour."""
     winners = empty_winners(slab.n_cells, threads=rule.threads)
     moments = np.zeros((slab.n_cells, 2))
@@ -118,8 +126,9 @@ def _surface_of_winners(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> Cel
         rgb=None if rgb is None else taken(rgb, 0),
         places=places_of_winners(cloud, slab, winners, threads=rule.threads),
     )
-    points = winners["point"][has_point]
-    return _triangulated(cloud, slab, points, surface) if rule.surface == "tin" else surface
+    if rule.surface != "tin":
+        return surface
+    return _spanned(surface, net or lay_net(cloud, slab, _vertices(winners, slab)))
 
 
 def _contest(
@@ -139,80 +148,32 @@ def _contest(
     return partial(keep_nearest, entries, winners)
 
 
-def _triangulated(
-    cloud: PointCloud, slab: Slab, points: NDArray[np.uint32], surface: CellSurface
-) -> CellSurface:
-    """Replace a surface by the net through the points nearest to the centres of their cells."""
-    offsets = np.stack([values[points] for values in (cloud.x, cloud.y, cloud.z)])
-    matrix = wall_from_offset(slab.frame, cloud.origin)
-    places = (matrix[:2, :3] @ offsets.astype(np.float64)).T + matrix[:2, 3]
-    measured = np.flatnonzero(surface.count)
-    channels: list[NDArray[np.generic]] = [surface.depth_m[measured, np.newaxis]]
-    if surface.intensity is not None:
-        channels.append(surface.intensity[measured, np.newaxis])
-    if surface.rgb is not None:
-        channels.append(surface.rgb[measured])
-    found = _interpolated(places, channels, slab.frame.shape)
+def vertices_of(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> Vertices:
+    """The points nearest to the centres of their cells, through which the surface tin goes."""
+    winners = empty_winners(slab.n_cells, threads=rule.threads)
+    for entries in entries_inside(cloud, slab, threads=rule.threads):
+        share_cells(rule.threads, _contest(cloud, slab, rule, entries, winners))
+    return _vertices(winners, slab)
+
+
+def _vertices(winners: NDArray[np.void], slab: Slab) -> Vertices:
+    has_point = winners["n_points"] > 0
+    return Vertices(
+        point=np.where(has_point, winners["point"], NO_POINT).reshape(slab.frame.shape),
+        depth_m=winners["depth_m"].reshape(slab.frame.shape),
+    )
+
+
+def _spanned(surface: CellSurface, net: Net) -> CellSurface:
+    """Replace what the points of cells tell by what the net does, at the centres."""
+    is_known = np.isfinite(net.depth_m)[:, np.newaxis]
     return replace(
         surface,
-        depth_m=np.ascontiguousarray(found[0][:, 0]),
-        intensity=None if surface.intensity is None else np.ascontiguousarray(found[1][:, 0]),
-        rgb=None if surface.rgb is None else np.rint(np.nan_to_num(found[-1])).astype(np.uint8),
-        # The net tells what is at the centres.
-        places=np.where(np.isfinite(found[0]), np.float32(0.0), np.float32(np.nan)).repeat(2, 1),
+        depth_m=net.depth_m,
+        intensity=net.intensity,
+        rgb=net.rgb,
+        places=np.where(is_known, np.float32(0.0), np.float32(np.nan)).repeat(2, 1),
     )
-
-
-def _interpolated(
-    places: NDArray[np.float64],
-    values: Sequence[NDArray[np.generic]],
-    shape: tuple[int, int],
-) -> list[NDArray[np.float32]]:
-    """Values at all cell centres, linear in the triangles of a Delaunay net.
-
-    The net spans every gap, windows included, and lays slopes where depths step.
-
-    Args:
-        places: (n, 2) column and row of the vertices, cell centres at .5.
-        values: arrays (n, channels), each with values at the vertices.
-        shape: rows and columns of the raster.
-
-    Returns:
-        An array (cells, channels) for each of `values`; NaN outside the net.
-
-    Raises:
-        MethodError: the points make no triangle, or too many.
-    """
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import Delaunay, QhullError
-
-    if len(places) > _VERTICES_MOST:
-        raise MethodError(
-            f"surface tin takes at most {_VERTICES_MOST} cells with points, this wall has "
-            f"{len(places)}: raise gsd_m, or take another surface"
-        )
-    stacked = np.column_stack([np.asarray(array, dtype=np.float64) for array in values])
-    no_net = MethodError(
-        f"surface tin needs points that span triangles about the cells of each wall, and the "
-        f"{len(places)} cells with points of this one do not: take another surface"
-    )
-    try:
-        net = Delaunay(places)
-    except (QhullError, ValueError) as error:
-        raise no_net from error
-    look_up = LinearNDInterpolator(net, stacked)
-    rows, columns = shape
-    found = np.empty((rows * columns, stacked.shape[1]), dtype=np.float32)
-    for first in range(0, rows, _ROWS_AT_ONCE):
-        end = min(first + _ROWS_AT_ONCE, rows)
-        row, column = np.mgrid[first:end, :columns] + 0.5
-        found[first * columns : end * columns] = look_up(
-            np.column_stack([column.ravel(), row.ravel()])
-        )
-    if not np.isfinite(found).any():
-        raise no_net
-    widths = np.cumsum([array.shape[1] for array in values])[:-1]
-    return np.split(found, widths, axis=1)
 
 
 def _surface_of_all(cloud: PointCloud, slab: Slab, rule: SurfaceRule) -> CellSurface:

@@ -16,9 +16,10 @@ from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, bands_with_reach
 from orthoflow.geometry.levels import REC_601
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
-from orthoflow_plugins.raster.rules import RasterRule, Surface
+from orthoflow_plugins.raster.rules import RasterRule
 
 if TYPE_CHECKING:
+    from orthoflow_plugins.raster.nets import Net
     from orthoflow_plugins.raster.surfaces import CellSurface
 
 # Bytes per cell: what a finished wall keeps, and what the passes over one wall hold on top.
@@ -37,7 +38,7 @@ class WallRaster:
     scan_step_m: float
 
 
-def require_memory(frames: Sequence[WallFrame], surface: Surface) -> None:
+def require_memory(frames: Sequence[WallFrame]) -> None:
     """Refuse cells that are too fine for the machine.
 
     Raises:
@@ -46,10 +47,7 @@ def require_memory(frames: Sequence[WallFrame], surface: Surface) -> None:
     sizes = [frame.width * frame.height for frame in frames]
     # What is large lies in files once it is done; in bands it takes the memory of a band.
     kept = sum(size for size in sizes if size <= IN_MEMORY_CELLS)
-    working = max(
-        _BAND_CELLS if _is_banded(frame, surface) else size
-        for size, frame in zip(sizes, frames, strict=True)
-    )
+    working = min(max(sizes), _BAND_CELLS)
     needed = _BYTES_KEPT * kept + _BYTES_WORKING * working
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     # Cells are numbered with 32 bits.
@@ -81,7 +79,7 @@ def rastered_wall(
         index: of the wall's plane.
         allocate: gives the arrays of a large wall, by name.
     """
-    if _is_banded(slab.frame, rule.surface.surface):
+    if slab.n_cells > _BAND_CELLS:
         raster = _rastered_in_bands(cloud, slab, rule, allocate)
     else:
         raster = _rastered(cloud, slab, rule)
@@ -155,16 +153,11 @@ class _Raster:
     mask: NDArray[np.uint8]
 
 
-def _is_banded(frame: WallFrame, surface: Surface) -> bool:
-    """Whether a wall is rastered band by band; the triangles of a net know no bands."""
-    return frame.width * frame.height > _BAND_CELLS and surface != "tin"
-
-
-def _rastered(cloud: PointCloud, slab: Slab, rule: RasterRule) -> _Raster:
+def _rastered(cloud: PointCloud, slab: Slab, rule: RasterRule, net: Net | None = None) -> _Raster:
     from orthoflow_plugins.raster.gaps import close_gaps
     from orthoflow_plugins.raster.surfaces import carried_to_centres, surface_of
 
-    surface = surface_of(cloud, slab, rule.surface)
+    surface = surface_of(cloud, slab, rule.surface, net)
     mask = close_gaps(cloud, slab, surface, rule.gaps)
     surface = carried_to_centres(surface, slab, rule.surface)
     if surface.intensity is None:
@@ -180,8 +173,11 @@ def _rastered_in_bands(
 
     whole: dict[str, NDArray[np.generic]] = {}
     frame, width = slab.frame, slab.frame.width
+    net = _net_in_bands(cloud, slab, rule, allocate) if rule.surface.surface == "tin" else None
     for band in bands_with_reach(frame.shape, cells_most=_BAND_CELLS, reach_rows=rule.reach_rows):
-        raster = _rastered(cloud, slab.over(band.around), rule)
+        around = slice(band.around.start * width, band.around.stop * width)
+        part = None if net is None else net.part(around)
+        raster = _rastered(cloud, slab.over(band.around), rule, part)
         cells = slice(band.rows.start * width, band.rows.stop * width)
         inner = slice(band.inner.start * width, band.inner.stop * width)
         arrays = {"mask": raster.mask} | _fields_of(raster.surface)
@@ -195,6 +191,23 @@ def _rastered_in_bands(
     # The arrays have the types of the bands' own.
     surface = CellSurface(**cast("dict[str, Any]", absent | whole))
     return _Raster(surface=surface, mask=mask.astype(np.uint8, copy=False))
+
+
+def _net_in_bands(cloud: PointCloud, slab: Slab, rule: RasterRule, allocate: Allocate) -> Net:
+    """The net of a large wall: its corners are found band by band, and lie in files as it does."""
+    from orthoflow_plugins.raster.nets import Vertices, lay_net
+    from orthoflow_plugins.raster.surfaces import vertices_of
+
+    shape = slab.frame.shape
+    vertices = Vertices(
+        point=np.asarray(allocate("net_point", shape, np.uint32), np.uint32),
+        depth_m=np.asarray(allocate("net_corner_m", shape, np.float32), np.float32),
+    )
+    for band in bands_with_reach(shape, cells_most=_BAND_CELLS, reach_rows=0):
+        found = vertices_of(cloud, slab.over(band.rows), rule.surface)
+        vertices.point[band.rows] = found.point
+        vertices.depth_m[band.rows] = found.depth_m
+    return lay_net(cloud, slab, vertices, allocate)
 
 
 def _in_files(raster: _Raster, allocate: Allocate) -> _Raster:

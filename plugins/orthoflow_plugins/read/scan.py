@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from orthoflow.errors import InputError
 from orthoflow.files.points import ScanFile, open_scan
+from orthoflow.files.points.ahead import read_ahead
 from orthoflow.files.points.columns import columns_of_text
 from orthoflow.files.points.copc import Wish
 from orthoflow.files.points.formats import LAS
@@ -153,12 +154,13 @@ class ReadScan(Method):
             ctx.warn("columns only speaks of text files, and none was read; it has no effect")
         assembly = CloudAssembly(ctx, files, unit_m, box_m)
         _warn_of_missing_fields(ctx, files, assembly)
-        for file in files:
-            # Damaged numbers overflow on their way; what is not finite is dropped and counted.
-            with np.errstate(all="ignore"):
-                assembly.add_file(file)
-            for note in file.notes:
-                ctx.warn(note)
+        with read_ahead(files, inputs.files.paths, columns, cores=ctx.cores) as read:
+            for file in read:
+                # Damaged numbers overflow on their way; what is not finite is dropped and counted.
+                with np.errstate(all="ignore"):
+                    assembly.add_file(file)
+                for note in file.notes:
+                    ctx.warn(note)
         assembly.require_points()
         cloud = _finish(ctx, assembly, files, params)
         ctx.figure(

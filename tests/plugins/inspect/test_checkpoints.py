@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.inspect import figures
 from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
 from orthoflow_plugins.inspect.findings import (
     check_findings,
@@ -24,7 +26,7 @@ from orthoflow_plugins.simulate.room import SimulateRoom
 from scipy.ndimage import gaussian_filter
 
 from orthoflow.errors import MethodError
-from orthoflow.geometry import frame_over
+from orthoflow.geometry import bands, frame_over
 from orthoflow.geometry.scene_views import render_frame
 from orthoflow.products import (
     CheckPoints,
@@ -266,3 +268,37 @@ def _intensity_of(path: Path, scratch: Path) -> Walls:
     # As fine as the points lie.
     grid = RasterGrid.Params(gsd_m=0.0013)
     return RasterGrid().run(RasterGrid.In(cloud=cloud, planes=planes), grid, context(scratch)).walls
+
+
+@pytest.mark.parametrize("has_image", [False, True], ids=["intensity", "orthoimage"])
+def test_points_are_measured_without_memory_per_cell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_image: bool
+) -> None:
+    where = inspect_scenes.frame(shape=(1600, 2000))
+    n_cells = where.width * where.height
+    for place in (bands, figures):
+        name = "_BAND_CELLS" if place is bands else "_WHOLE_CELLS"
+        monkeypatch.setattr(place, name, 1 << 17)
+    monkeypatch.setattr("orthoflow_plugins.inspect.checkpoints.IN_MEMORY_CELLS", 1 << 17)
+    monkeypatch.setattr("orthoflow_plugins.inspect.figures._LONGEST_PX", 200)
+    monkeypatch.setattr("orthoflow_plugins.inspect.image_quality._TILE_CELLS", 256)
+    grey = np.random.default_rng(1).random(where.shape, dtype=np.float32)
+    wall = samples.wall(
+        where,
+        depth_m=np.zeros(where.shape, dtype=np.float32),
+        sigma_m=np.zeros(where.shape, dtype=np.float32),
+        count=np.ones(where.shape, dtype=np.uint32),
+        mask=np.ones(where.shape, dtype=np.uint8),
+        intensity=grey,
+    )
+    image = inspect_scenes.image_of(255.0 * grey) if has_image else None
+    place = np.array([[1000.5, 800.5]])
+    points = points_at(where.world_from_wall(place), pixels=place + 0.25)
+    inspect(tmp_path, points, inspect_scenes.walls(), inspect_scenes.displaced(0, 0))  # loaded
+    tracemalloc.start()
+    try:
+        metrics, _, _ = inspect(tmp_path, points, samples.walls(wall), image)
+        assert tracemalloc.get_traced_memory()[1] < 4.0 * n_cells
+    finally:
+        tracemalloc.stop()
+    assert metrics["mean_x_mm"] == pytest.approx(0.25e3 * GSD_M)

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import tracemalloc
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect import key_pairs
+from orthoflow_plugins.inspect import key_pairs, patches
+from orthoflow_plugins.inspect.image_quality import OrthoimageGrey
+from orthoflow_plugins.inspect.key_pairs import find_key_pairs
 from orthoflow_plugins.inspect.patches import GreyImage
+
+from tests import inspect_scenes
+from tests.inspect_scenes import displaced
 
 
 def winners(pairs: list[tuple[int, float]]) -> list[bool]:
@@ -144,3 +152,52 @@ def test_patch_means_are_shares_of_a_square_about_the_place() -> None:
     valid[:, 50:] = 1.0
     places = np.array([[20.5, 50.5], [50.5, 50.5], [58.5, 50.5], [80.5, 50.5]])
     np.testing.assert_allclose(key_pairs._patch_means(valid, places), [0.0, 0.5, 0.75, 1.0])
+
+
+def test_tiles_of_large_pictures_give_the_pairs_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shown, true = (OrthoimageGrey(displaced(*by)) for by in ((1.4, -0.6), (0.0, 0.0)))
+    whole = find_key_pairs(shown, true, radius_cells=40.0)
+    monkeypatch.setattr(key_pairs, "_WHOLE_CELLS", 1000)
+    monkeypatch.setattr(key_pairs, "_TILE_CELLS", 150)
+    # What the widest descriptors look at fits in, so that all points are those of the whole.
+    monkeypatch.setattr(key_pairs, "_SURF_RIM_CELLS", 400)
+    tiled = find_key_pairs(shown, true, radius_cells=40.0)
+    assert tiled.n_points == whole.n_points
+    assert tiled.n_matched == whole.n_matched
+    assert len(tiled) == len(whole) >= 50
+    by_place = [np.lexsort((*pairs.places.T, *pairs.found.T)) for pairs in (tiled, whole)]
+    for name in ("places", "found", "shift"):
+        one, other = (
+            getattr(pairs, name)[order]
+            for pairs, order in zip((tiled, whole), by_place, strict=True)
+        )
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-6, err_msg=name)
+
+
+def test_large_pictures_take_the_memory_of_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = displaced(1.4, -0.6)
+    image = dataclasses.replace(
+        image,
+        frame=inspect_scenes.frame(shape=(560, 720)),
+        rgb=np.tile(image.rgb, (2, 2, 1)),
+        mask=np.tile(image.mask, (2, 2)),
+        source=np.tile(image.source, (2, 2)),
+    )
+    monkeypatch.setattr(key_pairs, "_WHOLE_CELLS", 1000)
+    monkeypatch.setattr(key_pairs, "_TILE_CELLS", 200)
+    monkeypatch.setattr(key_pairs, "_SURF_RIM_CELLS", 64)
+    monkeypatch.setattr(key_pairs, "_RIM_CELLS", 40)
+    monkeypatch.setattr(patches, "_AT_ONCE", 100)
+    grey = OrthoimageGrey(image)
+    find_key_pairs(OrthoimageGrey(displaced(0.0, 0.0)), grey, radius_cells=30.0)  # loaded
+    tracemalloc.start()
+    try:
+        pairs = find_key_pairs(grey, grey, radius_cells=30.0)
+        # A whole picture takes more than 200 bytes a cell.
+        assert tracemalloc.get_traced_memory()[1] < 70 * image.mask.size
+    finally:
+        tracemalloc.stop()
+    assert len(pairs) > 300
+    np.testing.assert_allclose(pairs.shift, 0.0, atol=1e-3)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+from orthoflow_plugins.inspect import image_quality
 from orthoflow_plugins.inspect.image_quality import cells_per_pixel, stretch_findings
 
+from orthoflow.geometry import bands
 from orthoflow.geometry.cameras import ViewingCamera, looking_at
-from orthoflow.products import Orthoimage, Wall
+from orthoflow.products import Orthoimage, OrthoMask, Wall
 from orthoflow.testing import photographed as ms
 from tests import samples
 
@@ -89,3 +92,22 @@ def test_shares_count_cells_of_pixels_over_two_and_over_five_cells() -> None:
     assert found["stretch_share"] == 1.0
     assert found["smear_share"] == pytest.approx(8 / SIDE)
     assert stretch_findings(image(), wall(depth), None) == []
+
+
+def test_the_same_cells_are_asked_whether_a_wall_is_large_or_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(3)
+    shown = dataclasses.replace(
+        image(), mask=rng.choice([OrthoMask.NONE, OrthoMask.PAINTED], FRAME.shape).astype(np.uint8)
+    )
+    monkeypatch.setattr(image_quality, "_ASKED_MOST", 100)
+    asked = []
+    for band_cells in (1 << 24, 7 * SIDE):
+        monkeypatch.setattr(bands, "_BAND_CELLS", band_cells)
+        asked.append(
+            image_quality._asked_cells(shown, wall(np.zeros(FRAME.shape)), shown.sources[0])
+        )
+    expected = np.flatnonzero(shown.mask == OrthoMask.PAINTED)
+    np.testing.assert_array_equal(asked[0], expected[:: len(expected) // 100])
+    np.testing.assert_array_equal(asked[1], asked[0])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from orthoflow_plugins.inspect import patches, surf
-from orthoflow_plugins.inspect.image_quality import grey_of
+from orthoflow_plugins.inspect.image_quality import OrthoimageGrey
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
 from orthoflow_plugins.inspect.surf import InspectSurf
 
@@ -51,7 +51,7 @@ def test_a_displacement_is_told_to_a_tenth_of_a_cell(
 def test_pairs_do_not_hang_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     # So that several parts are refined at once.
     monkeypatch.setattr(patches, "_AT_ONCE", 20)
-    shown, true = grey_of(displaced(1.4, -0.6)), grey_of(displaced(0.0, 0.0))
+    shown, true = (OrthoimageGrey(displaced(*by)) for by in ((1.4, -0.6), (0.0, 0.0)))
     one, two = (
         find_key_pairs(shown, true, radius_cells=40.0, threads=threads) for threads in (1, 2)
     )

@@ -195,3 +195,18 @@ def test_a_picture_of_a_depth_is_grey_where_it_is_void_and_spreads_the_rest() ->
 def test_pictures_of_large_walls_have_some_of_their_rows_and_columns(side: int, shown: int) -> None:
     of = wall([[1] * side] * 3)
     assert decode_image(reporting._depth_preview(of)).shape[1] == shown
+
+
+def test_gaps_that_a_net_of_triangles_leaves_open_are_told(
+    listener: Listener, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orthoflow_plugins.raster.nets.VERTICES_MOST", 3)
+    large = wall([[1, 1], [1, 1], [0, 0]])
+    closed = wall([[1, 1], [1, 1], [0, 0]], mask=[[1, 1], [1, 1], [2, 2]])
+    small = wall([[1, 1], [1, 0]])
+    reporting.warn_of_wide_gaps(listener.context, [large, closed, small])
+    (said,) = listener.warnings
+    assert said == (
+        "wall 0: surface tin spans no gap wider than about 512 cells (2.56 m) where more than 3 "
+        "cells of a wall have points, here 4: raise gsd_m to close wider ones"
+    )
