@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.match import tie_pieces
 from orthoflow_plugins.match.tie_pieces import TiePiece, key_point_ties, ties_of, without_twins
 
 from orthoflow.files.images import encode_png
@@ -125,10 +124,21 @@ def test_large_key_points_are_less_exact_and_those_of_voids_left_out(scale: floa
     np.testing.assert_array_equal(found.pixels_photo, in_photo.pixels[[0, 2]])
     expected = wall.frame.world_from_wall(on_wall.pixels[[0, 2]], 0.0)
     np.testing.assert_allclose(found.points_world, expected, atol=1e-6)
-    least, per_size = tie_pieces._SIGMA_LEAST_PX, tie_pieces._SIGMA_PER_SIZE
-    sizes = np.array([2.0, 100.0]) * scale
-    np.testing.assert_allclose(found.sigma_px, np.maximum(least, per_size * sizes) / scale)
-    on_raster = GSD_M * np.maximum(least, per_size * np.array([2.0, 40.0]))
+    # Key points of a hundred pixels are known to six of them, small ones to a third of one.
+    small, large = found.sigma_px * scale
+    assert small == pytest.approx(0.35)
+    assert large == pytest.approx(6.0 * scale)
+    on_raster = GSD_M * np.array([0.35, 2.4])
     # The surface's own deviation comes on top.
     assert (found.sigma_m >= on_raster).all()
     assert found.sigma_m[0] < found.sigma_m[1] < 3.0 * GSD_M
+
+
+def test_key_points_known_worse_than_to_three_cells_are_left_out() -> None:
+    wall = inspect_scenes.walls().walls[0]
+    sizes = [2.0, 5.6, 6.1, 44.0, 54.0]
+    pixels = np.column_stack([np.full(5, 50.5), 40.5 + 20.0 * np.arange(5)])
+    found = key_point_ties((0, 0), wall, (features(pixels, sizes), features(pixels, sizes)))
+    # They err by more from a size of six pixels on; of 54, by more than three cells.
+    np.testing.assert_array_equal(found.pixels_photo, pixels[:4])
+    assert found.sigma_px[0] == found.sigma_px[1] < found.sigma_px[2] < found.sigma_px[3]

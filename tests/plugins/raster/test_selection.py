@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -142,3 +143,70 @@ def test_a_rank_that_no_plane_has_is_refused() -> None:
     assert chosen_planes(two, replace(CHOICE, ranks=(1,))) == [1]
     with pytest.raises(MethodError, match=r"ranks names plane 2, but 2 planes were found, 0 to 1"):
         chosen_planes(two, replace(CHOICE, ranks=(1, 2)))
+
+
+def leaning(degrees: float) -> Planes:
+    """One plane of 4 m2 whose normal rises by so much above the horizon."""
+    rise = np.radians(degrees)
+    normal = np.array([[0.0, -np.cos(rise), np.sin(rise)]])
+    down = np.array([0.0, -2.0 * np.sin(rise), -2.0 * np.cos(rise)])
+    corners = _rectangle(np.zeros(3), np.array([2.0, 0.0, 0.0]), down)[None]
+    return samples.planes(
+        normal=normal,
+        offset=np.zeros(1),
+        corners=corners,
+        n_points=np.array([9]),
+        names=("a",),
+    )
+
+
+@pytest.mark.parametrize(
+    ("degrees", "constraint", "fits"),
+    [
+        (9.8, "vertical", True),
+        (-9.8, "vertical", True),
+        (10.2, "vertical", False),
+        (80.2, "horizontal", True),
+        (-80.2, "horizontal", True),
+        (79.8, "horizontal", False),
+        (45.0, "any", True),
+    ],
+)
+def test_walls_and_floors_lean_by_ten_degrees_at_most(
+    degrees: float, constraint: Any, fits: bool
+) -> None:
+    choice = replace(CHOICE, constraint=constraint)
+    if fits:
+        assert chosen_planes(leaning(degrees), choice) == [0]
+    else:
+        with pytest.raises(MethodError, match=f"none of the 1 planes is {constraint}"):
+            chosen_planes(leaning(degrees), choice)
+
+
+@pytest.mark.parametrize(
+    ("other", "is_covered"),
+    [
+        ((0.0, 1.0, 2.0, 4.8), True),
+        ((0.0, 1.0, 2.0, -4.8), True),
+        ((0.0, 1.0, 2.0, 5.2), False),
+        # 4 m wide: so much of it lies within the wall.
+        ((0.0, 1.76, 4.0, 0.0), True),
+        ((0.0, 1.84, 4.0, 0.0), False),
+        ((0.0, -0.76, 4.0, 0.0), True),
+        ((0.0, -0.84, 4.0, 0.0), False),
+    ],
+)
+def test_relief_is_parallel_to_five_degrees_and_four_fifths_within(
+    other: tuple[float, float, float, float], is_covered: bool
+) -> None:
+    wide = replace(CHOICE, buffer_m=lambda _: (0.5, 0.5))
+    assert chosen_planes(planes(MAIN, other), wide) == ([0] if is_covered else [0, 1])
+
+
+@pytest.mark.parametrize("depth_m", [0.2, -0.3])
+def test_a_buffer_has_a_front_and_a_back(depth_m: float) -> None:
+    both = planes(MAIN, (depth_m, 1.0, 3.0, 0.0))
+    for reach_m, covered in ((abs(depth_m) + 0.01, [0]), (abs(depth_m) - 0.01, [0, 1])):
+        buffer_m = (reach_m, 0.0) if depth_m > 0.0 else (0.0, reach_m)
+        choice = replace(CHOICE, buffer_m=lambda _, reach=buffer_m: reach)
+        assert chosen_planes(both, choice) == covered
