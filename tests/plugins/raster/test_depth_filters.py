@@ -137,3 +137,34 @@ def test_depths_of_no_noise_or_no_radius_are_left_as_they_are() -> None:
     nothing = np.full((20, 20), np.nan, dtype=np.float32)
     assert denoised(nothing, 3) is nothing
     assert denoised(noisy, 1) is not noisy
+
+
+def test_cells_are_sparse_for_what_lies_within_sixteen_of_a_dense_place() -> None:
+    # Squares of 5 x 5 cells are full up to column 27.
+    for column, is_sparse in ((43, True), (44, False)):
+        is_known = np.ones((60, 80), dtype=np.bool_)
+        is_known[:, 30:] = False
+        is_known[::6, column::6] = True
+        sparse = depth_filters._sparse(is_known)[18:42]
+        assert sparse[:, column].any() == is_sparse
+        assert not sparse[:, column + 1 :].any()
+
+
+@pytest.mark.parametrize(("sigmas", "is_speck"), [(3.2, False), (5.5, True)])
+def test_sparse_cells_agree_within_four_deviations_of_the_noise(
+    sigmas: float, is_speck: bool
+) -> None:
+    depth_m = flat(80, 80, noise_m=0.001)
+    depth_m[:, 25:35] = np.nan
+    depth_m[20, 30] = 0.5
+    for row, column in ((20, 28), (20, 32), (18, 30), (22, 30)):
+        depth_m[row, column] = 0.5 + 0.001 * sigmas
+    # Cells so small that the slope of a surface adds nothing.
+    cleaned = without_specks(depth_m, gsd_m=1e-9, layer_m=LAYER_M, threads=1)
+    assert np.isnan(cleaned[20, 30]) == is_speck
+
+
+def test_noise_of_less_than_a_fiftieth_of_a_millimetre_is_left() -> None:
+    quiet, noisy = flat(noise_m=1.6e-5), flat(noise_m=2.6e-5)
+    assert denoised(quiet, 3) is quiet
+    assert denoised(noisy, 3) is not noisy

@@ -1,0 +1,170 @@
+"""What counts as an edge, as shown and as stretched, from both sides of each limit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.inspect.image_quality import (
+    cells_per_pixel,
+    completeness,
+    grey_of,
+    quality_findings,
+    sharpness_findings,
+    shown,
+    stretch_findings,
+)
+from orthoflow_plugins.inspect.patches import GreyImage
+from scipy.special import erf
+
+from orthoflow.geometry.cameras import ViewingCamera, looking_at
+from orthoflow.products import Orthoimage, OrthoMask, Wall
+from orthoflow.testing import photographed as ms
+from tests import samples
+
+UP = np.array([0.0, 0.0, 1.0])
+SIDE, GSD_M = 20, 0.01
+FRAME = samples.facing_south(GSD_M, SIDE, SIDE)
+# The edge lies on the middle of this column.
+EDGE = 30
+
+
+def edge(rows: int = 40, *, contrast: float = 100.0, columns: int = 61) -> NDArray[np.float64]:
+    """An upright edge between two greys, as wide as a Gaussian of a cell makes it."""
+    across = np.arange(columns) - EDGE
+    row = 128.0 + 0.5 * contrast * erf(across / np.sqrt(2.0))
+    return np.tile(row, (rows, 1))
+
+
+def numbers(grey: NDArray[np.float64], valid: NDArray[np.bool_] | None = None) -> dict[str, float]:
+    known = np.ones(grey.shape, dtype=np.bool_) if valid is None else valid
+    image = GreyImage(grey=grey, valid=known, region=known)
+    return {item.name: item.value for item in sharpness_findings(image, 3)}
+
+
+@pytest.mark.parametrize(("rows", "is_told"), [(19, False), (20, True)])
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_twenty_edges_tell_how_sharp_an_image_is(rows: int, is_told: bool, turns: int) -> None:
+    found = numbers(np.rot90(edge(rows), turns))
+    assert bool(found) == is_told
+    if is_told:
+        assert found["n_edges"] == rows
+        # From 10 to 90 % of a Gaussian; its MTF halves at sqrt(ln 2 / 2) / pi.
+        assert found["edge_width_cells"] == pytest.approx(2.563, rel=0.03)
+        assert found["mtf50_per_cell"] == pytest.approx(0.1874, rel=0.03)
+
+
+@pytest.mark.parametrize(("contrast", "is_told"), [(29.5, False), (30.5, True), (-30.5, True)])
+def test_paler_edges_than_thirty_grey_levels_tell_nothing(contrast: float, is_told: bool) -> None:
+    assert bool(numbers(edge(contrast=contrast))) == is_told
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(("slope", "is_told"), [(5.9, True), (6.9, False)])
+def test_either_side_of_an_edge_is_even_to_a_seventh(
+    side: int, slope: float, is_told: bool
+) -> None:
+    # From three cells off on grey changes, by 2.75 cells' worth within what is looked at.
+    off = np.arange(61) - EDGE
+    grey = edge() + slope * side * np.clip(side * off - 4.0, 0.0, None)
+    assert bool(numbers(grey)) == is_told
+
+
+@pytest.mark.parametrize(("reach", "is_told"), [(7, False), (8, True)])
+def test_edges_lie_eight_cells_from_what_is_not_known(reach: int, is_told: bool) -> None:
+    valid = np.zeros((40, 61), dtype=np.bool_)
+    valid[:, EDGE - reach : EDGE + reach + 1] = True
+    found = numbers(np.where(valid, edge(), 0.0), valid)
+    assert bool(found) == is_told
+
+
+def image(
+    mask: NDArray[np.uint8], rgb: NDArray[np.uint8] | None = None, **known: object
+) -> Orthoimage:
+    plain = np.zeros((*FRAME.shape, 3), dtype=np.uint8) if rgb is None else rgb
+    return samples.orthoimage(FRAME, name="wall", rgb=plain, mask=mask, **known)
+
+
+def masked() -> NDArray[np.uint8]:
+    """A quarter painted, a tenth filled, the rest not."""
+    mask = np.full(FRAME.shape, OrthoMask.NO_SURFACE, dtype=np.uint8)
+    mask[:5] = OrthoMask.PAINTED
+    mask[5:7] = OrthoMask.FILLED
+    return mask
+
+
+def wall(depth_m: NDArray[np.float32] | None = None) -> Wall:
+    plain = np.zeros(FRAME.shape, dtype=np.float32)
+    return samples.wall(FRAME, depth_m=plain if depth_m is None else depth_m)
+
+
+def test_what_is_shown_is_painted_or_filled_and_the_rest_is_black() -> None:
+    rgb = np.full((*FRAME.shape, 3), 200, dtype=np.uint8)
+    rgb[..., 1] = 100
+    made = image(masked(), rgb)
+    np.testing.assert_array_equal(shown(made)[:, 0], np.arange(SIDE) < 7)
+    grey = grey_of(made)
+    np.testing.assert_array_equal(grey.valid, shown(made))
+    expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 200
+    np.testing.assert_allclose(grey.grey[:7], expected, atol=0.01)
+    assert not grey.grey[7:].any()
+
+
+def test_completeness_is_of_the_scanned_surface() -> None:
+    depth = np.zeros(FRAME.shape, dtype=np.float32)
+    depth[:, 10:] = np.nan
+    depth[0, 0] = np.nan
+    found = completeness(image(masked()), wall(depth))
+    assert (found.name, found.unit) == ("completeness", "1")
+    assert found.value == pytest.approx((7 * 10 - 1) / (20 * 10 - 1))
+    assert (
+        completeness(image(masked()), wall(np.full(FRAME.shape, np.nan, np.float32))).value == 0.0
+    )
+
+
+def test_the_filled_share_is_of_what_is_shown() -> None:
+    made = image(masked())
+    found = {f.name: f.value for f in quality_findings(made, wall(), grey_of(made), None)}
+    assert found == {"filled_share": pytest.approx(2.0 / 7.0)}
+
+
+def camera(cells_across: float, cells_down: float) -> ViewingCamera:
+    """Square before the wall and far away; a pixel covers so many cells."""
+    middle = FRAME.world_from_wall(np.array([[SIDE / 2, SIDE / 2]]))[0]
+    centre = middle + np.array([0.0, -100.0, 0.0])
+    lens = {"cx": 500.0, "cy": 500.0, "width": 1000, "height": 1000}
+    fx, fy = (100.0 / (cells * GSD_M) for cells in (cells_across, cells_down))
+    return samples.camera(looking_at(centre, middle, UP), centre, fx=fx, fy=fy, **lens)
+
+
+@pytest.mark.parametrize(
+    ("across", "down", "stretched", "smeared"),
+    [
+        (1.9, 1.0, 0.0, 0.0),
+        (2.1, 1.0, 1.0, 0.0),
+        (1.0, 2.1, 1.0, 0.0),
+        (4.9, 0.2, 1.0, 0.0),
+        (5.1, 5.0, 1.0, 1.0),
+    ],
+)
+def test_pixels_wider_than_two_cells_are_stretched_and_than_five_smeared(
+    across: float, down: float, stretched: float, smeared: float
+) -> None:
+    painted = np.full(FRAME.shape, OrthoMask.PAINTED, dtype=np.uint8)
+    cameras = ms.cameras(ms.oriented(camera(across, down), name="a.jpg"))
+    found = {f.name: f.value for f in stretch_findings(image(painted), wall(), cameras)}
+    assert found == {"stretch_share": stretched, "smear_share": smeared}
+
+
+def test_only_cells_that_a_photo_painted_are_asked() -> None:
+    mask = masked()
+    source = np.zeros(FRAME.shape, dtype=np.int16)
+    source[:2] = 1
+    made = image(mask, source=source, sources=("a.jpg", "b.jpg"))
+    view = camera(1.5, 1.5)
+    depth = np.zeros(FRAME.shape, dtype=np.float32)
+    depth[4] = np.nan
+    # Of the painted rows two are the other's, and one has no depth.
+    assert len(cells_per_pixel(made, wall(depth), ("a.jpg", view))) == 2 * SIDE
+    assert len(cells_per_pixel(made, wall(depth), ("b.jpg", view))) == 2 * SIDE
+    assert len(cells_per_pixel(made, wall(depth), ("c.jpg", view))) == 0
