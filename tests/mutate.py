@@ -49,7 +49,6 @@ import ast
 import hashlib
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -220,19 +219,16 @@ def folders_of(tree: Tree, path: str) -> list[str]:
 
 def _files_importing(root: Path, name: str) -> list[str]:
     """Files of tests, wherever they stand, that import a module itself."""
-    parent, _, stem = name.rpartition(".")
-    imports = re.compile(
-        rf"^ *(from {re.escape(name)} import|import {re.escape(name)}\b"
-        rf"|from {re.escape(parent)} import (\(\s*([\w ]+,\s*)*)?[^()\n]*\b{stem}\b)",
-        re.MULTILINE,
-    )
-    return [file for file, text in _texts_of_tests(root).items() if imports.search(text)]
+    return [file for file, names in _imports_of_tests(root).items() if name in names]
 
 
 @cache
-def _texts_of_tests(root: Path) -> dict[str, str]:
+def _imports_of_tests(root: Path) -> dict[str, frozenset[str]]:
     files = sorted((root / "tests").rglob("test_*.py"))
-    return {str(file.relative_to(root)): file.read_text(encoding="utf-8") for file in files}
+    return {
+        str(file.relative_to(root)): frozenset(_imported(ast.parse(file.read_bytes())))
+        for file in files
+    }
 
 
 def _kind_modules(names: set[str]) -> set[str]:
