@@ -140,8 +140,8 @@ def test_depths_of_no_noise_or_no_radius_are_left_as_they_are() -> None:
 
 
 def test_cells_are_sparse_for_what_lies_within_sixteen_of_a_dense_place() -> None:
-    # Squares of 5 x 5 cells are full up to column 27.
-    for column, is_sparse in ((43, True), (44, False)):
+    # The last square of 5 x 5 cells with a known one stands about column 31.
+    for column, is_sparse in ((47, True), (48, False)):
         is_known = np.ones((60, 80), dtype=np.bool_)
         is_known[:, 30:] = False
         is_known[::6, column::6] = True
