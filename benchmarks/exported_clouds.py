@@ -1,7 +1,8 @@
 """How long an export of a cloud takes and how much memory it needs, by number of points.
 
-`python benchmarks/exported_clouds.py --points 50` writes 50 million points of a simulated room as
-LAZ, PLY or E57, each in a process of its own, and prints seconds and the largest memory of each.
+`python -m benchmarks.exported_clouds --points 50` writes 50 million points of a simulated room as
+LAZ, COPC, PLY and E57, each in a process of its own, and prints seconds and the largest memory of
+each, with mapped files and without.
 """
 
 from __future__ import annotations
@@ -9,11 +10,15 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import tempfile
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.large_exports import own_mib, watch
+from benchmarks.tiled_orthoimage import largest_mib
+from orthoflow.files.clouds.copc import write_copc
 from orthoflow.files.clouds.dressing import DressedCloud
 from orthoflow.files.clouds.e57 import write_e57
 from orthoflow.files.clouds.las import write_laz
@@ -21,7 +26,7 @@ from orthoflow.files.clouds.neighbourhoods import neighbourhoods_of
 from orthoflow.files.clouds.ply import write_ply
 from orthoflow.products import PointCloud
 
-WRITERS = {"laz": write_laz, "ply": write_ply, "e57": write_e57}
+WRITERS = {"laz": write_laz, "copc": write_copc, "ply": write_ply, "e57": write_e57}
 ROOM_M = (12.0, 8.0, 4.0)
 
 
@@ -61,6 +66,9 @@ def export(name: str, folder: Path, n_points: int) -> None:
     cloud = PointCloud(
         origin=np.array([500_000.0, 4_000_000.0, 100.0]), up=np.array([0.0, 0.0, 1.0]), **arrays
     )
+    peaks, is_over = [own_mib()], threading.Event()
+    watcher = threading.Thread(target=watch, args=(peaks, is_over))
+    watcher.start()
     before, first = time.perf_counter(), time.process_time()
     dressed = DressedCloud(
         cloud=cloud, colouring="intensity", neighbourhoods=neighbourhoods_of(cloud)
@@ -68,13 +76,12 @@ def export(name: str, folder: Path, n_points: int) -> None:
     looked = time.perf_counter() - before
     path = folder / f"cloud.{name}"
     WRITERS[name](path, dressed)
-    lines = Path("/proc/self/status").read_text().splitlines()
-    # getrusage would tell the largest of the process that started this one.
-    (largest,) = [int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")]
+    is_over.set()
+    watcher.join()
     print(
         f"{name}: {n_points / 1e6:g} M points, {time.perf_counter() - before:.0f} s "
         f"({looked:.0f} s for normals), processor {time.process_time() - first:.0f} s, largest "
-        f"memory {largest:.0f} MiB with the mapped cloud of {16 * n_points / 2**20:.0f} MiB, "
+        f"memory {largest_mib():.0f} MiB, without mapped files {peaks[0]:.0f} MiB, "
         f"{path.stat().st_size / 1e6:.0f} MB",
         flush=True,
     )

@@ -23,7 +23,7 @@ Unit = Literal["m", "px", "grey", "deg", "1"]
 
 _ARRAY: Final = "$array"
 # Arrays of more than this are memory-mapped, whatever their product: nobody holds them in memory.
-_LARGE_BYTES: Final = 1 << 31
+_LARGE_BYTES: Final = 1 << 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +68,7 @@ class Product:
         type_name: identity in workflows, store and record; never changes.
         encoding_version: raised when the fields change; `upgraded` reads the older ones.
         mapped: store contiguous and memory-map on reading (for products of scan size; any product
-            of more than 2 GiB is).
+            of more than 1 GiB is).
         embedded: put the arrays into the record, not only their digest.
         tolerances: field name -> how far replays may differ; fields not named must be equal.
         items: name of the field, a tuple, whose entries a method may map over; empty for none.

@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pdfplumber
 import pytest
 from click.testing import CliRunner
 from PIL import Image
@@ -112,7 +113,6 @@ def test_librecad_draws_the_wall_with_its_picture_and_openings(exported: Path) -
         pytest.skip("LibreCAD or poppler is not installed (apt-get install librecad poppler-utils)")
     folder = exported / "dxf"
     name = f"wall_{WALL}"
-    # Its paper is in metres, as the drawing is, so that the page is vast; it is scaled down.
     for words in (
         [librecad, "dxf2pdf", "-a", f"{name}.dxf"],
         [pdftoppm, "-scale-to", "1000", "-png", "-singlefile", f"{name}.pdf", name],
@@ -127,6 +127,9 @@ def test_librecad_draws_the_wall_with_its_picture_and_openings(exported: Path) -
             env=environment(exported),
         )
         assert done.returncode == 0, done.stderr
+    with pdfplumber.open(folder / f"{name}.pdf") as pdf:
+        paper_mm = [side * 25.4 / 72.0 for side in (pdf.pages[0].width, pdf.pages[0].height)]
+    assert paper_mm == pytest.approx([420.0, 297.0], abs=0.5)
     picture = np.asarray(Image.open(folder / f"{name}.png").convert("RGB")).astype(int)
     # The layer of openings is cyan.
     is_cyan = (picture[..., 0] < 90) & (picture[..., 1:] > 200).all(axis=2)

@@ -54,7 +54,10 @@ _PICTURED: Final[Sequence[Command]] = tuple(
     for target in ("sheet", "dxf", "geojson", "gltf", "tiles", "stac")
 )
 _CLOUDS: Final[Sequence[Command]] = (
-    *(("export", "--to", target, "-o", f"out/{target}") for target in ("laz", "ply", "e57")),
+    *(
+        ("export", "--to", target, "-o", f"out/{target}")
+        for target in ("laz", "copc", "ply", "e57")
+    ),
     ("export", "--to", "ply", "--colour", "deviation", "--clean", "-o", "out/cleaned"),
     ("export", "--to", "laz", "--wall", "2", "-o", "out/wall"),
 )

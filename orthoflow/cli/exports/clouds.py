@@ -40,6 +40,13 @@ def export_laz(run: Run, folder: Path, chosen: Choices) -> str:
     return _export(run, folder, chosen, ("cloud.laz", write_laz))
 
 
+def export_copc(run: Run, folder: Path, chosen: Choices) -> str:
+    """Write `cloud.copc.laz` and what it holds as `cloud.json`."""
+    from orthoflow.files.clouds.copc import write_copc
+
+    return _export(run, folder, chosen, ("cloud.copc.laz", write_copc))
+
+
 def export_ply(run: Run, folder: Path, chosen: Choices) -> str:
     """Write `cloud.ply` and what it holds as `cloud.json`."""
     from orthoflow.files.clouds.ply import write_ply

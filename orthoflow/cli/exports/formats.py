@@ -85,6 +85,11 @@ FORMATS: Final[Mapping[str, Format]] = {
         "and scan of each point",
         options=_CLOUD_OPTIONS,
     ),
+    "copc": Format(
+        writer="clouds:export_copc",
+        summary="the same as COPC, a LAZ with an octree: viewers load what they show",
+        options=_CLOUD_OPTIONS,
+    ),
     "ply": Format(
         writer="clouds:export_ply",
         summary="the same as binary PLY with double coordinates",

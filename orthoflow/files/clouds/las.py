@@ -32,17 +32,18 @@ def write_laz(path: Path, dressed: DressedCloud) -> int:
         PluginError: laspy does not load.
     """
     laspy = load_library("laspy", path)
-    header = _header(laspy, dressed)
+    header = las_header(laspy, dressed)
     n_written = 0
     with laspy.open(path, mode="w", header=header) as writer:
         for points in dressed.blocks():
-            writer.write_points(_record(laspy, header, points))
+            writer.write_points(las_record(laspy, header, points))
             n_written += len(points)
     return n_written
 
 
 # Any: laspy has no types.
-def _record(laspy: Any, header: Any, points: Points) -> Any:
+def las_record(laspy: Any, header: Any, points: Points) -> Any:
+    """Give points as laspy writes them under a header."""
     record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
     record.x, record.y, record.z = points.world.T
     # LAS colours have 16 bits.
@@ -59,7 +60,8 @@ def _record(laspy: Any, header: Any, points: Points) -> Any:
     return record
 
 
-def _header(laspy: Any, dressed: DressedCloud) -> Any:
+def las_header(laspy: Any, dressed: DressedCloud) -> Any:
+    """Give the header of a cloud, without points."""
     cloud = dressed.cloud
     header = laspy.LasHeader(point_format=_POINT_FORMAT, version=_VERSION)
     extra: list[tuple[str, type[np.generic], str]] = [
@@ -79,9 +81,10 @@ def _header(laspy: Any, dressed: DressedCloud) -> Any:
     )
     header.scales = np.full(3, _scale_m(cloud))
     header.offsets = np.floor(cloud.origin)
+    # LAS 1.4 asks for it with this point format, known coordinate system or not.
+    header.global_encoding.wkt = True
     if dressed.crs_wkt:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(dressed.crs_wkt))
-        header.global_encoding.wkt = True
     # The same cloud gives the same bytes on another day; laspy would write today's.
     header.creation_date = _NO_DATE
     header.generating_software = "orthoflow"

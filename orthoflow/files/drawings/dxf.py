@@ -132,6 +132,8 @@ def _new_document() -> tuple[Drawing, Modelspace]:
     # Crosses of 5 cm: a dot is not seen on a picture.
     document.header["$PDMODE"] = 2
     document.header["$PDSIZE"] = _TEXT_M
+    # LibreCAD takes the limits of paper space for its paper, and them for metres: A3.
+    document.paperspace().dxf.limmax = (0.42, 0.297)
     return document, document.modelspace()
 
 

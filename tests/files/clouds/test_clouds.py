@@ -10,11 +10,13 @@ import laspy
 import numpy as np
 import pye57
 import pytest
+from laspy.copc import CopcReader
 from plyfile import PlyData
 from rasterio.crs import CRS
 
-from orthoflow.files.clouds import dressing
+from orthoflow.files.clouds import copc, dressing
 from orthoflow.files.clouds.colours import plane_colour
+from orthoflow.files.clouds.copc import write_copc
 from orthoflow.files.clouds.description import describe_cloud
 from orthoflow.files.clouds.dressing import DressedCloud
 from orthoflow.files.clouds.e57 import write_e57
@@ -24,6 +26,8 @@ from orthoflow.files.clouds.photo_colours import PointColours, colour_points
 from orthoflow.files.clouds.ply import write_ply
 from orthoflow.files.geotiff import epsg_of, epsg_wkt
 from orthoflow.files.images import encode_png
+from orthoflow.files.points import open_scan
+from orthoflow.files.points.copc import Wish
 from orthoflow.geometry.frames import frame_over
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Intrinsics, Photo, Planes, PointCloud, PointLabels
@@ -173,6 +177,62 @@ def test_another_program_reads_every_point_as_it_is(
     is_wall = np.arange(len(cloud)) < N_SIDE**2
     truth = np.where(is_wall[:, None], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     np.testing.assert_allclose(found.normal[away], truth[away], atol=1e-4)
+
+
+def test_copc_holds_the_points_of_laz_in_nodes_of_an_octree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(copc, "_KEPT_WHOLE", 300)
+    # The nearer to a corner the denser, as about a scanner.
+    x, y, z = (2.0 * np.random.default_rng(2).random((3, 8000)) ** 4).astype(np.float32)
+    cloud = PointCloud(
+        origin=ORIGIN, x=x, y=y, z=z, up=np.array([0.0, 0.0, 1.0]), intensity=x / 2.0
+    )
+    dress = dressed(cloud=cloud, colouring="intensity", planes=None)
+    path = tmp_path / "a.copc.laz"
+    assert write_copc(path, dress) == len(cloud)
+    assert list(tmp_path.iterdir()) == [path]
+    # In groups and blocks it gives the same bytes.
+    monkeypatch.setattr(copc, "_GROUP", 500)
+    monkeypatch.setattr(copc, "BLOCK", 1000)
+    monkeypatch.setattr(dressing, "BLOCK", 1000)
+    write_copc(tmp_path / "b.copc.laz", dress)
+    assert (tmp_path / "b.copc.laz").read_bytes() == path.read_bytes()
+    write_laz(tmp_path / "a.laz", dress)
+    found, laz = laspy.read(path), laspy.read(tmp_path / "a.laz")
+    rows = [sorted(row.tobytes() for row in read.points.array) for read in (found, laz)]
+    assert rows[0] == rows[1]
+    np.testing.assert_array_equal(found.header.mins, laz.header.mins)
+    np.testing.assert_array_equal(found.header.maxs, laz.header.maxs)
+    with CopcReader.open(path) as file:
+        info, entries = file.copc_info, file.root_page.entries
+        assert len(file.query().x) == len(cloud)
+    nodes = sorted(entries.values(), key=lambda entry: entry.offset)
+    places = {(node.key.level, node.key.x, node.key.y, node.key.z) for node in nodes}
+    parents = {(level - 1, x // 2, y // 2, z // 2) for level, x, y, z in places if level}
+    assert parents <= places
+    assert max(level for level, *_ in places) >= 3
+    first = 0
+    for node in nodes:
+        points = found.xyz[first : first + node.point_count]
+        first += node.point_count
+        side = 2.0 * info.halfsize / 2**node.key.level
+        place = (node.key.x, node.key.y, node.key.z)
+        within = (points - (info.center - info.halfsize)) / side - place
+        assert ((within > 0.0) & (within < 1.0)).all()
+        if (node.key.level, *place) in parents:
+            cells = np.floor(128 * within)
+            assert len(np.unique(cells, axis=0)) == len(points)
+        else:
+            assert len(points) <= 300
+    assert first == len(cloud)
+    # And orthoflow reads as much of it as one asks for.
+    root = [node.point_count for node in nodes if node.key.level == 0]
+    coarse = open_scan(path, wish=Wish(spacing=info.spacing))
+    assert [sum(block.n_read for block in coarse.read())] == root
+    assert info.spacing == pytest.approx(2.0 * info.halfsize / 128)
+    nothing = dataclasses.replace(dress, box_world=ORIGIN + 100.0 + np.eye(2, 3))
+    assert write_copc(tmp_path / "none", nothing) == 0
 
 
 @pytest.mark.parametrize("name", FORMATS)

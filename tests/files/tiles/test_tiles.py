@@ -126,12 +126,17 @@ def test_the_page_shows_and_measures_without_a_server(tiled: Path, tmp_path: Pat
         page.evaluate("new Promise(done => setTimeout(done, 500))")
         (tmp_path / "page.png").write_bytes(page.screenshot())
         picture = np.asarray(Image.open(tmp_path / "page.png").convert("RGB")).astype(int)
-        at = page.evaluate(
-            "(() => { const [x, y] = onScreen([800, 500]), box = canvas.getBoundingClientRect();"
-            " return [x + box.left, y + box.top]; })()"
-        )
-        pixel = picture[round(at[1]), round(at[0])]
-        assert np.abs(pixel - colours(WALL_SHAPE)[500, 800].astype(int)).max() <= 12
+
+        def shown(column: int, row: int) -> np.ndarray:
+            x, y = page.evaluate(
+                f"(() => {{ const [x, y] = onScreen([{column}, {row}]), box = "
+                "canvas.getBoundingClientRect(); return [x + box.left, y + box.top]; })()"
+            )
+            return picture[round(y), round(x)]
+
+        assert np.abs(shown(800, 500) - colours(WALL_SHAPE)[500, 800].astype(int)).max() <= 12
+        # Three cells inside the hole nothing shows, least of all a coarser level.
+        assert np.ptp(shown(350, 103)) == np.ptp(shown(350, 200)) == 0
         assert page.complaints == []
         assert all(address.startswith(("file:", "data:")) for address in page.requests)
 

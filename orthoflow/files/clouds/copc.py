@@ -1,0 +1,285 @@
+"""A cloud as COPC 1.0: a LAZ file whose chunks are the nodes of an octree, coarse ones first.
+
+Each node holds one point of each cell of its grid, its children hold points between those, and a
+node of few points keeps all of them. Points wait in files beside the one that is written, so that
+memory does not follow their number: they are sorted in groups along a Morton curve, none of which
+cuts a cell of the root's grid.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import struct
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.files.clouds.dressing import BLOCK, DressedCloud
+from orthoflow.files.clouds.las import las_header, las_record
+from orthoflow.files.points.libraries import load_library
+
+# Bits of a place along an axis; the grid of a node has 2^7 cells a side.
+_PLACE_BITS: Final = 21
+_GRID_BITS: Final = 7
+_DEEPEST: Final = _PLACE_BITS - _GRID_BITS
+_KEPT_WHOLE: Final = 1 << 15
+_GROUP: Final = 1 << 22
+_KEY_BITS: Final = 3 * _DEEPEST
+_SPREADS: Final = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+_INFO: Final = struct.Struct("<5d2Q2d88x")
+_ENTRY: Final = struct.Struct("<4iQ2i")
+# The chunks follow eight bytes that say where their table is.
+_TABLE_BYTES: Final = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Waiting:
+    """Points that wait to be written, in mapped files.
+
+    Attributes:
+        records: (n,) points as LAS stores them.
+        codes: (n,) uint64 places along the Morton curve of the root.
+        order: (n,) int64 numbers of the points, group after group.
+        counts: points of each cell of the root's grid, along the curve.
+        low: (3,) int64 lowest corner of the root, in steps of the file.
+        side: of the root, likewise.
+    """
+
+    records: NDArray[np.void]
+    codes: NDArray[np.uint64]
+    order: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    low: NDArray[np.int64]
+    side: int
+
+    @property
+    def groups(self) -> NDArray[np.int64]:
+        """Which group each cell belongs to; a group begins with a cell, none cuts one."""
+        return (np.cumsum(self.counts) - self.counts) // _GROUP
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Nodes:
+    """Runs of points of one node each, coarse nodes first; a node has a run per group.
+
+    Attributes:
+        key: (r,) uint64 level of the node, and below it 42 bits of its place along the curve.
+        first: (r,) int64 where the run begins in `_Waiting.order`.
+        count: (r,) int64.
+    """
+
+    key: NDArray[np.uint64]
+    first: NDArray[np.int64]
+    count: NDArray[np.int64]
+
+
+def write_copc(path: Path, dressed: DressedCloud) -> int:
+    """Write the chosen points, and give their number.
+
+    Raises:
+        PluginError: laspy or lazrs does not load.
+        OSError: the disk refuses.
+    """
+    laspy = load_library("laspy", path)
+    header = las_header(laspy, dressed)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        waiting = _waiting(laspy, header, dressed, Path(folder))
+        if waiting is None:
+            return 0
+        with path.open("w+b") as file:
+            _write(file, laspy, header, waiting)
+        return len(waiting.records)
+
+
+# Any: laspy and lazrs have no types.
+def _write(file: BinaryIO, laspy: Any, header: Any, waiting: _Waiting) -> None:
+    lazrs = load_library("lazrs", Path(file.name))
+    # A cube in steps of the file is one in metres, too: they are the same along all axes.
+    half = 0.5 * waiting.side * float(header.scales[0])
+    middle = header.offsets + header.scales * waiting.low + half
+    sizes = (*middle.tolist(), half, 2.0 * half / 2**_GRID_BITS)
+    info = laspy.VLR("copc", 1, "COPC info", _INFO.pack(*sizes, 0, 0, 0.0, 0.0))
+    header.vlrs.insert(0, info)
+    packed = lazrs.LazVlr.new_for_compression(
+        header.point_format.id, header.point_format.num_extra_bytes, use_variable_size_chunks=True
+    )
+    header.vlrs.append(laspy.vlrs.known.LasZipVlr(packed.record_data()))
+    header.are_points_compressed = True
+    # Extents begin with nothing instead of with 0.
+    header.partial_reset()
+    header.write_to(file)
+    compressor = lazrs.LasZipCompressor(file, packed)
+    nodes = _nodes(waiting)
+    for index in _points_of(waiting, nodes):
+        # The end of the last chunk is that of all; another would be empty.
+        if header.point_count:
+            compressor.finish_current_chunk()
+        points = waiting.records[index]
+        header.grow(laspy.PackedPointRecord(points, header.point_format))
+        compressor.compress_many(np.frombuffer(points, np.uint8))
+    compressor.done()
+    file.seek(header.offset_to_point_data)
+    chunks = lazrs.read_chunk_table(file, packed)
+    tree = _tree(nodes, chunks, header.offset_to_point_data + _TABLE_BYTES)
+    header.start_of_first_evlr, header.number_of_evlrs = file.seek(0, io.SEEK_END), 1
+    hierarchy = laspy.VLR("copc", 1000, "EPT hierarchy", tree)
+    laspy.vlrs.vlrlist.VLRList([hierarchy]).write_to(file, as_extended=True)
+    info.record_data = _INFO.pack(*sizes, file.tell() - len(tree), len(tree), 0.0, 0.0)
+    file.seek(0)
+    header.write_to(file, ensure_same_size=True)
+
+
+def _waiting(laspy: Any, header: Any, dressed: DressedCloud, folder: Path) -> _Waiting | None:
+    """Put the chosen points into files, with their places on the curve, ordered by groups."""
+    lowest, highest = [], []
+    kind = None
+    with (folder / "records").open("wb") as stream:
+        for points in dressed.blocks():
+            array = las_record(laspy, header, points).array
+            kind = array.dtype
+            stream.write(array.tobytes())
+            lowest.append([int(array[axis].min()) for axis in "XYZ"])
+            highest.append([int(array[axis].max()) for axis in "XYZ"])
+    if kind is None:
+        return None
+    records = np.memmap(folder / "records", dtype=kind, mode="r")
+    n_points = len(records)
+    # A step around it, and an odd number of them: then no point lies on a border of nodes, which
+    # readers compute from rounded metres.
+    low = np.min(lowest, axis=0) - 1
+    span = int((np.max(highest, axis=0) - low).max())
+    waiting = _Waiting(
+        records=records,
+        codes=np.memmap(folder / "codes", dtype=np.uint64, mode="w+", shape=n_points),
+        order=np.memmap(folder / "order", dtype=np.int64, mode="w+", shape=n_points),
+        counts=np.zeros(8**_GRID_BITS, dtype=np.int64),
+        low=low,
+        side=(span + 2) | 1,
+    )
+    for first in range(0, n_points, BLOCK):
+        part = slice(first, first + BLOCK)
+        waiting.codes[part] = codes = _codes(waiting, part)
+        waiting.counts[:] += np.bincount(_root_cells(codes), minlength=len(waiting.counts))
+    groups = waiting.groups
+    begins = np.cumsum(np.bincount(groups, weights=waiting.counts)).astype(np.int64)
+    begins = np.concatenate([[0], begins])
+    for first in range(0, n_points, BLOCK):
+        own = groups[_root_cells(waiting.codes[first : first + BLOCK])]
+        sorted_own = np.argsort(own, kind="stable")
+        for piece in np.split(sorted_own, np.flatnonzero(np.diff(own[sorted_own])) + 1):
+            group = own[piece[0]]
+            waiting.order[begins[group] : begins[group] + len(piece)] = first + piece
+            begins[group] += len(piece)
+    return waiting
+
+
+def _codes(waiting: _Waiting, part: slice) -> NDArray[np.uint64]:
+    """Places of points along the curve: bits of x, y and z in turn, from the lowest."""
+    records = waiting.records[part]
+    codes = np.zeros(len(records), dtype=np.uint64)
+    for axis, name in enumerate("XYZ"):
+        steps = records[name].astype(np.int64) - waiting.low[axis]
+        bits = ((steps << _PLACE_BITS) // waiting.side).astype(np.uint64)
+        for shift, mask in _SPREADS:
+            bits = (bits | (bits << np.uint64(shift))) & np.uint64(mask)
+        codes |= bits << np.uint64(axis)
+    return codes
+
+
+def _root_cells(codes: NDArray[np.uint64]) -> NDArray[np.int64]:
+    return _ancestors(codes, _GRID_BITS).astype(np.int64)
+
+
+def _ancestors(codes: NDArray[np.uint64], level: int) -> NDArray[np.uint64]:
+    """Cubes of a level, of which there are 8^level, that places lie in."""
+    return codes >> np.uint64(3 * (_PLACE_BITS - level))
+
+
+def _nodes(waiting: _Waiting) -> _Nodes:
+    """Order each group by its nodes."""
+    counts, order = waiting.counts, waiting.order
+    totals = [counts.reshape(8**level, -1).sum(axis=1) for level in range(_GRID_BITS + 1)]
+    sizes = np.bincount(waiting.groups, weights=counts).astype(np.int64)
+    # A cell of more points than a group takes the numbers of others.
+    sizes = sizes[sizes > 0]
+    keys, firsts, runs = [], [], []
+    for end, size in zip(np.cumsum(sizes), sizes, strict=True):
+        group = slice(end - size, end)
+        codes = waiting.codes[order[group]]
+        along = np.argsort(codes, kind="stable")
+        levels = np.empty(size, dtype=np.uint64)
+        levels[along] = _levels(codes[along], totals)
+        key = (levels << np.uint64(_KEY_BITS)) | (
+            codes >> (np.uint64(3) * (np.uint64(_PLACE_BITS) - levels))
+        )
+        by_node = np.argsort(key, kind="stable")
+        order[group] = order[group][by_node]
+        found, first, count = np.unique(key[by_node], return_index=True, return_counts=True)
+        keys.append(found)
+        firsts.append(first + group.start)
+        runs.append(count)
+    key = np.concatenate(keys)
+    by_key = np.argsort(key, kind="stable")
+    return _Nodes(
+        key=key[by_key],
+        first=np.concatenate(firsts)[by_key],
+        count=np.concatenate(runs)[by_key],
+    )
+
+
+def _levels(codes: NDArray[np.uint64], totals: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Levels of the nodes that keep points, which are sorted along the curve."""
+    levels = np.full(len(codes), _DEEPEST, dtype=np.int64)
+    left = np.arange(len(codes))
+    for level in range(_DEEPEST):
+        node = _ancestors(codes[left], level)
+        if level < len(totals):
+            total = totals[level][node]
+        else:
+            # Smaller than a cell of the root's grid, so all of it is in this group.
+            every = _ancestors(codes, level)
+            total = np.searchsorted(every, node, "right") - np.searchsorted(every, node, "left")
+        cell = _ancestors(codes[left], level + _GRID_BITS)
+        begins = np.flatnonzero(np.append(True, cell[1:] != cell[:-1]))
+        kept = total <= _KEPT_WHOLE
+        kept[(begins + np.append(begins[1:], len(cell))) // 2] = True
+        levels[left[kept]] = level
+        left = left[~kept]
+        if len(left) == 0:
+            break
+    return levels
+
+
+def _points_of(waiting: _Waiting, nodes: _Nodes) -> Iterator[NDArray[np.int64]]:
+    """Give the points of one node after the other."""
+    begins = np.flatnonzero(np.append(True, np.diff(nodes.key) != 0))
+    for begin, end in itertools.pairwise([*begins.tolist(), len(nodes.key)]):
+        runs = zip(nodes.first[begin:end], nodes.count[begin:end], strict=True)
+        index = np.concatenate([waiting.order[first : first + count] for first, count in runs])
+        # In the order of the cloud, which compresses best and does not tell the groups.
+        yield np.sort(index)
+
+
+def _tree(nodes: _Nodes, chunks: Sequence[tuple[int, int]], offset: int) -> bytes:
+    """The hierarchy: level, x, y, z, offset, bytes and points of each chunk, in their order."""
+    entries = []
+    for key, (n_points, n_bytes) in zip(np.unique(nodes.key).tolist(), chunks, strict=True):
+        level, place = key >> _KEY_BITS, key & ((1 << _KEY_BITS) - 1)
+        x, y, z = (
+            sum((place >> (3 * bit + axis) & 1) << bit for bit in range(level)) for axis in range(3)
+        )
+        entries.append(_ENTRY.pack(level, x, y, z, offset, n_bytes, n_points))
+        offset += n_bytes
+    return b"".join(entries)
