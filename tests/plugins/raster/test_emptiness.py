@@ -8,10 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.raster.emptiness import Sight, emptiness_of
 from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.raster.sampled_points import SampledPoints
 
+from orthoflow.geometry.slabs import Slab
 from orthoflow.products import PointCloud
 from tests import raster_scenes as scenes
+from tests import samples
 
 # A wall of 4 m x 3 m seen along +y, points 8 mm apart, cells of 2 cm; depth is -y.
 WALL = scenes.KnownWall(
@@ -105,3 +109,100 @@ def test_cells_finer_than_the_scan_are_told_from_holes(tmp_path: Path) -> None:
     assert shares["sparse"] > 0.9
     assert shares["unseen"] < SHARE
     assert "lie between the scan's points (raise gsd_m or recover_gap_cells)" in said[0]
+
+
+# A wall of 40 x 40 cells of 2 cm, void in the middle: four by four tiles of three cells each.
+VOID = slice(9, 21)
+VOID_SHARE = 144 / 1600
+
+
+def told(
+    places_m: NDArray[np.float64], *, station: tuple[float, float, float] | None = None
+) -> dict[str, float]:
+    """Why the void is empty, by points (n, 3): metres right, down and before the wall."""
+    frame = samples.facing_south(0.02, 40, 40)
+    count = np.ones(frame.shape, dtype=np.uint32)
+    count[VOID, VOID] = 0
+    depth = np.where(count > 0, np.float32(0.0), np.float32(np.nan))
+    wall = samples.wall(frame, depth_m=depth, count=count)
+
+    def world(places: NDArray[np.float64]) -> NDArray[np.float64]:
+        return places[:, [0, 2, 1]] * [1.0, -1.0, -1.0]
+
+    x, y, z = (np.ascontiguousarray(axis, dtype=np.float32) for axis in world(places_m).T)
+    points = SampledPoints(origin=np.zeros(3), x=x, y=y, z=z, n_represented=1.0)
+    stations = None if station is None else world(np.array([station]))
+    found = emptiness_of(
+        wall,
+        Slab(frame=frame, front_m=0.15, behind_m=0.25),
+        Sight(points=points, stations=stations),
+        threads=1,
+    )
+    assert found.share == pytest.approx(VOID_SHARE)
+    shares = {
+        "behind": found.behind_share,
+        "hidden": found.hidden_share,
+        "sparse": found.sparse_share,
+        "unseen": found.unseen_share,
+    }
+    return {cause: share / VOID_SHARE for cause, share in shares.items() if share}
+
+
+def in_each_tile(depth_m: float, count: int = 2) -> NDArray[np.float64]:
+    """So many points at one depth in each tile of the void."""
+    middles = 0.02 * (np.arange(VOID.start, VOID.stop, 3) + 1.5)
+    right, down = (axis.ravel() for axis in np.meshgrid(middles, middles))
+    tiles = np.column_stack([right, down, np.full(right.size, depth_m)])
+    return np.repeat(tiles, count, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "count", "cause"),
+    [
+        (-1.0, 2, "behind"),
+        (-1.0, 1, "unseen"),
+        (-0.26, 2, "behind"),
+        (-0.24, 2, "unseen"),
+        (-3.9, 2, "behind"),
+        (-4.1, 2, "unseen"),
+        (0.5, 2, "hidden"),
+        (0.5, 1, "unseen"),
+        (0.16, 2, "hidden"),
+        (0.14, 2, "unseen"),
+        (0.9, 2, "hidden"),
+        (1.1, 2, "unseen"),
+    ],
+)
+def test_two_points_behind_or_before_a_tile_tell_why_it_is_empty(
+    depth_m: float, count: int, cause: str
+) -> None:
+    assert told(in_each_tile(depth_m, count)) == {cause: pytest.approx(1.0)}
+
+
+def test_what_stands_before_counts_before_what_lies_behind() -> None:
+    both = np.vstack([in_each_tile(-1.0), in_each_tile(0.5)[:16]])
+    # The first half of the tiles.
+    assert told(both) == {"hidden": pytest.approx(0.5), "behind": pytest.approx(0.5)}
+
+
+@pytest.mark.parametrize(
+    ("along_m", "cause"), [(0.15, "unseen"), (0.55, "hidden"), (3.6, "hidden"), (4.1, "unseen")]
+)
+def test_a_screen_hides_what_lies_between_it_and_the_station_but_for_their_ends(
+    along_m: float, cause: str
+) -> None:
+    # Seen at half a right angle from 4.24 m away; the screen stands square to the rays.
+    middle, station = np.array([0.3, 0.3, 0.0]), np.array([3.3, 0.3, 3.0])
+    way = (station - middle) / np.linalg.norm(station - middle)
+    across = np.array([way[2], 0.0, -way[0]])
+    off = 0.02 * np.arange(-25, 26)
+    side, up = (axis.ravel() for axis in np.meshgrid(off, off))
+    screen = middle + along_m * way + side[:, None] * across + up[:, None] * [0.0, 1.0, 0.0]
+    # Nothing right before the void.
+    screen = screen[(screen[:, 2] > 1.0) | (screen[:, 0] > 0.45) | (screen[:, 2] < 0.15)]
+    room = np.array([[-3.0, -3.0, -1.0], [5.0, 4.0, 5.0]])
+    points = np.vstack([screen, np.repeat(room, 40, axis=0)])
+    found = told(points, station=(3.3, 0.3, 3.0))
+    assert found.get(cause, 0.0) > 0.8
+    # Nobody looks from behind the wall.
+    assert told(points, station=(3.3, 0.3, -3.0)) == {"hidden": pytest.approx(1.0)}
