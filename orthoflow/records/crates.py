@@ -14,6 +14,7 @@ from orthoflow_provenance.model import RecordedCell, RunRecord
 
 from orthoflow.engine.durability import writing_to
 from orthoflow.engine.run_folder import RECORD_FILE, cell_file_name
+from orthoflow.errors import RecordError
 from orthoflow.products.product import JsonValue
 from orthoflow.records import crate_entities as entities
 from orthoflow.records.crate_entities import (
@@ -72,8 +73,8 @@ def write_crate(
 
     Raises:
         StoreError: the disk refuses.
-        RecordError: a name in the record cannot be that of a file, or a link stands in the place
-            of a file.
+        RecordError: a name in the record cannot be that of a file, a link stands in the place of
+            a file, or a cell takes what none gave.
     """
     texts = {
         WORKFLOW_FILE: run.record.workflow_source,
@@ -420,7 +421,14 @@ def _output_id(source: str) -> str:
 def _source_id(source: str, outputs: Mapping[str, str]) -> str:
     """Formal parameter that a port takes its product from."""
     owner, _, name = source.rpartition(".")
-    return _input_id(name) if owner == "inputs" else outputs[source]
+    if owner == "inputs":
+        return _input_id(name)
+    if source not in outputs:
+        raise RecordError(
+            f"the record says that {source} was taken, which no cell that ran gave: "
+            "`orthoflow verify` says what else does not fit"
+        )
+    return outputs[source]
 
 
 def _connection(identifier: str, source: str, target: str) -> Entity:

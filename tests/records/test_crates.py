@@ -8,11 +8,15 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from orthoflow.errors import RecordError
+from orthoflow.records.crates import crate_metadata
+from orthoflow.records.runs import open_run
 from tests.crate_contexts import context_of
 from tests.studios import Studio, open_studio
 
@@ -237,6 +241,14 @@ def test_tables_hold_what_the_record_says(studio: Studio) -> None:
     ).read_bytes()
     assert {row["name"] for row in table("environments.csv")} > {"python", "cpu", "numpy"}
     assert studio("export", "first", "--to", "csv").exit_code == 2  # the folder is not empty
+
+
+def test_what_no_cell_gave_is_told(studio: Studio) -> None:
+    record = open_run(studio.folder / "first").record
+    without = replace(record, cells=tuple(cell for cell in record.cells if cell.step != "survey"))
+    assert len(without.cells) < len(record.cells)
+    with pytest.raises(RecordError, match=r"survey\.planes was taken, which no cell that ran gave"):
+        crate_metadata(without, [], license_text="none")
 
 
 def test_the_crate_has_no_folder_of_this_machine(studio: Studio) -> None:

@@ -86,7 +86,9 @@ class Octree:
         """
         last = _LEVELS_MOST
         if wish.spacing is not None:
-            last = max(0, math.ceil(math.log2(self.spacing / wish.spacing) - 1e-9))
+            # One by one: a damaged file's spacing may be so large that the quotient has no number.
+            levels = math.log2(self.spacing) - math.log2(wish.spacing)
+            last = max(0, math.ceil(levels - 1e-9))
         found = [node for node in self.nodes if node.level <= last and self._meets(node, wish)]
         return tuple(found or [node for node in self.nodes if node.level == 0])
 

@@ -138,6 +138,13 @@ def test_a_damaged_octree_is_told_before_anything_is_decoded(
     assert len(read(path, None)) == len(all_points())
 
 
+def test_a_spacing_beyond_all_numbers_asks_for_every_level(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<d", content, 429 + 32, 1e308)
+    path.write_bytes(bytes(content))
+    assert len(read(path, Wish(spacing=0.1))) == len(all_points())
+
+
 def test_pages_that_name_each_other_end(path: Path) -> None:
     content = bytearray(path.read_bytes())
     page, size = hierarchy(content)
