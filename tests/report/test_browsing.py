@@ -1,0 +1,189 @@
+"""Runs in folders: which are found, what is said of each, and in what they differ."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from orthoflow_provenance.model import RecordedFile, RecordedInput
+from orthoflow_provenance.writer import write_record
+
+from orthoflow.errors import ArgumentError
+from orthoflow.report import browsing as module
+from orthoflow.report.browsing import (
+    RunSummary,
+    differing_facts,
+    key_metrics,
+    run_folders,
+    summaries,
+)
+from tests.report_runs import HeldRun, cell, metrics, record
+
+
+def a_run(folder: Path, name: str = "journal.jsonl") -> Path:
+    folder.mkdir(parents=True)
+    (folder / name).touch()
+    return folder
+
+
+def test_runs_are_found_down_to_six_folders_and_not_in_each_other(tmp_path: Path) -> None:
+    for place in ("b", "a/x", "1/2/3/4/5/6", "a/x/deep", "1/2/3/4/5/6b/7"):
+        a_run(tmp_path / place, "run.h5" if place == "b" else "journal.jsonl")
+    for place in (".hidden/c", "products/d", "logs/e", "node_modules/f", "pages/g"):
+        a_run(tmp_path / place)
+    found = [path.relative_to(tmp_path).as_posix() for path in run_folders([tmp_path])]
+    assert found == ["1/2/3/4/5/6", "a/x", "b"]
+    # Each once, in the order of the folders that are given; a run may be one of them.
+    twice = run_folders([tmp_path / "b", tmp_path / "a", tmp_path])
+    assert [path.relative_to(tmp_path).as_posix() for path in twice] == ["b", "a/x", "1/2/3/4/5/6"]
+    (tmp_path / "elsewhere").symlink_to(tmp_path / "a", target_is_directory=True)
+    assert run_folders([tmp_path]) == [tmp_path / name for name in found]
+    with pytest.raises(
+        ArgumentError, match=r"b/run\.h5 is no folder: give folders that runs lie in"
+    ):
+        run_folders([tmp_path, tmp_path / "b" / "run.h5"])
+
+
+def summary(name: str, workflow: str = "hall", **facts: object) -> RunSummary:
+    return RunSummary(folder=Path(name), state="ok", workflow=workflow, facts=facts)  # type: ignore[arg-type]
+
+
+def test_what_all_runs_of_a_workflow_share_tells_none_of_them() -> None:
+    runs = [
+        summary("a", seed=1, cell_m=0.1, names=["x", "y"]),
+        summary("b", seed=1, cell_m=0.2, names=["x", "y"]),
+        # It lacks a fact, and has one that others lack.
+        summary("c", seed=1, names=["y", "x"], only=True),
+        summary("d", workflow="court", seed=2, cell_m=0.9),
+    ]
+    assert differing_facts(runs) == {
+        Path("a"): {"cell_m": 0.1, "names": ["x", "y"]},
+        Path("b"): {"cell_m": 0.2, "names": ["x", "y"]},
+        Path("c"): {"names": ["y", "x"]},
+        Path("d"): {},
+    }
+
+
+def test_the_numbers_that_most_runs_have_come_first_in_the_order_of_quality(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "QUALITY", ("a", "b", "c", "d"))
+    runs = [
+        replace(summary(str(k)), metrics=dict.fromkeys(names, 1.0))
+        for k, names in enumerate(("abx", "bc", "b", "ca"))
+    ]
+    assert key_metrics(runs, most=4) == ["a", "b", "c"]
+    assert key_metrics(runs, most=1) == ["b"]
+    # Of equals the first; shown in the order of all.
+    assert key_metrics(runs, most=2) == ["a", "b"]
+    assert key_metrics([], most=2) == []
+
+
+def written(folder: Path, *cells: object, **more: object) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_record(folder / "run.h5", record(cells, **more), lambda _digest: None)  # type: ignore[arg-type]
+    return folder
+
+
+def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
+    scan = RecordedFile(name="hall.laz", size_bytes=3, sha256="0123456789" + "a" * 54)
+    folder = written(
+        tmp_path / "run",
+        cell("plane", params={"cell_m": 0.1}, metrics=metrics(rms_mm=3.0, omega_deg=4.0)),
+        cell("check", params={"tries": 2}, metrics=metrics(rms_mm=1.0)),
+        cell("lost", status="skipped", params={"none": 1}),
+        cell("bad", status="failed", error_message="no plane"),
+        cell("worse", status="failed", error_message="no wall"),
+        cell("plane#1", params={"cell_m": 7.0}, metrics=metrics(rms_mm=9.0)),
+        name="hall",
+        status="failed",
+        inputs=(RecordedInput(name="scan", files=(scan, replace(scan, name="b.laz"))),),
+    )
+    (told,) = summaries([folder])
+    assert (told.folder, told.state, told.reason) == (folder, "failed", "bad: no plane")
+    assert (told.workflow, told.run_id, told.started) == ("hall", "r1", "2026-01-02T03:04:05Z")
+    # A later step has the plain name.
+    wanted = {"plane.rms_mm": 3.0, "check.rms_mm": 1.0, "rms_mm": 1.0, "omega_deg": 4.0}
+    assert {name: told.metrics[name] for name in wanted} == wanted
+    assert told.facts == {
+        "seed": 1,
+        "orthoflow": "orthoflow 0.1.0",
+        "input scan": ["hall.laz 01234567", "b.laz 01234567"],
+        "plane.cell_m": 0.1,
+        "plane.use": "plane.toy",
+        "check.tries": 2,
+        "check.use": "check.toy",
+        "bad.use": "bad.toy",
+        "worse.use": "worse.toy",
+    }
+
+
+def test_of_several_datasets_the_median_counts(tmp_path: Path) -> None:
+    cells = [
+        cell(f"check@data={name}", metrics=metrics(rms_mm=value), params={"tries": k})
+        for k, (name, value) in enumerate({"hall": 1.0, "stairs": 5.0, "court": 2.0}.items())
+    ]
+    rooms = {name: {"inputs": {}, "set": {}} for name in ("hall", "stairs", "court")}
+    told = record(cells, workflow_resolved=json.dumps({"datasets": rooms}))
+    run = HeldRun(path=tmp_path / "run.h5", record=told)
+    assert module._metrics(run)["rms_mm"] == module._metrics(run)["check.rms_mm"] == 2.0
+    facts = module._of_run(tmp_path, run).facts
+    assert {name: facts[name] for name in facts if name.endswith("tries")} == {
+        "check@data=hall.tries": 0,
+        "check@data=stairs.tries": 1,
+        "check@data=court.tries": 2,
+    }
+
+
+def test_a_run_without_a_record_says_what_its_journal_begins_with(tmp_path: Path) -> None:
+    folder = a_run(tmp_path / "going")
+    began = {"event": "run", "time": "2026-01-02T11:00:00Z", "run_id": "x", "workflow": "hall"}
+    (folder / "journal.jsonl").write_text(json.dumps(began) + "\n" + "broken")
+    (told,) = summaries([folder])
+    assert told == RunSummary(
+        folder=folder,
+        state="unfinished",
+        reason=f"goes on with the same command and -o {folder}, if it does not run just now",
+        workflow="hall",
+        run_id="x",
+        started="2026-01-02T11:00:00Z",
+    )
+    (folder / "journal.jsonl").write_text("[1]\n")
+    (odd,) = summaries([folder])
+    assert (odd.state, odd.workflow, odd.run_id, odd.started) == ("unfinished", "", "", "")
+
+
+@pytest.mark.parametrize(("n_bytes", "state"), [(65_536, "unfinished"), (65_600, "damaged")])
+def test_a_first_line_has_64_kilobytes(tmp_path: Path, n_bytes: int, state: str) -> None:
+    folder = a_run(tmp_path / "going")
+    text = json.dumps({"workflow": "x"})
+    (folder / "journal.jsonl").write_text(text[:-1].ljust(n_bytes - 1) + "}")
+    (told,) = summaries([folder])
+    assert told.state == state
+
+
+def test_what_cannot_be_read_is_told_and_the_others_are_summed_up(tmp_path: Path) -> None:
+    spoilt = a_run(tmp_path / "spoilt", "run.h5")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    good = written(tmp_path / "good", cell("plane"))
+    first, second, third = summaries([spoilt, empty, good])
+    assert (first.state, second.state, third.state) == ("damaged", "damaged", "ok")
+    assert "run.h5" in first.reason
+    assert second.reason.startswith("it has no run.h5, and its journal cannot be read: ")
+    assert third.reason == ""
+
+
+def test_a_record_that_nobody_foresaw_is_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(_folder: Path, _run: object) -> RunSummary:
+        raise RecursionError("too deep")
+
+    monkeypatch.setattr(module, "_of_run", fails)
+    (told,) = summaries([written(tmp_path / "odd", cell("plane"))])
+    assert (told.state, told.reason) == (
+        *("damaged", "the record is not as one was written: RecursionError: too deep"),
+    )

@@ -1,0 +1,200 @@
+"""Figures on a page: which are shown, how they share its bytes, and their files beside it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from orthoflow_provenance.model import RecordedCell, RecordedFigure
+
+from orthoflow.files.images import decode_image, encode_png, encode_webp
+from orthoflow.report import figures as module
+from orthoflow.report.figures import baseline_addresses, figure_groups, write_figures
+from tests.report_runs import HeldRun, cell, compared_resolved, record
+
+PNG, SVG, WEBP = "image/png", "image/svg+xml", "image/webp"
+
+
+def figure(name: str, data: bytes, media_type: str = PNG) -> RecordedFigure:
+    return RecordedFigure(name=name, caption=f"about {name}", media_type=media_type, data=data)
+
+
+def run(cells: Sequence[RecordedCell]) -> HeldRun:
+    told = record(cells, workflow_resolved=compared_resolved("plane.rms_mm"))
+    return HeldRun(path=Path("run") / "run.h5", record=told)
+
+
+def shown(of: HeldRun, **more: object) -> list[tuple[str, str, int]]:
+    """Cell, title and bytes of every figure on the page."""
+    return [
+        (group.cell, picture.title, len(base64.b64decode(picture.uri.partition(",")[2])))
+        for group in figure_groups(of, **more)  # type: ignore[arg-type]
+        for picture in group.pictures
+    ]
+
+
+def noise(seed: int, side: int = 300) -> bytes:
+    """A picture that packs badly: some 3 bytes a pixel as PNG."""
+    return encode_png(
+        np.random.default_rng(seed).integers(0, 256, (side, side, 3)).astype(np.uint8)
+    )
+
+
+def test_equal_figures_and_those_of_repeats_are_shown_once() -> None:
+    of = run(
+        [
+            cell("plane@plane=fine", figures=(figure("error_map", b"1"), figure("chart", b"2"))),
+            cell("plane@plane=fine#1", figures=(figure("error_map", b"3"),)),
+            cell("plane@plane=coarse", figures=(figure("error_map", b"1"), figure("other", b"4"))),
+            cell("check", figures=()),
+        ]
+    )
+    assert shown(of) == [
+        ("plane@plane=fine", "error map", 1),
+        ("plane@plane=fine", "chart", 1),
+        ("plane@plane=coarse", "other", 1),
+    ]
+    first, _ = figure_groups(of)
+    assert (first.cell, first.method) == ("plane@plane=fine", "plane.toy")
+    one, _ = first.pictures
+    assert (one.caption, one.cell, one.file) == ("about error_map", "plane@plane=fine", "")
+    assert one.uri == "data:image/png;base64,MQ=="
+
+
+def test_files_lie_beside_the_page_for_the_baseline_and_what_all_share() -> None:
+    of = run(
+        [
+            cell("scan", figures=(figure("plan", b"1"),)),
+            cell("plane@plane=fine", figures=(figure("error_map", b"2"),)),
+            cell("plane@plane=coarse", figures=(figure("error_map", b"3"),)),
+            cell("scan#1", figures=(figure("plan", b"4"),)),
+        ]
+    )
+    assert baseline_addresses(of) == ("scan", "plane@plane=fine")
+    files = [group.pictures[0].file for group in figure_groups(of, with_files=True)]
+    assert files == ["figures/scan/plan.png", "figures/plane@plane=fine/error_map.png", ""]
+    assert all(group.pictures[0].file == "" for group in figure_groups(of))
+
+
+# --- sharing the bytes of a page ---
+
+
+def test_few_figures_stay_as_they_are() -> None:
+    data = noise(1)
+    cells = [cell("plane@plane=fine", figures=(figure("a", data), figure("b", noise(2))))]
+    share = (2 * len(data) + 10_000) / 3_900_000
+    assert [size for *_, size in shown(run(cells), share=share)] == [len(data), len(noise(2))]
+    # A little less than they take: both are drawn smaller.
+    less = shown(run(cells), share=share - 20_000 / 3_900_000)
+    assert all(size < 0.5 * len(data) for *_, size in less)
+
+
+def test_all_figures_of_a_page_take_less_than_four_megabytes() -> None:
+    large = [figure(f"f{k}", noise(k, 700)) for k in range(5)]
+    n_bytes = len(large[0].data)
+    assert 2 * n_bytes < 3_900_000 < 3 * n_bytes
+    for n_figures, is_whole in ((2, True), (3, False)):
+        cells = [cell("plane@plane=fine", figures=tuple(large[:n_figures]))]
+        sizes = [size for *_, size in shown(run(cells))]
+        assert (sizes == [len(one.data) for one in large[:n_figures]]) is is_whole
+        assert sum(sizes) <= 3_900_000
+
+
+def test_the_baseline_has_seven_tenths_before_the_others_share_the_rest() -> None:
+    ours, theirs = noise(1), noise(2)
+    cells = [
+        cell("plane@plane=fine", figures=(figure("a", ours),)),
+        cell("plane@plane=coarse", figures=(figure("b", theirs),)),
+    ]
+    whole = len(ours) / 3_900_000
+    # The baseline fits into seven tenths; of the others a quarter of their bytes is left.
+    fits = {name: size for _, name, size in shown(run(cells), share=whole / 0.69)}
+    assert fits["a"] == len(ours)
+    assert fits["b"] < 0.5 * len(theirs)
+    tight = {name: size for _, name, size in shown(run(cells), share=whole / 0.72)}
+    assert tight["a"] < 0.5 * len(ours)
+    # What the others do not need is the baseline's as well.
+    alone = run([cells[0], replace(cells[1], figures=(figure("b", b"small"),))])
+    assert shown(alone, share=whole / 0.95)[0][2] == len(ours)
+
+
+def test_drawings_and_small_figures_are_never_drawn_anew() -> None:
+    small, large = noise(3, 80), noise(4, 84)
+    assert len(small) < 20_000 < len(large)
+    many = (
+        figure("small", small),
+        figure("large", large),
+        figure("drawing", b"<svg" + b" " * 30_000 + b"/>", SVG),
+    )
+    sizes = {one.name: len(one.data) for one in module._fitted(many, 1.0)}
+    assert sizes["small"] == len(small)
+    assert sizes["drawing"] == 30_006
+    assert sizes["large"] < len(large)
+
+
+@pytest.mark.parametrize(("wanted_share", "side"), [(0.9, 700), (0.06, 340), (0.001, 240)], ids=str)
+def test_figures_are_as_large_as_their_share_allows(wanted_share: float, side: int) -> None:
+    rows, columns = np.indices((600, 900))
+    picture = np.dstack([rows % 251, columns % 241, (rows * columns) % 239]).astype(np.uint8)
+    one = figure("a", encode_png(picture))
+    (found,) = module._fitted((one,), wanted_share * len(one.data))
+    assert (found.name, found.caption, found.media_type) == ("a", "about a", WEBP)
+    height, width = decode_image(found.data).shape[:2]
+    assert width == side
+    assert height == pytest.approx(side * 600 / 900, abs=1)
+
+
+def test_a_figure_that_would_grow_stays_as_it_is() -> None:
+    rng = np.random.default_rng(1)
+    picture = rng.integers(0, 256, (400, 400, 3)).astype(np.uint8)
+    packed = figure("packed", encode_webp(picture, quality=1), WEBP)
+    assert len(packed.data) > 20_000
+    assert module._smaller(packed, 10_000) is packed
+
+
+def test_a_damaged_figure_costs_its_place_and_not_the_page() -> None:
+    broken = figure("broken", b"\x89PNG" + bytes(30_000))
+    (found,) = module._fitted((broken,), 10.0)
+    assert (found.data, found.caption) == (b"", "about broken (the picture is damaged)")
+
+
+# --- files ---
+
+
+def test_figures_are_written_as_programs_take_them(tmp_path: Path) -> None:
+    picture = np.full((20, 30, 3), 77, np.uint8)
+    bad = b'<svg xmlns="http://www.w3.org/2000/svg"><script>alert(1)</script></svg>'
+    good = b'<svg xmlns="http://www.w3.org/2000/svg"><path d="M0 0L1 1"/></svg>'
+    of = run(
+        [
+            cell(
+                "check",
+                figures=(
+                    figure("photo", encode_webp(picture), WEBP),
+                    figure("chart", encode_png(picture)),
+                    figure("drawing", good, SVG),
+                    figure("script", bad, SVG),
+                    figure("damaged", b"RIFF....WEBP", WEBP),
+                ),
+            ),
+            cell("other", figures=(figure("not_asked", encode_png(picture)),)),
+        ]
+    )
+    assert write_figures(of, tmp_path / "out", ["check"]) == 3
+    found = sorted(
+        path.relative_to(tmp_path / "out").as_posix()
+        for path in (tmp_path / "out").rglob("*")
+        if path.is_file()
+    )
+    assert found == ["check/chart.png", "check/drawing.svg", "check/photo.png", "graph.svg"]
+    photo = decode_image((tmp_path / "out/check/photo.png").read_bytes())
+    assert np.abs(photo.astype(int) - 77).max() <= 3
+    assert (tmp_path / "out/check/drawing.svg").read_bytes() == good
+    assert (tmp_path / "out/graph.svg").read_text().startswith("<svg xmlns=")
+    assert write_figures(of, tmp_path / "page", ["other"], inside="figures") == 1
+    assert (tmp_path / "page/figures/other/not_asked.png").is_file()
+    assert (tmp_path / "page/figures/graph.svg").is_file()
