@@ -1,15 +1,30 @@
-"""Where a check point lies on the surface that a wall has: on the plane through what is near it."""
+"""Where a check point is shown, and where it lies on the surface that a wall has."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.inspect.point_places import point_on_surface
+from orthoflow_plugins.inspect.patches import GreyImage
+from orthoflow_plugins.inspect.point_places import (
+    Picture,
+    PointFinder,
+    find_by_truth,
+    point_on_surface,
+)
+from orthoflow_plugins.simulate.building import Extent, Paint, SceneDraft, wall_side
 
-from orthoflow.products import Wall
+from orthoflow.geometry import WallFrame, frame_over
+from orthoflow.geometry.levels import REC_601
+from orthoflow.geometry.scene_views import render_frame
+from orthoflow.geometry.scenes import SurfaceRole, TextureKind
+from orthoflow.products import CheckPoints, Truth, Wall
+from orthoflow.testing.examples import example
+from tests import samples
 from tests.inspect_scenes import GSD_M, SHAPE, frame, walls
 
 RADIUS_M = 0.04
@@ -69,3 +84,180 @@ def test_what_lies_beyond_the_radius_has_no_say() -> None:
     expected = frame().world_from_wall(np.array([[180.5, 140.5]]), np.array([0.01]))[0]
     assert found is not None
     np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+# A painted wall of 1.2 m x 1 m at y = 2, cells of 5 mm, and what lies on it.
+CELL_M = 0.005
+FULL: Extent = (-0.6, 0.6, -0.5, 0.5)
+
+
+@cache
+def painted() -> tuple[Truth, WallFrame]:
+    draft = SceneDraft()
+    side = wall_side(draft, omega_deg=90.0, phi_deg=0.0, distance_m=2.0)
+    fresco = Paint(kind=TextureKind.FRESCO, rgb=(180.0, 170.0, 150.0), reflectance=0.5, seed=7)
+    plane = side.true_plane("wall", FULL)
+    side.place(FULL, 0.0, fresco, SurfaceRole.WALL, plane=plane)
+    truth = example("truth")
+    assert isinstance(truth, Truth)
+    made = replace(truth, scene=draft.finished(spectral_gap=0.0))
+    outline = draft.planes[plane]
+    return made, frame_over(outline.outline, outline.plane.normal, gsd_m=CELL_M)
+
+
+@cache
+def shown_grey(right: float, down: float) -> GreyImage:
+    """What an image shows that lies too far to the right and too low by so many cells."""
+    truth, where = painted()
+    moved = -CELL_M * (right * where.u_world + down * where.v_world)
+    shown = replace(where, origin_world=where.origin_world + moved)
+    true = render_frame(truth.scene, shown, buffer_front_m=0.1, buffer_behind_m=0.1)
+    known = np.isfinite(true.rgb).all(axis=2)
+    return GreyImage(
+        grey=np.where(known, np.nan_to_num(true.rgb) @ REC_601, 0.0), valid=known, region=known
+    )
+
+
+def by_truth(
+    picture: GreyImage, place: tuple[float, float] = (120.0, 100.0), *, search: int = 5
+) -> NDArray[np.float64] | None:
+    truth, where = painted()
+    return find_by_truth(
+        picture,
+        where,
+        np.array(place),
+        truth,
+        buffers_m=(0.1, 0.1),
+        search_cells=search,
+    )
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (2.4, -1.3), (-4.0, 3.6)])
+@pytest.mark.parametrize("place", [(120.0, 100.0), (70.3, 60.8)])
+def test_a_place_is_found_where_its_surroundings_are_shown(
+    place: tuple[float, float], shift: tuple[float, float]
+) -> None:
+    found = by_truth(shown_grey(*shift), place)
+    assert found is not None
+    np.testing.assert_allclose(found - place, shift, atol=0.05)
+
+
+@pytest.mark.parametrize(("right", "is_found"), [(4.6, True), (9.0, False)])
+def test_a_place_is_not_looked_for_farther_off_than_asked(right: float, is_found: bool) -> None:
+    assert (by_truth(shown_grey(right, 0.0)) is not None) == is_found
+    assert by_truth(shown_grey(right, 0.0), search=12) is not None
+
+
+def test_light_and_contrast_do_not_matter_and_another_picture_shows_nothing() -> None:
+    there = shown_grey(2.4, -1.3)
+    darker = replace(there, grey=0.9 * there.grey + 7.0)
+    found = by_truth(darker)
+    assert found is not None
+    np.testing.assert_allclose(found, [122.4, 98.7], atol=0.05)
+    noise = np.random.default_rng(4).uniform(0.0, 255.0, there.grey.shape)
+    assert by_truth(replace(there, grey=noise)) is None
+
+
+@pytest.mark.parametrize(("reach", "is_found"), [(1, False), (9, True)])
+def test_the_point_counts_and_not_what_is_far_from_it(reach: int, is_found: bool) -> None:
+    # Valid within so many cells; a Gaussian of five cells weighs them.
+    there = shown_grey(0.0, 0.0)
+    rows, columns = np.indices(there.grey.shape) + 0.5
+    near = (np.abs(columns - 120.0) < reach + 1) & (np.abs(rows - 100.0) < reach + 1)
+    found = by_truth(replace(there, valid=there.valid & near))
+    assert (found is not None) == is_found
+    # What is elsewhere shown ten cells off does no harm.
+    far = shown_grey(10.0, 0.0)
+    mixed = replace(
+        there, grey=np.where(np.hypot(columns - 120, rows - 100) < 13, there.grey, far.grey)
+    )
+    place = by_truth(mixed)
+    assert place is not None
+    np.testing.assert_allclose(place, [120.0, 100.0], atol=0.1)
+
+
+def finder(
+    points: NDArray[np.float64], *, truth: bool = False, wall: int = -1, **known: Any
+) -> PointFinder:
+    """A finder on two parallel walls, the second 0.1 m before the first."""
+    made, where = painted()
+    frames = [where, replace(where, origin_world=where.origin_world + 0.1 * where.normal_world)]
+    rasters = [samples.wall(item, plane_index=4 + k) for k, item in enumerate(frames)]
+    on_both = samples.walls(*rasters, buffer_m=0.15)
+    pictures = [
+        Picture(
+            wall=k,
+            frame=raster.frame,
+            grey=shown_grey(1.5, 0.5),
+            surface=raster,
+            image=samples.orthoimage(
+                raster.frame, rgb=np.zeros((*raster.frame.shape, 3), np.uint8), plane_index=4 + k
+            ),
+        )
+        for k, raster in enumerate(rasters)
+    ]
+    count = len(points)
+    checks = CheckPoints(
+        names=tuple(f"P{k}" for k in range(count)),
+        points_world=points,
+        classes=("",) * count,
+        wall=np.full(count, wall, dtype=np.int32),
+        pixels_wall=known.pop("pixels_wall", np.full((count, 2), np.nan)),
+        **known,
+    )
+    return PointFinder(
+        pictures=pictures,
+        checkpoints=checks,
+        walls=on_both,
+        truth=made if truth else None,
+        search_m=0.02,
+        target_radius_m=0.05,
+    )
+
+
+def at(column: float, row: float, depth_m: float) -> NDArray[np.float64]:
+    """A world point (1, 3) of the first wall."""
+    return painted()[1].world_from_wall(np.array([[column, row]]), np.array([depth_m]))
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "wall"),
+    [(0.01, 0), (0.04, 0), (0.06, 1), (0.24, 1), (0.26, -1), (-0.14, 0), (-0.16, -1)],
+)
+def test_a_point_is_looked_for_on_the_nearest_wall_that_holds_it(depth_m: float, wall: int) -> None:
+    found = finder(at(120.0, 100.0, depth_m), truth=True).find(0)
+    assert found.wall == wall
+    assert found.how == ("truth" if wall == 0 else "outside" if wall < 0 else found.how)
+    if wall >= 0:
+        np.testing.assert_allclose(found.expected, [120.0, 100.0], atol=1e-6)
+    else:
+        assert np.isnan(found.place).all()
+
+
+@pytest.mark.parametrize(
+    ("column", "row"), [(-0.5, 100.0), (240.5, 100.0), (9.0, -0.5), (9.0, 200.5)]
+)
+def test_a_point_beside_all_walls_is_outside(column: float, row: float) -> None:
+    assert finder(at(column, row, 0.0), truth=True).find(0).how == "outside"
+
+
+def test_a_point_found_by_the_scene_is_where_the_picture_shows_it() -> None:
+    found = finder(at(120.0, 100.0, 0.0), truth=True).find(0)
+    np.testing.assert_allclose(found.place - found.expected, [1.5, 0.5], atol=0.05)
+    assert np.isnan(found.point_world).all()
+
+
+def test_what_was_measured_is_taken_as_it_is() -> None:
+    pixels = np.array([[33.0, 44.0]])
+    found = finder(at(120.0, 100.0, 0.0), pixels_wall=pixels, wall=5).find(0)
+    assert (found.how, found.wall) == ("measured", 1)
+    np.testing.assert_array_equal(found.place, [33.0, 44.0])
+    # The wall that it was measured on, however far it lies from there.
+    far = finder(at(120.0, 100.0, 3.0), pixels_wall=pixels, wall=4).find(0)
+    assert (far.how, far.wall) == ("measured", 0)
+
+
+def test_without_a_scene_a_target_is_looked_for() -> None:
+    found = finder(at(120.0, 100.0, 0.0)).find(0)
+    assert (found.how, found.wall) == ("not found", 0)
+    assert np.isnan(found.place).all()
