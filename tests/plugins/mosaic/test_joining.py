@@ -1,0 +1,248 @@
+"""Who paints each cell: states, preferences and islands, against loops over cells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.mosaic import joining as module
+from orthoflow_plugins.mosaic.joining import (
+    NOBODY,
+    Choice,
+    SeamWish,
+    best_views,
+    preferences,
+    without_islands,
+)
+
+from orthoflow.geometry.bands import in_memory
+from orthoflow.products import Layer, LayerMask, OrthoMask
+from tests import samples
+
+SHAPE = (23, 17)
+# A cell takes the highest of these that any layer gives it.
+ORDER = [
+    *(OrthoMask.NONE, OrthoMask.NO_SURFACE, OrthoMask.OCCLUDED),
+    *(OrthoMask.FILLED, OrthoMask.PAINTED),
+]
+
+
+def layer(seed: int, *, source: str = "", painted: float = 0.4, has_filled: bool = True) -> Layer:
+    rng = np.random.default_rng(seed)
+    states = [LayerMask.OUTSIDE, LayerMask.OCCLUDED, LayerMask.NO_SURFACE]
+    mask = np.where(
+        rng.random(SHAPE) < painted, LayerMask.PAINTED, rng.choice(states, SHAPE)
+    ).astype(np.uint8)
+    is_painted = mask == LayerMask.PAINTED
+    # Few values, so that some are equal.
+    quality = np.where(is_painted, rng.integers(1, 4, SHAPE) / 3.0, 0.0).astype(np.float32)
+    filled = (is_painted & (rng.random(SHAPE) < 0.3)).astype(np.uint8)
+    return Layer(
+        frame=samples.facing_south(0.01, SHAPE[1], SHAPE[0]),
+        wall=0,
+        source=source or f"{seed}.jpg",
+        rgb=np.zeros((*SHAPE, 3), np.uint8),
+        mask=mask,
+        quality=quality,
+        filled=filled if has_filled else None,
+    )
+
+
+def state(of: Layer, cell: tuple[int, int]) -> int:
+    """Place of a layer's state of a cell in the order."""
+    mask = of.mask[cell]
+    if mask == LayerMask.PAINTED:
+        is_filled = of.filled is not None and of.filled[cell] > 0
+        return ORDER.index(OrthoMask.FILLED if is_filled else OrthoMask.PAINTED)
+    return {
+        LayerMask.OUTSIDE: ORDER.index(OrthoMask.NONE),
+        LayerMask.OCCLUDED: ORDER.index(OrthoMask.OCCLUDED),
+        LayerMask.NO_SURFACE: ORDER.index(OrthoMask.NO_SURFACE),
+    }[LayerMask(int(mask))]
+
+
+LAYERS = [layer(1), layer(2, has_filled=False), layer(3), layer(4, painted=0.1)]
+
+
+def test_a_cell_is_painted_by_the_best_of_those_that_know_most_of_it() -> None:
+    choice = best_views(LAYERS, [one.quality for one in LAYERS])
+    for cell in np.ndindex(SHAPE):
+        states = [state(one, cell) for one in LAYERS]
+        highest = max(states)
+        assert choice.rank[cell] == highest
+        painters = [
+            k
+            for k, one in enumerate(LAYERS)
+            if states[k] == highest and one.mask[cell] == LayerMask.PAINTED
+        ]
+        # The first of equals.
+        wanted = max(painters, key=lambda k: (LAYERS[k].quality[cell], -k), default=NOBODY)
+        assert choice.source[cell] == wanted
+
+
+def test_ranks_become_states_of_the_orthoimage() -> None:
+    mask, source = module.joined(
+        LAYERS[:3],
+        LAYERS[3:],
+        SeamWish(rule="best-view"),
+        wall=None,
+        balance=None,
+        allocate=in_memory,
+    )
+    choice = best_views(LAYERS, [one.quality for one in LAYERS])
+    np.testing.assert_array_equal(mask, np.array(ORDER, dtype=np.uint8)[choice.rank])
+    own = np.where(choice.source == 3, source, choice.source)
+    np.testing.assert_array_equal(source, own)
+
+
+@pytest.mark.parametrize("rule", ["best-view", "voronoi", "priority"])
+def test_preferences_are_the_same_row_by_row(rule: str) -> None:
+    wish = SeamWish(rule=rule, priority=("3.jpg", "1.jpg"))  # type: ignore[arg-type]
+    whole = slice(0, SHAPE[0])
+    every = [preference(whole) for preference in preferences(LAYERS, wish)]
+    for preference, values in zip(preferences(LAYERS, wish), every, strict=True):
+        np.testing.assert_array_equal(preference(slice(5, 9)), values[5:9])
+    for one, values in zip(LAYERS, every, strict=True):
+        if rule == "best-view":
+            np.testing.assert_array_equal(values, one.quality)
+        elif rule == "voronoi":
+            # As far as the nearest cell that it does not paint, or the rim, is.
+            padded = np.pad(one.mask == LayerMask.PAINTED, 1)
+            others = np.argwhere(~padded)
+            for cell in [(0, 0), (4, 7), (11, 3), (22, 16)]:
+                away = np.hypot(*(others - np.add(cell, 1)).T).min()
+                assert values[cell] == pytest.approx(away, abs=1e-3)
+
+
+def test_photos_in_the_given_order_go_before_all_qualities() -> None:
+    wish = SeamWish(rule="priority", priority=("3.jpg", "1.jpg"))
+    found = {
+        one.source: preference(slice(0, SHAPE[0]))
+        for one, preference in zip(LAYERS, preferences(LAYERS, wish), strict=True)
+    }
+    assert found["3.jpg"].min() > found["1.jpg"].max()
+    assert found["1.jpg"].min() > max(found["2.jpg"].max(), found["4.jpg"].max())
+    np.testing.assert_array_equal(found["2.jpg"], LAYERS[1].quality)
+
+
+# --- islands ---
+
+
+def patches(source: NDArray[np.int16], index: int) -> list[list[tuple[int, int]]]:
+    """Cells of one source that are connected over sides."""
+    left = {tuple(cell) for cell in np.argwhere(source == index).tolist()}
+    found = []
+    while left:
+        new, patch = [left.pop()], []
+        while new:
+            row, column = new.pop()
+            patch.append((row, column))
+            for beside in (
+                (row + 1, column),
+                (row - 1, column),
+                (row, column + 1),
+                (row, column - 1),
+            ):
+                if beside in left:
+                    left.remove(beside)
+                    new.append(beside)
+        found.append(patch)
+    return found
+
+
+@pytest.mark.parametrize("cells_min", [2, 5, 9])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_small_patches_go_to_the_source_about_them_that_shows_them_too(
+    seed: int, cells_min: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    layers = [layer(10 + seed + k, painted=0.9, has_filled=False) for k in range(3)]
+    # Large areas with specks in them.
+    wanted = np.where(np.arange(SHAPE[1])[None] < 9, 0, 1) * np.ones(SHAPE, dtype=int)
+    specks = rng.random(SHAPE) < 0.15
+    wanted[specks] = rng.integers(0, 3, specks.sum())
+    painted = np.array([one.mask == LayerMask.PAINTED for one in layers])
+    source = np.where(np.take_along_axis(painted, wanted[None], 0)[0], wanted, NOBODY)
+    rank = np.where(source >= 0, ORDER.index(OrthoMask.PAINTED), 0).astype(np.uint8)
+    choice = Choice(rank=rank, source=source.astype(np.int16))
+    island = np.zeros(SHAPE, dtype=bool)
+    for index in range(3):
+        for patch in patches(choice.source, index):
+            if len(patch) < cells_min:
+                island[tuple(np.array(patch).T)] = True
+    assert 5 < island.sum() < 0.5 * island.size
+    expected = choice.source.copy()
+    reach = int(np.ceil(np.sqrt(cells_min)))
+    for row, column in np.argwhere(island).tolist():
+        about = (
+            slice(max(0, row - reach), row + reach + 1),
+            slice(max(0, column - reach), column + reach + 1),
+        )
+        counts = [
+            np.count_nonzero((choice.source[about] == k) & ~island[about])
+            if state(layers[k], (row, column)) == rank[row, column]
+            else 0
+            for k in range(3)
+        ]
+        if max(counts):
+            # The first of equals.
+            expected[row, column] = int(np.argmax(counts))
+    found = without_islands(choice, layers, cells_min)
+    np.testing.assert_array_equal(found.source, expected)
+    np.testing.assert_array_equal(found.rank, rank)
+
+
+def test_without_a_small_patch_nothing_changes() -> None:
+    layers = [layer(20 + k, painted=1.0, has_filled=False) for k in range(2)]
+    source = np.zeros(SHAPE, dtype=np.int16)
+    source[:3, :3] = 1
+    rank = np.full(SHAPE, ORDER.index(OrthoMask.PAINTED), dtype=np.uint8)
+    choice = Choice(rank=rank, source=source)
+    # Nine cells are a patch of nine.
+    assert without_islands(choice, layers, 9) is choice
+    assert (without_islands(choice, layers, 10).source == 0).all()
+
+
+@pytest.mark.parametrize("cells_min", [1, 2, 7, 30])
+def test_bands_decide_islands_as_the_whole_does(
+    monkeypatch: pytest.MonkeyPatch, cells_min: int
+) -> None:
+    layers = [layer(30 + k, painted=0.8, has_filled=False) for k in range(3)]
+    wish = SeamWish(rule="best-view", island_cells_min=cells_min)
+    given = {"wall": None, "balance": None, "allocate": in_memory}
+    mask, source = module.joined(layers, [], wish, **given)  # type: ignore[arg-type]
+    monkeypatch.setattr(module, "_BAND_CELLS", SHAPE[1])
+    banded = module.joined(layers, [], wish, **given)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(banded[0], mask)
+    np.testing.assert_array_equal(banded[1], source)
+    if cells_min == 1:
+        best = best_views(layers, [one.quality for one in layers])
+        np.testing.assert_array_equal(source, best.source)
+
+
+# --- colours ---
+
+
+@pytest.mark.parametrize("is_deep", [False, True])
+@pytest.mark.parametrize("band_cells", [20, 1 << 25])
+def test_each_cell_has_the_colour_of_its_layer(
+    monkeypatch: pytest.MonkeyPatch, band_cells: int, *, is_deep: bool
+) -> None:
+    monkeypatch.setattr(module, "_BAND_CELLS", band_cells)
+    rng = np.random.default_rng(6)
+    layers = [
+        replace(one, rgb=rng.integers(0, 256, (*SHAPE, 3)).astype(np.uint8)) for one in LAYERS[:2]
+    ]
+    if is_deep:
+        deep = rng.integers(0, 65536, (*SHAPE, 3)).astype(np.uint16)
+        layers[1] = replace(layers[1], rgb=deep)
+    source = rng.integers(-1, 2, SHAPE).astype(np.int16)
+    rgb = module.coloured(layers, source, None, allocate=in_memory)
+    assert rgb.dtype == (np.uint16 if is_deep else np.uint8)
+    assert not rgb[source == NOBODY].any()
+    np.testing.assert_array_equal(rgb[source == 1], layers[1].rgb[source == 1])
+    # 8 bits become 16 so that white stays white.
+    scale = 257 if is_deep else 1
+    np.testing.assert_array_equal(rgb[source == 0], scale * layers[0].rgb[source == 0].astype(int))
