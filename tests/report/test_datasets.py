@@ -14,10 +14,11 @@ import pytest
 from orthoflow.errors import StoreError
 from orthoflow.records import RecordedCell, Run
 from orthoflow.records.datasets import datasets_of, parts_of
-from orthoflow.report import write_page, write_report
+from orthoflow.report import dataset_tables, write_page, write_report
 from orthoflow.report.dataset_tables import dataset_table
 from orthoflow.report.paired import MethodOverDatasets, over_datasets, paired_differences
 from orthoflow.report.rankings import Sense
+from orthoflow.report.summaries import QUALITY
 from tests.report_runs import (
     HeldRun,
     cell,
@@ -233,3 +234,36 @@ def test_a_step_called_data_makes_no_datasets(rooms: Run) -> None:
     told = replace(rooms, record=replace(rooms.record, workflow_resolved="{}"))
     assert datasets_of(told) == ()
     assert parts_of(told) == {}
+
+
+@pytest.mark.parametrize("n_metrics", [6, 7])
+def test_a_table_of_datasets_has_six_columns_at_most(tmp_path: Path, n_metrics: int) -> None:
+    # The first ones of all that say how good a result is; photos have a column of their own.
+    names = [name for name in QUALITY if name != "n_oriented"][:n_metrics]
+    cells = [
+        cell(f"check@data={room}", metrics=metrics(**dict.fromkeys(names, 1.0)))
+        for room in ("hall", "stairs")
+    ]
+    resolved = {"datasets": {name: {"inputs": {}, "set": {}} for name in ("hall", "stairs")}}
+    told = record(cells, workflow_resolved=json.dumps(resolved))
+    table = dataset_table(parts_of(HeldRun(path=tmp_path / "run.h5", record=told)), {})
+    assert len(table.columns) == 6
+    assert [step for step, _ in table.columns] == ["check"] * 6
+    assert all(len(row.values) == 6 for row in table.rows)
+    assert not table.has_photos
+
+
+@pytest.mark.parametrize(
+    ("n_rooms", "side"), [(1, 220), (41, 220), (42, 218), (400, 70), (500, 64), (9000, 64)]
+)
+def test_pictures_of_many_datasets_become_smaller(
+    monkeypatch: pytest.MonkeyPatch, rooms: Run, n_rooms: int, side: int
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(
+        dataset_tables,
+        "thumbnail",
+        lambda _run, _cells, *, longest_side_px: asked.append(longest_side_px) or "",
+    )
+    dataset_tables._picture(rooms, frozenset(), n_rooms)
+    assert asked == [side]

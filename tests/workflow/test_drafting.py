@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 
 from orthoflow.catalog import discover_catalog
+from orthoflow.errors import InputError
 from orthoflow.foreign_text import shown
 from orthoflow.workflow import load_workflow, resolve_input_files
+from orthoflow.workflow.drafting import draft_workflow
+from orthoflow.workflow.recognising import Recognised
 from tests.studios import asked, said
 
 CALIBRATION = """cameras:
@@ -187,3 +190,61 @@ def test_what_is_no_file_is_not_waited_for(data: Path, name: str) -> None:
     zero.symlink_to("/dev/zero")
     told = said("new", data / "hall.las", data / "photos" / name, zero)
     assert f"not used: {name}, link-{name}: a pipe or a device" in told
+
+
+# --- drafts by themselves ---
+
+
+def found(kind: str, name: str, said: str = "something", n_photos: int = 0) -> Recognised:
+    return Recognised(kind=kind, path=Path(name), said=said, n_photos=n_photos)  # type: ignore[arg-type]
+
+
+def test_photos_in_a_scan_are_taken_where_there_are_no_others() -> None:
+    scan = found("scan", "hall.e57", "a scan", 3)
+    inside = draft_workflow([scan], Path("flow.yaml"), None)
+    assert inside.recipe == "photos-on-scan"
+    assert inside.inputs["photos"] == "hall.e57, the photos in it"
+    assert inside.inputs["cameras"] == "hall.e57, the poses of its photos"
+    beside = draft_workflow([scan, found("photos", "a.jpg", "a photo", 1)], Path("flow.yaml"), None)
+    assert beside.inputs["photos"] == "a.jpg, a photo"
+    assert "cameras" not in beside.inputs
+    # Of two scans nobody knows whose poses are meant.
+    two = draft_workflow([scan, found("scan", "b.e57", "a scan", 1)], Path("flow.yaml"), None)
+    assert two.inputs["photos"] == "2 files: hall.e57, b.e57"
+    assert "cameras" not in two.inputs
+    given = draft_workflow([scan, found("cameras", "poses.json", "poses")], Path("flow.yaml"), None)
+    assert given.inputs["cameras"] == "poses.json, poses"
+
+
+def test_text_beside_scans_of_other_formats_is_left_out() -> None:
+    scans = [found("scan", "hall.laz", "a scan"), found("scan", "notes.txt", "numbers")]
+    told = draft_workflow(scans, Path("flow.yaml"), None)
+    assert told.recipe == "direct"
+    assert told.left_out == ["notes.txt: text, left out beside scans of other formats"]
+    assert told.inputs["scan"] == "hall.laz, a scan"
+    alone = draft_workflow(scans[1:], Path("flow.yaml"), None)
+    assert (alone.left_out, alone.inputs["scan"]) == ([], "notes.txt, numbers")
+
+
+@pytest.mark.parametrize("n_others", [12, 13])
+def test_a_dozen_files_are_named_that_nothing_takes(n_others: int) -> None:
+    others = [found("unknown", f"f{k}.xyz", f"reason {k}") for k in range(n_others)]
+    with pytest.raises(InputError) as caught:
+        draft_workflow(others, Path("flow.yaml"), None)
+    assert str(caught.value).count("reason") == 12
+    with pytest.raises(InputError, match=r"found nothing$"):
+        draft_workflow([], Path("flow.yaml"), None)
+    told = draft_workflow([found("scan", "hall.laz"), *others], Path("flow.yaml"), None)
+    assert len(told.left_out) == n_others
+    assert told.text.count("# Not used: ") == 12
+
+
+def test_what_is_wrong_in_the_same_way_is_said_once() -> None:
+    others = [found("unknown", f"f{k}.doc", "no format of ours") for k in range(6)]
+    told = draft_workflow([found("scan", "hall.laz"), *others], Path("flow.yaml"), None)
+    assert told.left_out == ["f0.doc, f1.doc, f2.doc, f3.doc and 2 more: no format of ours"]
+
+
+def test_a_recipe_of_photos_needs_some() -> None:
+    with pytest.raises(InputError, match="photos-on-scan needs photos, and there are none"):
+        draft_workflow([found("scan", "hall.laz")], Path("flow.yaml"), "photos-on-scan")

@@ -12,6 +12,7 @@ from ruamel.yaml import YAML
 from orthoflow.catalog import Catalog, discover_catalog
 from orthoflow.files.yaml_positions import read_yaml
 from orthoflow.workflow import InvalidWorkflowError, load_workflow, workflow_schema
+from orthoflow.workflow.format import INPUTS, STEPS
 from orthoflow.workflow.problems import ProblemLog
 from orthoflow.workflow.shapes import Key
 from tests import workflow_format
@@ -88,3 +89,12 @@ def test_reader_and_schema_agree_on_metrics(metrics: str, catalog: Catalog, tmp_
         assert not is_valid
     else:
         assert is_valid
+
+
+def test_names_that_are_taken_are_no_names_in_the_schema() -> None:
+    steps, files = STEPS.shape.schema(), INPUTS.shape.schema()
+    assert steps["propertyNames"]["not"] == {"enum": ["inputs"]}
+    assert steps["minProperties"] == 1
+    # An input may be called anything, and there may be none.
+    assert "not" not in files["propertyNames"]
+    assert "minProperties" not in files
