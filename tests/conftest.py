@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import sys
 import tempfile
 from base64 import b64decode
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -18,6 +20,7 @@ from hypothesis import HealthCheck, settings
 from orthoflow.sdk import StepContext
 from orthoflow.sdk.context import Drawing
 from tests.long_loops import IS_LONG
+from tests.memory_folder import has_room, in_memory
 
 if TYPE_CHECKING:
     from tests.engine_world import World
@@ -37,6 +40,10 @@ def _kernels_digest() -> str:
     ]
     return hashlib.sha256(b"".join(kernels)).hexdigest()[:16]
 
+
+# As the command line has it. A search for garbage goes through all that eight thousand tests and
+# the libraries hold; with Python's own threshold that was a fifth of what detecting planes took.
+gc.set_threshold(50_000, *gc.get_threshold()[1:])
 
 # Numba's own cache does not notice edits of kernels that a kernel calls: a folder per state of all
 # of them does. One per user as well, since nobody can write into another's. Set before anything
@@ -76,6 +83,20 @@ _FIGURE: Final = StepContext.figure
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Write into memory; the processes that tests are spread over write where this one does."""
+    is_spread = "PYTEST_XDIST_WORKER" in os.environ
+    if not is_spread and config.option.basetemp is None and has_room():
+        config.add_cleanup(_entered(in_memory()))
+
+
+def _entered(context: AbstractContextManager[None]) -> Callable[[], object]:
+    """Enter a context; give what leaves it."""
+    stack = ExitStack()
+    stack.enter_context(context)
+    return stack.close
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
     """Look for no examples in the docstrings of tests: there are none."""
@@ -84,19 +105,32 @@ def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the longest modules, tests/road, and with what a second process can do meanwhile.
+    """Start with the longest modules, and with what a second process can do meanwhile.
 
     Two modules need no kernels: they run while the first process compiles those for tests/road.
+    What takes longest else comes next, so that in the end no process waits for the other.
     """
     first = [("road", "test_direct.py"), ("cli", "test_running.py")]
+    soon = [
+        *(("plane", "test_detectors.py"), ("testing", "test_conformance.py")),
+        *(("engine", "test_surroundings.py"), ("orient", "test_pnp.py")),
+    ]
 
     def turn(item: pytest.Item) -> int:
-        folder, name = item.path.parts[-2:]
-        if (folder, name) in first:
-            return first.index((folder, name))
-        return len(first) if folder == "road" else len(first) + 1
+        module = item.path.parts[-2:]
+        if module in first:
+            return first.index(module)
+        if module[0] == "road":
+            return len(first)
+        return len(first) + 1 + (soon.index(module) if module in soon else len(soon))
 
     items.sort(key=turn)
+
+
+def pytest_collection_finish() -> None:
+    """Set aside what is loaded by now, in each process: it is never garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

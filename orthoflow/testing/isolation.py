@@ -131,7 +131,8 @@ def _server() -> _Server:
 
 def _environment(folder: Path) -> dict[str, str]:
     # The parent's import path, so that an uninstalled checkout tests itself and nothing else.
-    names = ("PATH", "LD_LIBRARY_PATH", *INSTRUCTION_SWITCHES)
+    # Bytecode is read where this process has it, or the server would make its own, for seconds.
+    names = ("PATH", "LD_LIBRARY_PATH", "PYTHONPYCACHEPREFIX", *INSTRUCTION_SWITCHES)
     kept = {name: os.environ[name] for name in names if name in os.environ}
     one_thread = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return {
