@@ -1,0 +1,68 @@
+"""What the tests of matching share: key points of the few pictures that they look at."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.match import features
+
+# What compares runs, or looks at how key points are found, finds them anew each time.
+_ANEW: Final = (
+    "test_the_number_of_threads_does_not_show",
+    "test_ties_are_the_same_with_any_number_of_threads",
+)
+# Each holds some megabytes.
+_PICTURES_MOST: Final = 32
+
+
+@dataclass
+class _Remembered:
+    """Key points and their descriptors by what they were asked of."""
+
+    tiles: dict[tuple[object, ...], Any] = field(default_factory=dict)
+    described: dict[tuple[object, ...], NDArray[np.float32]] = field(default_factory=dict)
+    find: Any = features._in_tile
+    describe: Any = features._described
+
+    def in_tile(
+        self, sift: Any, picture: NDArray[np.uint8], corner: tuple[int, int], shift_px: float
+    ) -> Any:
+        """Give what OpenCV finds in a tile of a picture."""
+        digest = hashlib.sha256(np.ascontiguousarray(picture)).digest()
+        rule = (sift.getContrastThreshold(), sift.getEdgeThreshold(), shift_px)
+        key = (digest, picture.shape, corner, *rule)
+        if key not in self.tiles:
+            tile = self.find(sift, picture, corner, shift_px)
+            if len(self.tiles) >= _PICTURES_MOST:
+                # Both, since descriptors are known by the tiles that they are of.
+                self.described.clear()
+                self.tiles.clear()
+            self.tiles[key] = tile
+        return self.tiles[key]
+
+    def of_chosen(
+        self, sift: Any, picture: NDArray[np.uint8], tiles: list[Any], chosen: NDArray[np.intp]
+    ) -> NDArray[np.float32]:
+        """Give descriptors of chosen key points."""
+        if not all(any(tile is known for known in self.tiles.values()) for tile in tiles):
+            return self.describe(sift, picture, tiles, chosen)
+        key = (*map(id, tiles), chosen.tobytes())
+        if key not in self.described:
+            self.described[key] = self.describe(sift, picture, tiles, chosen)
+        return self.described[key].copy()
+
+
+_remembered = _Remembered()
+
+
+@pytest.fixture(autouse=True)
+def _key_points_found_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Look at each picture once: tests look at the same few, and at a wall in most of them."""
+    if request.path.stem != "test_features" and request.node.originalname not in _ANEW:
+        monkeypatch.setattr(features, "_in_tile", _remembered.in_tile)
+        monkeypatch.setattr(features, "_described", _remembered.of_chosen)
