@@ -13,9 +13,10 @@ from orthoflow.engine.durability import place_folder, remove_tree
 from orthoflow.errors import StoreError
 
 VARIABLE: Final = "ORTHOFLOW_KERNELS"
-# Our own kernels (`geometry.kept_kernels`): no two of these have one name, and damage shows. What
-# a plugin keeps past them stays in its store.
-_SHARED: Final = "*.checked*.nb[ci]"
+# Our own kernels (`geometry.kept_kernels`), in whose names stands what they hold: no two of these
+# have one name, and damage shows. What a plugin keeps past them stays in its store.
+CHECKED: Final = ".checked"
+_SHARED: Final = f"*{CHECKED}*.nb[ci]"
 # Of the files that say of a method that its kernels are there; they hold no code.
 DONE: Final = ".foretold"
 
@@ -36,20 +37,42 @@ def begun_with_warm(folder: Path) -> Path:
     """Give a store's folder of kernels; where it is not there yet, it begins with warm ones.
 
     They are copied, because numba writes beside what it reads, and a folder of an image or of
-    another user may be read-only. Whatever stands in the way, kernels are compiled instead.
+    another user may be read-only. Where this state of the code has none, those of the state before
+    it come first: of these, what an edit left alone is found by what it holds. Whatever stands in
+    the way, kernels are compiled instead.
     """
     warm = warm_folder() / folder.name
-    if folder.exists() or not warm.is_dir():
+    if folder.exists():
         return folder
     aside = folder.with_name(f".{folder.name}-{uuid.uuid4().hex}")
     try:
         # Not their times: they are as young as the store.
-        shutil.copytree(warm, aside, copy_function=shutil.copyfile)
+        if warm.is_dir():
+            shutil.copytree(warm, aside, copy_function=shutil.copyfile)
+        elif not _copy_state_before(aside):
+            return folder
         place_folder(aside, folder)
     except (OSError, shutil.Error, StoreError):
         with suppress(OSError):
             remove_tree(aside)
     return folder
+
+
+def _copy_state_before(folder: Path) -> bool:
+    """Copy our kernels of the state that was begun last, of each its youngest; False for none."""
+    states = [path for path in warm_folder().glob("*") if path.is_dir()]
+    if not states:
+        return False
+    before = max(states, key=lambda path: path.stat().st_mtime)
+    youngest: dict[str, Path] = {}
+    for index in sorted(before.rglob(f"*{CHECKED}-*.nbi"), key=lambda path: path.stat().st_mtime):
+        youngest[f"{index.parent} {index.name.partition(CHECKED)[0]}"] = index
+    for index in youngest.values():
+        place = folder / index.parent.relative_to(before)
+        place.mkdir(parents=True, exist_ok=True)
+        for path in (*index.parent.glob(f"{index.stem}.*.nbc"), index):
+            shutil.copyfile(path, place / path.name)
+    return bool(youngest)
 
 
 def leave_for_others(folder: Path, since_ns: int) -> None:

@@ -77,7 +77,7 @@ def _kept(function: Callable[..., Any], **options: object) -> Any:
     # Where nothing can be kept, no home and a program that only others may change, it is compiled
     # in each process.
     with suppress(RuntimeError):
-        _keep(kernel, KeptKernels(function))
+        _keep(kernel, KeptKernels(kernel))
     _give_constants_no_version(kernel)
     return kernel
 

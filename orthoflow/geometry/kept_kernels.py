@@ -4,6 +4,10 @@ What numba keeps are pickles, and to read one is to run it. Each file begins wit
 rest here: one that was damaged, cut off or written by somebody else is as good as none, and its
 kernel is compiled again. That finds damage, not an enemy, who can write a digest as well.
 
+Numba asks whether the file of a kernel is as it was, and not what the kernel takes from others.
+Here a kernel is known by what it holds (`geometry.kernel_contents`), and by nothing else: files of
+several states of the code lie beside each other, and none is ever taken for another.
+
 Of two processes that need a kernel one compiles it, and the other waits and loads it.
 """
 
@@ -14,19 +18,22 @@ import io
 import pickle
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
+from orthoflow.geometry.kernel_contents import UntellableError, contents_digest, fields_of
 from orthoflow.geometry.kernel_news import tell
 from orthoflow.system import FileLock, file_lock
 
 _DIGEST_BYTES: Final = 32
 # Of an index's files, in their names.
 CHECKED: Final = ".checked"
+# So many digits of the digest of what a kernel holds stand there, too.
+_NAMED: Final = 16
 # Longer than any kernel takes where its process gets a core. One that does not, beside much other
 # work, or that was stopped, shall not be waited for: then each compiles for itself.
 _PATIENCE_S: Final = 5.0
@@ -37,25 +44,49 @@ class KeptKernels(FunctionCache):
     """The kept versions of one kernel; stands in the place of numba's own."""
 
     # Any: numba's classes have no types.
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, kernel: Any) -> None:
         """Find where they are kept, as numba does.
 
         Raises:
             RuntimeError: nowhere on this machine can anything be kept.
         """
-        super().__init__(function)  # type: ignore[no-untyped-call]
-        self._cache_file = _CheckedFiles(  # type: ignore[no-untyped-call]
-            self._cache_path,
-            # Another name than numba's: a version before could not read these files.
-            f"{self._impl.filename_base}{CHECKED}",
-            self._impl.locator.get_source_stamp(),
-        )
+        self._kernel = kernel
+        self._files: _CheckedFiles | None = None
+        super().__init__(kernel.py_func)  # type: ignore[no-untyped-call]
+
+    @property
+    def _cache_file(self) -> _CheckedFiles:
+        # Not before it is asked for: what a kernel calls may stand behind it in its module.
+        if self._files is None:
+            digest = self._contents()
+            # Another name than numba's: a version before could not read these files. Without the
+            # line, which is no part of a kernel.
+            name, _, python = self._impl.filename_base.rpartition("-")
+            base = f"{name}-{python.partition('.')[2]}{CHECKED}-{digest[:_NAMED]}"
+            self._files = _CheckedFiles(self._cache_path, base, digest)  # type: ignore[no-untyped-call]
+        return self._files
+
+    @_cache_file.setter
+    def _cache_file(self, _: object) -> None:
+        """Take none of numba's own."""
+
+    def _contents(self) -> str:
+        try:
+            return contents_digest(self._kernel)
+        except UntellableError:
+            # As long as all sources of kernels are as they are, which names the folder.
+            stamp = self._impl.locator.get_source_stamp()
+            return hashlib.sha256(repr((stamp, self._cache_path)).encode()).hexdigest()
+
+    def _index_key(self, signature: Any, codegen: Any) -> Any:
+        key = super()._index_key(signature, codegen)  # type: ignore[no-untyped-call]
+        return (*key, fields_of(signature))
 
     def holds(self, signature: object, context: Any) -> bool:
         """Whether a version is kept, as far as the index says."""
         context.refresh()
-        key = self._index_key(signature, context.codegen())  # type: ignore[no-untyped-call]
-        return key in self._cache_file._load_index()  # type: ignore[no-untyped-call]  # noqa: SLF001
+        key = self._index_key(signature, context.codegen())
+        return key in self._cache_file._load_index()  # noqa: SLF001
 
     @contextmanager
     def alone(self) -> Iterator[None]:
@@ -64,7 +95,7 @@ class KeptKernels(FunctionCache):
         Kernels wait for those that they call and never the other way round, so nobody waits in a
         circle. Where files cannot be locked, or the other takes too long, nobody is kept from it.
         """
-        path = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
+        path = Path(self._cache_file.lock_path)
         try:
             lock = path.open("wb")
         except OSError:
@@ -83,6 +114,11 @@ class _CheckedFiles(IndexDataCacheFile):
 
     No two files ever have one name, whoever writes them: an index never names another's version.
     """
+
+    @property
+    def lock_path(self) -> str:
+        """The file that is locked while a version is compiled."""
+        return f"{self._index_path.removesuffix('.nbi')}.lock"
 
     def _data_name(self, number: int) -> str:
         return f"{Path(self._index_path).stem}.{uuid.uuid4().hex[:12]}.nbc"

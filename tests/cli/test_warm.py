@@ -75,6 +75,26 @@ def test_a_folder_of_kernels_is_copied_once_and_only_where_there_is_none(
     assert not begun_with_warm(folder.with_name("def")).exists()
 
 
+def test_a_new_state_of_the_code_begins_with_the_youngest_kernels_of_the_one_before(
+    tmp_path: Path, kernels: Path
+) -> None:
+    for nth, state in enumerate(("older", "before")):
+        (kernels / state / "plane_1").mkdir(parents=True)
+        (kernels / state / "plane.x.foretold").touch()
+        os.utime(kernels / state, ns=(nth, nth))
+    names = ("f.checked-1.nbi", "f.checked-1.ab.nbc", "f.checked-2.nbi", "f.checked-2.cd.nbc")
+    for nth, name in enumerate((*names, "strangers.1.nbc", "strangers.nbi")):
+        (kernels / "before" / "plane_1" / name).write_bytes(name.encode())
+        os.utime(kernels / "before" / "plane_1" / name, ns=(nth, nth))
+        os.utime(kernels / "before", ns=(9, 9))
+    folder = begun_with_warm(tmp_path / "store" / "numba" / "new")
+    # Nor what says that all kernels of a method are there.
+    found = {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert found == {name: name.encode() for name in names[2:]}
+    leave_for_others(folder, 1)
+    assert {path.name for path in (kernels / "new" / "plane_1").iterdir()} == set(found)
+
+
 def test_kernels_that_cannot_be_copied_are_compiled_instead(tmp_path: Path, kernels: Path) -> None:
     (kernels / "abc").mkdir(parents=True)
     (kernels / "abc" / "f.nbc").write_bytes(b"code")

@@ -16,7 +16,6 @@ import pytest
 from numba.core import config
 
 from orthoflow.geometry import kept_kernels
-from orthoflow.geometry.kept_kernels import CHECKED
 from orthoflow.geometry.kernel_news import heard_by
 
 KERNELS = """
@@ -76,6 +75,24 @@ def test_what_one_process_compiled_another_loads(load: Callable[[], Any]) -> Non
     assert counts(again.most) == (1, 0)
 
 
+def test_what_an_edit_left_alone_is_loaded_and_nothing_else(
+    load: Callable[[], Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "kernels.py"
+    assert load().asked(3) == 214.0
+    # Of another length: Python itself takes bytecode of the same second for that of the file.
+    path.write_text(KERNELS.replace("+ 100", "+ 1100"))
+    edited = load()
+    assert edited.asked(3) == 2214.0
+    assert counts(edited.most) == counts(edited.asked) == (0, 1)
+    assert counts(edited.more) == (1, 0)
+    # As it was, but for lines and an unused name: both states lie there.
+    path.write_text(f"# Above.\nUNUSED = 3\n{KERNELS}")
+    again = load()
+    assert again.asked(3) == 214.0
+    assert counts(again.asked) == counts(again.most) == (1, 0)
+
+
 def test_a_kernel_that_another_process_compiles_is_waited_for_and_loaded(
     load: Callable[[], Any], tmp_path: Path
 ) -> None:
@@ -114,7 +131,7 @@ def test_who_takes_too_long_to_compile_is_waited_for_once(
 
 
 def _locked(index: Path) -> BinaryIO:
-    lock = index.with_name(index.name.replace(f"{CHECKED}.nbi", ".lock")).open("wb")
+    lock = index.with_suffix(".lock").open("wb")
     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return lock
 
