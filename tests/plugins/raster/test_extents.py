@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.raster.extents import Extent, Reach, extent_of
 from orthoflow_plugins.raster.grid import RasterGrid
+from orthoflow_plugins.raster.sampled_points import sampled
 
 from orthoflow.products import Planes, PointCloud, Walls
 from tests import raster_scenes as scenes
@@ -248,3 +251,88 @@ def test_what_stands_apart_before_a_wall_is_no_relief(tmp_path: Path) -> None:
     screen = patch((1.0, 2.0), (0.4, 0.4), (0.0, 1.5))
     walls = laid(scanned(wall(), screen), planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)), tmp_path)
     assert walls.slab(0).front_m == pytest.approx(0.15)
+
+
+def extent(*patches: NDArray, planes: Planes | None = None, **reach: float | None) -> Extent:
+    """How far the wall of a cloud without noise reaches."""
+    cloud = scenes.cloud_of(np.vstack(patches))
+    found = planes_of((0.0, WIDTH_M), (0.0, HEIGHT_M)) if planes is None else planes
+    sought: dict[str, Any] = {"front_m": None, "behind_m": None, "least_m": 0.15, **reach}
+    return extent_of(sampled(cloud), found, 0, Reach(**sought), threads=1)
+
+
+def part(x: tuple[float, float], depth_m: float, z: tuple[float, float]) -> NDArray:
+    return patch(x, (depth_m, depth_m), z)
+
+
+@pytest.mark.parametrize(("beyond_m", "grown_m"), [(0.8, 0.8), (1.4, 1.0)])
+@pytest.mark.parametrize("side", [0, 1, 2, 3])
+def test_a_wall_grows_by_a_metre_at_most(side: int, beyond_m: float, grown_m: float) -> None:
+    strips = (
+        part((-beyond_m, 0.0), 0.0, (0.0, HEIGHT_M)),
+        part((WIDTH_M, WIDTH_M + beyond_m), 0.0, (0.0, HEIGHT_M)),
+        part((0.0, WIDTH_M), 0.0, (HEIGHT_M, HEIGHT_M + beyond_m)),
+        part((0.0, WIDTH_M), 0.0, (-beyond_m, 0.0)),
+    )
+    found = extent(wall(), strips[side])
+    # But for a fiftieth of the outermost points, which may be stray.
+    expected = np.zeros(4)
+    expected[side] = grown_m
+    np.testing.assert_allclose(found.growth_m, expected, atol=0.03)
+
+
+@pytest.mark.parametrize(("high_m", "grows"), [(0.45, False), (0.9, True)])
+def test_a_fifth_of_a_line_of_cells_must_be_covered(high_m: float, grows: bool) -> None:
+    strip = part((WIDTH_M, WIDTH_M + 0.5), 0.0, (1.0, 1.0 + high_m))
+    assert (extent(wall(), strip).growth_m[1] > 0.4) == grows
+
+
+@pytest.mark.parametrize(
+    ("depths_m", "front_m"),
+    [
+        ((0.12,), 0.14),
+        ((0.1, 0.2, 0.3, 0.4), 0.42),
+        # Where a column ends beyond reach, nothing of it is relief.
+        ((0.1, 0.2, 0.3, 0.4, 0.5, 0.58), 0.1),
+        ((0.2,), 0.1),
+        ((0.1, 0.3), 0.12),
+    ],
+    ids=str,
+)
+def test_relief_hangs_together_over_steps_of_a_tenth_of_a_metre(
+    depths_m: tuple[float, ...], front_m: float
+) -> None:
+    steps = [part((1.0, 2.0), depth, (1.0, 2.0)) for depth in depths_m]
+    found = extent(wall(), *steps, least_m=0.1)
+    # A step in depth of 2.5 cm, and 2 cm beyond the relief.
+    assert found.front_m == pytest.approx(front_m, abs=0.03)
+    assert found.behind_m == 0.1
+
+
+@pytest.mark.parametrize(("side_m", "counts"), [(0.09, False), (0.2, True)])
+def test_tiny_relief_decides_no_buffer(side_m: float, counts: bool) -> None:
+    boss = part((1.5, 1.5 + side_m), 0.11, (1.5, 1.5 + side_m))
+    assert (extent(wall(), boss, least_m=0.05).front_m > 0.1) == counts
+
+
+def test_what_is_set_is_not_looked_for() -> None:
+    step = part((1.0, 2.0), 0.12, (1.0, 2.0))
+    found = extent(wall(), step, front_m=0.07)
+    assert (found.front_m, found.behind_m) == (0.07, 0.15)
+    both = Reach(front_m=0.07, behind_m=0.3, least_m=0.15)
+    assert both.is_set
+    assert both.as_set.buffer_m == (0.07, 0.3)
+    assert not Reach(front_m=None, behind_m=0.3, least_m=0.15).is_set
+
+
+def test_a_cloud_without_the_wall_gives_it_what_is_set() -> None:
+    elsewhere = part((0.0, WIDTH_M), 0.8, (0.0, HEIGHT_M))
+    found = extent(elsewhere, least_m=0.2)
+    assert (found.growth_m, found.buffer_m) == ((0.0, 0.0, 0.0, 0.0), (0.2, 0.2))
+
+
+def test_a_frame_is_widened_by_whole_cells() -> None:
+    frame = samples.facing_south(0.1, 20, 10, (1.0, 2.0, 3.0))
+    grown = Extent(growth_m=(0.25, 0.3, 0.0, 0.59), front_m=0.1, behind_m=0.1).widened(frame)
+    assert (grown.width, grown.height) == (20 + 2 + 3, 10 + 5)
+    np.testing.assert_allclose(grown.origin_world, frame.origin_world - [0.2, 0.0, 0.0])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from orthoflow_plugins.raster import selection
 from orthoflow_plugins.raster.selection import WallChoice, chosen_planes
 
 from orthoflow.errors import MethodError
@@ -210,3 +211,33 @@ def test_a_buffer_has_a_front_and_a_back(depth_m: float) -> None:
         buffer_m = (reach_m, 0.0) if depth_m > 0.0 else (0.0, reach_m)
         choice = replace(CHOICE, buffer_m=lambda _, reach=buffer_m: reach)
         assert chosen_planes(both, choice) == covered
+
+
+def test_planes_away_from_the_origin_are_as_large_and_as_far_as_anywhere() -> None:
+    near, shift = planes(MAIN, (0.4, 1.0, 3.0, 30.0)), np.array([300.0, -200.0, 50.0])
+    far = replace(near, corners=near.corners + shift, offset=near.offset + near.normal @ shift)
+    place = np.array([2.0, 0.5, 1.2])
+    for index, size_m2 in ((0, 10.0), (1, 6.0)):
+        assert selection.area_m2(near.corners[index]) == pytest.approx(size_m2)
+        assert selection.area_m2(far.corners[index]) == pytest.approx(size_m2)
+        there = selection.distance_m(far, index, place + shift)
+        assert there == pytest.approx(selection.distance_m(near, index, place))
+    # Above, beside and before a rectangle, along one side of it and off its corner.
+    for off, away in (((-1.0, 0.0, 0.0), 1.0), ((0, 0, 0.5), 0.5), ((-3.0, 0.0, 4.0), 5.0)):
+        corner = far.corners[0, 0]
+        assert selection.distance_m(far, 0, corner + off) == pytest.approx(away)
+
+
+def test_the_raster_of_a_plane_lies_over_its_rectangle_and_a_margin() -> None:
+    turned = planes((0.0, 0.0, 5.0, 20.0))
+    for margin_m in (0.0, 0.5):
+        frame = selection.frame_of(turned, 0, gsd_m=0.1, margin_m=margin_m)
+        assert frame.shape == (round((2.0 + 2.0 * margin_m) / 0.1), round((5 + 2 * margin_m) / 0.1))
+        top_left, bottom_left, _, top_right = turned.corners[0]
+        right = (top_right - top_left) / 5.0
+        down = (bottom_left - top_left) / 2.0
+        np.testing.assert_allclose(
+            frame.origin_world, top_left - margin_m * (right + down), atol=1e-9
+        )
+        np.testing.assert_allclose(frame.u_world, right, atol=1e-9)
+        np.testing.assert_allclose(frame.v_world, down, atol=1e-9)

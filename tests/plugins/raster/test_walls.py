@@ -1,0 +1,152 @@
+"""How far apart points lie on a wall, how much memory it takes, and what of it is known."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.raster import walls
+from orthoflow_plugins.raster.walls import require_memory, scan_step_m
+
+from orthoflow.errors import MethodError
+from orthoflow.geometry import WallFrame
+from orthoflow.geometry.bands import IN_MEMORY_CELLS
+from orthoflow.products import SurfaceMask
+from tests import samples
+
+GSD_M = 0.01
+
+
+def every(step: int, shape: tuple[int, int] = (96, 128)) -> NDArray[np.uint32]:
+    """One point in each block of step x step cells."""
+    count = np.zeros(shape, dtype=np.uint32)
+    count[step // 2 :: step, step // 2 :: step] = 1
+    return count
+
+
+@pytest.mark.parametrize("step", [1, 2, 4, 8])
+def test_points_every_few_cells_lie_so_many_apart(step: int) -> None:
+    assert scan_step_m(every(step), gsd_m=GSD_M) == pytest.approx(step * GSD_M)
+    # So they do where they cover a corner of the wall alone, and on cells of other sizes.
+    part = every(step)
+    part[64:] = part[:, 64:] = 0
+    assert scan_step_m(part, gsd_m=0.25) == pytest.approx(step * 0.25)
+
+
+@pytest.mark.parametrize("per_cell", [1, 4, 9, 100])
+def test_many_points_per_cell_lie_closer_than_cells(per_cell: int) -> None:
+    count = np.full((30, 40), per_cell, dtype=np.uint32)
+    assert scan_step_m(count, gsd_m=GSD_M) == pytest.approx(GSD_M / np.sqrt(per_cell))
+
+
+def test_points_at_random_are_as_far_apart_as_they_are_many() -> None:
+    rng = np.random.default_rng(3)
+    for mean in (0.05, 0.3, 1.0, 6.0):
+        count = rng.poisson(mean, (200, 240)).astype(np.uint32)
+        assert scan_step_m(count, gsd_m=GSD_M) == pytest.approx(GSD_M / np.sqrt(mean), rel=0.05)
+
+
+def test_a_wall_without_points_has_no_step_and_one_point_has_the_wall() -> None:
+    assert scan_step_m(np.zeros((7, 9), dtype=np.uint32), gsd_m=GSD_M) == 0.0
+    one = np.zeros((7, 9), dtype=np.uint32)
+    one[3, 8] = 1
+    # Four doublings make one block of nine columns.
+    assert scan_step_m(one, gsd_m=GSD_M) == pytest.approx(16 * GSD_M)
+
+
+@pytest.mark.parametrize("shape", [(6, 8), (7, 8), (6, 9), (7, 9), (1, 1), (1, 5)])
+def test_joined_blocks_hold_the_points_of_two_by_two(shape: tuple[int, int]) -> None:
+    blocks = np.random.default_rng(1).integers(0, 9, shape).astype(np.uint32)
+    joined = walls._joined(blocks)
+    assert joined.shape == (-(-shape[0] // 2), -(-shape[1] // 2))
+    for row in range(joined.shape[0]):
+        for column in range(joined.shape[1]):
+            part = blocks[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
+            assert joined[row, column] == part.sum()
+
+
+def frame(rows: int, columns: int) -> WallFrame:
+    return samples.facing_south(GSD_M, columns, rows)
+
+
+def with_memory(monkeypatch: pytest.MonkeyPatch, n_bytes: float) -> None:
+    sizes = {"SC_PHYS_PAGES": int(n_bytes // 4096), "SC_PAGE_SIZE": 4096}
+    monkeypatch.setattr(os, "sysconf", sizes.__getitem__)
+
+
+def needed_bytes(monkeypatch: pytest.MonkeyPatch, *frames: WallFrame) -> float:
+    """What some walls are said to need."""
+    with_memory(monkeypatch, 4096.0)
+    with pytest.raises(MethodError, match="raise gsd_m, or lower n_walls_max") as caught:
+        require_memory(frames)
+    found = re.search(r"which need ([0-9.e+-]+) GiB", str(caught.value))
+    assert found is not None
+    return float(found[1]) * 2.0**30
+
+
+def test_walls_may_take_three_quarters_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = frame(2000, 3000)
+    needed = needed_bytes(monkeypatch, one)
+    with_memory(monkeypatch, 1.01 * needed / 0.75)
+    require_memory([one])
+    with_memory(monkeypatch, 0.99 * needed / 0.75)
+    with pytest.raises(MethodError, match=r"gsd_m = 0.01 m make 6e\+06 cells \(3000 x 2000"):
+        require_memory([one])
+
+
+def test_each_wall_is_kept_and_the_largest_is_worked_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    small, large = frame(1000, 1000), frame(2000, 2000)
+    one, other, both, twice = (
+        needed_bytes(monkeypatch, *frames)
+        for frames in ((small,), (large,), (small, large), (large, large))
+    )
+    assert other == pytest.approx(4.0 * one, rel=0.01)
+    kept_of_large = twice - other
+    assert both - other == pytest.approx(kept_of_large / 4.0, rel=0.05)
+    # What a finished wall holds: its depth, deviation, count, mask, intensity and colours.
+    assert 21.0 <= kept_of_large / 4e6 <= 32.0
+    assert other - kept_of_large > kept_of_large
+
+
+def test_a_wall_in_bands_takes_the_memory_of_a_band(monkeypatch: pytest.MonkeyPatch) -> None:
+    huge, larger = frame(8000, 20_000), frame(8000, 40_000)
+    assert huge.width * huge.height > IN_MEMORY_CELLS
+    assert needed_bytes(monkeypatch, huge) == needed_bytes(monkeypatch, larger)
+
+
+def test_no_wall_has_more_cells_than_32_bits_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_memory(monkeypatch, 1e15)
+    require_memory([frame(1 << 15, (1 << 16) - 1)])
+    with pytest.raises(MethodError, match="cells of gsd_m"):
+        require_memory([frame(1 << 15, 1 << 16)])
+
+
+def test_grey_is_that_of_the_eye_and_void_has_none() -> None:
+    rgb = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]], dtype=np.uint8)
+    mask = np.array([1, 1, 2, SurfaceMask.VOID], dtype=np.uint8)
+    grey = walls._grey(rgb, mask)
+    assert grey is not None
+    assert grey.dtype == np.float32
+    np.testing.assert_allclose(grey, [0.299, 0.587, 0.114, np.nan], atol=1e-3)
+    assert walls._grey(None, mask) is None
+
+
+@pytest.mark.parametrize("n_most", [5, 6])
+def test_what_is_not_void_is_known_in_memory_or_in_a_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, n_most: int
+) -> None:
+    asked = []
+
+    def allocate(name: str, shape: tuple[int, ...], dtype: type) -> NDArray[np.generic]:
+        asked.append(name)
+        return np.memmap(tmp_path / name, dtype=dtype, mode="w+", shape=shape)
+
+    monkeypatch.setattr(walls, "_BAND_CELLS", n_most)
+    mask = np.array([0, 1, 2, 3, 0, 1], dtype=np.uint8)
+    known = walls._where_known(mask, (2, 3), allocate)  # type: ignore[arg-type]
+    assert known.tolist() == [[0, 1, 1], [1, 0, 1]]
+    assert asked == (["rgb_mask"] if n_most == 5 else [])
