@@ -11,17 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, in_memory
 from orthoflow.geometry.levels import REC_601, eight_bits
-from orthoflow.geometry.robust import NMAD_FACTOR, median_deviation
+from orthoflow.geometry.robust import NMAD_FACTOR
 from orthoflow.products import Finding, Orthoimage, OrthoMask, SurfaceMask, Wall
 from orthoflow_plugins.inspect.findings import rms
+from orthoflow_plugins.inspect.image_quality import n_shown as n_shown_of
 from orthoflow_plugins.inspect.image_quality import shown
 from orthoflow_plugins.inspect.patches import GreyImage, PatchShifts, measure_shifts
+from orthoflow_plugins.inspect.spreads import Spread
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import TrueOrthoimage
@@ -76,7 +79,7 @@ def sampling_rule(
     images: Sequence[Orthoimage], *, colour_cells_most: int, seen_cells_most: int
 ) -> SamplingRule:
     """Find the share and the step that keep to about so many cells of all images together."""
-    n_shown = sum(int(np.count_nonzero(shown(image))) for image in images)
+    n_shown = sum(n_shown_of(image) for image in images)
     n_cells = sum(image.mask.size for image in images)
     return SamplingRule(
         colour_share=min(1.0, colour_cells_most / max(1, n_shown)),
@@ -84,8 +87,14 @@ def sampling_rule(
     )
 
 
-def sampling(image: Orthoimage, rule: SamplingRule) -> Sampling:
-    """Choose cells of an image; blocks that show nothing have no colours to compare."""
+def sampling(image: Orthoimage, rule: SamplingRule, first_row: int = 0) -> Sampling:
+    """Choose cells of an image; blocks that show nothing have no colours to compare.
+
+    Args:
+        image: of a wall, or some rows of one.
+        rule: how much is chosen.
+        first_row: of a part within its wall, a multiple of `BLOCK_CELLS`.
+    """
     shows = shown(image)
     coloured = np.zeros(shows.shape, dtype=np.bool_)
     for i in range(-(-shows.shape[0] // BLOCK_CELLS)):
@@ -94,11 +103,14 @@ def sampling(image: Orthoimage, rule: SamplingRule) -> Sampling:
                 slice(i * BLOCK_CELLS, (i + 1) * BLOCK_CELLS),
                 slice(j * BLOCK_CELLS, (j + 1) * BLOCK_CELLS),
             )
-            is_chosen = (i * _SPREAD[0] + j * _SPREAD[1]) % 1.0 < rule.colour_share
+            place = (first_row // BLOCK_CELLS + i) * _SPREAD[0] + j * _SPREAD[1]
+            is_chosen = place % 1.0 < rule.colour_share
             coloured[block] = is_chosen and shows[block].any()
     lattice = np.zeros(shows.shape, dtype=np.bool_)
     first = rule.lattice_step // 2
-    lattice[first :: rule.lattice_step, first :: rule.lattice_step] = True
+    lattice[
+        (first - first_row) % rule.lattice_step :: rule.lattice_step, first :: rule.lattice_step
+    ] = True
     return Sampling(coloured=coloured, lattice=lattice)
 
 
@@ -161,11 +173,22 @@ class WallErrors:
 
 
 def wall_errors(
-    image: Orthoimage, wall: Wall, true: TrueOrthoimage, chosen: Sampling
+    image: Orthoimage,
+    wall: Wall,
+    true: TrueOrthoimage,
+    chosen: Sampling,
+    inner: slice = slice(None),
 ) -> WallErrors:
     """Compare an orthoimage and its wall, both on the frame of `true`, with the truth.
 
     Depths are compared everywhere, the rest on the chosen cells.
+
+    Args:
+        image: the orthoimage.
+        wall: the wall.
+        true: the truth.
+        chosen: cells whose colour is compared, and that are asked for who sees them.
+        inner: rows that are told of; the others are about them. A multiple of patches.
     """
     known = true.rectangle >= 0
     steps = depth_step_band(true.depth_m)
@@ -175,15 +198,19 @@ def wall_errors(
     depth = np.where(
         (wall.mask == SurfaceMask.MEASURED) & known, wall.depth_m.astype(np.float64), np.nan
     ) - true.depth_m.astype(np.float64)
-    patches = _shifts(image, true, chosen.coloured & known & ~steps)
+    patches = _shifts(image, true, chosen.coloured & known & ~steps).within(inner)
     compared = painted & _inner(chosen.coloured, known)
-    gross = _gross_colours(image, true) & compared & ~steps
+    gross = (_gross_colours(image, true) & compared & ~steps)[inner]
+    asked, seen = (painted & chosen.lattice)[inner], (true.seen & chosen.lattice)[inner]
+    behind = true.behind_object[inner]
+    sigma_m = wall.sigma_m[inner]
+    depth, square, compared = depth[inner], square[inner], compared[inner]
+    painted, filled, steps = painted[inner], filled[inner], steps[inner]
     measured = np.isfinite(depth)
     compares = np.isfinite(square)
-    asked, seen = painted & chosen.lattice, true.seen & chosen.lattice
     samples = WallSamples(
         depth_m=depth[measured & ~steps],
-        sigma_m=wall.sigma_m[measured & ~steps].astype(np.float64),
+        sigma_m=sigma_m[measured & ~steps].astype(np.float64),
         step_depth_m=depth[measured & steps],
         colour=square[compares & painted & ~steps],
         filled_colour=square[compares & filled & ~steps],
@@ -197,38 +224,35 @@ def wall_errors(
         n_unseen_painted=_count(asked & ~seen & ~steps),
         n_coloured=_count(compared),
         n_gross=_count(gross),
-        n_ghost=_count(gross & true.behind_object),
+        n_ghost=_count(gross & behind),
     )
     return WallErrors(samples=samples, patches=patches, depth_m=depth, grey=np.sqrt(square))
 
 
-def pooled(samples: Sequence[WallSamples]) -> WallSamples:
-    """Put the errors of several walls together."""
+def pooled(samples: Sequence[WallSamples], allocate: Allocate = in_memory) -> WallSamples:
+    """Put the errors of several walls, or parts of one, together.
+
+    Args:
+        samples: of each.
+        allocate: gives arrays for the errors of large walls, by name.
+    """
 
     def joined(name: str) -> NDArray[np.float64]:
-        return np.concatenate([getattr(item, name) for item in samples])
+        parts = [np.asarray(getattr(item, name)) for item in samples]
+        total = sum(len(part) for part in parts)
+        if total <= IN_MEMORY_CELLS:
+            return np.concatenate(parts)
+        shape = (total, *parts[0].shape[1:])
+        whole = np.asarray(allocate(name, shape, np.float64), np.float64)
+        return np.concatenate(parts, out=whole)
 
     def added(name: str) -> int:
         return sum(int(getattr(item, name)) for item in samples)
 
-    return WallSamples(
-        depth_m=joined("depth_m"),
-        sigma_m=joined("sigma_m"),
-        step_depth_m=joined("step_depth_m"),
-        colour=joined("colour"),
-        filled_colour=joined("filled_colour"),
-        step_colour=joined("step_colour"),
-        shift_m=joined("shift_m"),
-        shift_cells=joined("shift_cells"),
-        n_painted=added("n_painted"),
-        n_seen=added("n_seen"),
-        n_seen_painted=added("n_seen_painted"),
-        n_seen_shown=added("n_seen_shown"),
-        n_unseen_painted=added("n_unseen_painted"),
-        n_coloured=added("n_coloured"),
-        n_gross=added("n_gross"),
-        n_ghost=added("n_ghost"),
-    )
+    whole: dict[str, Any] = {}
+    for name, value in vars(samples[0]).items():
+        whole[name] = added(name) if isinstance(value, int) else joined(name)
+    return WallSamples(**whole)
 
 
 def depth_step_band(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -320,21 +344,26 @@ def _count(mask: NDArray[np.bool_]) -> int:
 
 
 def _depth_numbers(samples: WallSamples) -> list[_Number]:
-    errors = 1e3 * samples.depth_m
-    if errors.size == 0:
+    if samples.depth_m.size == 0:
         return []
-    middle = float(np.median(errors))
+    errors = Spread(samples.depth_m, 1e3)
+    middle = errors.median()
     numbers = [
         ("depth_median_mm", middle, "mm"),
-        ("depth_nmad_mm", median_deviation(errors, middle), "mm"),
-        ("depth_rmse_mm", rms(errors), "mm"),
+        ("depth_nmad_mm", errors.median_deviation(middle), "mm"),
+        ("depth_rmse_mm", errors.rms(), "mm"),
     ]
-    stated = samples.sigma_m > 0.0
-    if stated.any():
-        inside = np.abs(samples.depth_m[stated]) <= 3.0 * samples.sigma_m[stated]
-        numbers.append(("depth_within_3sigma", float(inside.mean()), "1"))
+    n_stated = n_inside = 0
+    for first in range(0, len(samples.depth_m), IN_MEMORY_CELLS):
+        part = slice(first, first + IN_MEMORY_CELLS)
+        depth_m, sigma_m = samples.depth_m[part], samples.sigma_m[part]
+        stated = sigma_m > 0.0
+        n_stated += _count(stated)
+        n_inside += _count(np.abs(depth_m[stated]) <= 3.0 * sigma_m[stated])
+    if n_stated:
+        numbers.append(("depth_within_3sigma", n_inside / n_stated, "1"))
     if samples.step_depth_m.size:
-        numbers.append(("depth_step_rmse_mm", 1e3 * rms(samples.step_depth_m), "mm"))
+        numbers.append(("depth_step_rmse_mm", 1e3 * Spread(samples.step_depth_m).rms(), "mm"))
     return numbers
 
 
@@ -345,7 +374,9 @@ def _colour_numbers(samples: WallSamples) -> list[_Number]:
         ("step_colour_rmse_grey", samples.step_colour),
     )
     return [
-        (name, float(np.sqrt(squares.mean())), "grey") for name, squares in named if squares.size
+        (name, float(np.sqrt(Spread(squares).mean())), "grey")
+        for name, squares in named
+        if squares.size
     ]
 
 

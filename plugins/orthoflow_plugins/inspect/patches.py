@@ -121,6 +121,19 @@ class PatchShifts:
     found: NDArray[np.float64]
     correlation: NDArray[np.float64]
 
+    def within(self, rows: slice) -> PatchShifts:
+        """Those whose centre lies in some rows, counted from the first of these."""
+        first = rows.start or 0
+        end = np.inf if rows.stop is None else rows.stop
+        own = (self.centre[:, 1] >= first) & (self.centre[:, 1] < end)
+        return PatchShifts(
+            centre=self.centre[own] - (0.0, float(first)),
+            shift=self.shift[own],
+            sigma=self.sigma[own],
+            found=self.found[own],
+            correlation=self.correlation[own],
+        )
+
 
 def unrefined(centre: NDArray[np.float64], shift: NDArray[np.float64]) -> PatchShifts:
     """Give patches at (p, 2) whose displacements (p, 2) are known roughly."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Final, TypeVar
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,13 @@ from orthoflow.geometry import angle_between_deg
 from orthoflow.geometry.opencv_border import to_opencv
 from orthoflow.products import Orthoimage, Orthoimages, SurfaceMask, Wall, Walls
 
+if TYPE_CHECKING:
+    from orthoflow.geometry.scene_views import TrueOrthoimage
+
 _SAME_DIRECTION_DEG: Final = 2.0
 
 _Value = TypeVar("_Value", bound=np.generic)
+_Framed = TypeVar("_Framed", Orthoimage, Wall, "TrueOrthoimage")
 
 
 def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
@@ -39,6 +43,20 @@ def on_walls(images: Orthoimages, walls: Walls) -> Orthoimages:
         number = walls.walls[index].plane_index
         placed.append(replace(image, wall=index, plane_index=number))
     return replace(images, images=tuple(placed))
+
+
+def rows_of(raster: _Framed, rows: slice) -> _Framed:
+    """Give some rows of an orthoimage, a wall or a truth, on a frame of their own."""
+    frame = raster.frame
+    corner = frame.origin_world + rows.start * frame.gsd_m * frame.v_world
+    part = replace(frame, origin_world=corner, height=rows.stop - rows.start)
+    arrays: dict[str, Any] = {
+        field.name: value[rows]
+        for field in fields(raster)
+        if isinstance(value := getattr(raster, field.name), np.ndarray)
+        and value.shape[:2] == frame.shape
+    }
+    return replace(raster, frame=part, **arrays)
 
 
 def wall_of(image: Orthoimage, walls: Walls) -> Wall:

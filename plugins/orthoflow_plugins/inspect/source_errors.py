@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.geometry import WallFrame
-from orthoflow.geometry.robust import median_deviation
+from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, in_memory
 from orthoflow.geometry.scenes import SurfaceRole
 from orthoflow.products import Cameras, Finding, Orthoimage, OrthoMask, Truth, Wall
 from orthoflow_plugins.inspect.cell_errors import depth_step_band
-from orthoflow_plugins.inspect.findings import rms
 from orthoflow_plugins.inspect.orientation_errors import true_camera
+from orthoflow_plugins.inspect.spreads import Spread, in_file
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
@@ -47,6 +47,16 @@ class SourceErrors:
     ghosts: NDArray[np.bool_]
     n_seen_by_both: int
     n_seen_painted: int
+
+    def kept(self, name: str, allocate: Allocate) -> SourceErrors:
+        """The same with its arrays in files."""
+        return replace(
+            self,
+            displacement_m=in_file(self.displacement_m, f"{name}.displacement_m", allocate),
+            traced=in_file(self.traced, f"{name}.traced", allocate),
+            steps=in_file(self.steps, f"{name}.steps", allocate),
+            ghosts=in_file(self.ghosts, f"{name}.ghosts", allocate),
+        )
 
 
 def trace_sources(
@@ -108,29 +118,37 @@ def trace_sources(
     )
 
 
-def source_findings(errors: Sequence[SourceErrors], wall: int) -> list[Finding]:
+def source_findings(
+    errors: Sequence[SourceErrors], wall: int, allocate: Allocate = in_memory
+) -> list[Finding]:
     """Sum up one wall, or several together (wall -1); nothing when no photo painted anything.
 
     Displacements are of all painted cells that show no free-standing object; those within 2 cells
     of true depth steps are apart.
+
+    Args:
+        errors: of walls, or of parts of them.
+        wall: of the findings.
+        allocate: gives arrays for the displacements of many cells, by name.
     """
     errors = [item for item in errors if item.traced.any()]
     if not errors:
         return []
     n_traced = sum(int(np.count_nonzero(item.traced)) for item in errors)
-    away = 1e3 * np.concatenate([_of(item, item.traced & ~item.steps) for item in errors])
-    steps = 1e3 * np.concatenate([_of(item, item.traced & item.steps) for item in errors])
+    away = _gathered(errors, allocate, at_steps=False)
+    steps = _gathered(errors, allocate, at_steps=True)
     numbers = [("n_traced", float(n_traced), "1")]
     for axis, name in enumerate(("u", "v")):
         if len(away):
+            spread = Spread(away[:, axis], 1e3)
             numbers += [
-                (f"rmse_{name}_mm", rms(away[:, axis]), "mm"),
-                (f"mean_{name}_mm", float(away[:, axis].mean()), "mm"),
-                (f"nmad_{name}_mm", median_deviation(away[:, axis]), "mm"),
-                (f"p99_{name}_mm", float(np.percentile(np.abs(away[:, axis]), 99)), "mm"),
+                (f"rmse_{name}_mm", spread.rms(), "mm"),
+                (f"mean_{name}_mm", spread.mean(), "mm"),
+                (f"nmad_{name}_mm", spread.median_deviation(), "mm"),
+                (f"p99_{name}_mm", spread.percentile_of_size(99.0), "mm"),
             ]
         if len(steps):
-            numbers.append((f"step_rmse_{name}_mm", rms(steps[:, axis]), "mm"))
+            numbers.append((f"step_rmse_{name}_mm", Spread(steps[:, axis], 1e3).rms(), "mm"))
     n_far = sum(int(np.count_nonzero(_is_far(item))) for item in errors)
     n_ghosts = sum(int(np.count_nonzero(item.ghosts)) for item in errors)
     numbers += [
@@ -143,6 +161,43 @@ def source_findings(errors: Sequence[SourceErrors], wall: int) -> list[Finding]:
         n_painted = sum(item.n_seen_painted for item in errors)
         numbers.append(("completeness_seen_by_both", n_painted / n_both, "1"))
     return [Finding(name=name, value=value, unit=unit, wall=wall) for name, value, unit in numbers]
+
+
+def counted_once(bands: Sequence[SourceErrors]) -> tuple[SourceErrors, ...]:
+    """Let a band that photos painted count for all bands of its wall; none where none is."""
+    traced = [bool(item.traced.any()) for item in bands]
+    if not any(traced):
+        return ()
+    n_both = sum(item.n_seen_by_both for item in bands)
+    n_painted = sum(item.n_seen_painted for item in bands)
+    first = traced.index(True)
+    return tuple(
+        replace(
+            item,
+            n_seen_by_both=n_both if place == first else 0,
+            n_seen_painted=n_painted if place == first else 0,
+        )
+        for place, item in enumerate(bands)
+    )
+
+
+def _gathered(
+    errors: Sequence[SourceErrors], allocate: Allocate, *, at_steps: bool
+) -> NDArray[np.float64]:
+    """Displacements (n, 2) of cells at true depth steps, or away from them."""
+
+    def of(item: SourceErrors) -> NDArray[np.float64]:
+        return _of(item, item.traced & (item.steps if at_steps else ~item.steps))
+
+    if sum(item.traced.size for item in errors) <= IN_MEMORY_CELLS:
+        return np.concatenate([of(item) for item in errors])
+    counts = [len(of(item)) for item in errors]
+    name = "steps" if at_steps else "away"
+    whole = np.asarray(allocate(name, (sum(counts), 2), np.float64), np.float64)
+    ends = np.cumsum(counts)
+    for item, count, end in zip(errors, counts, ends, strict=True):
+        whole[end - count : end] = of(item)
+    return whole
 
 
 def _near_frame(frame: WallFrame, truth: Truth) -> WallFrame:

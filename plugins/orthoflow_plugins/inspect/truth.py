@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
+from orthoflow.geometry.bands import Allocate, Band
 from orthoflow.geometry.scenes import Viewers
 from orthoflow.products import (
     Cameras,
@@ -24,9 +27,12 @@ from orthoflow.products import (
 )
 from orthoflow.sdk import Determinism, Method, MethodParams, Ports, StepContext
 from orthoflow_plugins.inspect.cell_errors import (
+    BLOCK_CELLS,
     Sampling,
     SamplingRule,
     WallErrors,
+    WallSamples,
+    depth_step_band,
     pooled,
     sample_findings,
     sampling,
@@ -50,7 +56,8 @@ from orthoflow_plugins.inspect.orientation_errors import (
     pose_findings,
     tie_findings,
 )
-from orthoflow_plugins.inspect.placing import on_walls, wall_of
+from orthoflow_plugins.inspect.patches import PatchShifts, joined_shifts
+from orthoflow_plugins.inspect.placing import on_walls, rows_of, wall_of
 from orthoflow_plugins.inspect.plane_errors import (
     found_planes,
     inspect_planes,
@@ -58,12 +65,22 @@ from orthoflow_plugins.inspect.plane_errors import (
     wall_plane_findings,
     worst_plane_findings,
 )
-from orthoflow_plugins.inspect.source_errors import SourceErrors, source_findings, trace_sources
+from orthoflow_plugins.inspect.source_errors import (
+    SourceErrors,
+    counted_once,
+    source_findings,
+    trace_sources,
+)
+from orthoflow_plugins.inspect.spreads import in_file
 
 if TYPE_CHECKING:
     from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage
 
 _TRACED_POINTS: Final = 4000
+# Larger walls are compared in bands of so many cells, which take a gigabyte.
+_BAND_CELLS: Final = 1 << 23
+# Of large walls every so manyth cell is drawn, so that there are so many along the longest side.
+_DRAWN_CELLS: Final = 1800
 # Of each wall, from its cells and from what photos painted on it.
 _OF_WALLS: Final = (
     *("rmse_[uv]_mm", "mean_[uv]_mm", "nmad_[uv]_mm", "p99_[uv]_mm", "step_rmse_[uv]_mm"),
@@ -173,7 +190,7 @@ class InspectTruth(Method):
             params=params,
             rule=rule,
             views=views,
-            cores=ctx.cores,
+            ctx=ctx,
         )
         verdicts: list[_Verdict] = []
         findings: list[Finding] = []
@@ -182,13 +199,16 @@ class InspectTruth(Method):
             verdict = judge.verdict_on(image)
             verdicts.append(verdict)
             findings += wall_plane_findings(image.frame.plane, image.wall, inputs.truth.planes)
-            findings += verdict.findings(image.wall)
+            findings += verdict.findings(image.wall, ctx)
             _draw(image, verdict, ctx)
-        sources = [item.sources for item in verdicts if item.sources is not None]
+        sources = [band for item in verdicts for band in item.sources]
         findings += sample_findings(
-            pooled([item.errors.samples for item in verdicts]), -1, sources_are_traced=bool(sources)
+            pooled([item.samples for item in verdicts], _files(ctx, "all")),
+            -1,
+            sources_are_traced=bool(sources),
         )
-        findings += source_findings(sources, -1) + worst_plane_findings(findings)
+        findings += source_findings(sources, -1, _files(ctx, "all"))
+        findings += worst_plane_findings(findings)
         if inputs.cameras is not None:
             findings += pose_findings(poses)
             findings += tie_findings(inputs.cameras, inputs.walls, inputs.truth)
@@ -208,18 +228,41 @@ class InspectTruth(Method):
 
 @dataclass(frozen=True, kw_only=True)
 class _Verdict:
-    """All errors of one wall; `sources` is None where no photo painted."""
+    """All errors of one wall.
 
-    errors: WallErrors
-    sources: SourceErrors | None
+    Attributes:
+        samples: the errors as numbers.
+        patches: where displacements were measured.
+        depth_m: measured - true depth of every `step`th row and column, for the picture.
+        grey: root mean square colour error, likewise.
+        step: see `depth_m`; 1 unless the wall is large.
+        sources: of bands of the wall, from the top; none where no photo painted.
+        quality: what is told of every orthoimage.
+    """
+
+    samples: WallSamples
+    patches: PatchShifts
+    depth_m: NDArray[np.float64]
+    grey: NDArray[np.float64]
+    step: int
+    sources: tuple[SourceErrors, ...]
     quality: tuple[Finding, ...]
 
-    def findings(self, wall: int) -> list[Finding]:
+    def findings(self, wall: int, ctx: StepContext) -> list[Finding]:
         """The wall's numbers."""
-        is_traced = self.sources is not None
-        numbers = sample_findings(self.errors.samples, wall, sources_are_traced=is_traced)
+        is_traced = bool(self.sources)
+        numbers = sample_findings(self.samples, wall, sources_are_traced=is_traced)
         numbers += self.quality
-        return numbers + ([] if self.sources is None else source_findings([self.sources], wall))
+        return numbers + source_findings(self.sources, wall, _files(ctx, f"{wall}.sources"))
+
+
+def _files(ctx: StepContext, name: str) -> Allocate:
+    """Give arrays in files, for what many cells are wrong by."""
+
+    def allocate(field: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
+        return ctx.allocate("inspection", f"{name}.{field}", shape, dtype).view(np.ndarray)
+
+    return allocate
 
 
 def _inspect_planes(inputs: InspectTruth.In, ctx: StepContext) -> Inspection:
@@ -275,26 +318,68 @@ class _Judge:
     params: InspectTruth.Params
     rule: SamplingRule
     views: SceneCameras | None
-    cores: int
+    ctx: StepContext
 
     def verdict_on(self, image: Orthoimage) -> _Verdict:
-        """Compare one wall."""
+        """Compare one wall, a large one in bands of whole blocks with a block about them."""
         inputs = self.inputs
         wall = wall_of(image, self.walls)
-        chosen = sampling(image, self.rule)
-        true = self._true_orthoimage(image, chosen)
-        sources = None
-        if inputs.cameras is not None and self.views is not None:
-            sources = trace_sources(
-                image, wall, true, chosen.lattice, inputs.cameras, inputs.truth, self.views
-            )
-        if sources is not None and not sources.traced.any():
-            sources = None
+        step = max(1, max(image.frame.shape) // _DRAWN_CELLS) if _is_large(image) else 1
+        errors: list[WallErrors] = []
+        sources: list[SourceErrors] = []
+        for band in _bands(image):
+            part, surface = rows_of(image, band.around), rows_of(wall, band.around)
+            chosen = sampling(part, self.rule, band.around.start)
+            true = self._true_orthoimage(part, chosen)
+            found = wall_errors(part, surface, true, chosen, band.inner)
+            errors.append(self._kept(found, image, band, step))
+            if inputs.cameras is not None and self.views is not None:
+                traced = trace_sources(
+                    rows_of(part, band.inner),
+                    rows_of(surface, band.inner),
+                    rows_of(true, band.inner),
+                    chosen.lattice[band.inner],
+                    inputs.cameras,
+                    inputs.truth,
+                    self.views,
+                )
+                # Steps at the rim of a band are told from what is beyond it.
+                traced = replace(traced, steps=depth_step_band(true.depth_m)[band.inner])
+                name = f"{image.wall}.{band.rows.start}"
+                sources.append(traced.kept(name, self._files) if _is_large(image) else traced)
+        allocate = _files(self.ctx, f"{image.wall}.cells")
         return _Verdict(
-            errors=wall_errors(image, wall, true, chosen),
-            sources=sources,
+            samples=pooled([item.samples for item in errors], allocate),
+            patches=joined_shifts([item.patches for item in errors]),
+            depth_m=np.concatenate([item.depth_m for item in errors]),
+            grey=np.concatenate([item.grey for item in errors]),
+            step=step,
+            sources=counted_once(sources),
             quality=tuple(quality_findings(image, wall, inputs.cameras)),
         )
+
+    def _kept(self, errors: WallErrors, image: Orthoimage, band: Band, step: int) -> WallErrors:
+        """What is kept of a band: places in the wall, every so manyth cell to draw, and files."""
+        first = -band.rows.start % step
+        patches, samples = errors.patches, errors.samples
+        above = np.array([0.0, band.rows.start])
+        if _is_large(image):
+            name = f"{image.wall}.{band.rows.start}"
+            samples = replace(
+                samples,
+                depth_m=in_file(samples.depth_m, f"{name}.depth_m", self._files),
+                sigma_m=in_file(samples.sigma_m, f"{name}.sigma_m", self._files),
+            )
+        return WallErrors(
+            samples=samples,
+            patches=replace(patches, centre=patches.centre + above),
+            depth_m=errors.depth_m[first::step, ::step].copy(),
+            grey=errors.grey[first::step, ::step].copy(),
+        )
+
+    @property
+    def _files(self) -> Allocate:
+        return _files(self.ctx, "bands")
 
     def _true_orthoimage(self, image: Orthoimage, chosen: Sampling) -> TrueOrthoimage:
         from orthoflow.geometry.scene_views import Rendering, render
@@ -314,28 +399,35 @@ class _Judge:
             supersample=self.params.supersample,
             coloured=chosen.coloured,
             judged=chosen.coloured | chosen.lattice,
-            cores=self.cores,
+            cores=self.ctx.cores,
         )
         return render(truth.scene, image.frame, rendering)
 
 
 def _draw(image: Orthoimage, verdict: _Verdict, ctx: StepContext) -> None:
-    errors = verdict.errors
     ctx.figure(
         f"wall_{image.number}_depth_error",
-        depth_error_map(errors.depth_m),
+        depth_error_map(verdict.depth_m),
         f"{image.name}: measured - true depth, blue {-DEPTH_SPAN_MM:g} mm to red "
         f"{DEPTH_SPAN_MM:g} mm. Fine grain is noise of the scanner; whole areas of one colour are "
         "a plane or a surface in the wrong place.",
     )
     ctx.figure(
         f"wall_{image.number}_colour_error",
-        colour_error_map(errors.grey),
+        colour_error_map(verdict.grey),
         f"{image.name}: colour error, black 0 to yellow {COLOUR_SPAN_GREY:g} grey levels. Bright "
         "outlines are displaced edges, bright areas wrong paint or light of another photo.",
     )
-    if verdict.sources is not None:
-        length_m = np.linalg.norm(verdict.sources.displacement_m, axis=2)
+    if verdict.sources:
+        length_m = np.concatenate(
+            [
+                np.linalg.norm(
+                    item.displacement_m[-row % verdict.step :: verdict.step, :: verdict.step],
+                    axis=2,
+                )
+                for row, item in _by_first_row(verdict.sources)
+            ]
+        )
         ctx.figure(
             f"wall_{image.number}_displacement",
             displacement_map(length_m / image.frame.gsd_m),
@@ -355,13 +447,12 @@ def _inspection(
     """Put together the displacements of all patches and of a few thousand painted cells."""
     walls, points, shifts, kinds = [], [], [], []
     for image, item in zip(orthoimages.images, verdicts, strict=True):
-        places, shift = item.errors.patches.centre, item.errors.samples.shift_m
+        places, shift = item.patches.centre, item.samples.shift_m
         kind = np.zeros(len(places), dtype=np.uint8)
-        if item.sources is not None:
-            cells = np.argwhere(np.isfinite(item.sources.displacement_m).all(axis=2))
-            cells = cells[:: max(1, len(cells) // _TRACED_POINTS)]
+        if item.sources:
+            cells, traced = _traced_cells(item.sources)
             places = np.concatenate([places, cells[:, ::-1] + 0.5])
-            shift = np.concatenate([shift, item.sources.displacement_m[cells[:, 0], cells[:, 1]]])
+            shift = np.concatenate([shift, traced])
             kind = np.append(kind, np.ones(len(cells), dtype=np.uint8))
         walls.append(np.full(len(places), image.wall, dtype=np.int32))
         points.append(image.frame.world_from_wall(places))
@@ -378,3 +469,43 @@ def _inspection(
         findings=tuple(findings),
         details=details,
     )
+
+
+def _by_first_row(sources: Sequence[SourceErrors]) -> Iterator[tuple[int, SourceErrors]]:
+    """Bands of a wall, each with the number of the wall's rows above it."""
+    first = 0
+    for item in sources:
+        yield first, item
+        first += len(item.traced)
+
+
+def _traced_cells(
+    sources: Sequence[SourceErrors],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Every so manyth traced cell (n, 2) = (row, column) of a wall, and its displacement."""
+    known = [np.isfinite(item.displacement_m).all(axis=2) for item in sources]
+    counts = [int(np.count_nonzero(mask)) for mask in known]
+    step, n_before = max(1, sum(counts) // _TRACED_POINTS), 0
+    cells, shifts = [], []
+    for (row, item), mask, count in zip(_by_first_row(sources), known, counts, strict=True):
+        chosen = np.argwhere(mask)[-n_before % step :: step]
+        cells.append(chosen + np.array([row, 0]))
+        shifts.append(item.displacement_m[chosen[:, 0], chosen[:, 1]])
+        n_before += count
+    return np.concatenate(cells), np.concatenate(shifts)
+
+
+def _is_large(image: Orthoimage) -> bool:
+    return image.mask.size > _BAND_CELLS
+
+
+def _bands(image: Orthoimage) -> Iterator[Band]:
+    """Bands of whole blocks with a block about them; of an image that is not large, one."""
+    height, width = image.frame.shape
+    rows = height
+    if _is_large(image):
+        rows = BLOCK_CELLS * max(1, _BAND_CELLS // (width * BLOCK_CELLS) - 2)
+    for first in range(0, height, rows):
+        end = min(height, first + rows)
+        around = slice(max(0, first - BLOCK_CELLS), min(height, end + BLOCK_CELLS))
+        yield Band(rows=slice(first, end), around=around)

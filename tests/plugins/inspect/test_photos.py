@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from orthoflow_plugins.inspect import cell_errors, source_errors, spreads
+from orthoflow_plugins.inspect import truth as truth_module
 from orthoflow_plugins.inspect.orientation_errors import most_shown
 from orthoflow_plugins.inspect.truth import InspectTruth
 from orthoflow_plugins.simulate.room import SimulateRoom
 
 from orthoflow.errors import MethodError
+from orthoflow.files.images import decode_image
 from orthoflow.geometry import frame_over
 from orthoflow.geometry.scene_views import SceneCameras, TrueOrthoimage, Viewers, render_frame
 from orthoflow.products import (
@@ -323,3 +326,36 @@ def test_cameras_of_other_photos_are_refused(tmp_path: Path, truth: Truth) -> No
         MethodError, match=r"the truth holds no photo holiday\.jpg, it has 6 photos"
     ):
         inspect_cameras(tmp_path, truth, stranger)
+
+
+def test_bands_of_a_large_wall_say_what_the_whole_does(
+    tmp_path: Path, truth: Truth, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    off = np.array([0.012, 0.0, -0.007])
+    cameras = true_cameras(truth)
+    some = replace(cameras, cameras=tuple(moved(camera, off) for camera in cameras.cameras))
+    folders = [tmp_path / name for name in ("whole", "bands")]
+    for folder in folders:
+        folder.mkdir()
+    metrics, whole, context = inspect_cameras(folders[0], truth, some, lift_m=0.002)
+    assert metrics["n_traced"] > 10_000
+    assert metrics["n_patches"] >= 5
+    monkeypatch.setattr(truth_module, "_BAND_CELLS", 1000)
+    for module in (cell_errors, source_errors):
+        monkeypatch.setattr(module, "IN_MEMORY_CELLS", 5000)
+    monkeypatch.setattr(spreads, "_AT_ONCE", 3000)
+    monkeypatch.setattr(truth_module, "_DRAWN_CELLS", max(rendered(truth).frame.shape) // 2)
+    assert len([*truth_module._bands(painted(rendered(truth), truth))]) == 2
+    told, banded, other = inspect_cameras(folders[1], truth, some, lift_m=0.002)
+    assert told.keys() == metrics.keys()
+    for name, value in metrics.items():
+        assert told[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
+    for name in ("points_world", "displacement_m", "kind", "wall"):
+        one, two = (getattr(item.inspection, name) for item in (banded, whole))
+        np.testing.assert_allclose(one, two, rtol=0, atol=1e-9, err_msg=name)
+    assert [figure.name for figure in other.figures] == [item.name for item in context.figures]
+    for one, two in zip(other.figures, context.figures, strict=True):
+        sizes = [decode_image(item.path.read_bytes()).shape for item in (one, two)]
+        # Every other row and column is drawn.
+        assert sizes[0] == (-(-sizes[1][0] // 2), -(-sizes[1][1] // 2), 3)
+    assert (folders[1] / "allocated" / "inspection.bands.0.96.displacement_m").is_file()

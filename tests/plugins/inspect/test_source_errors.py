@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from orthoflow_plugins.inspect.source_errors import SourceErrors, source_findings
+from orthoflow_plugins.inspect.source_errors import SourceErrors, counted_once, source_findings
 
 from tests.inspect_scenes import frame
 
@@ -78,6 +78,21 @@ def test_walls_are_summed_up_together_and_those_without_painted_cells_left_out()
         # Percentiles lie between other cells.
         if not name.startswith("p99"):
             assert twice[name] == pytest.approx((2.0 if name in doubled else 1.0) * value), name
+
+
+def test_bands_that_no_photo_painted_count_for_what_could_be_seen() -> None:
+    errors = source_errors()
+    bare = replace(
+        errors, traced=np.zeros((1, 10), dtype=np.bool_), n_seen_by_both=8, n_seen_painted=0
+    )
+    assert counted_once([bare, bare]) == ()
+    bands = counted_once([bare, errors, bare, errors])
+    assert [item.n_seen_by_both for item in bands] == [0, 16 + 2 * errors.n_seen_by_both, 0, 0]
+    assert [item.n_seen_painted for item in bands] == [0, 2 * errors.n_seen_painted, 0, 0]
+    (share,) = (
+        item.value for item in source_findings(bands, 0) if item.name == "completeness_seen_by_both"
+    )
+    assert share == errors.n_seen_painted / (8 + errors.n_seen_by_both)
 
 
 def test_what_is_not_known_is_left_out() -> None:

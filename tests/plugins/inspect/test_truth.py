@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +37,7 @@ from orthoflow.products import (
     Walls,
 )
 from orthoflow.sdk import StepContext
-from tests import samples, scenes
+from tests import inspect_scenes, samples, scenes
 from tests.inspecting import BUFFER_M, inspect
 
 GSD_M = 0.014
@@ -383,3 +385,41 @@ def test_every_wall_tells_its_displacement(tmp_path: Path) -> None:
         "wall_1_rmse_u_mm": 2.0,
         "all_rmse_u_mm": 3.0,
     }
+
+
+def test_a_large_wall_takes_the_memory_of_a_band(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times = 6
+    given = inspect_scenes.truth_inputs()
+    (image,), (wall,) = given["orthoimages"].images, given["walls"].walls
+    height, width = (times * size for size in image.frame.shape)
+    frame = replace(image.frame, gsd_m=image.frame.gsd_m / times, width=width, height=height)
+
+    def larger(raster: Orthoimage | Wall, *names: str) -> Any:
+        arrays = {
+            name: np.repeat(np.repeat(getattr(raster, name), times, axis=0), times, axis=1)
+            for name in names
+        }
+        return replace(raster, frame=frame, **arrays)
+
+    inputs = InspectTruth.In(
+        truth=given["truth"],
+        orthoimages=Orthoimages(images=(larger(image, "rgb", "mask", "source"),)),
+        walls=replace(given["walls"], walls=(larger(wall, "depth_m", "sigma_m", "count", "mask"),)),
+    )
+    params = InspectTruth.Params(colour_cells_most=20_000, supersample=1)
+    monkeypatch.setattr("orthoflow_plugins.inspect.truth._BAND_CELLS", 1000)
+    monkeypatch.setattr("orthoflow_plugins.inspect.cell_errors.IN_MEMORY_CELLS", 5000)
+    monkeypatch.setattr("orthoflow_plugins.inspect.spreads._AT_ONCE", 1 << 14)
+    monkeypatch.setattr("orthoflow_plugins.inspect.image_quality._TILE_CELLS", 128)
+    context = StepContext(rng=np.random.default_rng(0), cores=1, scratch=tmp_path)
+    tracemalloc.start()
+    try:
+        InspectTruth().run(inputs, params, context)
+        # A band with its surroundings has half of the cells; the whole took 174 bytes each.
+        assert tracemalloc.get_traced_memory()[1] < 110 * width * height
+    finally:
+        tracemalloc.stop()
+    metrics = {metric.name: metric.value for metric in context.metrics}
+    assert metrics["depth_median_mm"] == pytest.approx(1e3 * 2.0**-9, rel=1e-6)
