@@ -8,11 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from orthoflow_plugins.mosaic.exposures import Radii, estimate
-from orthoflow_plugins.mosaic.light import BlockLight, light_of_levels, lit
+from orthoflow_plugins.mosaic import balance as balancing
+from orthoflow_plugins.mosaic.balance import Balance, balance_of
+from orthoflow_plugins.mosaic.blocks import Blocks
+from orthoflow_plugins.mosaic.exposures import Exposures, Radii, estimate
+from orthoflow_plugins.mosaic.light import BlockLight, block_light, light_of_levels, lit
 from orthoflow_plugins.mosaic.seams import MosaicSeams
+from scipy.ndimage import map_coordinates
 
-from orthoflow.products import Layer, Layers, Orthoimages, Walls
+from orthoflow.geometry.cameras import looking_at
+from orthoflow.products import Camera, Intrinsics, Layer, Layers, Orthoimages, Walls
 from tests import inspect_scenes, samples
 from tests import raster_scenes as scenes
 
@@ -179,3 +184,106 @@ def test_exposures_and_the_loss_of_a_lens_are_found_in_spite_of_outliers() -> No
     alone = estimate(lights[:1], radii[:1])
     assert not alone.exposures.any()
     assert not alone.nodes.any()
+
+
+# --- the pieces ---
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        (slice(0, 5), slice(0, 7)),
+        (slice(1, 4), slice(2, 6)),
+        (slice(2, 3), slice(1, 5)),
+        (slice(0, 2), slice(3, 4)),
+        (slice(4, 5), slice(6, 7)),
+    ],
+    ids=["whole", "part", "row", "column", "block"],
+)
+def test_what_is_added_is_straight_between_the_middles_of_blocks(box: tuple[slice, slice]) -> None:
+    blocks = Blocks.over((48, 70), 10)
+    assert blocks.shape == (5, 7)
+    shape = tuple(part.stop - part.start for part in box)
+    logs = np.random.default_rng(1).normal(size=(*shape, 3)).astype(np.float32)
+    light = BlockLight(box=box, log_light=np.zeros((*shape, 3), np.float32))
+    nothing = Exposures(
+        exposures=np.zeros((1, 3)), lenses=np.zeros((0, 2)), nodes=np.zeros((1, 4, 4, 3))
+    )
+    balance = Balance(blocks=blocks, lights=(light,), logs=(logs,), exposures=nothing)
+    rows, columns = (grid.ravel() for grid in np.indices((48, 70)))
+    found = balance.log_gains(0, rows, columns)
+    middles = [centres[part] for centres, part in zip(blocks.centres(), box, strict=True)]
+    # Beyond the outermost middles nothing changes any more.
+    places = [
+        np.interp(cells + 0.5, at, np.arange(len(at)))
+        for cells, at in zip((rows, columns), middles, strict=True)
+    ]
+    for channel in range(3):
+        wanted = map_coordinates(logs[..., channel].astype(np.float64), places, order=1)
+        np.testing.assert_allclose(found[:, channel], wanted, atol=1e-5)
+    colours = np.random.default_rng(2).integers(0, 65536, (len(rows), 3)).astype(np.uint16)
+    np.testing.assert_array_equal(balance.shown(0, colours, rows, columns), lit(colours, found))
+
+
+@pytest.mark.parametrize(("factor", "differs"), [(1.03, False), (1.05, True), (0.95, True)])
+def test_photos_differ_where_either_has_to_change_by_two_percent(
+    factor: float, *, differs: bool
+) -> None:
+    # Each goes half of the way.
+    pair = two_photos(factor)
+    found = balance_of(pair, None, [None, None], is_local=False)
+    assert (found is not None) is differs
+    if found is not None:
+        apart = found.exposures.exposures[0] - found.exposures.exposures[1]
+        np.testing.assert_allclose(apart, np.log(factor), atol=2e-3)
+
+
+def photographed(fx: float, width: int = 400, height: int = 300) -> Camera:
+    frame = inspect_scenes.frame(shape=SHAPE)
+    middle = frame.world_from_wall(np.array([[120.0, 60.0]]))[0]
+    centre = middle + 3.0 * frame.normal_world
+    rotation = looking_at(centre, middle, np.array([0.0, 0.0, 1.0]))
+    lens = Intrinsics(
+        width=width, height=height, fx=fx, fy=fx, cx=0.5 * width - 7.0, cy=0.5 * height + 3.0
+    )
+    return Camera(
+        photo="a.jpg",
+        status="ok",
+        intrinsics=lens,
+        rotation_camera_from_world=rotation,
+        translation_camera_from_world=-rotation @ centre,
+    )
+
+
+def test_photos_of_one_lens_lose_light_alike_however_it_was_adjusted() -> None:
+    lights = [block_light(one, Blocks.over(SHAPE, 8)) for one in two_photos(1.0)] * 3
+    cameras = [
+        *(photographed(1000.0), photographed(1010.0), photographed(1200.0)),
+        *(photographed(1000.0, width=800), None, photographed(1000.0)),
+    ]
+    frame = inspect_scenes.frame(shape=SHAPE)
+    found = balancing._radii(frame, None, cameras, Blocks.over(SHAPE, 8), lights)
+    lenses = [None if one is None else one.lens for one in found]
+    # A hundredth more is the same lens, a fifth more is zoomed, other sizes are of another camera.
+    assert lenses == [0, 0, 1, 2, None, 0]
+
+
+@pytest.mark.parametrize("has_depths", [False, True])
+def test_radii_are_told_from_the_middle_of_the_photo(*, has_depths: bool) -> None:
+    frame = inspect_scenes.frame(shape=SHAPE)
+    blocks = Blocks.over(SHAPE, 8)
+    (light, _) = (block_light(one, blocks) for one in two_photos(1.0))
+    camera = photographed(900.0)
+    depth_m = np.full(SHAPE, 0.4, dtype=np.float32)
+    depth_m[:40] = np.nan
+    wall = samples.wall(frame, depth_m=depth_m, mask=np.ones(SHAPE, dtype=np.uint8))
+    (found,) = balancing._radii(frame, wall if has_depths else None, [camera], blocks, [light])
+    assert found is not None
+    down, right = blocks.centres()
+    for row, column in ((0, 0), (7, 3), (14, 19)):
+        at = np.array([[right[column], down[row]]])
+        depth = 0.4 if has_depths and down[row] >= 40 else 0.0
+        pixel = camera.viewing().project(frame.world_from_wall(at, np.array([depth])))[0, :2]
+        # 400 x 300 pixels: 250 from the middle to a corner, beyond which nothing is painted.
+        wanted = min(1.0, float(np.hypot(*(pixel - [200.0, 150.0]))) / 250.0)
+        assert found.values[row, column] == pytest.approx(wanted, abs=1e-5)
