@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from orthoflow.catalog import Catalog
+from orthoflow.errors import ArgumentError
 from orthoflow.workflow import (
     InvalidArgumentsError,
     InvalidWorkflowError,
@@ -15,6 +16,7 @@ from orthoflow.workflow import (
     expand_cells,
     load_workflow,
     resolved_json,
+    sweeps,
     workflow_schema,
 )
 from orthoflow.workflow.resolved import workflow_from_resolved
@@ -268,3 +270,58 @@ def test_mistakes_in_a_file_of_parameters_are_told_at_their_place(
 def test_a_missing_file_of_parameters_is_an_argument_that_is_wrong(catalog: Catalog) -> None:
     with pytest.raises(InvalidArgumentsError, match=r"--set-file nix\.yaml: nix\.yaml cannot"):
         load(catalog, set_files=["nix.yaml"])
+
+
+# --- names ---
+
+
+@pytest.mark.parametrize(
+    ("value", "word"),
+    [
+        *((True, "true"), (False, "false"), (None, "none"), (0.02, "0_02"), (7, "7")),
+        *((-1.5, "m1_5"), (1.5e-7, "1_5em07"), (2e21, "2e21")),
+        *(("Fast Mode!", "fast_mode"), ("", "empty"), ("-_-", "empty"), ("x" * 13, "x" * 12)),
+        *(([1, "a b"], "1-a_b"), ({"k": 0.5, "l": True}, "0_5-true")),
+    ],
+)
+def test_a_value_is_a_word_of_small_letters(value: object, word: str) -> None:
+    assert sweeps._word(value) == word  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("before", ["", "fine"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        {"tolerance_m": ["0_02", "0_1"]},
+        {"sigma_corner_max_cells": ["100", "7"], "sigma_wall_max_cells": ["5"]},
+        {"A_LONG_PARAMETER_OF_A_METHOD": ["x" * 12], "another": ["1"], "third_one": ["2", "33"]},
+    ],
+    ids=["one", "two", "three"],
+)
+def test_names_of_variants_take_as_many_letters_as_there_are(
+    before: str, words: dict[str, list[str]]
+) -> None:
+    short = sweeps._shortened(before, words)
+    assert all(name.lower().startswith(short[name]) for name in words)
+    parts = [f"{short[name]}-{max(said, key=len)}" for name, said in words.items()]
+    longest = "-".join([before, *parts] if before else parts)
+    assert len(longest) <= 32
+    if any(short[name] != name.lower() for name in words):
+        # A letter more for each, and one of `_` that may have been cut off.
+        assert len(longest) + 2 * len(words) > 32
+
+
+@pytest.mark.parametrize(
+    ("n_values", "is_sweep"), [(1, False), (2, True), (100, True), (101, False)]
+)
+def test_a_sweep_has_two_to_a_hundred_values(n_values: int, *, is_sweep: bool) -> None:
+    values = list(range(n_values))
+    if is_sweep:
+        assert sweeps._listed({"sweep": values}) == values
+        with pytest.raises(ArgumentError, match="nothing beside it"):
+            sweeps._listed({"sweep": values, "more": 1})
+    else:
+        with pytest.raises(ArgumentError, match="with 2 to 100 values"):
+            sweeps._listed({"sweep": values})  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError):
+        sweeps._listed({"sweep": "0.1"})
