@@ -13,9 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, BinaryIO, Final, Protocol
 
 _FOREVER_S: Final = 1e6
+_ZEROS_BYTES: Final = 1 << 20
 
 
 def _module(name: str) -> Any:
@@ -26,13 +27,14 @@ def _module(name: str) -> Any:
 
 
 _fcntl: Final = _module("fcntl")
-_resource: Final = _module("resource")
+# Public: the processes of steps, which nothing else starts, set limits with it.
+resource: Final = _module("resource")
 
 # Whether steps can have processes of their own that end with whoever asked for them.
 HAS_STEP_PROCESSES: Final = (
     sys.platform == "linux"
     and _fcntl is not None
-    and _resource is not None
+    and resource is not None
     and all(hasattr(os, name) for name in ("fork", "killpg", "pidfd_open", "setsid"))
 )
 
@@ -45,6 +47,27 @@ def flags(*names: str) -> int:
     return known
 
 
+def take_room(file: BinaryIO, size_bytes: int) -> None:
+    """Make a new file so long, with room on the disk for all of it.
+
+    Raises:
+        OSError: there is no such room.
+    """
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), 0, size_bytes)
+        return
+    block = bytes(min(size_bytes, _ZEROS_BYTES))
+    file.writelines(block[: size_bytes - first] for first in range(0, size_bytes, _ZEROS_BYTES))
+
+
+def read_at(descriptor: int, n_bytes: int, position: int) -> bytes:
+    """Read from a place of a file that nobody else reads or writes meanwhile."""
+    if hasattr(os, "pread"):
+        return os.pread(descriptor, n_bytes, position)
+    os.lseek(descriptor, position, os.SEEK_SET)
+    return os.read(descriptor, n_bytes)
+
+
 def usable_cores() -> int:
     """How many cores this process may use."""
     if hasattr(os, "sched_getaffinity"):
@@ -54,18 +77,18 @@ def usable_cores() -> int:
 
 def address_space() -> int | None:
     """Bytes of memory that this process may ask for (`ulimit -v`); None without such a limit."""
-    if _resource is None:
+    if resource is None:
         return None
-    limit = int(_resource.getrlimit(_resource.RLIMIT_AS)[0])
-    return None if limit == _resource.RLIM_INFINITY else limit
+    limit = int(resource.getrlimit(resource.RLIMIT_AS)[0])
+    return None if limit == resource.RLIM_INFINITY else limit
 
 
 def children_processor_s() -> float:
     """Processor seconds of all processes that this one started and waited for."""
-    if _resource is None:
+    if resource is None:
         times = os.times()
         return times.children_user + times.children_system
-    used = _resource.getrusage(_resource.RUSAGE_CHILDREN)
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return float(used.ru_utime + used.ru_stime)
 
 

@@ -11,28 +11,12 @@ from pathlib import Path
 import pytest
 
 from orthoflow import system
-from orthoflow.system import FileLock, file_lock, flags
+from orthoflow.system import FileLock, file_lock, flags, read_at, take_room
 
 ROOT = Path(__file__).resolve().parents[1]
 
 # Our code finds neither these modules nor these names; libraries may have theirs.
-WITHOUT = """
-import os, sys
-class Forbidden:
-    def find_spec(self, name, path=None, target=None):
-        if name in {"fcntl", "resource"}:
-            frame = sys._getframe(1)
-            while frame and "importlib" in frame.f_globals.get("__name__", ""):
-                frame = frame.f_back
-            if frame and frame.f_globals.get("__name__", "").startswith("orthoflow"):
-                raise ImportError(name)
-for name in ("fcntl", "resource"):
-    sys.modules.pop(name, None)
-sys.meta_path.insert(0, Forbidden())
-for name in ("fork", "killpg", "setsid", "pidfd_open", "sched_getaffinity", "getresuid", "O_PATH"):
-    if hasattr(os, name):
-        delattr(os, name)
-"""
+WITHOUT = (Path(__file__).parent / "without_linux.py").read_text()
 COMMAND = f"{WITHOUT}\nfrom orthoflow.cli import main\nmain()\n"
 
 # Every module of ours is loaded as a system without these would load it.
@@ -166,3 +150,26 @@ def test_the_twin_of_a_dead_process_is_free(
 
 def test_flags_that_a_system_does_not_know_count_nothing() -> None:
     assert flags("O_RDWR", "O_CREAT", "O_OF_ANOTHER_PLANET") == os.O_RDWR | os.O_CREAT
+
+
+@pytest.mark.parametrize("twin", [False, True], ids=["system", "twin"])
+def test_room_on_the_disk_is_taken_and_places_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, twin: bool
+) -> None:
+    if twin:
+        monkeypatch.delattr(os, "posix_fallocate", raising=False)
+        monkeypatch.delattr(os, "pread", raising=False)
+    path = tmp_path / "array"
+    size_bytes = (5 << 20) + 3
+    with path.open("wb") as file:
+        take_room(file, size_bytes)
+    found = path.stat()
+    assert found.st_size == size_bytes
+    # Blocks of 512 bytes: nothing of it is a hole.
+    assert 512 * found.st_blocks >= size_bytes
+    path.write_bytes(b"0123456789")
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        assert read_at(descriptor, 4, 3) == b"3456"
+    finally:
+        os.close(descriptor)

@@ -14,7 +14,6 @@ import gc
 import importlib
 import json
 import os
-import resource
 import selectors
 import signal
 import socket
@@ -28,7 +27,7 @@ from typing import Final
 from orthoflow.engine.child import run_step
 from orthoflow.engine.executors import tell_numba
 from orthoflow.engine.keeper import fork_kept
-from orthoflow.system import address_space
+from orthoflow.system import address_space, resource
 
 # One per message: pid of the keeper, then its end as `os.waitstatus_to_exitcode` has it.
 NUMBER: Final = struct.Struct("=i")

@@ -11,12 +11,12 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
-import resource
 import signal
 import time
 from typing import Final
 
 from orthoflow.engine.process_trees import descendants
+from orthoflow.system import resource
 
 # Ends a step with all that it started; the kernel sends it too, when the coordinator dies.
 END_ALL: Final = signal.SIGHUP

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoflow.engine.durability import writing_to
-from orthoflow.system import flags
+from orthoflow.system import flags, read_at
 
 # Of a long log the end is kept: what went wrong stands last.
 _LOOKS: Final = 10
@@ -69,4 +69,4 @@ class StepLog:
         os.close(self.descriptor)
 
     def _tail(self, size: int) -> bytes:
-        return os.pread(self.descriptor, _KEPT_BYTES, max(0, size - _KEPT_BYTES))
+        return read_at(self.descriptor, _KEPT_BYTES, max(0, size - _KEPT_BYTES))

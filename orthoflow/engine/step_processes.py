@@ -11,7 +11,6 @@ import atexit
 import contextlib
 import json
 import os
-import resource
 import select
 import signal
 import socket
@@ -29,6 +28,7 @@ from orthoflow.engine.executors import COMPILED_CODE
 from orthoflow.engine.fork_server import NO_PROCESS, NUMBER, StepRequest
 from orthoflow.engine.tasks import Task
 from orthoflow.errors import StepFailedError
+from orthoflow.system import resource
 
 _THREAD_VARIABLES: Final = (
     "BLIS_NUM_THREADS",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from orthoflow_provenance.model import COSTS, Figure, Metric
 
 from orthoflow.errors import CancelledStepError, ProductError
 from orthoflow.sdk.lines import is_name, one_line
+from orthoflow.system import take_room
 
 __all__ = ["Drawing", "DrawnFigure", "Metric", "StepContext", "StepEvent"]
 
@@ -223,7 +223,7 @@ class StepContext:
         path.parent.mkdir(exist_ok=True)
         with path.open("wb") as file:
             # Writing into the hole of a sparse file on a full disk would kill the process.
-            os.posix_fallocate(file.fileno(), 0, size_bytes)
+            take_room(file, size_bytes)
         return np.memmap(path, dtype=np.dtype(dtype), mode="r+", shape=shape)
 
     def _take_name(self, name: object) -> None:

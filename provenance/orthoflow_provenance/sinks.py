@@ -24,6 +24,21 @@ _ALIGNED_FROM_BYTES: Final = 2048
 _KEPT_AFTER_FAILURE_BYTES: Final = 64 << 10
 
 
+def _read_at(descriptor: int, n_bytes: int, position: int) -> bytes:
+    if hasattr(os, "pread"):
+        return os.pread(descriptor, n_bytes, position)
+    # Windows has no such call; a sink has one thread.
+    os.lseek(descriptor, position, os.SEEK_SET)
+    return os.read(descriptor, n_bytes)
+
+
+def _write_at(descriptor: int, data: memoryview, position: int) -> int:
+    if hasattr(os, "pwrite"):
+        return os.pwrite(descriptor, data, position)
+    os.lseek(descriptor, position, os.SEEK_SET)
+    return os.write(descriptor, data)
+
+
 class FileSink:
     """A file that HDF5 writes to; writing never raises.
 
@@ -74,7 +89,7 @@ class FileSink:
     def readinto(self, buffer: memoryview) -> int:
         """Read at the position; what was never written is zeros."""
         view = memoryview(buffer).cast("B")
-        stored = os.pread(self._descriptor, len(view), self._position)
+        stored = _read_at(self._descriptor, len(view), self._position)
         view[: len(stored)] = stored
         view[len(stored) :] = bytes(len(view) - len(stored))
         for offset, data in self._kept:
@@ -116,7 +131,7 @@ class FileSink:
     def _write_all(self, view: memoryview) -> None:
         done = 0
         while done < len(view):
-            done += os.pwrite(self._descriptor, view[done:], self._position + done)
+            done += _write_at(self._descriptor, view[done:], self._position + done)
 
 
 @contextmanager

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from orthoflow.errors import MethodError
@@ -49,7 +49,7 @@ def require_memory(frames: Sequence[WallFrame]) -> None:
     kept = sum(size for size in sizes if size <= IN_MEMORY_CELLS)
     working = min(max(sizes), _BAND_CELLS)
     needed = _BYTES_KEPT * kept + _BYTES_WORKING * working
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    memory = psutil.virtual_memory().total
     # Cells are numbered with 32 bits.
     if needed > _MEMORY_SHARE * memory or max(sizes) > np.iinfo(np.int32).max:
         largest = frames[int(np.argmax(sizes))]
