@@ -17,6 +17,7 @@ from orthoflow_plugins.inspect.point_places import (
     point_on_surface,
 )
 from orthoflow_plugins.simulate.building import Extent, Paint, SceneDraft, wall_side
+from scipy.ndimage import gaussian_filter
 
 from orthoflow.geometry import WallFrame, frame_over
 from orthoflow.geometry.levels import REC_601
@@ -245,6 +246,7 @@ def test_a_point_found_by_the_scene_is_where_the_picture_shows_it() -> None:
     found = finder(at(120.0, 100.0, 0.0), truth=True).find(0)
     np.testing.assert_allclose(found.place - found.expected, [1.5, 0.5], atol=0.05)
     assert np.isnan(found.point_world).all()
+    assert found.point_world.shape == (3,)
 
 
 def test_what_was_measured_is_taken_as_it_is() -> None:
@@ -261,3 +263,28 @@ def test_without_a_scene_a_target_is_looked_for() -> None:
     found = finder(at(120.0, 100.0, 0.0)).find(0)
     assert (found.how, found.wall) == ("not found", 0)
     assert np.isnan(found.place).all()
+
+
+@pytest.mark.parametrize(("off_m", "is_found"), [(0.015, True), (0.045, False)])
+def test_a_target_is_found_within_the_search_and_carried_back_into_space(
+    off_m: float, is_found: bool
+) -> None:
+    # Quadrants of 5 cm about the middle of the wall, which stands out by 1 cm there.
+    rows, columns = np.indices((200, 240)) + 0.5
+    bright = np.where((columns > 120.0) == (rows > 100.0), 220.0, 40.0)
+    grey = gaussian_filter(bright, 0.8)
+    known = np.ones(grey.shape, dtype=np.bool_)
+    looked_for = finder(at(120.0 + off_m / CELL_M, 100.0, 0.0))
+    depth = np.zeros(grey.shape, dtype=np.float32)
+    depth[np.hypot(columns - 120.0, rows - 100.0) < 6.5] = 0.01
+    picture = replace(
+        looked_for.pictures[0],
+        grey=GreyImage(grey=grey, valid=known, region=known),
+        surface=replace(looked_for.pictures[0].surface, depth_m=depth),
+    )
+    found = replace(looked_for, pictures=[picture]).find(0)
+    assert found.how == ("target" if is_found else "not found")
+    if is_found:
+        np.testing.assert_allclose(found.place, [120.0, 100.0], atol=0.05)
+        # Half of the target's radius says how deep it lies.
+        np.testing.assert_allclose(found.point_world[None], at(120.0, 100.0, 0.01), atol=3e-4)

@@ -232,3 +232,19 @@ def test_withheld_ties_have_no_say_in_the_start() -> None:
     np.testing.assert_array_equal(start.agreeing, ~is_check)
     assert start.source == "calibration"
     np.testing.assert_allclose(start.camera.centre_world, true.centre_world, atol=1e-3)
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_ties_are_rejected_by_what_they_deviate_and_not_by_what_they_say(times: float) -> None:
+    true = camera()
+    # They say half a pixel each, and deviate by so many times as much; a tenth of them is wrong.
+    seen = seen_by(true, 300, noise_px=0.5 * times, seed=3)
+    wrong = np.arange(300) % 10 == 0
+    pixels = seen.pixels_photo + wrong[:, None] * np.array([0.5 * times * 6.5, 0.0])
+    is_check = np.arange(300) % 4 == 0
+    found = estimate_pose(photo_by(true), replace(seen, pixels_photo=pixels), is_check, RULE)
+    assert isinstance(found, Estimate)
+    assert found.limit == pytest.approx(3.5 * times, rel=0.2)
+    assert found.agreeing[~wrong].mean() > 0.98
+    assert found.agreeing[wrong].mean() < 0.2
+    np.testing.assert_array_equal(found.agreeing, found.fit.normalised <= found.limit)

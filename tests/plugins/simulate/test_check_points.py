@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from orthoflow_plugins.simulate import check_points
+from orthoflow_plugins.simulate.building import SceneDraft
+from orthoflow_plugins.simulate.room_model import RoomPlan, build_room, wall_sides
+from orthoflow_plugins.simulate.scanning import station_positions
+
+from orthoflow.geometry.scene_views import SceneCameras
+from orthoflow.products import CheckPoints
 
 
 def fresco(extent: tuple[float, float, float, float], period_m: float = 1.0) -> Any:
@@ -94,3 +101,45 @@ def test_a_place_is_level_where_a_surface_goes_on_at_its_height(
     spots = check_points._lattice(scene, 0)
     found = check_points._are_level(scene, Views(t=height_m), spots)  # type: ignore[arg-type]
     assert found.tolist() == [is_level] * 9
+
+
+@cache
+def of_the_room(n_most: int, turn_deg: float = 0.0, shift_m: float = 0.0) -> CheckPoints:
+    scene = build_room(RoomPlan(relief=1.0, obstacle=True, spectral_gap=0.3)).scene
+    turn = np.radians(turn_deg)
+    rotation = np.array(
+        [[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]]
+    )
+    return check_points.check_points(
+        scene,
+        SceneCameras(scene, cores=1),
+        station_positions(2),
+        rotation,
+        np.array([shift_m, -2.0 * shift_m, 0.5 * shift_m]),
+        n_most=n_most,
+    )
+
+
+def test_points_of_the_room_lie_on_its_main_wall_and_on_corners_of_its_mouldings() -> None:
+    found = of_the_room(8)
+    assert found.classes == ("flat",) * 8 + ("vertical edge",) * 8
+    assert found.names == tuple(f"{kind}{k:02d}" for kind in "FV" for k in range(8))
+    assert (found.wall == -1).all()
+    assert np.isnan(found.pixels_wall).all()
+    main = wall_sides(SceneDraft())[0]
+    off = (found.points_world - main.foot) @ main.normal
+    np.testing.assert_allclose(off[:8], 0.0, atol=1e-9)
+    # Mouldings stand out by two to fifteen centimetres.
+    assert off[8:].min() > 0.015
+    assert off[8:].max() < 0.16
+    apart = np.linalg.norm(found.points_world[:8, None] - found.points_world[None, :8], axis=2)
+    assert apart[~np.eye(8, dtype=bool)].min() > 0.3
+
+
+def test_points_of_a_turned_and_shifted_room_are_turned_and_shifted() -> None:
+    room, world = of_the_room(8), of_the_room(8, 30.0, 100.0)
+    x, y, z = room.points_world.T
+    half, high = 0.5, np.sqrt(0.75)
+    expected = np.column_stack([high * x - half * y + 100.0, half * x + high * y - 200.0, z + 50.0])
+    np.testing.assert_allclose(world.points_world, expected, atol=1e-9)
+    assert world.names == room.names
