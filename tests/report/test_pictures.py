@@ -283,6 +283,11 @@ def moved(metres: float) -> Any:
     return replace(FRAME, origin_world=FRAME.origin_world + metres * FRAME.u_world)
 
 
+def of_size(columns: int, rows: int, corner: tuple[float, float]) -> Any:
+    origin = FRAME.world_from_wall(np.array([corner]))[0]
+    return replace(FRAME, origin_world=origin, width=columns, height=rows)
+
+
 def turned(degrees: float, axis: str) -> Any:
     about = {"u": FRAME.u_world, "normal": FRAME.normal_world}[axis]
     turn = Rotation.from_rotvec(np.radians(degrees) * about)
@@ -298,12 +303,15 @@ def turned(degrees: float, axis: str) -> Any:
         # A tenth of 12 m between their centres.
         (moved(1.19), True),
         (moved(1.21), False),
+        # Half as large about the same centre, or from the same corner.
+        (of_size(600, 150, (300.0, 75.0)), True),
+        (of_size(600, 300, (0.0, 0.0)), False),
         (turned(4.9, "u"), True),
         (turned(5.1, "u"), False),
         (turned(4.9, "normal"), True),
         (turned(5.1, "normal"), False),
     ],
-    ids=["near", "far", "tilted", "tilted-more", "rolled", "rolled-more"],
+    ids=["near", "far", "smaller", "beside", "tilted", "tilted-more", "rolled", "rolled-more"],
 )
 def test_rasters_of_one_wall_lie_within_five_degrees_and_a_tenth(
     frame: Any, *, is_same: bool

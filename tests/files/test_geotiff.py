@@ -1,0 +1,151 @@
+"""What a GeoTIFF may say of itself: sizes that its bytes can hold, cells in metres, maps."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rasterio.transform import Affine
+
+from orthoflow.errors import InputError
+from orthoflow.files import geotiff as module
+from orthoflow.files.geotiff import check_header, epsg_of, epsg_wkt, require_map_crs
+
+PATH = Path("wall.tif")
+
+
+def stated(width: int, height: int = 1, count: int = 1, **tags: str) -> Any:
+    return SimpleNamespace(
+        width=width, height=height, count=count, tags=lambda ns: tags if ns == "OVERVIEWS" else {}
+    )
+
+
+def stored(folder: Path, n_bytes: int) -> Path:
+    path = folder / "wall.tif"
+    with path.open("wb") as stream:
+        stream.truncate(n_bytes)
+    return path
+
+
+def test_a_small_file_may_state_64_million_values(tmp_path: Path) -> None:
+    path = stored(tmp_path, 100)
+    check_header(path, stated(64 * 1024, 1024))
+    check_header(path, stated(32 * 1024, 1024, 2))
+    for more in (stated(64 * 1024 + 1, 1024), stated(64 * 1024, 1024, 2)):
+        with pytest.raises(InputError, match="but 100 bytes cannot hold as many"):
+            check_header(path, more)
+
+
+def test_a_larger_one_states_eleven_hundred_values_a_byte(tmp_path: Path) -> None:
+    path = stored(tmp_path, 1_000_000)
+    check_header(path, stated(1_100_000, 1000))
+    with pytest.raises(InputError, match="1100001 x 1000 cells in 1 bands, but 1000000 bytes"):
+        check_header(path, stated(1_100_001, 1000))
+
+
+def test_a_file_that_names_another_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^wall\.tif names another file for its overviews"):
+        check_header(stored(tmp_path, 100), stated(4, OVERVIEW_FILE="http://a/b.ovr"))
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "count", "is_read"),
+    [
+        (1 << 14, 1 << 14, 4, True),
+        ((1 << 14) + 1, 1 << 14, 1, False),
+        (4, 4, 5, False),
+    ],
+)
+def test_so_many_cells_and_bands_are_read(
+    width: int, height: int, count: int, *, is_read: bool
+) -> None:
+    if is_read:
+        module._check_size(PATH, stated(width, height, count))
+    else:
+        with pytest.raises(InputError, match=f"{width} x {height} cells in {count} bands"):
+            module._check_size(PATH, stated(width, height, count))
+
+
+@pytest.mark.parametrize(
+    ("side_m", "is_side"), [(0.9e-6, False), (1.1e-6, True), (0.9e6, True), (1.1e6, False)]
+)
+def test_cells_are_of_a_micrometre_to_a_thousand_kilometres(
+    side_m: float, *, is_side: bool
+) -> None:
+    transform = Affine(side_m, 0.0, 7.0, 0.0, -side_m, 9.0)
+    if is_side:
+        assert module._gsd_m(PATH, transform) == side_m
+    else:
+        with pytest.raises(
+            InputError, match=re.escape(f"cells of {side_m:g} m, expected 1e-06 to 1e+06 m")
+        ):
+            module._gsd_m(PATH, transform)
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_square"),
+    [
+        ({}, True),
+        ({"e": -0.5 * (1.0 + 0.9e-6)}, True),
+        ({"e": -0.5 * (1.0 + 1.1e-6)}, False),
+        ({"b": 0.45e-6}, True),
+        ({"b": 0.55e-6}, False),
+        ({"d": -0.45e-6}, True),
+        ({"d": -0.55e-6}, False),
+        ({"e": 0.5}, False),
+        ({"a": -0.5}, False),
+        ({"a": 0.0}, False),
+        ({"a": float("nan")}, False),
+    ],
+    ids=str,
+)
+def test_cells_are_square_and_upright_to_a_millionth(
+    changes: dict[str, float], *, is_square: bool
+) -> None:
+    terms = {"a": 0.5, "b": 0.0, "d": 0.0, "e": -0.5} | changes
+    transform = Affine(terms["a"], terms["b"], 7.0, terms["d"], terms["e"], 9.0)
+    if is_square:
+        assert module._gsd_m(PATH, transform) == 0.5
+    else:
+        with pytest.raises(InputError, match=r"^wall\.tif has cells that are not square and upri"):
+            module._gsd_m(PATH, transform)
+
+
+# --- coordinate systems ---
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        *(("EPSG:25832", 25832), ("epsg:2100", 2100), ("EPSG:123456", 123456)),
+        *(("EPSG:123", None), ("EPSG:1234567", None), ("xEPSG:25832", None), ("EPSG:25832 ", None)),
+        *(("", None), (None, None), ("site", None)),
+    ],
+)
+def test_codes_of_maps_have_four_to_six_digits(text: str | None, code: int | None) -> None:
+    assert epsg_of(text) == code
+
+
+def test_maps_are_in_metres() -> None:
+    for crs in ("EPSG:25832", "EPSG:2100", "site"):
+        require_map_crs(crs)
+    # Degrees, and feet.
+    for crs in ("EPSG:4326", "EPSG:2263"):
+        with pytest.raises(InputError, match=f"^{crs} is no coordinate system in metres"):
+            require_map_crs(crs)
+    assert "25832" in epsg_wkt(25832)
+    assert epsg_wkt(999_999) == ""
+
+
+def test_a_system_that_there_is_not_is_named_in_a_hundred_letters() -> None:
+    for crs, named in (
+        ("EPSG:999999", "EPSG:999999"),
+        ("x" * 100, "x" * 100),
+        ("y" * 101, "y" * 100),
+    ):
+        with pytest.raises(InputError) as caught:
+            require_map_crs(crs)
+        assert str(caught.value).startswith(f"there is no coordinate system {named}: expected")
