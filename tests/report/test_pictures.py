@@ -118,6 +118,24 @@ def test_a_wall_has_its_share_of_the_close_cells_by_its_form() -> None:
     assert asked == [1000, 1000, 1000]
 
 
+def test_pictures_have_the_whole_page_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[int, float, float]] = []
+
+    def keep(drawings: Any, *, n_products: float, close_cells: float = 0.0) -> list[Picture]:
+        asked.append((len(drawings), n_products, close_cells))
+        return []
+
+    monkeypatch.setattr(module, "_drawn", keep)
+    list(orthoimage_pictures(run(orthoimages(2), orthoimages())))
+    # Twelve million cells for the baseline's two images.
+    assert asked == [(2, 2.0, 6e6), (1, 2.0, 0.0)]
+    asked.clear()
+    list(wall_pictures(run(walls(), walls(), type_name="walls")))
+    assert asked == [(2, 2.0, 0.0), (2, 2.0, 0.0)]
+
+
 # --- what is said ---
 
 
