@@ -158,9 +158,11 @@ def _found(run: Run, chosen: Choices) -> _Found:
         raise ArgumentError(
             f"the labels are of {len(labels.plane_index)} points, but the cloud has {len(cloud)}"
         )
-    oriented = _oriented(run, cells, chosen) if chosen.colour in {None, "photos"} else ()
+    # Read only where their colours may be wanted; a refusal names them all the same.
+    is_wanted = chosen.colour in {None, "photos"}
+    oriented = _oriented(run, cells, chosen) if is_wanted else ()
     has = {
-        "photos": bool(oriented),
+        "photos": bool(oriented) if is_wanted else bool(_makers_of_cameras(cells)),
         "rgb": cloud.rgb is not None,
         "intensity": cloud.intensity is not None,
         "plane": labels is not None,
@@ -181,15 +183,19 @@ def _found(run: Run, chosen: Choices) -> _Found:
     )
 
 
-def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
-    """Photos and cameras of the last cell of a branch that oriented any."""
-    from orthoflow.products import Cameras, Photos
-
-    makers = {
+def _makers_of_cameras(cells: Any) -> dict[str, Any]:
+    return {
         address: cell
         for address, cell in cells.items()
         if any(output.type_name == "cameras" for output in cell.outputs.values())
     }
+
+
+def _oriented(run: Run, cells: Any, chosen: Choices) -> tuple[tuple[Photo, ViewingCamera], ...]:
+    """Photos and cameras of the last cell of a branch that oriented any."""
+    from orthoflow.products import Cameras, Photos
+
+    makers = _makers_of_cameras(cells)
     if not makers:
         return ()
     address, cell = list(makers.items())[-1]

@@ -17,6 +17,7 @@ from orthoflow.errors import ArgumentError
 from orthoflow.files.clouds.dressing import DressedCloud
 from orthoflow.products import Planes, PointCloud, PointLabels, Product
 from tests import samples
+from tests.report_runs import cameras_product
 
 N_SIDE = 12
 
@@ -159,6 +160,18 @@ def test_the_best_colours_that_there_are_come_first(
         "--colour photos: the run has nothing for it (plane); it has what is needed for "
         + ", ".join([first, *others])
     )
+
+
+def test_a_refusal_names_the_photos_that_the_run_oriented(tmp_path: Path) -> None:
+    run = ToyRun(
+        {
+            "scan": ({}, {"cloud": replace(cloud(), intensity=None)}),
+            "plane": ({"cloud": "scan"}, {"planes": planes(), "labels": labels()}),
+            "orient": ({}, {"cameras": cameras_product()}),
+        }
+    )
+    with pytest.raises(ArgumentError, match=r"needed for photos, plane, deviation$"):
+        exported(tmp_path, run, colour="intensity")
 
 
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
