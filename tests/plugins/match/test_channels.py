@@ -259,3 +259,20 @@ def test_contrast_is_evened_out_over_a_dozen_cells(aside: int, is_even: bool) ->
     if aside == 12:
         # One standard deviation of the surroundings off, most of it is still felt.
         assert 0.6 < ratio < 0.9
+
+
+@pytest.mark.parametrize("side", ["left", "right", "above", "below"])
+@pytest.mark.parametrize(("away", "is_left_out"), [(0, True), (1, False), (2, False)])
+def test_a_line_of_empty_cells_is_a_shadow_right_beside_the_step_alone(
+    side: str, away: int, is_left_out: bool
+) -> None:
+    # The first twenty columns stand out; so many measured ones lie between them and the line.
+    count = np.full((40, 40), 3, dtype=np.uint32)
+    count[:, 20 + away] = 0
+    depth_m = np.zeros((40, 40), dtype=np.float32)
+    depth_m[:, :20] = 0.03
+    turns = ["left", "below", "right", "above"].index(side)
+    made = wall(np.rot90(count, turns).copy(), np.rot90(depth_m, turns).copy())
+    grey = channels.target_of(made).grey
+    assert grey is not None
+    assert np.isnan(grey).sum() == (40 if is_left_out else 0)

@@ -104,6 +104,13 @@ def test_ties_in_masked_pixels_are_left_out() -> None:
     ties = ties_of([first], photos, inspect_scenes.walls(), {})
     np.testing.assert_array_equal(ties.sigma_m, [0.2, 0.3])
     np.testing.assert_array_equal(ties.pixels_photo, pixels[1:])
+    # The first column and row are those that begin at 0.
+    used[:, 0] = used[0] = 0
+    photos = SimpleNamespace(photos=(SimpleNamespace(name="a", mask=encode_png(used)),))
+    rim = piece(
+        [(0.4, 3.3), (3.3, 0.4), (1.2, 1.2)], [(k, k, k) for k in range(3)], [0.1, 0.2, 0.3]
+    )
+    assert ties_of([rim], photos, inspect_scenes.walls(), {}).sigma_m.tolist() == [0.3]
 
 
 def features(pixels: NDArray[np.float64], sizes: list[float]) -> Any:
