@@ -16,6 +16,8 @@ from orthoflow.files.sidecars import MOST_WALLS
 
 _MEASURED: Final = ("wall", "u_px", "v_px")
 _IN_MAP: Final = ("map_x", "map_y")
+_IN_SPACE: Final = ("shown_x", "shown_y", "shown_z")
+_TWICE: Final = "measured twice, as {} and as {}: leave one of them out"
 _SEPARATORS: Final = (";", "\t", ",")
 MOST_BYTES: Final = 20_000_000
 MOST_POINTS: Final = 100_000
@@ -34,6 +36,7 @@ class SurveyPoint:
         wall: wall in whose orthoimage the point was measured, or None.
         pixel_wall: measured column and row there, or None.
         place_m: measured X and Y there, as its GeoTIFF has them, or None.
+        shown_m: x, y, z in metres of what is shown where the point was measured, or None.
     """
 
     name: str
@@ -42,6 +45,7 @@ class SurveyPoint:
     wall: int | None = None
     pixel_wall: tuple[float, float] | None = None
     place_m: tuple[float, float] | None = None
+    shown_m: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +81,8 @@ def read_survey_points(path: Path) -> tuple[SurveyPoint, ...]:
     """Read a file of points.
 
     Columns are separated by commas, semicolons or tabs and named in the first line, in any order:
-    `name,x,y,z[,class][,wall,u_px,v_px]`, or `map_x,map_y[,wall]` instead of the last three.
+    `name,x,y,z[,class][,wall,u_px,v_px]`; instead of the last three there may be `map_x,map_y` or
+    `shown_x,shown_y,shown_z`, each with or without `wall`.
     Without such a line there are four or five columns in that order. Lines that are empty or begin
     with # are skipped.
 
@@ -98,8 +103,8 @@ class _Form:
         known: all columns, in the order of a table whose first line does not name them.
         bare: how many such a table may have.
         together: columns of which all are there or none.
-        in_map: columns that stand for them, of which all are there or none; the first of
-            `together` may go with them.
+        instead: groups of columns that stand for them, of each of which all are there or none;
+            the first of `together` may go with them.
     """
 
     content: str
@@ -107,16 +112,16 @@ class _Form:
     known: tuple[str, ...]
     bare: tuple[int, ...]
     together: tuple[str, ...] = ()
-    in_map: tuple[str, ...] = ()
+    instead: tuple[tuple[str, ...], ...] = ()
 
 
 _POINTS: Final = _Form(
     content="points",
     required=("name", "x", "y", "z"),
-    known=("name", "x", "y", "z", "class", *_MEASURED, *_IN_MAP),
+    known=("name", "x", "y", "z", "class", *_MEASURED, *_IN_MAP, *_IN_SPACE),
     bare=(4, 5),
     together=_MEASURED,
-    in_map=_IN_MAP,
+    instead=(_IN_MAP, _IN_SPACE),
 )
 _TIES: Final = _Form(
     content="ties",
@@ -206,7 +211,7 @@ class _TableReader:
             single = [
                 name
                 for name in form.known[len(form.required) :]
-                if name not in form.together + form.in_map
+                if name not in sum(form.instead, form.together)
             ]
             optional = [f"[,{name}]" for name in single]
             optional += [f"[,{','.join(form.together)}]"] if form.together else []
@@ -228,15 +233,20 @@ class _TableReader:
         missing = [name for name in form.required if name not in names]
         if missing:
             self._add(first, f"the column {', '.join(missing)} is missing")
-        in_map = [name for name in form.in_map if name in names]
-        if in_map and len(in_map) < len(form.in_map):
-            self._add(first, f"{', '.join(form.in_map)} belong together, got only {in_map[0]}")
-        given = [name for name in form.together if name in names]
-        if in_map and given == [form.together[0]]:
-            given = []
-        if given and len(given) < len(form.together):
-            self._add(first, f"{', '.join(form.together)} belong together, got only {given[0]}")
+        self._check_groups(first, names)
         return names if len(self.problems) == n_before else None
+
+    def _check_groups(self, first: _Row, names: tuple[str, ...]) -> None:
+        """Say which columns lack others that belong to them."""
+        together = self.form.together
+        given = [name for name in together if name in names]
+        groups = [([name for name in group if name in names], group) for group in self.form.instead]
+        if any(there for there, _ in groups) and given == [together[0]]:
+            given = []
+        for there, group in (*groups, (given, together)):
+            if there and len(there) < len(group):
+                only = ", ".join(there)
+                self._add(first, f"{', '.join(group)} belong together, got only {only}")
 
     def _number(self, row: _Row, key: str, cell: str) -> float:
         number = _as_number(cell)
@@ -274,8 +284,11 @@ class _PointReader(_TableReader):
         if not cells["name"]:
             self._add(row, "the name is missing")
         x, y, z = (self._number(row, key, cells[key]) for key in "xyz")
-        place = self._place(row, cells)
-        wall, pixel = self._measured(row, cells, is_placed=place is not None)
+        place = self._instead(row, cells, _IN_MAP)
+        shown = self._instead(row, cells, _IN_SPACE)
+        if place and shown:
+            self._add(row, _TWICE.format(", ".join(_IN_MAP), ", ".join(_IN_SPACE)))
+        wall, pixel = self._measured(row, cells, is_placed=bool(place or shown))
         if len(self.problems) > n_before:
             return None
         return SurveyPoint(
@@ -284,20 +297,24 @@ class _PointReader(_TableReader):
             class_name=cells.get("class", ""),
             wall=wall,
             pixel_wall=pixel,
-            place_m=place,
+            place_m=(place[0], place[1]) if place else None,
+            shown_m=(shown[0], shown[1], shown[2]) if shown else None,
         )
 
-    def _place(self, row: _Row, cells: dict[str, str]) -> tuple[float, float] | None:
-        given = [key for key in _IN_MAP if cells.get(key)]
+    def _instead(
+        self, row: _Row, cells: dict[str, str], group: tuple[str, ...]
+    ) -> tuple[float, ...]:
+        """Numbers of one of the groups that stand for a pixel; empty where there are none."""
+        given = [key for key in group if cells.get(key)]
         if not given:
-            return None
-        if len(given) < len(_IN_MAP):
-            self._add(row, f"{', '.join(_IN_MAP)} belong together, got only {given[0]}")
-            return None
+            return ()
+        if len(given) < len(group):
+            only = ", ".join(given)
+            self._add(row, f"{', '.join(group)} belong together, got only {only}")
+            return ()
         if cells.get("u_px") or cells.get("v_px"):
-            self._add(row, "measured twice, as u_px, v_px and as map_x, map_y: leave one pair out")
-        x, y = (self._number(row, key, cells[key]) for key in _IN_MAP)
-        return x, y
+            self._add(row, _TWICE.format("u_px, v_px", ", ".join(group)))
+        return tuple(self._number(row, key, cells[key]) for key in group)
 
     def _measured(
         self, row: _Row, cells: dict[str, str], *, is_placed: bool

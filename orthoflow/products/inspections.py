@@ -36,6 +36,8 @@ class CheckPoints(Product):
         places_m: (n, 2) float64 measured X and Y as the orthoimage's GeoTIFF has them, metres in
             the plane of the wall, or east and north of a map; NaN where not measured so. None
             where no point was.
+        shown_world: (n, 3) float64 metres, what is shown where the point was measured; NaN where
+            not measured so. None where no point was.
     """
 
     type_name: ClassVar[str] = "checkpoints"
@@ -46,6 +48,7 @@ class CheckPoints(Product):
     wall: NDArray[np.int32]
     pixels_wall: NDArray[np.float64]
     places_m: NDArray[np.float64] | None = None
+    shown_world: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -58,6 +61,7 @@ class CheckPoints(Product):
                 "wall": (self.wall, (count,)),
                 "pixels_wall": (self.pixels_wall, (count, 2)),
                 "places_m": (self.places_m, (count, 2)),
+                "shown_world": (self.shown_world, (count, 3)),
             },
         )
 

@@ -12,12 +12,13 @@ import numpy as np
 from orthoflow_provenance.model import RecordedCell
 from orthoflow_provenance.reader import open_record
 
+from orthoflow.engine.run_folder import cell_file_name
 from orthoflow.errors import ArgumentError, RecordError
 from orthoflow.files.geotiff import RasterParts
 from orthoflow.files.sidecars import placed_raster, read_sidecar
 from orthoflow.geometry import WallFrame
 from orthoflow.products import CheckPoints, Inspection, Opening, Openings, Planes, Walls
-from orthoflow.records.published import published_files
+from orthoflow.records.published import PRODUCTS_FOLDER, published_files
 from orthoflow.records.runs import Run, record_errors
 from orthoflow.records.verification import require_unchanged
 
@@ -95,9 +96,10 @@ def room_results(run: Run, cell: str | None = None) -> RoomResults:
 
     Raises:
         ArgumentError: there is no such cell, or nothing to draw.
-        RecordError: a published file is not what the record says.
+        RecordError: a published file is not what the record says, or an orthoimage is gone.
     """
     address = _pictured(run, cell)
+    _require_orthoimages(run, address)
     upstream = tuple(cell.address for cell in run.upstream(address))
     files: dict[int, dict[str, Path]] = {}
     # What lies behind is looked at first, so that what the chosen cell itself gave counts.
@@ -132,6 +134,18 @@ def room_results(run: Run, cell: str | None = None) -> RoomResults:
         inspections=inspections,
         openings=_openings(run, upstream),
     )
+
+
+def _require_orthoimages(run: Run, address: str) -> None:
+    """Refuse to go on without an orthoimage that was published: another raster would stand in."""
+    folder = f"{PRODUCTS_FOLDER}/{cell_file_name(address)}/"
+    for file in run.record.published:
+        found = _RASTER.fullmatch(file.path.removeprefix(folder))
+        if found and found[2] == "ortho" and not (run.folder / file.path).exists():
+            raise RecordError(
+                f"{file.path} is gone from {run.folder}, where the run left it: copy it back, or "
+                f"make it anew by `orthoflow replay {run.folder} -o NEW`"
+            )
 
 
 def _openings(run: Run, upstream: tuple[str, ...]) -> tuple[Opening, ...]:

@@ -15,7 +15,8 @@ from orthoflow.files.survey_points import (
     read_survey_points,
 )
 
-KNOWN = "known are name, x, y, z, class, wall, u_px, v_px, map_x, map_y"
+SHOWN = "shown_x, shown_y, shown_z"
+KNOWN = "known are name, x, y, z, class, wall, u_px, v_px, map_x, map_y, shown_x, shown_y, shown_z"
 NAMES_EXPECTED = "expected the names of the columns, name,x,y,z[,class][,wall,u_px,v_px]"
 CSV_EXPECTED = "expected a CSV file with the columns name,x,y,z"
 ALL = "name,x,y,z,wall,u_px,v_px\n"
@@ -94,7 +95,7 @@ def test_names_of_columns_may_be_followed_by_a_number(tmp_path: Path) -> None:
         ("name,x,y,z,x\nP,1,2,3,4", ["p.csv:1: the column x is there 2 times"] * 2),
         (
             "name,x,y,z,v_px,u_px\nP,1,2,3,4,5",
-            ["p.csv:1: wall, u_px, v_px belong together, got only u_px"],
+            ["p.csv:1: wall, u_px, v_px belong together, got only u_px, v_px"],
         ),
         (
             "P,1,2\n",
@@ -193,6 +194,16 @@ def test_points_measured_in_metres(tmp_path: Path) -> None:
     ]
 
 
+def test_points_by_what_is_shown_where_they_were_measured(tmp_path: Path) -> None:
+    head = "name,x,y,z,wall,shown_x,shown_y,shown_z"
+    text = f"{head}\nA,1,2,3,2,1.5,2.5,3.5\nB,1,2,3,,4,5,6\nC,1,2,3,,,,\n"
+    assert [(point.shown_m, point.wall, point.pixel_wall) for point in read(tmp_path, text)] == [
+        ((1.5, 2.5, 3.5), 2, None),
+        ((4.0, 5.0, 6.0), None, None),
+        (None, None, None),
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
@@ -203,7 +214,19 @@ def test_points_measured_in_metres(tmp_path: Path) -> None:
         ),
         (
             "name,x,y,z,wall,u_px,v_px,map_x,map_y\nP,1,2,3,0,1,2,4,5\n",
-            "p.csv:2: measured twice, as u_px, v_px and as map_x, map_y: leave one pair out",
+            "p.csv:2: measured twice, as u_px, v_px and as map_x, map_y: leave one of them out",
+        ),
+        (
+            "name,x,y,z,shown_x,shown_y\nP,1,2,3,4,5\n",
+            "p.csv:1: shown_x, shown_y, shown_z belong together, got only shown_x, shown_y",
+        ),
+        (
+            "name,x,y,z,shown_x,shown_y,shown_z\nP,1,2,3,4,,6\n",
+            "p.csv:2: shown_x, shown_y, shown_z belong together, got only shown_x, shown_z",
+        ),
+        (
+            "name,x,y,z,map_x,map_y,shown_x,shown_y,shown_z\nP,1,2,3,4,5,6,7,8\n",
+            f"p.csv:2: measured twice, as map_x, map_y and as {SHOWN}: leave one of them out",
         ),
     ],
 )

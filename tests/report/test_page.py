@@ -136,12 +136,16 @@ def test_clicks_are_saved_as_check_points_and_as_ties(page: Page, tmp_path: Path
     (tmp_path / "checkpoints.csv").write_text(saved)
     points = read_survey_points(tmp_path / "checkpoints.csv")
     assert [(point.name, point.wall) for point in points] == [("P1", 0), ("P3", 0)]
-    assert points[1].pixel_wall == pytest.approx((60.0, 40.0), abs=0.6)
     header, first, second = csv.reader(saved.splitlines())
-    assert header == ["name", "x", "y", "z", "wall", "u_px", "v_px"]
+    assert header == ["name", "x", "y", "z", "wall", "shown_x", "shown_y", "shown_z"]
     assert (first[0], second[0]) == ("P1", "P3")
-    assert float(first[1]) == pytest.approx(4.0e5 + 0.01 * float(first[5]), abs=1e-3)
-    assert float(second[5]) == pytest.approx(60.0, abs=0.6)
+    # 120 cells of 0.01 m along x, from 4e5: clicked at a quarter and in the middle.
+    assert [point.shown_m[0] for point in points if point.shown_m] == pytest.approx(
+        [4.0e5 + 0.30, 4.0e5 + 0.60], abs=6e-3
+    )
+    # Whoever surveyed them replaces x, y, z.
+    assert first[1:4] == first[5:8]
+    assert second[1:4] == second[5:8]
     page.evaluate(f"{panel}.querySelector('[data-part=ties]').click()")
     told = f"{panel}.querySelector('[data-part=told]').innerText"
     assert page.evaluate(told).startswith("0 ties; 2 points lack a photo")

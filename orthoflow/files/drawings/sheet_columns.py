@@ -26,7 +26,8 @@ _LEAST_PLAN_MM: Final = 15.0
 _MOST_PLAN_MM: Final = 90.0
 _MOST_SEGMENTS: Final = 5
 _SEGMENT_MM: Final = 25.0
-_KINDS: Final = {"ortho": "orthoimage", "depth": "depth contours", "intensity": "laser intensity"}
+# Where the laser saw no intensity, the grey of the scan's colours stands in.
+_KINDS: Final = {"ortho": "orthoimage", "depth": "depth contours", "intensity": "grey of the scan"}
 
 
 @dataclass

@@ -328,9 +328,10 @@
       setTimeout(() => URL.revokeObjectURL(link.href), 60000);
     };
     part.checkpoints.addEventListener("click", () => {
-      save("checkpoints.csv", ["name", "x", "y", "z", "wall", "u_px", "v_px"],
-        points.map((point) => [point.name.value, ...point.world, point.wall, point.u, point.v]));
-      part.told.textContent = `${points.length} check points`;
+      // What is shown there holds for any cell size; x, y, z are the survey's to fill in.
+      save("checkpoints.csv", ["name", "x", "y", "z", "wall", "shown_x", "shown_y", "shown_z"],
+        points.map((point) => [point.name.value, ...point.world, point.wall, ...point.world]));
+      part.told.textContent = `${points.length} check points: now put the surveyed x, y, z into the file`;
     });
     part.ties.addEventListener("click", () => {
       const isNumber = (input) => input.value.trim() !== "" && Number.isFinite(Number(input.value));

@@ -47,6 +47,7 @@ from orthoflow_plugins.inspect.image_quality import (
 )
 from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 from orthoflow_plugins.inspect.placing import on_walls, wall_of
+from orthoflow_plugins.inspect.point_doubts import doubts, is_own
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
 
 
@@ -104,6 +105,12 @@ class InspectCheckpoints(Method):
 
     def run(self, inputs: In, params: Params, ctx: StepContext) -> Out:
         """Find every point, then sum up."""
+        if is_own(inputs.checkpoints).all():
+            raise MethodError(
+                "x, y, z of all check points are those of the orthoimage in which they were "
+                "clicked, so that there is nothing to compare: put the surveyed coordinates into "
+                "their file, and leave shown_x,shown_y,shown_z as they are (inspect.checkpoints)"
+            )
         pictures = _pictures(inputs, ctx)
         finder = PointFinder(
             pictures=pictures,
@@ -124,6 +131,8 @@ class InspectCheckpoints(Method):
                 "(columns wall, u_px, v_px, or map_x, map_y), or check that scan and points have "
                 "one coordinate system (inspect.checkpoints)"
             )
+        for doubt in doubts(points, inputs.checkpoints, pictures):
+            ctx.warn(doubt)
         gsd_m = {picture.wall: picture.frame.gsd_m for picture in pictures}
         numbers = {picture.wall: picture.image.number for picture in pictures}
         shift_m = np.array(

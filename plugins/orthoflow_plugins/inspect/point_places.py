@@ -108,6 +108,8 @@ class PointFinder:
         measured = points.pixels_wall[index]
         if points.places_m is not None and np.isfinite(points.places_m[index]).all():
             measured = frame.wall_from_raster(points.places_m[index])
+        if points.shown_world is not None and np.isfinite(points.shown_world[index]).all():
+            measured = frame.wall_from_world(points.shown_world[index][None])[0, :2]
         if np.isfinite(measured).all():
             return ShownPoint(
                 how="measured",

@@ -31,6 +31,7 @@ from orthoflow_plugins.ortho.photos_on_walls import (
     pixels_of,
     places_in_part,
     shared_profile,
+    warn_of_heads,
 )
 
 if TYPE_CHECKING:
@@ -168,6 +169,7 @@ class DsmBackward(Method):
     ) -> Out:
         """Put the layers of all photos in order."""
         oriented = oriented_photos(inputs.walls, inputs.photos, inputs.cameras)
+        warn_of_heads(inputs.walls.up, oriented, ctx)
         profile = shared_profile([photo for photo, _ in oriented], ctx)
         layers = joined_layers(inputs.walls, parts, ctx)
         _report(ctx, count_shown(inputs.walls, layers), parts)

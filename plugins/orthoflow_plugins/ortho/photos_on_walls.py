@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from orthoflow.errors import MethodError
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 
 _PLAIN_BITS: Final = 8
+# Of the cosine between a photo's top and up, beyond which it was held upright, or turned over.
+_UPRIGHT: Final = 0.5
 
 
 class PhotosOnWalls(Ports):
@@ -99,6 +102,30 @@ def oriented_photos(walls: Walls, photos: Photos, cameras: Cameras) -> list[tupl
             "photos that were oriented"
         )
     return [(by_name[camera.photo], camera) for camera in posed]
+
+
+def warn_of_heads(
+    up: NDArray[np.float64], oriented: Sequence[tuple[Photo, Camera]], ctx: StepContext
+) -> None:
+    """Say so when most photos were taken with their tops down: rather, the scan's up is down.
+
+    Args:
+        up: (3,) unit vector that the scan calls up.
+        oriented: the photos and their poses.
+        ctx: of the step.
+    """
+    # Rows of a photo count downwards.
+    tops = [-camera.viewing().rotation[1] @ up for _, camera in oriented]
+    n_down = sum(float(top) < -_UPRIGHT for top in tops)
+    if 2 * n_down <= len(tops):
+        return
+    axis = int(np.abs(up).argmax())
+    opposite = f"{'-' if up[axis] > 0.0 else ''}{'xyz'[axis]}"
+    ctx.warn(
+        f"{n_down} of {len(tops)} photos stand on their heads: if the scan's vertical axis points "
+        f"down, so do walls, orthoimages and the names of floor and ceiling; set up: {opposite} "
+        "of read.scan"
+    )
 
 
 def places_in_part(cameras: Cameras, items: range) -> list[int]:

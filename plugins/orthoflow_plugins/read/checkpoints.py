@@ -22,7 +22,9 @@ class ReadCheckpoints(Method):
     centre of the first cell is at (0.5, 0.5). Instead of them `map_x,map_y` are X and Y in metres
     as a GIS shows them in the GeoTIFF: in the plane of the wall, or east and north of a map
     (`crs` of `raster.grid`); then `wall` may be left out. East and north hold for any cell size
-    and for images of other programs.
+    and for images of other programs. Or `shown_x,shown_y,shown_z` are the coordinates, in metres,
+    of what the orthoimage shows there, as the report saves them: they hold for any cell size and
+    crop of the same scan.
     """
 
     id = "read.checkpoints"
@@ -69,7 +71,9 @@ class ReadCheckpoints(Method):
                 points.append(point)
             places.update((point.name, path.name) for point in points)
         checkpoints = _checkpoints(points, UNITS_M[params.unit])
-        n_measured = sum(bool(point.pixel_wall or point.place_m) for point in points)
+        n_measured = sum(
+            bool(point.pixel_wall or point.place_m or point.shown_m) for point in points
+        )
         ctx.metric("n_points", len(points), "1")
         ctx.metric("n_measured", n_measured, "1")
         extent = np.ptp(checkpoints.points_world, axis=0)
@@ -82,6 +86,7 @@ class ReadCheckpoints(Method):
 def _checkpoints(points: list[SurveyPoint], unit_m: float) -> CheckPoints:
     nowhere = (np.nan, np.nan)
     is_placed = any(point.place_m is not None for point in points)
+    is_shown = any(point.shown_m is not None for point in points)
     return CheckPoints(
         names=tuple(point.name for point in points),
         points_world=unit_m * np.array([point.position for point in points], dtype=np.float64),
@@ -90,5 +95,8 @@ def _checkpoints(points: list[SurveyPoint], unit_m: float) -> CheckPoints:
         pixels_wall=np.array([p.pixel_wall or nowhere for p in points], dtype=np.float64),
         places_m=np.array([p.place_m or nowhere for p in points], dtype=np.float64)
         if is_placed
+        else None,
+        shown_world=np.array([p.shown_m or (*nowhere, np.nan) for p in points], dtype=np.float64)
+        if is_shown
         else None,
     )

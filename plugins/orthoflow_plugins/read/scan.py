@@ -31,11 +31,12 @@ from orthoflow_plugins.read.scales import (
 )
 from orthoflow_plugins.read.stations import Stations, choose_stations
 
-Unit = Literal["m", "mm", "ft", "us-ft"]
+Unit = Literal["m", "cm", "mm", "ft", "us-ft"]
 Corner = tuple[float, float, float]
 
 UNITS_M: Final[dict[Unit, float]] = {
     "m": 1.0,
+    "cm": 0.01,
     "mm": 0.001,
     "ft": 0.3048,
     "us-ft": 1200.0 / 3937.0,

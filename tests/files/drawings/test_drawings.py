@@ -163,6 +163,18 @@ def test_balanced_colours_are_said(tmp_path: Path, differ: bool, said: str) -> N
     assert wall.plane_index == WALL
 
 
+def test_no_other_raster_stands_in_for_an_orthoimage_that_is_gone(tmp_path: Path) -> None:
+    run = write_drawing_run(tmp_path / "run")
+    gone = run / "products" / "mosaic" / f"wall_{WALL}_ortho.tif"
+    gone.unlink()
+    for target in ("sheet", "dxf"):
+        done = export(run, target, tmp_path / target)
+        assert done.exit_code != 0
+        assert f"products/mosaic/{gone.name} is gone from" in done.output
+        assert "orthoflow replay" in done.output
+        assert not (tmp_path / target).exists()
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [

@@ -82,7 +82,8 @@ def cartesian(points: NDArray[np.float64], **more: object) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    ("unit", "factor"), [("m", 1.0), ("mm", 0.001), ("ft", 0.3048), ("us-ft", 1200 / 3937)]
+    ("unit", "factor"),
+    [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("ft", 0.3048), ("us-ft", 1200 / 3937)],
 )
 def test_survey_coordinates_come_out_in_metres_to_a_hundredth_of_a_millimetre(
     tmp_path: Path, read: Reader, points: NDArray[np.float64], unit: str, factor: float

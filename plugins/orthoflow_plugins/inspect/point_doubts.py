@@ -1,0 +1,104 @@
+"""Signs that check points mean another raster, unit or coordinate system than the orthoimage's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoflow.products import CheckPoints
+from orthoflow_plugins.inspect.findings import rms
+from orthoflow_plugins.inspect.point_places import Picture, ShownPoint
+
+# An orthoimage is off by cells, not by tens of them.
+_OFF_CELLS: Final = 20.0
+# Another cell size, and not what a photo's pose or a scan's scale can be wrong by.
+_SCALE_OFF: Final = 0.02
+# So much of all that is off is the same for all points.
+_ALIKE_SHARE: Final = 0.9
+_ALIKE_LEAST: Final = 3
+_ANY_CELLS: Final = (
+    "measure them in this orthoimage, or give what holds for any cell size: shown_x,shown_y,"
+    "shown_z as the report saves them, or map_x,map_y of a map"
+)
+
+
+def is_own(surveyed: CheckPoints) -> NDArray[np.bool_]:
+    """Points (n,) whose survey is nothing but what was shown where they were clicked."""
+    if surveyed.shown_world is None:
+        return np.zeros(len(surveyed.names), dtype=np.bool_)
+    return np.asarray((surveyed.shown_world == surveyed.points_world).all(axis=1), dtype=np.bool_)
+
+
+def doubts(
+    points: Sequence[ShownPoint], surveyed: CheckPoints, pictures: Sequence[Picture]
+) -> Iterator[str]:
+    """Say in words what of the check points can hardly be meant.
+
+    Args:
+        points: where each is expected and shown.
+        surveyed: the points.
+        pictures: what they are shown in.
+    """
+    if n_own := int(np.count_nonzero(is_own(surveyed))):
+        yield (
+            f"x, y, z of {n_own} of {len(points)} check points are those of the orthoimage in "
+            "which they were clicked, so that nothing is compared: put the surveyed ones there"
+        )
+    by_wall = {picture.wall: picture for picture in pictures}
+    beyond_m = np.array([_beyond_m(point, by_wall.get(point.wall)) for point in points])
+    if is_far := np.count_nonzero(beyond_m > 0.0):
+        farthest_m = float(beyond_m.max())
+        how_far = f", up to {farthest_m:.4g} m" if np.isfinite(farthest_m) else ""
+        yield (
+            f"{is_far} of {len(points)} check points lie farther from their wall than it is long"
+            f"{how_far}: check `unit` of read.checkpoints, and that points and scan have one "
+            "coordinate system"
+        )
+    for picture in pictures:
+        mine = [
+            point
+            for point, far_m in zip(points, beyond_m, strict=True)
+            if point.wall == picture.wall and point.how == "measured" and far_m <= 0.0
+        ]
+        yield from _doubts_of_places(mine, picture)
+
+
+def _beyond_m(point: ShownPoint, picture: Picture | None) -> float:
+    """How far a point lies off its wall, where that is more than the wall is long; else 0."""
+    if picture is None:
+        return 0.0
+    frame = picture.frame
+    size = np.array([frame.width, frame.height])
+    off_m = frame.gsd_m * float(np.max([-point.expected, point.expected - size]))
+    return off_m if off_m > frame.gsd_m * size.max() else 0.0
+
+
+def _doubts_of_places(points: Sequence[ShownPoint], picture: Picture) -> Iterator[str]:
+    """Measured places that are off by another cell size, or all alike."""
+    if len(points) < 2:
+        return
+    expected = np.array([point.expected for point in points])
+    shift = np.array([point.place for point in points]) - expected
+    if rms(np.linalg.norm(shift, axis=1)) <= _OFF_CELLS:
+        return
+    aside = expected - expected.mean(axis=0)
+    scale = 1.0 + float((aside * shift).sum() / max(float((aside**2).sum()), 1e-12))
+    gsd_m, name = picture.frame.gsd_m, picture.image.name
+    if scale > 0.0 and abs(scale - 1.0) > _SCALE_OFF:
+        yield (
+            f"{name}: its {len(points)} check points were measured on cells of about "
+            f"{gsd_m / scale:.3g} m, but its own are {gsd_m:.3g} m: {_ANY_CELLS}"
+        )
+        return
+    alike = shift.mean(axis=0)
+    of_all = float(np.linalg.norm(alike)) / rms(np.linalg.norm(shift, axis=1))
+    if len(points) >= _ALIKE_LEAST and of_all > _ALIKE_SHARE:
+        right_m, down_m = gsd_m * alike
+        yield (
+            f"{name}: all of its {len(points)} check points are shown {right_m:+.4g} m right and "
+            f"{down_m:+.4g} m down of the survey: was the raster cut or laid otherwise where they "
+            f"were measured? {_ANY_CELLS}"
+        )

@@ -1,0 +1,95 @@
+"""What check points say that mean another raster, unit or system than the orthoimage's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
+
+from orthoflow.errors import MethodError
+from orthoflow.products import CheckPoints, Orthoimages
+from orthoflow.sdk import StepContext
+from tests import inspect_scenes
+from tests.inspect_scenes import GSD_M, points_at
+
+PLACES = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0], [120.0, 150.0]])
+
+
+def surveyed() -> NDArray[np.float64]:
+    return inspect_scenes.frame().world_from_wall(PLACES, 0.01)
+
+
+def said(folder: Path, points: CheckPoints) -> tuple[list[str], dict[str, float]]:
+    ctx = StepContext(rng=np.random.default_rng(0), cores=1, scratch=folder)
+    inputs = InspectCheckpoints.In(
+        checkpoints=points,
+        walls=inspect_scenes.walls(),
+        orthoimages=Orthoimages(images=(inspect_scenes.displaced(0, 0),)),
+    )
+    InspectCheckpoints().run(inputs, InspectCheckpoints.Params(), ctx)
+    return ctx.warnings, {item.name: item.value for item in ctx.metrics}
+
+
+@pytest.mark.parametrize("factor", [0.4, 2.5, 1.2])
+def test_places_on_cells_of_another_size_are_told_with_that_size(
+    tmp_path: Path, factor: float
+) -> None:
+    points = points_at(surveyed(), pixels=factor * PLACES)
+    (warning,), _ = said(tmp_path, points)
+    assert f"measured on cells of about {GSD_M / factor:.3g} m" in warning
+    assert f"its own are {GSD_M:.3g} m" in warning
+    assert "shown_x,shown_y,shown_z" in warning
+
+
+def test_a_raster_laid_elsewhere_is_told_with_the_way_it_moved(tmp_path: Path) -> None:
+    (warning,), _ = said(tmp_path, points_at(surveyed(), pixels=PLACES + np.array([30.0, -40.0])))
+    assert f"{30 * GSD_M:+.4g} m right and {-40 * GSD_M:+.4g} m down" in warning
+
+
+@pytest.mark.parametrize("off_cells", [[3.0, 4.0], [-12.0, 9.0]])
+def test_an_orthoimage_that_is_off_by_cells_is_a_result_and_no_doubt(
+    tmp_path: Path, off_cells: list[float]
+) -> None:
+    warnings, metrics = said(tmp_path, points_at(surveyed(), pixels=PLACES + off_cells))
+    assert warnings == []
+    assert metrics["rms_mm"] == pytest.approx(1e3 * GSD_M * np.hypot(*off_cells))
+
+
+def test_scattered_blunders_are_no_other_raster(tmp_path: Path) -> None:
+    off = 40.0 * np.array([[1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+    warnings, _ = said(tmp_path, points_at(surveyed(), pixels=PLACES + off))
+    assert not any("laid otherwise" in warning for warning in warnings)
+
+
+def test_points_in_another_unit_are_told(tmp_path: Path) -> None:
+    far = inspect_scenes.frame().world_from_wall(100.0 * PLACES, 0.0)
+    warnings, _ = said(tmp_path, points_at(far, pixels=PLACES))
+    assert len(warnings) == 1
+    assert warnings[0].startswith("4 of 4 check points lie farther from their wall than it is long")
+    assert "check `unit`" in warnings[0]
+
+
+def test_what_was_shown_holds_for_cells_of_any_size(tmp_path: Path) -> None:
+    off = np.array([[1.5, 0.0], [1.5, 0.0], [0.0, -2.0], [0.0, -2.0]])
+    shown = inspect_scenes.frame().world_from_wall(PLACES + off, 0.02)
+    points = points_at(surveyed(), pixels=np.full((4, 2), np.nan))
+    warnings, metrics = said(tmp_path, replace(points, shown_world=shown))
+    assert warnings == []
+    assert metrics["n_found"] == 4
+    assert metrics["mean_x_mm"] == pytest.approx(0.75e3 * GSD_M)
+    assert metrics["mean_y_mm"] == pytest.approx(-1e3 * GSD_M)
+
+
+def test_clicked_points_that_nobody_surveyed_are_no_check(tmp_path: Path) -> None:
+    points = points_at(surveyed(), pixels=np.full((4, 2), np.nan))
+    own = surveyed()
+    with pytest.raises(MethodError, match="put the surveyed coordinates into their file"):
+        said(tmp_path, replace(points, shown_world=own))
+    own[3, 0] += 0.001
+    (warning,), metrics = said(tmp_path, replace(points, shown_world=own))
+    assert warning.startswith("x, y, z of 3 of 4 check points are those of the orthoimage")
+    assert metrics["n_found"] == 4
