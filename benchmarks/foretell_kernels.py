@@ -2,9 +2,10 @@
 
 python benchmarks/foretell_kernels.py [--write] [RECIPE ...]
 
-Runs the recipes of `orthoflow warm`, or those named, each step in a process of its own, and writes
-down which kernels it loads or compiles. With `--write` they go into the plugins' `kernels.json`
-beside what stands there and is still so; else it says what is missing there.
+Runs the recipes of `orthoflow warm`, or those named, each step in a process of its own, without
+repeats and others that need the same kernels, and writes down which kernels it loads or compiles.
+With `--write` they go into the plugins' `kernels.json` beside what stands there and is still so;
+else it says what is missing there.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from orthoflow.catalog import discover_catalog
-from orthoflow.cli.warm import _RECIPES
+from orthoflow.cli.warm import _RECIPES, _new_cells
 from orthoflow.engine import RunOptions, Store, execute, executors, plan_run
 from orthoflow.engine.compiling_ahead import FORETOLD
 from orthoflow.engine.results import CellResult, result_from_json, result_to_json
@@ -86,12 +87,11 @@ def main() -> None:
     asked = parser.parse_args()
     executors.run_task = run_apart
     with tempfile.TemporaryDirectory(prefix="orthoflow-foretell-") as folder:
-        catalog, store = discover_catalog(), Store(Path(folder) / "store")
+        catalog, store, seen = discover_catalog(), Store(Path(folder) / "store"), set()
         for name in asked.recipes:
             loaded = load_workflow(shipped_workflow(name), catalog, sets=_RECIPES.get(name, ()))
-            plan = plan_run(
-                expand_cells(loaded, catalog), loaded, catalog, store, RunOptions(executor="inline")
-            )
+            cells = _new_cells(expand_cells(loaded, catalog), None, seen)
+            plan = plan_run(cells, loaded, catalog, store, RunOptions(executor="inline"))
             execute(plan, Path(folder) / name, store)
     spec = importlib.util.find_spec("orthoflow_plugins")
     path = Path(spec.submodule_search_locations[0]) / FORETOLD  # type: ignore[index, union-attr]

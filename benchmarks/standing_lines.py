@@ -1,9 +1,11 @@
 """How long a line of the live table stands still: records a terminal while a workflow runs.
 
-    python benchmarks/standing_lines.py -o terminal.txt -- orthoflow run quickstart.yaml
+    python benchmarks/standing_lines.py -o terminal.txt --most 2 -- orthoflow run quickstart.yaml
 
-prints, per step, how long it ran and the longest time in which its line did not change, and the
-same for the whole screen. The recording has a frame per change, each with its second.
+prints, per step, how long it ran, the longest time in which its line did not change, and when that
+ended; and the same for the whole screen, from the start of the command. Ends with 1 where one stood
+still for longer than `--most` seconds, or the command failed. The recording has a frame per change,
+each with its second.
 """
 
 from __future__ import annotations
@@ -77,17 +79,23 @@ class Stillness:
     ended_s: float
     content: str
     longest_s: float = 0.0
+    longest_until_s: float = 0.0
 
     def see(self, content: str, now_s: float) -> None:
         """Look at it once more."""
-        self.longest_s = max(self.longest_s, now_s - self.changed_s)
+        if now_s - self.changed_s > self.longest_s:
+            self.longest_s, self.longest_until_s = now_s - self.changed_s, now_s
         self.ended_s = now_s
         if content != self.content:
             self.content, self.changed_s = content, now_s
 
 
-def record(command: list[str], frames: Path | None) -> dict[str, Stillness]:
-    """Run a command on a terminal of its own; watch the lines of what runs, and the whole."""
+def record(command: list[str], frames: Path | None) -> tuple[dict[str, Stillness], int]:
+    """Run a command on a terminal of its own; watch the lines of what runs, and the whole.
+
+    Returns:
+        Line -> how it stood; and the exit code.
+    """
     controlling, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", _ROWS, _COLUMNS, 0, 0))
     started = time.monotonic()
@@ -117,10 +125,10 @@ def record(command: list[str], frames: Path | None) -> dict[str, Stillness]:
         if out and shown != told:
             print(f"--- {now_s:.2f} s", *shown, sep="\n", file=out)
         told = shown
-    process.wait()
+    code = process.wait()
     if out:
         out.close()
-    return watched
+    return watched, code
 
 
 def _watch(watched: dict[str, Stillness], shown: tuple[str, ...], now_s: float) -> None:
@@ -134,14 +142,18 @@ def main() -> None:
     """Record and say."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, help="file for the frames")
+    parser.add_argument("--most", type=float, default=float("inf"), help="seconds")
     parser.add_argument("command", nargs="+")
     arguments = parser.parse_args()
     load = os.getloadavg()[0]
-    watched = record(arguments.command, arguments.output)
+    watched, code = record(arguments.command, arguments.output)
     for name, item in watched.items():
         seconds = item.ended_s - item.began_s
-        sys.stdout.write(f"{name:20s} {seconds:7.1f} s, at most {item.longest_s:4.1f} s still\n")
+        still = f"at most {item.longest_s:4.1f} s still, until {item.longest_until_s:.1f} s"
+        sys.stdout.write(f"{name:20s} {seconds:7.1f} s, {still}\n")
     sys.stdout.write(f"load before {load:.1f}, after {os.getloadavg()[0]:.1f}\n")
+    stood = any(item.longest_s > arguments.most for item in watched.values())
+    sys.exit(1 if stood or code else 0)
 
 
 if __name__ == "__main__":

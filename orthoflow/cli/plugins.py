@@ -10,7 +10,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -496,21 +496,32 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
 def _sharing_kernels(method_id: str) -> Iterator[None]:
     """Let the suite begin with what this user's runs have compiled, and leave them what it does.
 
-    Without it the runs in a process of their own would compile everything once more.
+    Without it the runs in a process of their own would compile everything once more. What is told
+    of the method's kernels is compiled on a second core from the last one on, until both meet.
     """
     from orthoflow.engine.compiled_code import begun_with_warm, leave_for_others
+    from orthoflow.engine.compiling_ahead import AheadCompiler
     from orthoflow.engine.executors import COMPILED_CODE, compiled_code_in
-    from orthoflow.engine.keys import compiled_digest
+    from orthoflow.engine.keys import compiled_digest, method_facts
     from orthoflow.engine.store import Store
+    from orthoflow.errors import PluginError
+    from orthoflow.system import usable_cores
 
     if COMPILED_CODE in os.environ:
         yield
         return
-    digest, since_ns = compiled_digest(discover_catalog().method(method_id)), time.time_ns()
+    catalog, since_ns = discover_catalog(), time.time_ns()
+    digest = compiled_digest(catalog.method(method_id))
+    ahead = AheadCompiler(is_wanted=usable_cores() > 1)
     with tempfile.TemporaryDirectory(prefix="orthoflow-check-") as folder:
         kernels = begun_with_warm(Store(Path(folder)).numba_folder(digest))
         try:
+            if ahead.is_wanted:
+                # What a method lacks the suite says.
+                with suppress(PluginError):
+                    ahead.begin({kernels: [method_facts(method_id, catalog)]}, is_backwards=True)
             with compiled_code_in(str(kernels)):
                 yield
         finally:
+            ahead.close()
             leave_for_others(kernels, since_ns)

@@ -49,15 +49,21 @@ class AheadCompiler:
     is_wanted: bool
     _processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
-    def begin(self, folders: Mapping[Path, Iterable[MethodFacts]]) -> None:
+    def begin(
+        self, folders: Mapping[Path, Iterable[MethodFacts]], *, is_backwards: bool = False
+    ) -> None:
         """Begin; nothing fails for it.
 
         Args:
             folders: where compiled kernels are kept -> methods in the order of their steps.
+            is_backwards: whether the last kernel of a method comes first, where the method runs
+                already and begins with the first.
         """
         self.is_wanted = False
         for folder, methods in folders.items():
             orders = _orders(folder, methods)
+            if is_backwards:
+                orders = {name: kernels[::-1] for name, kernels in orders.items()}
             if orders:
                 with suppress(OSError):
                     self._processes.append(_start(folder, orders))

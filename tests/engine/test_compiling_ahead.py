@@ -105,6 +105,22 @@ def test_one_that_is_held_begins_anew(tmp_path: Path, facts: MethodFacts) -> Non
         ahead.close()
 
 
+def test_who_comes_from_the_end_meets_the_method_that_begins(
+    tmp_path: Path, facts: MethodFacts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[list[object]] = []
+
+    def refused(_: Path, orders: dict[str, list[object]]) -> None:
+        told.extend(orders.values())
+        raise OSError("no process")
+
+    monkeypatch.setattr(compiling_ahead, "_start", refused)
+    monkeypatch.setattr(compiling_ahead, "_foretold", lambda _: {facts.method: [1, 2, 3]})
+    for is_backwards in (False, True):
+        AheadCompiler(is_wanted=True).begin({tmp_path: [facts]}, is_backwards=is_backwards)
+    assert told == [[1, 2, 3], [3, 2, 1]]
+
+
 WAITS = """
 import pathlib, time
 while not pathlib.Path("GO").exists():
