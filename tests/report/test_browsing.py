@@ -52,8 +52,9 @@ def summary(name: str, workflow: str = "hall", **facts: object) -> RunSummary:
 
 def test_what_all_runs_of_a_workflow_share_tells_none_of_them() -> None:
     runs = [
-        summary("a", seed=1, cell_m=0.1, names=["x", "y"]),
-        summary("b", seed=1, cell_m=0.2, names=["x", "y"]),
+        # The order of keys is no difference, that of a list is one.
+        summary("a", seed=1, cell_m=0.1, names=["x", "y"], box={"low": 1, "high": 2}),
+        summary("b", seed=1, cell_m=0.2, names=["x", "y"], box={"high": 2, "low": 1}),
         # It lacks a fact, and has one that others lack.
         summary("c", seed=1, names=["y", "x"], only=True),
         summary("d", workflow="court", seed=2, cell_m=0.9),
