@@ -87,11 +87,14 @@ def test_every_point_is_the_only_return_of_its_pulse_in_a_file_of_no_day(tmp_pat
 
 
 @pytest.mark.parametrize("crs_wkt", ["", epsg_wkt(25832)], ids=["unknown", "known"])
-def test_a_header_says_that_its_coordinate_system_is_wkt_where_it_has_one(
+def test_a_header_has_a_coordinate_system_where_there_is_one_and_only_wkt_ever(
     tmp_path: Path, crs_wkt: str
 ) -> None:
     found = written(tmp_path / "a.laz", replace(dressed(floor()), crs_wkt=crs_wkt))
-    assert found.header.global_encoding.wkt == bool(crs_wkt)
+    # LAS 1.4 has it for points of its formats from 6 on, whether there is one or not.
+    assert found.header.global_encoding.wkt
+    systems = [one.string for one in found.header.vlrs if one.record_id == 2112]
+    assert systems == ([crs_wkt] if crs_wkt else [])
 
 
 @pytest.mark.parametrize(
