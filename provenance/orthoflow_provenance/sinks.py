@@ -7,6 +7,7 @@ succeeds, remembers the first error, and raises it once HDF5 is out of the way.
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -51,6 +52,8 @@ class FileSink:
         flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC
         for name in ("O_NOFOLLOW", "O_CLOEXEC", "O_BINARY"):
             flags |= int(getattr(os, name, 0))
+        if not hasattr(os, "O_NOFOLLOW") and path.is_symlink():
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
         self._descriptor = os.open(path, flags, 0o666)
         self._position = 0
         self._kept: list[tuple[int, bytes]] = []

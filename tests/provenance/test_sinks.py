@@ -53,9 +53,9 @@ def test_a_position_counts_from_the_front_from_itself_or_from_the_end(tmp_path: 
 def test_a_file_is_written_to_its_end_however_little_the_disk_takes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = os.pwrite
+    whole = sinks._write_at
     monkeypatch.setattr(
-        sinks.os, "pwrite", lambda file, data, offset: whole(file, bytes(data)[:3], offset)
+        sinks, "_write_at", lambda file, data, offset: whole(file, data[:3], offset)
     )
     sink = FileSink(tmp_path / "a")
     put(sink, 2, b"0123456789")
@@ -72,7 +72,7 @@ def full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FileSink:
     def refuse(*_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(sinks.os, "pwrite", refuse)
+    monkeypatch.setattr(sinks, "_write_at", refuse)
     put(sink, 4, b"lost")
     return sink
 
