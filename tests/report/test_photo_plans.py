@@ -37,6 +37,8 @@ def test_a_photo_stands_before_its_wall_and_looks_at_it(tmp_path: Path) -> None:
     run = compared_run(tmp_path)
     plan = photo_plan(run, list(wall_pictures(run)))
     assert plan is not None
+    # Of two variants the baseline's.
+    assert plan.cell == "orient@plane=fine"
     [(x, y)] = re.findall(r'class="photo" cx="([0-9.]+)" cy="([0-9.]+)"', plan.svg)
     wall = np.array(
         re.findall(r"([0-9.]+) ([0-9.]+)", re.findall(r'wall" d="M([^"]*)Z', plan.svg)[0])

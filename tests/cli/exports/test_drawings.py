@@ -261,3 +261,102 @@ def test_what_a_room_has_is_counted() -> None:
     assert module._said(lines) == "2 planes, 1 edge, 0 corners"  # type: ignore[arg-type]
     lines.openings = (1, 2, 3)
     assert module._said(lines) == "2 planes, 1 edge, 0 corners, 3 openings"  # type: ignore[arg-type]
+
+
+# --- CAD and GIS ---
+
+
+@pytest.fixture
+def drawn_files(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """Which writer would have written which file."""
+    kept: list[tuple[str, str]] = []
+    places = {
+        "dxf": ("write_wall_dxf", "write_room_dxf"),
+        "geojson": ("write_wall_geojson", "write_room_geojson", "write_seams_geojson"),
+    }
+    for file, writers in places.items():
+        for writer in writers:
+            monkeypatch.setattr(
+                f"orthoflow.files.drawings.{file}.{writer}",
+                lambda path, *_args, writer=writer: kept.append((writer, path.name)),
+            )
+    monkeypatch.setattr(
+        "orthoflow.files.drawings.cad_pictures.write_cad_picture",
+        lambda _raster, path: kept.append(("picture", path.name)),
+    )
+    lines = SimpleNamespace(surfaces=(1, 2), edges=(1,), corners=(1, 2, 3), openings=())
+    monkeypatch.setattr(
+        "orthoflow.files.drawings.room_lines.room_lines", lambda *_args, **_more: lines
+    )
+    return kept
+
+
+def of_room(monkeypatch: pytest.MonkeyPatch, *, has_planes: bool) -> Any:
+    """A run of two walls, one of which has no orthoimage; each with seams."""
+    walls = (wall(3.8, 2.3, "ortho"), wall(9.0, 3.0, "depth"))
+    walls[1].number = 9
+    told = results(
+        walls=walls,
+        planes=SimpleNamespace() if has_planes else None,
+        checkpoints=None,
+        inspections={},
+        openings=(),
+    )
+    monkeypatch.setattr("orthoflow.records.wall_results.room_results", lambda _run, _cell: told)
+    images = [
+        SimpleNamespace(number=7, sources=("a.jpg", "b.jpg")),
+        SimpleNamespace(number=9, sources=("a.jpg",)),
+    ]
+    monkeypatch.setattr(module, "_images", lambda _run, _address: images)
+    return SimpleNamespace()
+
+
+@pytest.mark.parametrize("has_planes", [False, True])
+def test_cad_files_are_of_each_wall_and_of_the_room_where_it_is_known(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    drawn_files: list[tuple[str, str]],
+    *,
+    has_planes: bool,
+) -> None:
+    run = of_room(monkeypatch, has_planes=has_planes)
+    said = module.export_dxf(run, tmp_path / "out", Choices())
+    room = [("write_room_dxf", "room.dxf")] if has_planes else []
+    assert drawn_files == [
+        *(("picture", "wall_7_ortho.png"), ("write_wall_dxf", "wall_7.dxf")),
+        *(("write_wall_dxf", "wall_9.dxf"), *room),
+    ]
+    beside = ", and the room: 2 planes, 1 edge, 3 corners" if has_planes else ""
+    assert said == f"2 walls{beside}"
+    drawn_files.clear()
+    assert module.export_dxf(run, tmp_path / "out", Choices(wall=9)) == f"1 wall{beside}"
+    assert drawn_files == [("write_wall_dxf", "wall_9.dxf"), *room]
+
+
+@pytest.mark.parametrize("has_planes", [False, True])
+def test_gis_files_have_seams_of_walls_that_several_photos_paint(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    drawn_files: list[tuple[str, str]],
+    *,
+    has_planes: bool,
+) -> None:
+    run = of_room(monkeypatch, has_planes=has_planes)
+    said = module.export_geojson(run, tmp_path / "out", Choices())
+    room = [("write_room_geojson", "room.geojson")] if has_planes else []
+    assert drawn_files == [
+        *(("write_wall_geojson", "wall_7.geojson"), ("write_wall_geojson", "wall_9.geojson")),
+        *(("write_seams_geojson", "wall_7_seams.geojson"), *room),
+    ]
+    beside = ", and the room: 2 planes, 1 edge, 3 corners" if has_planes else ""
+    assert said == f"2 walls{beside}"
+    drawn_files.clear()
+    module.export_geojson(run, tmp_path / "out", Choices(wall=9))
+    assert drawn_files == [("write_wall_geojson", "wall_9.geojson"), *room]
+
+
+def test_a_wall_is_drawn_with_its_picture_and_its_openings() -> None:
+    one = wall(3.8, 2.3, "ortho")
+    told = module._drawn(results(openings_of=lambda _: ("door",)), one, "a.png")
+    assert (told.number, told.name, told.plane_index) == (7, "wall 7", 7)
+    assert (told.frame, told.image, told.openings) == (one.frame, "a.png", ("door",))
