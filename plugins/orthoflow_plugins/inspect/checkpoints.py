@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -49,6 +49,9 @@ from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
 from orthoflow_plugins.inspect.placing import on_walls, wall_of
 from orthoflow_plugins.inspect.point_doubts import doubts, is_own
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
+
+# Points whose residuals stand in the log.
+_TOLD: Final = 200
 
 
 class InspectCheckpoints(Method):
@@ -149,7 +152,9 @@ class InspectCheckpoints(Method):
         ctx.metric("n_points", len(points), "1")
         report(findings, pictures[0].wall, numbers, ctx)
         _warn_of_cap(findings, ctx)
-        _draw(pictures, [points[k] for k in found], ctx)
+        own_names = [inputs.checkpoints.names[k] for k in found]
+        _draw(pictures, [points[k] for k in found], own_names, ctx)
+        _tell(shift_m, own_names, ctx)
         names = tuple(dict.fromkeys(classes))
         return self.Out(
             inspection=Inspection(
@@ -298,20 +303,33 @@ def _warn_of_cap(findings: Sequence[Finding], ctx: StepContext) -> None:
         )
 
 
-def _draw(pictures: Sequence[Picture], points: Sequence[ShownPoint], ctx: StepContext) -> None:
+def _tell(shift_m: NDArray[np.float64], names: Sequence[str], ctx: StepContext) -> None:
+    """Write the residual of each point into the log of the step, the largest first."""
+    for k in np.argsort(-np.linalg.norm(shift_m, axis=1), kind="stable")[:_TOLD]:
+        right_mm, down_mm = 1e3 * shift_m[k]
+        ctx.log(f"check point {names[k]}: {right_mm:+.2f} mm right, {down_mm:+.2f} mm down")
+
+
+def _draw(
+    pictures: Sequence[Picture],
+    points: Sequence[ShownPoint],
+    names: Sequence[str],
+    ctx: StepContext,
+) -> None:
     for picture in pictures:
-        mine = [point for point in points if point.wall == picture.wall]
-        if not mine:
+        own = [k for k, point in enumerate(points) if point.wall == picture.wall]
+        if not own:
             continue
+        mine = [points[k] for k in own]
         places = np.array([point.place for point in mine])
         shifts = places - np.array([point.expected for point in mine])
         times = enlargement(shifts, picture.image)
         ctx.figure(
             f"wall_{picture.image.number}_residuals",
-            vector_map(picture.image, places, shifts),
+            vector_map(picture.image, places, shifts, [names[k] for k in own]),
             f"{picture.image.name}: check points, shown - surveyed, {times:g} times enlarged; "
-            "yellow over the median, red over twice the median. Short arrows to all sides are "
-            "noise; neighbours that point the same way are a real shift of the orthoimage.",
+            "green up to the median, yellow beyond, red over twice the median. Short arrows to all "
+            "sides are noise; neighbours that point the same way are a real shift of the image.",
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -24,6 +25,8 @@ _SMALLEST_PX: Final = 500
 _WHOLE_CELLS: Final = 1 << 24
 # The longest usual arrow is drawn so long.
 _ARROW_PX: Final = 40.0
+_NAMES_MOST: Final = 60
+_HEAD_PX: Final = 8.0
 _ARROWS_MOST: Final = 1500
 _ENLARGED_MOST: Final = 500.0
 
@@ -48,7 +51,10 @@ def displacement_map(displacement_cells: NDArray[np.float64]) -> bytes:
 
 
 def vector_map(
-    image: Orthoimage, places: NDArray[np.float64], shift_cells: NDArray[np.float64]
+    image: Orthoimage,
+    places: NDArray[np.float64],
+    shift_cells: NDArray[np.float64],
+    names: Sequence[str] = (),
 ) -> bytes:
     """Draw an orthoimage in pale grey and arrows from where things should be to where they are.
 
@@ -59,6 +65,7 @@ def vector_map(
         image: what was inspected.
         places: (n, 2) (column, row) where things are shown.
         shift_cells: (n, 2) shown - true.
+        names: n of them, written beside the arrows unless there are many; none for no names.
     """
     import cv2
 
@@ -77,7 +84,12 @@ def vector_map(
         colour = (30, 160, 30) if length[k] <= middle else (230, 180, 0)
         colour = (220, 30, 30) if length[k] > 2.0 * middle else colour
         ends = [(round(float(x)), round(float(y))) for x, y in (tail, tip)]
-        cv2.arrowedLine(picture, ends[0], ends[1], colour, 1, cv2.LINE_AA, tipLength=0.3)
+        head = min(0.3, _HEAD_PX / max(scale * times * float(length[k]), 1e-9))
+        cv2.arrowedLine(picture, ends[0], ends[1], colour, 1, cv2.LINE_AA, tipLength=head)
+        if 0 < len(names) <= _NAMES_MOST:
+            beside = (ends[1][0] + 5, ends[1][1] - 5)
+            font = cv2.FONT_HERSHEY_SIMPLEX
+            cv2.putText(picture, names[k], beside, font, 0.4, (20, 20, 20), 1, cv2.LINE_AA)
     return encode_webp(picture)
 
 

@@ -98,6 +98,23 @@ def test_measured_points_give_their_residuals_by_class(tmp_path: Path) -> None:
     }
 
 
+def test_each_point_is_told_the_farthest_off_first(tmp_path: Path) -> None:
+    said: list[str] = []
+    walls = inspect_scenes.walls()
+    assert GSD_M == 0.004
+    places = np.array([[50.0, 40.0], [200.0, 90.0], [300.0, 220.0]])
+    off = np.array([[1.0, 0.25], [0.25, -2.0], [-0.5, 0.25]])
+    points = points_at(walls.walls[0].frame.world_from_wall(places), pixels=places + off)
+    ctx = replace(context(tmp_path), listen=lambda event: said.append(event.text))
+    inputs = InspectCheckpoints.In(checkpoints=points, walls=walls)
+    InspectCheckpoints().run(inputs, InspectCheckpoints.Params(), ctx)
+    assert [text for text in said if text.startswith("check point ")] == [
+        "check point P1: +1.00 mm right, -8.00 mm down",
+        "check point P0: +4.00 mm right, +1.00 mm down",
+        "check point P2: -2.00 mm right, +1.00 mm down",
+    ]
+
+
 def test_a_rule_that_runs_into_its_cap_says_so_in_words(tmp_path: Path) -> None:
     walls = inspect_scenes.walls()
     places = np.column_stack([np.linspace(40.0, 300.0, 20), np.linspace(40.0, 200.0, 20)])

@@ -81,14 +81,34 @@ def test_arrows_run_from_where_things_should_be_to_where_they_are() -> None:
     drawn = np.array(vector_map(image, places, shift_cells))
     expected = np.array(vector_map(image, np.empty((0, 2)), np.empty((0, 2))))
     arrows = (
-        ((92, 120), (100, 120), (30, 160, 30)),
-        ((300, 192), (300, 200), (30, 160, 30)),
-        # Four times the median.
-        ((232, 400), (200, 400), (220, 30, 30)),
+        ((92, 120), (100, 120), (30, 160, 30), 0.3),
+        ((300, 192), (300, 200), (30, 160, 30), 0.3),
+        # Four times the median; heads are no longer than 8 pixels.
+        ((232, 400), (200, 400), (220, 30, 30), 0.25),
     )
-    for tail, tip, colour in arrows:
-        cv2.arrowedLine(expected, tail, tip, colour, 1, cv2.LINE_AA, tipLength=0.3)
+    for tail, tip, colour, head in arrows:
+        cv2.arrowedLine(expected, tail, tip, colour, 1, cv2.LINE_AA, tipLength=head)
     np.testing.assert_array_equal(drawn, expected)
+
+
+def test_names_stand_beside_their_arrows_unless_there_are_many() -> None:
+    image = grey_image(250, 250)
+    places, shift_cells = np.array([[50.0, 60.0], [150.0, 100.0]]), np.ones((2, 2))
+    plain = np.array(vector_map(image, places, shift_cells))
+    named = np.array(vector_map(image, places, shift_cells, ["P1", "P2"]))
+    rows, columns = np.nonzero((named != plain).any(axis=2))
+    # Above and to the right of the tips at (100, 120) and (300, 200).
+    first = columns < 200
+    for own, (x, y) in ((first, (100, 120)), (~first, (300, 200))):
+        assert own.any()
+        assert (columns[own] - x).min() > 0
+        assert (columns[own] - x).max() < 30
+        assert np.abs(rows[own] - y).max() < 20
+    many = 61
+    crowd = np.tile(places[:1], (many, 1)), np.tile(shift_cells[:1], (many, 1))
+    np.testing.assert_array_equal(
+        vector_map(image, *crowd), vector_map(image, *crowd, ["P"] * many)
+    )
 
 
 def test_arrows_beyond_the_median_are_yellow_and_of_many_an_even_part_is_drawn() -> None:
