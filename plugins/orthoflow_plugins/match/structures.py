@@ -205,6 +205,7 @@ def _widths_cells(photo: Sequence[int], wall: tuple[int, int]) -> list[int]:
 def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
     """Best place of a photo of a given size in cells."""
     import cv2
+    from scipy import fft
 
     height, width = picture.shape[:2]
     structure = structure_of(picture, np.ones((height, width), dtype=np.bool_))
@@ -216,8 +217,11 @@ def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
+    # Of all parts alike: the energy of the wall under a part at each place of its corner.
+    box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
+    under = fft.irfft2(wall.energy * np.conj(box), wall.padded)
     maps = [
-        _part_map(channels[:, top : top + side[0], left : left + side[1]], wall)
+        _part_map(channels[:, top : top + side[0], left : left + side[1]], under, wall)
         for top, left in corners
     ]
     kernel = np.ones((2 * slip + 1, 2 * slip + 1), dtype=np.uint8)
@@ -251,17 +255,26 @@ def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
     )
 
 
-def _part_map(part: NDArray[np.float32], wall: WallStructure) -> NDArray[np.float32]:
+def _part_map(
+    part: NDArray[np.float32], under: NDArray[np.float32], wall: WallStructure
+) -> NDArray[np.float32]:
     """Correlation of a part of a photo with the wall, at every place of its corner (wrapped)."""
     from scipy import fft
 
     own = float(np.einsum("cij,cij->", part, part))
-    box = fft.rfft2(np.ones(part.shape[1:], dtype=np.float32), wall.padded)
-    under = fft.irfft2(wall.energy * np.conj(box), wall.padded)
-    spectrum = np.einsum("cij,cij->ij", wall.spectra, np.conj(fft.rfft2(part, wall.padded)))
+    spectra = _spectrum(part, wall.padded)
+    spectrum = np.einsum("cij,cij->ij", wall.spectra, np.conj(spectra, out=spectra))
     cross = fft.irfft2(spectrum, wall.padded)
     norm = np.sqrt(max(own, 1e-9) * np.maximum(under, max(_ENERGY_LEAST * own, 1e-9)))
     return np.asarray(cross / norm, dtype=np.float32)
+
+
+def _spectrum(layers: NDArray[np.float32], padded: tuple[int, int]) -> NDArray[np.complex64]:
+    """Spectra of layers (c, rows, cols), padded; the rows that are added are not transformed."""
+    from scipy import fft
+
+    along = fft.rfft(layers, padded[1], axis=2)
+    return np.asarray(fft.fft(along, padded[0], axis=1, overwrite_x=True), dtype=np.complex64)
 
 
 def _slipped(part: NDArray[np.float32], at: tuple[int, int], slip: int) -> NDArray[np.float64]:
