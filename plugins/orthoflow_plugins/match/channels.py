@@ -31,9 +31,6 @@ _MARGIN_CELLS: Final = 2
 # the relief; nine depths of an even surface differ by three spreads, seldom by five.
 _STEP_CELLS: Final = 1.0
 _STEP_SPREADS: Final = 6.0
-# Of so many cells in a line along the shadow of a step, more than so many are empty.
-_LINE_CELLS: Final = 9
-_LINE_SHARE: Final = 0.5
 # Places with texture lie so far apart, and are taken in turns from a grid of so many cells a side.
 _APART_CELLS: Final = 5
 _GRID: Final = 16
@@ -137,31 +134,36 @@ def target_of(wall: Wall) -> WallTarget:
     """Prepare a wall for matching."""
     if wall.intensity is None:
         return WallTarget(wall=wall, grey=None)
-    known = np.isfinite(wall.depth_m) & ~_filled_at_steps(wall)
+    known = np.isfinite(wall.depth_m) & ~_at_steps(wall)
     return WallTarget(wall=wall, grey=np.where(known, wall.intensity, np.nan).astype(np.float32))
 
 
-def _filled_at_steps(wall: Wall) -> NDArray[np.bool_]:
-    """Cells (rows, cols) without points beside a step of the relief.
+def _at_steps(wall: Wall) -> NDArray[np.bool_]:
+    """Cells (rows, cols) beside a step of the relief.
 
-    They lie in the scan's shadow of the step, where the surface and what is painted on it end
-    nobody knows, and what fills them puts an edge of the picture there, off by part of a cell.
+    Where in its cell the edge lies nobody knows, and its points are of both sides: an edge of the
+    picture there is off by part of a cell. A photo from aside shows the step's face, or what is
+    behind it not at all. Slopes, however steep, are no steps.
     """
     import cv2
 
-    empty = wall.count == 0
-    # A shadow is a line of cells; single cells that no point fell into are filled well enough.
-    lines = [(1, _LINE_CELLS), (_LINE_CELLS, 1)]
-    shares = [cv2.blur(empty.astype(np.float32), line) for line in lines]
-    empty &= np.maximum(*shares) > _LINE_SHARE
-    if not empty.any():
-        return np.asarray(empty, dtype=np.bool_)
-    known = np.isfinite(wall.depth_m)
+    known, step_m = np.isfinite(wall.depth_m), least_step_m(wall)
     kernel, inf = np.ones((3, 3), dtype=np.uint8), np.float32(np.inf)
     high = cv2.dilate(np.where(known, wall.depth_m, -inf), kernel)
     low = cv2.erode(np.where(known, wall.depth_m, inf), kernel)
-    step_m = max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * usual_spread_m(wall))
-    return np.asarray(empty & (high - low > step_m), dtype=np.bool_)
+    bent = np.zeros(wall.frame.shape, dtype=np.bool_)
+    for depth_m, found in ((wall.depth_m, bent), (wall.depth_m.T, bent.T)):
+        # How far cells are off the line between their neighbours; no number beside void.
+        off_m = np.abs(depth_m[:-2] - 2.0 * depth_m[1:-1] + depth_m[2:])
+        found[1:-1] |= off_m > 0.5 * step_m
+    # Far from all depths both are none, and lie beyond each other.
+    with np.errstate(over="ignore"):
+        return np.asarray(known & bent & (high - low > step_m), dtype=np.bool_)
+
+
+def least_step_m(wall: Wall) -> float:
+    """By how much depths differ at a step of the relief, at least."""
+    return max(_STEP_CELLS * wall.frame.gsd_m, _STEP_SPREADS * usual_spread_m(wall))
 
 
 def grain_of(wall: Wall, half_patch_cells: int) -> NDArray[np.float32]:

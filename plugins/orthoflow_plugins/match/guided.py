@@ -44,14 +44,15 @@ class MatchGuided(Method):
 
     Only what the photo shows of a wall is searched, within a small radius (the mask of
     markiewicz2015 taken to its end), in oriented gradients and in mixtures of the photo's colours,
-    which survive that a laser sees another colour than a camera. With the cloud wired, patches keep
-    off what stands free before the walls. The pose is refitted and the photo
-    warped again until held-out ties stop improving. Photos without a pose are looked for on what
-    the others show of the walls, then traced like these; those not found there give no ties.
+    which survive that a laser sees another colour than a camera. Cells finer than points lie apart
+    are joined for it; patches keep off steps of the relief and, with the cloud wired, off what
+    stands free before the walls. The pose is refitted and the photo warped again until held-out
+    ties stop improving. Photos without a pose are looked for on what the others show of the walls,
+    then traced like these; those not found there give no ties.
     """
 
     id: ClassVar[str] = "match.guided"
-    result_version: ClassVar[int] = 7
+    result_version: ClassVar[int] = 8
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_ties",
@@ -223,7 +224,7 @@ class MatchGuided(Method):
         if _has_all(photos, oriented):
             return {}
         desk = self._desk or _laid_out(inputs)
-        walls = inputs.walls.walls
+        walls = [target.wall for target in desk.targets]
         known = [
             desk.traces.get(found.photo)
             or found.trace(photos.photos[found.photo], walls, desk.before)
@@ -259,11 +260,12 @@ class _Desk:
 def _laid_out(inputs: MatchGuided.In) -> _Desk:
     """Prepare the walls, and what any oriented photo has before them."""
     from orthoflow_plugins.match.channels import target_of
+    from orthoflow_plugins.match.joined_cells import in_cells_of_points
 
     oriented = _oriented(inputs.cameras)
     names = [photo.name for photo in inputs.photos.photos if photo.name in oriented]
     return _Desk(
-        targets=[target_of(wall) for wall in inputs.walls.walls],
+        targets=[target_of(in_cells_of_points(wall)) for wall in inputs.walls.walls],
         before=_before(inputs, [oriented[name] for name in names]),
     )
 

@@ -54,12 +54,12 @@ class RasterGrid(Method):
 
     Narrow gaps are closed: between neighbours of the scan's own rows and columns where these are
     known, else between the measured cells about them, by where their points lie. Wider ones, such
-    as windows, stay void. Where a cell has one or two points, the means of their intensities and
+    as windows, stay void. Where a cell has few points, up to 16, the means of their intensities and
     colours are carried along their slope from there to its centre.
     """
 
     id: ClassVar[str] = "raster.grid"
-    result_version: ClassVar[int] = 7
+    result_version: ClassVar[int] = 8
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = (
         "n_walls",

@@ -15,8 +15,9 @@ from orthoflow.geometry.compiling import compiled
 from orthoflow.geometry.point_kernels import Offsets
 from orthoflow.geometry.raster_kernels import BLOCK, Entries, is_own
 
-# The mean of more points lies so near the centre of their cell that nothing is left to carry.
-FEW_POINTS: Final = 2
+# The mean of more points lies near the centre of their cell. Of few it may lie aside, and over many
+# cells alike: where the scan's step is a whole part of a cell, by up to half a step.
+FEW_POINTS: Final = 16
 
 
 class FewPoints(NamedTuple):

@@ -14,6 +14,7 @@ from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
 from orthoflow.geometry.bands import IN_MEMORY_CELLS, Allocate, bands_with_reach
 from orthoflow.geometry.levels import REC_601
+from orthoflow.geometry.scan_steps import scan_step_m
 from orthoflow.geometry.slabs import Slab
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall
 from orthoflow_plugins.raster.rules import RasterRule
@@ -102,42 +103,6 @@ def rastered_wall(
         else surface.percentiles_m.reshape(*shape, -1),
     )
     return WallRaster(wall=wall, scan_step_m=scan_step_m(wall.count, gsd_m=slab.frame.gsd_m))
-
-
-def scan_step_m(count: NDArray[np.uint32], *, gsd_m: float) -> float:
-    """Distance between neighbouring points on the wall, estimated from the points per cell.
-
-    Cells are joined, 2 x 2, until a block that holds points holds at least four on average: from
-    then on chance hardly leaves a block of scanned surface empty, so that the blocks show the
-    scanned area.
-
-    Args:
-        count: (rows, cols) points per cell.
-        gsd_m: side of a cell in metres.
-
-    Returns:
-        Side of the square that each point has for itself, metres; 0 without points.
-    """
-    # Sums over ever larger blocks stay below the number of points, which 32 bits hold.
-    blocks, side_m = count, gsd_m
-    while blocks.any():
-        per_block = blocks.sum(dtype=np.int64) / np.count_nonzero(blocks)
-        if per_block >= 4.0 or blocks.size == 1:
-            return float(side_m / np.sqrt(per_block))
-        blocks = _joined(blocks)
-        side_m *= 2.0
-    return 0.0
-
-
-def _joined(blocks: NDArray[np.uint32]) -> NDArray[np.uint32]:
-    """Sums of 2 x 2 blocks; at the right and below what is left over counts as it is."""
-    rows, columns = blocks.shape
-    sums = np.zeros((-(-rows // 2), -(-columns // 2)), dtype=np.uint32)
-    for first_row in (0, 1):
-        for first_column in (0, 1):
-            quarter = blocks[first_row::2, first_column::2]
-            sums[: quarter.shape[0], : quarter.shape[1]] += quarter
-    return sums
 
 
 @dataclass(frozen=True, kw_only=True)

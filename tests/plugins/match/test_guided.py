@@ -128,6 +128,35 @@ def test_a_rough_pose_suffices(
     np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.05)
 
 
+def test_cells_finer_than_points_lie_apart_do_as_well(
+    scene: ms.TexturedWall, tmp_path: Path
+) -> None:
+    fine = ms.walls_of(replace(scene, frame=ms.textured_wall(2, gsd_m=0.003).frame)).walls[0]
+    # A point in every fifth cell, and no gap is filled: 6.7 mm apart.
+    is_void = np.random.default_rng(8).random(fine.frame.shape) > 0.2
+    sparse = replace(
+        fine,
+        depth_m=np.where(is_void, np.float32(np.nan), fine.depth_m),
+        sigma_m=np.full(fine.frame.shape, np.nan, dtype=np.float32),
+        count=np.where(is_void, 0, fine.count // 3).astype(np.uint32),
+        mask=np.where(is_void, 0, fine.mask).astype(np.uint8),
+        intensity=np.where(is_void, np.float32(np.nan), fine.intensity),
+        rgb=None,
+        rgb_mask=None,
+    )
+    camera = ms.camera_before(scene)
+    start = ms.cameras(ms.oriented(ms.nudged(camera, ROUGH)))
+    walls = replace(ms.walls_of(scene), walls=(sparse,))
+    ties = guided(ms.photos(ms.photo_of(scene, camera)), walls, start, tmp_path)
+    error = ties.pixels_photo - camera.project(ties.points_world)[:, :2]
+    assert len(error) > 200
+    assert np.sqrt(np.mean(error**2)) < 0.3
+    np.testing.assert_allclose(error.mean(axis=0), 0.0, atol=0.05)
+    assert 0.3 < np.sqrt(np.mean((error / ties.sigma_px[:, None]) ** 2)) < 1.4
+    # What orients judges by the cells that are painted.
+    assert ties.walls[0].gsd_m == pytest.approx(0.003)
+
+
 def test_ties_cover_the_photo_evenly(scene: ms.TexturedWall, walls: Walls, tmp_path: Path) -> None:
     camera = ms.camera_before(scene)
     ties = guided(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster.grid import RasterGrid
-from orthoflow_plugins.raster.walls import scan_step_m
 
 from orthoflow.errors import MethodError, OrthoflowError
 from orthoflow.products import Planes, PointCloud, SurfaceMask, Wall, Walls
@@ -230,21 +229,6 @@ def test_a_cloud_of_bare_points_gives_depth_only(tmp_path: Path) -> None:
     assert walls.walls[0].intensity is None
     assert walls.walls[0].rgb is None
     assert any("neither intensity nor colour" in warning for warning in ctx.warnings)
-
-
-@pytest.mark.parametrize("step_cells", [0.4, 1.0, 2.0, 5.0])
-def test_the_scan_step_is_read_from_the_counts(step_cells: float) -> None:
-    positions = np.arange(0.0, 400.0, step_cells) + 0.1
-    count, _, _ = np.histogram2d(
-        np.repeat(positions, positions.size),
-        np.tile(positions, positions.size),
-        bins=400,
-        range=[[0, 400], [0, 400]],
-    )
-    # 6 %: blocks at the rim are partly empty.
-    assert scan_step_m(count.astype(np.uint32), gsd_m=0.01) == pytest.approx(
-        0.01 * step_cells, rel=0.06
-    )
 
 
 def test_cells_finer_than_the_scan_are_warned_about(tmp_path: Path) -> None:

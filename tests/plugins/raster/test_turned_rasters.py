@@ -173,3 +173,20 @@ def test_what_a_raster_shows_is_where_it_is(
     # A lattice of one scan may lie on one side of many cells of rules that take a point as it is.
     limit = 0.01 if surface == "median" else 0.02
     assert np.abs(scenes.shift_of_waves(wall.intensity)).max() < limit
+
+
+@pytest.mark.parametrize("per_cell", [2, 3, 4])
+def test_where_the_scans_step_is_a_part_of_a_cell_nothing_is_displaced(
+    tmp_path: Path, per_cell: int
+) -> None:
+    """The points of every cell lie on the same side of its centre: by half a step."""
+    known = dataclasses.replace(scenes.leaning_wall(shape=(90, 110)), gsd_m=0.004)
+    steps = [(np.arange(per_cell * length) + 0.02) / per_cell for length in known.shape]
+    rows, columns = (grid.ravel() for grid in np.meshgrid(*steps, indexing="ij"))
+    shade = scenes.waves(columns, rows).astype(np.float32)
+    cloud = scenes.cloud_of(known.world(columns, rows, np.zeros(len(rows))), intensity=shade)
+    inputs = RasterGrid.In(cloud=cloud, planes=known.planes())
+    wall = RasterGrid().run(inputs, RasterGrid.Params(gsd_m=known.gsd_m), scenes.context(tmp_path))
+    intensity = wall.walls.walls[0].intensity
+    assert intensity is not None
+    assert np.abs(scenes.shift_of_waves(intensity)).max() < 0.02

@@ -1,4 +1,4 @@
-"""How far apart points lie on a wall, how much memory it takes, and what of it is known."""
+"""How much memory a wall takes, and what of it is known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster import walls
-from orthoflow_plugins.raster.walls import require_memory, scan_step_m
+from orthoflow_plugins.raster.walls import require_memory
 
 from orthoflow.errors import MethodError
 from orthoflow.geometry import WallFrame
@@ -19,54 +19,6 @@ from orthoflow.products import SurfaceMask
 from tests import samples
 
 GSD_M = 0.01
-
-
-def every(step: int, shape: tuple[int, int] = (96, 128)) -> NDArray[np.uint32]:
-    """One point in each block of step x step cells."""
-    count = np.zeros(shape, dtype=np.uint32)
-    count[step // 2 :: step, step // 2 :: step] = 1
-    return count
-
-
-@pytest.mark.parametrize("step", [1, 2, 4, 8])
-def test_points_every_few_cells_lie_so_many_apart(step: int) -> None:
-    assert scan_step_m(every(step), gsd_m=GSD_M) == pytest.approx(step * GSD_M)
-    # So they do where they cover a corner of the wall alone, and on cells of other sizes.
-    part = every(step)
-    part[64:] = part[:, 64:] = 0
-    assert scan_step_m(part, gsd_m=0.25) == pytest.approx(step * 0.25)
-
-
-@pytest.mark.parametrize("per_cell", [1, 4, 9, 100])
-def test_many_points_per_cell_lie_closer_than_cells(per_cell: int) -> None:
-    count = np.full((30, 40), per_cell, dtype=np.uint32)
-    assert scan_step_m(count, gsd_m=GSD_M) == pytest.approx(GSD_M / np.sqrt(per_cell))
-
-
-def test_points_at_random_are_as_far_apart_as_they_are_many() -> None:
-    rng = np.random.default_rng(3)
-    for mean in (0.05, 0.3, 1.0, 6.0):
-        count = rng.poisson(mean, (200, 240)).astype(np.uint32)
-        assert scan_step_m(count, gsd_m=GSD_M) == pytest.approx(GSD_M / np.sqrt(mean), rel=0.05)
-
-
-def test_a_wall_without_points_has_no_step_and_one_point_has_the_wall() -> None:
-    assert scan_step_m(np.zeros((7, 9), dtype=np.uint32), gsd_m=GSD_M) == 0.0
-    one = np.zeros((7, 9), dtype=np.uint32)
-    one[3, 8] = 1
-    # Four doublings make one block of nine columns.
-    assert scan_step_m(one, gsd_m=GSD_M) == pytest.approx(16 * GSD_M)
-
-
-@pytest.mark.parametrize("shape", [(6, 8), (7, 8), (6, 9), (7, 9), (1, 1), (1, 5)])
-def test_joined_blocks_hold_the_points_of_two_by_two(shape: tuple[int, int]) -> None:
-    blocks = np.random.default_rng(1).integers(0, 9, shape).astype(np.uint32)
-    joined = walls._joined(blocks)
-    assert joined.shape == (-(-shape[0] // 2), -(-shape[1] // 2))
-    for row in range(joined.shape[0]):
-        for column in range(joined.shape[1]):
-            part = blocks[2 * row : 2 * row + 2, 2 * column : 2 * column + 2]
-            assert joined[row, column] == part.sum()
 
 
 def frame(rows: int, columns: int) -> WallFrame:
