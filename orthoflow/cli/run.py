@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +21,14 @@ from orthoflow.cli.options import (
     store_option,
     workflow_arguments,
 )
-from orthoflow.cli.tables import counted, duration, echo, echo_table, echo_warnings
+from orthoflow.cli.tables import (
+    counted,
+    duration,
+    echo,
+    echo_folded,
+    echo_table,
+    echo_warnings,
+)
 
 if TYPE_CHECKING:
     from orthoflow.engine import RunOutcome, RunPlan, Store
@@ -111,6 +118,7 @@ class Call:
         from orthoflow.engine.run_folder import LOGS
         from orthoflow.errors import DiskSpaceError
         from orthoflow.records import REPORT_FILE
+        from orthoflow.workflow import doubts_about
 
         made = self.make()
         folder = made.run.folder
@@ -119,7 +127,7 @@ class Call:
         if any(DiskSpaceError.__name__ == cell.error_type for cell in made.run.record.cells):
             say_error(f"with more room on the disk, the same command with -o {folder} goes on")
         try:
-            _print_summary(made, report)
+            _print_summary(made, report, doubts_about(self.workflow))
         except BrokenPipeError:
             # Nobody reads the summary any more; the exit code still says how the run went.
             silence_stdout()
@@ -200,7 +208,7 @@ def _print_failures(cells: Iterable[RecordedCell], logs: Path) -> None:
             say_error(f"{cell.address} failed: {cell.error_message}{where}")
 
 
-def _print_summary(made: WrittenRun, report: Path) -> None:
+def _print_summary(made: WrittenRun, report: Path, doubts: Sequence[str]) -> None:
     """Write the table of cells, the warnings, and last the report, the record and the images."""
     run, cells = made.run, made.run.record.cells
     echo()
@@ -211,8 +219,10 @@ def _print_summary(made: WrittenRun, report: Path) -> None:
             for cell in cells
         ],
     )
-    if any(cell.warnings for cell in cells):
+    if doubts or any(cell.warnings for cell in cells):
         echo()
+    for doubt in doubts:
+        echo_folded(f"warning, workflow: {doubt}")
     echo_warnings(cells)
     echo("", _cached_text(cells, made.kept))
     if made.outcome.damaged:

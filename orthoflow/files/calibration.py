@@ -405,6 +405,8 @@ class _Reader:
             if entry.key not in known:
                 near = difflib.get_close_matches(entry.key, known, n=1)
                 hint = f" (did you mean {near[0]}?)" if near else ""
+                if entry.key.isdecimal():
+                    hint = ", what a decimal comma leaves behind: write decimal points"
                 self._add(
                     entry.position,
                     f"{path}{entry.key}: unknown key{hint}; expected {', '.join(known)}",

@@ -28,6 +28,8 @@ _CAMERAS: Final = (".xml", ".out", ".json")
 _SCAN_SUFFIXES: Final = tuple(
     suffix for item in FORMATS if item is not TEXT for suffix in item.suffixes
 )
+_FIRST_LINE_BYTES: Final = 10_000
+_WORKFLOW_BYTES: Final = 1_000_000
 DEEPEST: Final = 3
 MOST_FILES: Final = 20_000
 
@@ -94,7 +96,7 @@ def _file(path: Path) -> Recognised:
         **dict.fromkeys(TEXT.suffixes, _table),
         **dict.fromkeys(_SCAN_SUFFIXES, _scan),
         **dict.fromkeys(RAW_SUFFIXES, _raw),
-        **dict.fromkeys(_YAML, lambda file: _read("calibration", file, _calibration_said)),
+        **dict.fromkeys(_YAML, _yaml),
         **dict.fromkeys(
             _CAMERAS, lambda file: _read("cameras", file, lambda f: _cameras_said([f]))
         ),
@@ -130,7 +132,10 @@ def _table(path: Path) -> Recognised:
     for kind, reader, noun in _TABLES:
         try:
             rows = reader(path)
-        except InputError:
+        except InputError as error:
+            if _has_columns_of(path, kind):
+                first = str(error).partition("\n")[0]
+                return Recognised(kind="unknown", path=path, said=first)
             continue
         if not _is_cloud(rows):
             return Recognised(kind=kind, path=path, said=f"{len(rows)} {noun}")
@@ -150,10 +155,34 @@ _TABLES: Final[Sequence[tuple[FileKind, Callable[[Path], Sequence[object]], str]
 )
 
 
+_COLUMNS: Final[Mapping[FileKind, frozenset[str]]] = {
+    "ties": frozenset(("photo", "x", "y", "z")),
+    "checkpoints": frozenset(("name", "x", "y", "z")),
+}
+
+
+def _has_columns_of(path: Path, kind: FileKind) -> bool:
+    """Whether the first line names the columns of a table, which nothing else would."""
+    with path.open("rb") as file:
+        first = file.readline(_FIRST_LINE_BYTES).decode("utf-8", "replace")
+    names = {word.strip().lower() for word in re.split(r"[,;\t]", first)}
+    return _COLUMNS[kind] <= names
+
+
 def _is_cloud(rows: Sequence[object]) -> bool:
     """Whether what was read as names are coordinates: nobody calls a point 12.345."""
     names = [str(getattr(row, "name", "")) for row in rows]
     return all(re.fullmatch(r"[-+]?\d+\.\d*(e[-+]?\d+)?", name) for name in names)
+
+
+def _yaml(path: Path) -> Recognised:
+    """A calibration; a workflow, which `new` may have written before, is told as one."""
+    found = _read("calibration", path, _calibration_said)
+    with path.open("rb") as file:
+        is_workflow = re.search(rb"^steps:", file.read(_WORKFLOW_BYTES), re.MULTILINE)
+    if found.kind == "unknown" and is_workflow:
+        return Recognised(kind="unknown", path=path, said=f"{path.name} is a workflow itself")
+    return found
 
 
 def _calibration_said(path: Path) -> str:

@@ -456,6 +456,9 @@ def test_check_warns_of_what_is_allowed_and_hardly_meant(tmp_path: Path) -> None
     assert done.stdout == f"studio is fine: 2 steps, 2 cells\nwarning: {said}\n"
     answer = json.loads(orthoflow(tmp_path, "check", "studio.yaml", "--json").stdout)
     assert (answer["ok"], answer["warnings"]) == (True, [said])
+    # Whoever has not checked reads it where the run ends.
+    done = orthoflow(tmp_path, "run", "studio.yaml", "-o", "r", "--executor", "inline")
+    assert f"warning, workflow: {said}" in done.stdout.splitlines()
 
 
 def test_check_looks_for_the_files(tmp_path: Path) -> None:
