@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.inspect.image_quality import (
+    OrthoimageGrey,
     cells_per_pixel,
     completeness,
-    grey_of,
     quality_findings,
     sharpness_findings,
     shown,
@@ -103,7 +103,7 @@ def test_what_is_shown_is_painted_or_filled_and_the_rest_is_black() -> None:
     rgb[..., 1] = 100
     made = image(masked(), rgb)
     np.testing.assert_array_equal(shown(made)[:, 0], np.arange(SIDE) < 7)
-    grey = grey_of(made)
+    grey = OrthoimageGrey(made).cut((slice(0, SIDE), slice(0, SIDE)))
     np.testing.assert_array_equal(grey.valid, shown(made))
     expected = 0.299 * 200 + 0.587 * 100 + 0.114 * 200
     np.testing.assert_allclose(grey.grey[:7], expected, atol=0.01)
@@ -124,7 +124,7 @@ def test_completeness_is_of_the_scanned_surface() -> None:
 
 def test_the_filled_share_is_of_what_is_shown() -> None:
     made = image(masked())
-    found = {f.name: f.value for f in quality_findings(made, wall(), grey_of(made), None)}
+    found = {f.name: f.value for f in quality_findings(made, wall(), None)}
     assert found == {"filled_share": pytest.approx(2.0 / 7.0)}
 
 
