@@ -82,10 +82,10 @@ def test_kernels_that_nobody_used_for_thirty_days_are_garbage(
     folder = world.store.folder / "numba" / "code"
     folder.mkdir(parents=True)
     moment = time.time() - days * 24 * 3600
-    for name in ("old.nbi", "new.nbi"):
+    # The newest file counts.
+    for name, older_s in (("old.nbi", 1e6), ("new.nbi", 0.0)):
         (folder / name).touch()
-        os.utime(folder / name, (moment - 1e6 * (name == "old.nbi"), moment))
-    os.utime(folder / "old.nbi", (moment - 1e6, moment - 1e6))
+        os.utime(folder / name, (moment, moment - older_s))
     assert list(garbage._stale_kernels(world.store)) == ([folder] if is_stale else [])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -237,3 +238,27 @@ def test_points_that_no_photo_sees_stay_grey(
     assert colours.photo.tolist() == [0] + [-1] * (N_SIDE**2 - 1)
     assert (colours.best == 0.0).all()
     assert colours.rgb.shape == (N_SIDE**2, 3)
+
+
+@pytest.mark.parametrize("colour", [None, "photos", "intensity"])
+def test_photos_colour_a_cloud_where_any_is_oriented(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, colour: str | None
+) -> None:
+    def colour_points(_cloud: object, _oriented: object, colours: Any) -> None:
+        colours.rgb[:], colours.photo[:] = (9, 8, 7), 0
+
+    monkeypatch.setattr("orthoflow.files.clouds.photo_colours.colour_points", colour_points)
+    oriented = ((SimpleNamespace(name="a.jpg"), "its camera"),)
+    monkeypatch.setattr(module, "_oriented", lambda *_args: oriented)
+    said, dressed = exported(tmp_path, labelled(), colour=colour)
+    if colour == "intensity":
+        assert (dressed.photo_colours, dressed.photo_names) == (None, ())
+        return
+    assert said == "cloud.toy: 144 points by photos, cloud of plane"
+    assert dressed.colouring == "photos"
+    assert dressed.photo_names == ("a.jpg",)
+    about = json.loads((tmp_path / "cloud.json").read_text())
+    assert about["points_of_the_cloud_by_photo"] == [N_SIDE**2]
+    assert about["points_of_the_cloud_unseen"] == 0
+    # What was mapped for it is gone.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.json", "cloud.toy"]
