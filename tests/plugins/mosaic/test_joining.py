@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from orthoflow_plugins.mosaic.joining import (
     without_islands,
 )
 
+from orthoflow.errors import MethodError
 from orthoflow.geometry.bands import in_memory
 from orthoflow.products import Layer, LayerMask, OrthoMask
 from tests import samples
@@ -246,3 +249,35 @@ def test_each_cell_has_the_colour_of_its_layer(
     # 8 bits become 16 so that white stays white.
     scale = 257 if is_deep else 1
     np.testing.assert_array_equal(rgb[source == 0], scale * layers[0].rgb[source == 0].astype(int))
+
+
+def test_layers_of_a_wall_share_its_raster() -> None:
+    one, other = layer(40, source="a.jpg"), layer(41, source="b.jpg")
+    module.require_one_raster([one, other], "wall 0")
+    moved = replace(other, frame=replace(other.frame, gsd_m=0.02))
+    # Any of them, not only the second.
+    for layers in ([one, moved], [one, other, moved]):
+        with pytest.raises(MethodError) as caught:
+            module.require_one_raster(layers, "wall 0")
+        assert str(caught.value) == (
+            "the layers a.jpg and b.jpg of wall 0 lie on different rasters: all layers of a wall "
+            "must come from the same walls"
+        )
+    with pytest.raises(
+        MethodError, match=r"^priority names c\.jpg, but the layers are of a\.jpg, b"
+    ):
+        module.require_sources([other, one], ["b.jpg", "c.jpg"])
+    module.require_sources([other, one], ["b.jpg"])
+
+
+def test_a_cut_prefers_its_layer_by_more_than_any_quality() -> None:
+    labels = np.random.default_rng(8).integers(0, 2, SHAPE)
+    cut: Any = SimpleNamespace(in_rows=lambda rows: labels[rows])
+    best = module._best(LAYERS[:2])
+    assert best == max(float(one.quality.max()) for one in LAYERS[:2])
+    whole = slice(0, SHAPE[0])
+    values = [module._cut_off(one, k, cut, best, whole) for k, one in enumerate(LAYERS[:2])]
+    np.testing.assert_array_equal(np.argmax(values, axis=0), labels)
+    np.testing.assert_array_equal(
+        module._cut_off(LAYERS[0], 0, cut, best, slice(4, 9)), values[0][4:9]
+    )
