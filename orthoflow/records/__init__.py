@@ -32,10 +32,17 @@ from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.run_files import figure_files, write_files
 from orthoflow.records.runs import REPORT_FILE, Run, open_run
 from orthoflow.records.verification import Verification, verify_run
-from orthoflow.records.writing import WrittenRun, executed_and_written, show_unfinished, write_run
+from orthoflow.records.writing import (
+    NOT_YET,
+    WrittenRun,
+    executed_and_written,
+    show_unfinished,
+    write_run,
+)
 
 __all__ = [
     "COSTS",
+    "NOT_YET",
     "RECORD_FILE",
     "REPORT_FILE",
     "CellFacts",

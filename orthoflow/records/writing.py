@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 _UNFINISHED: Final = f".{RECORD_FILE}.unfinished"
 _MOST_ATTEMPTS: Final = 4
-_NOT_YET: Final = "not computed yet: the run was broken off"
+NOT_YET: Final = "not computed yet: the run was broken off"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +196,7 @@ def show_unfinished(
         item.cell.address: CellResult(
             status="skipped",
             run_id=outcome.run_id,
-            error_message=_NOT_YET,
+            error_message=NOT_YET,
             **shared_fields(
                 plan.methods.get(item.cell.method) or MethodIdentity(method=item.cell.method),
                 MethodIdentity,

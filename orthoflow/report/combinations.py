@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthoflow.files.json_texts import parse_json
-from orthoflow.records import RecordedCell, Run, cell_metrics
+from orthoflow.records import NOT_YET, RecordedCell, Run, cell_metrics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +59,11 @@ class Combination:
         return next(failed, None)
 
     @property
+    def missing(self) -> tuple[RecordedCell, ...]:
+        """Cells that the run was broken off before; optional steps without data are none."""
+        return tuple(cell for cell in self.cells if cell.repeat == 0 and is_missing(cell))
+
+    @property
     def n_failed_repeats(self) -> int:
         """How many of the repeats after the first failed."""
         return sum(cell.status == "failed" and cell.repeat > 0 for cell in self.cells)
@@ -88,6 +93,11 @@ class Combination:
             unit=found[0][0].unit,
             environment=found[0][1],
         )
+
+
+def is_missing(cell: RecordedCell) -> bool:
+    """Say whether the run was broken off before the cell."""
+    return cell.status == "skipped" and cell.error_message == NOT_YET
 
 
 def combinations_of(run: Run) -> tuple[Combination, ...]:

@@ -50,6 +50,7 @@ class Row:
         variants: variant of each varied step; a dash where the step has no part in it.
         is_baseline: the workflow calls it its baseline.
         failure: where and why it failed, empty when it did not.
+        missing: addresses that the run was broken off before.
         values: one per column.
         time: seconds of the cells that the variants have a part in.
         memory: largest memory of these cells.
@@ -60,10 +61,16 @@ class Row:
     variants: tuple[str, ...]
     is_baseline: bool
     failure: str
+    missing: tuple[str, ...]
     values: tuple[Value, ...]
     time: Value
     memory: Value
     remark: str
+
+    @property
+    def shortfall(self) -> str:
+        """Why it has no time and no memory, in a word or two; empty when it is whole."""
+        return "failed" if self.failure else "not computed" if self.missing else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +80,7 @@ class Standing:
     Attributes:
         name: its variants, behind the run where there are several.
         is_baseline: the workflow calls it its baseline.
-        is_failed: it did not come to its end.
+        shortfall: why it did not come to its end, empty when it did.
         n_best: numbers in which it is clearly best.
         n_near: numbers in which it is among the best, and no difference is shown.
         n_worst: numbers in which it is worst.
@@ -83,7 +90,7 @@ class Standing:
 
     name: str
     is_baseline: bool
-    is_failed: bool
+    shortfall: str
     n_best: int
     n_near: int
     n_worst: int
@@ -108,6 +115,11 @@ class ComparisonTable:
     rows: tuple[Row, ...]
     shows_runs: bool
     groups: Mapping[str, str]
+
+    @property
+    def n_whole(self) -> int:
+        """How many combinations came to their end."""
+        return sum(not row.shortfall for row in self.rows)
 
     @property
     def n_judged(self) -> int:
@@ -141,7 +153,7 @@ class ComparisonTable:
                 Standing(
                     name=f"{row.run}: {variants}" if self.shows_runs else variants,
                     is_baseline=row.is_baseline,
-                    is_failed=bool(row.failure),
+                    shortfall=row.shortfall,
                     n_best=len(best),
                     n_near=marks.count(Mark.NEAR),
                     n_worst=marks.count(Mark.WORST),
@@ -149,7 +161,7 @@ class ComparisonTable:
                     time=row.time,
                 )
             )
-        return tuple(sorted(found, key=lambda one: (one.is_failed, -one.n_best, one.n_worst)))
+        return tuple(sorted(found, key=lambda one: (bool(one.shortfall), -one.n_best, one.n_worst)))
 
 
 def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
@@ -219,7 +231,7 @@ def _row(
     failed = one.failure
     varied = [cell for cell in one.varied_cells if cell.status == "ok"]
     group = origins.letters(one.run, varied[0].environment if varied else "")
-    has_cost = failed is None and bool(varied)
+    has_cost = failed is None and not one.missing and bool(varied)
     time_s = sum(cell.wall_s for cell in varied)
     memory_mib = max((cell.peak_rss_mib for cell in varied), default=0.0)
     cost_group = "".join(
@@ -230,6 +242,7 @@ def _row(
         variants=tuple(one.assignment.get(step, _NOTHING) for step in steps),
         is_baseline=one.is_baseline,
         failure=f"{failed.address}: {failed.error_message}" if failed else "",
+        missing=tuple(cell.address for cell in one.missing),
         values=tuple(
             _value(one.measured(column.step, column.metric), one.run, origins) for column in columns
         ),

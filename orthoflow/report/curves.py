@@ -118,6 +118,7 @@ class _Point:
     x: float
     y: float
     spread: float
+    n: int  # datasets, or ways through the other variants, that it stands for
 
 
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
@@ -128,13 +129,13 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
     found = list(sweeps(cells))
     for column in sorted(chosen, key=lambda one: not one.is_key):
         for sweep in found:
-            lines = _lines(combinations, sweep, column)
+            lines = _lines(combinations, sweep, column, is_over=len(parts) > 1)
             if any(len(points) >= _FEWEST_VALUES for points in lines.values()):
                 yield _curve(sweep, column, lines, n_datasets=len(parts))
 
 
 def _lines(
-    combinations: Sequence[Combination], sweep: Sweep, column: Column
+    combinations: Sequence[Combination], sweep: Sweep, column: Column, *, is_over: bool
 ) -> dict[str, list[_Point]]:
     """One line per combination of the other variants."""
     values: dict[str, dict[float, list[tuple[float, float]]]] = {}
@@ -154,16 +155,32 @@ def _lines(
         at = values.setdefault(others, {}).setdefault(sweep.values[variant], [])
         at.append((measured.value, measured.spread))
     return {
-        name: [_point(x, found) for x, found in sorted(line.items())]
+        name: [_point(x, found, is_over=is_over) for x, found in sorted(line.items())]
         for name, line in list(values.items())[:_MOST_LINES]
     }
 
 
-def _point(x: float, found: Sequence[tuple[float, float]]) -> _Point:
+def _point(x: float, found: Sequence[tuple[float, float]], *, is_over: bool) -> _Point:
     if len(found) == 1:
-        return _Point(x=x, y=found[0][0], spread=found[0][1])
+        # A bar over datasets is how far they lie apart, not how far the repeats of one do.
+        return _Point(x=x, y=found[0][0], spread=math.nan if is_over else found[0][1], n=1)
     numbers = np.array([value for value, _ in found])
-    return _Point(x=x, y=float(np.median(numbers)), spread=median_deviation(numbers))
+    spread = median_deviation(numbers)
+    return _Point(x=x, y=float(np.median(numbers)), spread=spread, n=len(found))
+
+
+def _behind(points: Sequence[_Point], n_datasets: int) -> str:
+    """Say how many datasets points over datasets are of: those that failed have no part."""
+    least, most = min(point.n for point in points), max(point.n for point in points)
+    if most == 1:
+        return f"each of the only one of {n_datasets} datasets that has a value, without bars"
+    counted = f"{least}" if least == most else f"{least} to {most}"
+    of_all = f" of {n_datasets}" if least < n_datasets else ""
+    where = ", where there is more than one" if least == 1 else ""
+    return (
+        f"medians of {counted}{of_all} datasets, bars 1.4826 times the median absolute "
+        f"deviation{where}"
+    )
 
 
 def _curve(
@@ -176,7 +193,7 @@ def _curve(
         for point in points
     )
     if n_datasets > 1:
-        said = f"medians of {n_datasets} datasets, bars 1.4826 times the median absolute deviation"
+        said = _behind([point for points in lines.values() for point in points], n_datasets)
     elif has_spread:
         said = "means of the repeats, bars their standard deviation"
     else:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from orthoflow.records import Run, cell_metrics
-from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.combinations import baseline_cells, is_missing
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number
 from orthoflow.report.pictures import thumbnail
@@ -34,6 +34,7 @@ class DatasetRow:
         page: where its own page lies, relative to this one; empty without one.
         picture: data URI of its first orthoimage, empty without one.
         failed: its failed cells and why they did, without those that were skipped behind them.
+        missing: its cells that the run was broken off before.
         values: one per column.
         photos: photos oriented, of how many.
         limit: what limits it most, and how much more does.
@@ -43,6 +44,7 @@ class DatasetRow:
     page: str
     picture: str
     failed: tuple[str, ...]
+    missing: tuple[str, ...]
     values: tuple[Value, ...]
     photos: Value
     limit: str
@@ -65,7 +67,7 @@ class DatasetTable:
     @property
     def n_whole(self) -> int:
         """How many datasets are complete."""
-        return sum(not row.failed for row in self.rows)
+        return sum(not (row.failed or row.missing) for row in self.rows)
 
 
 def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> DatasetTable:
@@ -97,6 +99,7 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
                     for cell in part.record.cells
                     if cell.status == "failed"
                 ),
+                missing=tuple(cell.address for cell in part.record.cells if is_missing(cell)),
                 values=tuple(_value(measured[name].get(key)) for key in chosen),
                 photos=_photos(measured[name]),
                 limit=_limit(part, own[name]),

@@ -19,6 +19,8 @@ from orthoflow.workflow.format import DATA
 # The datasets that decide make up at least this share of all differences.
 _DECIDING_SHARE: Final = 0.5
 _MOST_DECIDING: Final = 3
+# Of four differences that all agree p is 0.125: a test of so few can show nothing.
+_FEWEST_TESTED: Final = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,10 +33,10 @@ class Paired:
         losses: datasets on which it is worse.
         median: median of the differences, in the metric's unit; negative where it has less. For
             signed errors the sizes are compared, where 1 is best the factors to 1, as logarithms.
-        p: Wilcoxon's signed-rank test that the differences lie about zero, two-sided; NaN without
-            differences.
+        p: Wilcoxon's signed-rank test that the differences lie about zero, two-sided; NaN of
+            fewer than five differences.
         effect: matched-pairs rank-biserial correlation, from -1 (worse on every dataset) to 1
-            (better on every one); NaN without differences.
+            (better on every one); NaN where p is.
         deciding: the largest differences, by dataset, which make up half of all; at most three.
     """
 
@@ -193,7 +195,7 @@ def paired_differences(worse: Mapping[str, float], sense: Sense) -> Paired:
         deciding[name] = sign * worse[name]
     moved = differences[differences != 0]
     p = effect = math.nan
-    if moved.size:
+    if moved.size >= _FEWEST_TESTED:
         from scipy.stats import rankdata, wilcoxon  # noqa: PLC0415 - takes half a second
 
         ranks = rankdata(np.abs(moved))

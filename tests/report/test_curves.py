@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,18 @@ def test_over_datasets_the_points_are_medians(tmp_path: Path) -> None:
     (curve,) = curves_over(parts)
     assert "medians of 2 datasets" in curve.caption
     assert curve.svg.count("<circle") == 3
+
+
+def test_a_curve_counts_the_datasets_that_its_points_are_of(tmp_path: Path) -> None:
+    fine, failing = swept(0.02, 0.05, 0.1, repeats=2), swept(0.02, 0.05, 0.1, failed=2)
+    parts = {"calm": held(tmp_path, fine), "dark": held(tmp_path, failing)}
+    (curve,) = curves_over(parts)
+    assert "medians of 1 to 2 of 2 datasets, bars" in curve.caption
+    nothing = held(tmp_path, [replace(one, status="failed") for one in swept(0.02, 0.05, 0.1)])
+    (curve,) = curves_over({"calm": held(tmp_path, fine), "broken": nothing})
+    assert "each of the only one of 2 datasets that has a value, without bars" in curve.caption
+    # Repeats of the one are no spread of datasets.
+    assert 'class="bar' not in curve.svg
 
 
 def test_far_apart_values_lie_on_a_logarithmic_axis(tmp_path: Path) -> None:

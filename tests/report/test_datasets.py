@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import StoreError
-from orthoflow.records import RecordedCell, Run
+from orthoflow.records import NOT_YET, RecordedCell, Run
 from orthoflow.records.datasets import datasets_of, parts_of
 from orthoflow.report import dataset_tables, write_page, write_report
 from orthoflow.report.dataset_tables import dataset_table
@@ -147,6 +147,14 @@ def test_methods_that_agree_everywhere_have_no_test() -> None:
     assert paired.deciding == {}
 
 
+def test_so_few_differences_that_they_show_nothing_have_no_test() -> None:
+    # Four that all agree have a p of 0.125, one has 1: an effect of -1.00 beside it says too much.
+    few = paired_differences({name: 1.0 + index for index, name in enumerate("abcd")}, Sense.LESS)
+    assert (few.n, few.losses) == (4, 4)
+    assert math.isnan(few.p)
+    assert math.isnan(few.effect)
+
+
 def test_differences_are_told_in_the_sign_of_the_metric() -> None:
     # Of a share more is better: 0.2 worse is 0.2 less.
     paired = paired_differences({"a": 0.2, "b": 0.1, "c": -0.1}, Sense.MORE)
@@ -168,6 +176,24 @@ def test_a_dataset_has_a_row_with_its_own_numbers(rooms: Run) -> None:
     assert attic.failed == ("plane@data=attic,plane=quick: no <plane>",)
     assert attic.values[0].text == "4"
     assert (attic.page, attic.picture) == ("", "")
+
+
+def test_a_dataset_that_the_run_was_broken_off_before_is_not_complete(
+    rooms: HeldRun, tmp_path: Path
+) -> None:
+    cells = tuple(
+        replace(one, status="skipped", error_message=NOT_YET)
+        if one.assignment.get("data") == "court" and one.step == "plane"
+        else one
+        for one in rooms.record.cells
+    )
+    broken_off = replace(rooms, record=replace(rooms.record, cells=cells))
+    table = dataset_table(parts_of(broken_off), {})
+    assert table.n_whole == 5
+    assert table.rows[-1].missing == ("plane@data=court,plane=slow", "plane@data=court,plane=quick")
+    write_report([broken_off], tmp_path / "report.html", go_on="orthoflow run x")
+    page = (tmp_path / "report.html").read_text()
+    assert "not computed: plane@data=court,plane=slow (and 1 more)" in page
 
 
 def test_a_part_of_a_run_is_its_dataset_and_what_all_share(rooms: Run) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from orthoflow.errors import StoreError
-from orthoflow.records import Run
+from orthoflow.records import NOT_YET, Run
 from orthoflow.report import write_figures, write_page, write_report
 from orthoflow.report.comparisons import comparison_table
 from orthoflow.report.diagrams import run_diagram
@@ -204,6 +204,50 @@ def test_a_comparison_has_a_row_per_combination_with_spread_failure_and_cost(
     assert table.groups == {}
 
 
+def test_what_a_run_was_broken_off_before_has_no_time_and_is_not_counted(
+    compared: HeldRun, tmp_path: Path
+) -> None:
+    # Of `coarse` only the step before is there, as where the room was built and no plane sought.
+    cells = [
+        replace(one, status="skipped", error_message=NOT_YET, metrics=(), outputs={}, figures=())
+        if one.assignment and one.address != "plane@plane=coarse"
+        else one
+        for one in compared.record.cells
+        if one.assignment.get("plane") != "broken"
+    ]
+    broken_off = replace(compared, record=replace(compared.record, cells=tuple(cells)))
+    table = comparison_table([broken_off])
+    assert table is not None
+    fine, coarse = table.rows
+    assert (fine.time.text, fine.memory.text, fine.shortfall) == ("", "", "not computed")
+    assert coarse.missing[0] == "wall@plane=coarse"
+    assert table.n_whole == 0
+    assert [one.shortfall for one in table.glance] == ["not computed"] * 2
+    write_report([broken_off], tmp_path / "report.html", go_on="orthoflow run x")
+    page = (tmp_path / "report.html").read_text()
+    assert "None of the 2 combinations was computed to its end" in page
+    assert "not computed: wall@plane=coarse and 3 more" in page
+    assert "found no plane" not in page
+
+
+def test_a_step_that_has_no_data_leaves_a_combination_whole() -> None:
+    cells = [
+        one
+        for name in "ab"
+        for one in (
+            cell(f"plane@plane={name}"),
+            cell(
+                f"points@plane={name}",
+                status="skipped",
+                error_message="port checkpoints stays empty, because checkpoints is not given",
+            ),
+        )
+    ]
+    table = comparison_table([run(*cells)])
+    assert table is not None
+    assert (table.n_whole, [row.time.text for row in table.rows]) == (2, ["1.0", "1.0"])
+
+
 def test_two_runs_on_a_page_say_what_differs(compared: HeldRun, tmp_path: Path) -> None:
     cells = [
         replace(one, params={"cell_m": 0.02}, metrics=metrics(rms_mm=1.5, omega_deg=10.0))
@@ -392,7 +436,7 @@ def test_a_glance_says_who_leads_and_what_is_shared_leads_nobody(compared: Run) 
         "check: error along u (right), RMS / mm",
     )
     assert second.n_worst >= 2
-    assert (last.name, last.is_failed, last.n_best) == ("plane=broken", True, 0)
+    assert (last.name, last.shortfall, last.n_best) == ("plane=broken", "failed", 0)
     row, *others = table.rows
     best = tuple(replace(value, mark=Mark.BEST) for value in row.values)
     alike = [replace(one, values=best) for one in (row, *others[:1])]
