@@ -68,6 +68,7 @@ def test_a_second_run_comes_from_the_cache(quick: Shell) -> None:
     assert quick("verify", "again").code == 0
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not IS_LONG, reason="the conformance suite does so on smaller pictures")
 @pytest.mark.parametrize("how", [{"jobs": 2, "parts": 3}, {"executor": "dask", "jobs": 4}])
 def test_steps_in_parts_give_the_same_digests(quick: Shell, how: dict[str, Any]) -> None:
@@ -81,6 +82,7 @@ def test_steps_in_parts_give_the_same_digests(quick: Shell, how: dict[str, Any])
     outcome = execute(plan, quick.folder / f"parts-{options.executor}", store)
     for step in steps:
         result = outcome.results[step]
+        assert result.status == "ok", result.error_message
         assert "part 2 of " in result.log
         for port, product in whole[step].outputs.items():
             assert result.outputs[port].digest == product.digest

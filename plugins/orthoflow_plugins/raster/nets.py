@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from scipy.spatial import Delaunay, cKDTree
 
 NO_POINT: Final = np.uint32(0xFFFFFFFF)
-# A net of more corners is made in tiles; one takes about a kilobyte for each.
+# A net of more corners is made in tiles; one takes some 700 bytes for each.
 VERTICES_MOST: Final = 2_000_000
 # Circles of triangles that are looked for, as wide and high as this within the raster.
 SPAN_MOST_CELLS: Final = 512

@@ -1,0 +1,235 @@
+"""What large walls take: the surface `tin` of a wall, and inspections of an orthoimage.
+
+    python benchmarks/large_walls.py FOLDER [--side 10000] [--only tin surf checkpoints]
+
+makes a wall of side x side cells in FOLDER, with a point in two of three of them, a window of 400
+cells and one of 900, and an orthoimage and an intensity with the same waves on it, displaced by
+half a cell. Each method runs in a process of its own on files that are mapped. Prints processor
+seconds and the anonymous memory of each, and exits with 1 where a number is not what was put in.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+from orthoflow_plugins.inspect.checkpoints import InspectCheckpoints
+from orthoflow_plugins.inspect.surf import InspectSurf
+from orthoflow_plugins.raster.grid import RasterGrid
+from plane_streaming import measured
+
+from orthoflow.geometry import WallFrame
+from orthoflow.products import (
+    CheckPoints,
+    Orthoimage,
+    Orthoimages,
+    Planes,
+    PointCloud,
+    SurfaceMask,
+    Wall,
+    Walls,
+)
+from orthoflow.sdk import StepContext
+
+GSD_M = 0.001
+UP = np.array([0.0, 0.0, 1.0])
+SHIFT_CELLS = 0.5
+ROWS_AT_ONCE = 256
+
+
+def main() -> None:
+    """Run each method in a process of its own; with --run, run one in this."""
+    methods = {"tin": run_tin, "surf": run_surf, "checkpoints": run_checkpoints}
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--side", type=int, default=10_000)
+    parser.add_argument("--only", nargs="+", choices=[*methods], default=[*methods])
+    parser.add_argument("--run", choices=[*methods], help=argparse.SUPPRESS)
+    wanted = parser.parse_args()
+    wanted.folder.mkdir(parents=True, exist_ok=True)
+    if wanted.run:
+        methods[wanted.run](wanted.folder, wanted.side)
+        return
+    for name in wanted.only:
+        with TemporaryDirectory(dir=wanted.folder) as folder:
+            told = [folder, "--side", str(wanted.side), "--run", name]
+            cost = measured([sys.executable, __file__, *told])
+        print(
+            f"{name}, {wanted.side} x {wanted.side} cells: {cost.wall_s:.0f} s, processor "
+            f"{cost.cpu_s:.0f} s, anonymous {cost.anonymous_mib:.0f} MiB",
+            flush=True,
+        )
+
+
+def run_tin(folder: Path, side: int) -> None:
+    """Lay the net over the wall; the narrow window is closed, the wide one is not."""
+    windows = [(side // 4, 400), (side // 2, 900)]
+    axes = [new(folder, axis, (side * side,), np.float32) for axis in "xyz"]
+    rng, count = np.random.default_rng(3), 0
+    for first in range(0, side, ROWS_AT_ONCE):
+        rows, columns = np.mgrid[first : min(first + ROWS_AT_ONCE, side), :side]
+        has_point = rng.random(rows.shape) < 0.67
+        for corner, width in windows:
+            inside = [(corner <= place) & (place < corner + width) for place in (rows, columns)]
+            has_point &= ~(inside[0] & inside[1])
+        down, right = (place[has_point] + rng.random(has_point.sum()) for place in (rows, columns))
+        part = slice(count, count + len(down))
+        depth_m = 0.01 * np.sin(right / 90.0)
+        for array, values in zip(
+            axes, (GSD_M * right, -depth_m, GSD_M * (side - down)), strict=True
+        ):
+            array[part] = values
+        count = part.stop
+    x, y, z = (axis[:count] for axis in axes)
+    cloud = PointCloud(origin=np.zeros(3), x=x, y=y, z=z, up=UP)
+    inputs = RasterGrid.In(cloud=cloud, planes=plane(side))
+    params = RasterGrid.Params(gsd_m=GSD_M, buffer_m=0.05, surface="tin", rectangle="points")
+    ctx = StepContext(rng=rng, cores=2, scratch=folder)
+    (wall,) = RasterGrid().run(inputs, params, ctx).walls.walls
+    middles = [wall.mask[corner + width // 2, corner + width // 2] for corner, width in windows]
+    expect("the window of 400 cells is closed", is_met=bool(middles[0] == SurfaceMask.RECOVERED))
+    if count > 2_000_000:
+        expect("the window of 900 cells stays open", is_met=bool(middles[1] == SurfaceMask.VOID))
+    row = wall.depth_m[side // 8]
+    apart = np.nanmax(np.abs(row - 0.01 * np.sin((np.arange(side) + 0.5) / 90.0)))
+    expect(f"depths are within 0.1 mm, not {1e3 * apart:.3f}", is_met=bool(apart < 1e-4))
+
+
+def run_surf(folder: Path, side: int) -> None:
+    """Compare the orthoimage with the intensity."""
+    image, walls = pictures(folder, side)
+    inputs = InspectSurf.In(orthoimages=Orthoimages(images=(image,)), walls=walls)
+    ctx = StepContext(rng=np.random.default_rng(1), cores=2, scratch=folder)
+    InspectSurf().run(inputs, InspectSurf.Params(), ctx)
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    expect(
+        f"more than a thousand pairs, not {metrics['n_pairs']:.0f}",
+        is_met=bool(metrics["n_pairs"] > 1000),
+    )
+    off = metrics["mean_x_mm"] - 1e3 * GSD_M * SHIFT_CELLS
+    expect(
+        f"the displacement is told within 0.05 cells, not {off:.3f}", is_met=bool(abs(off) < 0.05)
+    )
+
+
+def run_checkpoints(folder: Path, side: int) -> None:
+    """Measure points in the orthoimage."""
+    image, walls = pictures(folder, side)
+    places = np.random.default_rng(2).uniform(0.1 * side, 0.9 * side, (50, 2))
+    points = CheckPoints(
+        names=tuple(f"P{k}" for k in range(len(places))),
+        points_world=image.frame.world_from_wall(places),
+        classes=("",) * len(places),
+        wall=np.zeros(len(places), dtype=np.int32),
+        pixels_wall=places + 0.25,
+    )
+    inputs = InspectCheckpoints.In(
+        checkpoints=points, walls=walls, orthoimages=Orthoimages(images=(image,))
+    )
+    ctx = StepContext(rng=np.random.default_rng(1), cores=2, scratch=folder)
+    InspectCheckpoints().run(inputs, InspectCheckpoints.Params(), ctx)
+    metrics = {metric.name: metric.value for metric in ctx.metrics}
+    off = metrics["mean_x_mm"] - 1e3 * GSD_M * 0.25
+    expect(f"points are where they were measured, not {off:g} mm off", is_met=bool(abs(off) < 1e-6))
+
+
+def pictures(folder: Path, side: int) -> tuple[Orthoimage, Walls]:
+    """An orthoimage and the wall it is of."""
+    allocate = partial(new, folder)
+    rgb, intensity = allocate("rgb", (side, side, 3), np.uint8), allocate("intensity", (side,) * 2)
+    depth_m, count = allocate("depth", (side,) * 2), allocate("count", (side,) * 2, np.uint32)
+    mask, source = (allocate(name, (side,) * 2, kind) for name, kind in
+                    (("mask", np.uint8), ("source", np.int16)))  # fmt: skip
+    for first in range(0, side, ROWS_AT_ONCE):
+        rows = slice(first, min(first + ROWS_AT_ONCE, side))
+        down = np.arange(rows.start, rows.stop, dtype=np.float64)[:, np.newaxis]
+        right = np.arange(side, dtype=np.float64)
+        rgb[rows] = np.rint(waves(right - SHIFT_CELLS, down))[:, :, np.newaxis]
+        intensity[rows] = (waves(right, down) / 255.0) ** 2
+        mask[rows], count[rows] = 1, 1
+    wall = Wall(
+        frame=frame(side),
+        plane_index=0,
+        name="wall",
+        depth_m=depth_m,
+        sigma_m=depth_m,
+        count=count,
+        mask=mask,
+        intensity=intensity,
+    )
+    walls = Walls(
+        walls=(wall,),
+        up=UP,
+        intensity_source="laser",
+        buffer_front_m=0.1,
+        buffer_behind_m=0.1,
+    )
+    image = Orthoimage(
+        frame=wall.frame,
+        wall=0,
+        name="wall",
+        rgb=rgb,
+        mask=mask,
+        source=source,
+        sources=("photo",),
+    )
+    return image, walls
+
+
+def waves(right: NDArray[np.float64], down: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Grey levels that repeat nowhere: waves of many lengths and directions."""
+    rng = np.random.default_rng(11)
+    total = np.zeros(np.broadcast_shapes(right.shape, down.shape))
+    for length in np.geomspace(6.0, 60.0, 14):
+        turn, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+        total += np.sin((right * np.cos(turn) + down * np.sin(turn)) * 2 * np.pi / length + phase)
+    return np.clip(128.0 + 30.0 * total, 0.0, 255.0)
+
+
+def new(folder: Path, name: str, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray:
+    """A zeroed array in a file."""
+    return np.memmap(folder / name, dtype=dtype, mode="w+", shape=shape).view(np.ndarray)
+
+
+def frame(side: int) -> WallFrame:
+    """A wall that faces -y, its lower left corner at the origin."""
+    return WallFrame(
+        origin_world=np.array([0.0, 0.0, GSD_M * side]),
+        u_world=np.array([1.0, 0.0, 0.0]),
+        v_world=-UP,
+        normal_world=np.array([0.0, -1.0, 0.0]),
+        gsd_m=GSD_M,
+        width=side,
+        height=side,
+    )
+
+
+def plane(side: int) -> Planes:
+    """The plane of the wall."""
+    return Planes(
+        normal=np.array([[0.0, -1.0, 0.0]]),
+        offset=np.zeros(1),
+        covariance=np.zeros((1, 4, 4)),
+        corners=frame(side).corners_world()[np.newaxis],
+        n_points=np.array([1]),
+        rms_m=np.zeros(1),
+        names=("wall",),
+        up=UP,
+    )
+
+
+def expect(what: str, *, is_met: bool) -> None:
+    """End where a number is not what it should be."""
+    if not is_met:
+        sys.exit(f"not met: {what}")
+
+
+if __name__ == "__main__":
+    main()
