@@ -3,15 +3,17 @@
     python tests/forked_commands.py
 
 Loading takes most of the time of many a command. Reads orders from stdin, a JSON object per line:
-`arguments`, `folder`, `environment` and `streams`, two files for what is written to stdout and
-stderr; answers each with the exit code. A command has its import path, its surroundings and its end
-as `python -m orthoflow` has them; only what the interpreter reads from the environment when it
-starts is as it was when the first command was asked for.
+`arguments`, `folder`, `environment`, `streams`, two files for what is written to stdout and stderr,
+and `forgone`, numbers of rights of root that it gives up; answers each with the exit code. A
+command has its import path, its surroundings and its end as `python -m orthoflow` has them; only
+what the interpreter reads from the environment when it starts is as it was when the first command
+was asked for.
 """
 
 from __future__ import annotations
 
 import atexit
+import ctypes
 import json
 import os
 import select
@@ -21,7 +23,10 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, ClassVar, Final
+
+_PR_CAPBSET_DROP: Final = 24
+_CAPABILITY_VERSION_3: Final = 0x20080522
 
 
 def run_command(
@@ -29,8 +34,10 @@ def run_command(
     arguments: Sequence[object],
     environment: Mapping[str, str],
     timeout_s: float = 300,
+    *,
+    forgone: Sequence[int] = (),
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command in a folder and wait for its end.
+    """Run a command in a folder, without some of the rights of root, and wait for its end.
 
     Raises:
         TimeoutExpired: it has not ended; it is killed with the process that it came from.
@@ -43,6 +50,7 @@ def run_command(
             "folder": str(folder),
             "environment": dict(environment),
             "streams": [*map(str, streams)],
+            "forgone": [*forgone],
         }
         server = _server(environment.get("PYTHONPATH", ""))
         assert server.stdin is not None
@@ -99,12 +107,35 @@ def _become(order: dict[str, Any]) -> None:
     for descriptor, replaced in ((nothing, 0), (out, 1), (err, 2)):
         os.dup2(descriptor, replaced)
         os.close(descriptor)
+    if order["forgone"]:
+        _forgo(order["forgone"])
     os.environ.clear()
     os.environ.update(order["environment"])
     os.chdir(order["folder"])
     sys.path[0] = str(Path.cwd())
     sys.path_importer_cache.clear()
     sys.argv[:] = ["orthoflow", *order["arguments"]]
+
+
+class _Process(ctypes.Structure):
+    _fields_: ClassVar = [("version", ctypes.c_uint32), ("process", ctypes.c_int)]
+
+
+class _Rights(ctypes.Structure):
+    _fields_: ClassVar = [(name, ctypes.c_uint32) for name in ("used", "allowed", "inherited")]
+
+
+def _forgo(rights: Sequence[int]) -> None:
+    """Give up rights of root (capabilities below 32) here and in all that this process starts."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    for right in rights:
+        libc.prctl(_PR_CAPBSET_DROP, right, 0, 0, 0)
+    who, held = _Process(_CAPABILITY_VERSION_3, 0), (_Rights * 2)()
+    assert libc.capget(ctypes.byref(who), held) == 0
+    left = ~sum(1 << right for right in rights)
+    held[0].used &= left
+    held[0].allowed &= left
+    assert libc.capset(ctypes.byref(who), held) == 0
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ import pytest
 
 from orthoflow.records import open_run, verify_run
 from tests.engine_world import install_toys, toy_world
+from tests.forked_commands import run_command
 from tests.killed_runs import ROOT, run_here
 from tests.stored_runs import WORKFLOW
 
@@ -42,7 +43,7 @@ class Desk:
         before: Callable[[], object] = lambda: None,
     ) -> tuple[int, str]:
         """Run a command as a user without the rights of root; exit code, and what it said."""
-        changed = {**os.environ, "PYTHONPATH": self.python_path, **(environment or {})}
+        changed = self._variables(environment)
 
         def prepare() -> None:
             for capability in _RIGHTS_OF_ROOT:
@@ -52,7 +53,7 @@ class Desk:
         done = subprocess.run(
             [sys.executable, "-m", "orthoflow", *arguments],
             cwd=self.folder,
-            env={name: value for name, value in changed.items() if value is not None},
+            env=changed,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -61,6 +62,18 @@ class Desk:
             preexec_fn=prepare,
         )
         return done.returncode, done.stderr
+
+    def forked(
+        self, *arguments: str, environment: Mapping[str, str | None] | None = None
+    ) -> tuple[int, str]:
+        """Run a command so, where nothing is asked of how it loads: forked from one that has."""
+        changed = self._variables(environment)
+        done = run_command(self.folder, arguments, changed, forgone=_RIGHTS_OF_ROOT)
+        return done.returncode, done.stderr
+
+    def _variables(self, changed: Mapping[str, str | None] | None) -> dict[str, str]:
+        variables = {**os.environ, "PYTHONPATH": self.python_path, **(changed or {})}
+        return {name: value for name, value in variables.items() if value is not None}
 
     @property
     def python_path(self) -> str:
@@ -145,7 +158,7 @@ def test_a_folder_may_have_any_name_of_any_length(tmp_path: Path) -> None:
         ("cache", "verify"),
         ("cache", "gc"),
     ):
-        code, said = desk(*command, environment={"HOME": str(desk.folder)})
+        code, said = desk.forked(*command, environment={"HOME": str(desk.folder)})
         assert code == 0, said
     check_finished(desk, "again")
 
@@ -168,7 +181,7 @@ def test_what_may_only_be_read_is_read_and_nothing_else(used_desk: Desk) -> None
         ("plan", "toy.yaml"),
         ("cache", "list"),
     ):
-        code, said = desk(*command)
+        code, said = desk.forked(*command)
         assert code == 0, said
     for command in (
         ("run", "toy.yaml", "-o", "second"),
@@ -178,7 +191,7 @@ def test_what_may_only_be_read_is_read_and_nothing_else(used_desk: Desk) -> None
         ("cache", "gc"),
         ("cache", "verify"),
     ):
-        code, said = desk(*command)
+        code, said = desk.forked(*command)
         # 2: where an export goes is an argument.
         assert code in (1, 2), (command, said)
         check_sentence(said, "ermission")
@@ -195,7 +208,7 @@ def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
     for path in (store, *store.rglob("*")):
         os.chown(path, NOBODY, NOBODY)
         path.chmod(0o777 if is_open else 0o755 if path.is_dir() else 0o644)
-    code, said = desk.run("second")
+    code, said = desk.forked("run", "toy.yaml", "-o", "second")
     if is_open:
         assert code == 0, said
         assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
@@ -203,7 +216,7 @@ def test_the_store_of_another_user_serves_as_far_as_it_may_be_written(
     else:
         assert code == 1, said
         check_sentence(said, "permission is denied; choose another folder")
-    assert desk("cache", "gc")[0] == (0 if is_open else 1)
+    assert desk.forked("cache", "gc")[0] == (0 if is_open else 1)
 
 
 # What a machine has too little of -----------------------------------------------------------------
@@ -256,8 +269,8 @@ def test_files_from_the_future_are_taken_as_any_others(used_desk: Desk) -> None:
     assert code == 0, said
     assert all(cell.cached_from for cell in open_run(desk.folder / "second").cells.values())
     for command in (("cache", "verify"), ("cache", "list"), ("cache", "gc", "--older-than", "1")):
-        assert desk(*command)[0] == 0
-    assert desk.run("third")[0] == 0
+        assert desk.forked(*command)[0] == 0
+    assert desk.forked("run", "toy.yaml", "-o", "third")[0] == 0
     assert all(cell.cached_from for cell in open_run(desk.folder / "third").cells.values())
 
 
