@@ -57,7 +57,8 @@ def read_ahead(
         "columns": None if columns is None else asdict(columns),
     }
     slot_bytes = _POINT_BYTES * BLOCK_POINTS + _BLOCK_BYTES
-    with closing(Decoder(_WORKER, [json.dumps(told)], slot_bytes=slot_bytes)) as decoder:
+    order = json.dumps(told)
+    with closing(Decoder(_WORKER, (), slot_bytes=slot_bytes, order=order)) as decoder:
         yield [
             replace(file, read=partial(_blocks, decoder, file)) if k in others else file
             for k, file in enumerate(files)

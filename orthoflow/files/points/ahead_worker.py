@@ -1,4 +1,7 @@
-"""Run as a program: reads point files, one block for each line of input, into shared memory."""
+"""Run as a program: reads point files, one block for each line of input, into shared memory.
+
+The first line says which.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ def main() -> None:
     # What libraries print must not come between the lines.
     lines = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    shared, slot_bytes, told = int(sys.argv[1]), int(sys.argv[2]), json.loads(sys.argv[3])
+    shared, slot_bytes, told = int(sys.argv[1]), int(sys.argv[2]), json.loads(sys.stdin.readline())
     memory = memoryview(mmap.mmap(shared, 0))
     slots = [memory[k : k + slot_bytes] for k in range(0, len(memory), slot_bytes)]
     columns = None

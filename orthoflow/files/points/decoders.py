@@ -27,8 +27,17 @@ class Decoder:
     decodes a block for each line of its input, and says so in a line.
     """
 
-    def __init__(self, worker: Path, told: Sequence[str], *, slot_bytes: int) -> None:
-        """Start it; it may decode as many blocks at once as there are slots."""
+    def __init__(
+        self, worker: Path, told: Sequence[str], *, slot_bytes: int, order: str | None = None
+    ) -> None:
+        """Start it; it may decode as many blocks at once as there are slots.
+
+        Args:
+            worker: the program.
+            told: its further arguments.
+            slot_bytes: of the largest block.
+            order: first line of its input, where that is too long for an argument.
+        """
         shared = os.memfd_create("points")
         try:
             os.ftruncate(shared, _SLOTS * slot_bytes)
@@ -46,15 +55,21 @@ class Decoder:
             os.close(shared)
         self._slot_bytes = slot_bytes
         self._slot = 0
+        if order is not None:
+            self._write(order.encode() + b"\n")
         for _ in range(_SLOTS):
             self.allow()
 
     def allow(self) -> None:
         """Let it decode one more block, since the oldest one is done with."""
+        self._write(b"\n")
+
+    def _write(self, text: bytes) -> None:
         assert self._process.stdin is not None  # noqa: S101 - of a pipe that was asked for
         # Where it has ended, the next line says why.
         with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(b"\n")
+            while text:
+                text = text[self._process.stdin.write(text) :]
 
     def line(self) -> str:
         """Wait for what it says next; empty when it has ended."""

@@ -106,6 +106,18 @@ def test_what_is_refused_is_refused_in_the_same_words(tmp_path: Path) -> None:
     assert str(found.value) == str(plain.value)
 
 
+def test_names_of_many_files_may_be_longer_than_an_argument(tmp_path: Path) -> None:
+    folder = tmp_path / ("a" * 200) / ("b" * 200)
+    folder.mkdir(parents=True)
+    paths = [ply(folder / "0.ply", 3)]
+    for k in range(1, 300):
+        paths.append(folder / f"{k}.ply")
+        paths[k].hardlink_to(paths[0])
+    assert sum(len(str(path)) for path in paths) > 1 << 17
+    with read_ahead([open_scan(paths[0])] * len(paths), paths, None, cores=2) as read:
+        assert sum(len(block["points"]) for file in read for block in blocks_of(file)) == 900
+
+
 def test_a_reader_that_dies_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     worker = tmp_path / "worker.py"
     worker.write_text("import os\nos.abort()\n")
