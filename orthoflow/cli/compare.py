@@ -40,7 +40,9 @@ def compare(first: Path, second: Path, store: Path, *, as_json: bool) -> int:
 
     Says in what their inputs, workflows, parameters, versions and environments differ, and how
     far their metrics and products lie apart. A parameter with * was set, others are defaults.
-    Cells are the same when their addresses are. --json has also what is equal.
+    Cells are the same when their addresses are, or else when each step that varies on their way
+    has one method with the same parameters; what only one run has is counted apart. --json has
+    also what is equal.
     """
     from orthoflow.engine import Store
     from orthoflow.records import compare_runs, open_run
@@ -75,6 +77,7 @@ def comparison_json(comparison: RunComparison) -> dict[str, object]:
             name: [_row_json(row) for row in getattr(comparison, name)]
             for name in ("inputs", "cells", "parameters", "environment", "metrics")
         },
+        "readdressed": dict(comparison.readdressed),
         "products": [dataclasses.asdict(distance) for distance in comparison.products],
     }
 
@@ -99,9 +102,15 @@ def _print(comparison: RunComparison) -> None:
         echo("", "workflow: same text")
     _print_pairs("options", [comparison.overrides], " ".join)
     _print_pairs("cells", comparison.cells, str)
-    _print_pairs("parameters (* set, others are defaults)", comparison.parameters, _parameter_text)
+    for theirs, ours in comparison.readdressed.items():
+        echo(f"the same, though called otherwise: {ours} (A), {theirs} (B)")
+    _print_pairs(
+        "parameters (* set, others are defaults)",
+        comparison.shared(comparison.parameters),
+        _parameter_text,
+    )
     _print_pairs("environment", comparison.environment, str)
-    _print_metrics(comparison.metrics)
+    _print_metrics(comparison.shared(comparison.metrics))
     echo("", "products")
     echo_distances(comparison.products)
 
@@ -112,7 +121,15 @@ def _print_pairs(title: str, rows: Sequence[Pair[Value]], text: Callable[[Value]
     if not different:
         echo("", f"{title}: same")
         return
-    echo("", f"{title}: {len(different)} of {len(rows)} differ")
+    shared = [row for row in rows if row.is_shared]
+    alone = (
+        (sum(row.right is None for row in rows), "only in A"),
+        (sum(row.left is None for row in rows), "only in B"),
+    )
+    n_different = sum(not row.is_same for row in shared)
+    counts = [f"{n_different} of {len(shared)} differ"] if shared else []
+    counts += [f"{n} {where}" for n, where in alone if n]
+    echo("", f"{title}: {', '.join(counts)}")
     echo_table(
         ("", "A", "B"),
         [

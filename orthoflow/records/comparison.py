@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 import numpy as np
 from orthoflow_provenance.compare import ArrayDifference, measure_payloads
-from orthoflow_provenance.digests import payload_digest
-from orthoflow_provenance.model import COSTS, RecordedCell, RecordedFile, RunRecord
+from orthoflow_provenance.digests import canonical_json, payload_digest
+from orthoflow_provenance.model import (
+    COSTS,
+    RecordedCell,
+    RecordedFile,
+    RecordedProduct,
+    RunRecord,
+)
 
 from orthoflow.engine.keys import read_preimage, stated_versions
 from orthoflow.errors import OrthoflowError
@@ -19,6 +25,7 @@ from orthoflow.geometry.levels import DEEPER
 from orthoflow.products.product import JsonValue, Payload, Product, Tolerance
 from orthoflow.records.metrics import cell_metrics
 from orthoflow.records.runs import Run
+from orthoflow.workflow.format import DATA
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,6 +57,11 @@ class Pair(Generic[Side]):
     def is_same(self) -> bool:
         """Whether both say the same."""
         return self.left == self.right
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether both say anything."""
+        return self.left is not None and self.right is not None
 
     @property
     def either(self) -> Side:
@@ -141,8 +153,11 @@ class RunComparison:
         workflow: the first text against the second as a unified diff; empty when equal.
         overrides: options that changed the workflow.
         inputs: files of every input, without folders.
-        cells: method, version, seed and status of every cell.
-        parameters: resolved parameters of every cell that is in both runs.
+        cells: method, version, seed and status of every cell, named as in the first run that has
+            it.
+        readdressed: address in the second run -> that of the same cell in the first, where the two
+            differ: a step alone, say, and a variant that sets what its defaults are.
+        parameters: resolved parameters of every cell.
         environment: Python, system, processor and packages; several values are joined by commas.
         metrics: numbers of every cell.
         products: distance of every product of the cells that are in both runs.
@@ -154,6 +169,7 @@ class RunComparison:
     overrides: Pair[tuple[str, ...]]
     inputs: tuple[Pair[tuple[RecordedFile, ...]], ...]
     cells: tuple[Pair[CellFacts], ...]
+    readdressed: Mapping[str, str] = field(default_factory=dict)
     parameters: tuple[Pair[ParameterValue], ...]
     environment: tuple[Pair[str], ...]
     metrics: tuple[Pair[ComparedMetric], ...]
@@ -164,14 +180,21 @@ class RunComparison:
             f"{sum(not row.is_same for row in rows)} of {len(rows)} {name}"
             for name, rows in (
                 ("inputs", self.inputs),
-                ("parameters", self.parameters),
-                ("metrics", self.metrics),
+                ("parameters", self.shared(self.parameters)),
+                ("metrics", self.shared(self.metrics)),
             )
         ]
         n_products = sum(item.verdict == "different" for item in self.products)
         differing.append(f"{n_products} of {len(self.products)} products")
         runs = f"{self.left.run_id!r} and {self.right.run_id!r}"
-        return f"<RunComparison of {runs}: {', '.join(differing)} differ>"
+        n_alone = sum(not row.is_shared for row in self.cells)
+        alone = f"; {n_alone} cells in one of them only" if n_alone else ""
+        return f"<RunComparison of {runs}: {', '.join(differing)} differ{alone}>"
+
+    def shared(self, rows: Sequence[Pair[Side]]) -> tuple[Pair[Side], ...]:
+        """Leave out what belongs to cells that only one of the runs has: it cannot differ."""
+        alone = {row.cell for row in self.cells if not row.is_shared}
+        return tuple(row for row in rows if row.cell not in alone)
 
     def metric_table(self) -> pd.DataFrame:
         """Lay every number of both runs side by side.
@@ -193,7 +216,10 @@ class RunComparison:
 
 
 def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunComparison:
-    """Lay two runs side by side; cells are the same when their addresses are.
+    """Lay two runs side by side.
+
+    Cells are the same when their addresses are; else when they are of one step and dataset, and
+    each step that varies on their way has one method with the same parameters.
 
     Args:
         left: the first run.
@@ -205,7 +231,10 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
     """
     from orthoflow.catalog import discover_catalog  # noqa: PLC0415 - loads plugins
 
-    both = [address for address in left.cells if address in right.cells]
+    readdressed = _readdressed(left, right)
+    # How the second run's cells are called here -> how the run itself calls them.
+    own = {readdressed.get(address, address): address for address in right.cells}
+    both = [address for address in left.cells if address in own]
     sides = (left.record, right.record)
     return RunComparison(
         left=left.record,
@@ -213,13 +242,14 @@ def compare_runs(left: Run, right: Run, *, stores: Sequence[Store] = ()) -> RunC
         workflow=_text_differences(left.record, right.record),
         overrides=Pair(name="overrides", left=left.record.overrides, right=right.record.overrides),
         inputs=_pairs("", *({entry.name: entry.files for entry in side.inputs} for side in sides)),
-        cells=_per_cell(left, right, lambda cell: {cell.step: _facts(cell)}),
-        parameters=_per_cell(left, right, _parameters),
+        cells=_per_cell(left, right, own, lambda cell: {cell.step: _facts(cell)}),
+        readdressed=readdressed,
+        parameters=_per_cell(left, right, own, _parameters),
         environment=_pairs("", *(_environment(side) for side in sides)),
-        metrics=_per_cell(left, right, _metrics),
+        metrics=_per_cell(left, right, own, _metrics),
         products=product_distances(
             RunProducts(run=left, stores=tuple(stores)),
-            RunProducts(run=right, stores=tuple(stores)),
+            RunProducts(run=right, stores=tuple(stores), own=own),
             both,
             discover_catalog(),
         ),
@@ -236,15 +266,53 @@ def _pairs(
 
 
 def _per_cell(
-    left: Run, right: Run, values: Callable[[RecordedCell], Mapping[str, Side]]
+    left: Run,
+    right: Run,
+    own: Mapping[str, str],
+    values: Callable[[RecordedCell], Mapping[str, Side]],
 ) -> tuple[Pair[Side], ...]:
     found: list[Pair[Side]] = []
-    for address in dict.fromkeys((*left.cells, *right.cells)):
-        sides = [
-            values(run.cells[address]) if address in run.cells else {} for run in (left, right)
-        ]
+    for address in dict.fromkeys((*left.cells, *own)):
+        ours, theirs = left.cells.get(address), right.cells.get(own.get(address, address))
+        sides = [{} if cell is None else values(cell) for cell in (ours, theirs)]
         found += _pairs(address, *sides)
     return tuple(found)
+
+
+def _readdressed(left: Run, right: Run) -> dict[str, str]:
+    """Find cells of the second run that the first has under another address."""
+    varied = {
+        step for run in (left, right) for cell in run.cells.values() for step in cell.assignment
+    }
+    free: dict[tuple[object, ...], list[str]] = {}
+    for address, cell in left.cells.items():
+        if address not in right.cells and cell.status != "skipped":
+            free.setdefault(_way(left, cell, varied), []).append(address)
+    found: dict[str, str] = {}
+    for address, cell in right.cells.items():
+        # What was skipped has no inputs, so that nobody knows what it would have come from.
+        if address not in left.cells and cell.status != "skipped":
+            same = free.get(_way(right, cell, varied))
+            if same:
+                found[address] = same.pop(0)
+    return found
+
+
+def _way(run: Run, cell: RecordedCell, varied: Collection[str]) -> tuple[object, ...]:
+    """Say what a cell stands for without the names of its variants.
+
+    Args:
+        run: that it belongs to.
+        cell: the cell.
+        varied: steps that vary in either run; they count with what they call, as a step without
+            variants is the one variant that it has.
+    """
+    called = {
+        one.step: (one.method, canonical_json(dict(one.params)))
+        for one in run.upstream(cell.address)
+        if one.step in varied
+    }
+    return cell.step, cell.repeat, cell.assignment.get(DATA), tuple(sorted(called.items()))
 
 
 def _text_differences(left: RunRecord, right: RunRecord) -> tuple[str, ...]:
@@ -361,20 +429,26 @@ class RunProducts:
     Attributes:
         run: the run.
         stores: where arrays may lie that the record names by digest only.
+        own: address by which a cell is asked for -> its own one, where the two differ.
     """
 
     run: Run
     stores: tuple[Store, ...] = ()
+    own: Mapping[str, str] = field(default_factory=dict)
+
+    def outputs(self, address: str) -> Mapping[str, RecordedProduct]:
+        """Outputs of a cell by port; empty where the run has no such cell."""
+        cell = self.run.cells.get(self.own.get(address, address))
+        return {} if cell is None else cell.outputs
 
     def digest(self, address: str, port: str) -> str:
         """Digest of an output, empty when the run has no such output."""
-        cell = self.run.cells.get(address)
-        output = None if cell is None else cell.outputs.get(port)
+        output = self.outputs(address).get(port)
         return "" if output is None else output.digest
 
     def encoding_version(self, address: str, port: str) -> int:
         """Version of the encoding in which an output was written."""
-        return self.run.cells[address].outputs[port].encoding_version
+        return self.outputs(address)[port].encoding_version
 
     def payload(self, address: str, port: str, cls: type[Product]) -> Payload | None:
         """Arrays and metadata of an output as the present encoding has them.
@@ -384,9 +458,9 @@ class RunProducts:
         Raises:
             ProductError: the output is of a newer encoding than the installed type.
         """
-        output = self.run.cells[address].outputs[port]
+        output = self.outputs(address)[port]
         if output.embedded:
-            payload = self.run.payload(address, port)
+            payload = self.run.payload(self.own.get(address, address), port)
             if payload.encoding_version == cls.encoding_version:
                 return payload
             return cls.from_payload(payload).to_payload()
@@ -409,7 +483,7 @@ def product_distances(
     """
     found = []
     for address in addresses:
-        ours, theirs = left.run.cells[address].outputs, right.run.cells[address].outputs
+        ours, theirs = left.outputs(address), right.outputs(address)
         for port in dict.fromkeys((*ours, *theirs)):
             type_name = (ours.get(port) or theirs[port]).type_name
             found.append(_distance(left, right, (address, port, type_name), catalog))

@@ -39,13 +39,15 @@ class DifferenceTable:
 
     Attributes:
         title: what kind.
-        n_compared: how many things were compared.
+        n_compared: how many things both runs have.
         rows: those that differ.
+        n_alone: how many of the rows only one run has.
     """
 
     title: str
     n_compared: int
     rows: tuple[Difference, ...]
+    n_alone: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +89,9 @@ def differences(comparison: RunComparison) -> Differences:
             _table("Inputs", comparison.inputs, _files_text),
             _table("Options", [comparison.overrides], " ".join),
             _table("Steps", comparison.cells, str),
-            _table("Parameters", comparison.parameters, _parameter_text),
+            _table("Parameters", comparison.shared(comparison.parameters), _parameter_text),
             _table("Environment", comparison.environment, str),
-            _metric_table(comparison.metrics),
+            _metric_table(comparison.shared(comparison.metrics)),
         ),
         products=tuple(
             sorted(
@@ -103,7 +105,8 @@ def differences(comparison: RunComparison) -> Differences:
 def _table(title: str, pairs: Sequence[Pair[Side]], text: Callable[[Side], str]) -> DifferenceTable:
     return DifferenceTable(
         title=title,
-        n_compared=len(pairs),
+        n_compared=sum(pair.is_shared for pair in pairs),
+        n_alone=sum(not pair.is_shared for pair in pairs),
         rows=tuple(
             Difference(
                 cell=pair.cell,

@@ -69,6 +69,28 @@ def test_a_set_parameter_is_told_from_a_default(studio: Studio) -> None:
     assert "--set paint.grey=131" in shown
 
 
+def test_a_plain_run_is_compared_with_the_variant_that_does_the_same(studio: Studio) -> None:
+    text = (studio.folder / "studio.yaml").read_text()
+    swept = "{use: paint.plain, params: {grey: {sweep: [100, 128, 140]}},"
+    (studio.folder / "swept.yaml").write_text(text.replace("{use: paint.plain,", swept))
+    done = studio("run", "swept.yaml", "-o", "swept")
+    assert done.exit_code == 0, done.output
+    plain, variants = open_run("first"), open_run("swept")
+    told = compare_runs(plain, variants)
+    assert told.readdressed == {"paint@paint=grey-128": "paint"}
+    # Products are read under the name that each run gives them.
+    assert [(item.cell, item.verdict) for item in told.products] == [
+        ("survey", "identical"),
+        ("paint", "identical"),
+    ]
+    assert {row.cell for row in told.shared(told.parameters)} == {"survey", "paint"}
+    assert repr(told).endswith("differ; 2 cells in one of them only>")
+    shown = studio("compare", "first", "swept").stdout
+    assert "cells: 0 of 2 differ, 2 only in B" in shown
+    assert "the same, though called otherwise: paint (A), paint@paint=grey-128 (B)" in shown
+    assert compare_runs(variants, plain).readdressed == {"paint": "paint@paint=grey-128"}
+
+
 def test_distances_are_told_in_the_units_of_the_type(studio: Studio) -> None:
     survey, paint = verdicts(studio, "near")
     assert survey[:2] == ("survey", "within tolerance")

@@ -19,7 +19,7 @@ def test_only_what_differs_has_a_row_and_everything_is_counted() -> None:
         Pair(cell="c", name="x", left=3, right=None),
     ]
     table = differences._table("Things", pairs, str)
-    assert (table.title, table.n_compared) == ("Things", 4)
+    assert (table.title, table.n_compared, table.n_alone) == ("Things", 2, 2)
     assert table.rows == (
         Difference(cell="a", name="y", left="1", right="2"),
         Difference(cell="b", name="x", left="-", right="2"),

@@ -335,7 +335,7 @@ def test_all_that_differs_between_two_runs_is_told() -> None:
         ("Options", 1),
         ("Steps", 1),
         ("Parameters", 1),
-        ("Environment", 2),
+        ("Environment", 1),
         ("Metrics, time and memory left aside", 4),
     ]
     named = "a.e57 0123456789ab"
