@@ -147,6 +147,17 @@ def test_cells_beside_a_step_are_left_out_of_what_is_compared(
     assert left_out[10:].sum() == (60 if is_left_out else 0)
 
 
+@pytest.mark.parametrize(("every", "is_kept"), [(8, True), (40, False)], ids=["carved", "panels"])
+def test_where_steps_are_everywhere_they_are_compared(every: int, is_kept: bool) -> None:
+    columns = np.broadcast_to(np.arange(160), (140, 160))
+    depth_m = np.where(columns // every % 2 == 0, 0.03, 0.0).astype(np.float32)
+    made = wall(np.full(depth_m.shape, 3, dtype=np.uint32), depth_m)
+    made.sigma_m[:] = 0.001
+    grey = channels.target_of(made).grey
+    assert grey is not None
+    assert np.isnan(grey).sum() == (0 if is_kept else 140 * 2 * 3)
+
+
 def test_slopes_are_no_steps() -> None:
     depth_m = np.broadcast_to(0.03 * np.arange(40, dtype=np.float32), (30, 40)).copy()
     made = wall(np.full((30, 40), 3, dtype=np.uint32), depth_m)
