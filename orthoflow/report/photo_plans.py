@@ -26,6 +26,8 @@ _LEVEL: Final = 1.0 - 1e-6
 _LOOK_SHARE: Final = 0.045  # length of a viewing direction, of the drawing
 _NAMES_MOST: Final = 60  # of more photos only the dots are drawn
 _NAME_SIZE: Final = (120.0, 18.0)  # of a photo's name; one that would lie on another is left out
+_WALL_NAME_SIZE: Final = (70.0, 18.0)  # one that would lie on another stands below it
+_LETTER: Final = 9.5  # width of one, at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +135,8 @@ class _Plan:
     def drawn(self, oriented: Sequence[Camera], walls: Sequence[tuple[str, WallFrame]]) -> str:
         """Draw all of it."""
         width, height = self.size
-        parts = [part for name, frame in walls for part in self._wall(name, frame)]
+        names: list[NDArray[np.float64]] = []
+        parts = [part for name, frame in walls for part in self._wall(name, frame, names)]
         taken: list[NDArray[np.float64]] = []
         for one in oriented:
             foot = self.at(_centre(one)[None])[0]
@@ -152,15 +155,20 @@ class _Plan:
             f'of {len(oriented)} photos and {len(walls)} walls">{"".join(parts)}</svg>'
         )
 
-    def _wall(self, name: str, frame: WallFrame) -> list[str]:
+    def _wall(self, name: str, frame: WallFrame, taken: list[NDArray[np.float64]]) -> list[str]:
         ring = self.at(np.asarray(frame.corners_world(), dtype=np.float64))
         line = "L".join(f"{x:.1f} {y:.1f}" for x, y in ring.tolist())
         # The bottom of the picture, as the viewer has it before himself.
-        x, y = (0.5 * (ring[1] + ring[2])).tolist()
+        at = 0.5 * (ring[1] + ring[2]) - [0.0, 8.0]
+        # Walls back to back have one place: the second name stands below the first.
+        while any(np.all(np.abs(at - other) < _WALL_NAME_SIZE) for other in taken):
+            at = at + np.array([0.0, _WALL_NAME_SIZE[1]])
+        taken.append(at)
+        x, y = at.tolist()
         return [
             f'<path class="wall" d="M{line}Z"/>',
             (
-                f'<text class="wall-name" x="{x:.1f}" y="{y - 8:.1f}" text-anchor="middle">'
+                f'<text class="wall-name" x="{x:.1f}" y="{y:.1f}" text-anchor="middle">'
                 f"{escape(shown(name))}</text>"
             ),
         ]
@@ -178,9 +186,11 @@ class _Plan:
             )
         ]
         if with_name:
+            is_cut = foot[0] + 9 + _LETTER * len(camera.photo) > self.size[0]
+            x, end = (foot[0] - 9, ' text-anchor="end"') if is_cut else (foot[0] + 9, "")
             parts.append(
-                f'<text x="{foot[0] + 9:.1f}" y="{foot[1] + 17:.1f}">{escape(shown(camera.photo))}'
-                "</text>"
+                f'<text x="{x:.1f}" y="{foot[1] + 17:.1f}"{end}>'
+                f"{escape(shown(camera.photo))}</text>"
             )
         return parts
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -45,7 +46,7 @@ class PlaneTable:
 
     Attributes:
         cell: address of the cell.
-        viewpoint: where the side of the viewer comes from.
+        viewpoint: where the side of the viewer comes from, in words.
         rows: a row per plane.
         materials: thickness by place and material.
         later: cells that hand the same planes on.
@@ -75,10 +76,18 @@ def _told(run: Run) -> Iterator[PlaneTable]:
         planes = Planes.from_payload(payload)
         yield PlaneTable(
             cell=address,
-            viewpoint=planes.viewpoint,
+            viewpoint=_viewpoint(planes),
             rows=tuple(_plane_row(planes, index) for index in range(len(planes))),
             materials=tuple(_material_rows(planes)),
         )
+
+
+def _viewpoint(planes: Planes) -> str:
+    """Say where the sides come from, and of how many planes each where they differ."""
+    counts = Counter(planes.side_source(index) for index in range(len(planes)))
+    if not planes.side_from or len(counts) < 2:
+        return planes.side_source(0) if planes.side_from else planes.viewpoint.replace("_", " ")
+    return ", ".join(f"{source} ({count})" for source, count in counts.items())
 
 
 def _plane_row(planes: Planes, index: int) -> PlaneRow:

@@ -148,6 +148,21 @@ def test_walls_and_photos_lie_as_on_a_map() -> None:
     np.testing.assert_allclose(ways_of / lengths[0], [[0.0, -1.0], [-0.6, -0.8]], atol=0.005)
 
 
+def test_names_of_walls_back_to_back_stand_below_each_other_and_none_is_cut() -> None:
+    twice = [WALLS[0], ("twin", WALLS[0][1])]
+    svg = module._Plan.of(UP, PHOTOS, [frame for _, frame in WALLS]).drawn(PHOTOS, twice)
+    first, second = pairs(r'class="wall-name" x="([\d.]+)" y="([\d.]+)"', svg)
+    assert second[1] - first[1] >= 18.0
+    assert second[0] == first[0]
+    # The eastmost photo stands at the margin, where its name has no room to the right.
+    east = standing("DSC_0000.jpg", 109.0, 197.0, (1.0, 0.0))
+    svg = module._Plan.of(UP, [east, *PHOTOS], []).drawn([east, *PHOTOS], [])
+    [(x, anchor)] = re.findall(r'<text x="([\d.]+)" y="[\d.]+"([^>]*)>DSC_0000', svg)
+    [width] = re.findall(r'viewBox="0 0 (\d+)', svg)
+    assert anchor == (' text-anchor="end"' if float(x) + 100.0 > float(width) else "")
+    assert 'text-anchor="end"' in anchor
+
+
 def test_a_bar_is_as_long_as_it_says_and_at_most_a_quarter() -> None:
     plan = module._Plan.of(UP, PHOTOS, [frame for _, frame in WALLS])
     svg = plan.drawn(PHOTOS, WALLS)

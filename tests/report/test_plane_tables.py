@@ -77,10 +77,16 @@ def test_planes_that_a_later_step_hands_on_stand_there_once() -> None:
         for name, digest in zip(seen, "abcd", strict=True)
     ]
     products = {(name, "planes"): product for name, product in seen.items()}
+    # Sides that photos found one by one: a table said `guess`, as the planes began.
+    products["mixed", "planes"] = replace(
+        planes, viewpoint="guess", side_from=("photos", *["guess"] * (len(planes) - 1))
+    )
+    cells.append(cell("mixed", outputs={"planes": given("", "e", "planes")}))
     tables = plane_tables(HeldRun(path=Path("run.h5"), record=record(cells), products=products))
     told = [(table.cell, table.later, table.viewpoint) for table in tables]
     assert told == [
         ("plane", ("sides",), "stations"),
         ("turned", (), "photos"),
         ("moved", (), "stations"),
+        ("mixed", (), "photos (1), guess (1)"),
     ]

@@ -278,12 +278,12 @@
       return { wall: place.wall, of: place.name, u, v, depth, world };
     };
     const words = (point) => `u ${point.u.toFixed(1)} px, v ${point.v.toFixed(1)} px, depth ${
-      Number.isNaN(point.depth) ? "unknown (the plane is taken)" : `${point.depth.toFixed(3)} m`}, x ${
-      point.world.map((value) => value.toFixed(3)).join(", ")} m`;
-    const field = (label, size, list) => {
+      Number.isNaN(point.depth) ? "unknown (the plane is taken)" : `${point.depth.toFixed(3)} m`}, ${
+      point.world.map((value, axis) => `${"xyz"[axis]} ${value.toFixed(3)}`).join(", ")} m`;
+    const field = (label, size, hint, list) => {
       const input = document.createElement("input");
       input.setAttribute("aria-label", label);
-      input.placeholder = label;
+      input.placeholder = hint;
       input.size = size;
       if (list) input.setAttribute("list", list);
       return input;
@@ -295,10 +295,10 @@
     const collect = (point) => {
       const row = document.createElement("div");
       const number = 1 + Math.max(0, ...points.map((other) => other.number));
-      const name = field(`name of point ${number}`, 8);
+      const name = field(`name of point ${number}`, 8, "name");
       name.value = `P${number}`;
-      const entry = { ...point, number, name, photo: field(`photo of point ${number}`, 12, photos),
-        photoU: field("u in the photo", 8), photoV: field("v in the photo", 8) };
+      const entry = { ...point, number, name, photo: field(`photo of point ${number}`, 14, "photo", photos),
+        photoU: field(`u of point ${number} in the photo`, 8, "u / px"), photoV: field(`v of point ${number} in the photo`, 8, "v / px") };
       const remove = document.createElement("button");
       remove.type = "button";
       remove.textContent = "remove";
@@ -310,7 +310,7 @@
       });
       const told = document.createElement("span");
       told.textContent = `${point.of}, ${words(point)}`;
-      row.append(name, told, entry.photo, entry.photoU, entry.photoV, remove);
+      row.append(name, entry.photo, entry.photoU, entry.photoV, remove, told);
       part.list.append(row);
       points.push(entry);
       update();

@@ -294,8 +294,8 @@ def warn_of_guesses(ctx: StepContext, n_guessed: int, n_planes: int) -> None:
     """Say that the side from which planes are seen was guessed, and how to state it."""
     ctx.warn(
         f"no scanner station says from which side {n_guessed} of {n_planes} planes were seen; the "
-        "side with more of the other points was taken: if an image comes out mirrored, set "
-        "view_from of read.scan"
+        "side with more of the other points was taken, unless photos decide later (face.photos): "
+        "if an image comes out mirrored, set view_from of read.scan"
     )
 
 
