@@ -356,6 +356,19 @@ def test_on_paper_numbers_and_parameters_are_unfolded(page: Page) -> None:
     assert page.evaluate("document.querySelectorAll('.on-paper').length") == 0
 
 
+def test_no_method_is_printed_letter_below_letter(page: Page) -> None:
+    page.show_as(700)
+    page.ask("Emulation.setEmulatedMedia", media="print")
+    widths = page.evaluate(
+        "[...document.querySelectorAll('.steps tbody td:nth-child(2)')].map(e => e.clientWidth)"
+    )
+    page.ask("Emulation.setEmulatedMedia", media="")
+    page.show_as(1440)
+    assert len(widths) > 2
+    # Ten letters of 7.5 points.
+    assert min(widths) > 45
+
+
 def test_all_that_can_be_used_has_a_name(page: Page) -> None:
     nameless = page.evaluate(
         "[...document.querySelectorAll('button, select, input, a, [role=region]')]"
