@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import faulthandler
+import gc
 import json
 import os
 import re
@@ -56,6 +57,8 @@ def main() -> None:
         request = json.loads(line)
         # Loaded once, before the fork; what starts threads does so when it is first used.
         target_named(request["name"])
+        # What is loaded is never garbage; a search for it after some cases need not look there.
+        gc.freeze()
         _serve(request)
 
 
