@@ -21,6 +21,17 @@ if TYPE_CHECKING:
 
 # In the run's folder, with a folder per format.
 _EXPORT_FOLDER: Final = "export"
+
+
+class _Scale(click.IntRange):
+    """The N of a scale 1:N, which people also write whole."""
+
+    # Any: as click has it.
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        text: Any = value.replace(" ", "").removeprefix("1:") if isinstance(value, str) else value
+        return int(super().convert(text, param, ctx))
+
+
 _HELP: Final = "\n\n".join(
     [
         "Write the results of RUN, a run folder or its run.h5, for other programs.",
@@ -70,10 +81,10 @@ _HELP: Final = "\n\n".join(
 )
 @click.option(
     "--scale",
-    type=click.IntRange(min=1, max=100_000),
+    type=_Scale(min=1, max=100_000),
     metavar="N",
-    help="sheet: draw at 1:N; without it the largest usual scale at which each wall fits "
-    "onto one sheet.",
+    help="sheet: draw at 1:N (50 or 1:50); without it the largest usual scale at which each wall "
+    "fits onto one sheet.",
 )
 @click.option(
     "--paper",

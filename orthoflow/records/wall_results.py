@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from orthoflow_provenance.model import RecordedCell
 from orthoflow_provenance.reader import open_record
 
 from orthoflow.engine.run_folder import cell_file_name
@@ -31,6 +30,12 @@ _ACCURACY: Final = (
     ("rms_3d_mm", "max_3d_mm", "in space RMS {} mm, largest {} mm"),
 )
 
+# The same of the photos, all walls together.
+_PHOTOS: Final = {
+    "sigma_wall_mm_worst": "expected error on the wall",
+    "check_rmse_mm_worst": "ties that only check, RMS per axis",
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class WallResult:
@@ -42,7 +47,8 @@ class WallResult:
         plane_index: its plane's place in `planes.json`, or None where nothing says it.
         frame: where the largest of its rasters lies.
         rasters: `ortho`, `depth`, `intensity` -> GeoTIFF, those that are there.
-        accuracy: sentences of the inspections of this wall, and its plane's noise.
+        accuracy: sentences of the inspections of this wall, its plane's noise, and what the
+            orientation of the photos expects and checked.
         colours: what was done to the colours of the photos; empty without an orthoimage.
     """
 
@@ -122,12 +128,14 @@ def room_results(run: Run, cell: str | None = None) -> RoomResults:
         for name, inspection in _inspections(run, address)
     }
     kept = Planes.from_payload(run.payload(*planes)) if planes else None
-    colours = _colours(run.cells[address])
+    colours = _colours(run, address)
+    oriented = _photo_accuracy(run, upstream)
     return RoomResults(
         address=address,
         walls=tuple(
-            _wall_result(run, number, files[number], kept, inspections, colours)
+            replace(wall, accuracy=(*wall.accuracy, *oriented))
             for number in sorted(files)
+            for wall in [_wall_result(run, number, files[number], kept, inspections, colours)]
         ),
         planes=kept,
         checkpoints=CheckPoints.from_payload(run.payload(*points)) if points else None,
@@ -283,8 +291,22 @@ def _accuracy(inspections: dict[str, Inspection], wall: int) -> Iterator[str]:
                 break
 
 
-def _colours(cell: RecordedCell) -> str:
+def _photo_accuracy(run: Run, upstream: tuple[str, ...]) -> Iterator[str]:
+    """What the last orientation behind the pictures says of its worst photo."""
+    for address in upstream:
+        own = {metric.name: metric.value for metric in run.cells[address].metrics}
+        said = [f"{text} {own[name]:.1f} mm" for name, text in _PHOTOS.items() if name in own]
+        if said:
+            yield f"{address}, worst photo: {', '.join(said)}"
+            return
+
+
+def _colours(run: Run, address: str) -> str:
     """What the record says was done to the photos' colours."""
+    cell = run.cells[address]
+    given = (one for before in run.upstream(address) for one in before.inputs.values())
+    if all(one.type_name != "photos" for one in given):
+        return "colours as the scan has them"
     gains = cell.params.get("gains")
     if gains is None:
         return f"colours as {cell.method} gave them"

@@ -116,7 +116,8 @@ def _write_title(column: _Column, drawing: WallDrawing, sheet: Sheet) -> None:
         value = getattr(block, name)
         if value and name not in {"project", "title"}:
             if name == "drawing":
-                value = f"{value} / {drawing.number}.{sheet.number}"
+                place = f"sheet {sheet.number}" if sheet.number else "index"
+                value = f"{value}, wall {drawing.number}, {place}"
             column.write(f"{name.replace('_', ' ')}: {value}", high_mm=2.0)
 
 

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import ezdxf
 import numpy as np
 import pdfplumber
 import pytest
+from click import BadParameter
 from click.testing import CliRunner, Result
 from PIL import Image
 
+from orthoflow.cli.export import export as command
 from orthoflow.cli.program import program
-from orthoflow.records import open_run
+from orthoflow.records import Run, open_run
 from orthoflow.records.wall_results import content_digest, room_results
 from tests.drawing_runs import (
     GAP_M,
@@ -27,6 +30,7 @@ from tests.drawing_runs import (
     wall_frame,
     write_drawing_run,
 )
+from tests.report_runs import cell, given, metrics
 
 MM = 25.4 / 72.0
 WIDE_M, HIGH_M = SIZE_M[0] - 2 * GAP_M, SIZE_M[2] - 2 * GAP_M
@@ -99,7 +103,7 @@ def test_a_sheet_says_what_the_record_says(run: Path, sheet: pdfplumber.page.Pag
         *("Sala Łukowa", "scale 1:50", "21-017", "wall 2", "sheet 1 of 1"),
         "check: RMSE x 0.7 mm, y 1.4 mm",
         "plane fitted to 4,000 points, RMS 2.0 mm",
-        "colours untouched",
+        "colours as the scan has them",
         "grid 0.5 m",
         # Letters that stand upright come from below.
         *("0.101", "3.5"),
@@ -158,9 +162,37 @@ def test_a_wall_that_does_not_fit_takes_several_sheets_and_an_index(
 )
 def test_balanced_colours_are_said(tmp_path: Path, differ: bool, said: str) -> None:
     run = write_drawing_run(tmp_path / "run", gains="global", differ=differ)
-    (wall,) = room_results(open_run(run)).walls
+    (wall,) = room_results(photographed(open_run(run))).walls
     assert wall.colours == said
     assert wall.plane_index == WALL
+    # The column of a sheet had the plane's noise only, where the report had these.
+    assert wall.accuracy[-1] == (
+        "orient, worst photo: expected error on the wall 4.0 mm, ties that only check, RMS per "
+        "axis 2.5 mm"
+    )
+
+
+def photographed(run: Run) -> Run:
+    """The same run with an orientation of photos behind its orthoimages."""
+    orient = cell(
+        "orient",
+        inputs={"photos": given("inputs.photos", "a", "photos")},
+        metrics=metrics(sigma_wall_mm_worst=4.0, check_rmse_mm_worst=2.5),
+    )
+    cameras = given("orient.cameras", "b", "cameras")
+    cells = [
+        replace(one, inputs={**one.inputs, "cameras": cameras}) if one.step == "mosaic" else one
+        for one in run.record.cells
+    ]
+    return replace(run, record=replace(run.record, cells=(orient, *cells)))
+
+
+@pytest.mark.parametrize("text", ["50", "1:50", "1 : 50"])
+def test_a_scale_may_be_written_whole(text: str) -> None:
+    (option,) = (one for one in command.params if one.name == "scale")
+    assert option.type.convert(text, option, None) == 50
+    with pytest.raises(BadParameter):
+        option.type.convert("2:50", option, None)
 
 
 def test_no_other_raster_stands_in_for_an_orthoimage_that_is_gone(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_a_title_stands_before_the_name_and_fields_have_their_names(drawn: Page)
     module._write_title(column(drawn), drawing(text=text), sheet("intensity", number=0, count=3))
     assert written(drawn) == [
         *("Hall", "West", "wall 7", "grey of the scan", "scale 1:50", "index of 3 sheets"),
-        *("checked by: A B", "drawing: 21-017 / 7.0", "note: n"),
+        *("checked by: A B", "drawing: 21-017, wall 7, index", "note: n"),
     ]
     high = {one.text: one.high for one in drawn.texts}
     # The project is the largest text, its own title the next.
