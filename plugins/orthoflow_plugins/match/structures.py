@@ -205,7 +205,6 @@ def _widths_cells(photo: Sequence[int], wall: tuple[int, int]) -> list[int]:
 def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
     """Best place of a photo of a given size in cells."""
     import cv2
-    from scipy import fft
 
     height, width = picture.shape[:2]
     structure = structure_of(picture, np.ones((height, width), dtype=np.bool_))
@@ -217,9 +216,8 @@ def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
         for top in (0, (height - side[0]) // 2, height - side[0])
         for left in (0, (width - side[1]) // 2, width - side[1])
     ]
-    # Of all parts alike: the energy of the wall under a part at each place of its corner.
-    box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
-    under = fft.irfft2(wall.energy * np.conj(box), wall.padded)
+    # Of all parts alike.
+    under = _energy_under(side, wall)
     maps = [
         _part_map(channels[:, top : top + side[0], left : left + side[1]], under, wall)
         for top, left in corners
@@ -253,6 +251,14 @@ def _best_at(picture: NDArray[np.float32], wall: WallStructure) -> Place:
         parts_photo=middles / [width, height],
         parts_m=wall.wall.frame.gsd_m * found,
     )
+
+
+def _energy_under(side: tuple[int, int], wall: WallStructure) -> NDArray[np.float32]:
+    """Energy of the wall under a part of a size, at every place of its corner (wrapped)."""
+    from scipy import fft
+
+    box = _spectrum(np.ones((1, *side), dtype=np.float32), wall.padded)[0]
+    return np.asarray(fft.irfft2(wall.energy * np.conj(box), wall.padded), dtype=np.float32)
 
 
 def _part_map(

@@ -13,6 +13,7 @@ from orthoflow_plugins.match.structures import (
     Place,
     WallStructure,
     _coarser,
+    _energy_under,
     _is_elsewhere,
     _part_map,
     _slipped,
@@ -118,7 +119,8 @@ def test_a_part_is_compared_with_what_lies_under_it_everywhere(structure: WallSt
     channels = np.moveaxis(structure.channels.values, -1, 0).astype(np.float64)
     height, width = channels.shape[1:]
     part = channels[:, 40:75, 60:110] + RNG.normal(0.0, 0.2, (5, 35, 50))
-    found = _part_map(part.astype(np.float32), structure)
+    under_it = _energy_under((35, 50), structure)
+    found = _part_map(part.astype(np.float32), under_it, structure)
     own = float((part**2).sum())
     places = [(40, 60), (0, 0), (11, 7), (height - 35, width - 50), (height - 9, 5)]
     for row, column in places:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 from numpy.typing import NDArray
 from orthoflow_plugins.raster import walls
@@ -26,8 +27,8 @@ def frame(rows: int, columns: int) -> WallFrame:
 
 
 def with_memory(monkeypatch: pytest.MonkeyPatch, n_bytes: float) -> None:
-    sizes = {"SC_PHYS_PAGES": int(n_bytes // 4096), "SC_PAGE_SIZE": 4096}
-    monkeypatch.setattr(os, "sysconf", sizes.__getitem__)
+    memory = SimpleNamespace(total=int(n_bytes))
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: memory)
 
 
 def needed_bytes(monkeypatch: pytest.MonkeyPatch, *frames: WallFrame) -> float:
