@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol, cast
 
-from orthoflow.catalog.distributions import DistributionInfo, package_path, source_files
+from orthoflow.catalog.distributions import (
+    DistributionInfo,
+    may_define,
+    package_path,
+    source_files,
+)
 from orthoflow.catalog.wording import did_you_mean, nearest
 from orthoflow.errors import PluginError, WorkflowError
 from orthoflow.sdk.hooks import KindSpec, MethodSpec, ProductSpec
@@ -128,6 +133,20 @@ class MethodEntry:
         from orthoflow.catalog.loading import load_method  # noqa: PLC0415 - loads pydantic
 
         return load_method(self.spec, self.kind, self.distribution, self.product_types)
+
+    def looked_at(self) -> MethodEntry:
+        """Give the entry as it is: `broken` where its class is not in its source and does not load.
+
+        Of a class that seems to be there nothing is loaded, so what listings say of it may still
+        prove wrong.
+        """
+        if self.state != "fine" or may_define(self.spec.target):
+            return self
+        try:
+            self.load()
+        except PluginError as error:
+            return replace(self, state="broken", problem=str(error))
+        return self
 
     def source_files(self) -> tuple[Path, ...]:
         """Python files whose content can change the method's results, sorted.

@@ -8,7 +8,7 @@ from importlib import import_module
 
 from orthoflow.catalog.distributions import DistributionInfo
 from orthoflow.catalog.foreign_code import foreign_code
-from orthoflow.catalog.wording import describe_error
+from orthoflow.catalog.wording import describe_error, did_you_mean
 from orthoflow.errors import PluginError
 from orthoflow.sdk.hooks import FILES, KindSpec, MethodSpec
 from orthoflow.sdk.methods import (
@@ -34,17 +34,32 @@ def import_target(target: str, what: str, distribution: DistributionInfo) -> obj
         PluginError: the module fails to import or lacks the name.
     """
     module_name, _, name = target.partition(":")
+    module: object = None
     try:
         with foreign_code(f"{what} of {distribution}"):
-            return typing.cast("object", getattr(import_module(module_name), name))
+            module = import_module(module_name)
+            return typing.cast("object", getattr(module, name))
     except KeyboardInterrupt:
         raise
     except BaseException as error:
+        said, way_out = describe_error(error), _way_out(error, target, distribution)
+        lacks_it = isinstance(error, AttributeError) and error.obj is module
+        if lacks_it and module is not None:
+            near = did_you_mean(name, vars(module))
+            said = f"{module_name} has no {name}{near}"
         raise PluginError(
-            f"{what} of {distribution} cannot be loaded from {target}: "
-            f"{describe_error(error)}; install what is missing, or another version of "
-            f"{distribution.name}"
+            f"{what} of {distribution} cannot be loaded from {target}: {said}; {way_out}"
         ) from error
+
+
+def _way_out(error: BaseException, target: str, distribution: DistributionInfo) -> str:
+    """What helps: something that is missing, another release, or mending one's own source."""
+    package = target.partition(":")[0].partition(".")[0]
+    missing = (error.name or "") if isinstance(error, ImportError) else ""
+    other = f"another version of {distribution.name}"
+    if missing and missing.partition(".")[0] != package:
+        return f"install what is missing, or {other}"
+    return f"install {other}" if distribution.is_released else "mend its source, or the hooks"
 
 
 def load_method(

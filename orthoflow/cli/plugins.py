@@ -11,7 +11,7 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -33,19 +33,6 @@ _SUMMARIES: Final = {
     "new": "Write a plugin of your own that works and passes its tests at once.",
     "check": "Run the conformance suite on a method.",
 }
-_UNITS: Final = {
-    "_m": "m",
-    "_mm": "mm",
-    "_px": "px",
-    "_deg": "deg",
-    "_rad": "rad",
-    "_s": "s",
-    "_mib": "MiB",
-    "_grey": "grey levels",
-    "_cells": "cells",
-    "_share": "1",
-}
-
 
 plugins: Final[click.Command] = LazyGroup(
     name="plugins",
@@ -65,6 +52,8 @@ def plugins_list(*, as_json: bool) -> int:
     `orthoflow plugins show PLUGIN` prints the traceback of one that is broken.
     """
     catalog = discover_catalog()
+    methods = {name: entry.looked_at() for name, entry in catalog.methods.items()}
+    catalog = replace(catalog, methods=methods)
     if as_json:
         echo_json(_catalog_json(catalog))
         return EXIT_GOOD
@@ -325,6 +314,8 @@ def _docstring(method: type[Method]) -> str:
 
 
 def _parameters(params: type[MethodParams]) -> list[tuple[str, str, object, str, str]]:
+    from orthoflow.sdk.units import unit_of
+
     schema = params.model_json_schema()
     definitions = schema.get("$defs", {})
     return [
@@ -332,7 +323,7 @@ def _parameters(params: type[MethodParams]) -> list[tuple[str, str, object, str,
             name,
             _type_text(field, definitions),
             field.get("default"),
-            _unit_of(name),
+            unit_of(name),
             field.get("description", ""),
         )
         for name, field in schema.get("properties", {}).items()
@@ -365,11 +356,6 @@ def _type_text(field: dict[str, object], definitions: dict[str, dict[str, object
         if key in field
     )
     return f"{field.get('type', 'any')}{limits}"
-
-
-def _unit_of(name: str) -> str:
-    suffix = "_" + name.rpartition("_")[2] if "_" in name else ""
-    return _UNITS.get(suffix, "")
 
 
 def _ports(ports: type[Ports]) -> list[tuple[str, str, bool]]:
@@ -418,7 +404,12 @@ def plugins_new(
     """
     from orthoflow.scaffold import Project, write_project
 
-    if bool(said["kind"]) == bool(new_kind):
+    if said["kind"] and new_kind:
+        raise click.UsageError(
+            f"--kind {said['kind']} (a kind that is there) and --new-kind {new_kind} (a kind of "
+            "its own) exclude each other: leave one of them away"
+        )
+    if not (said["kind"] or new_kind):
         raise click.UsageError(
             "give --kind, the kind of the method (`orthoflow plugins list`), or --new-kind"
         )
@@ -467,7 +458,8 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
     you hand it on: a run in a new process and an empty folder, wild input, what is known of the
     example.
 
-    Ends with 1 when a rule is broken, with 4 when the method cannot be loaded.
+    What stops every run is told once, and other rules are skipped. Ends with 1 when a rule
+    is broken, with 4 when the method cannot be loaded.
     """
     from orthoflow.testing import conformance_cases
 
@@ -476,19 +468,24 @@ def plugins_check(method_id: str, *, as_json: bool, golden: Path | None, quick: 
         for case in conformance_cases(method_id, golden=golden):
             is_left_out = quick and not case.check.is_quick
             problem = "" if is_left_out else case.problem()
-            state = "left out" if is_left_out else "broken" if problem else "kept"
             name, rule = case.check.name, case.check.rule
+            told = next((one["check"] for one in results if one["problem"] == problem != ""), "")
+            state = "broken" if problem else "left out" if is_left_out else "kept"
+            state, said = (
+                ("skipped", f"stopped by the same as {told}") if told else (state, problem)
+            )
             results.append({"check": name, "state": state, "rule": rule, "problem": problem})
             if not as_json:
-                echo(f"{state:{8 if quick else 7}} {name}: {problem or rule}")
+                echo(f"{state:{8 if quick else 7}} {name}: {said or rule}")
     counts = Counter(result["state"] for result in results)
     if as_json:
         echo_json({"method": method_id, "checks": results})
     else:
-        said = [f"{method_id} keeps {counted(counts['kept'], 'rule')}"]
-        said += [f"breaks {counts['broken']}"] if counts["broken"] else []
-        said += [f"{counts['left out']} left out (--quick)"] if counts["left out"] else []
-        echo("", ", ".join(said))
+        summed = [f"{method_id} keeps {counted(counts['kept'], 'rule')}"]
+        summed += [f"breaks {counts['broken']}"] if counts["broken"] else []
+        summed += [f"{counts['skipped']} skipped"] if counts["skipped"] else []
+        summed += [f"{counts['left out']} left out (--quick)"] if counts["left out"] else []
+        echo("", ", ".join(summed))
     return EXIT_CELL_FAILED if counts["broken"] else EXIT_GOOD
 
 

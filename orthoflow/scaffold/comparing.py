@@ -21,6 +21,10 @@ _COARSE: Final = {
         "raster.grid": {"gsd_m": 0.06, "n_walls_max": 1},
     }
 }
+# What a detector says of its own planes (RMS) is good where it found but the easy ones.
+_JUDGED: Final = {
+    "plane": ("true_planes_found", "label_iou_mean", "plane_angle_deg", "plane_offset_mm")
+}
 
 
 def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
@@ -45,9 +49,24 @@ def comparison_text(method_id: str, name: str, catalog: Catalog) -> str:
             continue
         _vary(steps[of_kind[-1]], name, method_id)
         document["name"] = f"compare-{name}"
-        document["compare"] = {"design": "product"}
+        document["compare"] = {"design": "product", **_judged(kind, steps, catalog)}
         return _dumped(document)
     return ""
+
+
+def _judged(
+    kind: str, steps: Mapping[str, Mapping[str, Any]], catalog: Catalog
+) -> dict[str, list[str]]:
+    """The numbers that say which method is the better one, of a recipe that measures them."""
+    wanted = _JUDGED.get(kind, ())
+    measured = {
+        metric: f"{name}.{metric}"
+        for name, node in steps.items()
+        if "use" in node
+        for metric in catalog.method(node["use"]).load().metrics
+    }
+    found = [measured[metric] for metric in wanted if metric in measured]
+    return {"metrics": found} if found else {}
 
 
 def own_comparison_text(method_id: str, takes: Sequence[str], catalog: Catalog) -> str:

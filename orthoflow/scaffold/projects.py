@@ -103,8 +103,8 @@ def write_project(project: Project, parent: Path, catalog: Catalog) -> tuple[Pat
 def _check(project: Project, folder: Path, catalog: Catalog) -> None:
     if not _NAME.fullmatch(project.name) or keyword.iskeyword(project.package):
         raise ArgumentError(
-            f"a plugin's name must be small letters, digits and hyphens, as in my-detector, got "
-            f"{project.name!r}"
+            f"a plugin's name must be 2 to 32 small letters, digits and hyphens, a letter first, "
+            f"and no word of Python's, as in my-detector, got {project.name!r}"
         )
     if project.product:
         _check_new_kind(project, catalog)

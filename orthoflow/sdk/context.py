@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import wraps
 from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Literal, ParamSpec, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -16,6 +19,7 @@ from orthoflow_provenance.inner_files import colliding, path_below
 from orthoflow_provenance.model import COSTS, Figure, Metric
 
 from orthoflow.errors import CancelledStepError, ProductError
+from orthoflow.files.plain_svg import MOST_BYTES, is_plain_svg
 from orthoflow.sdk.lines import is_name, one_line
 from orthoflow.system import take_room
 
@@ -29,6 +33,31 @@ _MOST_METRICS: Final = 20_000
 _MOST_FIGURES: Final = 2_000
 _MOST_WARNINGS: Final = 200
 _LARGEST_FIGURE: Final = 64 << 20
+_SAID_WHERE: Final = re.compile(r" \([^()]+:\d+\)$")
+_Given = ParamSpec("_Given")
+_HEAD_BYTES: Final = 16  # by which a picture is known
+
+
+def _names_the_line(report: Callable[_Given, None]) -> Callable[_Given, None]:
+    """Let what a method is refused for reporting say where in its source it reported it."""
+
+    @wraps(report)
+    def told(*args: _Given.args, **kwargs: _Given.kwargs) -> None:
+        try:
+            report(*args, **kwargs)
+        except ProductError as error:
+            frame = inspect.currentframe()
+            # A trial watches through a context of its own.
+            while frame and (
+                frame.f_code.co_filename == __file__ or args[0] is frame.f_locals.get("self")
+            ):
+                frame = frame.f_back
+            if frame is None or _SAID_WHERE.search(str(error)):
+                raise
+            where = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
+            raise ProductError(f"{error} ({where})") from error
+
+    return told
 
 
 class Drawing(Protocol):
@@ -103,11 +132,13 @@ class StepContext:
     _named: set[str] = field(default_factory=set)
     _n_warnings: int = 0
 
+    @_names_the_line
     def metric(self, name: str, value: float, unit: str) -> None:
         """Report a number about the result.
 
         Args:
-            name: name with its unit at the end where it has one, e.g. `rms_mm`.
+            name: letters, digits, `-`, `_`, `.`, with its unit at the end where it has one, e.g.
+                `rms_mm`.
             value: a finite number.
             unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
 
@@ -129,6 +160,7 @@ class StepContext:
             raise ProductError(f"metric {name} must be finite, got {number}")
         self.metrics.append(Metric(name=name, value=number, unit=unit))
 
+    @_names_the_line
     def figure(self, name: str, content: bytes | Drawing, caption: str = "") -> None:
         """Keep a picture for the record and the report.
 
@@ -139,12 +171,14 @@ class StepContext:
             caption: one sentence on what it shows.
 
         Raises:
-            ProductError: no file can have the name, or a figure was drawn under it before, there
-                are too many figures, or one is no picture or larger than 64 MiB.
+            ProductError: the name has other letters or none, or a figure was drawn under it
+                before, there are too many figures, or one is no picture (an SVG with script or
+                links is none) or larger than 64 MiB.
         """
         _require_room("figure", len(self.figures), _MOST_FIGURES)
-        suffix = _suffix(content) if isinstance(content, bytes) else ".png"
         path = _path_below(self.scratch / "figures", name)
+        _require_letters("figure", name)
+        suffix = _suffix(content, name) if isinstance(content, bytes) else ".png"
         path = _path_below(path.parent, f"{name}{suffix}")
         if colliding([*(figure.name for figure in self.figures), name]):
             raise ProductError(f"figure {name} was drawn twice")
@@ -157,6 +191,9 @@ class StepContext:
             raise ProductError(
                 f"figure {name} must be a file of at most {_LARGEST_FIGURE >> 20} MiB"
             )
+        if not isinstance(content, bytes):
+            with path.open("rb") as file:
+                _suffix(file.read(_HEAD_BYTES), name)
         media_type = _MEDIA_TYPES[path.suffix]
         self.figures.append(
             DrawnFigure(name=name, caption=one_line(caption), media_type=media_type, path=path)
@@ -232,6 +269,7 @@ class StepContext:
                 f"a metric must have a name of one printable line, without `/` and of at most 200 "
                 f"bytes, got {one_line(ascii(name), 80)}"
             )
+        _require_letters("metric", name)
         if name in self._named:
             raise ProductError(f"metric {name} was reported twice")
         _require_room("metric", len(self.metrics), _MOST_METRICS)
@@ -243,6 +281,14 @@ def _require_room(what: str, n_before: int, most: int) -> None:
         raise ProductError(f"a step may report {most} {what}s, not more")
 
 
+def _require_letters(what: str, name: object) -> None:
+    if strange := "".join(dict.fromkeys(re.sub(r"[\w.-]", "", str(name)))):
+        raise ProductError(
+            f"the name of a {what} has letters, digits, `-`, `_` and `.`, got {strange!r} in "
+            f"{one_line(ascii(name), 80)}"
+        )
+
+
 def _path_below(folder: Path, name: object) -> Path:
     if not isinstance(name, str):
         raise ProductError(f"the name of a file must be a text, got {one_line(ascii(name), 80)}")
@@ -252,7 +298,15 @@ def _path_below(folder: Path, name: object) -> Path:
         raise ProductError(str(error)) from error
 
 
-def _suffix(picture: bytes) -> str:
-    if picture.startswith(b"\x89PNG"):
+def _suffix(picture: bytes, name: str) -> str:
+    if picture.startswith(b"\x89PNG\r\n\x1a\n"):
         return ".png"
-    return ".webp" if picture[:4] == b"RIFF" and picture[8:12] == b"WEBP" else ".svg"
+    if picture[:4] == b"RIFF" and picture[8:12] == b"WEBP":
+        return ".webp"
+    if not is_plain_svg(picture):
+        raise ProductError(
+            f"figure {name} must be a PNG, a WebP or a plain SVG (no script, no link, no file from "
+            f"elsewhere, at most {MOST_BYTES // 1_000_000} MB), got what begins with "
+            f"{picture[:_HEAD_BYTES]!r}"
+        )
+    return ".svg"

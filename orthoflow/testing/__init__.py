@@ -12,7 +12,7 @@ when it starts to pass, so that reasons do not outlive their cause.
 """
 
 from orthoflow.testing.cases import ConformanceCase, ConformanceError, conformance_cases
-from orthoflow.testing.examples import ExampleError, example_room
+from orthoflow.testing.examples import ExampleError, example_inputs, example_room
 from orthoflow.testing.trials import Trial, TrialRun, run_trial
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Trial",
     "TrialRun",
     "conformance_cases",
+    "example_inputs",
     "example_room",
     "run_trial",
 ]

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from pydantic import ValidationError
+
 from orthoflow.catalog import discover_catalog
-from orthoflow.errors import ArgumentError, OrthoflowError
+from orthoflow.catalog.distributions import package_path
+from orthoflow.catalog.wording import describe_error
+from orthoflow.errors import ArgumentError, OrthoflowError, ProductError
 from orthoflow.products import InputFiles, Product
 from orthoflow.sdk import Method
 from orthoflow.testing.checks import CHECKS, Check
-from orthoflow.testing.examples import example_inputs
+from orthoflow.testing.examples import ExampleError, example_inputs
 from orthoflow.testing.trials import Trial
 from orthoflow.testing.witnesses import Subject, Witness
 
@@ -68,12 +73,43 @@ class ConformanceCase:
                 subject = Subject(witness=self.witness(), folder=Path(folder), golden=self.golden)
                 self.check.run(subject)
             except AssertionError as error:
-                return str(error)
-            except OrthoflowError as error:
-                return f"the method refuses the suite's inputs: {error}"
+                # What stops every run says nothing of a rule about odd inputs.
+                return (error.__cause__ is not None and self._what_stops()) or str(error)
             except Exception as error:  # noqa: BLE001 - a foreign method may raise anything
-                return f"the method raised {type(error).__name__}: {error}"
+                return _failure(error, self.witness)
         return ""
+
+    def _what_stops(self) -> str:
+        """What the method's run on its examples fails with; empty when it does not."""
+        try:
+            _ = self.witness().first
+        except Exception as error:  # noqa: BLE001 - as above
+            return _failure(error, self.witness)
+        return ""
+
+
+def _failure(error: Exception, witness: Callable[[], Witness]) -> str:
+    """Say in one sentence, and in which line, what stopped a run of the method."""
+    if isinstance(error, ExampleError):
+        return str(error)
+    trial = witness().trial
+    if isinstance(error, ValidationError) and error.title == trial.method.Params.__name__:
+        return "; ".join(
+            f"parameter {'.'.join(map(str, one['loc']))} "
+            + ("has no default" if one["type"] == "missing" else f"cannot be: {one['msg']}")
+            for one in error.errors(include_url=False)
+        )
+    own = package_path(trial.method.__module__)
+    frames = traceback.extract_tb(error.__traceback__)
+    within = [one for one in frames if own and Path(one.filename).resolve().is_relative_to(own)]
+    where = f" ({Path(within[-1].filename).name}:{within[-1].lineno})" if within else ""
+    where = "" if str(error).endswith(where) else where
+    if not isinstance(error, OrthoflowError):
+        return f"the method raised {describe_error(error)}{where}"
+    # Raised behind the method's back, by a product that it makes or by what it reports.
+    if isinstance(error, ProductError) and within and frames[-1] != within[-1]:
+        return f"what the method makes is not valid: {error}{where}"
+    return f"the method refuses the suite's inputs: {error}{where}"
 
 
 def conformance_cases(

@@ -12,11 +12,13 @@ from typing import Final
 
 import numpy as np
 from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 
 from orthoflow.engine.store import digest_of
 from orthoflow.errors import CancelledStepError, OrthoflowError
 from orthoflow.products import Cameras, PointCloud
 from orthoflow.sdk import Method, port_specs
+from orthoflow.sdk.units import UNITS
 from orthoflow.testing.examples import example_room, few_points
 from orthoflow.testing.golden import golden_problem
 from orthoflow.testing.photographed import example_ties
@@ -32,12 +34,8 @@ from orthoflow.testing.physics import (
 )
 from orthoflow.testing.witnesses import Subject, require
 
-# What a float parameter's name ends with: its unit, or a word that says it has none.
-UNIT_SUFFIXES: Final = (
-    *("m", "mm", "m2", "px", "deg", "rad", "s", "cells", "sigma"),
-    *("grey", "share", "ratio", "factor", "scale", "exponent", "power", "probability", "world"),
-    "intensity",
-)
+# What a float parameter's name has in it: its unit, or a word that says it has none.
+UNIT_SUFFIXES: Final = (*UNITS, "world", "intensity")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,15 +60,21 @@ class Check:
 
 def parameters_are_documented(subject: Subject) -> None:
     """Every parameter has a default, a description, and a unit in its name."""
-    for name, info in subject.method.Params.model_fields.items():
-        require(info.description, f"parameter {name} has no description")
-        require(not info.is_required(), f"parameter {name} has no default")
-        if info.annotation is float or info.annotation == (float | None):
-            require(
-                re.search(rf"_({'|'.join(UNIT_SUFFIXES)})(_|$)", f"_{name}"),
-                f"parameter {name} does not say its unit: end it with one of "
-                f"{', '.join(UNIT_SUFFIXES)}",
-            )
+    fields = subject.method.Params.model_fields
+    faults = [fault for name, info in fields.items() for fault in _parameter_faults(name, info)]
+    require(not faults, "; ".join(faults))
+
+
+def _parameter_faults(name: str, info: FieldInfo) -> Iterator[str]:
+    if info.is_required():
+        yield f"parameter {name} has no default"
+    if not info.description:
+        yield f"parameter {name} has no description"
+    is_float = info.annotation is float or info.annotation == (float | None)
+    if is_float and not re.search(rf"_({'|'.join(UNIT_SUFFIXES)})(_|$)", f"_{name}"):
+        yield (
+            f"parameter {name} does not say its unit: end it with one of {', '.join(UNIT_SUFFIXES)}"
+        )
 
 
 def parameters_round_trip(subject: Subject) -> None:
@@ -125,6 +129,7 @@ def global_state_stays_untouched(subject: Subject) -> None:
 
 def nothing_is_written_outside_scratch(subject: Subject) -> None:
     """Working directory, home and temporary folder stay empty."""
+    _ = subject.witness.first  # what stops it everywhere is told as everywhere
     strays = subject.witness.elsewhere.strays
     require(not strays, f"files were written outside the scratch folder: {', '.join(strays)}")
 

@@ -138,7 +138,7 @@ class _OneFile:
                 # A column of a table is told of once, not for every line.
                 item.key if self.table else join(here, item.key),
                 f"there is no input {item.key}{did_you_mean(item.key, self.reader.inputs)}; "
-                f"inputs: {known}",
+                f"inputs: {known}{self._meant(item)}",
             )
         return WorkflowInputSpec(
             name=f"{item.key}@{dataset.key}",
@@ -146,6 +146,14 @@ class _OneFile:
             folder=self.folder,
             said_in=f"{self.table}:{dataset.position.line}" if self.table else "",
         )
+
+    def _meant(self, item: Entry) -> str:
+        """Say where parameters stand, to who put one in the place of an input."""
+        step, _, parameter = item.key.partition(".")
+        if parameter and any(one.name == step for one in self.reader.steps):
+            return f"; parameters stand in set: {{set: {{{item.key}: VALUE}}}}"
+        # A table has parameters by the dot in the names of their columns.
+        return "; columns of parameters are called step.parameter" if self.table else ""
 
     def _check_complete(self, entry: Entry, inputs: Mapping[str, WorkflowInputSpec]) -> None:
         for name, spec in self.reader.inputs.items():

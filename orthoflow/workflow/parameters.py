@@ -293,24 +293,23 @@ def _select_variants(
     if len(parts) == 1:
         return step.variants, parts
     head, *rest = parts
-    for variant in step.variants:
-        if head == _spoken_name(variant):
-            return (variant,), rest
+    if named := tuple(variant for variant in step.variants if head in _spoken_names(variant)):
+        return named, rest
     if any(head in _parameters(variant) for variant in step.variants):
         return step.variants, parts
-    names = [
-        variant.call.name or variant.call.method.partition(".")[2] for variant in step.variants
-    ]
+    names = dict.fromkeys(name for one in step.variants for name in _spoken_names(one))
     raise ArgumentError(
         f"step {step.name} has no variant {head}{did_you_mean(head, names)}; it has "
         f"{', '.join(names)}"
     )
 
 
-def _spoken_name(variant: DraftVariant) -> str:
+def _spoken_names(variant: DraftVariant) -> tuple[str, ...]:
     # A step without variants answers to its method's name, so that `plane.hough2d.cell_m` works in
-    # recipes with and without variants.
-    return variant.call.name or variant.call.method.partition(".")[2]
+    # recipes with and without variants; what was swept answers to the name that it had before, too.
+    method = variant.call.method.partition(".")[2]
+    before = (variant.family or method,) if variant.swept else ()
+    return (*before, variant.call.name or method)
 
 
 def _parameters(variant: DraftVariant) -> tuple[str, ...]:

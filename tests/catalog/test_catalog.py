@@ -350,7 +350,7 @@ CHANGES = {
     "other type": ("cloud: PointCloud", "cloud: Walls", "port cloud carries cloud in kind plane"),
     "lacking output": ("        labels: PointLabels\n", "", "its outputs must be planes, labels"),
     "no product": ("cloud: PointCloud", "cloud: int", "its ports cannot be read: PluginError"),
-    "name lacks": ("class Mine(", "class Yours(", "AttributeError"),
+    "name lacks": ("class Mine(", "class Yours(", "_class has no Mine"),
     "import fails": ("from orthoflow.sdk", "import no_such_library\nfrom orthoflow.sdk", "No mod"),
 }
 
@@ -505,3 +505,52 @@ def test_a_method_whose_class_does_not_load_is_shown_with_its_traceback(
     )
     assert (answer["state"], answer["distribution"]) == ("broken", "late")
     assert "Traceback" in answer["traceback"]
+
+
+def test_a_list_says_which_classes_are_missing_and_how_they_are_mended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    announced = (
+        ("plane.good", "named.method:Good"),
+        ("plane.case", "named.method:GoodPlane"),
+        ("plane.lost", "named.methods:Good"),
+        ("plane.indented", "named.odd:Odd"),
+    )
+    sources = {
+        "named_hooks.py": hooks(methods=", ".join(method(*one) for one in announced)),
+        "named/__init__.py": "",
+        "named/method.py": "class Good: pass\n",
+        "named/odd.py": "class Odd:\npass\n",
+    }
+    folder = write_distribution(tmp_path, "named", sources)
+    (folder / "named-1.0.dist-info" / "direct_url.json").write_text("{}")
+    monkeypatch.syspath_prepend(folder)
+    listed = CliRunner().invoke(program, ["plugins", "list"])
+    assert listed.exit_code == 0
+    rows = [line.split() for line in listed.stdout.splitlines()]
+    states = {row[0]: row[1] for row in rows if len(row) > 1}
+    assert [states[name] for name, _ in announced] == ["fine", "broken", "broken", "broken"]
+    # Only what was not in its source is loaded.
+    assert "plane.good of named" not in listed.stdout
+    for said in (
+        "from named.method:GoodPlane: named.method has no GoodPlane (did you mean Good?); mend its",
+        "ModuleNotFoundError: No module named 'named.methods'; mend its source, or the hooks",
+        "class definition on line 1 (odd.py, line 2); mend its source, or the hooks",
+    ):
+        assert said in listed.stdout
+
+
+def test_an_entry_point_that_names_no_module_is_told_with_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = {"spelt.py": "", "broken.py": ""}
+    folder = write_distribution(tmp_path, "misspelt", sources)
+    monkeypatch.syspath_prepend(folder)
+    (points,) = folder.rglob("entry_points.txt")
+    points.write_text("[orthoflow.plugins]\nmisspelt = spelt.hoks\n")
+    catalog = discover_catalog()
+    (broken,) = catalog.broken
+    assert str(broken).endswith(
+        '; its entry point in pyproject.toml names it: mend misspelt = "spelt.hoks" in '
+        '[project.entry-points."orthoflow.plugins"], and install it again'
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import venv
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from ruamel.yaml import YAML
 
 from orthoflow.catalog import discover_catalog
 from orthoflow.cli import program
@@ -47,11 +49,22 @@ def test_a_new_plugin_of_every_kind_loads_and_its_comparison_is_valid(
     catalog = discover_catalog()
     method = catalog.method(project.method_id).load()
     assert method.citations == ("doi:10.1000/xyz",)
+    # A template that reports a metric declares it.
+    text = (folder / project.package / "method.py").read_text(encoding="utf-8")
+    assert set(method.metrics) == set(re.findall(r"^ +ctx\.metric\(\"(\w+)", text, re.MULTILINE))
     comparison = folder / "compare.yaml"
     if comparison.exists():
         steps = load_workflow(comparison, catalog).steps.values()
         uses = {variant.method for step in steps for variant in step.variants}
         assert project.method_id in uses
+
+
+def test_a_new_detector_is_compared_by_the_planes_that_it_finds(tmp_path: Path) -> None:
+    write_project(Project(name="my-finder", kind="plane"), tmp_path, discover_catalog())
+    text = (tmp_path / "my-finder" / "compare.yaml").read_text(encoding="utf-8")
+    compared = YAML(typ="safe").load(text)["compare"]["metrics"]
+    assert compared[:2] == ["check.true_planes_found", "check.label_iou_mean"]
+    assert "ctx.figure(" in (tmp_path / "my-finder" / "my_finder" / "method.py").read_text()
 
 
 @pytest.mark.parametrize("kind", ["simulate"])
@@ -105,18 +118,25 @@ def test_a_new_kind_that_cannot_be_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [[], ["--kind", "plane", "--new-kind", "part"]])
-def test_a_kind_or_a_new_one_is_asked_for(arguments: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "give --kind, the kind of the method"),
+        (["--kind", "plane", "--new-kind", "part"], "exclude each other: leave one of them away"),
+    ],
+)
+def test_a_kind_or_a_new_one_is_asked_for(arguments: list[str], said: str, tmp_path: Path) -> None:
     asked = ["plugins", "new", "mine", "--folder", str(tmp_path), *arguments]
     result = CliRunner().invoke(program, asked)
     assert result.exit_code == 2
-    assert "or --new-kind" in result.output
+    assert said in " ".join(result.output.split())
 
 
 @pytest.mark.parametrize(
     ("name", "kind", "sentence"),
     [
-        ("My Detector", "plane", "a plugin's name must be small letters"),
+        ("My Detector", "plane", "a plugin's name must be 2 to 32 small letters"),
+        ("x", "plane", "a plugin's name must be 2 to 32 small letters"),
         ("mine", "plain", r"no installed plugin announces kind plain \(did you mean plane\?\)"),
         ("hough2d", "plane", "method plane.hough2d is brought by orthoflow-tls"),
         ("numpy", "plane", "a Python package numpy is installed already"),

@@ -56,6 +56,30 @@ def test_a_picture_that_no_file_can_be_called_after_is_refused(tmp_path: Path, n
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
+@pytest.mark.parametrize(
+    "content",
+    [b"no picture", b"", b"\x89PNG", SVG.replace(b"/>", b"><script/></svg>"), b"<svg"],
+    ids=["text", "nothing", "cut off", "script", "no XML"],
+)
+def test_what_is_no_picture_is_refused_where_it_is_drawn(tmp_path: Path, content: bytes) -> None:
+    ctx = context(tmp_path)
+    told = r"^figure plan must be a PNG, a WebP or a plain SVG .* \(test_context\.py:\d+\)$"
+    with pytest.raises(ProductError, match=told):
+        ctx.figure("plan", content)
+    assert (ctx.figures, list(tmp_path.rglob("*.svg"))) == ([], [])
+
+
+@pytest.mark.parametrize("name", ["my figure!", "rms mm", "a+b", "50%"])
+def test_names_have_letters_that_addresses_and_patterns_have(tmp_path: Path, name: str) -> None:
+    ctx = context(tmp_path)
+    with pytest.raises(ProductError, match=r"^the name of a figure has letters, digits"):
+        ctx.figure(name, PNG)
+    with pytest.raises(ProductError, match=r"^the name of a metric has letters, digits"):
+        ctx.metric(name, 1.0, "mm")
+    ctx.metric("höhe_1.5-mm", 1.0, "mm")
+    ctx.figure("höhe_1.5-mm", PNG)
+
+
 def test_two_pictures_have_names_that_differ_everywhere(tmp_path: Path) -> None:
     ctx = context(tmp_path)
     ctx.figure("depth", PNG)
@@ -141,7 +165,9 @@ def test_what_cannot_be_a_name_names_no_metric_and_no_figure(tmp_path: Path, nam
     ctx = context(tmp_path)
     with pytest.raises(ProductError, match=r"^a metric must have a name of one printable line"):
         ctx.metric(name, 1.0, "mm")
-    refused = r"cannot be the name of a file here$|^the name of a file must be a text, got 5$"
+    refused = (
+        r"(cannot be the name of a file here|^the name of a file must be a text, got 5) \(test_"
+    )
     with pytest.raises(ProductError, match=refused):
         ctx.figure(name, PNG)
     assert (ctx.metrics, ctx.figures, list(tmp_path.iterdir())) == ([], [], [])
@@ -206,7 +232,8 @@ class OfSize:
 
     def savefig(self, path: Path) -> None:
         with path.open("wb") as file:
-            file.truncate(self.n_bytes)  # without a byte on the disk
+            file.write(PNG)
+            file.truncate(self.n_bytes)  # without the rest on the disk
 
 
 @pytest.mark.usefixtures("charts")
@@ -242,6 +269,17 @@ class Giant:
     def savefig(self, path: Path) -> None:
         with path.open("wb") as file:
             file.truncate(1 << 40)
+
+
+class NoPicture:
+    def savefig(self, path: Path) -> None:
+        path.write_bytes(b"no picture")
+
+
+@pytest.mark.usefixtures("charts")
+def test_a_figure_that_writes_no_picture_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match="figure chart must be a PNG"):
+        context(tmp_path).figure("chart", NoPicture())
 
 
 class Nothing:

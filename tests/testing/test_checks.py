@@ -192,9 +192,10 @@ class Vague(MethodParams):
 
 
 class Demanding(MethodParams):
-    """Of no default."""
+    """Of no default, twice."""
 
     reach_m: float = Field(description="How far.")
+    n_trials: int
 
 
 @pytest.mark.parametrize(
@@ -202,7 +203,10 @@ class Demanding(MethodParams):
     [
         (Documented, ""),
         (Vague, "parameter reach does not say its unit: end it with one of m, mm, m2, px"),
-        (Demanding, "parameter reach_m has no default"),
+        (
+            Demanding,
+            "^parameter reach_m has no default; parameter n_trials has no default; parameter n_t",
+        ),
     ],
 )
 def test_parameters_say_what_they_are(params: type[MethodParams], said: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import textwrap
 from pathlib import Path
 
@@ -257,18 +258,64 @@ BESIDE_SAYS = {
 }
 
 
+# Of what stops every run: the check that tells it, how (a pattern), and how it comes about.
+STOPPED: dict[str, tuple[str, str, str]] = {
+    "wrong_key": (
+        "outputs-are-valid",
+        r"the method raised KeyError: 'tolerance' \(floors\.py:\d+\)",
+        """
+        def look_at(self, cloud):
+            return {}["tolerance"]
+        """,
+    ),
+    "wrong_output": (
+        "outputs-are-valid",
+        r"what the method makes is not valid: labels\.plane_index must be .* \(floors\.py:\d+\)",
+        """
+        def look_at(self, cloud):
+            PointLabels(plane_index=np.zeros(len(cloud), dtype=np.int64))
+        """,
+    ),
+    "wrong_metric": (
+        "outputs-are-valid",
+        r"what the method makes is not valid: metric height must be finite, got nan \(floors.*\)",
+        """
+        def listen(self, ctx):
+            ctx.metric("height", float("nan"), "m")
+        """,
+    ),
+    "no_figure": (
+        "outputs-are-valid",
+        r"what the method makes is not valid: figure plan must be .* \(floors\.py:\d+\)",
+        """
+        def listen(self, ctx):
+            ctx.figure("plan", b"no picture", "A plan.")
+        """,
+    ),
+    "no_default": (
+        "parameters-are-documented",
+        "parameter n_trials has no default",
+        """
+        class Params(MethodParams):
+            lift_m: float = Field(0.0, description="Raises the plane.")
+            n_trials: int = Field(description="How often.")
+        """,
+    ),
+}
+
+
 @pytest.fixture
 def cheats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Install a method that keeps the rules and one for every way to break them."""
     classes = "".join(
         f'\n\nclass {name.title().replace("_", "")}(Floor):\n    id = "plane.{name}"\n'
         + textwrap.indent(textwrap.dedent(body), "    ")
-        for name, (_, _, body) in CHEATS.items()
+        for name, (_, _, body) in (CHEATS | STOPPED).items()
     )
     listing = ", ".join(
         f'MethodSpec(id="plane.{name}", target="floors:{name.title().replace("_", "")}", '
         f'summary="For a test.")'
-        for name in ("floor", *CHEATS)
+        for name in ("floor", *CHEATS, *STOPPED)
     )
     listing += "".join(
         f', MethodSpec(id="{method_id}", target="beside:{method_id.partition(".")[2].title()}", '
@@ -414,7 +461,20 @@ def test_a_result_that_moved_without_its_version_is_noticed(
 def test_a_method_that_raises_what_nobody_expects_is_told_in_a_sentence() -> None:
     cases = conformance_cases("plane.floor", inputs=lambda: {"cloud": None})
     (case,) = (case for case in cases if case.check.name == "outputs-are-valid")
-    assert case.problem().startswith("the method raised AttributeError: ")
+    assert re.fullmatch(r"the method raised AttributeError: .* \(floors\.py:\d+\)", case.problem())
+
+
+@pytest.mark.usefixtures("cheats")
+@pytest.mark.parametrize("cheat", STOPPED)
+def test_what_stops_every_run_is_told_once_and_where(cheat: str) -> None:
+    check, said, _ = STOPPED[cheat]
+    result = CliRunner().invoke(program, ["plugins", "check", f"plane.{cheat}", "--quick"])
+    assert result.exit_code == 1
+    assert re.findall(rf"^broken   {check}: {said}$", result.stdout, re.MULTILINE)
+    assert result.stdout.count("broken ") == 1
+    skipped = f"skipped  inputs-stay-untouched: stopped by the same as {check}"
+    assert skipped in result.stdout
+    assert "a cloud with" not in result.stdout
 
 
 def test_an_expected_failure_needs_a_check_and_a_reason() -> None:

@@ -247,6 +247,13 @@ MAPPINGS = {
             "inputs: scan, photos"
         ),
     ),
+    "parameter in the place of an input": (
+        "datasets: {hall: {wall.gsd_m: 0.5}}",
+        (
+            "datasets.hall.wall.gsd_m: there is no input wall.gsd_m; inputs: scan, photos; "
+            "parameters stand in set: {set: {wall.gsd_m: VALUE}}"
+        ),
+    ),
     "bad name": (
         "datasets: {Hall: {}}",
         "rooms.yaml:18:12: datasets.Hall: 'Hall' cannot be a name",
@@ -320,7 +327,10 @@ def test_a_mistake_of_the_section_gets_a_place_and_a_sentence(
 TABLES = {
     "unknown column": (
         "name,scans\nhall,a\nattic,b\n",
-        "rooms.csv:1:6: scans: there is no input scans (did you mean scan?); inputs: scan, photos",
+        (
+            "rooms.csv:1:6: scans: there is no input scans (did you mean scan?); inputs: scan, "
+            "photos; columns of parameters are called step.parameter"
+        ),
     ),
     "unknown parameter": (
         "name,wall.gsd\nhall,1\nattic,1\n",

@@ -184,6 +184,30 @@ def test_a_dataset_cannot_set_what_is_swept(catalog: Catalog) -> None:
         load(catalog, text)
 
 
+@pytest.mark.parametrize(
+    ("variant", "step"),
+    [
+        (
+            "hough2d",
+            "{variants: {hough2d: {use: plane.hough2d, %s}, ransac: {use: plane.ransac}}, %s}",
+        ),
+        ("hough2d", "{use: plane.hough2d, %s, %s}"),
+    ],
+    ids=["of several", "alone"],
+)
+def test_a_dataset_names_a_swept_variant_as_set_does(
+    catalog: Catalog, variant: str, step: str
+) -> None:
+    swept = step % ("params: {tolerance_m: {sweep: [0.02, 0.05]}}", "in: {cloud: room.cloud}")
+    text = f"orthoflow: 1\nname: swept\nsteps: {{room: {{use: simulate.room}}, plane: {swept}}}\n"
+    given = f"{text}datasets: {{a: {{set: {{plane.{variant}.cell_m: 0.005}}}}}}\n"
+    calls = load(catalog, given).datasets["a"].calls
+    assert [call.params["cell_m"] for call in calls.values()] == [0.005, 0.005]
+    refused = f"{text}datasets: {{a: {{set: {{plane.{variant}.tolerance_m: 0.5}}}}}}\n"
+    with pytest.raises(InvalidWorkflowError, match="tolerance_m is swept in step plane"):
+        load(catalog, refused)
+
+
 def test_over_datasets_every_value_runs_on_each(catalog: Catalog) -> None:
     text = f"{ROOM}datasets: {{a: {{set: {{plane.cell_m: 0.005}}}}, b: {{}}}}\n"
     cells = [cell for cell in expand_cells(load(catalog, text), catalog) if cell.step == "plane"]

@@ -1,0 +1,25 @@
+"""Units as the names of parameters and metrics say them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+# What a part of a name stands for; `1` for numbers that have no unit, in whatever sense.
+UNITS: Final[Mapping[str, str]] = {
+    **{unit: unit for unit in ("m", "mm", "m2", "px", "deg", "rad", "s", "cells")},
+    "mib": "MiB",
+    "grey": "grey levels",
+    "sigma": "sigmas",
+    **dict.fromkeys(("share", "ratio", "factor", "scale", "exponent", "power", "probability"), "1"),
+}
+
+
+def unit_of(name: str) -> str:
+    """Give the unit that a name says, where the last of its words that is one stands; else nothing.
+
+    >>> unit_of("tolerance_m"), unit_of("area_min_m2"), unit_of("area_m2_min"), unit_of("n_trials")
+    ('m', 'm2', 'm2', '')
+    """
+    words = reversed(name.split("_"))
+    return next((UNITS[word] for word in words if word in UNITS), "")
