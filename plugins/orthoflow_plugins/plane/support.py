@@ -208,7 +208,7 @@ def support_of(
     without `joins_parts` only the one with most points.
 
     Returns:
-        The support, or None where no cell belongs.
+        The support, or None where no cell belongs, or all lie scattered: no part is large enough.
     """
     from scipy import ndimage
 
@@ -218,6 +218,8 @@ def support_of(
     names, n_parts = ndimage.label(joined | belongs, np.ones((3, 3), dtype=int))
     sizes = np.bincount(names[belongs], minlength=n_parts + 1)
     kept = np.flatnonzero(sizes >= max(part_share * belongs.sum(), 1.0))
+    if not len(kept):
+        return None
     n_points = np.bincount(names[belongs], sums.n_find[belongs], minlength=n_parts + 1)
     kept = kept[np.argsort(-n_points[kept], kind="stable")]
     kept = kept if joins_parts else kept[:1]

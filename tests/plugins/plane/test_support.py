@@ -138,6 +138,16 @@ def test_parts_with_a_fair_share_of_the_cells_count() -> None:
         assert len(support.parts_m) == 1 + counts
 
 
+def test_cells_that_all_lie_scattered_support_nothing() -> None:
+    # 7 x 7 single cells, eleven apart: no gap is closed, and each is one of forty-nine.
+    belongs = np.zeros((77, 77), dtype=bool)
+    belongs[::11, ::11] = True
+    sums = sums_of(belongs.astype(np.int64))
+    assert support_of(raster_of((77, 77)), belongs, sums) is None
+    belongs[0, 0:2] = True
+    assert support_of(raster_of((77, 77)), belongs, sums, part_share=0.04) is not None
+
+
 def test_nothing_supports_nothing() -> None:
     nothing = np.zeros((4, 5), dtype=bool)
     assert support_of(raster_of((4, 5)), nothing, sums_of(nothing.astype(np.int64))) is None
