@@ -13,6 +13,11 @@ if TYPE_CHECKING:
 __all__ = ["__version__", "open_run", "run"]
 
 
+def __dir__() -> list[str]:
+    # What is loaded on first use is there for `help` and for completion, too.
+    return sorted({*globals(), *__all__})
+
+
 def __getattr__(name: str) -> object:
     # Lazy: `orthoflow --help` must not load numpy and h5py for a name it never uses.
     if name == "open_run":

@@ -69,6 +69,22 @@ class Command(click.Command):
         super().__init__(*args, **kwargs)
         self.params.append(debug_parameter())
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; where a shell took a list apart, say so."""
+        given = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except click.UsageError as error:
+            broken = (one for one in given if one.count("[") > one.count("]"))
+            found = next(broken, "")
+            if not found or "unexpected extra argument" not in error.message:
+                raise
+            sentence = (
+                f"{error.message.rstrip('.')}; {found} was taken apart at its spaces: put all of "
+                "the value in quotes, as --set 'wall.near=[[1, 2, 3]]'"
+            )
+            raise click.UsageError(sentence, ctx) from error
+
 
 class RecordCommand(Command):
     """A command whose arguments are runs: what fails on a damaged record is said to be its fault.

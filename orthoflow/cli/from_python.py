@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
+from orthoflow.catalog import did_you_mean
 from orthoflow.cli.options import DEFAULT_STORE, Changes
 from orthoflow.cli.run import prepared
+from orthoflow.errors import ArgumentError
 
 if TYPE_CHECKING:
     from orthoflow.report.notebooks import OpenedRun
+
+# Options that are no fields of the engine's.
+_POPPED: Final = ("set_files", "embed")
 
 
 def run(
@@ -58,12 +65,26 @@ def run(
         only_data=tuple(only_data),
     )
     embed = bool(options.pop("embed", False))
+    _refuse_unknown(options)
     folder = None if output is None else Path(output)
     with prepared(str(workflow), changes, folder, Path(store), embed=embed, **options) as call:
         made = call.make()
     from orthoflow.report.notebooks import open_run
 
     return open_run(made.run.path)
+
+
+def _refuse_unknown(options: Mapping[str, object]) -> None:
+    from orthoflow.engine import RunOptions
+
+    known = [*(field.name for field in fields(RunOptions)), *(signature(run).parameters), *_POPPED]
+    known.remove("options")
+    for name in options:
+        if name not in known:
+            raise ArgumentError(
+                f"orthoflow.run takes no {name}{did_you_mean(name, known)}; it takes "
+                f"{', '.join(known)}"
+            )
 
 
 def _several(paths: str | Path | Sequence[str | Path]) -> tuple[str, ...]:

@@ -41,7 +41,7 @@ _SUMMARIES: Final = {
 _HELP: Final = """Make orthoimages of walls from laser scans and free-hand photographs, with methods
 that can be compared and repeated.
 
-A first run, on a simulated room: orthoflow run direct.yaml
+A first run, on a simulated room: orthoflow run quickstart.yaml
 
 Exit codes: 0 good; 1 some cell failed; 2 the workflow, an argument or an input is invalid; 3 a
 record is damaged or differs; 4 a plugin or a library is missing; 130 interrupted.

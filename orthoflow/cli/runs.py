@@ -73,7 +73,12 @@ _SIGNS: Final[Mapping[str, Callable[[float, float], bool]]] = {
     metavar="FILE",
     help="Write a page that leads to the report of each run.",
 )
-@click.option("--csv", "as_csv", is_flag=True, help="Print CSV, with every metric and parameter.")
+@click.option(
+    "--csv",
+    "as_csv",
+    is_flag=True,
+    help="Print CSV, with every metric and parameter; > FILE keeps it.",
+)
 @json_option
 def runs(
     folders: tuple[Path, ...],
@@ -94,6 +99,9 @@ def runs(
     """
     if as_csv and as_json:
         raise click.UsageError("--csv and --json exclude each other")
+    for folder in folders:
+        if as_csv and folder.suffix == ".csv" and not folder.exists():
+            raise click.UsageError(f"--csv prints its table: write it into a file by > {folder}")
     found = list_runs(folders or (Path(),))
     kept = _sorted(_filtered(found, where, **only), sort)
     if as_json:

@@ -256,7 +256,9 @@ def record_errors(path: Path) -> Iterator[None]:
         # h5py reports damage with any of these, depending on which structure is hit.
         if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EISDIR):
             raise ArgumentError(f"{path} is no file; give a run folder or its run.h5") from error
-        raise RecordError(f"{path} is no record or is damaged: {error}") from error
+        raise RecordError(
+            f"{path} is no record or is damaged: {error}; take another copy of it"
+        ) from error
 
 
 def _with_path(path: Path, sentence: str) -> str:

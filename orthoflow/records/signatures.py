@@ -197,6 +197,11 @@ def _private_key(path: Path, password: Callable[[], str]) -> Ed25519PrivateKey:
     )
 
     data = _key_bytes(path)
+    if data.startswith((b"ssh-", b"-----BEGIN PUBLIC")):
+        raise InputError(
+            f"{path} is the public half of a key, by which others check: sign with the private one"
+            f", {path.with_suffix('')}"
+        )
     load = load_ssh_private_key if b"OPENSSH PRIVATE KEY" in data else load_pem_private_key
     try:
         try:

@@ -29,6 +29,7 @@ from orthoflow.records import open_run as open_plain_run
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.pictures import embedded_products, thumbnail
 from orthoflow.report.summaries import answers
+from orthoflow.report.tidy_tables import Varied
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,19 +47,19 @@ class OpenedRun(Run):
 
         Returns:
             Columns `cell`, `step`, `method`, one per step that varies (`data` for datasets; the
-            variant, missing where the cell does not have it), `repeat`, `metric`, `value`, `unit`.
+            variant, missing where the cell does not have it; with a `=` behind where the step is
+            called as another column), one per swept parameter (`plane.tolerance_m`, a number),
+            `repeat`, `metric`, `value`, `unit`.
         """
         import pandas as pd  # noqa: PLC0415 - takes a second, and few ask
 
-        varied = list(
-            dict.fromkeys(step for cell in self.cells.values() for step in cell.assignment)
-        )
+        varied = Varied.of(self)
         rows = [
             (
                 cell.address,
                 cell.step,
                 cell.method,
-                *(cell.assignment.get(step) for step in varied),
+                *varied.values(cell.assignment),
                 cell.repeat,
                 row.metric,
                 row.value,
@@ -67,9 +68,9 @@ class OpenedRun(Run):
             for cell in self.record.cells
             for row in cell_metrics(cell)
         ]
-        # A step may be called as a column is.
-        columns = ["cell", "step", "method", *(f"{step}=" for step in varied)]
-        return pd.DataFrame(rows, columns=[*columns, "repeat", "metric", "value", "unit"])
+        first, last = ("cell", "step", "method"), ("repeat", "metric", "value", "unit")
+        columns = [*first, *varied.names((*first, *last)), *last]
+        return pd.DataFrame(rows, columns=columns)
 
     @cached_property
     def figures(self) -> Figures:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +23,7 @@ from orthoflow.workflow.problems import ProblemLog
 # Files and folders that are looked at for one input: `/**` would go on for hours.
 MOST_LOOKED_AT: Final = 100_000
 _MOST_LISTED: Final = 12
+_MOST_BESIDE: Final = 200
 
 
 def read_inputs(value: Value, folder: Path, log: ProblemLog) -> dict[str, WorkflowInputSpec]:
@@ -193,10 +196,18 @@ def _find(spec: WorkflowInputSpec, pattern: str) -> list[Path]:
         files = [match for match in look.for_pattern(spec.folder, pattern) if match.is_file()]
         missing = f"no file matches {pattern}{where}"
     else:
-        files, missing = [], f"there is no file {pattern}{where}"
+        files, missing = [], f"there is no file {pattern}{where}{_meant(path)}"
     if not files:
         raise InputError(f"input {spec.name}: {missing}")
     return [item.absolute() for item in files]
+
+
+def _meant(path: Path) -> str:
+    """Ask whether a file beside it was meant, empty where none is called alike."""
+    with suppress(OSError):
+        beside = [item.name for item in islice(path.parent.iterdir(), _MOST_BESIDE)]
+        return did_you_mean(path.name, beside)
+    return ""
 
 
 class _Look:

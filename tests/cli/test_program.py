@@ -144,6 +144,14 @@ def test_every_listing_verb_has_json(command: str) -> None:
     assert "--json" in CliRunner().invoke(program, [*command.split(), "--help"]).output
 
 
+def test_a_value_that_the_shell_took_apart_is_told_so() -> None:
+    words = ["run", "direct.yaml", "--set", "wall.near=[[1,", "2,", "3]]"]
+    result = CliRunner().invoke(program, words)
+    assert result.exit_code == 2
+    assert "wall.near=[[1, was taken apart at its spaces" in result.output
+    assert "quotes" in result.output
+
+
 def test_version_is_that_of_the_package() -> None:
     assert orthoflow("--version").stdout == f"orthoflow {__version__}\n"
 

@@ -218,6 +218,7 @@ def test_links_are_not_followed(runs: Path) -> None:
         (("--where", "rmse_u < 2"), "no run has a metric or parameter 'rmse_u'; did you mean"),
         (("--sort", "zzz"), "no run has a metric or parameter 'zzz'; --json has the names"),
         (("--metric", "zzz"), "no run has a metric or parameter 'zzz'"),
+        (("--csv", "r.csv"), "--csv prints its table: write it into a file by > r.csv"),
         (("--csv", "--json"), "--csv and --json exclude each other"),
     ],
 )

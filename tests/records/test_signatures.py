@@ -185,7 +185,7 @@ def test_what_is_no_signature_is_a_finding_only_when_one_is_asked_for(
     ("arguments", "sentence"),
     [
         (("sign", "--key", "nothing"), "there is no key file nothing"),
-        (("sign", "--key", "jane.pub"), "jane.pub is no private key in OpenSSH or PEM format"),
+        (("sign", "--key", "jane.pub"), "check: sign with the private one, jane"),
         (("sign", "--key", "other"), "other must be an Ed25519 key; `ssh-keygen -t ed25519` makes"),
         (("sign", "--key", "jane-protected"), "is protected by a password, and there is no term"),
         (("verify", "--signer", "jane"), "jane is no public key in OpenSSH or PEM format"),

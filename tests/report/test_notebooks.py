@@ -14,6 +14,7 @@ import orthoflow
 from orthoflow.errors import ArgumentError, OrthoflowError, WorkflowError
 from orthoflow.products import Orthoimages
 from orthoflow.report.notebooks import Figures, OpenedRun
+from orthoflow.report.tidy_tables import combination_rows
 from tests.provenance_records import write_sample
 from tests.report_runs import cell, compared_resolved, metrics, record
 from tests.report_runs import orthoimages_product as images_of
@@ -59,17 +60,57 @@ def test_a_run_fits_into_a_line_and_html_into_a_screen(tmp_path: Path) -> None:
     assert "\x1b" not in html
 
 
+def swept_run(folder: Path) -> OpenedRun:
+    """Three tolerances, one of them twice, in one room; a step is called `unit`."""
+    cells = []
+    for value in (0.02, 0.05, 0.1):
+        name = f"plane=tolerance_m-{value:g}".replace(".", "_")
+        cells += [
+            cell(f"plane@data=hall,{name}{mark}", params={"tolerance_m": value})
+            for mark in (("", "#1") if value == 0.05 else ("",))
+        ]
+        rms = metrics(rms_mm=100.0 * value)
+        cells.append(cell(f"check@data=hall,{name},unit=a", metrics=rms))
+    return OpenedRun(path=folder / "run.h5", record=record(cells))
+
+
 def test_metrics_are_a_row_each_with_the_variants_beside(tmp_path: Path) -> None:
     table = opened(tmp_path).metrics()
     rms = table[table.metric == "rms_mm"]
     assert list(table.columns) == [
-        "cell", "step", "method", "plane=", "repeat", "metric", "value", "unit",
+        "cell", "step", "method", "plane", "repeat", "metric", "value", "unit",
     ]  # fmt: skip
-    assert list(zip(rms["plane="], rms.repeat, rms.value, rms.unit, strict=True)) == [
+    assert list(zip(rms.plane, rms.repeat, rms.value, rms.unit, strict=True)) == [
         ("fine", 0, 1.0, "mm"), ("fine", 1, 1.5, "mm"), ("coarse", 0, 4.0, "mm"),
     ]  # fmt: skip
-    assert rms.groupby("plane=").value.mean().to_dict() == {"coarse": 4.0, "fine": 1.25}
-    assert table[table.step == "scan"]["plane="].isna().all()
+    assert rms.groupby("plane").value.mean().to_dict() == {"coarse": 4.0, "fine": 1.25}
+    assert table[table.step == "scan"]["plane"].isna().all()
+
+
+def test_a_swept_parameter_is_a_column_of_numbers(tmp_path: Path) -> None:
+    # A curve was `removeprefix("tolerance_m-").str.replace("_", ".").astype(float)` before.
+    table = swept_run(tmp_path).metrics()
+    rms = table[(table.step == "check") & (table.metric == "rms_mm")]
+    assert dict(zip(rms["plane.tolerance_m"], rms.value, strict=True)) == {
+        0.02: 2.0, 0.05: 5.0, 0.1: 10.0,
+    }  # fmt: skip
+    assert rms["plane.tolerance_m"].dtype == float
+    assert list(table.data.unique()) == ["hall"]
+    # A step may be called as a column is.
+    assert "unit=" in table.columns
+
+
+def test_the_rows_of_the_report_are_a_table_of_their_own(tmp_path: Path) -> None:
+    header, *rows = combination_rows(swept_run(tmp_path))
+    named = [dict(zip(header, row, strict=True)) for row in rows]
+    wanted = ("data", "plane", "plane.tolerance_m", "repeat", "status", "check.rms_mm")
+    assert [tuple(row[name] for name in wanted) for row in named] == [
+        ("hall", "tolerance_m-0_02", 0.02, 0, "ok", 2.0),
+        ("hall", "tolerance_m-0_05", 0.05, 0, "ok", 5.0),
+        ("hall", "tolerance_m-0_05", 0.05, 1, "ok", None),
+        ("hall", "tolerance_m-0_1", 0.1, 0, "ok", 10.0),
+    ]
+    assert [row["plane.wall_s"] for row in named] == [1.0] * 4
 
 
 def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:
@@ -131,6 +172,9 @@ def test_what_is_wrong_with_a_workflow_is_raised(
         OrthoflowError, match=r"there is no parameter gsd in raster\.grid \(did you"
     ):
         orthoflow.run("direct.yaml", set={"wall.gsd": 1})
+    with pytest.raises(ArgumentError, match=r"takes no only_dataa \(did you mean only_data\?\)"):
+        orthoflow.run("direct.yaml", only_dataa="calm")
+    assert {"run", "open_run"} <= set(dir(orthoflow))
     with pytest.raises(WorkflowError, match="did you mean direct"):
         orthoflow.run("dirct.yaml")
     (tmp_path / "fine.yaml").write_text("wall.gsd_m: 0.004\nwall.gsd: 1\n")

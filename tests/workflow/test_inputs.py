@@ -85,6 +85,7 @@ def test_absolute_patterns_work(project: Path, catalog: Catalog) -> None:
             r"input photos: the folder empty beside the workflow \(.*\) holds no files",
         ),
         ("{files: /nowhere/x.jpg}", r"input photos: there is no file /nowhere/x\.jpg$"),
+        ("{files: photos/b_.jpg}", r"no file photos/b_\.jpg beside .* \(did you mean b\.jpg\?\)"),
         ("{files: [photos/a.jpg, x.jpg]}", "input photos: there is no file x.jpg"),
         ("{}", r"input photos has no files; name them .* or with --input photos=PATH"),
     ],

@@ -30,10 +30,17 @@ def export_colmap(run: Run, folder: Path, chosen: Choices) -> str:
 
 def export_csv(run: Run, folder: Path, _chosen: Choices) -> str:
     """Write all tables."""
+    from orthoflow.foreign_text import csv_text
     from orthoflow.records.spreadsheets import write_csv_tables
+    from orthoflow.report.tidy_tables import combination_rows
 
     make_empty(folder)
-    return ", ".join(path.name for path in write_csv_tables(run, folder))
+    written = [path.name for path in write_csv_tables(run, folder)]
+    text = csv_text(combination_rows(run))
+    (folder / "combinations.csv").write_text(
+        text, encoding="utf-8", errors="backslashreplace", newline=""
+    )
+    return ", ".join([*written, "combinations.csv"])
 
 
 def export_figures(run: Run, folder: Path, chosen: Choices) -> str:

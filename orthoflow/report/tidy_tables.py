@@ -1,0 +1,72 @@
+"""Numbers for statistics programs: a column per step that varies, and per parameter of a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from orthoflow.foreign_text import Value
+from orthoflow.records import RecordedCell, Run, cell_metrics
+from orthoflow.report.combinations import Combination, combinations_of
+from orthoflow.report.curves import sweeps
+
+
+@dataclass(frozen=True, kw_only=True)
+class Varied:
+    """What varies in a run.
+
+    Attributes:
+        steps: the steps with variants; `data` for datasets.
+        swept: (step, parameter) -> variant -> value, of parameters that are swept.
+    """
+
+    steps: tuple[str, ...]
+    swept: Mapping[tuple[str, str], Mapping[str, float]]
+
+    @classmethod
+    def of(cls, run: Run) -> Varied:
+        """Look through the cells of a run."""
+        swept: dict[tuple[str, str], dict[str, float]] = {}
+        for sweep in sweeps(run.record.cells):
+            swept.setdefault((sweep.step, sweep.parameter), {}).update(sweep.values)
+        steps = dict.fromkeys(step for cell in run.record.cells for step in cell.assignment)
+        return cls(steps=tuple(steps), swept=swept)
+
+    def names(self, taken: Collection[str]) -> tuple[str, ...]:
+        """Name the columns: steps, with a `=` where a column is called so; parameters in full."""
+        steps = (f"{step}=" if step in taken else step for step in self.steps)
+        return (*steps, *(".".join(parameter) for parameter in self.swept))
+
+    def values(self, assignment: Mapping[str, str]) -> tuple[str | float | None, ...]:
+        """Give the columns of a cell or combination; None where it has no part in one."""
+        variants = (assignment.get(step) for step in self.steps)
+        numbers = (values.get(assignment.get(step, "")) for (step, _), values in self.swept.items())
+        return (*variants, *numbers)
+
+
+def combination_rows(run: Run) -> Iterator[Sequence[Value]]:
+    """Give a header, then a row per combination and repeat with every number of its cells.
+
+    What is not repeated stands in the row of the first repeat only.
+    """
+    varied = Varied.of(run)
+    fixed = ("repeat", "status")
+    metrics = dict.fromkeys(
+        (row.step, row.metric) for cell in run.record.cells for row in cell_metrics(cell)
+    )
+    yield (*varied.names(fixed), *fixed, *(".".join(metric) for metric in metrics))
+    for one in combinations_of(run):
+        for repeat in sorted({cell.repeat for cell in one.cells}):
+            cells = [cell for cell in one.cells if cell.repeat == repeat]
+            found = {
+                (row.step, row.metric): row.value for cell in cells for row in cell_metrics(cell)
+            }
+            status = _status(one, cells)
+            values = (found.get(metric) for metric in metrics)
+            yield (*varied.values(one.assignment), repeat, status, *values)
+
+
+def _status(one: Combination, cells: Sequence[RecordedCell]) -> str:
+    if any(cell.status == "failed" for cell in cells):
+        return "failed"
+    return "not computed" if one.missing else "ok"
