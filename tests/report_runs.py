@@ -59,6 +59,10 @@ class HeldRun(Run):
         yield self
 
 
+# Steps whose name is not their kind's.
+_KINDS = {"check": "inspect", "other": "inspect", "first": "orient", "second": "orient"}
+
+
 def cell(address: str, **more: object) -> RecordedCell:
     """A cell that went well, but for what `more` says."""
     step, _, variants = address.partition("#")[0].partition("@")
@@ -66,7 +70,7 @@ def cell(address: str, **more: object) -> RecordedCell:
     wanted: dict[str, object] = {
         "address": address,
         "step": step,
-        "method": f"{step}.toy",
+        "method": f"{_KINDS.get(step, step)}.toy",
         "status": "ok",
         "assignment": assignment,
         "repeat": int(address.partition("#")[2] or 0),

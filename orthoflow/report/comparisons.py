@@ -8,12 +8,12 @@ from fnmatch import fnmatchcase
 from string import ascii_uppercase
 from typing import Final
 
-from orthoflow.records import COSTS, RecordedEnvironment, Run, cell_metrics
+from orthoflow.records import COSTS, MetricRow, RecordedEnvironment, Run, cell_metrics
 from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics
-from orthoflow.report.metric_words import label_in_words
+from orthoflow.report.metric_words import label_in_words, label_of
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
-from orthoflow.report.summaries import QUALITY
+from orthoflow.report.summaries import QUALITY, is_quality
 
 _NOTHING: Final = "-"
 _NAMED: Final = 3  # numbers that a combination is best in
@@ -188,27 +188,35 @@ def comparison_table(runs: Sequence[Run]) -> ComparisonTable | None:
 
 def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...]:
     """Metrics that the workflows ask for, else the quality metrics; the cost has its own places."""
-    units: dict[tuple[str, str], str] = {}
+    first: dict[tuple[str, str], MetricRow] = {}
     for cell in (cell for one in combinations for cell in one.cells):
         for row in cell_metrics(cell):
-            units.setdefault((row.step, row.metric), row.unit)
+            first.setdefault((row.step, row.metric), row)
     runs = {one.run.path: one.run for one in combinations}.values()
     patterns = dict.fromkeys(pattern for run in runs for pattern in wanted_metrics(run))
     if patterns:
-        wanted = _matching(patterns, units)
+        wanted = _matching(patterns, first)
     else:
         # A later step of the chain improves on an earlier one: first and final orientation.
         last: dict[tuple[str, str], None] = {}
         for one in combinations:
             steps = {row.metric: row.step for cell in one.cells for row in cell_metrics(cell)}
             last |= dict.fromkeys((step, metric) for metric, step in steps.items())
-        wanted = [key for name in QUALITY for key in last if key[1] == name]
+        wanted = [
+            key for name in QUALITY for key in last if key[1] == name and is_quality(first[key])
+        ]
+        # What a plugin says to have a good side is worth a column, too.
+        wanted += [
+            key
+            for key, row in first.items()
+            if (label := label_of(row.metric, row.method)) and label.good
+        ]
     return tuple(
         Column(
             step=step,
             metric=metric,
-            label=label_in_words(metric, units[step, metric]),
-            sense=sense_of(metric),
+            label=label_in_words(metric, first[step, metric].unit, first[step, metric].method),
+            sense=sense_of(metric, first[step, metric].method),
         )
         for step, metric in wanted
     )

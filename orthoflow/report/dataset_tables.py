@@ -8,13 +8,13 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Final
 
-from orthoflow.records import Run, cell_metrics
+from orthoflow.records import MetricRow, Run, cell_metrics
 from orthoflow.report.combinations import baseline_cells, is_missing
 from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number
 from orthoflow.report.pictures import thumbnail
 from orthoflow.report.rankings import Value
-from orthoflow.report.summaries import QUALITY, limits
+from orthoflow.report.summaries import QUALITY, is_quality, limits
 from orthoflow.workflow.format import DATA
 
 _ORIENTED: Final = "n_oriented"
@@ -82,12 +82,18 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
         for name, part in parts.items()
     }
     measured = {name: _measured(part, own[name]) for name, part in parts.items()}
-    units = {key: unit for values in measured.values() for key, (_, unit) in values.items()}
-    wanted = [key for metric in QUALITY for key in units if key[1] == metric]
+    units = {key: row for values in measured.values() for key, row in values.items()}
+    wanted = [
+        key
+        for metric in QUALITY
+        for key, row in units.items()
+        if key[1] == metric and is_quality(row)
+    ]
     chosen = [key for key in wanted if key[1] != _ORIENTED][:_MOST_COLUMNS]
     return DatasetTable(
         columns=tuple(
-            (step, label_in_words(metric, units[step, metric])) for step, metric in chosen
+            (row.step, label_in_words(row.metric, row.unit, row.method))
+            for row in (units[key] for key in chosen)
         ),
         rows=tuple(
             DatasetRow(
@@ -110,13 +116,13 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     )
 
 
-_Measured = Mapping[tuple[str, str], tuple[float, str]]
+_Measured = Mapping[tuple[str, str], MetricRow]
 
 
 def _measured(part: Run, own: AbstractSet[str]) -> _Measured:
-    """What the baseline's cells of this dataset measured: (step, metric) -> value and unit."""
+    """What the baseline's cells of this dataset measured: (step, metric) -> the number."""
     return {
-        (row.step, row.metric): (row.value, row.unit)
+        (row.step, row.metric): row
         for cell in baseline_cells(part)
         if cell.address in own
         for row in cell_metrics(cell)
@@ -129,8 +135,8 @@ def _picture(part: Run, own: AbstractSet[str], n_rows: int) -> str:
     return thumbnail(part, addresses, longest_side_px=min(_LARGEST_PX, max(_SMALLEST_PX, side_px)))
 
 
-def _value(measured: tuple[float, str] | None) -> Value:
-    return Value(text=number(measured[0]), sort=measured[0]) if measured else Value()
+def _value(measured: MetricRow | None) -> Value:
+    return Value(text=number(measured.value), sort=measured.value) if measured else Value()
 
 
 def _limit(part: Run, own: AbstractSet[str]) -> str:
@@ -148,7 +154,7 @@ def _photos(measured: _Measured) -> Value:
     steps = [step for step, metric in measured if metric == _ORIENTED]
     if not steps:
         return Value()
-    oriented, _ = measured[steps[-1], _ORIENTED]
+    oriented = measured[steps[-1], _ORIENTED].value
     total = measured.get((steps[-1], "n_photos"))
-    text = f"{number(oriented)} of {number(total[0])}" if total else number(oriented)
+    text = f"{number(oriented)} of {number(total.value)}" if total else number(oriented)
     return Value(text=text, sort=oriented)

@@ -39,7 +39,7 @@ from orthoflow.report.figures import (
     write_figures,
 )
 from orthoflow.report.legends import depth_gradient
-from orthoflow.report.metric_words import metric_words
+from orthoflow.report.metric_words import metric_words, words_of
 from orthoflow.report.numbers import number, number_with_unit
 from orthoflow.report.overlays import overlays
 from orthoflow.report.paired import MetricOverDatasets, over_datasets
@@ -268,6 +268,7 @@ def environment() -> jinja2.Environment:
     environment.filters["breakable"] = _breakable
     environment.filters["urlpath"] = quote
     environment.filters["in_words"] = metric_words
+    environment.filters["of_method"] = words_of
     environment.filters["drawing"] = Markup
     environment.globals["costs"] = COSTS
     environment.globals["version"] = __version__

@@ -9,6 +9,8 @@ from enum import Enum
 from fnmatch import fnmatchcase
 from typing import Final
 
+from orthoflow.report.metric_words import label_of
+
 # Without repeats nobody knows how far values of the same method lie apart. What is nearer than this
 # share of the best is no difference then; times and memory scatter more, times from run to run by
 # so much (docs/performance.md), whatever their repeats in one run say.
@@ -109,6 +111,12 @@ class Sense(Enum):
     NEITHER = "neither more nor less is better"
 
 
+_DECLARED: Final = {
+    "less": Sense.LESS,
+    "more": Sense.MORE,
+    "one": Sense.ONE,
+    "": Sense.NEITHER,
+}
 # The first pattern that fits holds. A name that fits none is described, not judged: most metrics
 # (angles, counts, shares of kinds of points) have no good side.
 _PATTERNS: Final[tuple[tuple[str, Sense], ...]] = (
@@ -149,12 +157,14 @@ _PATTERNS: Final[tuple[tuple[str, Sense], ...]] = (
 )
 
 
-def sense_of(metric: str) -> Sense:
-    """Say what makes a value of the metric good.
+def sense_of(metric: str, method: str = "") -> Sense:
+    """Say what makes a value of the metric good: what its method declares, else what its name says.
 
     >>> sense_of("rmse_u_mm").name, sense_of("label_iou").name, sense_of("omega_deg").name
     ('LESS', 'MORE', 'NEITHER')
     """
+    if label := label_of(metric, method):
+        return _DECLARED[label.good]
     for pattern, sense in _PATTERNS:
         if fnmatchcase(metric, pattern):
             return sense

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from orthoflow.alike import alike
-from orthoflow.records import Run, cell_metrics
+from orthoflow.records import MetricRow, Run, cell_metrics
 from orthoflow.report.combinations import baseline_cells
-from orthoflow.report.metric_words import WORDS
+from orthoflow.report.metric_words import WORDS, words_of
 from orthoflow.report.numbers import number, number_with_unit
 
 # Without photos that show a place, completeness cannot be asked for there.
@@ -52,13 +52,18 @@ class Limit:
     cells: tuple[str, ...]
 
 
+def is_quality(row: MetricRow) -> bool:
+    """Whether a number is one of QUALITY; a stranger's kind may mean something else by the name."""
+    return row.metric in QUALITY and words_of(row.metric, row.method) != row.metric
+
+
 def answers(run: Run) -> tuple[Answer, ...]:
     """How good the products are: the quality metrics of the baseline's inspections and planes."""
     rows = [row for cell in baseline_cells(run) for row in cell_metrics(cell)]
     values = {(row.cell, row.metric): row.value for row in rows}
     found: list[Answer] = []
-    for wanted, what in QUALITY.items():
-        stated = [row for row in rows if row.metric == wanted]
+    for wanted in QUALITY:
+        stated = [row for row in rows if row.metric == wanted and is_quality(row)]
         # A later step of the chain improves on an earlier one: first and final orientation.
         stated = [row for row in stated if row.step == stated[-1].step]
         if wanted == "completeness":
@@ -67,6 +72,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
             value = _in_words(wanted, row.value, row.unit)
             if wanted == "n_oriented" and (row.cell, "n_photos") in values:
                 value = f"{value} of {number(values[row.cell, 'n_photos'])}"
+            what = words_of(wanted, row.method)
             found.append(Answer(what=what, value=value, cell=row.cell))
     return tuple(found)
 

@@ -108,6 +108,20 @@ class MappedPort:
     item_name: str
 
 
+@dataclass(frozen=True, kw_only=True)
+class MetricLabel:
+    """What a report says of a metric beside its unit.
+
+    Attributes:
+        words: heading, e.g. `damp patches`.
+        good: which side is good, `less`, `more` or `one`; empty where none is: then it is shown,
+            and nobody is best in it.
+    """
+
+    words: str
+    good: Literal["", "less", "more", "one"] = ""
+
+
 class Method:
     """Base of all methods.
 
@@ -124,6 +138,8 @@ class Method:
         metrics: names of all metrics that it may report, with the wildcards of file names (`*`,
             `[xy]`) where a part hangs on the data. A comparison that asks for another one is
             refused; empty where the author declares none: then nothing is refused.
+        metric_labels: what metrics of its own are called in tables, and what makes them good:
+            name, with wildcards as above -> label. What it says nothing of keeps its name.
         citations: where the method comes from: DOI, title or URL.
         Params: parameters.
         In: input ports.
@@ -137,6 +153,7 @@ class Method:
     result_version: ClassVar[int] = 1
     determinism: ClassVar[Determinism] = "exact"
     metrics: ClassVar[tuple[str, ...]] = ()
+    metric_labels: ClassVar[Mapping[str, MetricLabel]] = {}
     citations: ClassVar[tuple[str, ...]] = ()
     Params: ClassVar[type[MethodParams]]
     In: ClassVar[type[Ports]]

@@ -115,7 +115,7 @@ def test_a_run_is_summed_up_by_its_baseline(tmp_path: Path) -> None:
         "plane.cell_m": 0.1,
         "plane.use": "plane.toy",
         "check.tries": 2,
-        "check.use": "check.toy",
+        "check.use": "inspect.toy",
         "bad.use": "bad.toy",
         "worse.use": "worse.toy",
     }

@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+import orthoflow.report.metric_words as metric_words_module
 from orthoflow.catalog import discover_catalog
-from orthoflow.report.metric_words import WORDS, is_described, label_in_words, metric_words
+from orthoflow.report.combinations import combinations_of
+from orthoflow.report.comparisons import comparison_columns
+from orthoflow.report.metric_words import (
+    WORDS,
+    is_described,
+    label_in_words,
+    metric_words,
+    words_of,
+)
+from orthoflow.report.rankings import Sense
 from orthoflow.report.summaries import QUALITY
 from orthoflow.workflow.methods import describe_method
+from tests.laboratories import write_distribution
+from tests.report_runs import HeldRun, cell, metrics, record
 
 
 def test_every_metric_of_ours_is_described() -> None:
@@ -43,9 +57,9 @@ def test_prefixes_stand_behind_the_words(name: str, words: str) -> None:
 
 
 def test_a_unit_stands_behind_once_and_not_for_shares() -> None:
-    assert label_in_words("rmse_u_mm", "mm") == "error along u (right), RMS / mm"
-    assert label_in_words("strange_mm", "mm") == "strange_mm / mm"
-    assert label_in_words("n_planes", "1") == "planes found"
+    assert label_in_words("rmse_u_mm", "mm", "inspect.truth") == "error along u (right), RMS / mm"
+    assert label_in_words("strange_mm", "mm", "inspect.truth") == "strange_mm / mm"
+    assert label_in_words("n_planes", "1", "plane.toy") == "planes found"
 
 
 def test_words_tell_names_apart() -> None:
@@ -64,3 +78,69 @@ def test_words_tell_names_apart() -> None:
         ("megapixels", "photo_megapixels"),
         ("void_*_share", "empty*_share"),
     }
+
+
+MOISTURE = """
+from orthoflow.sdk import Method, MethodParams, MetricLabel, Ports
+
+
+class Damp(Method):
+    id = "damp.simple"
+    Params = MethodParams
+
+    class In(Ports):
+        cloud: "PointCloud"
+
+    class Out(Ports):
+        planes: "Planes"
+
+    metric_labels = {
+        "n_patches": MetricLabel(words="damp patches"),
+        "damp_share": MetricLabel(words="share that is damp", good="less"),
+    }
+
+    def run(self, inputs, params, ctx):
+        raise NotImplementedError
+
+
+from orthoflow.products import Planes, PointCloud
+"""
+HOOKS = """
+from orthoflow.sdk.hooks import KindSpec, MethodSpec, hookimpl
+
+
+@hookimpl
+def orthoflow_kinds():
+    ports = {"inputs": {"cloud": "cloud"}, "outputs": {"planes": "planes"}}
+    return [KindSpec(name="damp", summary="-", **ports)]
+
+
+@hookimpl
+def orthoflow_methods():
+    return [MethodSpec(id="damp.simple", target="damp_method:Damp", summary="-")]
+"""
+
+
+def test_a_stranger_names_metrics_and_their_good_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = {"damp_hooks.py": HOOKS, "damp_method.py": MOISTURE}
+    monkeypatch.syspath_prepend(write_distribution(tmp_path, "damp", sources))
+    metric_words_module._catalog.cache_clear()
+    metric_words_module._declared.cache_clear()
+    shares = ((0.5, "dry"), (0.1, "wet"))
+    cells = [
+        cell(
+            f"damp@damp={name}",
+            method="damp.simple",
+            metrics=metrics(n_patches=3.0, damp_share=share, rms_mm=share),
+        )
+        for share, name in shares
+    ]
+    columns = comparison_columns(combinations_of(HeldRun(path=tmp_path, record=record(cells))))
+    metric_words_module._catalog.cache_clear()
+    metric_words_module._declared.cache_clear()
+    assert [(one.label, one.sense) for one in columns] == [("share that is damp", Sense.LESS)]
+    # Of a kind of a stranger's, what ours of the same name are called would be false.
+    assert words_of("n_patches", "moisture.simple") == "n_patches"
+    assert words_of("n_patches", "inspect.truth") == "patches compared with the truth"
