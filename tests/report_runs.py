@@ -30,7 +30,7 @@ from orthoflow.products import (
 )
 from orthoflow.products.product import Payload, Product
 from orthoflow.records import ComparedMetric, ProductDistance, Run
-from orthoflow.records.comparison import Distance
+from orthoflow.records.distances import Distance
 from tests import samples
 
 FRAME = samples.facing_south(0.01, 120, 80, (4.0e5, 5.0e6, 3.0))

@@ -41,7 +41,7 @@ def new(files: tuple[Path, ...], output: Path, *, recipe: Recipe | None, as_json
     """Look at each FILE, or what lies in a folder, and write a commented workflow for them.
 
     Scans, photos, a calibration, check points, ties measured by hand, cameras of other programs
-    and their orthoimages are told by their content. The workflow is a shipped recipe that names
+    and their orthoimages are told by their content. The workflow is a shipped one that names
     them; it is yours to change.
     """
     from orthoflow.cli.progress import working_on

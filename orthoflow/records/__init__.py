@@ -18,14 +18,16 @@ from orthoflow.engine.run_folder import RECORD_FILE
 from orthoflow.records.comparison import (
     CellFacts,
     ComparedMetric,
-    Distance,
     Pair,
     ParameterValue,
-    ProductDistance,
     RunComparison,
+    compare_runs,
+)
+from orthoflow.records.distances import (
+    Distance,
+    ProductDistance,
     RunProducts,
     Verdict,
-    compare_runs,
     product_distances,
 )
 from orthoflow.records.metrics import MetricRow, cell_metrics

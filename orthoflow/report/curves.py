@@ -202,7 +202,10 @@ def _curve(
     return Curve(
         title=title,
         svg=_Axes.of([point for points in lines.values() for point in points]).drawn(
-            lines, label=title, below=f"{sweep.step}.{sweep.parameter}"
+            lines,
+            label=title,
+            below=f"{sweep.step}.{sweep.parameter}",
+            beside=column.label,
         ),
         caption=(
             f"Points are {said}{good}. A flat stretch is where the parameter does not matter; at a "
@@ -248,10 +251,13 @@ class _Axes:
         low, high = self.y
         return _HEIGHT - _BOTTOM - (y - low) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
 
-    def drawn(self, lines: Mapping[str, Sequence[_Point]], *, label: str, below: str) -> str:
+    def drawn(
+        self, lines: Mapping[str, Sequence[_Point]], *, label: str, below: str, beside: str
+    ) -> str:
         floor = _HEIGHT - _BOTTOM
         parts = [
             f'<path class="axis" d="M{_LEFT} {_TOP}V{floor}H{_WIDTH - _RIGHT}"/>',
+            f'<text class="beside" x="6" y="{_TOP - 14}">{escape(shown(beside))}</text>',
             (
                 f'<text x="{0.5 * (_LEFT + _WIDTH):.0f}" y="{_HEIGHT - 6}" text-anchor="middle">'
                 f"{escape(shown(below))}{' (logarithmic)' if self.is_logarithmic else ''}</text>"

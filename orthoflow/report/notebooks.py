@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,7 +35,8 @@ from orthoflow.report.tidy_tables import Varied
 if TYPE_CHECKING:
     import pandas as pd
 
-_THUMBNAIL_PX: Final = 320
+_THUMBNAIL_PX: Final = 640
+_FIGURES_MOST: Final = 24  # shown at once: a notebook keeps them all in its file
 _SHOWN: Final = (OrthoMask.PAINTED, OrthoMask.FILLED)
 
 
@@ -128,10 +130,16 @@ class OpenedRun(Run):
             f"<tr><td>{_html(one.what)}</td><td>{_html(one.value)}</td><td>{_html(one.cell)}</td></tr>"
             for one in answers(self)
         )
-        counts = _html(repr(self))
+        counts = Counter(cell.status for cell in record.cells)
+        told = _html(", ".join(f"{count} {status}" for status, count in counts.items()))
         return (
-            f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>{counts}</p>"
-            + (f'<img alt="first orthoimage" src="{picture}">' if picture else "")
+            f"<div><p><b>{_html(record.name)}</b>, {_html(record.started)}<br>"
+            f"cells: {told or 'none'}</p>"
+            + (
+                f'<img alt="first orthoimage" src="{picture}" style="max-width:100%">'
+                if picture
+                else ""
+            )
             + (f"<table>{rows}</table>" if rows else "")
             + "</div>"
         )
@@ -169,6 +177,17 @@ class Figures(Mapping[str, RecordedFigure]):
 
     def __repr__(self) -> str:
         return "\n".join(shown(f"{name}: {one.caption}") for name, one in self._figures.items())
+
+    def _repr_html_(self) -> str:
+        named = list(self._figures.items())
+        pictures = (
+            _picture(one.data, one.media_type, f"{name}: {one.caption}")
+            for name, one in named[:_FIGURES_MOST]
+        )
+        more = "".join(f"<br>{_html(name)}" for name, _ in named[_FIGURES_MOST:])
+        return "".join(pictures) + (
+            f"<p>By name, <code>figures[...]</code>:{more}</p>" if more else ""
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,7 +273,7 @@ class WallImage:
         picture = cells_webp(
             self.image.mask.shape,
             lambda part: (eight_bits(self.rgb[part]), np.isin(self.image.mask[part], _SHOWN)),
-            longest_side_px=2 * _THUMBNAIL_PX,
+            longest_side_px=_THUMBNAIL_PX,
         )
         return _picture(picture, "image/webp", repr(self))
 

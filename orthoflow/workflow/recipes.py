@@ -30,7 +30,7 @@ def shipped_workflow(name: str) -> Path:
     if wanted.parent in (Path(), Path("workflows")) and stem in recipes:
         return recipes[stem]
     raise WorkflowError(
-        f"there is no workflow file {name} and no shipped recipe of that name"
+        f"there is no workflow file {name} and no shipped workflow of that name"
         f"{did_you_mean(stem, recipes)}; shipped: {', '.join(recipes)}"
     )
 

@@ -29,7 +29,7 @@ from orthoflow.records import (
     RecordedFile,
     RunComparison,
 )
-from orthoflow.records.comparison import Distance
+from orthoflow.records.distances import Distance
 from orthoflow.sdk import MethodParams, Ports
 from tests.laboratories import laboratory_catalog
 from tests.report_runs import cell, distance, metric, record

@@ -62,6 +62,7 @@ def test_points_lie_in_the_order_of_values_whatever_that_of_the_variants(tmp_pat
     (curve,) = curves(held(tmp_path, swept(0.1, 0.02, 0.05)))
     assert curve.title == "points to their plane, RMS / mm (plane) over plane.tolerance_m"
     assert "without repeats nobody knows" in curve.caption
+    assert ">points to their plane, RMS / mm</text>" in curve.svg
     points = [
         (float(x), float(y)) for x, y in re.findall(r'cx="([0-9.]+)" cy="([0-9.]+)"', curve.svg)
     ]

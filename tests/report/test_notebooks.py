@@ -57,6 +57,8 @@ def test_a_run_fits_into_a_line_and_html_into_a_screen(tmp_path: Path) -> None:
     html = run._repr_html_()
     assert len(html) < 5_000
     assert "points to their plane, RMS" in html
+    assert "cells: 4 ok" in html
+    assert "&lt;Run" not in html
     assert "\x1b" not in html
 
 
@@ -121,6 +123,10 @@ def test_figures_are_by_cell_and_name_and_shown(tmp_path: Path) -> None:
     told = Figures({"scan/\x1b[2J": replace(figure, caption="a\u202eb")})
     assert repr(told) == "scan/\\x1b[2J: a\\u202eb"
     assert "a &lt;plan&gt;" in figure._repr_html_()
+    # All of them are pictures, too, and beyond some the rest has names.
+    assert figures._repr_html_().count("<img") == 1
+    many = Figures({f"scan/{index}": figures["scan/plan"] for index in range(30)})._repr_html_()
+    assert (many.count("<img"), many.count("<br>scan/")) == (24, 6)
     assert 'src="data:image/png;base64,iVBORw0KGgo' in figure._repr_html_()
     figure.save(tmp_path / "plan.png")
     assert (tmp_path / "plan.png").read_bytes() == PNG
@@ -156,6 +162,9 @@ def test_runs_are_compared_as_a_table(tmp_path: Path) -> None:
     assert repr(comparison).startswith("<RunComparison of 'r1' and 'r2': 0 of 0 inputs, ")
     table = comparison.metric_table().set_index(["cell", "metric"])
     assert tuple(table.loc[("scan", "n_points")]) == (7.0, 9.0, 2.0, "1")
+    html = comparison._repr_html_()
+    assert "<td>n_points</td>" in html
+    assert "rms_mm" not in html
     assert np.isnan(table.loc[("plane@plane=coarse", "rms_mm")].difference)
 
 

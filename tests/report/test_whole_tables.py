@@ -14,7 +14,7 @@ from orthoflow.records import (
     RecordedFile,
     RunComparison,
 )
-from orthoflow.records.comparison import Distance
+from orthoflow.records.distances import Distance
 from orthoflow.report import numbers
 from orthoflow.report.combinations import (
     baseline_cells,
