@@ -95,7 +95,8 @@ def runs(
 
     A row says when a run was made, with which workflow, how it ended, how good its baseline is
     (of several datasets, the median), and which parameters and inputs differ from those of other
-    runs of the workflow. Runs without a record, and records that cannot be read, say why.
+    runs of the workflow. What --split wrote into a run is listed where its folder is named. Runs
+    without a record, and records that cannot be read, say why.
     """
     if as_csv and as_json:
         raise click.UsageError("--csv and --json exclude each other")

@@ -436,6 +436,11 @@ def test_options_belong_to_formats(
         check_choices(Choices(), target)
 
 
+def test_whoever_splits_is_told_where_to_export_then() -> None:
+    with pytest.raises(ArgumentError, match=r"as orthoflow export RUN/datasets/NAME --to csv$"):
+        check_choices(Choices(split=True), "csv")
+
+
 def test_only_an_empty_folder_is_written_to(tmp_path: Path) -> None:
     make_empty(tmp_path / "deep" / "er")
     make_empty(tmp_path / "deep" / "er")

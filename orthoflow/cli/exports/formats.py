@@ -164,7 +164,7 @@ def check_choices(chosen: Choices, target: str | None) -> None:
         raise ArgumentError(
             f"--split writes records of its own, so it does not go with "
             f"{f'--to {target}' if target else '--embed'}: split first, then export each, as "
-            f"orthoflow export RUN/export/datasets/NAME {f'--to {target}' if target else '--embed'}"
+            f"orthoflow export RUN/datasets/NAME {f'--to {target}' if target else '--embed'}"
         )
     taken = FORMATS[target].options if target else ()
     for name, flag in FLAGS.items():
