@@ -217,10 +217,13 @@ def _of_pytest(words: list[str]) -> str:
                 return f"there is no {word}"
             paths = [ROOT / word] if word.endswith(".py") else (ROOT / word).rglob("test_*.py")
             texts += "".join(path.read_text() for path in paths)
-    if "-k" in words and (name := words[words.index("-k") + 1]) != "NAME":
+    if "-k" in words and (names := words[words.index("-k") + 1]) != "NAME":
+        files = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
         texts = texts or "".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
-        if re.search(rf"def test_\w*{name}|class \w*{name}|{name}\w*\.py", texts) is None:
-            return f"no test is called {name}"
+        for name in set(re.findall(r"\w+", names)) - {"and", "or", "not"}:
+            is_file = any(name in file for file in files)
+            if not is_file and re.search(rf"def test_\w*{name}|class \w*{name}", texts) is None:
+                return f"no test is called {name}"
     return ""
 
 

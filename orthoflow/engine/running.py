@@ -237,7 +237,8 @@ class _Call:
                 # The method forked, and this is not the process whose result counts.
                 os._exit(1)
             self._wall_s = round(self._meter.clock_s() - wall_s, 4)
-            self._processor_s = round(self._cpu_s() - cpu_s, 4)
+            # Clocks of threads run ahead of their process's by ticks.
+            self._processor_s = max(0.0, round(self._cpu_s() - cpu_s, 4))
         # Not through `progress`: who was asked to stop, and ended all the same, has a result.
         self._context.listen(StepEvent(kind="progress", text="keeping the results", fraction=1.0))
         self._check_inputs(inputs)

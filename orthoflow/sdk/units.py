@@ -16,10 +16,13 @@ UNITS: Final[Mapping[str, str]] = {
 
 
 def unit_of(name: str) -> str:
-    """Give the unit that a name says, where the last of its words that is one stands; else nothing.
+    """Give the unit that the last word of a name that is one says; a name alone is no length.
 
     >>> unit_of("tolerance_m"), unit_of("area_min_m2"), unit_of("area_m2_min"), unit_of("n_trials")
     ('m', 'm2', 'm2', '')
+    >>> unit_of("m"), unit_of("share")
+    ('', '1')
     """
-    words = reversed(name.split("_"))
-    return next((UNITS[word] for word in words if word in UNITS), "")
+    words = name.split("_")
+    said = next((UNITS[word] for word in reversed(words) if word in UNITS), "")
+    return said if len(words) > 1 or said == "1" else ""

@@ -31,6 +31,7 @@ from orthoflow.records import (
 )
 from orthoflow.records.distances import Distance
 from orthoflow.sdk import MethodParams, Ports
+from orthoflow.sdk.units import unit_of
 from tests.laboratories import laboratory_catalog
 from tests.report_runs import cell, distance, metric, record
 
@@ -293,7 +294,7 @@ def test_parameters_are_said_with_type_limits_and_unit() -> None:
     assert plugins_commands._type_text({"$ref": "#/$defs/a"}, {"a": {"type": "object"}}) == "object"
     units = {"a_mm": "mm", "a_px": "px", "a_rad": "rad", "a_s": "s", "a_grey": "grey levels"}
     units |= {"a_cells": "cells", "m": "", "a_b": ""}
-    assert {name: plugins_commands._unit_of(name) for name in units} == units
+    assert {name: unit_of(name) for name in units} == units
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import threading
 import time
 from pathlib import Path
@@ -66,6 +67,16 @@ def test_looking_at_the_memory_is_in_no_processor_time(
     result = world.run(steps, executor="inline").results["b"]
     assert looks[-1].processor_s > 0.15
     assert result.cpu_s < looks[-1].processor_s / 2
+
+
+def test_a_step_that_takes_nothing_takes_no_less(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads' clocks run ahead of their process's by ticks, and a record takes no such time."""
+    clock = itertools.count(5.0, -0.001)
+    monkeypatch.setattr(running._Call, "_cpu_s", lambda _: next(clock))
+    result = world.run(STEPS.format("slow", ", params: {steps: 1}"), executor="inline").results["b"]
+    assert result.cpu_s == 0.0
 
 
 def test_no_search_for_garbage_looks_at_what_a_step_has_loaded(world: World) -> None:
