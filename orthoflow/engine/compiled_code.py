@@ -17,6 +17,8 @@ VARIABLE: Final = "ORTHOFLOW_KERNELS"
 # have one name, and damage shows. What a plugin keeps past them stays in its store.
 CHECKED: Final = ".checked"
 _SHARED: Final = f"*{CHECKED}*.nb[ci]"
+# All kernels take some 60 MB.
+_ROOM_BYTES: Final = 500_000_000
 # Of the files that say of a method that its kernels are there; they hold no code.
 DONE: Final = ".foretold"
 
@@ -39,10 +41,10 @@ def begun_with_warm(folder: Path) -> Path:
     They are copied, because numba writes beside what it reads, and a folder of an image or of
     another user may be read-only. Where this state of the code has none, those of the state before
     it come first: of these, what an edit left alone is found by what it holds. Whatever stands in
-    the way, kernels are compiled instead.
+    the way, little room on the disk as well, kernels are compiled instead.
     """
     warm = warm_folder() / folder.name
-    if folder.exists():
+    if folder.exists() or not _has_room(folder):
         return folder
     aside = folder.with_name(f".{folder.name}-{uuid.uuid4().hex}")
     try:
@@ -56,6 +58,12 @@ def begun_with_warm(folder: Path) -> Path:
         with suppress(OSError):
             remove_tree(aside)
     return folder
+
+
+def _has_room(folder: Path) -> bool:
+    """Whether copies leave room on the disk for what a run makes."""
+    there = next(path for path in folder.parents if path.exists())
+    return shutil.disk_usage(there).free > _ROOM_BYTES
 
 
 def _copy_state_before(folder: Path) -> bool:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -102,6 +104,21 @@ def test_kernels_that_cannot_be_copied_are_compiled_instead(tmp_path: Path, kern
     folder = tmp_path / "store" / "numba" / "abc"
     assert begun_with_warm(folder) == folder
     assert (tmp_path / "store").read_bytes() == b""
+
+
+@pytest.mark.parametrize(("free_bytes", "is_copied"), [(499_000_000, False), (501_000_000, True)])
+def test_kernels_leave_a_disk_with_little_room_to_the_run(
+    tmp_path: Path,
+    kernels: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    free_bytes: int,
+    is_copied: bool,
+) -> None:
+    (kernels / "abc").mkdir(parents=True)
+    (kernels / "abc" / "f.nbc").write_bytes(b"code")
+    usage = SimpleNamespace(free=free_bytes)
+    monkeypatch.setattr(shutil, "disk_usage", {tmp_path: usage}.__getitem__)
+    assert begun_with_warm(tmp_path / "store" / "numba" / "abc").exists() == is_copied
 
 
 def test_what_a_run_compiles_every_later_store_begins_with(tmp_path: Path, kernels: Path) -> None:

@@ -275,7 +275,7 @@ def test_environments_and_data_have_letters_of_their_own() -> None:
 
 
 def test_one_combination_is_no_comparison() -> None:
-    alone = HeldRun(path=Path("a.h5"), record=record([cell("a", metrics=metrics(rms_mm=1.0))]))
+    alone = HeldRun(path=Path("a.h5"), record=record([cell("plane", metrics=metrics(rms_mm=1.0))]))
     assert comparison_table([alone]) is None
     both = comparison_table([alone, replace(alone, path=Path("b.h5"))])
     assert both is not None

@@ -167,7 +167,10 @@ def test_the_orthoimages_are_handed_over(quick: Shell, target: str, file: str) -
         (("--to", "gltf", "--wall", "99", "-o", "other"), "mosaic shows no wall 99; it shows 0"),
         (("--to", "ply", "--box", "1,2,3"), "--box takes six numbers in metres"),
         (("--to", "e57", "--box", "90,90,90,91,91,91"), "no point of the cloud of plane is left"),
-        (("--to", "csv", "--clean"), "--clean belongs to --to laz, copc, ply or e57, not to --to csv"),
+        (
+            ("--to", "csv", "--clean"),
+            "--clean belongs to --to laz, copc, ply or e57, not to --to csv",
+        ),
     ],
     ids=[
         *("no orientations", "no such cell", "no labels", "folder in use", "no such format"),
