@@ -21,6 +21,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, Final
 
+from orthoflow.engine.compiled_code import VARIABLE
 from orthoflow.errors import OrthoflowError
 from tests.fuzz.mutation import Mutate, mutate_bytes
 
@@ -198,6 +199,16 @@ def _take(outcome: Outcome, answer: Mapping[str, Any], folder: Path) -> float:
     return 0.0
 
 
+def _environment() -> dict[str, str]:
+    """What the process is told."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    # No case begins its store with all kernels of others, which takes longer than the rest of it,
+    # nor leaves them there, which is outside of it.
+    if kernels := environment.get("NUMBA_CACHE_DIR"):
+        environment[VARIABLE] = str(Path(kernels) / "of-fuzzing")
+    return environment
+
+
 class _Server:
     """The process that has everything loaded and forks one that reads."""
 
@@ -207,7 +218,7 @@ class _Server:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             cwd=_ROOT,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env=_environment(),
             text=True,
         )
         atexit.register(self._process.kill)
