@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Final
 
@@ -45,7 +44,7 @@ from orthoflow_plugins.inspect.image_quality import (
     completeness,
     quality_findings,
 )
-from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
+from orthoflow_plugins.inspect.patches import IntensityGrey
 from orthoflow_plugins.inspect.placing import on_walls, wall_of
 from orthoflow_plugins.inspect.point_doubts import doubts, is_own
 from orthoflow_plugins.inspect.point_places import Picture, PointFinder, ShownPoint
@@ -195,27 +194,10 @@ def _pictures(inputs: InspectCheckpoints.In, ctx: StepContext) -> list[Picture]:
     return pictures
 
 
-@dataclass(frozen=True)
-class _IntensityGrey(GreyCells):
-    """Grey levels of an intensity (rows, cols) from 0 to 1, 0 where it is not known."""
-
-    intensity: NDArray[np.float32]
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        rows, columns = self.intensity.shape
-        return rows, columns
-
-    def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        known = np.isfinite(self.intensity[part])
-        grey = 255.0 * np.where(known, self.intensity[part], 0.0).astype(np.float64)
-        return GreyImage(grey=grey, valid=known, region=known)
-
-
 def _intensity_picture(
     index: int, wall: Wall, intensity: NDArray[np.float32], ctx: StepContext
 ) -> Picture:
-    cells, shape = _IntensityGrey(intensity), wall.frame.shape
+    cells, shape = IntensityGrey(intensity=intensity), wall.frame.shape
     is_large = wall.mask.size > IN_MEMORY_CELLS
     allocate = partial(_allocated, ctx, index) if is_large else in_memory
     rgb = np.asarray(allocate("rgb", (*shape, 3), np.uint8), np.uint8)

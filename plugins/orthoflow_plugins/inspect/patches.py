@@ -93,6 +93,36 @@ class GreyImage(GreyCells):
         return GreyImage(grey=self.grey[part], valid=self.valid[part], region=self.region[part])
 
 
+@dataclass(frozen=True, kw_only=True)
+class IntensityGrey(GreyCells):
+    """An intensity as grey levels, 0 where it is not known.
+
+    Attributes:
+        intensity: (rows, cols) float32 from 0 to 1, NaN where it is not known.
+        of_roots: that of a laser spans decades; its roots look more like what a camera sees.
+    """
+
+    intensity: NDArray[np.float32]
+    of_roots: bool = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        rows, columns = self.intensity.shape
+        return rows, columns
+
+    def cut(self, part: tuple[slice, slice]) -> GreyImage:
+        """Some rows and columns, all of them within the wall."""
+        values = self.intensity[part]
+        known = np.isfinite(values)
+        level = np.where(known, values, np.float32(0.0))
+        if self.of_roots:
+            grey = 255.0 * np.sqrt(np.maximum(level, 0.0))
+        else:
+            grey = 255.0 * level.astype(np.float64)
+        return GreyImage(grey=grey, valid=known, region=known)
+
+
 def tiles(shape: tuple[int, int], side: int) -> Iterator[tuple[slice, slice]]:
     """Cut a raster into tiles of at most so many rows and columns, row by row."""
     for row in range(0, shape[0], side):

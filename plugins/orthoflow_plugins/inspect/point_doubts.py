@@ -49,11 +49,11 @@ def doubts(
         )
     by_wall = {picture.wall: picture for picture in pictures}
     beyond_m = np.array([_beyond_m(point, by_wall.get(point.wall)) for point in points])
-    if is_far := np.count_nonzero(beyond_m > 0.0):
+    if n_far := np.count_nonzero(beyond_m > 0.0):
         farthest_m = float(beyond_m.max())
         how_far = f", up to {farthest_m:.4g} m" if np.isfinite(farthest_m) else ""
         yield (
-            f"{is_far} of {len(points)} check points lie farther from their wall than it is long"
+            f"{n_far} of {len(points)} check points lie farther from their wall than it is long"
             f"{how_far}: check `unit` of read.checkpoints, and that points and scan have one "
             "coordinate system"
         )

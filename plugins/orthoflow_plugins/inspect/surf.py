@@ -36,7 +36,7 @@ from orthoflow_plugins.inspect.image_quality import (
     quality_findings,
 )
 from orthoflow_plugins.inspect.key_pairs import KeyPairs, find_key_pairs, no_pairs
-from orthoflow_plugins.inspect.patches import GreyCells, GreyImage
+from orthoflow_plugins.inspect.patches import GreyCells, GreyImage, IntensityGrey
 from orthoflow_plugins.inspect.placing import on_walls, wall_of
 
 # The intensity is laid so far aside to see how exactly the comparison measures that; some hundred
@@ -241,30 +241,6 @@ def _unfit(inputs: InspectSurf.In) -> str | None:
 
 
 @dataclass(frozen=True)
-class _IntensityGrey(GreyCells):
-    """Laser intensity (rows, cols) as grey levels, 0 where it is not known.
-
-    It spans decades; its roots look more like what a camera sees.
-    """
-
-    intensity: NDArray[np.float32]
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        rows, columns = self.intensity.shape
-        return rows, columns
-
-    def cut(self, part: tuple[slice, slice]) -> GreyImage:
-        values = self.intensity[part]
-        known = np.isfinite(values)
-        return GreyImage(
-            grey=255.0 * np.sqrt(np.where(known, np.maximum(values, 0.0), 0.0)),
-            valid=known,
-            region=known,
-        )
-
-
-@dataclass(frozen=True)
 class _Comparison:
     """How walls are compared: their cameras, the radius in cells, and so many threads."""
 
@@ -278,7 +254,7 @@ class _Comparison:
             raise MethodError(f"{wall.name} has no intensity to compare with")
         if not n_shown(image):
             return _Verdict(image=image)
-        intensity = _IntensityGrey(wall.intensity)
+        intensity = IntensityGrey(intensity=wall.intensity, of_roots=True)
         pairs = self._pairs(OrthoimageGrey(image), intensity)
         if len(pairs) < _FEWEST_PAIRS:
             return _Verdict(image=image, pairs=pairs)

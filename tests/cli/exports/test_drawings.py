@@ -311,48 +311,39 @@ def of_room(monkeypatch: pytest.MonkeyPatch, *, has_planes: bool) -> Any:
     return SimpleNamespace()
 
 
+CAD_OF_9 = ("write_wall_dxf", "wall_9.dxf")
+CAD = [("picture", "wall_7_ortho.png"), ("write_wall_dxf", "wall_7.dxf"), CAD_OF_9]
+GIS_OF_9 = ("write_wall_geojson", "wall_9.geojson")
+# Only the first wall is painted by several photos.
+SEAMS = ("write_seams_geojson", "wall_7_seams.geojson")
+GIS = [("write_wall_geojson", "wall_7.geojson"), GIS_OF_9, SEAMS]
+
+
 @pytest.mark.parametrize("has_planes", [False, True])
-def test_cad_files_are_of_each_wall_and_of_the_room_where_it_is_known(
+@pytest.mark.parametrize(
+    ("name", "of_all", "of_9"),
+    [("dxf", CAD, CAD_OF_9), ("geojson", GIS, GIS_OF_9)],
+    ids=["CAD", "GIS"],
+)
+def test_files_are_of_each_wall_and_of_the_room_where_it_is_known(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     drawn_files: list[tuple[str, str]],
     *,
+    name: str,
+    of_all: list[tuple[str, str]],
+    of_9: tuple[str, str],
     has_planes: bool,
 ) -> None:
-    run = of_room(monkeypatch, has_planes=has_planes)
-    said = module.export_dxf(run, tmp_path / "out", Choices())
-    room = [("write_room_dxf", "room.dxf")] if has_planes else []
-    assert drawn_files == [
-        *(("picture", "wall_7_ortho.png"), ("write_wall_dxf", "wall_7.dxf")),
-        *(("write_wall_dxf", "wall_9.dxf"), *room),
-    ]
+    run, export = of_room(monkeypatch, has_planes=has_planes), getattr(module, f"export_{name}")
+    said = export(run, tmp_path / "out", Choices())
+    room = [(f"write_room_{name}", f"room.{name}")] if has_planes else []
+    assert drawn_files == [*of_all, *room]
     beside = ", and the room: 2 planes, 1 edge, 3 corners" if has_planes else ""
     assert said == f"2 walls{beside}"
     drawn_files.clear()
-    assert module.export_dxf(run, tmp_path / "out", Choices(wall=9)) == f"1 wall{beside}"
-    assert drawn_files == [("write_wall_dxf", "wall_9.dxf"), *room]
-
-
-@pytest.mark.parametrize("has_planes", [False, True])
-def test_gis_files_have_seams_of_walls_that_several_photos_paint(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    drawn_files: list[tuple[str, str]],
-    *,
-    has_planes: bool,
-) -> None:
-    run = of_room(monkeypatch, has_planes=has_planes)
-    said = module.export_geojson(run, tmp_path / "out", Choices())
-    room = [("write_room_geojson", "room.geojson")] if has_planes else []
-    assert drawn_files == [
-        *(("write_wall_geojson", "wall_7.geojson"), ("write_wall_geojson", "wall_9.geojson")),
-        *(("write_seams_geojson", "wall_7_seams.geojson"), *room),
-    ]
-    beside = ", and the room: 2 planes, 1 edge, 3 corners" if has_planes else ""
-    assert said == f"2 walls{beside}"
-    drawn_files.clear()
-    module.export_geojson(run, tmp_path / "out", Choices(wall=9))
-    assert drawn_files == [("write_wall_geojson", "wall_9.geojson"), *room]
+    assert export(run, tmp_path / "out", Choices(wall=9)) == f"1 wall{beside}"
+    assert drawn_files == [of_9, *room]
 
 
 def test_a_wall_is_drawn_with_its_picture_and_its_openings() -> None:
