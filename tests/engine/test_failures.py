@@ -228,7 +228,8 @@ def test_a_method_that_eats_all_memory_is_stopped_and_the_coordinator_lives(
         f"({result.peak_rss_mib / 1024:.1f} GiB when stopped); give it less data or coarser "
         "parameters"
     )
-    assert 900 < result.peak_rss_mib < 2000
+    # What other children of this test hold (the server of processes) is missing from it.
+    assert 500 < result.peak_rss_mib < 2000
 
 
 def _is_child(entry: Path) -> bool:
