@@ -10,7 +10,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Final, Literal
@@ -31,14 +31,17 @@ class Library:
     Attributes:
         distribution: its name on the package index.
         module: what is imported.
-        loss: what does not work without it.
+        use: what needs it.
         is_core: nothing works without it.
+        is_extra: it is no part of a plain installation; `pip install` gets it by this name, with
+            the extras of its own that are used.
     """
 
     distribution: str
     module: str
-    loss: str
+    use: str
     is_core: bool = False
+    is_extra: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +52,7 @@ class Diagnosis:
         name: what was looked at.
         verdict: ok, limited (works, with a restriction) or missing.
         found: version, size or setting.
+        use: what needs it, where that is a library.
         cost: what does not work because of it, and the way out; empty when ok.
         is_core: orthoflow cannot work without it.
     """
@@ -56,60 +60,75 @@ class Diagnosis:
     name: str
     verdict: Verdict
     found: str
+    use: str = ""
     cost: str = ""
     is_core: bool = False
 
 
-_EVERYTHING: Final = "nothing works"
+_EVERYTHING: Final = "everything"
 LIBRARIES: Final = (
-    Library(distribution="click", module="click", loss=_EVERYTHING, is_core=True),
-    Library(distribution="h5py", module="h5py", loss=_EVERYTHING, is_core=True),
-    Library(distribution="jinja2", module="jinja2", loss="no report", is_core=True),
-    Library(distribution="networkx", module="networkx", loss=_EVERYTHING, is_core=True),
-    Library(distribution="numpy", module="numpy", loss=_EVERYTHING, is_core=True),
-    Library(distribution="pluggy", module="pluggy", loss=_EVERYTHING, is_core=True),
-    Library(distribution="pydantic", module="pydantic", loss=_EVERYTHING, is_core=True),
-    Library(distribution="rich", module="rich", loss="no live progress", is_core=True),
-    Library(distribution="ruamel.yaml", module="ruamel.yaml", loss=_EVERYTHING, is_core=True),
+    Library(distribution="click", module="click", use=_EVERYTHING, is_core=True),
+    Library(distribution="h5py", module="h5py", use=_EVERYTHING, is_core=True),
+    Library(distribution="jinja2", module="jinja2", use="the report", is_core=True),
+    Library(distribution="networkx", module="networkx", use=_EVERYTHING, is_core=True),
+    Library(distribution="numpy", module="numpy", use=_EVERYTHING, is_core=True),
+    Library(distribution="pluggy", module="pluggy", use=_EVERYTHING, is_core=True),
+    Library(distribution="pydantic", module="pydantic", use=_EVERYTHING, is_core=True),
+    Library(distribution="rich", module="rich", use="live progress", is_core=True),
+    Library(distribution="ruamel.yaml", module="ruamel.yaml", use=_EVERYTHING, is_core=True),
     Library(
         distribution="numba",
         module="numba",
-        loss="no method of simulate, plane, raster, ortho and inspect",
+        use="methods of simulate, plane, raster, ortho and inspect",
     ),
-    Library(distribution="scipy", module="scipy", loss="no method of plane and inspect"),
+    Library(distribution="scipy", module="scipy", use="methods of plane and inspect"),
     Library(
         distribution="opencv-python-headless",
         module="cv2",
-        loss="no photographs, no filled gaps, no previews: simulate.room and the methods of raster "
-        "and ortho",
+        use="photographs, filled gaps, previews: simulate.room and the methods of raster and ortho",
     ),
     Library(
         distribution="rasterio",
         module="rasterio",
-        loss="no GeoTIFF files: what raster and mosaic publish",
+        use="GeoTIFF files: what raster and mosaic publish",
     ),
-    Library(distribution="laspy", module="laspy", loss="no LAS and LAZ files: read.scan"),
-    Library(distribution="lazrs", module="lazrs", loss="no compressed LAZ files: read.scan"),
-    Library(distribution="pye57", module="pye57", loss="no E57 files: read.scan"),
-    Library(distribution="pandas", module="pandas", loss="no text files of points: read.scan"),
-    Library(distribution="pillow", module="PIL", loss="no EXIF data of photos: read.photos, ortho"),
+    Library(distribution="laspy", module="laspy", use="LAS and LAZ files: read.scan, --to laz"),
+    Library(distribution="lazrs", module="lazrs", use="compressed LAZ files: read.scan, --to laz"),
+    Library(distribution="pye57", module="pye57", use="E57 files: read.scan, --to e57"),
+    Library(distribution="pandas", module="pandas", use="text files of points: read.scan"),
+    Library(distribution="pillow", module="PIL", use="EXIF data of photos: read.photos, ortho"),
     Library(
         distribution="matplotlib",
         module="matplotlib",
-        loss="no method of plane, which draw their plans with it",
+        use="methods of plane, which draw their plans with it",
     ),
-    Library(distribution="mahotas", module="mahotas", loss="no inspection by SURF features"),
-    Library(distribution="pycolmap", module="pycolmap", loss="no bundle adjustment"),
-    Library(distribution="pyceres", module="pyceres", loss="no bundle adjustment"),
+    Library(distribution="mahotas", module="mahotas", use="inspection by SURF features"),
+    Library(distribution="pycolmap", module="pycolmap", use="bundle adjustment"),
+    Library(distribution="pyceres", module="pyceres", use="bundle adjustment"),
     Library(
         distribution="libusb-package",
         module="libusb_package",
-        loss="open3d may not load on machines without libusb-1.0",
+        use="open3d on machines without libusb-1.0",
     ),
     Library(
         distribution="open3d-cpu",
         module="open3d",
-        loss="no comparators of open3d; the default methods work without it",
+        use="comparators of open3d; the default methods work without it",
+    ),
+    Library(distribution="ezdxf", module="ezdxf", use="CAD drawings: --to dxf"),
+    Library(distribution="reportlab", module="reportlab", use="sheets: --to sheet"),
+    Library(distribution="segno", module="segno", use="the code on sheets: --to sheet"),
+    Library(
+        distribution="cryptography",
+        module="cryptography",
+        use="signatures of records: sign, verify --signer",
+        is_extra="cryptography[ssh]",
+    ),
+    Library(
+        distribution="distributed",
+        module="distributed",
+        use="clusters: --executor dask",
+        is_extra="distributed",
     ),
 )
 
@@ -137,22 +156,26 @@ def diagnose_library(library: Library) -> Diagnosis:
         version = metadata.version(library.distribution)
     except metadata.PackageNotFoundError:
         version = ""
+    good = Diagnosis(
+        name=library.distribution,
+        verdict="ok",
+        found=version or "present",
+        use=library.use,
+        is_core=library.is_core,
+    )
     problem = _import_problem(library.module)
     if not problem:
-        return Diagnosis(
-            name=library.distribution,
-            verdict="ok",
-            found=version or "present",
-            is_core=library.is_core,
-        )
-    found = f"{version}, but {problem}" if version else "not installed"
-    way_out = _way_out(problem) if version else f"pip install {library.distribution}"
-    return Diagnosis(
-        name=library.distribution,
-        verdict="missing",
+        return good
+    if version:
+        found, way_out = f"{version}, but {problem}", _way_out(problem)
+    else:
+        wanted = f"'{library.is_extra}'" if "[" in library.is_extra else library.distribution
+        found, way_out = "not installed", f"pip install {wanted}"
+    return replace(
+        good,
+        verdict="limited" if library.is_extra and not version else "missing",
         found=found,
-        cost=f"{library.loss} ({way_out})",
-        is_core=library.is_core,
+        cost=f"not to be had: {library.use} ({way_out})",
     )
 
 

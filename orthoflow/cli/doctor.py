@@ -34,6 +34,7 @@ def doctor(store: Path, *, as_json: bool) -> int:
                         "name": item.name,
                         "verdict": item.verdict,
                         "found": item.found,
+                        "for": item.use,
                         "cost": item.cost,
                         "core": item.is_core,
                     }
@@ -49,8 +50,8 @@ def doctor(store: Path, *, as_json: bool) -> int:
 def _print(findings: list[Diagnosis], *, broken_core: bool) -> None:
     echo(f"orthoflow {__version__}", "")
     echo_table(
-        ("what", "verdict", "found"),
-        [(item.name, item.verdict, item.found) for item in findings],
+        ("what", "verdict", "found", "for"),
+        [(item.name, item.verdict, item.found, item.use) for item in findings],
     )
     costs = [item for item in findings if item.cost]
     if costs:

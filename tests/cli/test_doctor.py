@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import platform
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from orthoflow.cli.diagnosis import Library, diagnose_library, diagnose_machine
 from orthoflow.engine import memory
 
 GIB = 1 << 30
-CLICK = Library(distribution="click", module="click", loss="nothing works", is_core=True)
+CLICK = Library(distribution="click", module="click", use="everything", is_core=True)
 
 
 def module_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> str:
@@ -25,7 +27,7 @@ def module_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> s
 
 def library(module: str, *, distribution: str = "click", is_core: bool = False) -> Library:
     return Library(
-        distribution=distribution, module=module, loss="no E57 files: read.scan", is_core=is_core
+        distribution=distribution, module=module, use="E57 files: read.scan", is_core=is_core
     )
 
 
@@ -39,7 +41,32 @@ def test_a_missing_library_costs_what_it_is_used_for() -> None:
     found = diagnose_library(library("not_there_at_all", distribution="not-there-at-all"))
     assert found.verdict == "missing"
     assert found.found == "not installed"
-    assert found.cost == "no E57 files: read.scan (pip install not-there-at-all)"
+    assert found.cost == "not to be had: E57 files: read.scan (pip install not-there-at-all)"
+
+
+def test_a_missing_extra_is_a_restriction_only() -> None:
+    extra = Library(
+        distribution="no-such", module="no_such", use="signatures", is_extra="no-such[ssh]"
+    )
+    found = diagnose_library(extra)
+    assert (found.verdict, found.found, found.use) == ("limited", "not installed", "signatures")
+    assert found.cost == "not to be had: signatures (pip install 'no-such[ssh]')"
+
+
+def test_every_library_that_an_installation_brings_is_looked_at_and_said_what_it_is_for() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text("utf-8"))
+    extras = project["project"]["optional-dependencies"]
+    brought = {
+        re.match(r"[\w.-]+", text).group()  # type: ignore[union-attr]
+        for text in (*project["project"]["dependencies"], *extras["sign"], *extras["dask"])
+    }
+    looked_at = {library.distribution: library for library in diagnosis.LIBRARIES}
+    # The wheel of open3d has another name on Linux; laspy[lazrs] brings lazrs.
+    assert looked_at.keys() - {"lazrs"} == brought - {"open3d"}
+    assert all(library.use for library in looked_at.values())
+    assert {name for name, library in looked_at.items() if library.is_extra} == {
+        *("cryptography", "distributed")
+    }
 
 
 @pytest.mark.parametrize(
@@ -64,7 +91,7 @@ def test_an_installed_library_that_does_not_import_says_why(
     diagnosed = diagnose_library(library(module_that(tmp_path, monkeypatch, code)))
     assert diagnosed.verdict == "missing"
     assert diagnosed.found.endswith(f", but {found}")
-    assert diagnosed.cost.startswith("no E57 files: read.scan (")
+    assert diagnosed.cost.startswith("not to be had: E57 files: read.scan (")
     assert way_out in diagnosed.cost
 
 

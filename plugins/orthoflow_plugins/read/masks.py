@@ -22,11 +22,17 @@ _NAMED: Final = 3
 
 
 class Masks:
-    """Pictures and polygons, and which of them photos have taken."""
+    """Pictures and polygons, which of them photos have taken, and files that are neither."""
 
-    def __init__(self, pictures: Mapping[str, Path], polygons: Sequence[NamedPolygon]) -> None:
+    def __init__(
+        self,
+        pictures: Mapping[str, Path],
+        polygons: Sequence[NamedPolygon],
+        others: Sequence[str] = (),
+    ) -> None:
         self._pictures = pictures
         self._polygons = polygons
+        self._others = others
         self._taken: set[str] = set()
 
     @classmethod
@@ -38,24 +44,29 @@ class Masks:
             given: files of an input of their own.
 
         Raises:
-            InputError: a file is no mask, or two are for one photo.
+            InputError: no file that is given is a mask, polygons are none, or two masks are for
+                one photo.
         """
         pictures: dict[str, Path] = {}
         polygons: list[NamedPolygon] = []
+        others: list[str] = []
+        given = tuple(given)
         for path in [*beside, *given]:
             if path.suffix.lower() in _POLYGONS:
                 polygons += read_polygons(path, "photo", what="a mask of photos")
             elif path.suffix.lower() not in PHOTO_SUFFIXES:
-                raise InputError(
-                    f"mask {path.name} is neither a picture (PNG, JPEG, TIFF) nor polygons "
-                    "(GeoJSON)"
-                )
+                others.append(path.name)
             elif pictures.setdefault(_key(path.stem), path) != path:
                 raise InputError(
                     f"{path.name} and {pictures[_key(path.stem)].name} are masks of one photo: "
                     "leave one of them"
                 )
-        return cls(pictures, polygons)
+        if others and len(others) == len(given):
+            raise InputError(
+                f"no file of the masks is a picture (PNG, JPEG, TIFF) or polygons (GeoJSON), only "
+                f"{_named(others)}"
+            )
+        return cls(pictures, polygons, others)
 
     def encoded(self, photo: str, size: tuple[int, int]) -> bytes | None:
         """Mask of a photo of some width and height as PNG, white where it may be used.
@@ -81,14 +92,17 @@ class Masks:
         return encode_png(np.where(used, np.uint8(255), np.uint8(0)))
 
     def warn_of_unused(self, ctx: StepContext) -> None:
-        """Say which masks are of no photo."""
+        """Say which masks are of no photo, and which files are no masks."""
         unused = [path.name for path in self._pictures.values() if path.name not in self._taken] + [
             polygon.name for polygon in self._polygons if polygon.name not in self._taken
         ]
         if unused:
-            named = ", ".join(sorted(set(unused))[:_NAMED])
-            more = " ..." if len(set(unused)) > _NAMED else ""
-            ctx.warn(f"masks of no photo: {named}{more}; photos are found by their names")
+            ctx.warn(f"masks of no photo: {_named(unused)}; photos are found by their names")
+        if self._others:
+            ctx.warn(
+                f"left out of the masks, neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): "
+                f"{_named(self._others)}"
+            )
 
     def _picture(self, path: Path, photo: str, size: tuple[int, int]) -> NDArray[np.bool_]:
         self._taken.add(path.name)
@@ -115,6 +129,12 @@ def beside_photos(paths: Sequence[Path]) -> frozenset[Path]:
         and path.suffix.lower() in PHOTO_SUFFIXES
         and _key(path.stem) in stems | {other.name for other in paths}
     )
+
+
+def _named(names: Sequence[str]) -> str:
+    """Some of the names."""
+    found = sorted(set(names))
+    return f"{', '.join(found[:_NAMED])}{' ...' if len(found) > _NAMED else ''}"
 
 
 def _key(stem: str) -> str:

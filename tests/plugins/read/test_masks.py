@@ -128,7 +128,7 @@ def test_masks_of_no_photo_are_told(tmp_path: Path) -> None:
         ),
         ("a.png", encode_png(np.zeros(SIZE[::-1], np.uint8)), "the mask of a.jpg leaves nothing"),
         ("a.png", b"no picture", "mask a.png"),
-        ("a.txt", "words", "mask a.txt is neither a picture"),
+        ("a.txt", "words", r"no file of the masks is a picture .* only a\.txt"),
         ("a.json", "{", "a.json is not a mask of photos: expected a GeoJSON FeatureCollection"),
         ("a.json", '{"features": 3}', "a.json is not a mask of photos"),
         ("a.json", '{"features": [3]}', r"\(feature 0\)"),
@@ -149,6 +149,18 @@ def test_what_is_no_mask_is_refused(
     mask = file_in(tmp_path / "masks", name, content)
     with pytest.raises(InputError, match=said):
         read(tmp_path, [photo_in(tmp_path)], [mask])
+
+
+def test_a_file_among_masks_that_is_none_is_left_out_and_named(tmp_path: Path) -> None:
+    masks = [
+        file_in(tmp_path / "masks", name, content)
+        for name, content in (("a.png", picture()), ("notes.txt", "drawn on Friday"))
+    ]
+    (photo,), said = read(tmp_path, [photo_in(tmp_path)], masks)
+    np.testing.assert_array_equal(masked(photo), expected())
+    assert (
+        "left out of the masks, neither picture (PNG, JPEG, TIFF) nor polygons (GeoJSON): notes.txt"
+    ) in said
 
 
 def test_two_masks_of_one_photo_are_refused(tmp_path: Path) -> None:
