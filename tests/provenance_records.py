@@ -110,7 +110,7 @@ def sample_record(cloud_digest: str, walls_digest: str) -> RunRecord:
             },
             metrics=(
                 Metric(name="rms_mm", value=1.25, unit="mm"),
-                Metric(name="cells", value=5400.0, unit="1"),
+                Metric(name="cells", value=5400.0, unit="1", words="cells seen", good="more"),
             ),
             figures=(
                 RecordedFigure(

@@ -15,6 +15,7 @@ from orthoflow.sdk.methods import (
     Determinism,
     Method,
     MethodParams,
+    MetricLabel,
     Ports,
     PortSpec,
     mapped_port,
@@ -92,6 +93,7 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
     own_id: object = getattr(method, "id", None)
     version: object = method.result_version
     citations: object = method.citations
+    labels: object = method.metric_labels
     rules = {
         f"its class says id {own_id!r}": own_id == spec.id,
         "its Params must be a subclass of MethodParams": _is_subclass(
@@ -107,6 +109,10 @@ def _class_complaint(method: type[Method], spec: MethodSpec) -> str:
         ),
         f"citations must be a tuple of texts, got {citations!r}": (
             isinstance(citations, tuple) and all(isinstance(item, str) for item in citations)
+        ),
+        f"metric_labels must give names a MetricLabel each, got {labels!r}": (
+            isinstance(labels, Mapping)
+            and all(isinstance(label, MetricLabel) for label in labels.values())
         ),
         "it has no run": method.run is not Method.run or bool(method.maps_over),
     }

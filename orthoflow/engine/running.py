@@ -47,7 +47,7 @@ from orthoflow.products.input_files import InputFiles
 from orthoflow.products.product import Product
 from orthoflow.sdk.context import StepContext, StepEvent
 from orthoflow.sdk.lines import one_line
-from orthoflow.sdk.methods import Method, Part, Ports, checked_part
+from orthoflow.sdk.methods import Method, Part, Ports, checked_part, labelled
 from orthoflow.system import children_processor_s
 
 # Inputs up to this size are digested again after the run: they must not have changed.
@@ -245,7 +245,7 @@ class _Call:
         result = dataclasses.replace(
             blank_result(self.task),
             outputs=self._keep_part(outputs) or self._keep(self._products(cls, outputs)),
-            metrics=tuple(self._context.metrics),
+            metrics=labelled(cls, self._context.metrics),
             figures=self._keep_figures(),
         )
         if self.task.part is None:

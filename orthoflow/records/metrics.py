@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from orthoflow_provenance.model import RecordedCell, cost_metrics
 
 from orthoflow.foreign_text import csv_text
+
+_COLUMNS: Final = ("cell", "step", "method", "metric", "value", "unit")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +25,8 @@ class MetricRow:
         metric: name, with its unit at the end where it has one.
         value: finite number.
         unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
+        words: what its method calls it; empty where it says nothing.
+        good: with words: which side is good, `less`, `more` or `one`; empty where none is.
     """
 
     cell: str
@@ -30,6 +35,8 @@ class MetricRow:
     metric: str
     value: float
     unit: str
+    words: str = ""
+    good: str = ""
 
 
 def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
@@ -47,6 +54,8 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
             metric=metric.name,
             value=metric.value,
             unit=metric.unit,
+            words=metric.words,
+            good=metric.good,
         )
         for metric in (*cell.metrics, *cost_metrics(cell))
     )
@@ -54,6 +63,5 @@ def cell_metrics(cell: RecordedCell) -> tuple[MetricRow, ...]:
 
 def write_metrics_csv(path: Path, rows: Iterable[MetricRow]) -> None:
     """Write rows with a header; numbers with every digit that they have."""
-    header = [field.name for field in fields(MetricRow)]
-    text = csv_text([header, *(astuple(row) for row in rows)])
+    text = csv_text([_COLUMNS, *([getattr(row, name) for name in _COLUMNS] for row in rows)])
     path.write_text(text, encoding="utf-8", newline="")

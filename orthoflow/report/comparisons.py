@@ -10,7 +10,7 @@ from typing import Final
 
 from orthoflow.records import COSTS, MetricRow, RecordedEnvironment, Run, cell_metrics
 from orthoflow.report.combinations import Combination, Measured, combinations_of, wanted_metrics
-from orthoflow.report.metric_words import label_in_words, label_of
+from orthoflow.report.metric_words import label_in_words
 from orthoflow.report.numbers import number, number_with_spread
 from orthoflow.report.rankings import Mark, Sense, Value, rank, sense_of
 from orthoflow.report.summaries import QUALITY, is_quality
@@ -206,17 +206,13 @@ def comparison_columns(combinations: Sequence[Combination]) -> tuple[Column, ...
             key for name in QUALITY for key in last if key[1] == name and is_quality(first[key])
         ]
         # What a plugin says to have a good side is worth a column, too.
-        wanted += [
-            key
-            for key, row in first.items()
-            if (label := label_of(row.metric, row.method)) and label.good
-        ]
+        wanted += [key for key, row in first.items() if row.good]
     return tuple(
         Column(
             step=step,
             metric=metric,
-            label=label_in_words(metric, first[step, metric].unit, first[step, metric].method),
-            sense=sense_of(metric, first[step, metric].method),
+            label=label_in_words(first[step, metric]),
+            sense=sense_of(metric, first[step, metric]),
         )
         for step, metric in wanted
     )

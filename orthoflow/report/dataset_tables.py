@@ -91,10 +91,7 @@ def dataset_table(parts: Mapping[str, Run], pages: Mapping[str, str]) -> Dataset
     ]
     chosen = [key for key in wanted if key[1] != _ORIENTED][:_MOST_COLUMNS]
     return DatasetTable(
-        columns=tuple(
-            (row.step, label_in_words(row.metric, row.unit, row.method))
-            for row in (units[key] for key in chosen)
-        ),
+        columns=tuple((row.step, label_in_words(row)) for row in (units[key] for key in chosen)),
         rows=tuple(
             DatasetRow(
                 name=name,

@@ -9,15 +9,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
-from functools import cache
 from typing import Final
 
-from orthoflow.catalog import Catalog, discover_catalog
-from orthoflow.errors import PluginError
-from orthoflow.records import COSTS
-from orthoflow.sdk import MetricLabel
+from orthoflow.records import COSTS, MetricRow
 
-_OURS: Final = "orthoflow-tls"
 # What stands before a name, and what is said behind the words of the rest.
 _BEFORE: Final[tuple[tuple[re.Pattern[str], str], ...]] = (
     (re.compile(r"all_(?=.)"), "all walls"),
@@ -317,43 +312,25 @@ _OF_KIND: Final[Mapping[tuple[str, str], str]] = {
 }
 
 
-def words_of(name: str, method: str) -> str:
-    """Say what a metric of a method is: a stranger's own label, or our words for our own kinds.
+def words_of(name: str, method: str, declared: str = "") -> str:
+    """Say what a metric of a method is: what a stranger calls it, or our words for our own kinds.
+
+    Args:
+        name: of the metric.
+        method: that reported it.
+        declared: what its record says that the method calls it; empty where it says nothing.
 
     >>> words_of("rms_mm", "plane.hough2d"), words_of("rms_mm", "register.similarity")
     ('points to their plane, RMS', 'points to their places, RMS')
     >>> words_of("n_patches", "moisture.simple"), words_of("wall_s", "moisture.simple")
     ('n_patches', 'time')
     """
-    if label := label_of(name, method):
-        return label.words
+    if declared:
+        return declared
     kind = method.partition(".")[0]
     if kind not in _KINDS and name not in COSTS:
         return name
     return _OF_KIND.get((kind, name)) or metric_words(name)
-
-
-def label_of(name: str, method: str) -> MetricLabel | None:
-    """The label that a plugin declares for a metric; None without, or where it is not installed."""
-    labels = _declared(method)
-    return next((label for key, label in labels.items() if fnmatchcase(name, key)), None)
-
-
-@cache
-def _declared(method: str) -> Mapping[str, MetricLabel]:
-    entry = _catalog().methods.get(method)
-    # Our own are described here, and loading them takes seconds.
-    if entry is None or entry.distribution.name == _OURS:
-        return {}
-    try:
-        return entry.load().metric_labels
-    except PluginError:
-        return {}
-
-
-@cache
-def _catalog() -> Catalog:
-    return discover_catalog()
 
 
 def metric_words(name: str) -> str:
@@ -377,16 +354,10 @@ def metric_words(name: str) -> str:
     return "; ".join([words, *behind])
 
 
-def label_in_words(name: str, unit: str, method: str) -> str:
-    """Say what a metric is, with its unit; shares and counts (unit 1) stand alone.
-
-    >>> label_in_words("rmse_u_mm", "mm", "inspect.truth")
-    'error along u (right), RMS / mm'
-    >>> label_in_words("n_planes", "1", "plane.hough2d")
-    'planes found'
-    """
-    words = words_of(name, method)
-    return words if unit == "1" else f"{words} / {unit}"
+def label_in_words(row: MetricRow) -> str:
+    """Say what a metric is, with its unit; shares and counts (unit 1) stand alone."""
+    words = words_of(row.metric, row.method, row.words)
+    return words if row.unit == "1" else f"{words} / {row.unit}"
 
 
 def is_described(name: str) -> bool:

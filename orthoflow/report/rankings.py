@@ -9,7 +9,7 @@ from enum import Enum
 from fnmatch import fnmatchcase
 from typing import Final
 
-from orthoflow.report.metric_words import label_of
+from orthoflow.records import MetricRow
 
 # Without repeats nobody knows how far values of the same method lie apart. What is nearer than this
 # share of the best is no difference then; times and memory scatter more, times from run to run by
@@ -157,14 +157,15 @@ _PATTERNS: Final[tuple[tuple[str, Sense], ...]] = (
 )
 
 
-def sense_of(metric: str, method: str = "") -> Sense:
+def sense_of(metric: str, row: MetricRow | None = None) -> Sense:
     """Say what makes a value of the metric good: what its method declares, else what its name says.
 
     >>> sense_of("rmse_u_mm").name, sense_of("label_iou").name, sense_of("omega_deg").name
     ('LESS', 'MORE', 'NEITHER')
     """
-    if label := label_of(metric, method):
-        return _DECLARED[label.good]
+    if row is not None and row.words:
+        # A record may hold anything.
+        return _DECLARED.get(row.good, Sense.NEITHER)
     for pattern, sense in _PATTERNS:
         if fnmatchcase(metric, pattern):
             return sense

@@ -54,7 +54,7 @@ class Limit:
 
 def is_quality(row: MetricRow) -> bool:
     """Whether a number is one of QUALITY; a stranger's kind may mean something else by the name."""
-    return row.metric in QUALITY and words_of(row.metric, row.method) != row.metric
+    return row.metric in QUALITY and words_of(row.metric, row.method, row.words) != row.metric
 
 
 def answers(run: Run) -> tuple[Answer, ...]:
@@ -72,7 +72,7 @@ def answers(run: Run) -> tuple[Answer, ...]:
             value = _in_words(wanted, row.value, row.unit)
             if wanted == "n_oriented" and (row.cell, "n_photos") in values:
                 value = f"{value} of {number(values[row.cell, 'n_photos'])}"
-            what = words_of(wanted, row.method)
+            what = words_of(wanted, row.method, row.words)
             found.append(Answer(what=what, value=value, cell=row.cell))
     return tuple(found)
 

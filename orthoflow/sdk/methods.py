@@ -5,18 +5,20 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Any, ClassVar, Literal, Union, dataclass_transform
+from typing import Any, ClassVar, Final, Literal, Union, dataclass_transform
 
 from pydantic import BaseModel, ConfigDict
 
 from orthoflow.errors import MethodError, PluginError
 from orthoflow.products.product import Product
-from orthoflow.sdk.context import StepContext
+from orthoflow.sdk.context import Metric, StepContext
+from orthoflow.sdk.lines import is_name, one_line
 
 Determinism = Literal["exact", "seeded", "loose"]
+_GOOD_SIDES: Final = ("", "less", "more", "one")
 
 
 class MethodParams(BaseModel):
@@ -120,6 +122,17 @@ class MetricLabel:
 
     words: str
     good: Literal["", "less", "more", "one"] = ""
+
+    def __post_init__(self) -> None:
+        if not is_name(self.words, also_of_file=False):
+            raise PluginError(
+                f"a metric's words must be one printable line of at most 200 bytes, got "
+                f"{one_line(ascii(self.words), 80)}"
+            )
+        if self.good not in _GOOD_SIDES:
+            raise PluginError(
+                f"a metric's good side must be less, more, one or empty, got {self.good!r}"
+            )
 
 
 class Method:
@@ -282,3 +295,15 @@ def checked_part(method: Method, inputs: Any, items: range, params: Any, ctx: St
             f"which knows all parts"
         )
     return part
+
+
+def labelled(method: type[Method], metrics: Iterable[Metric]) -> tuple[Metric, ...]:
+    """Give metrics what their method calls them, and their good side: records tell it to others."""
+    found = []
+    for metric in metrics:
+        labels = method.metric_labels.items()
+        label = next((one for name, one in labels if fnmatchcase(metric.name, name)), None)
+        found.append(
+            replace(metric, words=label.words, good=label.good) if label is not None else metric
+        )
+    return tuple(found)

@@ -212,6 +212,17 @@ def write_table(
     group.create_dataset(name, data=table, track_times=False)
 
 
+def column_titles(group: h5py.Group, name: str) -> frozenset[str]:
+    """Which columns a table has.
+
+    Raises:
+        RecordFormatError: it is missing, or damaged.
+    """
+    dataset = dataset_of(group, name)
+    with reading(dataset.name):
+        return frozenset(dataset.dtype.names or ())
+
+
 def read_table(group: h5py.Group, name: str, columns: Columns) -> list[tuple[Cell, ...]]:
     """Read what `write_table` wrote, row by row; columns it does not know are passed over.
 

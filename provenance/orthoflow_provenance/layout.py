@@ -15,6 +15,7 @@ import h5py
 from orthoflow_provenance.digests import canonical_json
 from orthoflow_provenance.encoding import (
     Columns,
+    column_titles,
     float_attribute,
     has_attribute,
     int_attribute,
@@ -75,8 +76,16 @@ def read_fields(group: h5py.Group, cls: type) -> dict[str, Any]:
 
 
 def write_rows(group: h5py.Group, name: str, rows: tuple[object, ...], cls: type) -> None:
-    """Write dataclasses of texts and numbers as a table, a column per field."""
-    columns = _columns(cls)
+    """Write dataclasses of texts and numbers as a table, a column per field.
+
+    Columns of later versions are left out where all rows have what earlier ones stand for.
+    """
+    defaults = _later(cls)
+    columns = [
+        (title, kind)
+        for title, kind in _columns(cls)
+        if title not in defaults or any(getattr(row, title) != defaults[title] for row in rows)
+    ]
     write_table(
         group, name, columns, [tuple(getattr(row, title) for title, _ in columns) for row in rows]
     )
@@ -89,9 +98,11 @@ def read_rows(group: h5py.Group, name: str, cls: Callable[..., Entry]) -> tuple[
         RecordFormatError: the table is missing, damaged, or lacks a column.
     """
     columns = _columns(cls)
-    titles = [title for title, _ in columns]
+    later = _later(cls).keys() & ({title for title, _ in columns} - column_titles(group, name))
+    present = [(title, kind) for title, kind in columns if title not in later]
+    titles = [title for title, _ in present]
     return tuple(
-        cls(**dict(zip(titles, row, strict=True))) for row in read_table(group, name, columns)
+        cls(**dict(zip(titles, row, strict=True))) for row in read_table(group, name, present)
     )
 
 
@@ -219,6 +230,17 @@ def _rows(cls: type) -> _Codec:
 def _columns(cls: Any) -> Columns:
     hints = typing.get_type_hints(cls)
     return tuple((field.name, hints[field.name]) for field in dataclasses.fields(cls))
+
+
+@cache
+# Any: as above.
+def _later(cls: Any) -> Mapping[str, str | int | float]:
+    """Columns that tables of earlier versions lack, and what stands for them."""
+    return {
+        field.name: field.default
+        for field in dataclasses.fields(cls)
+        if field.default is not dataclasses.MISSING
+    }
 
 
 def _bare(hint: object) -> object:

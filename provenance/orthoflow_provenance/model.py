@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 RUN_FORMAT: Final = "orthoflow-run"
 # Of the record; the minor number rises with every field that is added below (SPEC, 1.2).
-RUN_FORMAT_VERSION: Final = "1.3"
+RUN_FORMAT_VERSION: Final = "1.4"
 
 # What a figure may be, and what its file is called.
 FIGURE_SUFFIXES: Final[Mapping[str, str]] = {
@@ -87,11 +87,21 @@ class PayloadLike(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
-    """One number with its unit."""
+    """One number with its unit.
+
+    Attributes:
+        name: of the number, with its unit at the end where it has one.
+        value: finite.
+        unit: `mm`, `px`, `s`, ...; `1` for counts and shares.
+        words: what tables call it, where its method says that; empty without.
+        good: with words: which side is good, `less`, `more` or `one`; empty where none is.
+    """
 
     name: str
     value: float
     unit: str
+    words: str = ""
+    good: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -346,6 +346,11 @@ CHANGES = {
         "whole number from 1 on, got 0",
     ),
     "citations": ("    Params", "    citations = 'doi'\n    Params", "must be a tuple of texts"),
+    "labels": (
+        "    Params",
+        "    metric_labels = {'n': 'damp'}\n    Params",
+        "metric_labels must give names a MetricLabel each",
+    ),
     "invented port": ("cloud: P", "cloud: PointCloud\n        more: P", "kind plane has no input"),
     "other type": ("cloud: PointCloud", "cloud: Walls", "port cloud carries cloud in kind plane"),
     "lacking output": ("        labels: PointLabels\n", "", "its outputs must be planes, labels"),

@@ -79,7 +79,9 @@ CELL = st.builds(
     compile_s=st.none() | NUMBER,
     environment=TEXT,
     cached_from=TEXT,
-    metrics=st.lists(st.builds(Metric, name=TEXT, value=NUMBER, unit=TEXT), max_size=3).map(tuple),
+    metrics=st.lists(
+        st.builds(Metric, name=TEXT, value=NUMBER, unit=TEXT, words=TEXT, good=TEXT), max_size=3
+    ).map(tuple),
     figures=st.lists(
         st.builds(
             RecordedFigure, name=TEXT, caption=TEXT, media_type=TEXT, data=st.binary(max_size=20)
@@ -290,11 +292,27 @@ def test_folders_stay_out_of_the_record(tmp_path: Path) -> None:
     assert read_record(path) == told
 
 
+def test_columns_of_a_later_version_are_written_where_they_say_something(tmp_path: Path) -> None:
+    path, _, _ = write_sample(tmp_path)
+    with h5py.File(path, "r+") as file:
+        cells = file["cells"]
+        titles = {name: cells[name]["metrics"].dtype.names for name in cells}
+        said = [name for name, found in titles.items() if found != ("name", "value", "unit")]
+        assert [titles[name] for name in said] == [("name", "value", "unit", "words", "good")]
+        table = cells[said[0]]["metrics"][()]
+        _replace(cells[said[0]], "metrics", table[["name", "value", "unit"]].copy())
+    found = {cell.address: cell for cell in read_record(path).cells}[said[0]].metrics
+    assert [(one.name, one.words, one.good) for one in found] == [
+        ("rms_mm", "", ""),
+        ("cells", "", ""),
+    ]
+
+
 def test_a_newer_format_is_refused_with_a_sentence(tmp_path: Path) -> None:
     path, _, _ = write_sample(tmp_path)
     with h5py.File(path, "r+") as file:
         file.attrs["format_version"] = np.bytes_(b"2.0")
-    message = r"run\.h5 has format version 2\.0, this program reads version 1\.3: use a newer"
+    message = r"run\.h5 has format version 2\.0, this program reads version 1\.4: use a newer"
     with pytest.raises(RecordFormatError, match=message):
         read_record(path)
     (finding,) = verify_record(path)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-import orthoflow.report.metric_words as metric_words_module
 from orthoflow.catalog import discover_catalog
+from orthoflow.records import Metric, cell_metrics
 from orthoflow.report.combinations import combinations_of
 from orthoflow.report.comparisons import comparison_columns
 from orthoflow.report.metric_words import (
@@ -17,10 +17,9 @@ from orthoflow.report.metric_words import (
     metric_words,
     words_of,
 )
-from orthoflow.report.rankings import Sense
+from orthoflow.report.rankings import Sense, sense_of
 from orthoflow.report.summaries import QUALITY
 from orthoflow.workflow.methods import describe_method
-from tests.laboratories import write_distribution
 from tests.report_runs import HeldRun, cell, metrics, record
 
 
@@ -57,9 +56,11 @@ def test_prefixes_stand_behind_the_words(name: str, words: str) -> None:
 
 
 def test_a_unit_stands_behind_once_and_not_for_shares() -> None:
-    assert label_in_words("rmse_u_mm", "mm", "inspect.truth") == "error along u (right), RMS / mm"
-    assert label_in_words("strange_mm", "mm", "inspect.truth") == "strange_mm / mm"
-    assert label_in_words("n_planes", "1", "plane.toy") == "planes found"
+    reported = metrics(rmse_u_mm=1.0, strange_mm=1.0, n_planes=3.0)
+    rows = cell_metrics(cell("check", metrics=reported))
+    assert [label_in_words(row) for row in rows[:3]] == [
+        *("error along u (right), RMS / mm", "strange_mm / mm", "planes found")
+    ]
 
 
 def test_words_tell_names_apart() -> None:
@@ -80,67 +81,38 @@ def test_words_tell_names_apart() -> None:
     }
 
 
-MOISTURE = """
-from orthoflow.sdk import Method, MethodParams, MetricLabel, Ports
-
-
-class Damp(Method):
-    id = "damp.simple"
-    Params = MethodParams
-
-    class In(Ports):
-        cloud: "PointCloud"
-
-    class Out(Ports):
-        planes: "Planes"
-
-    metric_labels = {
-        "n_patches": MetricLabel(words="damp patches"),
-        "damp_share": MetricLabel(words="share that is damp", good="less"),
-    }
-
-    def run(self, inputs, params, ctx):
-        raise NotImplementedError
-
-
-from orthoflow.products import Planes, PointCloud
-"""
-HOOKS = """
-from orthoflow.sdk.hooks import KindSpec, MethodSpec, hookimpl
-
-
-@hookimpl
-def orthoflow_kinds():
-    ports = {"inputs": {"cloud": "cloud"}, "outputs": {"planes": "planes"}}
-    return [KindSpec(name="damp", summary="-", **ports)]
-
-
-@hookimpl
-def orthoflow_methods():
-    return [MethodSpec(id="damp.simple", target="damp_method:Damp", summary="-")]
-"""
-
-
-def test_a_stranger_names_metrics_and_their_good_side(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sources = {"damp_hooks.py": HOOKS, "damp_method.py": MOISTURE}
-    monkeypatch.syspath_prepend(write_distribution(tmp_path, "damp", sources))
-    metric_words_module._catalog.cache_clear()
-    metric_words_module._declared.cache_clear()
+def test_a_stranger_names_metrics_and_their_good_side(tmp_path: Path) -> None:
     shares = ((0.5, "dry"), (0.1, "wet"))
     cells = [
         cell(
             f"damp@damp={name}",
             method="damp.simple",
-            metrics=metrics(n_patches=3.0, damp_share=share, rms_mm=share),
+            metrics=(
+                Metric(name="n_patches", value=3.0, unit="1", words="damp patches"),
+                Metric(
+                    name="damp_share",
+                    value=share,
+                    unit="1",
+                    words="damp",
+                    good="less",
+                ),
+                Metric(name="rms_mm", value=share, unit="mm"),
+            ),
         )
         for share, name in shares
     ]
     columns = comparison_columns(combinations_of(HeldRun(path=tmp_path, record=record(cells))))
-    metric_words_module._catalog.cache_clear()
-    metric_words_module._declared.cache_clear()
-    assert [(one.label, one.sense) for one in columns] == [("share that is damp", Sense.LESS)]
+    assert [(one.label, one.sense) for one in columns] == [("damp", Sense.LESS)]
+    first = cell_metrics(cells[0])
+    assert [label_in_words(row) for row in first[:3]] == ["damp patches", "damp", "rms_mm / mm"]
+    assert sense_of("n_patches", first[0]) is Sense.NEITHER
     # Of a kind of a stranger's, what ours of the same name are called would be false.
     assert words_of("n_patches", "moisture.simple") == "n_patches"
     assert words_of("n_patches", "inspect.truth") == "patches compared with the truth"
+
+
+def test_a_good_side_that_nobody_knows_is_none() -> None:
+    row = cell_metrics(
+        cell("damp", metrics=(Metric(name="a_mm", value=1.0, unit="mm", words="a", good="odd"),))
+    )[0]
+    assert sense_of("a_mm", row) is Sense.NEITHER

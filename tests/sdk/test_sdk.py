@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from orthoflow.errors import CancelledStepError, PluginError, ProductError
 from orthoflow.products import Photos, Planes, PointCloud
-from orthoflow.sdk import Method, Part, Ports, StepContext, StepEvent, port_specs
-from orthoflow.sdk.methods import MappedPort, mapped_port
+from orthoflow.sdk import (
+    Method,
+    Metric,
+    MetricLabel,
+    Part,
+    Ports,
+    StepContext,
+    StepEvent,
+    port_specs,
+)
+from orthoflow.sdk.methods import MappedPort, labelled, mapped_port
 
 
 class Inputs(Ports):
@@ -135,3 +145,34 @@ def test_a_figure_from_bytes_is_kept_as_a_file(tmp_path: Path) -> None:
     assert ctx.figures[0].path.name == "histogram.png"
     ctx.figure("photo", b"RIFF1234WEBP rest", "a photo")
     assert ctx.figures[1].path.name == "photo.webp"
+
+
+class Damp(Method):
+    metric_labels: ClassVar[dict[str, MetricLabel]] = {
+        "n_*": MetricLabel(words="damp patches"),
+        "damp_share": MetricLabel(words="share that is damp", good="less"),
+    }
+
+
+def test_metrics_carry_what_their_method_calls_them() -> None:
+    reported = [
+        Metric(name=name, value=1.0, unit="1") for name in ("n_patches", "damp_share", "other")
+    ]
+    assert [(one.name, one.words, one.good) for one in labelled(Damp, reported)] == [
+        ("n_patches", "damp patches", ""),
+        ("damp_share", "share that is damp", "less"),
+        ("other", "", ""),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("label", "said"),
+    [
+        ({"words": "two\nlines"}, "words must be one printable line of at most 200 bytes"),
+        ({"words": ""}, "words must be one printable line"),
+        ({"words": "a", "good": "most"}, "good side must be less, more, one or empty, got 'most'"),
+    ],
+)
+def test_a_label_that_is_none_is_refused(label: dict[str, str], said: str) -> None:
+    with pytest.raises(PluginError, match=said):
+        MetricLabel(**label)  # type: ignore[arg-type]
