@@ -347,7 +347,7 @@ def refuses(values, params, ctx):
 
 @work("exact")
 def unreadable(values, params, ctx):
-    raise InputError("the numbers are unreadable")
+    raise InputError("a.csv:2: no number\\na.csv:3: two numbers")
 
 @work("exact")
 def needs_library(values, params, ctx):

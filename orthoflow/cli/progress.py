@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _REFRESH_PER_S: Final = 4
 # A log file gets a line at least so often.
 _EVERY_S: Final = 10.0
+# Before a step has said for long what it compiles, nobody misses that time.
+_TOLD_COMPILE_S: Final = 2.0
 _STARTING: Final = "starting"
 _STYLES: Final = {
     "running": "cyan",
@@ -169,6 +171,8 @@ def end_text(event: CellFinished) -> str:
     if event.cached:
         return f"{event.address}: cached"
     took = f" in {duration(result.wall_s)}" if result.started else ""
+    if took and (result.compile_s or 0.0) >= _TOLD_COMPILE_S:
+        took += f", besides {duration(result.compile_s or 0.0)} of loading and compiling"
     why = f": {result.error_message}" if result.error_message else ""
     return f"{event.address}: {result.status}{took}{why}"
 

@@ -104,11 +104,13 @@ def run_task(
 
 def failed_result(task: Task, error: OrthoflowError, trace: str = "") -> CellResult:
     """Give the result of a cell that failed."""
+    # Of a file all problems come at once, a line each.
+    said = "; ".join(str(error).splitlines()) if type(error) is InputError else error
     return dataclasses.replace(
         blank_result(task),
         status="failed",
         error_type=type(error).__name__,
-        error_message=one_line(error, _LONGEST_ERROR) or f"{task.who} failed without a word",
+        error_message=one_line(said, _LONGEST_ERROR) or f"{task.who} failed without a word",
         traceback=trace,
         exit_code=error.exit_code,
     )
@@ -169,6 +171,7 @@ class _News:
     def __init__(self, listen: Listener) -> None:
         self._listen = listen
         self._last = StepEvent(kind="progress", text="", fraction=0.0)
+        self._n_kernels = 0
 
     def listen(self, event: StepEvent) -> None:
         """Pass on what the method says."""
@@ -177,8 +180,13 @@ class _News:
         self._listen(event)
 
     def compiling(self, text: str) -> None:
-        """Say what is compiled; when that is over, what was said before."""
-        self._listen(dataclasses.replace(self._last, text=text or self._last.text))
+        """Say what is compiled, and how many of the step's so far; then what was said before.
+
+        How many there will be, nobody knows: which ones are needed hangs on the data.
+        """
+        self._n_kernels += bool(text)
+        told = f"{text} ({self._n_kernels} in this step so far)" if text else self._last.text
+        self._listen(dataclasses.replace(self._last, text=told))
 
 
 class _Call:
@@ -293,7 +301,11 @@ class _Call:
         try:
             return cls.Params.model_validate_json(json.dumps(dict(self.task.params)), strict=True)
         except ValidationError as error:
-            raise MethodError(f"{self.task.who} refuses its parameters: {error}") from error
+            said = "; ".join(
+                f"{'.'.join(map(str, one['loc']))}: {one['msg']}"
+                for one in error.errors(include_url=False)
+            )
+            raise MethodError(f"{self.task.who} refuses its parameters: {said}") from error
 
     def _check_inputs(self, inputs: Mapping[str, Product | InputFiles]) -> None:
         for port, given in self.task.inputs.items():

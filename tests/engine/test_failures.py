@@ -72,7 +72,7 @@ RAISED = {
         1,
     ),
     "refuses": ("MethodError", "no number is large enough", 1),
-    "unreadable": ("InputError", "the numbers are unreadable", 2),
+    "unreadable": ("InputError", "a.csv:2: no number; a.csv:3: two numbers", 2),
     "needs_library": (
         "PluginError",
         (

@@ -374,7 +374,10 @@ steps:
 def test_the_plan_says_what_failed_last_time_until_garbage_is_collected(world: World) -> None:
     world.run(FAILING, executor="inline")
     planned = world.status(FAILING)
-    assert planned["second"] == ("will run", "failed last time: the numbers are unreadable")
+    assert planned["second"] == (
+        "will run",
+        "failed last time: a.csv:2: no number; a.csv:3: two numbers",
+    )
     assert world.status(FAILING, force=("second",))["second"] == ("will run", "forced")
     assert collect_garbage(world.store, dry_run=True).freed_bytes > 0
     collect_garbage(world.store)

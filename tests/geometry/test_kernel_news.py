@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numba
 
+from orthoflow.engine.running import _News
 from orthoflow.geometry import compiling
 from orthoflow.geometry.kernel_news import heard_by
+from orthoflow.sdk import StepEvent
 
 
-def test_a_kernel_and_those_that_it_needs_are_counted_and_told_once() -> None:
+def test_a_kernel_and_those_that_it_needs_are_told_once() -> None:
     assert compiling.numba is numba
     namespace: dict[str, object] = {"njit": numba.njit}
     exec(
@@ -20,6 +22,23 @@ def test_a_kernel_and_those_that_it_needs_are_counted_and_told_once() -> None:
     with heard_by(heard.append):
         assert outer(1) == 4  # type: ignore[operator]
         assert outer(2) == 6  # type: ignore[operator]
-    assert heard == ["compiling 1 of 2: outer", "compiling 2 of 2: inner", ""]
+    assert heard == ["compiling outer", "compiling inner", ""]
     assert namespace["inner"](1.5) == 2.5  # type: ignore[operator]
     assert len(heard) == 3
+
+
+def test_a_step_counts_what_it_compiles_and_then_says_again_what_it_did() -> None:
+    told: list[StepEvent] = []
+    news = _News(told.append)
+    news.listen(StepEvent(kind="progress", text="peeling", fraction=0.25))
+    for text in ("compiling outer", "compiling inner", "", "compiling other", ""):
+        news.compiling(text)
+    assert [event.text for event in told] == [
+        "peeling",
+        "compiling outer (1 in this step so far)",
+        "compiling inner (2 in this step so far)",
+        "peeling",
+        "compiling other (3 in this step so far)",
+        "peeling",
+    ]
+    assert {event.fraction for event in told} == {0.25}
