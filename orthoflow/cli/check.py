@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,6 +12,9 @@ from orthoflow.cli.failures import EXIT_GOOD
 from orthoflow.cli.options import Changes, json_option, workflow_arguments
 from orthoflow.cli.tables import counted, echo, echo_json
 from orthoflow.errors import OrthoflowError
+
+if TYPE_CHECKING:
+    from orthoflow.workflow import Workflow
 
 
 @click.command(cls=Command)
@@ -60,6 +64,12 @@ def _check(workflow: str, changes: Changes) -> _Verdict:
     datasets = f"{counted(n_data, 'dataset')}, " if n_data else ""
     summary = (
         f"{loaded.name} is fine: {counted(len(loaded.steps), 'step')}, {datasets}"
-        f"{counted(len(cells), 'cell')}{without_data}"
+        f"{counted(len(cells), 'cell')}{without_data}{_baseline_text(loaded)}"
     )
     return _Verdict(summary=summary, warnings=doubts_about(loaded))
+
+
+def _baseline_text(workflow: Workflow) -> str:
+    """Which variants the others are compared with: of a sweep, nobody named it."""
+    named = ", ".join(f"{step}={variant}" for step, variant in workflow.baseline.items())
+    return f"; baseline {named}" if named else ""

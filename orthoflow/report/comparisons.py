@@ -122,6 +122,28 @@ class ComparisonTable:
         return sum(not row.shortfall for row in self.rows)
 
     @property
+    def baseline(self) -> str:
+        """The combination that the others are compared with; empty where there is none, or two."""
+        found = [one for row, one in zip(self.rows, self._names, strict=True) if row.is_baseline]
+        return found[0] if len(found) == 1 else ""
+
+    @property
+    def _names(self) -> list[str]:
+        """What tells each row from the others."""
+        variants = (
+            ", ".join(
+                f"{step}={chosen}"
+                for step, chosen in zip(self.steps, row.variants, strict=True)
+                if chosen != _NOTHING
+            )
+            for row in self.rows
+        )
+        return [
+            f"{row.run}: {said}" if self.shows_runs else said
+            for row, said in zip(self.rows, variants, strict=True)
+        ]
+
+    @property
     def n_judged(self) -> int:
         """How many of the columns have a good side, time and memory included."""
         return sum(column.sense is not Sense.NEITHER for column in self.columns) + 2
@@ -138,20 +160,15 @@ class ComparisonTable:
             sum(marks[index] is Mark.BEST for marks in marked) > 1 for index in range(len(labels))
         ]
         found = []
-        for row, all_marks in zip(self.rows, marked, strict=True):
+        for row, name, all_marks in zip(self.rows, self._names, marked, strict=True):
             marks = [
                 Mark.NEAR if mark is Mark.BEST and is_shared else mark
                 for mark, is_shared in zip(all_marks, shared, strict=True)
             ]
             best = [label for label, mark in zip(labels, marks, strict=True) if mark is Mark.BEST]
-            variants = ", ".join(
-                f"{step}={chosen}"
-                for step, chosen in zip(self.steps, row.variants, strict=True)
-                if chosen != _NOTHING
-            )
             found.append(
                 Standing(
-                    name=f"{row.run}: {variants}" if self.shows_runs else variants,
+                    name=name,
                     is_baseline=row.is_baseline,
                     shortfall=row.shortfall,
                     n_best=len(best),

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -119,6 +119,7 @@ class _Point:
     y: float
     spread: float
     n: int  # datasets, or ways through the other variants, that it stands for
+    is_baseline: bool
 
 
 def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
@@ -134,11 +135,19 @@ def _curves(parts: Sequence[Run]) -> Iterator[Curve]:
                 yield _curve(sweep, column, lines, n_datasets=len(parts))
 
 
+class _Value(NamedTuple):
+    """What one combination measured."""
+
+    value: float
+    spread: float
+    is_baseline: bool
+
+
 def _lines(
     combinations: Sequence[Combination], sweep: Sweep, column: Column, *, is_over: bool
 ) -> dict[str, list[_Point]]:
     """One line per combination of the other variants."""
-    values: dict[str, dict[float, list[tuple[float, float]]]] = {}
+    values: dict[str, dict[float, list[_Value]]] = {}
     for one in combinations:
         variant = one.assignment.get(sweep.step, "")
         measured = one.measured(column.step, column.metric)
@@ -153,20 +162,22 @@ def _lines(
         )
         others = ", ".join(filter(None, [sweep.others[variant], *variants]))
         at = values.setdefault(others, {}).setdefault(sweep.values[variant], [])
-        at.append((measured.value, measured.spread))
+        at.append(_Value(measured.value, measured.spread, one.is_baseline))
     return {
         name: [_point(x, found, is_over=is_over) for x, found in sorted(line.items())]
         for name, line in list(values.items())[:_MOST_LINES]
     }
 
 
-def _point(x: float, found: Sequence[tuple[float, float]], *, is_over: bool) -> _Point:
+def _point(x: float, found: Sequence[_Value], *, is_over: bool) -> _Point:
+    is_baseline = any(one.is_baseline for one in found)
     if len(found) == 1:
         # A bar over datasets is how far they lie apart, not how far the repeats of one do.
-        return _Point(x=x, y=found[0][0], spread=math.nan if is_over else found[0][1], n=1)
-    numbers = np.array([value for value, _ in found])
-    spread = median_deviation(numbers)
-    return _Point(x=x, y=float(np.median(numbers)), spread=spread, n=len(found))
+        y, spread = found[0].value, math.nan if is_over else found[0].spread
+    else:
+        numbers = np.array([one.value for one in found])
+        y, spread = float(np.median(numbers)), median_deviation(numbers)
+    return _Point(x=x, y=y, spread=spread, n=len(found), is_baseline=is_baseline)
 
 
 def _behind(points: Sequence[_Point], n_datasets: int) -> str:
@@ -199,6 +210,8 @@ def _curve(
     else:
         said = "one value each: without repeats nobody knows how far they scatter"
     good = "" if column.sense is Sense.NEITHER else f"; {column.sense.value}"
+    if any(point.is_baseline for points in lines.values() for point in points):
+        good += "; the filled point is the baseline"
     return Curve(
         title=title,
         svg=_Axes.of([point for points in lines.values() for point in points]).drawn(
@@ -301,7 +314,8 @@ class _Axes:
             if math.isfinite(point.spread)
         )
         dots = "".join(
-            f'<circle class="dot line-{index}" cx="{x:.1f}" cy="{y:.1f}" r="3.6">'
+            f'<circle class="dot line-{index}{" base" if point.is_baseline else ""}" '
+            f'cx="{x:.1f}" cy="{y:.1f}" r="3.6">'
             f"<title>{number(point.x)}: {number(point.y)}</title></circle>"
             for (x, y), point in zip(at, points, strict=True)
         )

@@ -141,7 +141,7 @@ def _limit(part: Run, own: AbstractSet[str]) -> str:
     said = [
         limit.text
         for limit in limits(part)
-        if not own.isdisjoint(limit.cells) and not limit.text.startswith("failed: ")
+        if not own.isdisjoint(limit.cells) and not limit.is_failure
     ]
     return f"{said[0]} (and {len(said) - 1} more)" if len(said) > 1 else "".join(said)
 

@@ -46,10 +46,11 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """A sentence on what limits the result, and the cells that say it."""
+    """A sentence on what limits the result, the cells that say it, and whether they failed."""
 
     text: str
     cells: tuple[str, ...]
+    is_failure: bool = False
 
 
 def is_quality(row: MetricRow) -> bool:
@@ -85,12 +86,15 @@ def limits(run: Run) -> tuple[Limit, ...]:
     addresses: dict[str, list[str]] = {}
     for cell in run.record.cells:
         if cell.status == "failed":
-            addresses.setdefault(f"failed: {cell.error_message}", []).append(cell.address)
+            addresses.setdefault(cell.error_message, []).append(cell.address)
     first = {cell.address for cell in baseline_cells(run)}
     by_baseline = sorted(run.record.cells, key=lambda cell: cell.address not in first)
     warnings = alike((cell.address, text) for cell in by_baseline for text in cell.warnings)
     return (
-        *(Limit(text=text, cells=tuple(cells)) for text, cells in addresses.items()),
+        *(
+            Limit(text=text, cells=tuple(cells), is_failure=True)
+            for text, cells in addresses.items()
+        ),
         *(Limit(text=item.sentence, cells=item.places) for item in warnings),
     )
 

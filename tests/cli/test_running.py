@@ -429,6 +429,18 @@ def test_check_is_content_with_a_good_workflow(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, "studio is fine: 2 steps, 2 cells\n")
 
 
+def test_check_says_which_variant_the_others_are_compared_with(tmp_path: Path) -> None:
+    path = write_studio(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    assert "use: paint.plain" in text
+    swept = "variants: {rough: {use: paint.plain}, fine: {use: paint.plain}}"
+    path.write_text(
+        f"{text.replace('use: paint.plain', swept)}compare: {{design: product}}\n", encoding="utf-8"
+    )
+    done = orthoflow(tmp_path, "check", "studio.yaml")
+    assert done.stdout.endswith("3 cells; baseline paint=rough\n"), done.stdout + done.stderr
+
+
 def test_check_names_every_problem_with_its_place(tmp_path: Path) -> None:
     path = write_studio(tmp_path, "paint.plane")
     path.write_text(path.read_text(encoding="utf-8") + "colour: red\n", encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import re
 from dataclasses import replace
@@ -79,6 +80,19 @@ def test_repeats_have_bars_and_what_failed_has_no_point(tmp_path: Path) -> None:
     assert curve.svg.count("<circle") == 3
     assert 'class="bar line-0"' in curve.svg
     assert "means of the repeats" in curve.caption
+
+
+def test_the_baseline_of_a_sweep_is_the_filled_point(tmp_path: Path) -> None:
+    told = record(
+        swept(0.02, 0.05, 0.1),  # type: ignore[arg-type]
+        workflow_resolved=json.dumps({"compare": {"baseline": {"plane": "tolerance_m-0.05"}}}),
+    )
+    (curve,) = curves(HeldRun(path=tmp_path / "run.h5", record=told))
+    assert re.findall(r'class="dot line-0 base"[^>]*><title>([^<]*)', curve.svg) == ["0.05: 0.005"]
+    assert "the filled point is the baseline" in curve.caption
+    (plain,) = curves(held(tmp_path, swept(0.02, 0.05, 0.1)))
+    assert "base" not in plain.svg
+    assert "baseline" not in plain.caption
 
 
 def test_over_datasets_the_points_are_medians(tmp_path: Path) -> None:

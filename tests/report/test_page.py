@@ -71,6 +71,13 @@ def test_a_failed_combination_stands_in_its_row_with_the_reason(page: Page) -> N
     assert "no plane & no <wall>" in text
 
 
+def test_a_failure_is_told_once_before_the_tables_and_the_baseline_is_named(page: Page) -> None:
+    text = page.evaluate("document.querySelector('main').innerText")
+    summary = text[: text.index("At a glance")]
+    assert summary.count("no plane & no <wall>") == 1
+    assert "the numbers are of the baseline, plane=fine, with which the others" in summary
+
+
 def test_the_slider_moves_by_keyboard_and_cuts_both_pictures(page: Page) -> None:
     page.evaluate("document.querySelector('[data-part=position]').focus()")
     before = float(page.evaluate("document.querySelector('[data-part=position]').value"))

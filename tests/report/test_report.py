@@ -150,7 +150,7 @@ def test_many_pictures_are_small_ones() -> None:
 
 def test_what_limits_the_result_is_said_once_failures_first(compared: Run) -> None:
     assert [(limit.text, limit.cells) for limit in limits(compared)] == [
-        ("failed: no plane & no <wall>", ("plane@plane=broken",)),
+        ("no plane & no <wall>", ("plane@plane=broken",)),
         ("the grid is <fine>", ("check@plane=fine",)),
         ("the grid is <coarse>", ("check@plane=coarse",)),
     ]

@@ -252,7 +252,7 @@ def test_limits_name_all_cells_that_say_the_same() -> None:
         workflow_resolved=compared_resolved(),
     )
     assert limits(told) == (
-        Limit(text="failed: no plane", cells=("plane@plane=bad", "plane@plane=worse")),
+        Limit(text="no plane", cells=("plane@plane=bad", "plane@plane=worse"), is_failure=True),
         Limit(text="few points", cells=("plane@plane=fine", "plane@plane=coarse")),
         Limit(text="odd", cells=("plane@plane=coarse", "plane@plane=worse")),
     )
