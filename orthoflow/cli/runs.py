@@ -140,9 +140,9 @@ def runs_json(kept: Sequence[RunSummary]) -> list[dict[str, object]]:
 
 def print_runs(kept: Sequence[RunSummary], *, n_found: int, metrics: Sequence[str] = ()) -> None:
     """Print a table of runs, what went wrong in them, and how many there are."""
-    from orthoflow.report.browsing import differing_facts, key_metrics
+    from orthoflow.report.browsing import differing_facts, key_metrics, told_apart
 
-    names = list(metrics) or key_metrics(kept, most=_METRICS_MOST)
+    names = list(metrics) or list(told_apart(key_metrics(kept, most=_METRICS_MOST), kept))
     _require_known(names, kept)
     facts = differing_facts(kept)
     echo_table(
@@ -251,6 +251,7 @@ def _facts_text(facts: Mapping[str, object]) -> str:
 def _row_json(run: RunSummary, differs: Mapping[str, object]) -> dict[str, object]:
     values = dataclasses.asdict(run) | {"folder": str(run.folder)}
     values["status"] = values.pop("state")
+    del values["labels"]
     return values | {"differs": dict(differs)}
 
 

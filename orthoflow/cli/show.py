@@ -57,6 +57,7 @@ def show(run: Path, *, as_json: bool) -> int:
         _print_metrics(opened)
         _print_environments(opened)
         _print_files(opened)
+        echo("", f"whether all of it is as it was written, says `orthoflow verify {run}`")
     return EXIT_GOOD
 
 

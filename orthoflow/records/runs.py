@@ -24,6 +24,8 @@ from orthoflow.records.metrics import MetricRow, cell_metrics
 from orthoflow.records.published import PRODUCTS_FOLDER, published_files
 
 REPORT_FILE: Final = "report.html"
+_DAMAGED: Final = "the file is damaged"
+_AWAY: Final = "; take another copy of it, `orthoflow verify` says whether that one is whole"
 # Of a run on several datasets, a page for each.
 PAGES_FOLDER: Final = "pages"
 
@@ -249,16 +251,15 @@ def record_errors(path: Path) -> Iterator[None]:
     except OrthoflowError:
         raise
     except RecordFormatError as error:
-        raise RecordError(_with_path(path, str(error))) from error
+        said = _with_path(path, str(error))
+        raise RecordError(f"{said}{_AWAY if _DAMAGED in said else ''}") from error
     except PermissionError as error:
         raise ArgumentError(f"{path} cannot be read: permission denied") from error
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         # h5py reports damage with any of these, depending on which structure is hit.
         if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.EISDIR):
             raise ArgumentError(f"{path} is no file; give a run folder or its run.h5") from error
-        raise RecordError(
-            f"{path} is no record or is damaged: {error}; take another copy of it"
-        ) from error
+        raise RecordError(f"{path} is no record or is damaged: {error}{_AWAY}") from error
 
 
 def _with_path(path: Path, sentence: str) -> str:

@@ -18,6 +18,7 @@ from orthoflow.products import JsonValue
 from orthoflow.records import RECORD_FILE, Run, cell_metrics, open_run
 from orthoflow.records.datasets import parts_of
 from orthoflow.report.combinations import baseline_cells
+from orthoflow.report.metric_words import words_of
 from orthoflow.report.summaries import QUALITY
 from orthoflow.workflow.format import DATA
 
@@ -44,6 +45,7 @@ class RunSummary:
         started: ISO 8601 UTC; empty where nothing says it.
         metrics: numbers of the baseline by `step.metric`, and by `metric` alone as the last step
             has it; of several datasets the median.
+        labels: what each of these is, in words.
         facts: what may differ between runs, as JSON: parameters by `cell.parameter`, those of the
             baseline by `step.parameter` and its methods by `step.use`; `seed`, `orthoflow` (its
             version), and inputs by `input <name>`.
@@ -56,6 +58,7 @@ class RunSummary:
     run_id: str = ""
     started: str = ""
     metrics: Mapping[str, float] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, JsonValue] = field(default_factory=dict)
 
 
@@ -105,6 +108,21 @@ def key_metrics(runs: Iterable[RunSummary], *, most: int) -> list[str]:
     known = [name for name, count in counts.items() if count]
     chosen = sorted(known, key=lambda name: -counts[name])[:most]
     return [name for name in known if name in chosen]
+
+
+def told_apart(names: Iterable[str], runs: Sequence[RunSummary]) -> Iterator[str]:
+    """Put `step.metric` in the place of names that are not the same thing in all runs."""
+    for name in names:
+        said = {run.labels[name] for run in runs if name in run.labels}
+        if len(said) < 2:
+            yield name
+            continue
+        yield from dict.fromkeys(
+            own
+            for run in runs
+            for own, label in run.labels.items()
+            if own.endswith(f".{name}") and label in said
+        )
 
 
 def _below(folder: Path) -> Iterator[Path]:
@@ -161,6 +179,7 @@ def _of_run(folder: Path, run: Run) -> RunSummary:
         run_id=record.run_id,
         started=record.started,
         metrics=_metrics(run),
+        labels=_labels(run),
         facts=facts,
     )
 
@@ -176,6 +195,17 @@ def _metrics(run: Run) -> dict[str, float]:
         for name, value in own.items():
             values.setdefault(name, []).append(value)
     return {name: statistics.median(found) for name, found in values.items()}
+
+
+def _labels(run: Run) -> dict[str, str]:
+    """What the numbers of the baseline are; of several datasets, as the last has them."""
+    found: dict[str, str] = {}
+    for part in parts_of(run).values() or (run,):
+        for cell in baseline_cells(part):
+            for row in cell_metrics(cell):
+                label = words_of(row.metric, row.method, row.words)
+                found |= {f"{row.step}.{row.metric}": label, row.metric: label}
+    return found
 
 
 def _unfinished(folder: Path) -> RunSummary:

@@ -11,7 +11,7 @@ from typing import Final
 
 from orthoflow.errors import OrthoflowError
 from orthoflow.records import REPORT_FILE, open_run
-from orthoflow.report.browsing import RunSummary, differing_facts, key_metrics
+from orthoflow.report.browsing import RunSummary, differing_facts, key_metrics, told_apart
 from orthoflow.report.combinations import baseline_cells
 from orthoflow.report.metric_words import WORDS
 from orthoflow.report.pages import environment, write_whole
@@ -43,7 +43,11 @@ def write_run_table(runs: Sequence[RunSummary], path: Path) -> None:
         StoreError: it cannot be written.
     """
     facts = differing_facts(runs)
-    names = [name for name in WORDS if any(name in run.metrics for run in runs)]
+    known = [name for name in WORDS if any(name in run.metrics for run in runs)]
+    names = {
+        name: next(run.labels[name] for run in runs if name in run.labels)
+        for name in told_apart(known, runs)
+    }
     rows = [
         _Row(
             run=run,
@@ -63,7 +67,7 @@ def write_run_table(runs: Sequence[RunSummary], path: Path) -> None:
             title=f"{len(runs)} runs",
             rows=rows,
             names=names,
-            key_names=key_metrics(runs, most=_KEYS_MOST),
+            key_names=set(told_apart(key_metrics(runs, most=_KEYS_MOST), runs)),
             reasons={str(run.folder): run.reason for run in runs if run.reason},
         )
     )

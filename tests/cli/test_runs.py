@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import re
 from pathlib import Path
 
 import h5py
@@ -157,6 +158,27 @@ def test_a_page_leads_to_the_report_of_each_run(runs: Path) -> None:
     assert "cannot be written" in asked("runs", "runs", "--html", "no/folder.html").output
 
 
+def test_a_name_that_means_two_things_has_a_column_for_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, method in (("plane", "plane.toy"), ("points", "inspect.checkpoints")):
+        (tmp_path / name).mkdir()
+        made = record([cell(name, method=method, metrics=metrics(rms_mm=7.0))], name=name)
+        write_record(tmp_path / name / "run.h5", made, lambda _digest: None)
+    said("runs", "--html", "runs.html")
+    page = (tmp_path / "runs.html").read_text()
+    heading = r'data-name="(\w+\.rms_mm|rms_mm)" data-key data-sort="number"><span>([^/]*)</span>'
+    assert re.findall(heading, page.replace("<wbr>", "")) == [
+        ("plane.rms_mm", "points to their plane, RMS"),
+        ("points.rms_mm", "check points, RMS"),
+    ]
+    header = said("runs").splitlines()[0]
+    assert "plane.rms_mm" in header
+    assert "points.rms_mm" in header
+    assert " rms_mm " not in header
+
+
 def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     (runs / "torn").mkdir()
     (runs / "torn" / "run.h5").write_bytes((runs / "runs/a/run.h5").read_bytes()[:2000])
@@ -173,6 +195,13 @@ def test_what_cannot_be_read_is_a_row_with_its_reason(runs: Path) -> None:
     }  # fmt: skip
     assert rows["torn"]["reason"].startswith("torn/run.h5 cannot be read, the file is damaged")
     assert all(rows[name]["reason"] for name in ("linked", "pipe"))
+    shown = asked("show", "torn")
+    assert shown.exit_code == 3
+    assert shown.output.startswith("error: torn/run.h5 cannot be read, the file is damaged: ")
+    assert shown.output.endswith(
+        "; take another copy of it, `orthoflow verify` says whether that one is whole\n"
+    )
+    assert shown.output.count("\n") == 1
     assert rows["hostile"]["workflow"] == "\x1b[2Jred"
     assert "\x1b" not in said("runs")
     assert "torn damaged: torn/run.h5 cannot be read" in said("runs")

@@ -49,6 +49,8 @@ def test_a_run_is_shown_completely(tmp_path: Path) -> None:
         "numpy 2.4.0, h5py 3.16.0 and 0 others (--json names them)",
         "",
         f"products: {tmp_path / 'products'}, 0 files",
+        "",
+        f"whether all of it is as it was written, says `orthoflow verify {path}`",
     ]
     told = json.loads(said("show", path, "--json"))
     assert [cell["address"] for cell in told["cells"]] == ["cloud", wall, "ortho"]
