@@ -27,6 +27,7 @@ class KeyPlan:
 
     Attributes:
         walls: (w, 2, 2) upright rectangles from above.
+        numbers: of these walls, as files and reports have them.
         outlines: of the room, (n, 2) each; closed ones end where they begin.
         marked: (n, 2) the wall that is meant: two ends, or the four corners of a level plane.
         arrow: (2, 2) from the viewer to the wall; None for level planes.
@@ -34,6 +35,7 @@ class KeyPlan:
     """
 
     walls: NDArray[np.float64]
+    numbers: tuple[int, ...]
     outlines: tuple[NDArray[np.float64], ...]
     marked: NDArray[np.float64]
     arrow: NDArray[np.float64] | None
@@ -106,6 +108,7 @@ def key_plan(planes: Planes, frame: WallFrame) -> KeyPlan:
     axis = int(np.argmax(np.abs(basis[1])))
     return KeyPlan(
         walls=np.array(walls).reshape(-1, 2, 2),
+        numbers=tuple(int(number) for number in np.flatnonzero(upright)),
         outlines=tuple(
             seen(np.vstack([chain, chain[:1]]) if is_closed else chain)
             for chain, is_closed in zip(outline.chains_world, outline.closed, strict=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -43,15 +44,18 @@ def write_text(
     *,
     high_mm: float = LABEL_MM,
     is_bold: bool = False,
-    is_upright: bool = False,
+    turned_deg: float = 0.0,
     is_centred: bool = False,
 ) -> None:
-    """Write a line of text, its height that of its capital letters; foreign letters harmless."""
+    """Write a line of text, its height that of its capital letters; foreign letters harmless.
+
+    It is turned counter-clockwise about where it begins, or about its middle where it is centred.
+    """
     canvas.saveState()
     canvas.setFont(f"{FONT}-Bold" if is_bold else FONT, font_points(high_mm))
     canvas.translate(at_mm[0] * POINTS_PER_MM, at_mm[1] * POINTS_PER_MM)
-    if is_upright:
-        canvas.rotate(90)
+    if turned_deg:
+        canvas.rotate(turned_deg)
     (canvas.drawCentredString if is_centred else canvas.drawString)(0, 0, shown(text))
     canvas.restoreState()
 
@@ -59,3 +63,38 @@ def write_text(
 def font_points(high_mm: float) -> float:
     """Size of the font whose capital letters are so high."""
     return high_mm * POINTS_PER_MM / 0.729
+
+
+def write_on_white(
+    canvas: Canvas,
+    text: str,
+    middle_mm: tuple[float, float],
+    *,
+    high_mm: float = LABEL_MM,
+    turned_deg: float = 0.0,
+) -> None:
+    """Write a line of text around a place, on white: what lies below is cut out for it."""
+    along = np.array([math.cos(math.radians(turned_deg)), math.sin(math.radians(turned_deg))])
+    middle = np.array(middle_mm)
+    half = 0.5 * text_width_mm(text, high_mm) + 0.4 * high_mm
+    canvas.saveState()
+    canvas.setStrokeColorRGB(1.0, 1.0, 1.0)
+    line(canvas, np.array([middle - half * along, middle + half * along]), width_mm=1.6 * high_mm)
+    canvas.restoreState()
+    # Its capital letters stand as far above the middle as below it.
+    x, y = middle + 0.5 * high_mm * np.array([along[1], -along[0]])
+    write_text(
+        canvas,
+        text,
+        (float(x), float(y)),
+        high_mm=high_mm,
+        turned_deg=turned_deg,
+        is_centred=True,
+    )
+
+
+def text_width_mm(text: str, high_mm: float) -> float:
+    """How wide a line of bold text is on the paper; of plain text a little less."""
+    from reportlab.pdfbase.pdfmetrics import stringWidth
+
+    return float(stringWidth(shown(text), f"{FONT}-Bold", font_points(high_mm))) / POINTS_PER_MM

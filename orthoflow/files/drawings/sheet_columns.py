@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 
 from orthoflow.files.drawings.key_plans import KeyPlan
 from orthoflow.files.drawings.papers import MARGIN_MM, Part
-from orthoflow.files.drawings.pens import FONT, POINTS_PER_MM, font_points, line, write_text
+from orthoflow.files.drawings.pens import (
+    FONT,
+    LABEL_MM,
+    POINTS_PER_MM,
+    font_points,
+    line,
+    text_width_mm,
+    write_on_white,
+    write_text,
+)
 from orthoflow.files.drawings.sheet_contents import Sheet, WallDrawing
 from orthoflow.files.drawings.title_blocks import FIELDS
 from orthoflow.foreign_text import shown
@@ -22,6 +31,8 @@ if TYPE_CHECKING:
 
 _PADDING_MM: Final = 3.0
 _TEXT_MM: Final = 1.7
+# The column whose text is as high as it says: that of A3, 1.7 mm; A1 has 3.0.
+_PLAIN_COLUMN_MM: Final = 0.24 * 420.0
 _LEAST_PLAN_MM: Final = 15.0
 _MOST_PLAN_MM: Final = 90.0
 _MOST_SEGMENTS: Final = 5
@@ -32,16 +43,21 @@ _KINDS: Final = {"ortho": "orthoimage", "depth": "depth contours", "intensity": 
 
 @dataclass
 class _Column:
-    """Where the next thing goes, in mm: down from the top, or up from the bottom."""
+    """Where the next thing goes, in mm: down from the top, or up from the bottom.
+
+    Text is `size` times as high as it says, which grows with the paper: large sheets hang.
+    """
 
     canvas: Canvas
     left: float
     width: float
     top: float
     bottom: float
+    size: float
 
     def write(self, text: str, *, high_mm: float = _TEXT_MM, is_bold: bool = False) -> None:
         """Write a paragraph at the top."""
+        high_mm *= self.size
         for row in self.rows(text, high_mm):
             self.top -= 1.7 * high_mm
             write_text(self.canvas, row, (self.left, self.top), high_mm=high_mm, is_bold=is_bold)
@@ -76,6 +92,7 @@ def draw_column(canvas: Canvas, drawing: WallDrawing, sheet: Sheet) -> None:
         width=sheet.paper.column_mm - 2 * _PADDING_MM,
         top=sheet.paper.height_mm - MARGIN_MM - _PADDING_MM,
         bottom=MARGIN_MM + _PADDING_MM,
+        size=max(1.0, sheet.paper.column_mm / _PLAIN_COLUMN_MM),
     )
     _draw_seal(column, drawing)
     _write_title(column, drawing, sheet)
@@ -90,13 +107,16 @@ def draw_column(canvas: Canvas, drawing: WallDrawing, sheet: Sheet) -> None:
     room = (column.top - column.bottom) / max(1, pictures) - 5.0
     if room < _LEAST_PLAN_MM:
         return
-    room = min(room, _MOST_PLAN_MM)
+    room = min(room, _MOST_PLAN_MM * column.size)
     if sheet.numbered and sheet.number > 0:
         column.write(f"sheets of {drawing.text.name}")
         _draw_sheet_key(column, sheet, room)
     if drawing.plan is not None:
-        column.write("from above; the wall of this sheet, and the side it is seen from, in red")
-        _draw_plan(column, drawing.plan, room)
+        column.write(
+            "from above, walls with their numbers; the wall of this sheet, and the side it is seen "
+            "from, in red"
+        )
+        _draw_plan(column, drawing.plan, room, number=drawing.number)
 
 
 def _write_title(column: _Column, drawing: WallDrawing, sheet: Sheet) -> None:
@@ -142,7 +162,7 @@ def _draw_scale_bar(column: _Column, scale: int) -> None:
     length_m = max(m for m in lengths if 1e3 * m / scale <= _SEGMENT_MM + 1e-6)
     segment = 1e3 * length_m / scale
     count = max(1, min(_MOST_SEGMENTS, int((column.width - 8.0) / segment)))
-    column.top -= 7.0
+    column.top -= 5.0 + 2.0 * column.size
     canvas, left = column.canvas, column.left + 2.0
     canvas.setLineWidth(0.1 * POINTS_PER_MM)
     for place in range(count):
@@ -156,12 +176,12 @@ def _draw_scale_bar(column: _Column, scale: int) -> None:
     for place in range(count + 1):
         text = f"{place * length_m:g}" + (" m" if place == count else "")
         at = (left + place * segment, column.top + 3.2)
-        write_text(canvas, text, at, high_mm=1.8, is_centred=True)
+        write_text(canvas, text, at, high_mm=1.8 * column.size, is_centred=True)
     column.top -= 1.0
 
 
-def _draw_plan(column: _Column, plan: KeyPlan, room: float) -> None:
-    """Draw the room from above as large as there is room."""
+def _draw_plan(column: _Column, plan: KeyPlan, room: float, *, number: int = -1) -> None:
+    """Draw the room from above as large as there is room, with the number of the marked wall."""
     lines = [*plan.walls, *plan.outlines, plan.marked]
     if plan.arrow is not None:
         lines.append(plan.arrow)
@@ -182,7 +202,38 @@ def _draw_plan(column: _Column, plan: KeyPlan, room: float) -> None:
     _draw_arrow(
         canvas, np.array([[right, column.top + 1.0], [right, column.top + 9.0]]), width_mm=0.3
     )
-    write_text(canvas, plan.up_label, (right, column.top + 10.0), is_centred=True)
+    write_text(
+        canvas,
+        plan.up_label,
+        (right, column.top + 10.0),
+        high_mm=LABEL_MM * column.size,
+        is_centred=True,
+    )
+    # The marked one first: where walls lie close, not all of them have room.
+    on_paper = {n: place(wall) for n, wall in zip(plan.numbers, plan.walls, strict=True)}
+    in_order = sorted(on_paper, key=lambda n: (n != number, -_length(on_paper[n])))
+    _number_walls(canvas, {n: on_paper[n] for n in in_order}, high_mm=_TEXT_MM * column.size)
+
+
+def _number_walls(
+    canvas: Canvas, on_paper: Mapping[int, NDArray[np.float64]], *, high_mm: float
+) -> None:
+    """Write the numbers of walls into their middles, in this order, where there is room."""
+    placed: list[NDArray[np.float64]] = []
+    for number, wall in on_paper.items():
+        middle = wall.mean(axis=0)
+        room = 1.5 * text_width_mm(str(number), high_mm) + high_mm
+        if _length(wall) < room or any(
+            float(np.linalg.norm(middle - other)) < room for other in placed
+        ):
+            continue
+        placed.append(middle)
+        at = (float(middle[0]), float(middle[1]))
+        write_on_white(canvas, str(number), at, high_mm=high_mm)
+
+
+def _length(ends: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(ends[1] - ends[0]))
 
 
 def _draw_sheet_key(column: _Column, sheet: Sheet, room: float) -> None:
@@ -199,7 +250,7 @@ def _draw_sheet_key(column: _Column, sheet: Sheet, room: float) -> None:
             canvas.rect(*(POINTS_PER_MM * side for side in sides), stroke=0, fill=1)
             canvas.setFillColorRGB(0.0, 0.0, 0.0)
         line(canvas, corners, is_closed=True)
-        high = min(2.5, 0.5 * (top - bottom), 0.4 * (right - left))
+        high = min(2.5 * column.size, 0.5 * (top - bottom), 0.4 * (right - left))
         middle = (0.5 * (left + right), 0.5 * (bottom + top - high))
         write_text(canvas, str(number), middle, high_mm=high, is_centred=True)
     column.top -= 2.0
@@ -242,7 +293,7 @@ def _draw_seal(column: _Column, drawing: WallDrawing) -> None:
     code = segno.make(f"sha256:{drawing.text.digest}", error="m", micro=False)
     dots = [list(row) for row in code.matrix]
     # Phones want 0.5 mm a dot; four dots of quiet around it.
-    side = min(28.0, 0.45 * column.width)
+    side = min(28.0 * column.size, 0.45 * column.width)
     dot = side / (len(dots) + 8)
     canvas, left, bottom = column.canvas, column.left, column.bottom
     for row, values in enumerate(dots):

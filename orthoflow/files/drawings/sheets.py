@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoflow.errors import StoreError
+from orthoflow.files.drawings.contour_labels import label_place
 from orthoflow.files.drawings.papers import MARGIN_MM, Paper, View
 from orthoflow.files.drawings.pens import (
     FONT,
@@ -25,6 +26,8 @@ from orthoflow.files.drawings.pens import (
     THIN_MM,
     font_points,
     line,
+    text_width_mm,
+    write_on_white,
     write_text,
 )
 from orthoflow.files.drawings.printed_pictures import contours, picture_file, write_picture
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
     from reportlab.pdfgen.canvas import Canvas
 
 _THICK_MM: Final = 0.35
+_CONTOUR_TEXT_MM: Final = 1.5
 _CROSS_MM: Final = 1.5
 _BEFORE: Final = (0.80, 0.25, 0.05)
 _BEHIND: Final = (0.05, 0.30, 0.75)
@@ -125,9 +129,25 @@ def _draw_contours(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
     found = contours(
         drawing.rasters[view.kind], view.part, scale=drawing.scale, interval_m=drawing.interval_m
     )
+    placed: list[NDArray[np.float64]] = []
     for level, points in found:
-        canvas.setStrokeColorRGB(*(_BEFORE if level > 0.0 else _BEHIND))
-        line(canvas, [_on_paper(drawing, view, x, y) for x, y in points.tolist()], width_mm=0.13)
+        colour = _BEFORE if level > 0.0 else _BEHIND
+        canvas.setStrokeColorRGB(*colour)
+        on_paper = np.array([_on_paper(drawing, view, x, y) for x, y in points.tolist()])
+        line(canvas, on_paper, width_mm=0.13)
+        label = f"{round(1e3 * level, 6):+g}"
+        place = label_place(on_paper, text_width_mm(label, _CONTOUR_TEXT_MM), placed)
+        if place is not None:
+            placed.append(np.array(place.middle_mm))
+            canvas.setFillColorRGB(*colour)
+            write_on_white(
+                canvas,
+                label,
+                place.middle_mm,
+                high_mm=_CONTOUR_TEXT_MM,
+                turned_deg=place.turned_deg,
+            )
+    canvas.setFillColorRGB(0.0, 0.0, 0.0)
 
 
 def _draw_areas(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
@@ -188,7 +208,7 @@ def _draw_grid(canvas: Canvas, drawing: WallDrawing, view: View) -> None:
         for x, end in ((left, left - 1.5), (right, right + 1.5)):
             line(canvas, [(x, y), (end, y)])
         label = (left - 2.5, y)
-        write_text(canvas, f"{value:.{digits}f}", label, is_upright=True, is_centred=True)
+        write_text(canvas, f"{value:.{digits}f}", label, turned_deg=90.0, is_centred=True)
     # White below black, so that a cross is seen on any picture.
     for colour, width_mm in ((1.0, 0.35), (0.0, THIN_MM)):
         canvas.setStrokeColorRGB(colour, colour, colour)

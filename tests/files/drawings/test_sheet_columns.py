@@ -14,7 +14,7 @@ from reportlab.pdfbase.pdfmetrics import stringWidth
 
 from orthoflow.files.drawings import sheet_columns as module
 from orthoflow.files.drawings.key_plans import KeyPlan
-from orthoflow.files.drawings.papers import Paper, Part, View
+from orthoflow.files.drawings.papers import Paper, Part, View, paper_of
 from orthoflow.files.drawings.sheet_columns import draw_column
 from orthoflow.files.drawings.sheet_contents import Axes, Sheet, SheetText, WallDrawing
 from orthoflow.files.drawings.title_blocks import TitleBlock
@@ -24,6 +24,7 @@ DIGEST = "0123456789abcdef" * 4
 PART = Part(left_m=0.0, top_m=0.0, right_m=4.0, bottom_m=3.0)
 PLAN = KeyPlan(
     walls=np.array([[[0.0, 0.0], [6.0, 0.0]], [[6.0, 0.0], [6.0, 4.0]]]),
+    numbers=(3, 5),
     outlines=(np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.0], [0.0, 0.0]]),),
     marked=np.array([[1.0, 0.0], [5.0, 0.0]]),
     arrow=np.array([[3.0, 2.0], [3.0, 0.2]]),
@@ -66,7 +67,7 @@ def drawn() -> Iterator[Page]:
 
 
 def column(canvas: Page, *, width: float = 94.0, top: float = 280.0) -> module._Column:
-    return module._Column(canvas=canvas, left=310.0, width=width, top=top, bottom=13.0)  # type: ignore[arg-type]
+    return module._Column(canvas=canvas, left=310.0, width=width, top=top, bottom=13.0, size=1.0)  # type: ignore[arg-type]
 
 
 def written(canvas: Page) -> list[str]:
@@ -204,7 +205,13 @@ def similarity(on_paper: NDArray[np.float64], plan: NDArray[np.float64]) -> floa
 def test_a_key_plan_is_the_room_in_one_scale(drawn: Page, room: float) -> None:
     one = column(drawn)
     module._draw_plan(one, PLAN, room)
-    first, second, outline, marked, shaft, barbs, north, _ = drawn.lines
+    first, second, outline, marked, shaft, barbs, north, _, *below_numbers = drawn.lines
+    assert [line.colour for line in below_numbers] == [(1.0, 1.0, 1.0)] * 2
+    numbers = {text.text: text for text in drawn.texts if text.text in "35"}
+    for number, wall in (("3", first), ("5", second)):
+        middle = wall.points.mean(axis=0)
+        assert numbers[number].middle == pytest.approx(middle[0])
+        assert numbers[number].bottom == pytest.approx(middle[1] - 0.5 * numbers[number].high)
     scales = [
         similarity(first.points, PLAN.walls[0]),
         similarity(second.points, PLAN.walls[1]),
@@ -222,17 +229,17 @@ def test_a_key_plan_is_the_room_in_one_scale(drawn: Page, room: float) -> None:
     # From the column's left edge, below what stands there.
     np.testing.assert_allclose(first.points[0], [310.0, one.top], atol=1e-9)
     assert one.top + high < 280.0
-    assert [text.text for text in drawn.texts] == ["N"]
+    assert [text.text for text in drawn.texts] == ["N", "3", "5"]
     # The wall of the sheet is red and the widest, and not closed: it is seen from above.
     assert marked.colour == shaft.colour == barbs.colour == RED
-    assert marked.width_mm > max(one.width_mm for one in drawn.lines if one is not marked)
+    assert marked.width_mm > max(one.width_mm for one in drawn.lines[:8] if one is not marked)
     assert not marked.is_closed
     assert {first.colour, second.colour} == {(0.6, 0.6, 0.6)}
     assert outline.colour == north.colour == (0.0, 0.0, 0.0)
     # Upwards, in the column, beside its right edge, the name over its end.
     assert north.points[0][0] == north.points[1][0] < 310.0 + 94.0
     assert north.points[1][1] > north.points[0][1] > one.top
-    (label,) = drawn.texts
+    label = drawn.texts[0]
     assert label.middle == pytest.approx(north.points[1][0])
     assert label.bottom > north.points[1][1]
 
@@ -391,3 +398,30 @@ def test_the_index_has_no_key_of_its_sheets(drawn: Page) -> None:
     draw_column(drawn, drawing(), sheet("ortho", number=0, count=2, numbered=numbered))  # type: ignore[arg-type]
     assert "sheets of wall 7" not in written(drawn)
     assert "index of 2 sheets" in written(drawn)
+
+
+@pytest.mark.parametrize(
+    ("paper", "high_mm"), [("A4", 1.7), ("A3", 1.7), ("A2", 2.4), ("A1", 3.0), ("A0", 3.0)]
+)
+def test_notes_are_as_high_as_large_paper_wants(drawn: Page, paper: str, high_mm: float) -> None:
+    draw_column(drawn, drawing(), sheet("ortho", paper=paper_of(paper)))  # type: ignore[arg-type]
+    note = next(text for text in drawn.texts if text.text == "first note")
+    assert note.high == pytest.approx(high_mm, abs=0.05)
+    right = paper_of(paper).width_mm - 10.0
+    assert all(text.left + text.width < right for text in drawn.texts)
+    assert min(text.bottom for text in drawn.texts) > 10.0
+
+
+def test_walls_that_are_short_or_close_have_no_number(drawn: Page) -> None:
+    long = np.array([[0.0, 0.0], [40.0, 0.0]])
+    beside, short = long + np.array([0.0, 1.0]), np.array([[0.0, 20.0], [1.0, 20.0]])
+    walls = {12: short, 13: long, 14: beside}
+    module._number_walls(drawn, walls, high_mm=1.7)  # type: ignore[arg-type]
+    assert written(drawn) == ["13"]
+
+
+def test_the_wall_of_the_sheet_has_its_number_before_those_beside_it(drawn: Page) -> None:
+    walls = np.array([[[0.0, 0.0], [6.0, 0.0]], [[0.0, 0.1], [6.0, 0.1]]])
+    plan = replace(PLAN, walls=walls, numbers=(3, 0))
+    module._draw_plan(column(drawn), plan, 40.0, number=0)
+    assert written(drawn) == ["N", "0"]

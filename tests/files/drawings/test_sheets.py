@@ -242,7 +242,17 @@ def test_contours_before_the_plane_and_behind_it_have_two_colours(
     monkeypatch.setattr(module, "contours", lambda *_args, **_kwargs: steps)
     depth = replace(VIEW, kind="depth")
     module._draw_contours(drawn, drawing(rasters={"depth": None}), depth)  # type: ignore[arg-type]
-    behind, before = drawn.lines
+    behind, below_first, before, below = drawn.lines
+    first, second = drawn.texts
+    assert [(text.text, text.colour) for text in (first, second)] == [
+        ("-30", behind.colour),
+        ("+10", before.colour),
+    ]
+    assert below_first.colour == below.colour == WHITE
+    np.testing.assert_allclose(below_first.points.mean(axis=0), [60.0, 100.0], atol=1e-9)
+    # On white, straight along its line.
+    np.testing.assert_allclose(below.points.mean(axis=0), [second.middle, 80.0], atol=1e-9)
+    assert 50.0 < below.points[:, 0].min() < below.points[:, 0].max() < 90.0
     np.testing.assert_allclose(behind.points, [[50.0, 100.0], [70.0, 100.0]])
     np.testing.assert_allclose(before.points, [[50.0, 60.0], [50.0, 80.0], [90.0, 80.0]])
     assert not behind.is_closed

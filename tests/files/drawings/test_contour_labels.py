@@ -1,0 +1,49 @@
+"""Numbers of contours: where they stand, which way up, and where there is none."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from orthoflow.files.drawings.contour_labels import label_place
+
+
+@pytest.mark.parametrize(
+    ("direction_deg", "turned_deg"),
+    [(0, 0), (30, 30), (90, 90), (91, -89), (180, 0), (225, 45), (270, 90), (300, -60)],
+)
+def test_a_number_lies_along_its_line_and_is_never_upside_down(
+    direction_deg: float, turned_deg: float
+) -> None:
+    angle = math.radians(direction_deg)
+    line = np.array([[5.0, 6.0], [5.0 + 40.0 * math.cos(angle), 6.0 + 40.0 * math.sin(angle)]])
+    place = label_place(line, 4.0, [])
+    assert place is not None
+    np.testing.assert_allclose(place.middle_mm, line.mean(axis=0))
+    assert math.isclose(math.sin(math.radians(place.turned_deg - turned_deg)), 0.0, abs_tol=1e-9)
+    assert -90.0 - 1e-9 <= place.turned_deg <= 90.0
+
+
+def test_numbers_keep_apart_and_short_lines_have_none() -> None:
+    line = np.array([[0.0, 0.0], [80.0, 0.0]])
+    first = label_place(line, 4.0, [])
+    assert first is not None
+    second = label_place(line, 4.0, [np.array(first.middle_mm)])
+    assert second is not None
+    assert abs(second.middle_mm[0] - first.middle_mm[0]) >= 12.0
+    everywhere = [np.array([x, 1.0]) for x in np.arange(0.0, 81.0, 10.0)]
+    assert label_place(line, 4.0, everywhere) is None
+    assert label_place(line[:, :] * 0.24, 4.0, []) is None
+
+
+def test_a_number_stands_where_its_line_is_straight() -> None:
+    # A corner in the middle: there the number would lie beside its line.
+    line = np.array([[0.0, 0.0], [30.0, 0.0], [28.0, 1.0], [0.0, 1.0]])
+    place = label_place(line, 6.0, [])
+    assert place is not None
+    assert place.middle_mm[1] in (0.0, 1.0)
+    assert place.middle_mm[0] < 27.0
+    zigzag = np.array([[float(k % 2), 0.2 * k] for k in range(60)])
+    assert label_place(zigzag, 6.0, []) is None
